@@ -1,0 +1,56 @@
+# One virtual environment for everything; each part of it is installed once, and again when its pins change.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+DEMO_SECONDS := 45
+BENCHMARKS := $(sort $(wildcard benchmarks/[a-z]*.py))
+
+.PHONY: demo test lint format bench clean help
+
+help:
+	@echo "make demo    train on the built-in scene, evaluate, export abundance maps"
+	@echo "make test    run every test"
+	@echo "make lint    check format, lint rules, types and the import law"
+	@echo "make format  rewrite the code in the one format"
+	@echo "make bench   run every benchmark, results into benchmarks/results"
+	@echo "make clean   remove the virtual environment and caches"
+
+$(BIN)/python:
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "installing unmix-nerf into $(VENV) (once) ..."
+	$(INSTALL) --editable .
+	@touch $@
+
+$(VENV)/.installed-dev: $(VENV)/.installed
+	@echo "installing the development tools into $(VENV) (once) ..."
+	$(INSTALL) --editable '.[dev,tensorboard]'
+	@touch $@
+
+demo: $(VENV)/.installed
+	$(BIN)/unmix-train unmix-nerf --data demo --max-seconds $(DEMO_SECONDS) --pipeline.model.num-endmembers 6
+	@set -e; run=$$(ls -td outputs/demo/unmix-nerf/*/ | head -n 1); \
+	$(BIN)/unmix-eval --run "$$run"; \
+	$(BIN)/unmix-export abundances --run "$$run"; \
+	echo; echo "pictures: $${run}eval (true, predicted, error) and $${run}exports (abundance maps)"
+
+test: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/.installed-dev
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/pyright --pythonpath $(BIN)/python
+	$(BIN)/lint-imports --no-logo
+
+format: $(VENV)/.installed-dev
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+bench: $(VENV)/.installed-dev
+	@set -e; for benchmark in $(BENCHMARKS); do echo "== $$benchmark"; $(BIN)/python $$benchmark; done
+
+clean:
+	rm -rf $(VENV) build .pytest_cache .ruff_cache .hypothesis *.egg-info

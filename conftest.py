@@ -1,0 +1,22 @@
+"""What every test and every doctest runs under: one thread, no display, slow first calls allowed, numpy's own print."""
+
+import os
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+import torch
+from hypothesis import settings
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # for commands that tests start as processes of their own
+torch.set_num_threads(1)  # tensors in tests are tiny, and results should not depend on the machine
+mpl.use("Agg")
+settings.register_profile("unmix", deadline=None, derandomize=True)  # a first call may compile a kernel
+settings.load_profile("unmix")
+
+
+@pytest.fixture(autouse=True)
+def default_numpy_print():
+    """Importing colour-science sets numpy's print to that of 1.13, which would change what doctests show."""
+    with np.printoptions(legacy=False):
+        yield

@@ -1,0 +1,52 @@
+"""`unmix-demo-scene`: what it prints, writes and refuses."""
+
+import json
+
+import pytest
+
+from unmix_plugin.commands import demo_scene
+
+SMALL = ["--size", "16", "--bands", "3", "--views", "4"]
+
+
+def run(monkeypatch, *words):
+    """Run the command as the console script does; its exit code."""
+    monkeypatch.setattr("sys.argv", ["unmix-demo-scene", *map(str, words)])
+    with pytest.raises(SystemExit) as stop:
+        demo_scene.main()
+    return stop.value.code
+
+
+def test_it_writes_a_scene_of_the_wanted_size_and_names_what_it_wrote(monkeypatch, capsys, tmp_path):
+    assert run(monkeypatch, tmp_path / "scene", *SMALL) == 0
+    transforms = json.loads((tmp_path / "scene" / "transforms.json").read_text())
+    assert (transforms["w"], len(transforms["wavelengths"]), len(transforms["frames"])) == (16, 3, 4)
+    printed = capsys.readouterr().out
+    assert "4 views (3 to train on, 1 for evaluation) of 16 x 16 pixels and 3 bands" in printed
+    for path in (tmp_path / "scene").iterdir():
+        assert str(path) in printed
+
+
+def test_a_folder_with_something_in_it_needs_overwrite(monkeypatch, capsys, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    assert run(monkeypatch, tmp_path, *SMALL) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+    assert run(monkeypatch, tmp_path, *SMALL, "--overwrite") == 0
+    assert (tmp_path / "transforms.json").exists()
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize("words", [["--size", "5"], ["--bands", "0"], ["--views", "1"]])
+def test_a_number_out_of_bounds_exits_2_with_the_bounds(monkeypatch, capsys, tmp_path, words):
+    assert run(monkeypatch, tmp_path / "scene", *words) == 2
+    shown = capsys.readouterr().err
+    assert shown.startswith(f"error: {words[0]} of a demo scene must be")
+    assert shown.rstrip().endswith(f"found {words[1]}")
+    assert not (tmp_path / "scene").exists()
+
+
+@pytest.mark.parametrize("words", [[], ["--size", "large", "scene"]])
+def test_words_that_do_not_parse_exit_2(monkeypatch, capsys, words):
+    assert run(monkeypatch, *words) == 2
+    assert capsys.readouterr().err

@@ -1,0 +1,77 @@
+"""Exit codes and error messages, shared by all commands."""
+
+import errno
+
+import pytest
+
+from unmix_plugin.commands.entry import run_command
+from unmix_plugin.errors import ConfigError, SceneError
+
+
+def end_of(command, arguments=()):
+    """The exit code that a command leaves the process with."""
+    with pytest.raises(SystemExit) as stop:
+        run_command(command, arguments)
+    return stop.value.code
+
+
+def raising(error):
+    def command(_words):
+        raise error
+
+    return command
+
+
+def test_a_finished_command_exits_0_and_says_nothing_on_stderr(capsys):
+    assert end_of(lambda _words: "ignored") == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_a_command_gets_its_words_without_debug():
+    seen = []
+    end_of(seen.extend, ["--data", "demo", "--debug", "7"])
+    assert seen == ["--data", "demo", "7"]
+
+
+def test_words_default_to_those_of_the_process(monkeypatch):
+    monkeypatch.setattr("sys.argv", ["unmix-train", "unmix-nerf"])
+    seen = []
+    with pytest.raises(SystemExit):
+        run_command(seen.extend)
+    assert seen == ["unmix-nerf"]
+
+
+@pytest.mark.parametrize("error", [ConfigError("no such method"), SceneError("no such method")])
+def test_a_users_error_exits_2_with_its_message_alone(capsys, error):
+    assert end_of(raising(error)) == 2
+    assert capsys.readouterr().err == "error: no such method\n"
+
+
+def test_debug_shows_the_traceback_of_a_users_error(capsys):
+    assert end_of(raising(ConfigError("no such method")), ["--debug"]) == 2
+    shown = capsys.readouterr().err
+    assert shown.startswith("Traceback")
+    assert shown.endswith("error: no such method\n")
+
+
+def test_a_full_disk_is_the_users_error(capsys):
+    assert end_of(raising(OSError(errno.ENOSPC, "No space left on device", "cube.npy"))) == 2
+    assert "No space left on device" in capsys.readouterr().err
+
+
+def test_anything_else_exits_1_and_is_called_a_bug_in_one_line(capsys):
+    assert end_of(raising(ZeroDivisionError("division by zero"))) == 1
+    shown = capsys.readouterr().err
+    assert "this is a bug" in shown
+    assert "ZeroDivisionError: division by zero" in shown
+    assert shown.count("\n") == 1
+
+
+def test_an_interrupt_exits_130(capsys):
+    assert end_of(raising(KeyboardInterrupt())) == 130
+    assert capsys.readouterr().err == "interrupted\n"
+
+
+@pytest.mark.parametrize("status", [0, 2])
+def test_the_parsers_own_exit_passes_through(status):
+    assert end_of(raising(SystemExit(status))) == status

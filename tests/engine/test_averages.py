@@ -1,0 +1,69 @@
+"""The moving average of the parameters."""
+
+import io
+from dataclasses import replace
+
+import torch
+from rich.console import Console
+from torch import nn
+
+from unmix_plugin.engine.averages import ParameterAverage
+from unmix_plugin.engine.configs import TrainerConfig
+from unmix_plugin.engine.load_run import load_model
+from unmix_plugin.engine.trainer import Trainer
+
+
+def test_the_average_of_a_constant_is_the_constant():
+    module = nn.Linear(3, 2)
+    expected = module.weight.detach().clone()
+    average = ParameterAverage(module, decay=0.9)
+    for step in range(1, 30):
+        average.update(step)
+    torch.testing.assert_close(average.values["weight"], expected, rtol=0, atol=1e-7)
+
+
+def test_after_many_steps_the_average_is_exponential():
+    module = nn.Linear(1, 1, bias=False)
+    average = ParameterAverage(module, decay=0.5)
+    expected = 0.0
+    for step in range(1, 60):
+        with torch.no_grad():
+            module.weight.fill_(float(step % 7))
+        average.update(step)
+        expected = 0.5 * expected + 0.5 * (step % 7)
+    torch.testing.assert_close(average.values["weight"].item(), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_an_interval_of_two_updates_at_every_second_step_with_the_decay_squared():
+    module = nn.Linear(1, 1, bias=False)
+    average = ParameterAverage(module, decay=0.9, interval=2)
+    assert average.decay == 0.9**2
+    for step in range(1, 6):
+        average.update(step)
+    assert average.updates == 2
+
+
+def test_swapping_in_shows_the_average_and_gives_the_parameters_back():
+    module = nn.Linear(2, 2)
+    average = ParameterAverage(module, decay=0.9)
+    before = module.weight.detach().clone()
+    with torch.no_grad():
+        module.weight.add_(1.0)
+    with average.swapped_in():
+        assert torch.equal(module.weight, before)
+    assert torch.equal(module.weight, before + 1.0)
+    assert torch.equal(average.values["weight"], before)
+
+
+def test_a_run_with_an_average_is_evaluated_and_loaded_with_it(short_config: TrainerConfig):
+    config = replace(short_config, average_decay=0.8, steps_per_eval_all_images=12)
+    trainer = Trainer(config, console=Console(file=io.StringIO()))
+    trainer.train()
+    assert trainer.average is not None
+    loaded = load_model(trainer.run.path, "cpu")
+    grid = dict(loaded.model.named_parameters())["field.grid"]
+    assert torch.equal(grid, trainer.average.values["field.grid"])
+    assert not torch.equal(grid, dict(trainer.pipeline.model.named_parameters())["field.grid"])
+    line = trainer.run.metrics_path.read_text().splitlines()[-1]
+    with trainer.average.swapped_in():
+        assert f'"psnr": {trainer.pipeline.get_average_eval_image_metrics()["psnr"]}' in line

@@ -1,0 +1,136 @@
+"""What a pipeline computes from a model and a data manager, whatever they are."""
+
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+
+from unmix_plugin.engine.callbacks import TrainingCallback, TrainingCallbackLocation, run_callbacks
+from unmix_plugin.engine.configs import TrainerConfig
+from unmix_plugin.engine.load_run import load_pipeline
+from unmix_plugin.engine.pipeline import Pipeline, evaluating
+from unmix_plugin.engine.trainer import Trainer
+from unmix_plugin.errors import ConfigError
+
+
+@pytest.fixture
+def pipeline(short_config: TrainerConfig) -> Pipeline:
+    torch.manual_seed(0)
+    made = short_config.pipeline.setup(data=short_config.data, device=torch.device("cpu"), seed=3)
+    made.initialise()
+    return made
+
+
+def test_a_whole_image_is_its_rays_rendered_in_any_chunks(pipeline: Pipeline):
+    camera = pipeline.datamanager.eval_cameras[0]
+    model = pipeline.model.eval()
+    at_once = model.get_outputs(camera.image_rays(0))
+    image = model.get_outputs_for_camera(camera)
+    assert image["rgb"].shape == (20, 20, 3)
+    assert image["accumulation"].shape == (20, 20)
+    torch.testing.assert_close(image["rgb"].reshape(-1, 3), at_once["rgb"], rtol=0, atol=1e-6)
+
+
+def test_only_the_outputs_asked_for_are_rendered_and_unknown_ones_are_refused(pipeline: Pipeline):
+    camera = pipeline.datamanager.eval_cameras[0]
+    assert set(pipeline.model.get_outputs_for_camera(camera, ["rgb"])) == {"rgb"}
+    with pytest.raises(ConfigError, match="no output depht; it has accumulation, rgb"):
+        pipeline.model.get_outputs_for_camera(camera, ["depht"])
+
+
+def test_average_metrics_are_the_mean_over_the_evaluation_views_that_have_them(
+    pipeline: Pipeline, monkeypatch
+):
+    seen: list[bool] = []
+
+    def metrics(outputs, _):
+        seen.append(pipeline.model.training)
+        return ({"psnr": 10.0, "miou": 0.5} if len(seen) == 1 else {"psnr": 20.0}), {"rgb": outputs["rgb"]}
+
+    monkeypatch.setattr(pipeline.model, "get_image_metrics_and_images", metrics)
+    pipeline.train()
+    assert pipeline.get_average_eval_image_metrics() == {"psnr": 15.0, "miou": 0.5}
+    assert seen == [False, False]
+    assert pipeline.model.training
+
+
+def test_a_training_step_has_gradients_and_an_evaluation_step_has_none(pipeline: Pipeline):
+    assert pipeline.get_train_loss_dict(0)[1]["rgb_loss"].requires_grad
+    outputs, losses, metrics = pipeline.get_eval_loss_dict(0)
+    assert not losses["rgb_loss"].requires_grad
+    assert set(outputs) == {"rgb", "accumulation"}
+    torch.testing.assert_close(metrics["psnr"], -10 * losses["rgb_loss"].log10())
+
+
+def test_evaluating_gives_back_the_mode_it_found():
+    module = torch.nn.Linear(1, 1)
+    for mode in (True, False):
+        module.train(mode)
+        with evaluating(module):
+            assert not module.training
+        assert module.training is mode
+
+
+def test_callbacks_run_at_their_place_in_order_with_step_and_progress():
+    seen: list[tuple[str, int, float]] = []
+    before, after = TrainingCallbackLocation
+    callbacks = [
+        TrainingCallback(where, lambda step, progress, name=name: seen.append((name, step, progress)))
+        for where, name in ((after, "a"), (before, "b"), (after, "c"))
+    ]
+    run_callbacks(callbacks, before, 3, 0.5)
+    run_callbacks(callbacks, after, 3, 0.5)
+    assert seen == [("b", 3, 0.5), ("a", 3, 0.5), ("c", 3, 0.5)]
+
+
+def test_training_calls_the_callbacks_of_every_step_with_rising_progress(short_config: TrainerConfig):
+    trainer = Trainer(short_config, console=Console(file=io.StringIO()))
+    seen: list[tuple[int, float]] = []
+    where = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION
+    trainer.callbacks.append(TrainingCallback(where, lambda step, progress: seen.append((step, progress))))
+    trainer.train()
+    assert seen == [(step, step / 12) for step in range(12)]
+
+
+def test_a_model_takes_its_first_values_from_the_scene_only_when_a_run_starts(
+    short_config: TrainerConfig, monkeypatch: pytest.MonkeyPatch
+):
+    from tests.engine.rgb_nerf_plugin import RgbNerf
+
+    calls: list[set[str]] = []
+    original = RgbNerf.initialise
+
+    def counted(self: RgbNerf, initial_data) -> None:
+        calls.append(set(initial_data))
+        original(self, initial_data)
+
+    monkeypatch.setattr(RgbNerf, "initialise", counted)
+    trainer = Trainer(short_config, console=Console(file=io.StringIO()))
+    trainer.train()
+    load_pipeline(trainer.run.path, "cpu")
+    assert calls == [{"raw_density"}]
+
+
+def test_a_pipeline_loads_with_its_scene_at_another_place(short_config: TrainerConfig, tmp_path: Path):
+    trainer = Trainer(short_config, console=Console(file=io.StringIO()))
+    trainer.train()
+    assert short_config.data is not None
+    moved = short_config.data.rename(tmp_path / "moved")
+    loaded = load_pipeline(trainer.run.path, "cpu", data=moved)
+    assert loaded.config.data == loaded.pipeline.datamanager.data == moved
+    assert loaded.training == trainer.record
+    assert not loaded.pipeline.model.training
+
+
+def test_two_runs_of_one_seed_are_equal_and_of_another_seed_are_not(short_config: TrainerConfig):
+    def trained(seed: int) -> torch.Tensor:
+        trainer = Trainer(replace(short_config, seed=seed), console=Console(file=io.StringIO()))
+        trainer.train()
+        return next(trainer.pipeline.model.parameters()).detach()
+
+    first = trained(1)
+    assert torch.equal(trained(1), first)
+    assert not torch.equal(trained(2), first)

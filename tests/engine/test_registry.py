@@ -1,0 +1,78 @@
+"""Methods are found through entry points, and one broken plugin harms no other."""
+
+from dataclasses import replace
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import pytest
+
+from unmix_plugin.engine.registry import METHOD_GROUP, discover_methods, find_method
+from unmix_plugin.errors import ConfigError
+
+
+def entry(name: str, value: str) -> EntryPoint:
+    return EntryPoint(name, value, METHOD_GROUP)
+
+
+def test_a_registered_method_is_found_under_its_configs_name(registered: list[EntryPoint]):
+    registered[0] = entry("another-name", registered[0].value)
+    methods, broken = discover_methods()
+    assert list(methods) == ["rgb-nerf"]
+    assert broken == []
+    assert methods["rgb-nerf"].description == "Plain RGB radiance field."
+
+
+@pytest.mark.parametrize(
+    ("value", "reason"),
+    [
+        ("no_such_module_at_all:method", "ModuleNotFoundError: No module named 'no_such_module_at_all'"),
+        ("tests.engine.rgb_nerf_plugin:no_such_name", "AttributeError"),
+        ("tests.engine.rgb_nerf_plugin:VIEWS", "is a int, not a MethodSpecification"),
+        ("plugin_that_fails:method", "RuntimeError: this plugin fails on import"),
+    ],
+)
+def test_a_broken_plugin_is_named_with_its_reason_and_skipped(
+    registered: list[EntryPoint], value: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "plugin_that_fails.py").write_text(
+        'raise RuntimeError("this plugin fails on import\\nbadly")'
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    registered.append(entry("broken-one", value))
+    methods, broken = discover_methods()
+    assert list(methods) == ["rgb-nerf"]
+    assert [plugin.name for plugin in broken] == ["broken-one"]
+    assert str(broken[0]).startswith("skipped the plugin broken-one: ")
+    assert reason in str(broken[0])
+    assert "\n" not in str(broken[0])
+
+
+def test_the_second_of_two_methods_of_one_name_is_skipped(registered: list[EntryPoint]):
+    registered.append(entry("z-again", registered[0].value))
+    methods, broken = discover_methods()
+    assert list(methods) == ["rgb-nerf"]
+    assert "z-again: a method rgb-nerf is registered already" in str(broken[0])
+
+
+def test_an_unknown_method_is_answered_with_the_nearest_names_the_list_and_what_was_skipped(
+    registered: list[EntryPoint],
+):
+    registered.append(entry("broken-one", "no_such_module_at_all:method"))
+    with pytest.raises(ConfigError) as caught:
+        find_method("rgb-nurf")
+    message = str(caught.value)
+    assert "unknown method 'rgb-nurf'; did you mean rgb-nerf?" in message
+    assert "installed: rgb-nerf" in message
+    assert "skipped the plugin broken-one: ModuleNotFoundError" in message
+
+
+def test_a_name_near_to_none_gets_the_list_alone(registered: list[EntryPoint]):
+    assert len(registered) == 1
+    with pytest.raises(ConfigError, match="unknown method 'xyz'\ninstalled: rgb-nerf"):
+        find_method("xyz")
+
+
+def test_a_found_method_can_be_changed_without_changing_the_registered_one(registered: list[EntryPoint]):
+    assert len(registered) == 1
+    changed = replace(find_method("rgb-nerf").config, seed=1)
+    assert changed != find_method("rgb-nerf").config

@@ -1,0 +1,167 @@
+"""A run that was stopped and resumed is the run that was never stopped."""
+
+import io
+import json
+import os
+import signal
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+
+from unmix_plugin.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from unmix_plugin.engine.checkpoints import Checkpoint, checkpoint_steps, newest_complete_checkpoint
+from unmix_plugin.engine.configs import TrainerConfig
+from unmix_plugin.engine.interrupts import Interrupted
+from unmix_plugin.engine.load_run import load_config, load_model
+from unmix_plugin.engine.trainer import Trainer
+from unmix_plugin.errors import RunError
+
+
+def quiet_trainer(config: TrainerConfig) -> Trainer:
+    return Trainer(config, console=Console(file=io.StringIO()))
+
+
+def call_after_step(trainer: Trainer, step: int, action: Callable[[], None]) -> None:
+    """Let `action` run inside the step that brings the count to `step`."""
+    where = TrainingCallbackLocation.AFTER_TRAIN_ITERATION
+    trainer.callbacks.append(TrainingCallback(where, lambda i, _: action() if i + 1 == step else None))
+
+
+def stop_at(config: TrainerConfig, step: int, number: int = signal.SIGINT) -> Interrupted:
+    trainer = quiet_trainer(config)
+    call_after_step(trainer, step, lambda: os.kill(os.getpid(), number))
+    with pytest.raises(Interrupted) as caught:
+        trainer.train()
+    return caught.value
+
+
+def press_ctrl_c_twice() -> None:
+    os.kill(os.getpid(), signal.SIGINT)
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def newest(run: Path) -> Checkpoint:
+    checkpoint = newest_complete_checkpoint(run / "checkpoints")
+    assert checkpoint is not None
+    return checkpoint
+
+
+def train_lines(run: Path) -> list[dict]:
+    """Metrics lines without what depends on the clock."""
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    return [{k: v for k, v in line.items() if k not in ("seconds", "rays_per_second")} for line in lines]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("average_decay", [None, 0.9])
+def test_stopped_and_resumed_equals_straight_to_the_bit(
+    short_config: TrainerConfig, number: int, average_decay: float | None
+):
+    config = replace(short_config, average_decay=average_decay, average_interval=2)
+    straight = quiet_trainer(config)
+    straight.train()
+    stopped = stop_at(config, 6, number)
+    assert stopped.step == 6
+    resumed = quiet_trainer(load_config(stopped.run))
+    assert resumed.step == 6
+    resumed.train()
+    assert resumed.run.path == stopped.run
+    expected, actual = newest(straight.run.path), newest(resumed.run.path)
+    assert actual.step == expected.step == 12
+    assert set(actual.tensors) == set(expected.tensors)
+    assert any(name.startswith("average/") for name in actual.tensors) == (average_decay is not None)
+    for name, tensor in expected.tensors.items():
+        assert torch.equal(actual.tensors[name], tensor), name
+    for key in ("learning_rates", "num_rays", "total_rays", "skipped_steps", "average_updates", "progress"):
+        assert actual.record[key] == expected.record[key], key
+    assert train_lines(resumed.run.path) == train_lines(straight.run.path)
+
+
+def test_resuming_takes_back_every_step_counter_of_the_optimiser(short_config: TrainerConfig):
+    stopped = stop_at(short_config, 5)
+    resumed = quiet_trainer(load_config(stopped.run))
+    counters = [float(state["step"]) for state in resumed.optimizer.state.values()]
+    assert counters == [5.0]
+
+
+def test_a_killed_run_goes_on_from_its_last_checkpoint_and_forgets_later_metrics(short_config: TrainerConfig):
+    class Killed(BaseException):
+        pass
+
+    def kill() -> None:
+        raise Killed
+
+    trainer = quiet_trainer(short_config)
+    call_after_step(trainer, 7, kill)
+    with pytest.raises(Killed):
+        trainer.train()
+    with trainer.run.metrics_path.open("a") as file:
+        file.write('{"step": 7, "sec')
+    assert [line["step"] for line in train_lines_until_cut(trainer.run.metrics_path)] == [1, 2, 3, 4, 5, 6]
+    resumed = quiet_trainer(load_config(trainer.run.path))
+    assert resumed.step == 4
+    resumed.train()
+    assert [line["step"] for line in train_lines(trainer.run.path)] == list(range(1, 13))
+
+
+def train_lines_until_cut(path: Path) -> list[dict]:
+    return [json.loads(line) for line in path.read_text().splitlines() if line.endswith("}")]
+
+
+def test_a_longer_limit_lets_a_finished_run_go_on(short_config: TrainerConfig):
+    first = quiet_trainer(short_config)
+    first.train()
+    longer = quiet_trainer(replace(load_config(first.run.path), max_num_iterations=15))
+    longer.train()
+    assert newest(first.run.path).step == 15
+    assert load_config(first.run.path).max_num_iterations == 15
+
+
+def test_a_finished_run_resumed_is_left_as_it_is(short_config: TrainerConfig):
+    first = quiet_trainer(short_config)
+    first.train()
+    before = newest(first.run.path)
+    record = quiet_trainer(load_config(first.run.path)).train()
+    assert record.steps == 12
+    assert newest(first.run.path).record == before.record
+
+
+def test_a_second_ctrl_c_stops_within_the_step_and_names_the_last_checkpoint(short_config: TrainerConfig):
+    trainer = quiet_trainer(short_config)
+    call_after_step(trainer, 6, press_ctrl_c_twice)
+    with pytest.raises(Interrupted) as caught:
+        trainer.train()
+    assert caught.value.step == 4
+    assert checkpoint_steps(trainer.run.checkpoints) == [4]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_ctrl_c_before_any_checkpoint_says_there_is_none(short_config: TrainerConfig):
+    trainer = quiet_trainer(short_config)
+    call_after_step(trainer, 2, press_ctrl_c_twice)
+    with pytest.raises(Interrupted, match="no checkpoint") as caught:
+        trainer.train()
+    assert caught.value.step is None
+
+
+def test_resuming_on_another_scene_is_refused(short_config: TrainerConfig, monkeypatch: pytest.MonkeyPatch):
+    stopped = stop_at(short_config, 5)
+    monkeypatch.setattr(
+        "tests.engine.rgb_nerf_plugin.BallDataManager.metadata", lambda _: {"grid_size": 20, "bands": 3}
+    )
+    with pytest.raises(RunError, match=r"not the one that .* was trained on: bands differ"):
+        quiet_trainer(load_config(stopped.run))
+
+
+def test_changed_model_settings_do_not_fit_a_resumed_run(short_config: TrainerConfig):
+    stopped = stop_at(short_config, 5)
+    scene_path = stopped.run / "scene.json"
+    scene = json.loads(scene_path.read_text())
+    scene["metadata"]["grid_size"] = 10
+    scene_path.write_text(json.dumps(scene))
+    with pytest.raises(RunError, match="does not fit the model"):
+        load_model(stopped.run, "cpu")

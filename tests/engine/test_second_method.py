@@ -1,0 +1,67 @@
+"""A method that has nothing to do with spectra is found, trained and brought back by the engine as it is."""
+
+import ast
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+
+from tests.engine import rgb_nerf_plugin
+from unmix_plugin.engine.configs import TrainerConfig
+from unmix_plugin.engine.load_run import load_model, load_pipeline
+from unmix_plugin.engine.registry import find_method
+from unmix_plugin.engine.trainer import Trainer
+
+
+@pytest.mark.usefixtures("registered")
+@pytest.mark.parametrize("device", ["cpu"] + ["cuda"] * torch.cuda.is_available())
+def test_a_plain_rgb_nerf_trains_from_its_entry_point_to_23_db(tmp_path: Path, device: str):
+    (tmp_path / "ball").mkdir()
+    config = replace(
+        find_method("rgb-nerf").config, data=tmp_path / "ball", output_dir=tmp_path, device=device
+    )
+    trainer = Trainer(config, console=Console(file=io.StringIO()))
+    assert trainer.pipeline.get_average_eval_image_metrics()["psnr"] < 12
+    record = trainer.train()
+    loaded = load_pipeline(trainer.run.path, "cpu")
+    assert loaded.step == record.steps == 200
+    assert loaded.pipeline.get_average_eval_image_metrics(loaded.step)["psnr"] > 23
+
+
+def test_the_second_method_imports_nothing_of_ours_but_the_engine():
+    tree = ast.parse(Path(rgb_nerf_plugin.__file__).read_text())
+    modules = [node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    ours = [module for module in modules if module.startswith("unmix_plugin")]
+    assert len(ours) > 5
+    assert all(module.startswith("unmix_plugin.engine.") for module in ours)
+
+
+def test_a_finished_run_renders_from_its_folder_alone(short_config: TrainerConfig, tmp_path: Path):
+    trainer = Trainer(short_config, console=Console(file=io.StringIO()))
+    trainer.train()
+    expected = trainer.pipeline.eval().model.get_outputs_for_camera(
+        trainer.pipeline.datamanager.eval_cameras[1]
+    )
+    assert short_config.data is not None
+    short_config.data.rmdir()
+    moved = trainer.run.path.rename(tmp_path / "elsewhere")
+    loaded = load_model(moved, "cpu")
+    actual = loaded.model.get_outputs_for_camera(loaded.scene.eval_cameras[1])
+    assert set(actual) == {"rgb", "accumulation"}
+    assert torch.equal(actual["rgb"], expected["rgb"])
+    assert loaded.scene.summary == {"scene": "ball"}
+    assert len(loaded.scene.train_cameras) == 10
+
+
+def test_training_json_says_how_long_and_how_much_was_trained(short_config: TrainerConfig):
+    trainer = Trainer(short_config, console=Console(file=io.StringIO()))
+    record = trainer.train()
+    written = json.loads(trainer.run.training_path.read_text())
+    assert written["steps"] == 12
+    assert written["total_rays"] == record.total_rays == sum(512 + i for i in range(12))
+    assert written["train_rays_per_second"] == record.total_rays / record.train_seconds
+    assert written["num_rays"] == 524

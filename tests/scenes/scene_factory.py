@@ -1,0 +1,142 @@
+"""Tiny scene folders for tests: a matt ball at the origin, seen from a ring of cameras, written and then spoilt."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+WIDTH, HEIGHT = 20, 16
+WAVELENGTHS = (450.0, 520.0, 600.0, 680.0)
+SPECTRUM = np.array([0.2, 0.5, 0.8, 0.4], dtype=np.float32)
+FOCAL = 28.0
+
+
+@dataclass(frozen=True)
+class SceneFolder:
+    """A written scene and the means to spoil it."""
+
+    root: Path
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """transforms.json as it stands."""
+        return json.loads((self.root / "transforms.json").read_text(encoding="utf-8"))
+
+    def edit(self, change: Callable[[dict[str, Any]], Any]) -> SceneFolder:
+        """Change transforms.json in place."""
+        content = self.content
+        change(content)
+        (self.root / "transforms.json").write_text(json.dumps(content), encoding="utf-8")
+        return self
+
+    def edit_cube(self, index: int, change: Callable[[np.ndarray], np.ndarray | None]) -> SceneFolder:
+        """Change a cube in place, or replace it with what `change` returns."""
+        path = self.root / f"cubes/view_{index}.npy"
+        cube = np.load(path)
+        changed = change(cube)
+        np.save(path, cube if changed is None else changed)
+        return self
+
+    def edit_cubes(self, change: Callable[[np.ndarray], np.ndarray | None]) -> SceneFolder:
+        """Change all cubes."""
+        for index in range(len(self.content["frames"])):
+            self.edit_cube(index, change)
+        return self
+
+
+def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Camera to world (4, 4) with OpenGL axes, +z up in the world."""
+    back = (position - target) / np.linalg.norm(position - target)
+    right = np.cross(np.array([0.0, 0.0, 1.0]), back)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :4] = np.stack([right, np.cross(back, right), back, position], axis=1)
+    return pose
+
+
+def ring_poses(count: int, distance: float = 4.0) -> list[np.ndarray]:
+    """Cameras around the origin, alternately lower and higher."""
+    poses = []
+    for index in range(count):
+        angle, height = 2.0 * np.pi * index / count, (0.25, 0.7)[index % 2]
+        radius = np.sqrt(1.0 - height**2)
+        position = distance * np.array([radius * np.cos(angle), radius * np.sin(angle), height])
+        poses.append(look_at(position, np.zeros(3)))
+    return poses
+
+
+def ball_alpha(pose: np.ndarray, radius: float, width: int, height: int, focal: float) -> np.ndarray:
+    """Coverage (H, W) of a ball at the origin, from 5 x 5 rays a pixel."""
+    steps = (np.arange(5) + 0.5) / 5.0
+    x = (np.arange(width)[:, None] + steps).reshape(-1)
+    y = (np.arange(height)[:, None] + steps).reshape(-1)
+    grid_x, grid_y = np.meshgrid(x, y)
+    local = np.stack(
+        [(grid_x - width / 2) / focal, -(grid_y - height / 2) / focal, -np.ones_like(grid_x)], -1
+    )
+    directions = local @ pose[:3, :3].T
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    along = -(directions @ pose[:3, 3])
+    hits = (pose[:3, 3] @ pose[:3, 3] - along**2 < radius**2) & (along > 0)
+    return hits.reshape(height, 5, width, 5).mean(axis=(1, 3))
+
+
+def make_scene(
+    root: Path,
+    frames: int = 6,
+    alpha: bool = True,
+    radius: float = 0.6,
+    poses: list[np.ndarray] | None = None,
+) -> SceneFolder:
+    """Write a sound scene: frame 0 is for evaluation, by lists."""
+    for folder in ("cubes", "images", "labels", "abundances"):
+        (root / folder).mkdir(parents=True)
+    poses = ring_poses(frames) if poses is None else poses
+    entries = []
+    for index, pose in enumerate(poses):
+        cover = ball_alpha(pose, radius, WIDTH, HEIGHT, FOCAL) if alpha else np.ones((HEIGHT, WIDTH))
+        np.save(root / f"cubes/view_{index}.npy", (cover[..., None] * SPECTRUM).astype(np.float16))
+        grey = (200 * cover).astype(np.uint8)
+        pixels = np.stack([grey, grey, grey, np.round(255 * cover).astype(np.uint8)], axis=-1)
+        Image.fromarray(pixels).save(root / f"images/view_{index}.png")
+        labels = np.where(cover > 0.5, np.uint8(1), np.uint8(255))
+        Image.fromarray(labels).save(root / f"labels/view_{index}.png")
+        abundances = np.stack([np.zeros_like(cover), (cover > 0.5).astype(float)], axis=-1)
+        np.save(root / f"abundances/view_{index}.npy", abundances.astype(np.float16))
+        entries.append(
+            {
+                "file_path": f"images/view_{index}.png",
+                "hyperspectral_file_path": f"cubes/view_{index}.npy",
+                "seg_file_path": f"labels/view_{index}.png",
+                "abundance_file_path": f"abundances/view_{index}.npy",
+                "transform_matrix": pose.tolist(),
+            }
+        )
+    (root / "endmembers.csv").write_text(
+        "wavelength,leaf,clay\n450,0.1,0.2\n520,0.3,0.5\n600,0.1,0.8\n680,0.1,0.4\n", encoding="utf-8"
+    )
+    (root / "illuminant.csv").write_text("wavelength,power\n450,1\n600,2\n680,4\n", encoding="utf-8")
+    content = {
+        "camera_model": "OPENCV",
+        "w": WIDTH,
+        "h": HEIGHT,
+        "fl_x": FOCAL,
+        "fl_y": FOCAL,
+        "cx": WIDTH / 2,
+        "cy": HEIGHT / 2,
+        "wavelengths": list(WAVELENGTHS),
+        "materials": ["leaf", "clay"],
+        "illuminant_path": "illuminant.csv",
+        "endmembers_path": "endmembers.csv",
+        "train_filenames": [f"images/view_{index}.png" for index in range(1, len(poses))],
+        "test_filenames": ["images/view_0.png"],
+        "frames": entries,
+    }
+    (root / "transforms.json").write_text(json.dumps(content), encoding="utf-8")
+    return SceneFolder(root)

@@ -1,0 +1,237 @@
+"""A sound scene is read as it was written."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from tests.scenes.scene_factory import FOCAL, HEIGHT, SPECTRUM, WAVELENGTHS, WIDTH, make_scene
+from unmix_plugin.scenes import Normalisation, SceneOptions, load_scene
+
+
+def test_every_part_of_a_scene_is_what_was_written(tmp_path):
+    folder = make_scene(tmp_path / "scene")
+    scene = load_scene(folder.root)
+    assert scene.wavelengths_nm.tolist() == list(WAVELENGTHS)
+    assert scene.train_indices == (1, 2, 3, 4, 5)
+    assert scene.eval_indices == (0,)
+    assert scene.material_names == ("leaf", "clay")
+    assert (scene.has_alpha, scene.has_labels, scene.has_abundances) == (True, True, True)
+    assert [frame.name for frame in scene.frames] == [f"view_{i}" for i in range(6)]
+    stored = np.load(folder.root / "cubes/view_3.npy")
+    cube = scene.cube(3)
+    assert cube.dtype == np.float32
+    assert np.array_equal(cube, stored.astype(np.float32))
+    pixels = np.asarray(Image.open(folder.root / "images/view_3.png"))
+    alpha, srgb, labels, abundances = scene.alpha(3), scene.srgb(3), scene.labels(3), scene.abundances(3)
+    assert alpha is not None
+    assert srgb is not None
+    assert labels is not None
+    assert abundances is not None
+    np.testing.assert_allclose(alpha, pixels[..., 3] / 255.0, atol=1e-7)
+    np.testing.assert_allclose(srgb, pixels[..., :3] / 255.0, atol=1e-7)
+    assert np.array_equal(labels, np.asarray(Image.open(folder.root / "labels/view_3.png")))
+    assert np.array_equal(abundances, np.load(folder.root / "abundances/view_3.npy").astype(np.float32))
+    assert scene.valid_mask(3).all()
+
+
+def test_light_and_endmembers_come_at_the_scenes_bands(tmp_path):
+    scene = load_scene(make_scene(tmp_path / "scene").root)
+    assert scene.illuminant is not None
+    assert scene.endmembers is not None
+    at_520 = 1.0 + (520 - 450) / (600 - 450)  # the table has no row at 520 nm
+    np.testing.assert_allclose(scene.illuminant, np.array([1.0, at_520, 2.0, 4.0]) / 4.0)
+    np.testing.assert_allclose(scene.endmembers, [[0.1, 0.3, 0.1, 0.1], SPECTRUM.tolist()], atol=1e-7)
+
+
+def test_endmember_columns_follow_the_materials_by_name(tmp_path):
+    folder = make_scene(tmp_path / "scene")
+    straight = load_scene(folder.root).endmembers
+    folder.edit(lambda c: c.update(materials=["clay", "leaf"]))
+    swapped = load_scene(folder.root).endmembers
+    assert straight is not None
+    assert swapped is not None
+    assert np.array_equal(swapped, straight[::-1])
+
+
+def test_cameras_see_the_same_pixels_before_and_after_normalisation(tmp_path):
+    folder = make_scene(tmp_path / "scene")
+    scene = load_scene(folder.root)
+    pose = np.array(folder.content["frames"][2]["transform_matrix"])
+    point = np.array([[0.3, -0.2, 0.1]])
+    local = (point - pose[:3, 3]) @ pose[:3, :3]
+    expected = [WIDTH / 2 - FOCAL * local[0, 0] / local[0, 2], HEIGHT / 2 + FOCAL * local[0, 1] / local[0, 2]]
+    pixel, depth = scene.cameras.project(torch.from_numpy(scene.normalisation.to_model(point)).float(), 2)
+    np.testing.assert_allclose(pixel[0].numpy(), expected, atol=1e-3)
+    np.testing.assert_allclose(depth.item(), -local[0, 2] * scene.normalisation.scale, rtol=1e-5)
+
+
+def test_normalisation_to_world_undoes_to_model_and_survives_json(tmp_path):
+    normalisation = load_scene(make_scene(tmp_path / "scene").root).normalisation
+    points = np.random.default_rng(0).normal(size=(5, 3))
+    np.testing.assert_allclose(normalisation.to_world(normalisation.to_model(points)), points, atol=1e-12)
+    again = Normalisation.from_json(json.loads(json.dumps(normalisation.to_json())))
+    assert np.array_equal(again.to_model(points), normalisation.to_model(points))
+
+
+@pytest.mark.parametrize("dtype", ["<f2", "<f4", ">f4", "<f8"])
+def test_cubes_of_every_float_type_and_byte_order_read_alike(tmp_path, dtype):
+    folder = make_scene(tmp_path / "scene")
+    expected = load_scene(folder.root).cube(1)
+    folder.edit_cubes(lambda cube: cube.astype(dtype))
+    assert np.array_equal(load_scene(folder.root).cube(1), expected)
+
+
+@pytest.mark.parametrize(("dtype", "scale"), [("u1", 255), ("<u2", 65535), ("<i2", 10000), ("<i4", 10000)])
+def test_integer_cubes_are_divided_by_the_value_scale(tmp_path, dtype, scale):
+    folder = make_scene(tmp_path / "scene")
+    expected = load_scene(folder.root).cube(1)
+    folder.edit_cubes(lambda cube: np.round(cube.astype(np.float64) * scale).astype(dtype))
+    scene = load_scene(folder.root, SceneOptions(value_scale=float(scale)))
+    np.testing.assert_allclose(scene.cube(1), expected, atol=0.5 / scale + 1e-6)
+
+
+def test_a_cube_in_fortran_order_reads_like_any_other(tmp_path):
+    folder = make_scene(tmp_path / "scene")
+    expected = load_scene(folder.root).cube(1)
+    folder.edit_cubes(np.asfortranarray)
+    assert np.array_equal(load_scene(folder.root).cube(1), expected)
+
+
+def test_few_highlights_above_one_are_clipped_like_a_saturated_sensor(tmp_path):
+    folder = make_scene(tmp_path / "scene").edit_cube(1, lambda cube: cube.__setitem__((8, 10, 0), 3.0))
+    assert load_scene(folder.root).cube(1)[8, 10, 0] == 1.0
+
+
+def test_invalid_pixels_are_masked_out_and_zero_when_asked_to(tmp_path):
+    def spoil(cube):
+        cube[2, 3, 1] = np.nan
+        cube[4, 5, 0] = -0.5
+        cube[6, 7, 3] = np.inf
+
+    folder = make_scene(tmp_path / "scene").edit_cube(2, spoil)
+    scene = load_scene(folder.root, SceneOptions(invalid_pixels="mask"))
+    invalid = np.argwhere(~scene.valid_mask(2)).tolist()
+    assert invalid == [[2, 3], [4, 5], [6, 7]]
+    assert np.isfinite(scene.cube(2)).all()
+    assert not scene.cube(2)[2, 3].any()
+    assert scene.valid_mask(1).all()
+
+
+def test_black_pixels_of_a_mask_do_not_count(tmp_path):
+    folder = make_scene(tmp_path / "scene", alpha=False)
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:3] = 0
+    Image.fromarray(mask).save(folder.root / "mask.png")
+    folder.edit(lambda c: c["frames"][1].update(mask_path="mask.png"))
+    scene = load_scene(folder.root)
+    assert not scene.valid_mask(1)[:3].any()
+    assert scene.valid_mask(1)[3:].all()
+    assert scene.alpha(1) is None
+
+
+def test_pictures_that_are_opaque_everywhere_are_no_alpha(tmp_path):
+    scene = load_scene(make_scene(tmp_path / "scene", alpha=False).root)
+    assert not scene.has_alpha
+    assert scene.alpha(0) is None
+
+
+def test_a_scene_needs_no_pictures_and_no_truth(tmp_path):
+    def bare(content):
+        for key in ("materials", "illuminant_path", "endmembers_path", "train_filenames", "test_filenames"):
+            del content[key]
+        for frame in content["frames"]:
+            for key in ("file_path", "seg_file_path", "abundance_file_path"):
+                del frame[key]
+
+    scene = load_scene(make_scene(tmp_path / "scene").edit(bare).root)
+    assert scene.srgb(0) is None
+    assert scene.labels(0) is None
+    assert scene.abundances(0) is None
+    assert scene.material_names is None
+    assert scene.illuminant is None
+    assert (scene.has_alpha, scene.has_labels, scene.has_abundances) == (False, False, False)
+
+
+def test_size_may_be_left_to_the_cubes_and_the_lens_to_an_angle(tmp_path):
+    def use_angle(content):
+        for key in ("w", "h", "fl_x", "fl_y", "cx", "cy"):
+            del content[key]
+        content["camera_angle_x"] = 2 * np.arctan(0.5 * WIDTH / FOCAL)
+
+    cameras = load_scene(make_scene(tmp_path / "scene").edit(use_angle).root).cameras
+    assert (cameras.width, cameras.height) == (WIDTH, HEIGHT)
+    np.testing.assert_allclose(cameras.focal_px.numpy(), FOCAL, rtol=1e-6)
+    np.testing.assert_allclose(cameras.center_px.numpy(), [[WIDTH / 2, HEIGHT / 2]] * 6)
+
+
+def test_a_frames_own_lens_goes_before_that_of_the_scene(tmp_path):
+    folder = make_scene(tmp_path / "scene").edit(lambda c: c["frames"][4].update(fl_x=33.0, cx=9.5, k1=0.01))
+    cameras = load_scene(folder.root).cameras
+    assert cameras.focal_px[4].tolist() == [33.0, FOCAL]
+    assert cameras.center_px[4].tolist() == [9.5, HEIGHT / 2]
+    np.testing.assert_allclose(cameras.distortion[4].numpy(), [0.01, 0, 0, 0], atol=1e-9)
+    assert cameras.focal_px[3].tolist() == [FOCAL, FOCAL]
+
+
+def test_distortion_params_are_read_in_nerfstudios_order(tmp_path):
+    folder = make_scene(tmp_path / "scene").edit(
+        lambda c: c.update(distortion_params=[0.1, 0.2, 0, 0, 0.3, 0.4])
+    )
+    np.testing.assert_allclose(
+        load_scene(folder.root).cameras.distortion[0].numpy(), [0.1, 0.2, 0.3, 0.4], rtol=1e-6
+    )
+
+
+def test_poses_of_three_rows_read_like_those_of_four(tmp_path):
+    folder = make_scene(tmp_path / "scene")
+    expected = load_scene(folder.root).cameras.camera_to_world
+    folder.edit(
+        lambda c: [frame.update(transform_matrix=frame["transform_matrix"][:3]) for frame in c["frames"]]
+    )
+    assert torch.equal(load_scene(folder.root).cameras.camera_to_world, expected)
+
+
+def test_names_take_the_folder_in_where_stems_repeat(tmp_path):
+    folder = make_scene(tmp_path / "scene")
+    (folder.root / "cubes/other").mkdir()
+    (folder.root / "cubes/view_1.npy").rename(folder.root / "cubes/other/view_0.npy")
+    folder.edit(lambda c: c["frames"][1].update(hyperspectral_file_path="cubes/other/view_0.npy"))
+    names = [frame.name for frame in load_scene(folder.root).frames]
+    assert names[:3] == ["cubes_view_0", "other_view_0", "cubes_view_2"]
+
+
+def test_every_file_read_has_its_hash_and_a_changed_file_another(tmp_path):
+    folder = make_scene(tmp_path / "scene")
+    before = load_scene(folder.root).input_hashes
+    assert len(before) == 6 * 4 + 3
+    assert all(len(digest) == 64 for digest in before.values())
+    folder.edit_cube(1, lambda cube: cube * np.float16(0.5))
+    after = load_scene(folder.root).input_hashes
+    assert {path for path in before if before[path] != after[path]} == {"cubes/view_1.npy"}
+
+
+def test_the_summary_is_json_and_holds_what_a_run_must_know(tmp_path):
+    scene = load_scene(make_scene(tmp_path / "scene").root)
+    summary = json.loads(json.dumps(scene.summary(), allow_nan=False))
+    assert summary["train_indices"] == list(scene.train_indices)
+    assert summary["wavelengths_nm"] == list(WAVELENGTHS)
+    assert summary["input_hashes"] == scene.input_hashes
+    assert summary["normalisation"]["scale"] == scene.normalisation.scale
+    assert summary["options"]["invalid_pixels"] == "refuse"
+
+
+def test_links_out_of_the_folder_are_followed_when_allowed(tmp_path):
+    folder = make_scene(tmp_path / "scene")
+    outside = tmp_path / "elsewhere.npy"
+    (folder.root / "cubes/view_1.npy").rename(outside)
+    (folder.root / "cubes/view_1.npy").symlink_to(outside)
+    (folder.root / "cubes/view_2.npy").rename(tmp_path / "other.npy")
+    folder.edit(lambda c: c["frames"][2].update(hyperspectral_file_path="../other.npy"))
+    folder.edit(
+        lambda c: c["frames"][3].update(hyperspectral_file_path=str(folder.root / "cubes/view_3.npy"))
+    )
+    scene = load_scene(folder.root, SceneOptions(allow_outside_paths=True))
+    assert scene.cube(1).shape == scene.cube(2).shape == (HEIGHT, WIDTH, len(WAVELENGTHS))

@@ -1,0 +1,188 @@
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.testing import assert_close
+
+from unmix_plugin.errors import SpectrumError
+from unmix_plugin.spectral import (
+    Bands,
+    band_composite_matrix,
+    colour_mode,
+    describe_colour,
+    linear_to_srgb,
+    rgb_matrix,
+    srgb_to_linear,
+    xyz_matrix,
+)
+
+visible = st.lists(st.floats(385, 775), min_size=4, max_size=60, unique_by=lambda x: round(x, 1)).map(
+    lambda values: Bands.of(sorted([*values, 455.03, 545.03, 615.03]))
+)
+anywhere = st.lists(st.floats(200, 2500), min_size=1, max_size=30, unique_by=lambda x: round(x, 1)).map(
+    lambda values: Bands.of(sorted(values))
+)
+EVERY_NM = Bands.of(range(360, 831))
+
+
+def luminance(linear_rgb):
+    return linear_rgb @ torch.tensor([0.2126, 0.7152, 0.0722], dtype=linear_rgb.dtype)
+
+
+def test_xyz_of_the_equal_energy_spectrum_has_the_chromaticity_of_illuminant_e():
+    # Sums of the CIE 1931 colour matching functions at 1 nm (CIE 15): 106.8655, 106.8569, 106.8923.
+    white = xyz_matrix(EVERY_NM, torch.float64).sum(0)
+    assert_close(
+        white, torch.tensor([106.8655, 106.8569, 106.8923], dtype=torch.float64) / 106.8569, atol=1e-4, rtol=0
+    )
+
+
+@pytest.mark.parametrize(
+    ("wavelength_nm", "x", "y"),
+    # Spectrum locus, CIE 15 table of chromaticity coordinates of the 1931 observer.
+    [(450, 0.15664, 0.01770), (520, 0.07430, 0.83380), (600, 0.62704, 0.37249), (650, 0.72599, 0.27401)],
+)
+def test_one_narrow_band_has_the_published_chromaticity_of_its_wavelength(wavelength_nm, x, y):
+    xyz = xyz_matrix(EVERY_NM, torch.float64)[EVERY_NM.nearest(wavelength_nm)]
+    assert_close(xyz[:2] / xyz.sum(), torch.tensor([x, y], dtype=torch.float64), atol=1e-3, rtol=0)
+
+
+def test_linear_rgb_is_the_published_srgb_matrix_up_to_the_white_of_each_channel():
+    # IEC 61966-2-1, XYZ to linear sRGB; each column of the result scaled so that flat 1 is 1.
+    to_rgb = torch.tensor(
+        [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]],
+        dtype=torch.float64,
+    )
+    bands = Bands.of(range(400, 701, 10))
+    raw = xyz_matrix(bands, torch.float64) @ to_rgb.T
+    assert_close(rgb_matrix(bands, torch.float64), raw / raw.sum(0))
+
+
+@given(visible)
+def test_flat_spectrum_is_white_with_unit_luminance_on_any_visible_sampling(bands):
+    if colour_mode(bands) == "false-colour":
+        return
+    white = torch.ones(len(bands), dtype=torch.float64) @ rgb_matrix(bands, torch.float64)
+    assert_close(white, torch.ones(3, dtype=torch.float64))
+    assert_close(luminance(white), torch.tensor(1.0, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    "centers",
+    [range(400, 701, 20), np.sort(np.random.default_rng(0).uniform(385, 745, 70)), range(390, 760, 7)],
+    ids=["coarse", "irregular", "dense"],
+)
+def test_sampling_hardly_changes_the_colour_of_a_smooth_spectrum(centers):
+    def colour(bands):
+        spectrum = 0.2 + 0.6 / (1 + np.exp(-(bands.centers_nm - 580) / 30))
+        return torch.tensor(spectrum) @ rgb_matrix(bands, torch.float64)
+
+    assert_close(colour(Bands.of(np.asarray(centers))), colour(EVERY_NM), atol=0.012, rtol=0)
+
+
+def test_a_band_weighs_what_the_fine_bands_inside_its_interval_weigh_together():
+    fine = xyz_matrix(Bands.of(np.arange(360.5, 830)), torch.float64)  # edges at whole nm
+    coarse = xyz_matrix(Bands.of([430, 490, 550, 562, 580]), torch.float64)
+    edges = [400, 460, 520, 556, 571, 589]
+    sums = torch.stack([fine[low - 360 : high - 360].sum(0) for low, high in pairwise(edges)])
+    assert_close(coarse, sums / sums[:, 1].sum())
+
+
+def test_spectra_look_like_their_names():
+    bands = Bands.of(range(400, 701, 10))
+    nm = torch.tensor(bands.centers_nm)
+    for low, high, channel in ((600, 700, 0), (500, 570, 1), (400, 480, 2)):
+        rgb = ((nm >= low) & (nm <= high)).double() @ rgb_matrix(bands, torch.float64)
+        assert int(rgb.argmax()) == channel
+        assert rgb[channel] > 2 * rgb.sort().values[1]
+
+
+@given(anywhere)
+def test_flat_spectrum_is_white_on_every_sampling_false_colour_too(bands):
+    matrix = rgb_matrix(bands, torch.float64)
+    assert_close(matrix.sum(0), torch.ones(3, dtype=torch.float64))
+    if colour_mode(bands) == "false-colour":
+        assert float(matrix.min()) >= 0
+
+
+@pytest.mark.parametrize(
+    ("centers", "mode"),
+    [
+        (range(400, 701, 10), "true-colour"),
+        (range(450, 651, 10), "true-colour"),
+        (np.linspace(400, 1000, 128), "true-colour"),
+        ([450, 550, 650], "true-colour"),
+        (range(700, 1001, 10), "false-colour"),
+        (range(600, 701, 10), "false-colour"),
+        (range(510, 780, 10), "false-colour"),
+        ([499, 501, 601], "false-colour"),
+        ([450, 650], "false-colour"),
+        ([550], "false-colour"),
+        ([1000, 2000], "false-colour"),
+    ],
+)
+def test_true_colour_needs_bands_in_blue_green_and_red(centers, mode):
+    bands = Bands.of(np.asarray(centers, dtype=float))
+    assert colour_mode(bands) == mode
+    assert describe_colour(bands).startswith(mode.replace("-", " "))
+
+
+def test_false_colour_shows_the_longest_third_red_and_the_shortest_blue():
+    matrix = rgb_matrix(Bands.of([800, 850, 900, 950, 1000, 1050]), torch.float64)
+    half = 0.5
+    expected = torch.tensor([[0, 0, half]] * 2 + [[0, half, 0]] * 2 + [[half, 0, 0]] * 2, dtype=torch.float64)
+    assert_close(matrix, expected)
+
+
+def test_false_colour_of_one_band_is_grey():
+    assert_close(rgb_matrix(Bands.of([900])), torch.ones(1, 3))
+
+
+def test_false_colour_says_its_ranges():
+    assert describe_colour(Bands.of([800, 850, 900, 950, 1000, 1050])) == (
+        "false colour: red 975-1075 nm, green 875-975 nm, blue 775-875 nm"
+    )
+
+
+def test_xyz_without_visible_light_is_refused():
+    with pytest.raises(SpectrumError, match=r"3 bands, 900-1100 nm hold no visible light"):
+        xyz_matrix(Bands.of([900, 1000, 1100]))
+
+
+def test_band_composite_picks_the_nearest_band_of_each_channel():
+    spectrum = torch.arange(31.0)
+    picked = spectrum @ band_composite_matrix(Bands.of(range(400, 701, 10)), (698, 551, 404))
+    assert picked.tolist() == [30.0, 15.0, 0.0]
+
+
+def test_band_composite_refuses_what_the_sensor_does_not_see():
+    with pytest.raises(SpectrumError, match="no band at 860 nm"):
+        band_composite_matrix(Bands.of([400, 500, 600]), (860, 500, 400))
+    with pytest.raises(SpectrumError, match=r"three wavelengths .* found 2"):
+        band_composite_matrix(Bands.of([400, 500, 600]), (500, 400))
+
+
+@given(st.floats(-0.5, 2))
+def test_srgb_encoding_inverts(value):
+    x = torch.tensor([value], dtype=torch.float64)
+    assert_close(srgb_to_linear(linear_to_srgb(x)), x, atol=2e-7, rtol=0)
+
+
+def test_srgb_encoding_has_the_standards_values():
+    # IEC 61966-2-1: code 128 of 255 decodes to 0.21586, code 10 (on the linear piece) to 0.0030353.
+    linear = torch.tensor([0.0, 0.0030353, 0.215861, 1.0], dtype=torch.float64)
+    codes = torch.tensor([0, 10, 128, 255], dtype=torch.float64) / 255
+    assert_close(linear_to_srgb(linear), codes, atol=1e-5, rtol=0)
+    assert_close(srgb_to_linear(codes), linear, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("encode", [linear_to_srgb, srgb_to_linear])
+def test_srgb_gradients_are_finite_and_right_at_zero_and_below(encode):
+    x = torch.tensor([-0.3, 0.0, 1e-12, 0.02, 0.5, 1.0], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(encode, x)
+    slope = 12.92 if encode is linear_to_srgb else 1 / 12.92
+    (gradient,) = torch.autograd.grad(encode(x).sum(), x)
+    assert_close(gradient[:3], torch.full((3,), slope, dtype=torch.float64))

@@ -1,0 +1,110 @@
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.testing import assert_close
+
+from tests.spectral.mixtures import seeded, smooth_endmembers
+from unmix_plugin.errors import SpectrumError
+from unmix_plugin.spectral import normalised_kmeans, scale_to_lit_pixels, spectral_angle
+
+
+def shaded_clusters(num_clusters, per_cluster=60, seed=0, noise=0.01):
+    """Pixels of each material under random shading, cluster after cluster, and the materials."""
+    materials = smooth_endmembers(num_clusters)
+    ids = torch.arange(num_clusters).repeat_interleave(per_cluster)
+    shading = 0.05 + 0.95 * torch.rand(len(ids), 1, dtype=torch.float64, generator=seeded(seed))
+    spread = noise * torch.randn(
+        len(ids), materials.shape[1], dtype=torch.float64, generator=seeded(seed + 1)
+    )
+    return (materials[ids] + spread).clamp(min=1e-3) * shading, ids, materials
+
+
+def same_partition(a, b):
+    return len({*zip(a.tolist(), b.tolist(), strict=True)}) == len(a.unique()) == len(b.unique())
+
+
+@given(st.integers(1, 7), st.integers(0, 500))
+def test_materials_are_told_apart_under_any_shading(num_clusters, seed):
+    pixels, ids, materials = shaded_clusters(num_clusters, seed=seed)
+    result = normalised_kmeans(pixels, num_clusters, seeded(seed))
+    assert same_partition(result.cluster_ids, ids)
+    angles = spectral_angle(result.endmembers[:, None], materials[None]).amin(1)
+    assert float(angles.max()) < 0.01
+
+
+@given(st.integers(0, 500))
+def test_gains_change_neither_clusters_nor_shapes(seed):
+    pixels, _, _ = shaded_clusters(4, seed=seed, noise=0.1)
+    gains = 10 ** (4 * torch.rand(len(pixels), 1, dtype=torch.float64, generator=seeded(seed)) - 2)
+    plain, scaled = (normalised_kmeans(p, 4, seeded(seed)) for p in (pixels, gains * pixels))
+    assert torch.equal(plain.cluster_ids, scaled.cluster_ids)
+    assert float(spectral_angle(plain.endmembers, scaled.endmembers).max()) < 1e-6
+    assert plain.inertia == pytest.approx(scaled.inertia, rel=1e-6)
+
+
+def test_every_pixel_is_with_its_nearest_centre_and_centres_are_mean_shapes():
+    pixels = torch.rand(400, 6, dtype=torch.float64, generator=seeded(3)) + 0.01
+    result = normalised_kmeans(pixels, 5, seeded(3))
+    shapes = torch.nn.functional.normalize(pixels, dim=1)
+    centres = torch.stack([shapes[result.cluster_ids == k].mean(0) for k in range(5)])
+    centres = torch.nn.functional.normalize(centres, dim=1)
+    assert_close(torch.nn.functional.normalize(result.endmembers, dim=1), centres)
+    assert torch.equal((shapes @ centres.T).argmax(1), result.cluster_ids)
+    inertia = (shapes - centres[result.cluster_ids]).square().sum(1).mean()
+    assert result.inertia == pytest.approx(float(inertia), rel=1e-9)
+
+
+def test_clusters_come_largest_first():
+    pixels, _, _ = shaded_clusters(3)
+    result = normalised_kmeans(torch.cat([pixels, pixels[60:120], pixels[60:120], pixels[120:]]), 3, seeded())
+    assert torch.bincount(result.cluster_ids).tolist() == [180, 120, 60]
+
+
+def test_more_restarts_never_fit_worse():
+    pixels = torch.rand(300, 8, dtype=torch.float64, generator=seeded(1))
+    few, many = (normalised_kmeans(pixels, 6, seeded(2), restarts=n).inertia for n in (1, 12))
+    assert many < few
+
+
+def test_an_endmember_is_as_bright_as_the_well_lit_pixels_of_its_cluster():
+    shape = torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64)
+    pixels = torch.linspace(0.01, 0.81, 101, dtype=torch.float64)[:, None] * shape
+    result = normalised_kmeans(pixels, 1, seeded(), brightness_quantile=0.9)
+    assert_close(result.endmembers[0], 0.73 * shape)
+
+
+def test_scaling_up_stops_where_a_band_would_pass_one_and_keeps_the_shape():
+    shape = torch.tensor([[0.6, 0.8]], dtype=torch.float64)
+    lit = scale_to_lit_pixels(shape, 5 * shape, torch.tensor([0]))
+    assert_close(lit, torch.tensor([[0.75, 1.0]], dtype=torch.float64))
+
+
+def test_a_spectrum_without_pixels_keeps_its_length():
+    spectra = torch.tensor([[0.1, 0.2], [0.3, 0.1]], dtype=torch.float64)
+    lit = scale_to_lit_pixels(spectra, 2 * spectra[:1], torch.tensor([0]))
+    assert_close(lit, torch.tensor([[0.2, 0.4], [0.3, 0.1]], dtype=torch.float64))
+
+
+def test_every_cluster_has_a_pixel_even_when_there_are_as_many_as_shapes():
+    pixels = torch.eye(5) * torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5])[:, None]
+    result = normalised_kmeans(pixels.repeat_interleave(3, 0), 5, seeded())
+    assert sorted(torch.bincount(result.cluster_ids).tolist()) == [3] * 5
+    assert result.inertia == pytest.approx(0, abs=1e-6)
+
+
+def test_shapes_that_differ_only_in_brightness_are_one():
+    pixels = torch.linspace(0.1, 0.9, 30)[:, None] * torch.tensor([0.3, 0.7, 0.2])
+    with pytest.raises(SpectrumError, match="only 1 distinct spectral shapes among 30 pixels: 2 endmembers"):
+        normalised_kmeans(pixels, 2, seeded())
+
+
+def test_zero_spectra_are_refused():
+    with pytest.raises(SpectrumError, match="non-zero length; found 1 zero ones"):
+        normalised_kmeans(torch.tensor([[0.0, 0.0], [0.1, 0.2]]), 1, seeded())
+
+
+def test_the_same_generator_gives_the_same_clusters():
+    pixels = torch.rand(500, 8, generator=seeded(1))
+    first, again = (normalised_kmeans(pixels, 6, seeded(9)) for _ in range(2))
+    assert torch.equal(first.endmembers, again.endmembers)

@@ -1,0 +1,220 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.testing import assert_close
+
+from tests.spectral.mixtures import seeded, smooth_endmembers
+from unmix_plugin.errors import SpectrumError
+from unmix_plugin.spectral import (
+    abundance_rmse,
+    endmember_angle,
+    match_endmembers,
+    psnr,
+    rgb_psnr,
+    rmse,
+    sam,
+    spectral_angle,
+    ssim,
+)
+
+spectra = st.lists(st.floats(0.01, 1), min_size=5, max_size=5).map(
+    lambda v: torch.tensor(v, dtype=torch.float64)
+)
+
+
+def image(seed, height=12, width=15, num_bands=4, low=0.05):
+    return low + (1 - low) * torch.rand(height, width, num_bands, dtype=torch.float64, generator=seeded(seed))
+
+
+def test_psnr_and_rmse_have_their_closed_forms():
+    target = torch.full((3, 4, 2), 0.25)
+    assert psnr(target + 0.1, target) == pytest.approx(20, abs=1e-5)
+    assert psnr(target + 0.01, target) == pytest.approx(40, abs=1e-4)
+    assert rmse(target + 0.1, target) == pytest.approx(0.1, rel=1e-6)
+    assert rgb_psnr(torch.full((2, 2, 3), 0.5), torch.full((2, 2, 3), 0.4)) == pytest.approx(20, abs=1e-5)
+
+
+def test_rmse_is_over_all_pixels_and_bands_not_a_mean_of_roots():
+    target = torch.zeros(1, 2, 2)
+    pred = torch.tensor([[[0.6, 0.0], [0.0, 0.0]]])
+    assert rmse(pred, target) == pytest.approx(0.3, rel=1e-6)
+
+
+def test_equal_images_have_infinite_psnr_no_error_full_similarity_and_no_angle():
+    same = image(1)
+    assert (psnr(same, same), rmse(same, same), ssim(same, same)) == (math.inf, 0, pytest.approx(1))
+    assert sam(same, same) == pytest.approx(0, abs=1e-12)
+
+
+@pytest.mark.parametrize("metric", [psnr, rmse, ssim, sam])
+def test_predictions_are_clamped_to_the_unit_range(metric):
+    pred, target = 3 * image(1) - 1, image(2)
+    assert metric(pred, target) == metric(pred.clamp(0, 1), target)
+
+
+@pytest.mark.parametrize("metric", [psnr, rmse, ssim])
+def test_pixels_outside_the_valid_mask_do_not_count_even_if_nan(metric):
+    pred, target = image(1), image(2)
+    valid = torch.rand(12, 15, generator=seeded(5)) > 0.3
+    spoiled = target.clone()
+    spoiled[~valid] = float("nan")
+    value = metric(pred, spoiled, valid)
+    assert math.isfinite(value)
+    assert value == metric(torch.where(valid[..., None], pred, 0.9), spoiled, valid)
+    assert value != metric(pred, target)
+    assert metric(pred, target, torch.ones_like(valid)) == pytest.approx(metric(pred, target))
+
+
+@pytest.mark.parametrize("metric", [psnr, rmse, ssim, sam])
+def test_a_figure_over_no_pixel_is_nan(metric):
+    assert math.isnan(metric(image(1), image(2), torch.zeros(12, 15, dtype=torch.bool)))
+
+
+def test_ssim_is_the_published_formula_over_7_by_7_windows():
+    pred, target = image(3, num_bands=2), image(4, num_bands=2)
+    values = []
+    for band in range(2):
+        for row in range(12 - 6):
+            for column in range(15 - 6):
+                x, y = (im[row : row + 7, column : column + 7, band].numpy().ravel() for im in (pred, target))
+                covariance = np.cov(x, y)  # normalised by n - 1
+                numerator = (2 * x.mean() * y.mean() + 0.01**2) * (2 * covariance[0, 1] + 0.03**2)
+                spread = covariance[0, 0] + covariance[1, 1] + 0.03**2
+                values.append(numerator / ((x.mean() ** 2 + y.mean() ** 2 + 0.01**2) * spread))
+    assert ssim(pred, target) == pytest.approx(float(np.mean(values)), rel=1e-9)
+
+
+def test_ssim_refuses_an_image_smaller_than_its_window():
+    with pytest.raises(SpectrumError, match="at least 7 x 7 pixels; found 6 x 15"):
+        ssim(image(1, height=6), image(2, height=6))
+
+
+@given(spectra, spectra, st.floats(0.01, 100), st.floats(0.01, 100))
+def test_spectral_angle_ignores_brightness_and_order(a, b, gain_a, gain_b):
+    angle = spectral_angle(a, b)
+    assert_close(spectral_angle(gain_b * b, gain_a * a), angle, atol=1e-12, rtol=0)
+    assert 0 <= float(angle) <= math.pi / 2
+
+
+@given(spectra, spectra, spectra)
+def test_spectral_angle_obeys_the_triangle_inequality(a, b, c):
+    assert float(spectral_angle(a, c)) <= float(spectral_angle(a, b) + spectral_angle(b, c)) + 1e-12
+
+
+@given(spectra, spectra)
+def test_spectral_angle_is_the_arccos_of_the_cosine(a, b):
+    cosine = (a @ b / (a.norm() * b.norm())).clamp(-1, 1)
+    assert_close(spectral_angle(a, b).cos(), cosine, atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("angle", [1e-12, 1e-6, 0.1, math.pi / 2, math.pi - 1e-6, math.pi])
+def test_spectral_angle_is_precise_everywhere(angle):
+    a = torch.tensor([1.0, 0.0], dtype=torch.float64)
+    b = torch.tensor([math.cos(angle), math.sin(angle)], dtype=torch.float64)
+    assert float(spectral_angle(a, b)) == pytest.approx(angle, rel=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("pair", [(1, 1), (1, 2), (1, -1), (0, 1), (0, 0)])
+def test_spectral_angle_has_finite_gradients_at_parallel_opposite_and_zero_spectra(pair, dtype):
+    base = torch.tensor([0.3, 0.5, 0.1], dtype=dtype)
+    a, b = (torch.nn.Parameter(gain * base) for gain in pair)
+    for gradient in torch.autograd.grad(spectral_angle(a, b), (a, b)):
+        assert torch.isfinite(gradient).all()
+        assert float(gradient.abs().max()) < 100
+
+
+def test_spectral_angle_has_the_right_gradient():
+    a = torch.rand(3, 5, dtype=torch.float64, generator=seeded(1), requires_grad=True)
+    b = torch.rand(3, 5, dtype=torch.float64, generator=seeded(2), requires_grad=True)
+    assert torch.autograd.gradcheck(spectral_angle, (a, b))
+
+
+def test_angle_to_a_zero_spectrum_is_a_right_angle():
+    assert float(spectral_angle(torch.zeros(3), torch.ones(3))) == pytest.approx(math.pi / 2)
+
+
+def test_sam_is_the_mean_angle_over_masked_pixels_that_are_not_dark():
+    target = torch.tensor([[[0.5, 0.0], [0.5, 0.0], [0.004, 0.004], [0.2, 0.0]]])
+    pred = torch.tensor([[[0.3, 0.3], [0.0, 0.9], [0.0, 0.5], [0.9, 0.0]]])
+    everything = [math.pi / 4, math.pi / 2, 0]
+    assert sam(pred, target) == pytest.approx(sum(everything) / 3)
+    mask = torch.tensor([[True, False, True, True]])
+    assert sam(pred, target, mask) == pytest.approx((math.pi / 4 + 0) / 2)
+
+
+@pytest.mark.parametrize(("value", "counts"), [(0.0049, False), (0.0051, True)])
+def test_sam_calls_dark_what_is_below_0005_root_mean_square(value, counts):
+    target = torch.full((1, 1, 100), value)
+    pred = torch.rand(1, 1, 100, generator=seeded())
+    assert math.isnan(sam(pred, target)) != counts
+
+
+@given(st.permutations(range(5)))
+def test_endmembers_are_matched_whatever_their_order_and_brightness(order):
+    true = smooth_endmembers(5)
+    pred = true[list(order)] * torch.linspace(0.2, 1, 5, dtype=torch.float64)[:, None]
+    matching = match_endmembers(pred, true)
+    assert matching.true_ids == tuple(range(5))
+    assert [order[p] for p in matching.pred_ids] == list(range(5))
+    assert max(matching.angles) < 1e-7
+
+
+def test_matching_minimises_the_sum_not_each_angle():
+    def ray(degrees):
+        return [math.cos(math.radians(degrees)), math.sin(math.radians(degrees))]
+
+    true, pred = torch.tensor([ray(40), ray(0)]), torch.tensor([ray(30), ray(89)])
+    # Greedy: 40-30 then 0-89 sums to 99 degrees; the best pairing is 40-89 and 0-30, 79 degrees.
+    matching = match_endmembers(pred, true)
+    assert dict(zip(matching.true_ids, matching.pred_ids, strict=True)) == {0: 1, 1: 0}
+    assert sum(matching.angles) == pytest.approx(math.radians(79), abs=1e-6)
+
+
+def test_endmember_angle_compares_with_reflectance_times_illuminant():
+    reflectance = smooth_endmembers(4)
+    light = torch.linspace(1, 0.2, 24, dtype=torch.float64)
+    radiance = reflectance * light
+    assert endmember_angle(0.3 * radiance[[2, 0, 3, 1]], reflectance, light) == pytest.approx(0, abs=1e-7)
+    assert endmember_angle(reflectance, reflectance, light) > 0.1
+
+
+def test_endmember_angle_counts_a_missing_material_as_a_right_angle_and_ignores_surplus():
+    reflectance, light = smooth_endmembers(4), torch.ones(24, dtype=torch.float64)
+    assert endmember_angle(reflectance[:3], reflectance, light) == pytest.approx(math.pi / 8, abs=1e-7)
+    surplus = torch.cat([reflectance, torch.rand(2, 24, dtype=torch.float64, generator=seeded())])
+    assert endmember_angle(surplus, reflectance, light) == pytest.approx(0, abs=1e-7)
+
+
+def test_abundance_rmse_is_taken_after_matching_over_pixels_with_truth():
+    endmembers = smooth_endmembers(3)
+    order = [2, 0, 1]
+    true = torch.rand(4, 5, 3, dtype=torch.float64, generator=seeded(1))
+    true = true / true.sum(-1, keepdim=True)
+    true[0] = 0
+    matching = match_endmembers(endmembers[order], endmembers)
+    pred = true[..., order].clone()
+    assert abundance_rmse(pred, true, matching) == 0
+    assert abundance_rmse(true, true, matching) > 0.1
+    pred[0] = 0.7
+    assert abundance_rmse(pred, true, matching) == 0
+    assert abundance_rmse(pred, true, matching, torch.ones(4, 5, dtype=torch.bool)) == pytest.approx(0.7 / 2)
+    pred[2, 3, 0] = true[2, 3, 2] - 0.6 if true[2, 3, 2] > 0.6 else true[2, 3, 2] + 0.3
+    step = float((pred[2, 3, 0] - true[2, 3, 2]).abs())
+    assert abundance_rmse(pred, true, matching) == pytest.approx(step / math.sqrt(15 * 3))
+
+
+def test_unmatched_materials_count_as_absent_and_surplus_ones_have_no_column():
+    endmembers = smooth_endmembers(3)
+    true = torch.zeros(1, 1, 3, dtype=torch.float64)
+    true[..., 0], true[..., 2] = 0.4, 0.6
+    fewer = match_endmembers(endmembers[:2], endmembers)
+    assert abundance_rmse(true[..., :2], true, fewer) == pytest.approx(0.6 / math.sqrt(3))
+    more = match_endmembers(torch.cat([endmembers[:1] ** 3, endmembers]), endmembers)
+    pred = torch.cat([torch.full((1, 1, 1), 0.9, dtype=torch.float64), true], dim=-1)
+    assert more.pred_ids == (1, 2, 3)
+    assert abundance_rmse(pred, true, more) == 0

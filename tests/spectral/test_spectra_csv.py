@@ -1,0 +1,176 @@
+import errno
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from unmix_plugin.errors import RunError, SpectrumError
+from unmix_plugin.spectral import (
+    Bands,
+    SpectraTable,
+    read_illuminant_csv,
+    read_spectra_csv,
+    resample_spectra,
+    write_spectra_csv,
+)
+
+SMALL = SpectraTable(
+    Bands.of([400, 500, 600]), ("leaf", "soil, dry"), np.array([[0.1, 0.5, 0.2], [0, 1, 2.5]])
+)
+
+
+def written(tmp_path, text, encoding="utf-8"):
+    path = tmp_path / "spectra.csv"
+    path.write_bytes(text.encode(encoding))
+    return path
+
+
+def test_a_file_has_a_wavelength_column_and_a_column_for_each_spectrum(tmp_path):
+    path = tmp_path / "e.csv"
+    write_spectra_csv(path, SMALL)
+    assert path.read_text() == 'wavelength,leaf,"soil, dry"\n400,0.1,0\n500,0.5,1\n600,0.2,2.5\n'
+
+
+@given(values=st.lists(st.floats(0, 10, width=32), min_size=6, max_size=6))
+def test_float32_spectra_survive_a_file_exactly(values, tmp_path_factory):
+    path = tmp_path_factory.mktemp("csv") / "e.csv"
+    spectra = np.array(values, dtype=np.float32).reshape(2, 3)
+    write_spectra_csv(path, SpectraTable(SMALL.bands, SMALL.names, spectra.astype(np.float64)))
+    table = read_spectra_csv(path)
+    np.testing.assert_array_equal(table.spectra.astype(np.float32), spectra)
+    assert (table.bands, table.names) == (SMALL.bands, SMALL.names)
+
+
+def test_a_byte_order_mark_blank_lines_spaces_and_windows_line_ends_are_read(tmp_path):
+    text = "Wavelength, leaf ,soil\r\n400,0.1,0.2\r\n\r\n500, 0.3 ,0.4\r\n,,\r\n"
+    table = read_spectra_csv(written(tmp_path, text, "utf-8-sig"))
+    assert table.names == ("leaf", "soil")
+    np.testing.assert_array_equal(table.spectra, [[0.1, 0.3], [0.2, 0.4]])
+    np.testing.assert_array_equal(table.bands.centers_nm, [400, 500])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "file is empty"),
+        ("\n\n", "file is empty"),
+        ("nm,leaf\n400,1\n", "first column must be headed 'wavelength' .* found 'nm'"),
+        ("wavelength\n400\n", "no column beside 'wavelength'"),
+        ("wavelength,leaf\n", "no row of values"),
+        ("wavelength,leaf,leaf\n400,1,1\n", "must differ; found 'leaf' 2 times"),
+        ("wavelength,leaf,\n400,1,1\n", "each spectrum needs a name"),
+        ("wavelength,leaf\n400,1\n\n500,1,2\n", "line 4 has 3 values, the header has 2"),
+        ("wavelength,leaf\n400,1\n500,bright\n", "line 3, column 'leaf': 'bright' is no number"),
+        ("wavelength,leaf\n400,1\n500,\n", "line 3, column 'leaf': '' is no number"),
+        ("wavelength,leaf\n400,1\n500,nan\n", "spectra must be finite; found nan in 'leaf' at 500 nm"),
+        ("wavelength,leaf\n400,inf\n", "spectra must be finite; found inf in 'leaf' at 400 nm"),
+        ("wavelength,leaf,soil\n400,1,1\n500,1,-0.5\n", "not be negative; found -0.5 in 'soil' at 500 nm"),
+        (
+            "wavelength,leaf\n500,1\n400,1\n",
+            "strictly increase; found 500 nm at index 0 then 400 nm at index 1",
+        ),
+        ("wavelength,leaf\n-4,1\n", "be positive; found -4 nm"),
+    ],
+)
+def test_a_faulty_file_is_refused_with_its_name_and_the_place(tmp_path, text, message):
+    path = written(tmp_path, text)
+    with pytest.raises(SpectrumError, match=f"spectra.csv: .*{message}"):
+        read_spectra_csv(path)
+
+
+def test_a_file_that_is_missing_a_folder_or_no_text_is_refused(tmp_path):
+    with pytest.raises(SpectrumError, match=r"nowhere.csv: can't read spectra: No such file"):
+        read_spectra_csv(tmp_path / "nowhere.csv")
+    with pytest.raises(SpectrumError, match="can't read spectra"):
+        read_spectra_csv(tmp_path)
+    with pytest.raises(SpectrumError, match="not a CSV file in UTF-8"):
+        read_spectra_csv(written(tmp_path, "wavelength,caf\xe9\n400,1\n", "latin-1"))
+
+
+def test_writing_where_nothing_can_be_written_is_a_run_error(tmp_path):
+    with pytest.raises(RunError, match=r"e.csv: can't write spectra: No such file or directory"):
+        write_spectra_csv(tmp_path / "absent" / "e.csv", SMALL)
+
+
+def test_a_full_disk_leaves_the_old_file_and_no_litter(tmp_path, monkeypatch):
+    path = tmp_path / "e.csv"
+    path.write_text("old")
+
+    def fail(*_args, **_options):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("csv.writer", fail)
+    with pytest.raises(RunError, match="No space left on device"):
+        write_spectra_csv(path, SMALL)
+    assert [file.name for file in tmp_path.iterdir()] == ["e.csv"]
+    assert path.read_text() == "old"
+
+
+def test_a_table_must_hold_together():
+    with pytest.raises(
+        SpectrumError, match=r"2 names and 3 bands need spectra of shape \(2, 3\); found \(3, 2\)"
+    ):
+        SpectraTable(SMALL.bands, SMALL.names, SMALL.spectra.T)
+
+
+@given(st.lists(st.floats(0, 1), min_size=3, max_size=3))
+def test_resampling_to_the_same_bands_changes_nothing(values):
+    table = SpectraTable(SMALL.bands, ("a",), np.array([values]))
+    np.testing.assert_array_equal(table.resampled(Bands.of([400, 500, 600])).spectra, table.spectra)
+
+
+@given(
+    st.floats(-1, 1), st.lists(st.floats(401, 599), min_size=1, max_size=9, unique_by=lambda x: round(x, 2))
+)
+def test_resampling_is_exact_for_straight_spectra(slope, centers):
+    bands = Bands.of(sorted(centers))
+    straight = 1.5 + slope * (SMALL.bands.centers_nm - 500) / 100
+    expected = 1.5 + slope * (bands.centers_nm - 500) / 100
+    np.testing.assert_allclose(resample_spectra(straight, SMALL.bands, bands), expected)
+
+
+def test_resampling_interpolates_linearly_and_keeps_leading_axes():
+    resampled = resample_spectra(SMALL.spectra[None], SMALL.bands, Bands.of([425, 560]))
+    np.testing.assert_allclose(resampled, [[[0.2, 0.32], [0.25, 1.9]]])
+
+
+@pytest.mark.parametrize(
+    ("centers", "message"),
+    [
+        ([390, 500], "10 nm below their range"),
+        ([500, 602.5], "2.5 nm above their range"),
+        ([399, 601], "1 nm below and 1 nm above their range"),
+    ],
+)
+def test_extrapolation_is_refused_with_the_distance(centers, message):
+    with pytest.raises(SpectrumError, match=message):
+        SMALL.resampled(Bands.of(centers))
+
+
+def test_rounding_of_the_ends_is_no_extrapolation():
+    table = SMALL.resampled(Bands.of([400 - 1e-9, 600 + 1e-9]))
+    np.testing.assert_allclose(table.spectra, [[0.1, 0.2], [0, 2.5]])
+
+
+def test_spectra_of_another_length_do_not_fit_their_bands():
+    with pytest.raises(SpectrumError, match="spectra of 2 values do not fit 3 bands"):
+        resample_spectra(np.ones((4, 2)), SMALL.bands, SMALL.bands)
+
+
+def test_an_illuminant_is_resampled_then_scaled_to_a_maximum_of_one(tmp_path):
+    path = written(tmp_path, "wavelength,power\n400,10\n500,20\n600,80\n")
+    np.testing.assert_allclose(read_illuminant_csv(path, Bands.of([450, 500, 525])), [15 / 35, 20 / 35, 1])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("wavelength,a,b\n400,1,1\n600,1,1\n", "two columns, wavelength and power; found 3"),
+        ("wavelength,power\n400,0\n600,0\n", "the illuminant is zero at all of 2 bands, 450-550 nm"),
+        ("wavelength,power\n460,1\n600,1\n", "10 nm below their range"),
+    ],
+)
+def test_an_unusable_illuminant_is_refused_with_its_file(tmp_path, text, message):
+    with pytest.raises(SpectrumError, match=f"spectra.csv: .*{message}"):
+        read_illuminant_csv(written(tmp_path, text), Bands.of([450, 550]))

@@ -1,0 +1,104 @@
+"""What is true of the distribution as a whole: what a wheel holds, and what an import costs."""
+
+import configparser
+import subprocess
+import sys
+import zipfile
+from email.parser import Parser
+from pathlib import Path
+from shutil import copytree, ignore_patterns
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+HEAVY = ("colour", "scipy", "skimage", "matplotlib", "warp", "OpenEXR", "viser", "pandas", "tensorboard")
+COMMANDS = ("train", "eval", "export", "demo_scene")
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """A wheel built from a copy, so that no build folder appears in the repository."""
+    folder = tmp_path_factory.mktemp("wheel")
+    source = folder / "source"
+    source.mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        (source / name).write_bytes((ROOT / name).read_bytes())
+    copytree(ROOT / "unmix_plugin", source / "unmix_plugin", ignore=ignore_patterns("__pycache__"))
+    options = ["--quiet", "--no-deps", "--no-build-isolation", "--disable-pip-version-check"]
+    command = [sys.executable, "-m", "pip", "wheel", *options, "--wheel-dir", str(folder), str(source)]
+    finished = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert finished.returncode == 0, finished.stderr
+    [path] = folder.glob("*.whl")
+    with zipfile.ZipFile(path) as archive:
+        yield archive
+
+
+def metadata_file(wheel, name):
+    [path] = [entry for entry in wheel.namelist() if entry.endswith(f".dist-info/{name}")]
+    return wheel.read(path).decode()
+
+
+def test_a_wheel_holds_every_file_of_the_package_and_nothing_else(wheel):
+    expected = {
+        path.relative_to(ROOT).as_posix()
+        for path in (ROOT / "unmix_plugin").rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+    assert {name for name in wheel.namelist() if ".dist-info/" not in name} == expected
+
+
+def test_a_wheel_declares_commands_and_the_method(wheel):
+    entry_points = configparser.ConfigParser()
+    entry_points.read_string(metadata_file(wheel, "entry_points.txt"))
+    assert dict(entry_points["console_scripts"]) == {
+        "unmix-train": "unmix_plugin.commands.train:main",
+        "unmix-eval": "unmix_plugin.commands.eval:main",
+        "unmix-export": "unmix_plugin.commands.export:main",
+        "unmix-demo-scene": "unmix_plugin.commands.demo_scene:main",
+    }
+    assert dict(entry_points["unmix_plugin.method_configs"]) == {
+        "unmix-nerf": "unmix_plugin.method_config:unmix_nerf"
+    }
+
+
+def test_a_wheel_carries_licence_readme_and_dependency_ranges(wheel):
+    metadata = Parser().parsestr(metadata_file(wheel, "METADATA"))
+    assert metadata["License-Expression"] == "Apache-2.0"
+    assert metadata["Version"] == __import__("unmix_plugin").__version__
+    assert str(metadata.get_payload()).strip()
+    needed = [line for line in metadata.get_all("Requires-Dist", []) if "extra ==" not in line]
+    assert any(line.startswith("torch") for line in needed)
+    assert not [line for line in needed if "==" in line], (
+        "a library bounds its dependencies, it does not pin them"
+    )
+    assert "Apache License" in metadata_file(wheel, "licenses/LICENSE")
+
+
+def lines_printed_by(code):
+    """Standard output of a fresh interpreter that runs the code."""
+    command = [sys.executable, "-c", code]
+    finished = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+    assert finished.returncode == 0, finished.stderr
+    return finished.stdout.splitlines()
+
+
+LIST_MODULES = "print(*{name.partition('.')[0] for name in sys.modules})"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_importing_a_command_imports_no_heavy_package_but_torch(command):
+    [modules] = lines_printed_by(f"import sys, unmix_plugin.commands.{command}; {LIST_MODULES}")
+    assert set(modules.split()).isdisjoint(HEAVY)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_of_a_command_is_printed_without_a_heavy_package(command):
+    *_, status, modules = lines_printed_by(
+        f"import sys, unmix_plugin.commands.{command} as command\n"
+        f"sys.argv = ['unmix', '--help']\n"
+        f"try:\n    command.main()\n"
+        f"except SystemExit as stop:\n    print('status', stop.code)\n"
+        f"{LIST_MODULES}"
+    )
+    assert status == "status 0"
+    assert set(modules.split()).isdisjoint(HEAVY)

@@ -1,0 +1,86 @@
+"""Settings of a whole training run: the root of what the command line and `config.json` spell out."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from unmix_plugin.engine.instantiate import InstantiateConfig, Target
+from unmix_plugin.engine.optimizers import OptimizerConfig
+from unmix_plugin.engine.pipeline import PipelineConfig
+from unmix_plugin.errors import ConfigError
+
+__all__ = ["DeviceName", "InstantiateConfig", "OptimizerConfig", "Target", "TrainerConfig"]
+
+DeviceName = Literal["auto", "cpu", "cuda"]
+"""`auto` is CUDA where there is one."""
+
+
+@dataclass(frozen=True)
+class TrainerConfig:
+    """Settings of one training run; `Trainer(config)` runs it."""
+
+    method_name: tyro.conf.Suppress[str] = "unnamed"
+    """Name under which the method is registered."""
+    data: Path | None = None
+    """The scene's folder."""
+    output_dir: Path = Path("outputs")
+    """Folder under which the run's own folder is made."""
+    max_num_iterations: int | None = 20_000
+    """Training ends after so many steps (None: no such limit)."""
+    max_seconds: float | None = None
+    """Training ends after so many seconds of training; reading, compiling, evaluating and saving not counted."""
+    seed: int = 42
+    """Everything random follows from this."""
+    device: DeviceName = "auto"
+    """Where to compute; auto takes CUDA where there is one."""
+    steps_per_save: int = 1000
+    """Save a checkpoint every so many steps; 0: only at the end."""
+    steps_per_eval_image: int = 0
+    """Evaluate one view every so many steps; 0: never."""
+    steps_per_eval_all_images: int = 0
+    """Evaluate all evaluation views every so many steps; 0: never."""
+    steps_per_log: int = 50
+    """Write losses and metrics to metrics.jsonl every so many steps."""
+    checkpoints_kept: int = 2
+    """How many of the newest checkpoints stay in the run folder."""
+    max_skipped_steps: int = 20
+    """Training fails after so many steps in a row with a non-finite loss or gradient."""
+    average_decay: float | None = None
+    """Evaluate and render with a moving average of the parameters that keeps this part of itself each step."""
+    average_interval: int = 8
+    """Update that average every so many steps; each update costs about as much as one of the optimiser."""
+    load_run: Path | None = None
+    """Run folder to continue instead of starting a new one."""
+    pipeline: PipelineConfig = field(default_factory=PipelineConfig)
+    """Data and model."""
+    optimizers: Mapping[str, OptimizerConfig] = field(default_factory=dict)
+    """Settings of the optimiser by parameter group."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible settings.
+
+        Raises:
+            ConfigError: a number out of its range, or no limit at all.
+        """
+        rules = {
+            "max_num_iterations >= 0": self.max_num_iterations is None or self.max_num_iterations >= 0,
+            "max_seconds > 0 and finite": self.max_seconds is None or 0 < self.max_seconds < math.inf,
+            "max_num_iterations or max_seconds": (self.max_num_iterations, self.max_seconds) != (None, None),
+            "steps_per_save >= 0": self.steps_per_save >= 0,
+            "steps_per_eval_image >= 0": self.steps_per_eval_image >= 0,
+            "steps_per_eval_all_images >= 0": self.steps_per_eval_all_images >= 0,
+            "steps_per_log >= 1": self.steps_per_log >= 1,
+            "checkpoints_kept >= 1": self.checkpoints_kept >= 1,
+            "max_skipped_steps >= 1": self.max_skipped_steps >= 1,
+            "average_decay in [0, 1)": self.average_decay is None or 0 <= self.average_decay < 1,
+            "average_interval >= 1": self.average_interval >= 1,
+            "a file name as method_name": bool(self.method_name) and "/" not in self.method_name,
+        }
+        broken = [rule for rule, holds in rules.items() if not holds]
+        if broken:
+            values = {rule: getattr(self, rule.split()[0], None) for rule in broken}
+            raise ConfigError(f"the training settings must have {', '.join(broken)}; got {values}")

@@ -1,0 +1,25 @@
+"""Frozen settings that know which class they are for.
+
+A config is a frozen dataclass of plain values (numbers, strings, paths, tuples, further configs) beside the class
+that it configures. The string under each field is its help on the command line.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import tyro
+
+Target = tyro.conf.Suppress[type]
+"""Annotation of `_target`: the class that a config sets up; neither shown on the command line nor written to a file."""
+
+
+@dataclass(frozen=True)
+class InstantiateConfig:
+    """Settings of one object, and the class that takes them."""
+
+    _target: Target = field(default_factory=lambda: object)
+    """Class that `setup` calls. Subclasses write `_target: Target = field(default_factory=lambda: TheirClass)`."""
+
+    def setup(self, **kwargs: Any) -> Any:
+        """The configured object: `_target(self, **kwargs)`."""
+        return self._target(self, **kwargs)

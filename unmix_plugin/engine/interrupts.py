@@ -1,0 +1,48 @@
+"""Stopping between two steps when asked to, so that what is saved is a whole step."""
+
+import signal
+import threading
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any
+
+
+class Interrupted(Exception):  # noqa: N818
+    """Training was stopped by Ctrl-C or SIGTERM; the run can be resumed."""
+
+    def __init__(self, run: Path, step: int | None) -> None:
+        super().__init__(f"stopped; {'no checkpoint' if step is None else f'step {step}'} is saved in {run}")
+        self.run = run
+        """The run folder."""
+        self.step = step
+        """Step of the newest checkpoint, from which `load_config(run)` resumes; None if there is none."""
+
+
+class StopSignals:
+    """Context in which the first Ctrl-C or SIGTERM is only noted, and a second one raises KeyboardInterrupt.
+
+    In a thread that is not the main one signals can't be caught, and nothing is ever noted.
+    """
+
+    SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+    def __init__(self) -> None:
+        self.requested = False
+        """Whether a stop was asked for."""
+        self._previous: dict[signal.Signals, Any] = {}
+
+    def __enter__(self) -> "StopSignals":
+        if threading.current_thread() is threading.main_thread():
+            self._previous = {number: signal.signal(number, self._note) for number in self.SIGNALS}
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
+        if self.requested:
+            raise KeyboardInterrupt
+        self.requested = True

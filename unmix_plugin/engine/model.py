@@ -1,0 +1,140 @@
+"""The interface of a model: from rays to outputs, losses, metrics and pictures."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from unmix_plugin.engine.callbacks import TrainingCallback
+from unmix_plugin.engine.cameras import Cameras
+from unmix_plugin.engine.instantiate import InstantiateConfig, Target
+from unmix_plugin.engine.rays import RayBundle
+from unmix_plugin.engine.scene_box import SceneBox
+from unmix_plugin.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class ModelConfig(InstantiateConfig):
+    """Settings that every model has."""
+
+    _target: Target = field(default_factory=lambda: Model)
+    eval_num_rays_per_chunk: int = 8192
+    """Rays rendered at once for a whole image; fewer take less memory."""
+
+
+class Model(nn.Module, ABC):
+    """A scene representation with its renderer.
+
+    The config, the scene box and the metadata alone give a model its modules and the shape of every parameter and
+    buffer; the checkpoint gives the values. So a run folder renders without the data it was trained on.
+    """
+
+    def __init__(self, config: ModelConfig, *, scene_box: SceneBox, metadata: Mapping[str, Any]) -> None:
+        """Keep the arguments, then call `populate_modules`."""
+        super().__init__()
+        self.config = config
+        self.scene_box = scene_box
+        self.metadata = metadata
+        self.populate_modules()
+
+    @property
+    def device(self) -> torch.device:
+        """Where the parameters are."""
+        return next(self.parameters()).device
+
+    @abstractmethod
+    def populate_modules(self) -> None:
+        """Make the modules, parameters and buffers, their shapes from `config`, `scene_box` and `metadata` only."""
+
+    def initialise(self, initial_data: Mapping[str, np.ndarray]) -> None:
+        """Fill parameters and buffers from the data manager's `initial_data`; called once when a run starts, after
+        the move to the device, and never when one is loaded."""
+
+    @abstractmethod
+    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Parameters to train, by the name of the optimizer config that they use."""
+
+    @abstractmethod
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
+        """What is seen along the rays: tensors with one row a ray, and any others that losses or metrics use."""
+
+    def forward(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
+        """`get_outputs`."""
+        return self.get_outputs(ray_bundle)
+
+    @abstractmethod
+    def get_loss_dict(
+        self,
+        outputs: dict[str, Tensor],
+        batch: dict[str, Tensor],
+        metrics_dict: dict[str, Tensor] | None = None,
+    ) -> dict[str, Tensor]:
+        """Scalar losses, already weighted; training minimises their sum."""
+
+    def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:  # noqa: ARG002
+        """Scalars worth following in training; `psnr` (dB) is shown in the progress display."""
+        return {}
+
+    @abstractmethod
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Metrics of one whole image, and pictures of it (height, width, 3) in sRGB [0, 1]."""
+
+    def get_training_callbacks(self) -> list[TrainingCallback]:
+        """Functions to call around each step."""
+        return []
+
+    def num_samples(self, outputs: dict[str, Tensor]) -> int:  # noqa: ARG002
+        """Field samples behind `outputs`, for the log; 0 where a model does not count."""
+        return 0
+
+    def next_num_rays(self, outputs: dict[str, Tensor], current: int) -> int | None:  # noqa: ARG002
+        """Rays that the next step should have, given the outputs of one with `current` rays; None leaves it."""
+        return None
+
+    def warm_up(self) -> None:
+        """Compile and allocate what the first step needs, before the training clock starts; changes no parameter,
+        no buffer."""
+
+    @torch.no_grad()
+    def get_outputs_for_camera(
+        self, camera: Cameras, outputs: Collection[str] | None = None
+    ) -> dict[str, Tensor]:
+        """Render a whole image, chunk by chunk.
+
+        Args:
+            camera: One camera.
+            outputs: Names to keep; None keeps every output that has one row a ray.
+        Returns:
+            Tensors (height, width, ...).
+        Raises:
+            ConfigError: a name that `get_outputs` does not give.
+        """
+        ray_bundle = camera.to(self.device).image_rays(0)
+        chunk = self.config.eval_num_rays_per_chunk
+        parts = [
+            self._ray_outputs(ray_bundle[i : i + chunk], outputs) for i in range(0, len(ray_bundle), chunk)
+        ]
+        names = [name for name in parts[0] if all(name in part for part in parts)]
+        return {
+            name: torch.cat([part[name] for part in parts]).unflatten(0, (camera.height, camera.width))
+            for name in names
+        }
+
+    def _ray_outputs(self, ray_bundle: RayBundle, names: Collection[str] | None) -> dict[str, Tensor]:
+        found = {
+            name: value
+            for name, value in self.get_outputs(ray_bundle).items()
+            if value.ndim > 0 and value.shape[0] == len(ray_bundle)
+        }
+        unknown = sorted(set(names or ()) - set(found))
+        if unknown:
+            raise ConfigError(
+                f"this model has no output {', '.join(unknown)}; it has {', '.join(sorted(found))}"
+            )
+        return {name: value for name, value in found.items() if names is None or name in names}

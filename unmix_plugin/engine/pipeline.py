@@ -1,0 +1,107 @@
+"""A data manager and a model, joined: what one training or evaluation step computes."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeAlias
+
+import torch
+from torch import Tensor, nn
+
+from unmix_plugin.engine.callbacks import TrainingCallback
+from unmix_plugin.engine.data_manager import DataManager, DataManagerConfig
+from unmix_plugin.engine.instantiate import InstantiateConfig, Target
+from unmix_plugin.engine.model import Model, ModelConfig
+from unmix_plugin.engine.rays import RayBundle
+
+
+@dataclass(frozen=True)
+class PipelineConfig(InstantiateConfig):
+    """Settings of the data and of the model."""
+
+    _target: Target = field(default_factory=lambda: Pipeline)
+    datamanager: DataManagerConfig = field(default_factory=DataManagerConfig)
+    """How the scene is read and sampled."""
+    model: ModelConfig = field(default_factory=ModelConfig)
+    """What is trained."""
+
+
+TrainOutputs: TypeAlias = tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Tensor]]
+"""Outputs, losses and metrics of one batch."""
+
+
+class Pipeline(nn.Module):
+    """Data manager and model. Only the model has parameters."""
+
+    def __init__(self, config: PipelineConfig, *, data: Path, device: torch.device, seed: int = 0) -> None:
+        """Read the scene, then make the model for it, with parameters not yet initialised from the scene.
+
+        Raises:
+            SceneError: the scene is missing or malformed.
+            ConfigError: the model does not fit the scene.
+        """
+        super().__init__()
+        self.config = config
+        self.datamanager: DataManager = config.datamanager.setup(data=data, device=device, seed=seed)
+        self.model: Model = config.model.setup(
+            scene_box=self.datamanager.scene_box, metadata=self.datamanager.metadata()
+        ).to(device)
+
+    def initialise(self) -> None:
+        """Let the model of a new run take its first values from the scene."""
+        with torch.no_grad():
+            self.model.initialise(self.datamanager.initial_data())
+
+    def get_train_loss_dict(self, step: int) -> TrainOutputs:
+        """Outputs, losses and metrics of training step `step`."""
+        return self._losses(*self.datamanager.next_train(step))
+
+    @torch.no_grad()
+    def get_eval_loss_dict(self, step: int) -> TrainOutputs:
+        """The same on a batch of evaluation rays, without gradients."""
+        with evaluating(self.model):
+            return self._losses(*self.datamanager.next_eval(step))
+
+    @torch.no_grad()
+    def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Metrics and pictures of the evaluation view that `step` chooses."""
+        _, camera, batch = self.datamanager.next_eval_image(step)
+        with evaluating(self.model):
+            return self.model.get_image_metrics_and_images(self.model.get_outputs_for_camera(camera), batch)
+
+    @torch.no_grad()
+    def get_average_eval_image_metrics(self, step: int | None = None) -> dict[str, float]:  # noqa: ARG002
+        """Metrics averaged over all evaluation views, each over the views that have it, whatever the step."""
+        values: dict[str, list[float]] = {}
+        with evaluating(self.model):
+            for index in range(self.datamanager.num_eval_images):
+                camera, batch = self.datamanager.eval_image(index)
+                outputs = self.model.get_outputs_for_camera(camera)
+                for name, value in self.model.get_image_metrics_and_images(outputs, batch)[0].items():
+                    values.setdefault(name, []).append(float(value))
+        return {name: sum(found) / len(found) for name, found in values.items()}
+
+    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
+        """The model's parameters by optimizer name."""
+        return self.model.get_param_groups()
+
+    def get_training_callbacks(self) -> list[TrainingCallback]:
+        """The data manager's callbacks, then the model's."""
+        return self.datamanager.get_training_callbacks() + self.model.get_training_callbacks()
+
+    def _losses(self, ray_bundle: RayBundle, batch: dict[str, Tensor]) -> TrainOutputs:
+        outputs = self.model(ray_bundle)
+        metrics = self.model.get_metrics_dict(outputs, batch)
+        return outputs, self.model.get_loss_dict(outputs, batch, metrics), metrics
+
+
+@contextmanager
+def evaluating(module: nn.Module) -> Iterator[None]:
+    """Context in which `module` is in evaluation mode; afterwards it is in the mode it was in."""
+    was_training = module.training
+    module.eval()
+    try:
+        yield
+    finally:
+        module.train(was_training)

@@ -1,0 +1,25 @@
+"""What can go wrong that is not our bug: one hierarchy, one clear message each.
+
+A message says what, where (file, frame, band), found against expected, and what to do. Commands print it without a
+traceback and exit with status 2; anything else that escapes is our own defect and exits with status 1.
+"""
+
+
+class UnmixError(Exception):
+    """Base of every error whose cause a user can mend."""
+
+
+class SceneError(UnmixError):
+    """The input scene is missing, malformed or contradicts itself."""
+
+
+class RunError(UnmixError):
+    """A run folder is missing, half-written, from a newer version, or can't be written."""
+
+
+class ConfigError(UnmixError):
+    """A setting or a command-line word is unknown, impossible, or doesn't fit this machine or scene."""
+
+
+class SpectrumError(UnmixError):
+    """Spectra, wavelengths or endmembers do not fit each other or the request."""

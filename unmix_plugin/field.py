@@ -1,0 +1,154 @@
+"""The field of UnMix-NeRF: what a point is made of, how brightly it is lit, and what it reflects towards a direction.
+
+Notation: `S` samples, `K` endmembers, `J` specular coefficients (spectra of a dictionary, or bands). A hash grid and a
+small network give density and features g(x); heads on g give abundances a = softmax(logits / T), scales s in (0, 1) and
+specular coefficients in (0, 1) that already carry the tint h.
+
+Source: Perez et al. 2025, UnMix-NeRF, section 3; the coefficients replace the paper's spectra a sample, see model.py.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from unmix_plugin.engine.field import Field
+from unmix_plugin.engine.scene_box import SceneBox
+from unmix_plugin.rendering.hash_encoding import HashGridLayout, hash_encode
+
+_LARGEST_LOG_DENSITY = 15.0
+
+
+@dataclass(frozen=True)
+class UnmixFieldConfig:
+    """Sizes of the field's grid and networks."""
+
+    num_levels: int = 8
+    """Levels of the hash grid."""
+    features_per_level: int = 4
+    """Features that the hash grid holds at each vertex of a level."""
+    coarsest_resolution: int = 16
+    """Cells along an edge of the scene box on the coarsest level."""
+    finest_resolution: int = 256
+    """Cells along an edge of the scene box on the finest level."""
+    log2_rows_per_level: int = 17
+    """Largest number of vertices that a level stores, as a power of two; finer levels share rows by a hash."""
+    hidden_width: int = 64
+    """Width of the hidden layers."""
+    num_features: int = 15
+    """Geometry features that the heads see."""
+    temperature: float = 1.0
+    """T of the abundances' softmax: lower is purer."""
+    scale: Literal["shared", "per-endmember"] = "shared"
+    """One brightness a point, or one a point and endmember as published."""
+    specular_bias: float = -3.0
+    """Logit of the view-dependent part at the start; low, so that colour is first explained by materials."""
+
+
+class UnmixField(Field):
+    """Density, abundances, scales and specular coefficients of points in a scene box."""
+
+    def __init__(
+        self,
+        config: UnmixFieldConfig,
+        scene_box: SceneBox,
+        num_endmembers: int,
+        num_specular: int,
+        initial_density: float,
+    ) -> None:
+        """
+        Args:
+            config: Sizes.
+            scene_box: Where the field is defined, model space.
+            num_endmembers: K.
+            num_specular: J; 0 leaves the view-dependent part out.
+            initial_density: Density of the untrained field, per scene unit.
+        """
+        super().__init__()
+        self.config = config
+        self.num_specular = num_specular
+        self.log_initial_density = math.log(initial_density)
+        self.layout = HashGridLayout(
+            config.num_levels,
+            config.features_per_level,
+            config.coarsest_resolution,
+            config.finest_resolution,
+            config.log2_rows_per_level,
+        )
+        self.register_buffer("aabb", scene_box.aabb.clone())
+        table = torch.empty(self.layout.num_rows, config.features_per_level)
+        self.table = nn.Parameter(nn.init.uniform_(table, -1e-4, 1e-4))
+        width, num_encoded = config.hidden_width, config.num_levels * config.features_per_level
+        num_features = config.num_features + 1
+        self.density_network = _network(num_encoded, width, num_features)
+        num_scales = 1 if config.scale == "shared" else num_endmembers
+        self.num_endmembers = num_endmembers
+        self.material_network = _network(num_features, width, num_endmembers + num_scales)
+        if num_specular:
+            self.specular_network = _network(num_features + NUM_DIRECTION_FEATURES, width, num_specular + 1)
+
+    def get_density(
+        self, positions: Float[Tensor, "S 3"]
+    ) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
+        """Density per scene unit and geometry features."""
+        unit_positions = (positions - self.aabb[0]) / (self.aabb[1] - self.aabb[0])
+        features = self.density_network(hash_encode(unit_positions, self.table, self.layout))
+        raw = features[:, 0] + self.log_initial_density
+        # Clamped in value only: a point that grew too dense can still be thinned.
+        bounded = raw + (raw.clamp(max=_LARGEST_LOG_DENSITY) - raw).detach()
+        return bounded.exp(), features
+
+    def get_outputs(
+        self,
+        positions: Float[Tensor, "S 3"],
+        directions: Float[Tensor, "S 3"],
+        features: Float[Tensor, "S G"],
+    ) -> dict[str, Tensor]:
+        """`abundances` (S, K), `scaled_abundances` S a (S, K) and `specular_coefficients` h u (S, J)."""
+        material = self.material_network(features)
+        abundances = torch.softmax(material[:, : self.num_endmembers] / self.config.temperature, dim=-1)
+        scales = torch.sigmoid(material[:, self.num_endmembers :])
+        outputs = {"abundances": abundances, "scaled_abundances": scales * abundances}
+        if self.num_specular:
+            seen = torch.cat([features, direction_features(directions)], dim=-1)
+            specular = torch.sigmoid(self.specular_network(seen) + self.config.specular_bias / 2)
+            outputs["specular_coefficients"] = specular[:, :1] * specular[:, 1:]
+        return outputs
+
+
+NUM_DIRECTION_FEATURES = 15
+
+
+def direction_features(directions: Float[Tensor, "S 3"]) -> Float[Tensor, "S 15"]:
+    """Real spherical harmonics of degrees 1 to 3 of unit directions (the constant carries nothing), up to scale."""
+    x, y, z = directions.unbind(-1)
+    xx, yy, zz = x * x, y * y, z * z
+    return torch.stack(
+        [
+            x,
+            y,
+            z,
+            1.7320508 * x * y,
+            1.7320508 * y * z,
+            0.5 * (3 * zz - 1),
+            1.7320508 * x * z,
+            0.8660254 * (xx - yy),
+            0.7905694 * y * (3 * xx - yy),
+            3.8729833 * x * y * z,
+            0.6123724 * y * (5 * zz - 1),
+            0.5 * z * (5 * zz - 3),
+            0.6123724 * x * (5 * zz - 1),
+            1.9364917 * z * (xx - yy),
+            0.7905694 * x * (xx - 3 * yy),
+        ],
+        dim=-1,
+    )
+
+
+def _network(num_inputs: int, width: int, num_outputs: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(num_inputs, width), nn.ReLU(), nn.Linear(width, num_outputs))

@@ -1,0 +1,117 @@
+"""Samples along rays, only where an occupancy grid says that matter may be.
+
+Notation: `R` rays, `S` samples in all, stored packed: the samples of a ray are consecutive and `packed_info` holds
+(first sample, count) a ray. Points are in the unit cube that the grid fills, `t` in the unit of the ray parameter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+
+from unmix_plugin.rendering.launching import as_warp, launch, vector_type
+
+
+@dataclass(frozen=True)
+class PackedSamples:
+    """Samples of a batch of rays, ray after ray."""
+
+    t: Float[Tensor, "S"]
+    """Ray parameter of each sample: the middle of its interval."""
+    ray_indices: Int[Tensor, "S"]
+    packed_info: Int[Tensor, "R 2"]
+    """First sample and number of samples of each ray."""
+    step: float
+    """Length of every sample's interval."""
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def select(self, keep: Bool[Tensor, "S"]) -> PackedSamples:
+        """Only the samples marked in `keep`, still packed."""
+        kept_before = torch.cat([keep.new_zeros(1, dtype=torch.int64), keep.cumsum(0)])
+        starts = kept_before[self.packed_info[:, 0]]
+        ends = kept_before[self.packed_info[:, 0] + self.packed_info[:, 1]]
+        packed_info = torch.stack([starts, ends - starts], dim=-1)
+        return PackedSamples(self.t[keep], self.ray_indices[keep], packed_info, self.step)
+
+
+def march(
+    origins: Float[Tensor, "R 3"],
+    directions: Float[Tensor, "R 3"],
+    t_near: Float[Tensor, "R"],
+    t_far: Float[Tensor, "R"],
+    jitter: Float[Tensor, "R"],
+    occupied: UInt8[Tensor, "X Y Z"],
+    step: float,
+) -> PackedSamples:
+    """Samples at t_near + (i + jitter) step that lie in occupied cells.
+
+    Args:
+        origins, directions: Rays in unit-cube coordinates; directions need not have unit length.
+        t_near, t_far: Where each ray enters and leaves the unit cube; t_far <= t_near marks a miss.
+        jitter: Offset of each ray's lattice in steps, [0, 1).
+        occupied: Non-zero where matter may be; cell (x, y, z) is [x/X, (x+1)/X] and so on.
+        step: Distance of neighbouring samples in the ray parameter, > 0.
+    Raises:
+        ValueError: step isn't positive.
+    """
+    from unmix_plugin.rendering._marching_kernels import count_kernel, write_kernel
+
+    _check_step(step)
+    device, point = origins.device, vector_type(3, torch.float32)
+    sides = torch.tensor(occupied.shape, dtype=torch.float32, device=device)
+    t_first = (t_near + jitter * step).contiguous()
+    cell_origins, cell_directions = origins * sides, directions * sides
+    rays = [
+        as_warp(cell_origins, point),
+        as_warp(cell_directions, point),
+        as_warp(t_first),
+        as_warp(t_far.contiguous()),
+        step,
+        as_warp(occupied.contiguous()),
+    ]
+    counts = torch.empty(len(origins), dtype=torch.int64, device=device)
+    launch(count_kernel, len(origins), [*rays, as_warp(counts)], device)
+    ends = counts.cumsum(0)
+    starts = ends - counts
+    total = int(ends[-1]) if len(ends) else 0
+    t_samples = torch.empty(total, dtype=torch.float32, device=device)
+    ray_indices = torch.empty(total, dtype=torch.int64, device=device)
+    if total:
+        written = [as_warp(starts), as_warp(ray_indices), as_warp(t_samples)]
+        launch(write_kernel, len(origins), [*rays, *written], device)
+    return PackedSamples(t_samples, ray_indices, torch.stack([starts, counts], dim=-1), step)
+
+
+def march_twin(
+    origins: Float[Tensor, "R 3"],
+    directions: Float[Tensor, "R 3"],
+    t_near: Float[Tensor, "R"],
+    t_far: Float[Tensor, "R"],
+    jitter: Float[Tensor, "R"],
+    occupied: UInt8[Tensor, "X Y Z"],
+    step: float,
+) -> PackedSamples:
+    """The same as `march` in plain PyTorch: tests every lattice point of every ray."""
+    _check_step(step)
+    t_first = t_near + jitter * step
+    longest = float((t_far - t_first).max()) if len(t_far) else 0.0
+    index = torch.arange(max(int(longest / step) + 2, 1), device=origins.device)
+    t = t_first[:, None] + index * step
+    points = origins[:, None] + t[..., None] * directions[:, None]
+    sides = torch.tensor(occupied.shape, device=origins.device)
+    cells = torch.minimum((points * sides).floor().long().clamp(min=0), sides - 1)
+    hit = (t < t_far[:, None]) & (occupied[tuple(cells.unbind(-1))] != 0)
+    counts = hit.sum(dim=1)
+    starts = counts.cumsum(0) - counts
+    ray_indices, _ = hit.nonzero(as_tuple=True)
+    return PackedSamples(t[hit], ray_indices, torch.stack([starts, counts], dim=-1), step)
+
+
+def _check_step(step: float) -> None:
+    if not step > 0:
+        raise ValueError(f"step must be positive; got {step}")

@@ -1,0 +1,88 @@
+"""A grid over the scene box that remembers where matter may be, so that rays skip what is empty.
+
+Each cell keeps an exponential moving maximum of the densities probed in it. The grid only says what is empty; what is
+visible is decided from the field's own densities, since a cell's maximum would hide what lies behind its empty part.
+
+Source: Mueller et al. 2022, appendix C.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor, nn
+
+DensityFn = Callable[[Float[Tensor, "S 3"]], Float[Tensor, "S"]]
+
+
+class OccupancyGrid(nn.Module):
+    """Moving maxima of density in the cells of the unit cube and which of them count as occupied."""
+
+    peak_densities: Tensor
+    occupied: Tensor
+    reachable: Tensor
+
+    def __init__(self, reachable: Bool[Tensor, "X Y Z"]) -> None:
+        """Start with every cell occupied that `reachable` allows; the others stay empty for ever."""
+        super().__init__()
+        self.register_buffer("reachable", reachable.clone())
+        self.register_buffer("peak_densities", torch.full(reachable.shape, torch.inf))
+        self.register_buffer("occupied", reachable.to(torch.uint8))
+
+    def occupied_cells(self) -> UInt8[Tensor, "X Y Z"]:
+        """Non-zero where rays are to be sampled."""
+        return self.occupied
+
+    @property
+    def occupied_fraction(self) -> float:
+        """Part of the box that rays are sampled in."""
+        return float(self.occupied.float().mean())
+
+    @torch.no_grad()
+    def update(
+        self,
+        density_fn: DensityFn,
+        threshold: float,
+        decay: float,
+        num_cells: int | None,
+        generator: torch.Generator,
+    ) -> None:
+        """Probe one random point in each of some cells and decide anew what is occupied.
+
+        Args:
+            density_fn: Points in the unit cube to densities.
+            threshold: Density from which a cell counts as occupied; never above the mean over reachable cells.
+            decay: Factor on a probed cell's old maximum.
+            num_cells: Cells to probe: half drawn from the occupied ones, half from all reachable ones; None for all.
+            generator: Source of the points and cells.
+        """
+        cells = self._choose_cells(num_cells, generator)
+        sides = torch.tensor(self.occupied.shape, device=cells.device)
+        offsets = torch.rand(len(cells), 3, generator=generator).to(cells.device)
+        densities = density_fn((self._coordinates(cells) + offsets) / sides)
+        peaks = self.peak_densities.view(-1)
+        known = torch.where(torch.isinf(peaks[cells]), 0.0, peaks[cells] * decay)
+        peaks[cells] = torch.maximum(known, densities)
+        reachable_peaks = peaks[self.reachable.view(-1)]
+        finite = reachable_peaks[torch.isfinite(reachable_peaks)]
+        limit = min(threshold, float(finite.mean())) if len(finite) else threshold
+        self.occupied.copy_((self.peak_densities > limit) & self.reachable)
+
+    def _choose_cells(self, num_cells: int | None, generator: torch.Generator) -> Int[Tensor, "N"]:
+        reachable = self.reachable.view(-1).nonzero()[:, 0]
+        if num_cells is None or num_cells >= len(reachable):
+            return reachable
+        occupied = self.occupied.view(-1).nonzero()[:, 0]
+        chosen = [
+            pool[torch.randint(len(pool), (num_cells // 2,), generator=generator).to(pool.device)]
+            for pool in (reachable, occupied)
+            if len(pool)
+        ]
+        return torch.cat(chosen).unique()
+
+    def _coordinates(self, cells: Int[Tensor, "N"]) -> Float[Tensor, "N 3"]:
+        _, side_y, side_z = self.occupied.shape
+        x, rest = cells // (side_y * side_z), cells % (side_y * side_z)
+        return torch.stack([x, rest // side_z, rest % side_z], dim=-1).float()

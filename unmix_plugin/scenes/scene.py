@@ -1,0 +1,210 @@
+"""A validated scene: posed spectral images, their truth if any, and the box of space they show.
+
+Notation: `N` frames, `B` bands, `K` materials, `H x W` pixels. World space is that of transforms.json, model space
+is the one that `Scene.normalisation` maps it to and in which `Scene.cameras` and `Scene.scene_box` are given.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Float64, UInt8
+
+from unmix_plugin.engine.cameras import Cameras
+from unmix_plugin.engine.scene_box import SceneBox
+from unmix_plugin.scenes.arrays import map_array
+from unmix_plugin.scenes.images import read_colour, read_labels, read_mask
+
+UNLABELLED = 255
+"""Label of a pixel whose material is unknown."""
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """How to read a scene."""
+
+    value_scale: float | None = None
+    """Cubes are divided by this number (needed for integer cubes: 255, 10000 or 65535); None takes them as they are."""
+    invalid_pixels: Literal["refuse", "mask"] = "refuse"
+    """What to do with pixels that hold NaN, infinite or negative values: refuse the scene, or leave them out."""
+    allow_outside_paths: bool = False
+    """Follow paths in transforms.json that lead out of the scene folder (`..`, absolute, symbolic links)."""
+    eval_split: Literal["auto", "lists", "filename", "interval"] = "auto"
+    """Evaluation frames by the lists of transforms.json, by folder or file name, or every n-th; auto takes the first
+    of these that the scene supports."""
+    eval_interval: int = 8
+    """With an interval split every n-th frame, from the first on, is for evaluation."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The files of one view."""
+
+    name: str
+    """Short name, unique in the scene, fit for file names."""
+    cube_path: Path
+    """(H, W, B) .npy file."""
+    image_path: Path | None
+    """sRGB picture, with or without alpha."""
+    label_path: Path | None
+    """Material indices, 255 = unlabelled."""
+    mask_path: Path | None
+    """Black where pixels are ignored."""
+    abundance_path: Path | None
+    """(H, W, K) .npy file of true abundances."""
+
+
+@dataclass(frozen=True)
+class Normalisation:
+    """Similarity from world to model space: p_model = scale * (rotation @ p_world + translation)."""
+
+    rotation: Float64[np.ndarray, "3 3"]
+    """Orthonormal, determinant 1."""
+    translation: Float64[np.ndarray, "3"]
+    """World units, added after the rotation."""
+    scale: float
+    """Model units a world unit, > 0."""
+
+    def to_model(self, points: Float[np.ndarray, "*points 3"]) -> Float64[np.ndarray, "*points 3"]:
+        """World points in model space."""
+        return self.scale * (points @ self.rotation.T + self.translation)
+
+    def to_world(self, points: Float[np.ndarray, "*points 3"]) -> Float64[np.ndarray, "*points 3"]:
+        """Model points in world space, the inverse of `to_model`."""
+        return (points / self.scale - self.translation) @ self.rotation
+
+    def to_json(self) -> dict[str, Any]:
+        """Numbers and lists; `from_json` gives back the same bits."""
+        return {
+            "rotation": self.rotation.tolist(),
+            "translation": self.translation.tolist(),
+            "scale": self.scale,
+        }
+
+    @staticmethod
+    def from_json(values: dict[str, Any]) -> Normalisation:
+        """The transform that `to_json` wrote."""
+        return Normalisation(
+            np.array(values["rotation"], dtype=np.float64).reshape(3, 3),
+            np.array(values["translation"], dtype=np.float64).reshape(3),
+            float(values["scale"]),
+        )
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything known about a scene; made by `load_scene` only, which guarantees what is said here."""
+
+    root: Path
+    """Scene folder."""
+    wavelengths_nm: Float64[np.ndarray, " B"]
+    """Band centres in nm, strictly increasing."""
+    frames: tuple[Frame, ...]
+    """All views, in the order of transforms.json."""
+    cameras: Cameras
+    """One a frame, in model space."""
+    train_indices: tuple[int, ...]
+    """Frames to train on; at least one."""
+    eval_indices: tuple[int, ...]
+    """Frames to evaluate on; at least one, none of them trained on."""
+    scene_box: SceneBox
+    """Model space that is modelled; its longest edge is [-1, 1]."""
+    normalisation: Normalisation
+    """From world to model space."""
+    material_names: tuple[str, ...] | None
+    """True materials in the order of labels and abundances."""
+    illuminant: Float64[np.ndarray, " B"] | None
+    """Relative power of the light a band, greatest value 1."""
+    endmembers: Float64[np.ndarray, "K B"] | None
+    """True reflectance of each material, [0, 1]."""
+    has_alpha: bool
+    """Every picture has an alpha channel and at least one pixel of one is not opaque."""
+    has_labels: bool
+    """Every evaluation frame has labels."""
+    has_abundances: bool
+    """Every evaluation frame has abundances."""
+    input_hashes: dict[str, str]
+    """SHA-256 of every file read, by its path relative to the scene folder."""
+    options: SceneOptions
+    """How the scene was read."""
+
+    def cube(self, index: int) -> Float32[np.ndarray, "H W B"]:
+        """Spectra of a view in [0, 1].
+
+        Values above 1 after the division by `value_scale` are clipped to 1, as a saturated sensor does, and with
+        `invalid_pixels="mask"` the spectra of invalid pixels are 0 (see `valid_mask`).
+        """
+        values = self._scaled(index)
+        if self.options.invalid_pixels == "mask":
+            values[~_is_valid(values)] = 0.0
+        return np.clip(values, 0.0, 1.0, out=values)
+
+    def alpha(self, index: int) -> Float32[np.ndarray, "H W"] | None:
+        """Opacity of a view's pixels in [0, 1]; None if the scene has no alpha.
+
+        Cubes are expected as rendered over black, that is multiplied by alpha (premultiplied): a pixel half covered
+        by an object holds half its radiance. So is the light behind `srgb`, before its gamma encoding.
+        """
+        path = self.frames[index].image_path
+        if not self.has_alpha or path is None:
+            return None
+        return read_colour(path)[..., 3].astype(np.float32) / np.float32(255.0)
+
+    def srgb(self, index: int) -> Float32[np.ndarray, "H W 3"] | None:
+        """sRGB picture of a view in [0, 1], as stored (gamma-encoded); None if it has none."""
+        path = self.frames[index].image_path
+        if path is None:
+            return None
+        return read_colour(path)[..., :3].astype(np.float32) / np.float32(255.0)
+
+    def labels(self, index: int) -> UInt8[np.ndarray, "H W"] | None:
+        """Material index of each pixel, 255 = unlabelled; None if the view has no labels."""
+        path = self.frames[index].label_path
+        return None if path is None else read_labels(path)
+
+    def valid_mask(self, index: int) -> Bool[np.ndarray, "H W"]:
+        """True where a pixel counts: not black in the view's mask and, with `invalid_pixels="mask"`, all bands
+        finite and not negative."""
+        path = self.frames[index].mask_path
+        valid = np.ones((self.cameras.height, self.cameras.width), bool) if path is None else read_mask(path)
+        if self.options.invalid_pixels == "mask":
+            valid = valid & _is_valid(self._scaled(index))
+        return valid
+
+    def abundances(self, index: int) -> Float32[np.ndarray, "H W K"] | None:
+        """True abundances of a view; None if it has none."""
+        path = self.frames[index].abundance_path
+        return None if path is None else np.array(map_array(path), dtype=np.float32, order="C")
+
+    def summary(self) -> dict[str, Any]:
+        """What a run has to remember of the scene, as JSON-able values."""
+        return {
+            "root": str(self.root),
+            "wavelengths_nm": self.wavelengths_nm.tolist(),
+            "frames": [frame.name for frame in self.frames],
+            "train_indices": list(self.train_indices),
+            "eval_indices": list(self.eval_indices),
+            "cameras": self.cameras.to_json(),
+            "scene_box": self.scene_box.aabb.tolist(),
+            "normalisation": self.normalisation.to_json(),
+            "material_names": None if self.material_names is None else list(self.material_names),
+            "illuminant": None if self.illuminant is None else self.illuminant.tolist(),
+            "endmembers": None if self.endmembers is None else self.endmembers.tolist(),
+            "has_alpha": self.has_alpha,
+            "has_labels": self.has_labels,
+            "has_abundances": self.has_abundances,
+            "input_hashes": dict(self.input_hashes),
+            "options": asdict(self.options),
+        }
+
+    def _scaled(self, index: int) -> Float32[np.ndarray, "H W B"]:
+        values = np.array(map_array(self.frames[index].cube_path), dtype=np.float32, order="C")
+        scale = self.options.value_scale
+        return values if scale is None else np.divide(values, np.float32(scale), out=values)
+
+
+def _is_valid(values: Float32[np.ndarray, "H W B"]) -> Bool[np.ndarray, "H W"]:
+    return np.all(np.isfinite(values) & (values >= 0.0), axis=-1)

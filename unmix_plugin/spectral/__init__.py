@@ -1,0 +1,86 @@
+"""Pure spectral maths on tensors: bands last, wavelengths in nm. Knows no scene, no model and no file but CSV.
+
+Importing this package costs torch and numpy; scipy, scikit-image and colour-science are imported by the functions that
+need them.
+"""
+
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.colour import (
+    band_composite_matrix,
+    colour_mode,
+    describe_colour,
+    linear_to_srgb,
+    rgb_matrix,
+    srgb_to_linear,
+    xyz_matrix,
+)
+from unmix_plugin.spectral.endmembers import EndmemberMethod, drop_uninformative_pixels, initialise_endmembers
+from unmix_plugin.spectral.kmeans_normalised import KmeansResult, normalised_kmeans, scale_to_lit_pixels
+from unmix_plugin.spectral.metrics import (
+    EndmemberMatching,
+    abundance_rmse,
+    endmember_angle,
+    match_endmembers,
+    psnr,
+    rgb_psnr,
+    rmse,
+    sam,
+    spectral_angle,
+    ssim,
+)
+from unmix_plugin.spectral.nfindr_winter1999 import nfindr, simplex_volume
+from unmix_plugin.spectral.segmentation import (
+    SegmentationScores,
+    SegmentationTally,
+    material_ids,
+    material_scores,
+)
+from unmix_plugin.spectral.spectra_csv import (
+    SpectraTable,
+    read_illuminant_csv,
+    read_spectra_csv,
+    resample_spectra,
+    write_spectra_csv,
+)
+from unmix_plugin.spectral.vca_nascimento2005 import VcaResult, estimate_snr_db, vca
+
+__all__ = [
+    "Bands",
+    "EndmemberMatching",
+    "EndmemberMethod",
+    "KmeansResult",
+    "SegmentationScores",
+    "SegmentationTally",
+    "SpectraTable",
+    "VcaResult",
+    "abundance_rmse",
+    "band_composite_matrix",
+    "colour_mode",
+    "describe_colour",
+    "drop_uninformative_pixels",
+    "endmember_angle",
+    "estimate_snr_db",
+    "initialise_endmembers",
+    "linear_to_srgb",
+    "match_endmembers",
+    "material_ids",
+    "material_scores",
+    "nfindr",
+    "normalised_kmeans",
+    "psnr",
+    "read_illuminant_csv",
+    "read_spectra_csv",
+    "resample_spectra",
+    "rgb_matrix",
+    "rgb_psnr",
+    "rmse",
+    "sam",
+    "scale_to_lit_pixels",
+    "simplex_volume",
+    "spectral_angle",
+    "srgb_to_linear",
+    "ssim",
+    "vca",
+    "write_spectra_csv",
+    "xyz_matrix",
+]

@@ -1,0 +1,132 @@
+"""Spectral sampling of a sensor.
+
+Notation: `B` bands, index `i` rising with wavelength; wavelengths in nm. Each band stands for an interval of the
+spectrum; the intervals tile the covered range without gaps: inner edges lie halfway between neighbouring centres, and
+the outermost bands are symmetric about their centres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from torch import Tensor
+
+from unmix_plugin.errors import SpectrumError
+
+VISIBLE_RANGE_NM = (380.0, 780.0)
+"""What a band must lie in to count as visible: the range in which colour matching functions are noticeably non-zero."""
+
+LONE_BAND_WIDTH_NM = 10.0
+"""Width given to a band that has no neighbour to tell its spacing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bands:
+    """Spectral sampling of one sensor, validated where it is made; compares and hashes by value."""
+
+    centers_nm: Float64[np.ndarray, " B"]
+    """Band centres in nm: finite, positive, strictly increasing; stored as a read-only copy."""
+
+    def __post_init__(self) -> None:
+        centers = np.array(self.centers_nm, dtype=np.float64)
+        _require_one_axis(centers)
+        _require_increasing(centers)
+        centers.setflags(write=False)
+        object.__setattr__(self, "centers_nm", centers)
+
+    @classmethod
+    def of(cls, centers_nm: Sequence[object] | np.ndarray | Tensor) -> Bands:
+        """Bands from a list, an array of any number type, or a tensor on any device.
+
+        Raises:
+            SpectrumError: not one axis, empty, not numbers, not finite, not positive, or not strictly increasing.
+
+        >>> Bands.of([450, 550, 650]).edges_nm
+        array([400., 500., 600., 700.])
+        """
+        if isinstance(centers_nm, Tensor):
+            centers_nm = centers_nm.detach().cpu().numpy()
+        try:
+            centers = np.asarray(centers_nm, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise SpectrumError(f"wavelengths must be a list of numbers in nm; {error}") from error
+        _require_one_axis(centers)
+        return cls(centers)
+
+    def __len__(self) -> int:
+        return len(self.centers_nm)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Bands) and np.array_equal(self.centers_nm, other.centers_nm)
+
+    def __hash__(self) -> int:
+        return hash(self.centers_nm.tobytes())
+
+    def __str__(self) -> str:
+        plural = "" if len(self) == 1 else "s"
+        return f"{len(self)} band{plural}, {self.centers_nm[0]:g}-{self.centers_nm[-1]:g} nm"
+
+    @property
+    def edges_nm(self) -> Float64[np.ndarray, " edges"]:
+        """The B + 1 borders of the bands' intervals in nm, increasing."""
+        centers = self.centers_nm
+        if len(centers) == 1:
+            return np.array([centers[0] - LONE_BAND_WIDTH_NM / 2, centers[0] + LONE_BAND_WIDTH_NM / 2])
+        inner = (centers[1:] + centers[:-1]) / 2
+        return np.concatenate([[2 * centers[0] - inner[0]], inner, [2 * centers[-1] - inner[-1]]])
+
+    @property
+    def widths_nm(self) -> Float64[np.ndarray, " B"]:
+        """Widths of the bands' intervals in nm: an estimate of the sensor's from its spacing alone."""
+        return np.diff(self.edges_nm)
+
+    @property
+    def visible_mask(self) -> Bool[np.ndarray, " B"]:
+        """Which bands have their centre inside `VISIBLE_RANGE_NM`, ends included."""
+        low, high = VISIBLE_RANGE_NM
+        return (self.centers_nm >= low) & (self.centers_nm <= high)
+
+    def contains(self, wavelength_nm: float | int) -> bool:
+        """Whether a wavelength lies in some band's interval (half a spacing beyond the outermost centres)."""
+        edges = self.edges_nm
+        return bool(edges[0] <= wavelength_nm <= edges[-1])
+
+    def nearest(self, wavelength_nm: float | int) -> int:
+        """Index of the band whose centre is nearest; of two equally near the shorter wavelength.
+
+        Raises:
+            SpectrumError: no band's interval contains the wavelength.
+
+        >>> Bands.of([450, 550, 650]).nearest(560)
+        1
+        """
+        if not self.contains(wavelength_nm):
+            edges = self.edges_nm
+            raise SpectrumError(
+                f"no band at {wavelength_nm:g} nm: {self} cover {edges[0]:g}-{edges[-1]:g} nm; choose one in there"
+            )
+        return int(np.argmin(np.abs(self.centers_nm - wavelength_nm)))
+
+
+def _require_one_axis(centers: np.ndarray) -> None:
+    if centers.ndim != 1 or centers.size == 0:
+        raise SpectrumError(
+            f"wavelengths must be a list of at least one number in nm; found an array of shape {centers.shape}"
+        )
+
+
+def _require_increasing(centers: np.ndarray) -> None:
+    for rule, holds in (("be finite", np.isfinite(centers)), ("be positive", centers > 0)):
+        if not holds.all():
+            i = int(np.argmin(holds))
+            raise SpectrumError(f"wavelengths must {rule}; found {centers[i]:g} nm at index {i}")
+    steps = np.diff(centers)
+    if (steps <= 0).any():
+        i = int(np.argmax(steps <= 0))
+        raise SpectrumError(
+            f"wavelengths must strictly increase; found {centers[i]:g} nm at index {i} "
+            f"then {centers[i + 1]:g} nm at index {i + 1}; sort the bands and drop repeated ones"
+        )

@@ -1,0 +1,212 @@
+"""Every figure of merit, defined once.
+
+Notation: images are (H, W, B), values in [0, 1], bands last; `pred_*` against `target_*`. Figures are Python floats,
+computed in float64 with the prediction clamped to [0, 1]; the mean over views is the caller's. Angles are in radians.
+A spectrum of zero length has no direction: its angle to anything is pi/2.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from unmix_plugin.errors import SpectrumError
+from unmix_plugin.spectral.endmembers import DARK_RMS
+
+SSIM_WINDOW_PX = 7
+
+
+def psnr(
+    pred_image: Float[Tensor, "H W B"],
+    target_image: Float[Tensor, "H W B"],
+    valid_mask: Bool[Tensor, "H W"] | None = None,
+) -> float:
+    """Peak signal to noise ratio in dB over all pixels and bands, peak 1; infinite for equal images.
+
+    Args:
+        valid_mask: Pixels that count; None counts all.
+
+    >>> psnr(torch.full((2, 2, 3), 0.6, dtype=torch.float64), torch.full((2, 2, 3), 0.5, dtype=torch.float64))
+    20.0...
+    """
+    error = rmse(pred_image, target_image, valid_mask)
+    return math.inf if error == 0 else -20 * math.log10(error)
+
+
+def rmse(
+    pred_image: Float[Tensor, "H W B"],
+    target_image: Float[Tensor, "H W B"],
+    valid_mask: Bool[Tensor, "H W"] | None = None,
+) -> float:
+    """Root of the mean squared error over all pixels and bands; NaN where no pixel counts."""
+    difference = _clamped(pred_image) - target_image.double()
+    if valid_mask is not None:
+        difference = difference[valid_mask]
+    return math.sqrt(difference.square().mean()) if difference.numel() else math.nan
+
+
+def rgb_psnr(
+    pred_srgb: Float[Tensor, "H W 3"],
+    target_srgb: Float[Tensor, "H W 3"],
+    valid_mask: Bool[Tensor, "H W"] | None = None,
+) -> float:
+    """`psnr` of display-encoded (sRGB) colours, over black where alpha is below 1."""
+    return psnr(pred_srgb, target_srgb, valid_mask)
+
+
+def ssim(
+    pred_image: Float[Tensor, "H W B"],
+    target_image: Float[Tensor, "H W B"],
+    valid_mask: Bool[Tensor, "H W"] | None = None,
+) -> float:
+    """Structural similarity in [-1, 1], mean over bands: 7 x 7 uniform window, data range 1, sample covariance, windows
+    that stick out of the image left out.
+
+    Args:
+        valid_mask: Pixels whose windows count. Pixels that do not are made equal in both images first.
+    Raises:
+        SpectrumError: an image smaller than the window.
+    Source:
+        Wang et al., IEEE TIP 13(4), 2004, as computed by scikit-image.
+    """
+    from skimage.metrics import structural_similarity
+
+    height, width, _ = pred_image.shape
+    if min(height, width) < SSIM_WINDOW_PX:
+        raise SpectrumError(
+            f"SSIM needs images of at least {SSIM_WINDOW_PX} x {SSIM_WINDOW_PX} pixels; found {height} x {width}"
+        )
+    pred, target = _clamped(pred_image), target_image.double()
+    if valid_mask is not None:
+        pred, target = (torch.where(valid_mask[..., None], image, 0.0) for image in (pred, target))
+    result: Any = structural_similarity(
+        target.cpu().numpy(),
+        pred.cpu().numpy(),
+        win_size=SSIM_WINDOW_PX,
+        data_range=1.0,
+        channel_axis=-1,
+        full=True,
+    )
+    margin = SSIM_WINDOW_PX // 2
+    inner = slice(margin, -margin)
+    counted = result[1][inner, inner]  # [0] is the mean over all pixels
+    if valid_mask is not None:
+        counted = counted[valid_mask[inner, inner].cpu().numpy()]
+    return float(counted.mean()) if counted.size else math.nan
+
+
+def sam(
+    pred_image: Float[Tensor, "H W B"],
+    target_image: Float[Tensor, "H W B"],
+    mask: Bool[Tensor, "H W"] | None = None,
+) -> float:
+    """Spectral angle mapper: mean angle in radians over the pixels that count; NaN where none does.
+
+    Args:
+        mask: Labelled or opaque pixels; None takes all. Pixels whose true spectrum is dark (root mean square over
+            bands at most 0.005) never count.
+    """
+    target = target_image.double()
+    counts = target.norm(dim=-1) > DARK_RMS * math.sqrt(target.shape[-1])
+    if mask is not None:
+        counts = counts & mask
+    if not bool(counts.any()):
+        return math.nan
+    return float(spectral_angle(_clamped(pred_image)[counts], target[counts]).mean())
+
+
+def spectral_angle(a: Float[Tensor, "*#rays B"], b: Float[Tensor, "*#rays B"]) -> Float[Tensor, "*#rays"]:
+    """Angle between spectra, blind to brightness.
+
+    Args:
+        a, b: Spectra in any common unit, bands last; leading axes broadcast.
+    Returns:
+        Radians in [0, pi], precise for small angles too; gradients stay finite at parallel and at zero spectra.
+    Source:
+        Kruse et al. 1993, spectral angle mapper; in Kahan's form, 2 atan2(|u - v|, |u + v|) of the unit spectra, as
+        arccos loses half the digits at 0 and has an infinite slope there.
+
+    >>> spectral_angle(torch.tensor([1.0, 0.0]), torch.tensor([0.0, 2.0]))
+    tensor(1.5708)
+    """
+    u, v = _unit(a), _unit(b)
+    return 2 * torch.atan2((u - v).norm(dim=-1), (u + v).norm(dim=-1))
+
+
+@dataclass(frozen=True)
+class EndmemberMatching:
+    """Which predicted endmember stands for which true one."""
+
+    pred_ids: tuple[int, ...]
+    true_ids: tuple[int, ...]
+    """Pairs in step with `pred_ids`, increasing; as many as the smaller set has."""
+    angles: tuple[float, ...]
+    """Angle of each pair in radians."""
+
+
+def match_endmembers(
+    pred_endmembers: Float[Tensor, "P B"], true_endmembers: Float[Tensor, "K B"]
+) -> EndmemberMatching:
+    """Pair predicted with true endmembers one to one so that the sum of spectral angles is least (Hungarian method)."""
+    from scipy.optimize import linear_sum_assignment
+
+    angles = spectral_angle(true_endmembers.double()[:, None], pred_endmembers.double()[None])
+    true_ids, pred_ids = linear_sum_assignment(angles.cpu().numpy())
+    return EndmemberMatching(
+        pred_ids=tuple(int(i) for i in pred_ids),
+        true_ids=tuple(int(i) for i in true_ids),
+        angles=tuple(float(angles[t, p]) for t, p in zip(true_ids, pred_ids, strict=True)),
+    )
+
+
+def endmember_angle(
+    pred_endmembers: Float[Tensor, "P B"],
+    true_reflectance: Float[Tensor, "K B"],
+    illuminant: Float[Tensor, " B"],
+) -> float:
+    """Mean angle in radians between true endmember radiance, reflectance x illuminant, and its match.
+
+    The mean is over true materials: one without a match counts pi/2, surplus predicted endmembers do not count.
+    """
+    matching = match_endmembers(pred_endmembers, true_reflectance.double() * illuminant.double())
+    num_unmatched = len(true_reflectance) - len(matching.true_ids)
+    return (sum(matching.angles) + num_unmatched * math.pi / 2) / len(true_reflectance)
+
+
+def abundance_rmse(
+    pred_abundances: Float[Tensor, "H W P"],
+    true_abundances: Float[Tensor, "H W K"],
+    matching: EndmemberMatching,
+    mask: Bool[Tensor, "H W"] | None = None,
+) -> float:
+    """Root mean squared error of abundances over pixels and true materials; NaN where no pixel counts.
+
+    A true material without a match is predicted as 0. A surplus predicted endmember has no column of its own: what it
+    takes is missing from the others.
+
+    Args:
+        matching: From `match_endmembers`, once a scene.
+        mask: Pixels that count; None takes those whose true abundances are not all zero.
+    """
+    target = true_abundances.double()
+    pred = torch.zeros_like(target)
+    pred[..., list(matching.true_ids)] = _clamped(pred_abundances)[..., list(matching.pred_ids)]
+    if mask is None:
+        mask = target.sum(dim=-1) > 0
+    difference = (pred - target)[mask]
+    return math.sqrt(difference.square().mean()) if difference.numel() else math.nan
+
+
+def _clamped(prediction: Tensor) -> Tensor:
+    return prediction.double().clamp(0, 1)
+
+
+def _unit(spectra: Tensor) -> Tensor:
+    """Spectra of length 1; zero ones stay zero (dividing by 1, not by a tiny number, keeps their gradient finite)."""
+    lengths = spectra.norm(dim=-1, keepdim=True)
+    return spectra / torch.where(lengths > 0, lengths, 1.0)

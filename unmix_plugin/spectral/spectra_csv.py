@@ -1,0 +1,194 @@
+"""Spectra as CSV: one row a wavelength, one column a spectrum.
+
+`wavelength,name,name,...` for endmembers and libraries, `wavelength,power` for an illuminant. Wavelengths in nm,
+strictly increasing; values finite and not negative. UTF-8, with or without a byte order mark; blank lines are skipped.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from unmix_plugin.errors import RunError, SpectrumError
+from unmix_plugin.spectral.bands import Bands
+
+_TOLERANCE_NM = 1e-6
+"""Reach beyond the data that counts as rounding, not as extrapolation."""
+
+
+@dataclass(frozen=True)
+class SpectraTable:
+    """Named spectra on one sampling."""
+
+    bands: Bands
+    names: tuple[str, ...]
+    """One for each spectrum, distinct, not empty."""
+    spectra: Float64[np.ndarray, "K B"]
+    """One spectrum a row; finite, not negative."""
+
+    def __post_init__(self) -> None:
+        if self.spectra.shape != (len(self.names), len(self.bands)):
+            raise SpectrumError(
+                f"{len(self.names)} names and {len(self.bands)} bands need spectra of shape "
+                f"({len(self.names)}, {len(self.bands)}); found {self.spectra.shape}"
+            )
+        _validate_names(self.names)
+        for rule, holds in (("be finite", np.isfinite(self.spectra)), ("not be negative", self.spectra >= 0)):
+            if not holds.all():
+                k, b = np.unravel_index(np.argmin(holds), holds.shape)
+                raise SpectrumError(
+                    f"spectra must {rule}; found {self.spectra[k, b]:g} in '{self.names[k]}' "
+                    f"at {self.bands.centers_nm[b]:g} nm"
+                )
+
+    def resampled(self, bands: Bands) -> SpectraTable:
+        """The same spectra at other wavelengths, by linear interpolation; at the same ones, unchanged.
+
+        Raises:
+            SpectrumError: a wanted wavelength lies outside the table's (nothing is extrapolated).
+        """
+        return SpectraTable(bands, self.names, resample_spectra(self.spectra, self.bands, bands))
+
+
+def resample_spectra(
+    spectra: Float64[np.ndarray, "*batch B"], source: Bands, target: Bands
+) -> Float64[np.ndarray, "*batch C"]:
+    """Linear interpolation between band centres, bands last.
+
+    Raises:
+        SpectrumError: a target centre lies outside the source's centres; the message says by how much.
+    """
+    if spectra.shape[-1] != len(source):
+        raise SpectrumError(f"spectra of {spectra.shape[-1]} values do not fit {source}")
+    below = source.centers_nm[0] - target.centers_nm[0]
+    above = target.centers_nm[-1] - source.centers_nm[-1]
+    if max(below, above) > _TOLERANCE_NM:
+        sides = [f"{d:g} nm {side}" for d, side in ((below, "below"), (above, "above")) if d > _TOLERANCE_NM]
+        raise SpectrumError(
+            f"spectra at {source} do not reach {target}: {' and '.join(sides)} their range; "
+            "measure them there or leave those bands out (nothing is extrapolated)"
+        )
+    if source == target:
+        return spectra.copy()
+    rows = spectra.reshape(-1, len(source))
+    resampled = [np.interp(target.centers_nm, source.centers_nm, row) for row in rows]
+    return np.array(resampled, dtype=np.float64).reshape(*spectra.shape[:-1], len(target))
+
+
+def read_spectra_csv(path: Path) -> SpectraTable:
+    """Read and validate a table of spectra.
+
+    Raises:
+        SpectrumError: missing, unreadable or empty; no `wavelength` column; names missing or repeated; a row of another
+            length; a value that is no number, not finite or negative; wavelengths that do not increase.
+    """
+    try:
+        header, rows = _read_rows(path)
+        names = _parse_header(header)
+        values = np.array([_parse_row(row, line, header) for line, row in rows], dtype=np.float64)
+        if len(values) == 0:
+            raise SpectrumError("there is a header but no row of values")
+        return SpectraTable(Bands(values[:, 0].copy()), names, np.ascontiguousarray(values[:, 1:].T))
+    except SpectrumError as error:
+        raise SpectrumError(f"{path}: {error}") from error
+
+
+def read_illuminant_csv(path: Path, bands: Bands) -> Float64[np.ndarray, " B"]:
+    """Relative power of a light at the bands' centres, scaled to a maximum of 1.
+
+    Raises:
+        SpectrumError: as `read_spectra_csv`; not exactly one spectrum; it does not reach all bands; zero everywhere.
+    """
+    table = read_spectra_csv(path)
+    if len(table.names) != 1:
+        raise SpectrumError(
+            f"{path}: an illuminant has two columns, wavelength and power; found {len(table.names) + 1}"
+        )
+    try:
+        power = table.resampled(bands).spectra[0]
+    except SpectrumError as error:
+        raise SpectrumError(f"{path}: {error}") from error
+    if not power.max() > 0:
+        raise SpectrumError(
+            f"{path}: the illuminant is zero at all of {bands}; give the light that lit the scene"
+        )
+    return power / power.max()
+
+
+def write_spectra_csv(path: Path, table: SpectraTable) -> None:
+    """Write a table with 9 significant digits, exact for float32; an older file is replaced in one step.
+
+    Raises:
+        RunError: the file can't be written (no such folder, no permission, disk full).
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        try:
+            with temporary.open("w", newline="", encoding="utf-8") as file:
+                writer = csv.writer(file, lineterminator="\n")
+                writer.writerow(["wavelength", *table.names])
+                for wavelength_nm, values in zip(table.bands.centers_nm, table.spectra.T, strict=True):
+                    writer.writerow([f"{value:.9g}" for value in (wavelength_nm, *values)])
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise RunError(f"{path}: can't write spectra: {error.strerror or error}") from error
+
+
+def _read_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Header, and each row with its line number; blank lines left out."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.reader(file)
+            rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+    except OSError as error:
+        raise SpectrumError(f"can't read spectra: {error.strerror or error}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise SpectrumError(f"not a CSV file in UTF-8: {error}") from error
+    if not rows:
+        raise SpectrumError(
+            "the file is empty; expected a header 'wavelength,name,...' and one row a wavelength"
+        )
+    return [cell.strip() for cell in rows[0][1]], rows[1:]
+
+
+def _parse_header(header: list[str]) -> tuple[str, ...]:
+    if header[0].lower() not in ("wavelength", "wavelength_nm", "wavelengths"):
+        raise SpectrumError(f"the first column must be headed 'wavelength' (in nm); found '{header[0]}'")
+    if len(header) == 1:
+        raise SpectrumError("no spectra: there is no column beside 'wavelength'")
+    names = tuple(header[1:])
+    _validate_names(names)
+    return names
+
+
+def _parse_row(row: list[str], line: int, header: list[str]) -> list[float]:
+    if len(row) != len(header):
+        raise SpectrumError(f"line {line} has {len(row)} values, the header has {len(header)}")
+    return [
+        _parse_number(cell, f"line {line}, column '{name}'") for cell, name in zip(row, header, strict=True)
+    ]
+
+
+def _parse_number(cell: str, where: str) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        raise SpectrumError(f"{where}: '{cell.strip()}' is no number") from None
+
+
+def _validate_names(names: tuple[str, ...]) -> None:
+    if not names or not all(name.strip() for name in names):
+        raise SpectrumError(f"each spectrum needs a name; found {list(names)}")
+    repeated = [name for name, count in Counter(names).items() if count > 1]
+    if repeated:
+        raise SpectrumError(
+            f"names of spectra must differ; found '{repeated[0]}' {names.count(repeated[0])} times"
+        )
