@@ -9,7 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from PIL import Image
+
+from unmix_plugin.errors import SceneError
+from unmix_plugin.scenes import SceneOptions, load_scene
 
 WIDTH, HEIGHT = 20, 16
 WAVELENGTHS = (450.0, 520.0, 600.0, 680.0)
@@ -140,3 +144,17 @@ def make_scene(
     }
     (root / "transforms.json").write_text(json.dumps(content), encoding="utf-8")
     return SceneFolder(root)
+
+
+def fault_of(folder: SceneFolder, **options: Any) -> str:
+    """The message with which a scene is refused."""
+    with pytest.raises(SceneError) as caught:
+        load_scene(folder.root, SceneOptions(**options))
+    message = str(caught.value)
+    assert str(folder.root) in message
+    return message
+
+
+def set_frame(index: int, **values: Any) -> Callable[[dict[str, Any]], None]:
+    """An edit that gives a frame other values."""
+    return lambda content: content["frames"][index].update(values)

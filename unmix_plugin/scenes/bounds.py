@@ -39,7 +39,8 @@ HULL_SHARES = (2.0 / 3.0, 1.0 / 3.0)
 """Tried in turn: the hull's cells count for its extent if this share of the cameras that see its best seen cell see
 them, as long as the box still explains the images."""
 MIN_CONSISTENT = 0.5
-"""Least share of the pixels with matter that must have hull behind them; masks that are a little off keep far more."""
+"""Least share of the pixels with matter that must have hull behind them: only gross contradictions fall below, since
+masks that are a little off keep far more."""
 MAX_RAYS = 20_000
 """Pixels that are asked for this and the next share."""
 MIN_EXPLAINED = 0.999
@@ -70,11 +71,13 @@ def find_bounds(root: Path, cameras: Cameras, matter: list[Bool[np.ndarray, "H W
     rays = _rays_to_matter(cameras, matter)
     box = _box(centre - HULL_START * half, centre + HULL_START * half)
     hull = carve_box(cameras, matter, box, HULL_CELLS)
-    explained = _share_through(rays, box, hull)
+    # Near a camera that looks out of the others' images everything is consistent, so only shared places count.
+    count = _count_views(cameras, box, HULL_CELLS)
+    explained = _share_through(rays, box, hull & (count >= HULL_SHARES[0] * count.max()))
     if explained < MIN_CONSISTENT:
         raise SceneError(
             f"{root}: alpha and poses contradict: only {explained:.0%} of the pixels that are not transparent have "
-            "anything behind them that no other training view looks through; check that 'transform_matrix' is camera "
+            "a place behind them that no other training view looks through; check that 'transform_matrix' is camera "
             "to world with OpenGL axes (+y up, looking along -z), and that each picture stands with its own pose"
         )
     box = _tighten(cameras, rays, box, hull)
@@ -128,6 +131,8 @@ def _tighten(cameras: Cameras, rays: RayBundle, box: SceneBox, hull: Bool[np.nda
 
     Where views are cropped the hull has long arms that reach from the subject to the edge of what is seen.
     """
+    if not hull.any():  # finer cells may find that nothing fits after all
+        return box
     count = _count_views(cameras, box, HULL_CELLS)
     for share in HULL_SHARES:
         tight = _extent(box, hull & (count >= share * count.max(where=hull, initial=0)), margin_cells=1)

@@ -1,0 +1,202 @@
+"""Training batches of rays with their spectra, from a validated scene.
+
+Notation: `R` pixels of a batch, `P` rays a pixel, `B` bands, `H x W` pixels of a view.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from unmix_plugin.engine.cameras import Cameras
+from unmix_plugin.engine.data_manager import DataManager, DataManagerConfig
+from unmix_plugin.engine.instantiate import Target
+from unmix_plugin.engine.rays import RayBundle
+from unmix_plugin.engine.seeding import step_generator
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.scenes.carving import carve
+from unmix_plugin.scenes.loader import load_scene
+from unmix_plugin.scenes.scene import Scene, SceneOptions
+
+DEMO = Path("demo")
+"""`--data demo` stands for the built-in scene."""
+
+_EVAL_STREAM = 2
+
+
+@dataclass(frozen=True)
+class HyperspectralDataManagerConfig(DataManagerConfig):
+    """How a scene of spectral images is read and sampled."""
+
+    _target: Target = field(default_factory=lambda: HyperspectralDataManager)
+    train_num_rays_per_batch: int = 512
+    """Pixels of the first training step; the model adapts the number to its budget of samples."""
+    scene: SceneOptions = SceneOptions()
+    """How the files are read and split."""
+    carving_resolution: int = 128
+    """Cells along an edge of the grid in which space that the views show to be empty is carved away."""
+    max_initial_pixels: int = 50_000
+    """Pixels, drawn from all training views, from which the endmembers are initialised."""
+
+
+class HyperspectralDataManager(DataManager):
+    """Serves pixels of the training views, drawn evenly from all valid ones.
+
+    A training batch has `spectra` (R, B) and `alpha` (R); an image batch has `spectra` (H, W, B), `alpha` (H, W),
+    `valid` (H, W) and, where the scene has them, `labels` (H, W) and `abundances` (H, W, K).
+    """
+
+    def __init__(
+        self,
+        config: HyperspectralDataManagerConfig,
+        *,
+        data: Path,
+        device: torch.device,
+        seed: int = 0,
+    ) -> None:
+        """
+        Raises:
+            SceneError: the scene is missing or malformed; all its faults in one message.
+        """
+        super().__init__(config, data=data, device=device, seed=seed)
+        self.options = config
+        self.scene = load_scene(_scene_folder(data), config.scene)
+        self.scene_box = self.scene.scene_box
+        self.train_cameras = self.scene.cameras[list(self.scene.train_indices)]
+        self.eval_cameras = self.scene.cameras[list(self.scene.eval_indices)]
+        self._device_cameras = self.train_cameras.to(device)
+        self._pixels = _TrainingPixels(self.scene, device)
+        self._num_rays = config.train_num_rays_per_batch
+
+    def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
+        """Random valid pixels of the training views; the draw depends on (seed, step) only."""
+        generator = step_generator(self.seed, step)
+        chosen = self._pixels.draw(self._num_rays, generator)
+        return self._batch(self._device_cameras, self._pixels, chosen)
+
+    def next_eval(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
+        """Random pixels of one evaluation view."""
+        view = self.scene.eval_indices[step % self.num_eval_images]
+        pixels = _TrainingPixels(self.scene, self.device, (view,))
+        generator = step_generator(self.seed, step, stream=_EVAL_STREAM)
+        chosen = pixels.draw(self.config.eval_num_rays_per_batch, generator)
+        return self._batch(self.scene.cameras[[view]].to(self.device), pixels, chosen)
+
+    def next_eval_image(self, step: int) -> tuple[int, Cameras, dict[str, Tensor]]:
+        """The evaluation views in turn."""
+        index = step % self.num_eval_images
+        return index, *self.eval_image(index)
+
+    def eval_image(self, index: int) -> tuple[Cameras, dict[str, Tensor]]:
+        """Camera and whole image of one evaluation view."""
+        view = self.scene.eval_indices[index]
+        alpha = self.scene.alpha(view)
+        arrays = {
+            "spectra": self.scene.cube(view),
+            "alpha": np.ones(self._image_shape, np.float32) if alpha is None else alpha,
+            "valid": self.scene.valid_mask(view),
+            "labels": self.scene.labels(view),
+            "abundances": self.scene.abundances(view),
+        }
+        batch = {
+            name: torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
+            for name, array in arrays.items()
+            if array is not None
+        }
+        return self.eval_cameras[index], batch
+
+    def get_train_rays_per_batch(self) -> int:
+        """Pixels of the next training batch."""
+        return self._num_rays
+
+    def set_train_rays_per_batch(self, num_rays: int) -> None:
+        """Let the next training batches have `num_rays` pixels."""
+        self._num_rays = num_rays
+
+    def metadata(self) -> dict[str, Any]:
+        """Bands, light and kind of the scene, and the size of the carving grid."""
+        illuminant = self.scene.illuminant
+        return {
+            "wavelengths_nm": self.scene.wavelengths_nm.tolist(),
+            "illuminant": None if illuminant is None else illuminant.tolist(),
+            "has_alpha": self.scene.has_alpha,
+            "grid_resolution": self.options.carving_resolution,
+        }
+
+    def initial_data(self) -> Mapping[str, np.ndarray]:
+        """`pixels`: spectra pooled over all training views; `reachable`: where matter may be."""
+        return {
+            "pixels": self._pixels.sample_opaque(self.options.max_initial_pixels, self.seed),
+            "reachable": carve(self.scene, self.options.carving_resolution),
+        }
+
+    def summary(self) -> dict[str, Any]:
+        """The scene's own record: files, splits, normalisation, truth, hashes."""
+        return self.scene.summary()
+
+    @property
+    def _image_shape(self) -> tuple[int, int]:
+        return self.scene.cameras.height, self.scene.cameras.width
+
+    def _batch(
+        self, cameras: Cameras, pixels: _TrainingPixels, chosen: Int[Tensor, "R"]
+    ) -> tuple[RayBundle, dict[str, Tensor]]:
+        height, width = self._image_shape
+        within = chosen % (height * width)
+        corner = torch.stack([within % width, within // width], dim=-1)
+        views = chosen // (height * width)
+        bundle = cameras.generate_rays(views, corner + 0.5)
+        return bundle, {"spectra": pixels.spectra[chosen], "alpha": pixels.alpha[chosen]}
+
+
+class _TrainingPixels:
+    """All pixels of some views as tables, and which of them count."""
+
+    spectra: Float[Tensor, "pixels B"]
+    alpha: Float[Tensor, "pixels"]
+
+    def __init__(self, scene: Scene, device: torch.device, views: tuple[int, ...] | None = None) -> None:
+        views = scene.train_indices if views is None else views
+        num_pixels = scene.cameras.height * scene.cameras.width
+        spectra = torch.empty(len(views), num_pixels, len(scene.wavelengths_nm), device=device)
+        alpha = torch.ones(len(views), num_pixels, device=device)
+        valid = torch.empty(len(views), num_pixels, dtype=torch.bool)
+        for row, view in enumerate(views):
+            spectra[row] = torch.from_numpy(scene.cube(view)).flatten(0, 1)
+            valid[row] = torch.from_numpy(scene.valid_mask(view)).flatten()
+            opacity = scene.alpha(view)
+            if opacity is not None:
+                alpha[row] = torch.from_numpy(opacity).flatten()
+        self.spectra, self.alpha = spectra.flatten(0, 1), alpha.flatten()
+        self._valid = None if bool(valid.all()) else valid.flatten().nonzero()[:, 0]
+        if self._valid is not None and len(self._valid) == 0:
+            raise ConfigError("no valid pixel is left in the training views: masks leave out every one")
+
+    def draw(self, count: int, generator: torch.Generator) -> Int[Tensor, "R"]:
+        """Indices of random valid pixels."""
+        pool = len(self.spectra) if self._valid is None else len(self._valid)
+        drawn = torch.randint(pool, (count,), generator=generator)
+        chosen = drawn if self._valid is None else self._valid[drawn]
+        return chosen.to(self.spectra.device)
+
+    def sample_opaque(self, count: int, seed: int) -> Float[np.ndarray, "pixels B"]:
+        """Spectra of at most `count` random valid pixels that show matter only."""
+        pool = torch.arange(len(self.spectra)) if self._valid is None else self._valid
+        opaque = pool[(self.alpha.cpu()[pool] > 0.99)]
+        chosen = opaque[torch.randperm(len(opaque), generator=step_generator(seed, 0))[:count]]
+        return self.spectra[chosen.to(self.spectra.device)].cpu().numpy()
+
+
+def _scene_folder(data: Path) -> Path:
+    if data == DEMO:
+        from unmix_plugin.scenes.demo_scene import demo_scene_path
+
+        return demo_scene_path()
+    return data

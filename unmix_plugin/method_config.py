@@ -1,0 +1,28 @@
+"""What the package registers: the method `unmix-nerf`, a name, a description and all its settings."""
+
+from pathlib import Path
+
+from unmix_plugin.datamanager import HyperspectralDataManagerConfig
+from unmix_plugin.engine.configs import TrainerConfig
+from unmix_plugin.engine.optimizers import OptimizerConfig
+from unmix_plugin.engine.pipeline import PipelineConfig
+from unmix_plugin.engine.registry import MethodSpecification
+from unmix_plugin.model import UnmixModelConfig
+
+unmix_nerf = MethodSpecification(
+    config=TrainerConfig(
+        method_name="unmix-nerf",
+        output_dir=Path("outputs"),
+        max_num_iterations=10_000,
+        pipeline=PipelineConfig(
+            datamanager=HyperspectralDataManagerConfig(),
+            model=UnmixModelConfig(),
+        ),
+        optimizers={
+            "grid": OptimizerConfig(lr=1e-2, final_factor=0.03),
+            "networks": OptimizerConfig(lr=1e-2, final_factor=0.03),
+            "spectra": OptimizerConfig(lr=1e-3, final_factor=0.03),
+        },
+    ),
+    description="radiance field of spectral images whose every point is a mixture of a few materials",
+)
