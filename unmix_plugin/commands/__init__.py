@@ -1,1 +1,7 @@
-"""The command line: parse, call, say what was written where."""
+"""The command line: thin functions that parse words, call the rooms and say what was written where."""
+
+import os
+
+# Threads that wait for each other by spinning take the time slices of those they wait for as soon as anything else runs
+# on the machine: on two shared cores a training step took three times as long. Read when torch loads OpenMP, hence here.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

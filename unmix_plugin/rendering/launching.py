@@ -8,8 +8,10 @@ thread pool; parts must not write to the same address, which is why callers name
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+import sys
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
@@ -24,10 +26,29 @@ def warp() -> Any:
     """The Warp package, initialised quietly at first use: importing it takes longer than most commands need."""
     import warp as wp
 
-    wp.config.quiet = True
-    wp.config.log_level = getattr(wp, "LOG_ERROR", wp.config.log_level)
-    wp.init()
+    settings: Any = wp.config
+    settings.quiet = True
+    settings.log_level = getattr(wp, "LOG_ERROR", None)
+    if torch.cuda.is_available():
+        wp.init()
+    else:
+        with _standard_error_closed():  # the native library warns there that a machine without a GPU has no driver
+            wp.init()
     return wp
+
+
+@contextmanager
+def _standard_error_closed() -> Iterator[None]:
+    """What native code writes to standard error is dropped."""
+    sys.stderr.flush()
+    saved = os.dup(2)
+    try:
+        with open(os.devnull, "w") as nowhere:  # noqa: PTH123 - a device, not a path
+            os.dup2(nowhere.fileno(), 2)
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
 
 
 @cache

@@ -1,0 +1,83 @@
+"""Marching through an occupancy grid against its twin and closed forms."""
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from unmix_plugin.rendering.marching import PackedSamples, march, march_twin
+
+
+def make_rays(num_rays: int, seed: int = 0):
+    """Rays that cross the unit cube, with their entry and exit."""
+    g = torch.Generator().manual_seed(seed)
+    inside = torch.rand(num_rays, 3, generator=g)
+    directions = torch.nn.functional.normalize(torch.randn(num_rays, 3, generator=g), dim=-1)
+    origins = inside - 3 * directions
+    to_low, to_high = -origins / directions, (1 - origins) / directions
+    t_near = torch.minimum(to_low, to_high).amax(-1)
+    t_far = torch.maximum(to_low, to_high).amin(-1)
+    return origins, directions, t_near, t_far, torch.rand(num_rays, generator=g)
+
+
+@pytest.mark.parametrize("num_rays", [0, 1, 5, 900])
+@pytest.mark.parametrize("sides", [(8, 8, 8), (3, 5, 7), (1, 1, 1)])
+def test_kernel_and_twin_take_the_same_samples(num_rays, sides, device):
+    g = torch.Generator().manual_seed(3)
+    occupied = (torch.rand(sides, generator=g) < 0.3).to(torch.uint8).to(device)
+    rays = [x.to(device) for x in make_rays(num_rays)]
+    actual, expected = (f(*rays, occupied, 0.013) for f in (march, march_twin))
+    # A sample within rounding of a cell's face may fall to either side.
+    differing = (actual.packed_info[:, 1] - expected.packed_info[:, 1]).abs().sum().item()
+    assert differing <= max(2, len(expected)) * 1e-3
+    if differing == 0:
+        assert torch.equal(actual.packed_info, expected.packed_info)
+        assert torch.equal(actual.ray_indices, expected.ray_indices)
+        assert_close(actual.t, expected.t, rtol=0, atol=2e-6)
+
+
+def test_a_full_grid_is_sampled_at_every_step():
+    origins, directions = torch.tensor([[-1.0, 0.5, 0.5]]), torch.tensor([[1.0, 0.0, 0.0]])
+    samples = march(
+        origins, directions, torch.ones(1), 2 * torch.ones(1), torch.tensor([0.5]), torch.ones(4, 4, 4).byte(), 0.1
+    )
+    assert_close(samples.t, torch.arange(10) * 0.1 + 1.05)
+    assert samples.packed_info.tolist() == [[0, 10]]
+
+
+def test_only_the_occupied_slab_is_sampled_and_its_samples_measure_it():
+    occupied = torch.zeros(8, 1, 1).byte()
+    occupied[2:5] = 1
+    n = 64
+    origins = torch.tensor([[-1.0, 0.5, 0.5]]).repeat(n, 1)
+    directions = torch.tensor([[1.0, 0.0, 0.0]]).repeat(n, 1)
+    samples = march(
+        origins, directions, torch.ones(n), 2 * torch.ones(n), torch.arange(n) / n, occupied, 0.03
+    )
+    x = samples.t - 1
+    assert (x >= 0.25 - 1e-6).all()
+    assert (x <= 0.625 + 1e-6).all()
+    # Over evenly spread jitter the mean count times the step is the slab's thickness.
+    assert len(samples) / n * 0.03 == pytest.approx(0.375, abs=1e-3)
+
+
+def test_rays_that_miss_or_meet_nothing_have_no_samples():
+    origins, directions, t_near, t_far, jitter = make_rays(6)
+    empty = march(origins, directions, t_near, t_far, jitter, torch.zeros(4, 4, 4).byte(), 0.05)
+    missed = march(origins, directions, t_near, t_near, jitter, torch.ones(4, 4, 4).byte(), 0.05)
+    assert len(empty) == len(missed) == 0
+    assert empty.packed_info[:, 1].tolist() == [0] * 6
+
+
+def test_selecting_samples_keeps_them_packed_by_ray():
+    samples = PackedSamples(
+        torch.arange(5.0), torch.tensor([0, 0, 2, 2, 2]), torch.tensor([[0, 2], [2, 0], [2, 3]]), 0.1
+    )
+    kept = samples.select(torch.tensor([False, True, True, False, True]))
+    assert kept.t.tolist() == [1.0, 2.0, 4.0]
+    assert kept.ray_indices.tolist() == [0, 2, 2]
+    assert kept.packed_info.tolist() == [[0, 1], [1, 0], [1, 2]]
+
+
+def test_a_step_of_no_length_is_refused():
+    with pytest.raises(ValueError, match="step must be positive; got 0"):
+        march(*make_rays(2), torch.ones(2, 2, 2).byte(), 0.0)

@@ -1,0 +1,64 @@
+"""What the occupancy grid remembers and forgets."""
+
+import torch
+
+from unmix_plugin.rendering.occupancy import OccupancyGrid
+
+
+def ball(points: torch.Tensor) -> torch.Tensor:
+    return 100.0 * ((points - 0.5).norm(dim=-1) < 0.25)
+
+
+def updated(grid: OccupancyGrid, density_fn, times: int = 1, num_cells=None, seed=0) -> OccupancyGrid:
+    generator = torch.Generator().manual_seed(seed)
+    for _ in range(times):
+        grid.update(density_fn, threshold=1.0, decay=0.5, num_cells=num_cells, generator=generator)
+    return grid
+
+
+def full(side: int = 8) -> OccupancyGrid:
+    return OccupancyGrid(torch.ones(side, side, side, dtype=torch.bool))
+
+
+def test_cells_are_occupied_where_there_is_density_and_empty_elsewhere():
+    grid = updated(full(), ball, times=10)
+    centres = (torch.stack(torch.meshgrid(*[torch.arange(8)] * 3, indexing="ij"), -1) + 0.5) / 8
+    distance = (centres - 0.5).norm(dim=-1)
+    assert grid.occupied[distance < 0.2].all()
+    assert not grid.occupied[distance > 0.4].any()
+
+
+def test_unreachable_cells_stay_empty_whatever_the_density():
+    reachable = torch.ones(4, 4, 4, dtype=torch.bool)
+    reachable[0] = False
+    grid = updated(OccupancyGrid(reachable), lambda points: torch.full((len(points),), 50.0), times=3)
+    assert not grid.occupied[0].any()
+    assert grid.occupied[1:].all()
+
+
+def test_a_cell_is_forgotten_once_its_density_has_decayed():
+    grid = updated(full(4), lambda points: torch.full((len(points),), 8.0))
+    assert grid.occupied.all()
+    updated(grid, lambda points: torch.zeros(len(points)), times=2)
+    assert grid.occupied.all()
+    updated(grid, lambda points: torch.zeros(len(points)), times=2)
+    assert not grid.occupied.any()
+
+
+def test_a_cell_that_gains_density_is_occupied_again():
+    grid = updated(full(4), lambda points: torch.zeros(len(points)), times=2)
+    assert not grid.occupied.any()
+    updated(grid, ball, times=4)
+    assert grid.occupied[1:3, 1:3, 1:3].all()
+
+
+def test_probing_some_cells_at_a_time_finds_the_same_ball():
+    grid = updated(full(), ball, times=60, num_cells=128)
+    reference = updated(full(), ball, times=60)
+    assert (grid.occupied != reference.occupied).float().mean() < 0.05
+
+
+def test_a_thin_density_everywhere_stays_visible():
+    """The threshold never exceeds the mean, so a faint scene isn't taken for empty space."""
+    grid = updated(full(4), lambda points: 0.01 + 0.01 * points[:, 0], times=3)
+    assert 0 < grid.occupied_fraction < 1
