@@ -53,6 +53,8 @@ class UnmixFieldConfig:
 class UnmixField(Field):
     """Density, abundances, scales and specular coefficients of points in a scene box."""
 
+    aabb: Tensor
+
     def __init__(
         self,
         config: UnmixFieldConfig,
@@ -92,9 +94,7 @@ class UnmixField(Field):
         if num_specular:
             self.specular_network = _network(num_features + NUM_DIRECTION_FEATURES, width, num_specular + 1)
 
-    def get_density(
-        self, positions: Float[Tensor, "S 3"]
-    ) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
+    def get_density(self, positions: Float[Tensor, "S 3"]) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
         """Density per scene unit and geometry features."""
         unit_positions = (positions - self.aabb[0]) / (self.aabb[1] - self.aabb[0])
         features = self.density_network(hash_encode(unit_positions, self.table, self.layout))
@@ -113,12 +113,20 @@ class UnmixField(Field):
         material = self.material_network(features)
         abundances = torch.softmax(material[:, : self.num_endmembers] / self.config.temperature, dim=-1)
         scales = torch.sigmoid(material[:, self.num_endmembers :])
-        outputs = {"abundances": abundances, "scaled_abundances": scales * abundances}
-        if self.num_specular:
-            seen = torch.cat([features, direction_features(directions)], dim=-1)
-            specular = torch.sigmoid(self.specular_network(seen) + self.config.specular_bias / 2)
-            outputs["specular_coefficients"] = specular[:, :1] * specular[:, 1:]
-        return outputs
+        return {
+            "abundances": abundances,
+            "scaled_abundances": scales * abundances,
+            "specular_coefficients": self._specular(directions, features),
+        }
+
+    def _specular(
+        self, directions: Float[Tensor, "S 3"], features: Float[Tensor, "S G"]
+    ) -> Float[Tensor, "S J"]:
+        if self.num_specular == 0:
+            return features.new_zeros(len(features), 0)
+        seen = torch.cat([features, direction_features(directions)], dim=-1)
+        factors = torch.sigmoid(self.specular_network(seen) + self.config.specular_bias / 2)
+        return factors[:, :1] * factors[:, 1:]
 
 
 NUM_DIRECTION_FEATURES = 15

@@ -8,7 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
-from unmix_plugin.rendering.compositing import accumulate, accumulate_twin, volume_weights, volume_weights_twin
+from unmix_plugin.rendering.compositing import (
+    accumulate,
+    accumulate_twin,
+    volume_weights,
+    volume_weights_twin,
+)
 
 
 def pack(counts: list[int]) -> torch.Tensor:
@@ -33,7 +38,9 @@ def test_weights_and_their_gradient_agree_with_the_twin(counts, dtype, device):
     tau, packed_info = optical_depths.to(device).requires_grad_(), packed_info.to(device)
     actual, expected = volume_weights(tau, packed_info), volume_weights_twin(tau, packed_info)
     assert_close(actual, expected, rtol=1e-4, atol=1e-5)
-    cotangent = torch.randn(expected.shape, generator=torch.Generator().manual_seed(1), dtype=dtype).to(device)
+    cotangent = torch.randn(expected.shape, generator=torch.Generator().manual_seed(1), dtype=dtype).to(
+        device
+    )
     found, wanted = (torch.autograd.grad(w, tau, cotangent)[0] for w in (actual, expected))
     assert_close(found, wanted, rtol=1e-3, atol=1e-4)
 
@@ -42,10 +49,13 @@ def test_weights_and_their_gradient_agree_with_the_twin(counts, dtype, device):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_totals_and_their_gradients_agree_with_the_twin(counts, dtype, device):
     weights, values, packed_info = (x.to(device) for x in make(counts, dtype))
-    weights.requires_grad_(), values.requires_grad_()
+    for tensor in (weights, values):
+        tensor.requires_grad_()
     actual, expected = (f(weights, values, packed_info) for f in (accumulate, accumulate_twin))
     assert_close(actual, expected)
-    cotangent = torch.randn(expected.shape, generator=torch.Generator().manual_seed(1), dtype=dtype).to(device)
+    cotangent = torch.randn(expected.shape, generator=torch.Generator().manual_seed(1), dtype=dtype).to(
+        device
+    )
     found = torch.autograd.grad(actual, (weights, values), cotangent)
     assert_close(found, torch.autograd.grad(expected, (weights, values), cotangent))
 

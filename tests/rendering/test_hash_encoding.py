@@ -25,10 +25,13 @@ def make(layout: HashGridLayout, num_samples: int, dtype=torch.float32, device="
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_kernel_and_twin_agree_in_value_and_every_gradient(layout, num_samples, dtype, device):
     positions, table = make(layout, num_samples, dtype, device)
-    positions.requires_grad_(), table.requires_grad_()
+    for tensor in (positions, table):
+        tensor.requires_grad_()
     actual, expected = hash_encode(positions, table, layout), hash_encode_twin(positions, table, layout)
     assert_close(actual, expected)
-    cotangent = torch.randn(expected.shape, generator=torch.Generator().manual_seed(1), dtype=dtype).to(device)
+    cotangent = torch.randn(expected.shape, generator=torch.Generator().manual_seed(1), dtype=dtype).to(
+        device
+    )
     found = torch.autograd.grad(actual, (positions, table), cotangent)
     wanted = torch.autograd.grad(expected, (positions, table), cotangent)
     assert_close(found, wanted, rtol=1e-4, atol=1e-4)
@@ -37,7 +40,8 @@ def test_kernel_and_twin_agree_in_value_and_every_gradient(layout, num_samples, 
 @pytest.mark.parametrize("layout", [DENSE, HASHED])
 def test_gradients_are_those_of_finite_differences(layout):
     positions, table = make(layout, 5, torch.float64)
-    positions.requires_grad_(), table.requires_grad_()
+    for tensor in (positions, table):
+        tensor.requires_grad_()
     assert torch.autograd.gradcheck(lambda p, t: hash_encode(p, t, layout), (positions, table), eps=1e-7)
 
 
@@ -60,7 +64,9 @@ def test_a_field_linear_in_position_is_reproduced_exactly():
 def test_vertices_get_their_own_row():
     layout = HashGridLayout(1, 1, 2, 2, 6)
     table = torch.arange(27.0)[:, None]
-    corners = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 1.0]])
+    corners = torch.tensor(
+        [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 1.0]]
+    )
     assert hash_encode(corners, table, layout)[:, 0].tolist() == [0.0, 2.0, 6.0, 18.0, 26.0]
 
 

@@ -24,8 +24,8 @@ def make_rays(num_rays: int, seed: int = 0):
 def test_kernel_and_twin_take_the_same_samples(num_rays, sides, device):
     g = torch.Generator().manual_seed(3)
     occupied = (torch.rand(sides, generator=g) < 0.3).to(torch.uint8).to(device)
-    rays = [x.to(device) for x in make_rays(num_rays)]
-    actual, expected = (f(*rays, occupied, 0.013) for f in (march, march_twin))
+    o, d, t_near, t_far, jitter = (x.to(device) for x in make_rays(num_rays))
+    actual, expected = (f(o, d, t_near, t_far, jitter, occupied, 0.013) for f in (march, march_twin))
     # A sample within rounding of a cell's face may fall to either side.
     differing = (actual.packed_info[:, 1] - expected.packed_info[:, 1]).abs().sum().item()
     assert differing <= max(2, len(expected)) * 1e-3
@@ -38,7 +38,13 @@ def test_kernel_and_twin_take_the_same_samples(num_rays, sides, device):
 def test_a_full_grid_is_sampled_at_every_step():
     origins, directions = torch.tensor([[-1.0, 0.5, 0.5]]), torch.tensor([[1.0, 0.0, 0.0]])
     samples = march(
-        origins, directions, torch.ones(1), 2 * torch.ones(1), torch.tensor([0.5]), torch.ones(4, 4, 4).byte(), 0.1
+        origins,
+        directions,
+        torch.ones(1),
+        2 * torch.ones(1),
+        torch.tensor([0.5]),
+        torch.ones(4, 4, 4).byte(),
+        0.1,
     )
     assert_close(samples.t, torch.arange(10) * 0.1 + 1.05)
     assert samples.packed_info.tolist() == [[0, 10]]

@@ -62,7 +62,7 @@ def count_kernel(
     counts: wp.array(dtype=wp.int64),
 ):
     ray = first + wp.tid()
-    count = int(0)
+    count = int(0)  # noqa: RUF046, UP018 - Warp takes a bare literal for a constant
     i = next_occupied(0, origins[ray], directions[ray], t_first[ray], t_far[ray], step, occupied)
     while i >= 0:
         count += 1

@@ -9,6 +9,8 @@ Source: Max 1995, Optical Models for Direct Volume Rendering, in the discrete fo
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -16,9 +18,7 @@ from torch import Tensor
 from unmix_plugin.rendering.launching import as_warp, launch
 
 
-def volume_weights(
-    optical_depths: Float[Tensor, "S"], packed_info: Int[Tensor, "R 2"]
-) -> Float[Tensor, "S"]:
+def volume_weights(optical_depths: Float[Tensor, "S"], packed_info: Int[Tensor, "R 2"]) -> Float[Tensor, "S"]:
     """Share of its ray's light that each sample sends to the camera, in [0, 1]; differentiable once.
 
     Args:
@@ -58,7 +58,7 @@ def accumulate_twin(
 
 class _VolumeWeights(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, optical_depths: Tensor, packed_info: Tensor) -> Tensor:
+    def forward(ctx: Any, optical_depths: Tensor, packed_info: Tensor) -> Tensor:
         from unmix_plugin.rendering._compositing_kernels import weights_kernel
 
         weights, transmittances = torch.empty_like(optical_depths), torch.empty_like(optical_depths)
@@ -69,7 +69,7 @@ class _VolumeWeights(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, *gradients: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
         from unmix_plugin.rendering._compositing_kernels import weights_gradient_kernel
 
         weights, transmittances, packed_info = ctx.saved_tensors
@@ -81,7 +81,7 @@ class _VolumeWeights(torch.autograd.Function):
 
 class _Accumulate(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, weights: Tensor, values: Tensor, packed_info: Tensor) -> Tensor:
+    def forward(ctx: Any, weights: Tensor, values: Tensor, packed_info: Tensor) -> Tensor:
         from unmix_plugin.rendering._compositing_kernels import accumulate_kernel
 
         totals = values.new_zeros(len(packed_info), values.shape[1])
@@ -92,7 +92,7 @@ class _Accumulate(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, *gradients: Tensor) -> tuple[Tensor, Tensor, None]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
         from unmix_plugin.rendering._compositing_kernels import accumulate_gradient_kernel
 
         weights, values, packed_info = ctx.saved_tensors

@@ -1,7 +1,7 @@
 """Multiresolution hash encoding of positions in the unit cube.
 
-Notation: `S` samples, `L` levels, `F` features a level, `R` rows of the table over all levels. A level of n cells a side
-has (n + 1)^3 vertices; where they fit, the level is a dense grid, else its vertices share rows through a hash.
+Notation: `S` samples, `L` levels, `F` features a level, `R` rows of the table over all levels. A level of n cells a
+side has (n + 1)^3 vertices; where they fit, the level is a dense grid, else its vertices share rows through a hash.
 
 Source: Mueller et al. 2022, Instant Neural Graphics Primitives, section 3.
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -111,7 +112,7 @@ def _check_table(table: Tensor, layout: HashGridLayout) -> None:
 
 class _HashEncode(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, positions: Tensor, table: Tensor, layout: HashGridLayout) -> Tensor:
+    def forward(ctx: Any, positions: Tensor, table: Tensor, layout: HashGridLayout) -> Tensor:
         from unmix_plugin.rendering._hash_kernels import encode_kernel
 
         num_samples, (num_levels, width) = len(positions), (layout.num_levels, layout.features_per_level)
@@ -137,7 +138,7 @@ class _HashEncode(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
         from unmix_plugin.rendering._hash_kernels import position_gradient_kernel, table_gradient_kernel
 
         positions, table, levels = ctx.saved_tensors

@@ -1,8 +1,8 @@
 """Where Warp kernels are launched from torch tensors: one call for CUDA and for CPU threads.
 
-A kernel's first parameter is the index of its first work item. On CUDA the whole range is one launch on torch's current
-stream. Warp's CPU launches are serial but release the interpreter lock, so there the range is cut into parts that run on a
-thread pool; parts must not write to the same address, which is why callers name the unit that may be cut.
+A kernel's first parameter is the index of its first work item. On CUDA the whole range is one launch on torch's
+current stream. Warp's CPU launches are serial but release the interpreter lock, so there the range is cut into parts
+that run on a thread pool; parts must not write to the same address, which is why callers name the unit that may be cut.
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ def warp() -> Any:
     if torch.cuda.is_available():
         wp.init()
     else:
-        with _standard_error_closed():  # the native library warns there that a machine without a GPU has no driver
+        with (
+            _standard_error_closed()
+        ):  # the native library warns there that a machine without a GPU has no driver
             wp.init()
     return wp
 

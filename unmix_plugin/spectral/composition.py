@@ -36,12 +36,6 @@ class Coefficients:
     specular: Float[Tensor, "*rays J"]
     """h u: what the specular dictionary is multiplied with; J = 0 without a view-dependent part."""
 
-    def averaged(self, group: int) -> Coefficients:
-        """Means over each `group` consecutive rays: from the rays of a pixel to the pixel."""
-        if group == 1:
-            return self
-        return Coefficients(*(getattr(self, name).unflatten(0, (-1, group)).mean(dim=1) for name in _FIELDS))
-
     def unflatten(self, height: int, width: int) -> Coefficients:
         """Rows of rays as an image."""
         return Coefficients(*(getattr(self, name).unflatten(0, (height, width)) for name in _FIELDS))
@@ -110,7 +104,9 @@ def compose(name: str, coefficients: Coefficients, materials: Materials) -> Tens
     if kind == "false-colour" and argument:
         wavelengths = [_parse_nm(part, name) for part in argument.split(",")]
         if len(wavelengths) != 3:
-            raise ConfigError(f"false-colour takes three wavelengths, as in false-colour:860,650,550; got {name}")
+            raise ConfigError(
+                f"false-colour takes three wavelengths, as in false-colour:860,650,550; got {name}"
+            )
         matrix = band_composite_matrix(materials.bands, (wavelengths[0], wavelengths[1], wavelengths[2]))
         return (spectral(coefficients, materials) @ matrix.to(coefficients.abundances)).clamp(0, 1)
     if name not in _COMPOSERS:
@@ -146,14 +142,14 @@ def _segmentation(coefficients: Coefficients, materials: Materials) -> Tensor:
     return material_ids(scores, coefficients.accumulation, OCCUPIED_ACCUMULATION)
 
 
-def _confidence(coefficients: Coefficients, materials: Materials) -> Float[Tensor, "*rays"]:
+def _confidence(coefficients: Coefficients, _: Materials) -> Float[Tensor, "*rays"]:
     if coefficients.abundances.shape[-1] == 1:
         return coefficients.accumulation
     largest = coefficients.abundances.topk(2, dim=-1).values
     return largest[..., 0] - largest[..., 1]
 
 
-def _ray_distance(coefficients: Coefficients, materials: Materials) -> Float[Tensor, "*rays"]:
+def _ray_distance(coefficients: Coefficients, _: Materials) -> Float[Tensor, "*rays"]:
     return coefficients.distance / coefficients.accumulation.clamp(min=1e-6)
 
 

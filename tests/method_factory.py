@@ -1,0 +1,58 @@
+"""Tiny models and ray bundles for tests of the method."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from unmix_plugin.engine.rays import RayBundle
+from unmix_plugin.engine.scene_box import SceneBox
+from unmix_plugin.field import UnmixFieldConfig
+from unmix_plugin.model import UnmixModel, UnmixModelConfig
+from unmix_plugin.renderer import RendererConfig
+
+NUM_BANDS = 5
+WAVELENGTHS_NM = [450.0, 500.0, 550.0, 600.0, 650.0]
+BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
+CONFIG = UnmixModelConfig(
+    num_endmembers=3,
+    field=UnmixFieldConfig(num_levels=2, coarsest_resolution=4, finest_resolution=8, log2_rows_per_level=10, hidden_width=16),
+    renderer=RendererConfig(samples_across=40, smallest_weight=0.0),
+)
+
+
+def make_model(seed: int = 0, has_alpha: bool = True, light: list[float] | None = None, **settings: Any) -> UnmixModel:
+    """A model with random parameters of some size, so that its picture isn't uniform."""
+    torch.manual_seed(seed)
+    metadata = {
+        "wavelengths_nm": WAVELENGTHS_NM,
+        "illuminant": light,
+        "has_alpha": has_alpha,
+        "grid_resolution": 8,
+    }
+    model: UnmixModel = replace(CONFIG, **settings).setup(scene_box=BOX, metadata=metadata)
+    with torch.no_grad():
+        model.initialise(initial_data())
+        model.field.table.normal_(std=0.5)
+    return model.eval()
+
+
+def initial_data() -> dict[str, np.ndarray]:
+    """Pixels of three well separated materials, and a box with nothing carved away."""
+    g = np.random.default_rng(0)
+    shapes = np.eye(3, NUM_BANDS, dtype=np.float32) * 0.6 + 0.1
+    pixels = shapes[g.integers(0, 3, 300)] * g.uniform(0.5, 1, (300, 1)).astype(np.float32)
+    return {"pixels": pixels + g.normal(0, 1e-3, pixels.shape).astype(np.float32) ** 2, "reachable": np.ones((8, 8, 8), bool)}
+
+
+def make_rays(num_rays: int, seed: int = 0) -> RayBundle:
+    """Rays towards the box from all around; the last one misses it."""
+    g = torch.Generator().manual_seed(seed)
+    origins = 3 * torch.nn.functional.normalize(torch.randn(num_rays, 3, generator=g), dim=-1)
+    targets = torch.rand(num_rays, 3, generator=g) - 0.5
+    directions = torch.nn.functional.normalize(targets - origins, dim=-1)
+    directions[-1:] *= -1
+    return RayBundle(origins, directions, torch.zeros(num_rays, dtype=torch.int64))

@@ -1,0 +1,83 @@
+"""What the field guarantees at every point."""
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from tests.method_factory import BOX, CONFIG
+from unmix_plugin.field import UnmixField, direction_features
+
+
+def make_field(num_specular: int = 2, scale: str = "shared", temperature: float = 1.0) -> UnmixField:
+    from dataclasses import replace
+
+    torch.manual_seed(0)
+    config = replace(CONFIG.field, scale=scale, temperature=temperature)
+    field = UnmixField(config, BOX, 3, num_specular, initial_density=2.0)
+    torch.nn.init.normal_(field.table)
+    return field
+
+
+def evaluate(field: UnmixField, count: int = 50):
+    positions = torch.rand(count, 3) * 2 - 1
+    directions = torch.nn.functional.normalize(torch.randn(count, 3), dim=-1)
+    density, features = field.get_density(positions)
+    return density, field.get_outputs(positions, directions, features)
+
+
+@pytest.mark.parametrize("scale", ["shared", "per-endmember"])
+def test_abundances_lie_on_the_simplex_and_scales_only_darken(scale):
+    density, outputs = evaluate(make_field(scale=scale))
+    assert (density > 0).all()
+    assert_close(outputs["abundances"].sum(-1), torch.ones(50))
+    assert (outputs["abundances"] >= 0).all()
+    ratio = outputs["scaled_abundances"] / outputs["abundances"]
+    assert ((ratio > 0) & (ratio < 1)).all()
+    is_shared = (ratio - ratio[:, :1]).abs().max() < 1e-5
+    assert is_shared == (scale == "shared")
+
+
+def test_an_untrained_field_has_the_initial_density():
+    field = make_field()
+    torch.nn.init.zeros_(field.table)
+    torch.nn.init.zeros_(field.density_network[-1].bias)
+    torch.nn.init.zeros_(field.density_network[-1].weight)
+    assert_close(evaluate(field)[0], torch.full((50,), 2.0))
+
+
+def test_a_lower_temperature_makes_purer_abundances():
+    soft, hard = (evaluate(make_field(temperature=t))[1]["abundances"].amax(-1).mean() for t in (1.0, 0.1))
+    assert hard > soft + 0.1
+
+
+def test_only_the_specular_part_depends_on_direction():
+    field = make_field()
+    positions = torch.rand(20, 3) * 2 - 1
+    _, features = field.get_density(positions)
+    up, down = (
+        field.get_outputs(positions, torch.tensor([[0.0, 0.0, z]]).repeat(20, 1), features) for z in (1, -1)
+    )
+    assert_close(up["scaled_abundances"], down["scaled_abundances"])
+    assert (up["specular_coefficients"] - down["specular_coefficients"]).abs().max() > 1e-3
+    assert ((up["specular_coefficients"] > 0) & (up["specular_coefficients"] < 1)).all()
+
+
+def test_without_a_specular_part_there_are_no_coefficients():
+    assert evaluate(make_field(num_specular=0))[1]["specular_coefficients"].shape == (50, 0)
+
+
+def test_a_point_that_grew_too_dense_can_still_be_thinned():
+    field = make_field()
+    torch.nn.init.constant_(field.density_network[-1].bias, 40.0)
+    density, _ = field.get_density(torch.zeros(1, 3))
+    (gradient,) = torch.autograd.grad(density.sum(), field.density_network[-1].bias)
+    assert torch.isfinite(density).all()
+    assert gradient[0] > 0
+
+
+def test_direction_features_are_orthogonal_over_the_sphere():
+    directions = torch.nn.functional.normalize(torch.randn(200_000, 3, dtype=torch.float64), dim=-1)
+    features = direction_features(directions)
+    correlation = torch.corrcoef(features.T)
+    assert_close(correlation, torch.eye(15, dtype=torch.float64), atol=0.02, rtol=0)
+    assert features.mean(0).abs().max() < 0.02

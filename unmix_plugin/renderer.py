@@ -1,0 +1,156 @@
+"""From rays to composited coefficients: which samples are taken, which carry weight, and what they sum to.
+
+Notation: `R` rays, `S` samples, `K` endmembers, `J` specular coefficients; w_i = T_i (1 - exp(-sigma_i delta)). Rays
+are marched through the occupied cells of a grid; a first pass without gradient finds the samples that carry weight, and
+only those go through the heads and the backward pass. The cost of a sample doesn't depend on the number of bands.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from unmix_plugin.engine.rays import RayBundle
+from unmix_plugin.engine.scene_box import SceneBox
+from unmix_plugin.field import UnmixField
+from unmix_plugin.rendering.compositing import accumulate, volume_weights
+from unmix_plugin.rendering.marching import PackedSamples, march
+from unmix_plugin.rendering.occupancy import OccupancyGrid
+from unmix_plugin.spectral.composition import Coefficients
+
+
+@dataclass(frozen=True)
+class RendererConfig:
+    """How finely rays are sampled and what is left out."""
+
+    samples_across: int = 384
+    """Samples along the diagonal of the scene box: what sets their distance."""
+    smallest_weight: float = 1e-3
+    """Samples that send less than this part of their ray's light to the camera are left out."""
+    grid_update_interval: int = 16
+    """Steps between updates of the occupancy grid."""
+    grid_probed_share: float = 1 / 32
+    """Part of the grid's cells that an update probes."""
+    grid_decay: float = 0.5
+    """Factor on the remembered density of a probed cell: lower forgets emptied space sooner."""
+    grid_smallest_opacity: float = 0.01
+    """Opacity of one sample's interval from which a cell counts as occupied."""
+
+
+class CoefficientRenderer(nn.Module):
+    """Volume renderer of a field's coefficients, with the occupancy grid that it keeps."""
+
+    aabb: Tensor
+
+    def __init__(
+        self, config: RendererConfig, scene_box: SceneBox, grid_resolution: int, close_rays: bool
+    ) -> None:
+        """
+        Args:
+            config: Sampling.
+            scene_box: What is rendered, model space.
+            grid_resolution: Cells along an edge of the occupancy grid.
+            close_rays: The last sample of a ray takes all the light that is left.
+        """
+        super().__init__()
+        self.config = config
+        self.close_rays = close_rays
+        self.step = sample_distance(config, scene_box)
+        self.grid = OccupancyGrid(torch.ones((grid_resolution,) * 3, dtype=torch.bool))
+        self.register_buffer("aabb", scene_box.aabb.clone(), persistent=False)
+
+    def carve(self, reachable: Bool[Tensor, "X Y Z"]) -> None:
+        """Start from a grid of which only some cells may ever hold matter."""
+        self.grid = OccupancyGrid(reachable).to(self.aabb.device)
+
+    def forward(self, field: UnmixField, ray_bundle: RayBundle) -> tuple[Coefficients, int]:
+        """Composited coefficients of each ray, and how many samples were marched for all.
+
+        In training mode the samples of each ray are shifted at random, drawn from torch's global generator.
+        """
+        samples = self._march(ray_bundle)
+        kept = samples.select(self._carries_weight(field, samples, ray_bundle))
+        positions, along = _points(kept, ray_bundle)
+        densities, features = field.get_density(positions)
+        weights = volume_weights(densities * self.step, kept.packed_info)
+        outputs = field.get_outputs(positions, along, features)
+        names = ("abundances", "scaled_abundances", "specular_coefficients")
+        columns = [torch.ones_like(kept.t)[:, None], kept.t[:, None], *(outputs[name] for name in names)]
+        values = torch.cat(columns, dim=-1)
+        totals = accumulate(weights, values, kept.packed_info)
+        if self.close_rays:
+            totals = totals + _rest_on_last_sample(totals[:, 0], values, kept)
+        parts = totals.split([column.shape[1] for column in columns], dim=-1)
+        return Coefficients(parts[0][:, 0], parts[1][:, 0], *parts[2:]), len(samples)
+
+    def update_grid(self, field: UnmixField, step: int) -> None:
+        """Probe the field where the grid's turn has come; the first updates of a run probe every cell."""
+        interval = self.config.grid_update_interval
+        if step % interval:
+            return
+        num_cells = int(self.grid.occupied.numel() * self.config.grid_probed_share)
+        self.grid.update(
+            lambda points: field.get_density(points * self._size + self.aabb[0])[0],
+            threshold=-math.log1p(-self.config.grid_smallest_opacity) / self.step,
+            decay=self.config.grid_decay,
+            num_cells=None if step < 4 * interval else num_cells,
+            generator=torch.Generator().manual_seed(int(torch.randint(2**62, (1,)))),
+        )
+
+    @torch.no_grad()
+    def normals(
+        self, field: UnmixField, ray_bundle: RayBundle, ray_distance: Float[Tensor, "R"]
+    ) -> Float[Tensor, "R 3"]:
+        """Unit normals in model space where the rays end: against the gradient of the log density."""
+        with torch.enable_grad():
+            ends = ray_bundle.origins + ray_distance[:, None] * ray_bundle.directions
+            positions = ends.detach().requires_grad_()
+            log_density = field.get_density(positions)[0].clamp(min=1e-20).log().sum()
+            (gradient,) = torch.autograd.grad(log_density, positions)
+        return torch.nn.functional.normalize(-gradient, dim=-1)
+
+    @property
+    def _size(self) -> Float[Tensor, "3"]:
+        return self.aabb[1] - self.aabb[0]
+
+    def _march(self, ray_bundle: RayBundle) -> PackedSamples:
+        origins, directions = ray_bundle.origins, ray_bundle.directions
+        t_near, t_far = SceneBox(self.aabb).intersect(origins, directions)
+        jitter = torch.rand_like(t_near) if self.training else torch.full_like(t_near, 0.5)
+        unit_origins, unit_directions = (origins - self.aabb[0]) / self._size, directions / self._size
+        return march(unit_origins, unit_directions, t_near, t_far, jitter, self.grid.occupied, self.step)
+
+    @torch.no_grad()
+    def _carries_weight(
+        self, field: UnmixField, samples: PackedSamples, ray_bundle: RayBundle
+    ) -> Bool[Tensor, "S"]:
+        densities, _ = field.get_density(_points(samples, ray_bundle)[0])
+        return volume_weights(densities * self.step, samples.packed_info) > self.config.smallest_weight
+
+
+def sample_distance(config: RendererConfig, scene_box: SceneBox) -> float:
+    """Distance of neighbouring samples, scene units."""
+    return float(scene_box.size.norm()) / config.samples_across
+
+
+def _points(
+    samples: PackedSamples, ray_bundle: RayBundle
+) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3"]]:
+    """Positions of samples and the directions they are seen along."""
+    along = ray_bundle.directions[samples.ray_indices]
+    return ray_bundle.origins[samples.ray_indices] + samples.t[:, None] * along, along
+
+
+def _rest_on_last_sample(
+    accumulation: Float[Tensor, "R"], values: Float[Tensor, "S C"], samples: PackedSamples
+) -> Float[Tensor, "R C"]:
+    """What the last sample of each ray adds if it takes all the light left; 0 for rays without samples."""
+    starts, counts = samples.packed_info.unbind(-1)
+    if len(values) == 0:
+        return values.new_zeros(len(starts), values.shape[1])
+    last = values[(starts + counts - 1).clamp(min=0)]
+    return torch.where(counts > 0, 1 - accumulation, 0.0)[:, None] * last

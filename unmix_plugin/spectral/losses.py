@@ -1,0 +1,43 @@
+"""How far rendered spectra are from measured ones, over a common background.
+
+Notation: `R` pixels, `B` bands.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from unmix_plugin.spectral.colour import linear_to_srgb
+
+
+def over_background(
+    spectra: Float[Tensor, "R B"], opacities: Float[Tensor, "R"], background: Float[Tensor, "R 1"]
+) -> Float[Tensor, "R B"]:
+    """Spectra on black, premultiplied by their opacity, laid over a grey background."""
+    return spectra + (1 - opacities)[:, None] * background
+
+
+def forgive_saturation(
+    pred_spectra: Float[Tensor, "R B"], target_spectra: Float[Tensor, "R B"], measured: Float[Tensor, "R B"]
+) -> Float[Tensor, "R B"]:
+    """The prediction, but the target itself where the sensor was saturated and the prediction is brighter still.
+
+    A measured 1 only says that the light was at least so strong.
+    """
+    return torch.where((measured >= 1) & (pred_spectra > target_spectra), target_spectra, pred_spectra)
+
+
+def srgb_error(
+    pred_spectra: Float[Tensor, "R B"],
+    target_spectra: Float[Tensor, "R B"],
+    rgb_weights: Float[Tensor, "B 3"],
+) -> Float[Tensor, ""]:
+    """Mean squared difference of the sRGB colours of two sets of spectra.
+
+    Against the colours of the measured spectra, not of a picture file: another colour pipeline than ours there would
+    contradict the spectra.
+    """
+    colours = linear_to_srgb(torch.stack([pred_spectra, target_spectra]) @ rgb_weights)
+    return (colours[0] - colours[1]).square().mean()
