@@ -19,12 +19,16 @@ WAVELENGTHS_NM = [450.0, 500.0, 550.0, 600.0, 650.0]
 BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 CONFIG = UnmixModelConfig(
     num_endmembers=3,
-    field=UnmixFieldConfig(num_levels=2, coarsest_resolution=4, finest_resolution=8, log2_rows_per_level=10, hidden_width=16),
+    field=UnmixFieldConfig(
+        num_levels=2, coarsest_resolution=4, finest_resolution=8, log2_rows_per_level=10, hidden_width=16
+    ),
     renderer=RendererConfig(samples_across=40, smallest_weight=0.0),
 )
 
 
-def make_model(seed: int = 0, has_alpha: bool = True, light: list[float] | None = None, **settings: Any) -> UnmixModel:
+def make_model(
+    seed: int = 0, has_alpha: bool = True, light: list[float] | None = None, **settings: Any
+) -> UnmixModel:
     """A model with random parameters of some size, so that its picture isn't uniform."""
     torch.manual_seed(seed)
     metadata = {
@@ -32,6 +36,7 @@ def make_model(seed: int = 0, has_alpha: bool = True, light: list[float] | None 
         "illuminant": light,
         "has_alpha": has_alpha,
         "grid_resolution": 8,
+        "subpixels": 2,
     }
     model: UnmixModel = replace(CONFIG, **settings).setup(scene_box=BOX, metadata=metadata)
     with torch.no_grad():
@@ -45,7 +50,10 @@ def initial_data() -> dict[str, np.ndarray]:
     g = np.random.default_rng(0)
     shapes = np.eye(3, NUM_BANDS, dtype=np.float32) * 0.6 + 0.1
     pixels = shapes[g.integers(0, 3, 300)] * g.uniform(0.5, 1, (300, 1)).astype(np.float32)
-    return {"pixels": pixels + g.normal(0, 1e-3, pixels.shape).astype(np.float32) ** 2, "reachable": np.ones((8, 8, 8), bool)}
+    return {
+        "pixels": pixels + g.normal(0, 1e-3, pixels.shape).astype(np.float32) ** 2,
+        "reachable": np.ones((8, 8, 8), bool),
+    }
 
 
 def make_rays(num_rays: int, seed: int = 0) -> RayBundle:

@@ -56,7 +56,9 @@ def test_deferred_composition_equals_compositing_a_spectrum_a_sample(specular, s
 
 def test_spectrum_is_diffuse_plus_specular_and_abundances_sum_to_accumulation():
     model = make_model()
-    outputs = model.get_outputs_for_camera(CAMERA, ["spectral", "diffuse", "specular", "abundances", "accumulation"])
+    outputs = model.get_outputs_for_camera(
+        CAMERA, ["spectral", "diffuse", "specular", "abundances", "accumulation"]
+    )
     assert_close(outputs["spectral"], outputs["diffuse"] + outputs["specular"])
     assert_close(outputs["abundances"].sum(-1), outputs["accumulation"], rtol=1e-5, atol=1e-6)
     assert outputs["accumulation"].max() <= 1 + 1e-5
@@ -100,7 +102,10 @@ def test_a_perfect_prediction_has_no_loss_over_any_background(background):
 def test_a_bright_background_penalises_missing_opacity():
     batch = {"spectra": torch.zeros(4, NUM_BANDS), "alpha": torch.ones(4)}
     outputs = {"spectral": torch.zeros(4, NUM_BANDS), "accumulation": torch.zeros(4)}
-    losses = {b: float(make_model(background=b).get_loss_dict(outputs, batch)["spectral"]) for b in ("black", "white")}
+    losses = {
+        b: float(make_model(background=b).get_loss_dict(outputs, batch)["spectral"])
+        for b in ("black", "white")
+    }
     assert losses == {"black": 0.0, "white": 1.0}
 
 
@@ -108,7 +113,11 @@ def test_brighter_than_a_saturated_sensor_is_no_error_but_darker_is():
     model = make_model(background="black")
     batch = {"spectra": torch.ones(1, NUM_BANDS), "alpha": torch.ones(1)}
     error = [
-        float(model.get_loss_dict({"spectral": torch.full((1, NUM_BANDS), v), "accumulation": torch.ones(1)}, batch)["spectral"])
+        float(
+            model.get_loss_dict(
+                {"spectral": torch.full((1, NUM_BANDS), v), "accumulation": torch.ones(1)}, batch
+            )["spectral"]
+        )
         for v in (1.5, 0.5)
     ]
     assert error == [0.0, 0.25]
@@ -218,7 +227,9 @@ def test_an_unknown_output_is_refused_with_the_known_ones():
 
 
 def test_a_band_is_that_plane_of_the_spectrum():
-    outputs = make_model().get_outputs_for_camera(CAMERA, ["spectral", "band:560nm", "false-colour:650,550,450"])
+    outputs = make_model().get_outputs_for_camera(
+        CAMERA, ["spectral", "band:560nm", "false-colour:650,550,450"]
+    )
     spectra = outputs["spectral"]
     assert torch.equal(outputs["band:560nm"], spectra[..., WAVELENGTHS_NM.index(550.0)])
     assert_close(outputs["false-colour:650,550,450"], spectra[..., [4, 2, 0]].clamp(0, 1))

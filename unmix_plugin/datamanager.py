@@ -1,6 +1,7 @@
 """Training batches of rays with their spectra, from a validated scene.
 
-Notation: `R` pixels of a batch, `P` rays a pixel, `B` bands, `H x W` pixels of a view.
+Notation: `R` pixels of a batch, `P` rays a pixel, `B` bands, `H x W` pixels of a view. A pixel measures the mean over
+its area, so several rays are cast through it, one in each cell of a grid on it; they follow each other in a bundle.
 """
 
 from __future__ import annotations
@@ -36,20 +37,39 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
     """How a scene of spectral images is read and sampled."""
 
     _target: Target = field(default_factory=lambda: HyperspectralDataManager)
-    train_num_rays_per_batch: int = 512
-    """Pixels of the first training step; the model adapts the number to its budget of samples."""
+    train_num_rays_per_batch: int = 2048
+    """Rays of the first training step; the model adapts the number to its budget of samples."""
     scene: SceneOptions = SceneOptions()
     """How the files are read and split."""
+    subpixels: int = 2
+    """Rays cast through a pixel, along each of its edges; their mean is the pixel, in training and in rendering."""
     carving_resolution: int = 128
     """Cells along an edge of the grid in which space that the views show to be empty is carved away."""
     max_initial_pixels: int = 50_000
     """Pixels, drawn from all training views, from which the endmembers are initialised."""
 
+    def __post_init__(self) -> None:
+        """Refuse impossible settings.
+
+        Raises:
+            ConfigError: a number out of its range.
+        """
+        rules = {
+            "train-num-rays-per-batch of at least 1": self.train_num_rays_per_batch >= 1,
+            "eval-num-rays-per-batch of at least 1": self.eval_num_rays_per_batch >= 1,
+            "subpixels of 1 to 8": 1 <= self.subpixels <= 8,
+            "carving-resolution of 8 to 512": 8 <= self.carving_resolution <= 512,
+            "max-initial-pixels of at least 1": self.max_initial_pixels >= 1,
+        }
+        broken = [rule for rule, holds in rules.items() if not holds]
+        if broken:
+            raise ConfigError(f"the data manager needs {' and '.join(broken)}")
+
 
 class HyperspectralDataManager(DataManager):
     """Serves pixels of the training views, drawn evenly from all valid ones.
 
-    A training batch has `spectra` (R, B) and `alpha` (R); an image batch has `spectra` (H, W, B), `alpha` (H, W),
+    A training batch has R P rays, `spectra` (R, B) and `alpha` (R); an image batch has `spectra` (H, W, B), `alpha` (H, W),
     `valid` (H, W) and, where the scene has them, `labels` (H, W) and `abundances` (H, W, K).
     """
 
@@ -72,22 +92,23 @@ class HyperspectralDataManager(DataManager):
         self.train_cameras = self.scene.cameras[list(self.scene.train_indices)]
         self.eval_cameras = self.scene.cameras[list(self.scene.eval_indices)]
         self._device_cameras = self.train_cameras.to(device)
-        self._pixels = _TrainingPixels(self.scene, device)
-        self._num_rays = config.train_num_rays_per_batch
+        self._pixels = _PixelTable(self.scene, device)
+        self.set_train_rays_per_batch(config.train_num_rays_per_batch)
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
         """Random valid pixels of the training views; the draw depends on (seed, step) only."""
         generator = step_generator(self.seed, step)
-        chosen = self._pixels.draw(self._num_rays, generator)
-        return self._batch(self._device_cameras, self._pixels, chosen)
+        chosen = self._pixels.draw(self._num_pixels, generator)
+        return self._batch(self._device_cameras, self._pixels, chosen, generator)
 
     def next_eval(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
         """Random pixels of one evaluation view."""
         view = self.scene.eval_indices[step % self.num_eval_images]
-        pixels = _TrainingPixels(self.scene, self.device, (view,))
+        pixels = _PixelTable(self.scene, self.device, (view,))
         generator = step_generator(self.seed, step, stream=_EVAL_STREAM)
-        chosen = pixels.draw(self.config.eval_num_rays_per_batch, generator)
-        return self._batch(self.scene.cameras[[view]].to(self.device), pixels, chosen)
+        num_pixels = self._pixels_for(self.config.eval_num_rays_per_batch)
+        chosen = pixels.draw(num_pixels, generator)
+        return self._batch(self.scene.cameras[[view]].to(self.device), pixels, chosen, generator)
 
     def next_eval_image(self, step: int) -> tuple[int, Cameras, dict[str, Tensor]]:
         """The evaluation views in turn."""
@@ -106,19 +127,19 @@ class HyperspectralDataManager(DataManager):
             "abundances": self.scene.abundances(view),
         }
         batch = {
-            name: torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
+            name: torch.tensor(array, device=self.device)
             for name, array in arrays.items()
             if array is not None
         }
         return self.eval_cameras[index], batch
 
     def get_train_rays_per_batch(self) -> int:
-        """Pixels of the next training batch."""
-        return self._num_rays
+        """Rays of the next training batch."""
+        return self._num_pixels * self.options.subpixels**2
 
     def set_train_rays_per_batch(self, num_rays: int) -> None:
-        """Let the next training batches have `num_rays` pixels."""
-        self._num_rays = num_rays
+        """Let the next training batches have `num_rays` rays, but whole pixels and at least one."""
+        self._num_pixels = self._pixels_for(num_rays)
 
     def metadata(self) -> dict[str, Any]:
         """Bands, light and kind of the scene, and the size of the carving grid."""
@@ -128,6 +149,7 @@ class HyperspectralDataManager(DataManager):
             "illuminant": None if illuminant is None else illuminant.tolist(),
             "has_alpha": self.scene.has_alpha,
             "grid_resolution": self.options.carving_resolution,
+            "subpixels": self.options.subpixels,
         }
 
     def initial_data(self) -> Mapping[str, np.ndarray]:
@@ -141,23 +163,35 @@ class HyperspectralDataManager(DataManager):
         """The scene's own record: files, splits, normalisation, truth, hashes."""
         return self.scene.summary()
 
+    def _pixels_for(self, num_rays: int) -> int:
+        return max(1, num_rays // self.options.subpixels**2)
+
     @property
     def _image_shape(self) -> tuple[int, int]:
         return self.scene.cameras.height, self.scene.cameras.width
 
     def _batch(
-        self, cameras: Cameras, pixels: _TrainingPixels, chosen: Int[Tensor, "R"]
+        self, cameras: Cameras, pixels: _PixelTable, chosen: Int[Tensor, "R"], generator: torch.Generator
     ) -> tuple[RayBundle, dict[str, Tensor]]:
         height, width = self._image_shape
         within = chosen % (height * width)
-        corner = torch.stack([within % width, within // width], dim=-1)
-        views = chosen // (height * width)
-        bundle = cameras.generate_rays(views, corner + 0.5)
+        corners = torch.stack([within % width, within // width], dim=-1)
+        offsets = _scattered_offsets(len(chosen), self.options.subpixels, generator).to(corners.device)
+        points = (corners[:, None] + offsets).flatten(0, 1)
+        views = (chosen // (height * width)).repeat_interleave(offsets.shape[1])
+        bundle = cameras.generate_rays(views, points)
         return bundle, {"spectra": pixels.spectra[chosen], "alpha": pixels.alpha[chosen]}
 
 
-class _TrainingPixels:
-    """All pixels of some views as tables, and which of them count."""
+def _scattered_offsets(num_pixels: int, subpixels: int, generator: torch.Generator) -> Float[Tensor, "R P 2"]:
+    """One random point in each cell of a subpixels x subpixels grid on every pixel, (x, y) in [0, 1)."""
+    cells = torch.arange(subpixels)
+    grid = torch.stack(torch.meshgrid(cells, cells, indexing="xy"), dim=-1).reshape(1, -1, 2)
+    return (grid + torch.rand(num_pixels, subpixels**2, 2, generator=generator)) / subpixels
+
+
+class _PixelTable:
+    """All pixels of some views, row after row, and which of them count."""
 
     spectra: Float[Tensor, "pixels B"]
     alpha: Float[Tensor, "pixels"]

@@ -180,9 +180,10 @@ class UnmixModel(Model):
         metrics_dict: dict[str, Tensor] | None = None,
     ) -> dict[str, Tensor]:
         """Weighted errors of spectra and, if asked, of their sRGB colours, over a common background."""
-        background = self._background(outputs["accumulation"])
+        spectra, opacities = _pixel_means(outputs, len(batch["spectra"]))
+        background = self._background(opacities)
         target = over_background(batch["spectra"], batch["alpha"], background)
-        predicted = over_background(outputs["spectral"], outputs["accumulation"], background)
+        predicted = over_background(spectra, opacities, background)
         predicted = forgive_saturation(predicted, target, batch["spectra"])
         losses = {"spectral": self.config.spectral_loss_weight * (predicted - target).square().mean()}
         if self.config.rgb_loss_weight > 0:
@@ -191,16 +192,22 @@ class UnmixModel(Model):
 
     def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """`psnr` of the batch in dB, on black."""
-        error = (outputs["spectral"].detach().clamp(0, 1) - batch["spectra"]).square().mean()
+        spectra, _ = _pixel_means(outputs, len(batch["spectra"]))
+        error = (spectra.detach().clamp(0, 1) - batch["spectra"]).square().mean()
         return {"psnr": -10 * torch.log10(error.clamp(min=1e-12))}
 
     @torch.no_grad()
-    def get_image_coefficients(self, camera: Cameras) -> Coefficients:
-        """Coefficients (H, W, ...) of a whole view, rendered chunk by chunk: every picture of it follows from them."""
-        bundle = camera.to(self.device).image_rays(0)
-        chunk = self.config.eval_num_rays_per_chunk
-        parts = [self.renderer(self.field, bundle[i : i + chunk])[0] for i in range(0, len(bundle), chunk)]
-        return Coefficients.concatenate(parts).unflatten(camera.height, camera.width)
+    def get_image_coefficients(self, camera: Cameras, subpixels: int | None = None) -> Coefficients:
+        """Coefficients (H, W, ...) of a whole view, rendered chunk by chunk: every picture of it follows from them.
+
+        Args:
+            camera: One camera.
+            subpixels: Rays through a pixel along each of its edges, averaged; None for as many as in training.
+        """
+        count = self.metadata["subpixels"] if subpixels is None else subpixels
+        centres = [(i + 0.5) / count for i in range(count)]
+        passes = [self._coefficients_through(camera, (x, y)) for y in centres for x in centres]
+        return Coefficients.mean(passes).unflatten(camera.height, camera.width)
 
     @torch.no_grad()
     def get_outputs_for_camera(
@@ -261,6 +268,12 @@ class UnmixModel(Model):
             parameters = [value for group in self.get_param_groups().values() for value in group]
             torch.autograd.grad(self.get_outputs(bundle)["spectral"].sum(), parameters, allow_unused=True)
 
+    def _coefficients_through(self, camera: Cameras, offset: tuple[float, float]) -> Coefficients:
+        bundle = camera.to(self.device).image_rays(0, offset)
+        chunk = self.config.eval_num_rays_per_chunk
+        parts = [self.renderer(self.field, bundle[i : i + chunk])[0] for i in range(0, len(bundle), chunk)]
+        return Coefficients.concatenate(parts)
+
     def _first_endmembers(
         self, pixels: Float[Tensor, "N B"], lamp: Float[Tensor, "B"]
     ) -> Float[Tensor, "K B"]:
@@ -304,3 +317,11 @@ class UnmixModel(Model):
     def _keep_spectra_physical(self, step: int, progress: float) -> None:
         self.endmembers.clamp_(0, 1)
         self.specular_spectra.clamp_(0, 1)
+
+
+def _pixel_means(
+    outputs: dict[str, Tensor], num_pixels: int
+) -> tuple[Float[Tensor, "R B"], Float[Tensor, "R"]]:
+    """Spectra and opacities of pixels from those of the rays cast through them, which follow each other."""
+    spectra, accumulation = outputs["spectral"], outputs["accumulation"]
+    return spectra.unflatten(0, (num_pixels, -1)).mean(1), accumulation.unflatten(0, (num_pixels, -1)).mean(1)

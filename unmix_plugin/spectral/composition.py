@@ -41,6 +41,13 @@ class Coefficients:
         return Coefficients(*(getattr(self, name).unflatten(0, (height, width)) for name in _FIELDS))
 
     @staticmethod
+    def mean(passes: list[Coefficients]) -> Coefficients:
+        """Mean over several renders of the same rays: since all outputs but ratios are linear, that of a pixel."""
+        return Coefficients(
+            *(sum(getattr(one, name) for one in passes) / len(passes) for name in _FIELDS)  # type: ignore[arg-type]
+        )
+
+    @staticmethod
     def concatenate(parts: list[Coefficients]) -> Coefficients:
         """The rays of all parts, in order."""
         return Coefficients(*(torch.cat([getattr(part, name) for part in parts]) for name in _FIELDS))

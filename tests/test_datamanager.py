@@ -1,0 +1,114 @@
+"""What batches hold and which randomness they depend on."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from unmix_plugin.datamanager import HyperspectralDataManager, HyperspectralDataManagerConfig
+from unmix_plugin.errors import ConfigError, SceneError
+from unmix_plugin.scenes.demo_scene import make_demo_scene
+from unmix_plugin.scenes.scene import SceneOptions
+
+CONFIG = HyperspectralDataManagerConfig(train_num_rays_per_batch=64, carving_resolution=16)
+
+
+@pytest.fixture(scope="module")
+def scene_folder(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("scenes") / "tiny"
+    make_demo_scene(folder, size=16, bands=6, views=8)
+    return folder
+
+
+def make(folder: Path, seed: int = 0, **settings) -> HyperspectralDataManager:
+    return replace(CONFIG, **settings).setup(data=folder, device=torch.device("cpu"), seed=seed)
+
+
+def test_a_batch_is_a_function_of_seed_and_step(scene_folder):
+    batches = [make(scene_folder, seed).next_train(step) for seed, step in ((0, 3), (0, 3), (0, 4), (1, 3))]
+    directions = [bundle.directions for bundle, _ in batches]
+    assert torch.equal(directions[0], directions[1])
+    assert not torch.equal(directions[0], directions[2])
+    assert not torch.equal(directions[0], directions[3])
+
+
+def test_the_rays_of_a_pixel_lie_within_it_one_in_each_cell(scene_folder):
+    manager = make(scene_folder, subpixels=3)
+    bundle, batch = manager.next_train(0)
+    assert len(bundle) == 9 * len(batch["spectra"])
+    for pixel in range(20):
+        rays = bundle[slice(9 * pixel, 9 * pixel + 9)]
+        camera = int(rays.camera_indices[0])
+        points, _ = manager.train_cameras.project(rays.origins + 2 * rays.directions, camera)
+        corner = points.mean(dim=0).floor()
+        cells = ((points - corner) * 3).floor().long()
+        assert sorted((cells[:, 1] * 3 + cells[:, 0]).tolist()) == list(range(9))
+        row, column = int(corner[1]), int(corner[0])
+        cube = manager.scene.cube(manager.scene.train_indices[camera])
+        assert_close(batch["spectra"][pixel], torch.from_numpy(cube[row, column]))
+
+
+def test_masked_and_invalid_pixels_are_never_drawn(scene_folder, tmp_path):
+    import json
+    import shutil
+
+    folder = tmp_path / "holes"
+    shutil.copytree(scene_folder, folder)
+    names = json.loads((folder / "transforms.json").read_text())["frames"]
+    for frame in names:
+        path = folder / frame["hyperspectral_file_path"]
+        cube = np.load(path)
+        cube[:, :8] = np.nan
+        np.save(path, cube)
+    with pytest.raises(SceneError, match="NaN"):
+        make(folder)
+    manager = make(folder, scene=SceneOptions(invalid_pixels="mask"))
+    bundle, batch = manager.next_train(0)
+    assert torch.isfinite(batch["spectra"]).all()
+    for index in range(0, len(bundle), 4):
+        ray = bundle[slice(index, index + 1)]
+        points, _ = manager.train_cameras.project(ray.origins + ray.directions, int(ray.camera_indices[0]))
+        assert points[0, 0] >= 8 - 1e-3
+
+
+def test_an_evaluation_image_carries_the_truth(scene_folder):
+    manager = make(scene_folder)
+    camera, batch = manager.eval_image(1)
+    view = manager.scene.eval_indices[1]
+    assert_close(batch["spectra"], torch.from_numpy(manager.scene.cube(view)))
+    assert batch["alpha"].shape == batch["labels"].shape == batch["valid"].shape == (16, 16)
+    assert batch["abundances"].shape == (16, 16, 6)
+    assert_close(camera.camera_to_world[0], manager.scene.cameras.camera_to_world[view])
+    assert manager.next_eval_image(manager.num_eval_images + 1)[0] == 1
+
+
+def test_initial_pixels_come_from_opaque_pixels_of_all_training_views(scene_folder):
+    manager = make(scene_folder)
+    data = manager.initial_data()
+    opaque = sum(int((manager.scene.alpha(i) > 0.99).sum()) for i in manager.scene.train_indices)  # type: ignore[operator]
+    assert data["pixels"].shape == (opaque, 6)
+    assert data["reachable"].shape == (16, 16, 16)
+    assert 0.02 < data["reachable"].mean() < 1
+    assert len(make(scene_folder, max_initial_pixels=50).initial_data()["pixels"]) == 50
+
+
+def test_the_number_of_rays_can_be_changed(scene_folder):
+    manager = make(scene_folder)
+    manager.set_train_rays_per_batch(41)
+    bundle, batch = manager.next_train(0)
+    assert manager.get_train_rays_per_batch() == len(bundle) == 40  # whole pixels of four rays
+    assert len(batch["spectra"]) == 10
+    manager.set_train_rays_per_batch(1)
+    assert manager.get_train_rays_per_batch() == 4
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [({"subpixels": 0}, "subpixels of 1 to 8"), ({"carving_resolution": 4}, "carving-resolution of 8 to 512")],
+)
+def test_impossible_settings_are_refused(settings, message):
+    with pytest.raises(ConfigError, match=message):
+        replace(CONFIG, **settings)
