@@ -39,7 +39,7 @@ def test_the_rays_of_a_pixel_lie_within_it_one_in_each_cell(scene_folder):
     manager = make(scene_folder, subpixels=3)
     bundle, batch = manager.next_train(0)
     assert len(bundle) == 9 * len(batch["spectra"])
-    for pixel in range(20):
+    for pixel in range(len(batch["spectra"])):
         rays = bundle[slice(9 * pixel, 9 * pixel + 9)]
         camera = int(rays.camera_indices[0])
         points, _ = manager.train_cameras.project(rays.origins + 2 * rays.directions, camera)

@@ -75,7 +75,7 @@ class Model(nn.Module, ABC):
     ) -> dict[str, Tensor]:
         """Scalar losses, already weighted; training minimises their sum."""
 
-    def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:  # noqa: ARG002
+    def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """Scalars worth following in training; `psnr` (dB) is shown in the progress display."""
         return {}
 
@@ -89,11 +89,11 @@ class Model(nn.Module, ABC):
         """Functions to call around each step."""
         return []
 
-    def num_samples(self, outputs: dict[str, Tensor]) -> int:  # noqa: ARG002
+    def num_samples(self, outputs: dict[str, Tensor]) -> int:
         """Field samples behind `outputs`, for the log; 0 where a model does not count."""
         return 0
 
-    def next_num_rays(self, outputs: dict[str, Tensor], current: int) -> int | None:  # noqa: ARG002
+    def next_num_rays(self, outputs: dict[str, Tensor], current: int) -> int | None:
         """Rays that the next step should have, given the outputs of one with `current` rays; None leaves it."""
         return None
 

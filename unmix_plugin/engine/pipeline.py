@@ -71,7 +71,7 @@ class Pipeline(nn.Module):
             return self.model.get_image_metrics_and_images(self.model.get_outputs_for_camera(camera), batch)
 
     @torch.no_grad()
-    def get_average_eval_image_metrics(self, step: int | None = None) -> dict[str, float]:  # noqa: ARG002
+    def get_average_eval_image_metrics(self, step: int | None = None) -> dict[str, float]:
         """Metrics averaged over all evaluation views, each over the views that have it, whatever the step."""
         values: dict[str, list[float]] = {}
         with evaluating(self.model):

@@ -1,0 +1,126 @@
+"""`unmix-eval`: the keys of metrics.json, what is drawn, and what is refused."""
+
+import errno
+import json
+import math
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.commands.running import picture_size, run
+from unmix_plugin.commands.eval import evaluate
+from unmix_plugin.datamanager import HyperspectralDataManager
+from unmix_plugin.engine.load_run import load_pipeline
+from unmix_plugin.exports.evaluation import DEFINITIONS
+from unmix_plugin.spectral.metrics import psnr
+
+KEYS = [
+    *("psnr", "rmse", "ssim", "sam", "rgb_psnr", "miou", "macro_f1", "accuracy", "abundance_rmse"),
+    *("endmember_angle", "views", "bands", "train_seconds", "train_rays_per_second"),
+]
+
+
+@pytest.fixture(scope="module")
+def evaluated(trained, tmp_path_factory):
+    """A copy of the trained run, evaluated, and what was printed."""
+    path = Path(shutil.copytree(trained.run, tmp_path_factory.mktemp("evaluated") / "run"))
+    ended = run(evaluate, "--run", path, "--device", "cpu")
+    assert ended.status == 0, ended.err
+    return path, ended
+
+
+def test_metrics_have_exactly_the_keys_of_the_contract_all_known_where_there_is_truth(evaluated):
+    metrics = json.loads((evaluated[0] / "eval" / "metrics.json").read_text())
+    assert list(metrics) == [*KEYS, "per_view", "definitions"]
+    assert list(DEFINITIONS) == KEYS == list(metrics["definitions"])
+    assert all(math.isfinite(metrics[key]) for key in KEYS)
+    assert (metrics["views"], metrics["bands"]) == (2, 8)
+    assert (
+        metrics["train_seconds"] == json.loads((evaluated[0] / "training.json").read_text())["train_seconds"]
+    )
+
+
+def test_figures_are_means_over_the_views_of_what_the_model_renders(evaluated):
+    path, _ = evaluated
+    metrics = json.loads((path / "eval" / "metrics.json").read_text())
+    loaded = load_pipeline(path, "cpu")
+    assert isinstance(loaded.pipeline.datamanager, HyperspectralDataManager)
+    scene = loaded.pipeline.datamanager.scene
+    expected = []
+    for index in scene.eval_indices:
+        predicted = loaded.pipeline.model.get_outputs_for_camera(scene.cameras[index], ["spectral"])[
+            "spectral"
+        ]
+        expected.append(psnr(predicted, torch.from_numpy(scene.cube(index))))
+    assert [view["psnr"] for view in metrics["per_view"]] == pytest.approx(expected, rel=1e-6)
+    assert metrics["psnr"] == pytest.approx(sum(expected) / 2, rel=1e-6)
+    assert [view["name"] for view in metrics["per_view"]] == [
+        scene.frames[i].name for i in scene.eval_indices
+    ]
+
+
+def test_each_view_gets_three_pictures_and_all_that_was_written_is_named(evaluated):
+    path, ended = evaluated
+    for kind in ("rgb", "segmentation", "abundances"):
+        pictures = sorted((path / "eval" / kind).iterdir())
+        assert [picture.name for picture in pictures] == ["eval_002.png", "eval_006.png"]
+        for picture in pictures:
+            assert min(picture_size(picture)) > 200
+    assert str(path / "eval" / "metrics.json") in ended.out
+    assert "6 pictures" in ended.out
+    for key in KEYS:
+        assert key in ended.out
+
+
+def test_what_has_no_truth_is_null(trained, run_copy, tmp_path):
+    scene = Path(shutil.copytree(trained.scene, tmp_path / "untold"))
+    content = json.loads((scene / "transforms.json").read_text())
+    content = {key: value for key, value in content.items() if key not in ("materials", "endmembers_path")}
+    for frame in content["frames"]:
+        for key in ("seg_file_path", "abundance_file_path"):
+            frame.pop(key, None)
+    (scene / "transforms.json").write_text(json.dumps(content))
+    ended = run(evaluate, "--run", run_copy, "--data", scene, "--device", "cpu")
+    assert ended.status == 0, ended.err
+    metrics = json.loads((run_copy / "eval" / "metrics.json").read_text())
+    unknown = {"miou", "macro_f1", "accuracy", "abundance_rmse", "endmember_angle"}
+    assert {key for key in KEYS if metrics[key] is None} == unknown
+    assert len(list((run_copy / "eval").rglob("*.png"))) == 6
+
+
+def test_without_run_the_newest_is_evaluated_and_named(run_copy, monkeypatch):
+    monkeypatch.chdir(run_copy.parents[3])
+    older = run_copy.with_name("2001-01-01_000000")
+    shutil.copytree(run_copy, older)
+    ended = run(evaluate, "--output-dir", "copy")
+    assert ended.status == 0, ended.err
+    assert ended.out.splitlines()[0] == f"newest run: {run_copy}"
+    assert (run_copy / "eval" / "metrics.json").is_file()
+    assert not (older / "eval").exists()
+
+
+def test_no_run_at_all_exits_2(tmp_path):
+    ended = run(evaluate, "--output-dir", tmp_path)
+    assert ended.status == 2
+    assert "no run with a checkpoint" in ended.err
+
+
+def test_data_that_is_gone_exits_2_and_writes_nothing(run_copy, tmp_path):
+    ended = run(evaluate, "--run", run_copy, "--data", tmp_path / "gone")
+    assert ended.status == 2
+    assert str(tmp_path / "gone") in ended.err
+    assert not (run_copy / "eval").exists()
+
+
+def test_a_full_disk_exits_2_and_leaves_no_part_of_a_file(run_copy, monkeypatch):
+    def full(*_args):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "write", full)
+    ended = run(evaluate, "--run", run_copy)
+    assert ended.status == 2
+    assert "No space left on device; make room" in ended.err
+    assert [path for path in (run_copy / "eval").rglob("*") if path.is_file()] == []

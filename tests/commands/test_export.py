@@ -1,0 +1,143 @@
+"""`unmix-export`: what is in the files, that nothing is lost, and that a run folder is all it takes."""
+
+import errno
+import os
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.commands.running import picture_size, run
+from unmix_plugin.commands.export import export
+from unmix_plugin.engine.load_run import load_model
+from unmix_plugin.spectral.spectra_csv import read_spectra_csv
+
+
+@pytest.fixture(scope="module")
+def model_outputs(trained):
+    """What the trained model renders of its evaluation views, by view name."""
+    loaded = load_model(trained.run, "cpu")
+    names = ["eval_002", "eval_006"]
+    outputs = ["abundances", "accumulation", "segmentation"]
+    return {
+        name: {
+            key: value.numpy()
+            for key, value in loaded.model.get_outputs_for_camera(
+                loaded.scene.eval_cameras[index], outputs
+            ).items()
+        }
+        for index, name in enumerate(names)
+    }
+
+
+def test_abundances_are_the_models_and_sum_to_its_opacity(trained, tmp_path, model_outputs):
+    ended = run(export, "abundances", "--run", trained.run, "--output", tmp_path, "--device", "cpu")
+    assert ended.status == 0, ended.err
+    for name, outputs in model_outputs.items():
+        exported = np.load(tmp_path / f"{name}.npy")
+        assert (exported.dtype, exported.shape) == (np.float32, (16, 16, 6))
+        np.testing.assert_array_equal(exported, outputs["abundances"])
+        np.testing.assert_allclose(exported.sum(axis=-1), outputs["accumulation"], atol=1e-5)
+        assert min(picture_size(tmp_path / f"{name}.png")) > 200
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        f"{name}.{kind}" for name in model_outputs for kind in ("npy", "png")
+    ]
+    for path in tmp_path.iterdir():
+        assert str(path) in ended.out
+
+
+def test_segmentation_is_the_models_ids_their_scores_and_a_figure(trained, tmp_path, model_outputs):
+    ended = run(export, "segmentation", "--run", trained.run, "--output", tmp_path, "--device", "cpu")
+    assert ended.status == 0, ended.err
+    for name, outputs in model_outputs.items():
+        ids = np.asarray(Image.open(tmp_path / "labels" / f"{name}.png"))
+        scores = np.load(tmp_path / f"{name}.npy")
+        assert (ids.dtype, scores.dtype, scores.shape) == (np.uint8, np.float32, (16, 16, 6))
+        np.testing.assert_array_equal(ids, outputs["segmentation"])
+        seen = ids != 255
+        np.testing.assert_array_equal(ids[seen], scores.argmax(axis=-1)[seen])
+        np.testing.assert_array_equal(seen, outputs["accumulation"] >= 0.5)
+        assert (tmp_path / f"{name}.png").is_file()
+
+
+def test_endmembers_are_those_of_the_run_as_csv_and_plot(trained, tmp_path):
+    ended = run(export, "endmembers", "--run", trained.run, "--output", tmp_path, "--device", "cpu")
+    assert ended.status == 0, ended.err
+    assert (tmp_path / "endmembers.csv").read_bytes() == (trained.run / "endmembers.csv").read_bytes()
+    assert read_spectra_csv(tmp_path / "endmembers.csv").spectra.shape == (6, 8)
+    assert min(picture_size(tmp_path / "endmembers.png")) > 400
+
+
+@pytest.mark.parametrize(("views", "count"), [("eval", 2), ("train", 6), ("all", 8)])
+def test_views_are_chosen_by_split_and_named_as_the_frames(trained, tmp_path, views, count):
+    ended = run(export, "abundances", "--run", trained.run, "--output", tmp_path, "--views", views)
+    assert ended.status == 0, ended.err
+    names = {path.stem for path in tmp_path.glob("*.npy")}
+    frames = {path.stem for path in (trained.scene / "cubes").iterdir()}
+    assert len(names) == count
+    assert names == {name for name in frames if views == "all" or name.startswith(views)}
+
+
+def test_exports_go_into_the_run_by_default_and_need_no_data(trained, run_copy, tmp_path):
+    shutil.move(trained.scene, tmp_path / "elsewhere")
+    try:
+        for product in ("abundances", "segmentation", "endmembers"):
+            ended = run(export, product, "--run", run_copy)
+            assert ended.status == 0, ended.err
+            assert list((run_copy / "exports" / product).iterdir())
+    finally:
+        shutil.move(tmp_path / "elsewhere", trained.scene)
+
+
+def test_without_run_the_newest_is_exported(run_copy, monkeypatch, tmp_path):
+    shutil.move(run_copy.parents[2], tmp_path / "outputs")
+    monkeypatch.chdir(tmp_path)
+    ended = run(export, "endmembers")
+    assert ended.status == 0, ended.err
+    assert (
+        tmp_path / "outputs/demo/unmix-nerf" / run_copy.name / "exports/endmembers/endmembers.csv"
+    ).is_file()
+
+
+@pytest.mark.parametrize("product", ["abundances", "segmentation", "endmembers"])
+def test_files_of_an_earlier_export_are_kept_unless_overwrite_is_given(trained, tmp_path, product):
+    words = [product, "--run", trained.run, "--output", tmp_path]
+    assert run(export, *words).status == 0
+    files = [path for path in tmp_path.rglob("*") if path.is_file()]
+    for path in files:
+        path.write_bytes(b"mine")
+    files[0].unlink()
+    ended = run(export, *words)
+    assert ended.status == 2
+    assert "--overwrite" in ended.err
+    assert {path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == {b"mine"}
+    assert run(export, *words, "--overwrite").status == 0
+    assert b"mine" not in {path.read_bytes() for path in files}
+
+
+@pytest.mark.parametrize("product", ["abundances", "segmentation"])
+def test_a_full_disk_exits_2_says_where_and_leaves_no_part_of_a_file(trained, tmp_path, monkeypatch, product):
+    def full(*_args):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "write", full)
+    ended = run(export, product, "--run", trained.run, "--output", tmp_path)
+    assert ended.status == 2
+    assert f"can't write {tmp_path / 'eval_002.npy'}: No space left on device" in ended.err
+    assert "--load-run" not in ended.err
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+
+
+def test_a_folder_that_cannot_be_made_exits_2(trained, tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    ended = run(export, "endmembers", "--run", trained.run, "--output", tmp_path / "file" / "here")
+    assert ended.status == 2
+    assert str(tmp_path / "file" / "here") in ended.err
+
+
+@pytest.mark.parametrize("words", [[], ["spectra"], ["abundances", "--views", "some"]])
+def test_words_that_do_not_parse_exit_2(words):
+    ended = run(export, *words)
+    assert ended.status == 2
+    assert ended.err

@@ -1,0 +1,207 @@
+"""`unmix-train`: the contract of its words, its last line, its exit codes, and going on with a run."""
+
+import errno
+import importlib.metadata
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.commands.running import SMALL_METHOD, run
+from unmix_plugin.commands import train as train_module
+from unmix_plugin.commands.train import parse, train
+from unmix_plugin.engine import registry
+from unmix_plugin.engine.load_run import load_model
+from unmix_plugin.engine.trainer import Trainer
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.model import UnmixModel, UnmixModelConfig
+from unmix_plugin.spectral.spectra_csv import read_spectra_csv
+
+
+def small_training(trained, output_dir, *words):
+    """Words that train on the tiny scene, with further ones."""
+    return ["unmix-nerf", "--data", trained.scene, "--output-dir", output_dir, *SMALL_METHOD, *words]
+
+
+def test_the_last_line_is_the_absolute_path_of_the_run_and_nothing_else(trained):
+    assert trained.ended.last_line == f"run: {trained.run}"
+    assert trained.run.is_absolute()
+    assert trained.ended.out.endswith(f"run: {trained.run}\n")
+    assert "\x1b" not in trained.ended.out
+    assert trained.run.parent.parent.parent == trained.output_dir
+
+
+def test_a_run_holds_its_settings_its_scene_a_checkpoint_and_its_endmembers(trained):
+    stored = json.loads((trained.run / "config.json").read_text())["config"]
+    assert (stored["max_num_iterations"], stored["device"]) == (20, "cpu")
+    assert json.loads((trained.run / "training.json").read_text())["steps"] == 20
+    assert (trained.run / "checkpoints" / "step-000020.safetensors").is_file()
+    table = read_spectra_csv(trained.run / "endmembers.csv")
+    model = load_model(trained.run, "cpu").model
+    assert isinstance(model, UnmixModel)
+    assert table.names == tuple(f"endmember_{index}" for index in range(6))
+    np.testing.assert_allclose(table.spectra, model.endmembers.detach().numpy(), rtol=1e-6)
+    np.testing.assert_allclose(table.bands.centers_nm, model.metadata["wavelengths_nm"], rtol=1e-8)
+
+
+def test_the_words_of_the_contract_work_right_after_the_method(tmp_path):
+    config = parse(
+        f"unmix-nerf --data {tmp_path} --output-dir out --max-num-iterations 5 --max-seconds 7.5 --seed 3 --device cpu "
+        "--pipeline.model.num-endmembers 7".split()
+    )
+    assert (config.data, config.output_dir, config.seed, config.device) == (tmp_path, Path("out"), 3, "cpu")
+    assert (config.max_num_iterations, config.max_seconds) == (5, 7.5)
+    assert isinstance(config.pipeline.model, UnmixModelConfig)
+    assert config.pipeline.model.num_endmembers == 7
+
+
+@pytest.mark.parametrize(
+    ("words", "iterations", "seconds"),
+    [
+        ("", 10_000, None),
+        ("--max-seconds 60", None, 60.0),
+        ("--max-seconds=60", None, 60.0),
+        ("--max_seconds 60", None, 60.0),
+        ("--max-num-iterations 50", 50, None),
+        ("--max-seconds 60 --max-num-iterations 50", 50, 60.0),
+        ("--max-seconds None", 10_000, None),
+    ],
+)
+def test_a_limit_given_alone_is_the_only_limit(words, iterations, seconds):
+    config = parse(["unmix-nerf", *words.split()])
+    assert (config.max_num_iterations, config.max_seconds) == (iterations, seconds)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["unmix-nref", "--data", "demo"], "did you mean unmix-nerf?"),
+        ([], "say which method to train first"),
+        (["--data", "demo"], "say which method to train first"),
+        (["unmix-nerf"], "give its folder with --data"),
+        (["unmix-nerf", "--data", "no-such-folder"], "no-such-folder"),
+        (["unmix-nerf", "--data", "demo", "--no-such-option"], "--no-such-option"),
+        (["unmix-nerf", "--data", "demo", "--seed", "pi"], "seed"),
+        (["unmix-nerf", "--data", "demo", "--max-seconds", "-1"], "max_seconds > 0"),
+        (["unmix-nerf", "--data", "demo", "--pipeline.model.num-endmembers", "0"], "num-endmembers"),
+        (["unmix-nerf", "--load-run", "no-such-run"], "no run folder at no-such-run"),
+    ],
+)
+def test_a_bad_word_exits_2_with_its_cause_and_writes_nothing(monkeypatch, tmp_path, words, said):
+    monkeypatch.chdir(tmp_path)
+    ended = run(train, *words)
+    assert ended.status == 2
+    assert said in ended.err
+    assert "Traceback" not in ended.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_more_endmembers_than_bands_exit_2_with_both_numbers_and_write_nothing(trained, tmp_path):
+    ended = run(train, *small_training(trained, tmp_path / "out", "--pipeline.model.num-endmembers", 9))
+    assert ended.status == 2
+    assert "num-endmembers is 9 but the scene has 8 bands" in ended.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_cuda_without_cuda_exits_2_and_writes_nothing(trained, tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    ended = run(train, *small_training(trained, tmp_path / "out", "--device", "cuda"))
+    assert ended.status == 2
+    assert "--device cuda, but" in ended.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_broken_plugin_is_a_warning_and_the_others_go_on(monkeypatch):
+    broken = importlib.metadata.EntryPoint("broken", "no_such_module:method", registry.METHOD_GROUP)
+    ours = importlib.metadata.EntryPoint(
+        "unmix-nerf", "unmix_plugin.method_config:unmix_nerf", registry.METHOD_GROUP
+    )
+    monkeypatch.setattr(registry, "entry_points", lambda group: [broken, ours])  # noqa: ARG005
+    ended = run(train, "--help")
+    assert ended.status == 0
+    assert "warning: skipped the plugin broken: ModuleNotFoundError" in ended.err
+    assert "  unmix-nerf  radiance field" in ended.out
+
+
+@pytest.mark.parametrize("words", [["--help"], ["unmix-nerf", "--help"]])
+def test_help_imports_nothing_heavy_but_torch(words):
+    code = (
+        "import sys\nfrom unmix_plugin.commands.entry import run_command\n"
+        "from unmix_plugin.commands.train import train\n"
+        "try:\n    run_command(train, sys.argv[1:])\nfinally:\n"
+        "    heavy = {'warp', 'scipy', 'skimage', 'matplotlib', 'colour', 'PIL', 'tensorboard'} & set(sys.modules)\n"
+        "    print('heavy:', sorted(heavy))"
+    )
+    ended = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout.splitlines()[-1] == "heavy: []"
+    assert "unmix-nerf" in ended.stdout
+
+
+def test_a_defect_exits_1(trained, tmp_path, monkeypatch):
+    def fail(_self):
+        raise ZeroDivisionError("a slip")
+
+    monkeypatch.setattr(Trainer, "_train_step", fail)
+    ended = run(train, *small_training(trained, tmp_path))
+    assert ended.status == 1
+    assert "this is a bug" in ended.err
+
+
+def test_ctrl_c_saves_exits_130_and_says_how_to_go_on_which_then_works(trained, tmp_path, monkeypatch):
+    step = Trainer._train_step
+
+    def interrupted_at_3(self):
+        if self.step == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+        return step(self)
+
+    monkeypatch.setattr(Trainer, "_train_step", interrupted_at_3)
+    ended = run(train, *small_training(trained, tmp_path / "out", "--max-seconds", 1000))
+    monkeypatch.undo()
+    assert ended.status == 130
+    path = Path(ended.last_line.removeprefix("run: "))
+    command = ended.err.splitlines()[-1].removeprefix("go on with: ").split()
+    assert command == ["unmix-train", "unmix-nerf", "--load-run", str(path)]
+    resumed = run(train, *command[1:], "--max-num-iterations", 6)
+    assert resumed.status == 0, resumed.err
+    assert resumed.last_line == f"run: {path}"
+    assert json.loads((path / "training.json").read_text())["steps"] == 6
+    assert (path / "endmembers.csv").is_file()
+
+
+def test_a_finished_run_without_a_larger_limit_says_that_there_is_nothing_to_train(run_copy):
+    ended = run(train, "unmix-nerf", "--load-run", run_copy)
+    assert ended.status == 0
+    assert "nothing to train: the run is at its limit, with 20 steps" in ended.out
+    assert ended.last_line == f"run: {run_copy}"
+
+
+def test_a_run_of_another_method_is_not_gone_on_with(run_copy, monkeypatch):
+    ours = registry.discover_methods()[0]["unmix-nerf"]
+    monkeypatch.setattr(train_module, "find_method", lambda _name: ours)
+    with pytest.raises(ConfigError, match="is a run of unmix-nerf, not of other-nerf"):
+        parse(["other-nerf", "--load-run", str(run_copy)])
+
+
+def test_a_full_disk_while_saving_exits_2_and_says_so(trained, tmp_path, monkeypatch):
+    def full(*_args):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def full_from_the_first_step(self):
+        monkeypatch.setattr(os, "write", full)
+        return step(self)
+
+    step = Trainer._train_step
+    monkeypatch.setattr(Trainer, "_train_step", full_from_the_first_step)
+    ended = run(train, *small_training(trained, tmp_path / "out", "--max-num-iterations", 2))
+    assert ended.status == 2
+    assert "No space left on device" in ended.err
+    assert not list(tmp_path.rglob("*.tmp"))
+    assert not list(tmp_path.rglob("step-*"))

@@ -1,0 +1,46 @@
+"""What commands show while they work."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+ItemT = TypeVar("ItemT")
+
+_PLAIN_INTERVAL_S = 5.0
+
+
+@contextmanager
+def working(console: Console, doing: str) -> Iterator[None]:
+    """Context that shows that something of unknown length is under way; a plain line where there is no terminal."""
+    if not console.is_terminal:
+        say(console, f"{doing} ...")
+        yield
+        return
+    with console.status(doing):
+        yield
+
+
+def follow(console: Console, doing: str, items: Sequence[ItemT]) -> Iterator[ItemT]:
+    """The items, with a bar that shows how many are done; a plain line every few seconds without a terminal."""
+    if console.is_terminal:
+        from rich.progress import track
+
+        yield from track(items, doing, console=console, transient=True)
+        return
+    said_at = time.monotonic()
+    for done, item in enumerate(items):
+        if done == 0 or time.monotonic() - said_at >= _PLAIN_INTERVAL_S:
+            say(console, f"{doing}: {done} of {len(items)} done")
+            said_at = time.monotonic()
+        yield item
+
+
+def say(console: Console, text: str) -> None:
+    """A line as it is: not wrapped, nothing in it taken for markup."""
+    console.print(text, markup=False, highlight=False, soft_wrap=True)
