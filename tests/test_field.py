@@ -15,6 +15,7 @@ def make_field(num_specular: int = 2, scale: str = "shared", temperature: float 
     config = replace(CONFIG.field, scale=scale, temperature=temperature)
     field = UnmixField(config, BOX, 3, num_specular, initial_density=2.0)
     torch.nn.init.normal_(field.table)
+    torch.nn.init.normal_(field.material_network[-1].weight)  # pyright: ignore[reportArgumentType]
     return field
 
 
@@ -40,8 +41,6 @@ def test_abundances_lie_on_the_simplex_and_scales_only_darken(scale):
 def test_an_untrained_field_has_the_initial_density():
     field = make_field()
     torch.nn.init.zeros_(field.table)
-    torch.nn.init.zeros_(field.density_network[-1].bias)
-    torch.nn.init.zeros_(field.density_network[-1].weight)
     assert_close(evaluate(field)[0], torch.full((50,), 2.0))
 
 
@@ -68,11 +67,11 @@ def test_without_a_specular_part_there_are_no_coefficients():
 
 def test_a_point_that_grew_too_dense_can_still_be_thinned():
     field = make_field()
-    torch.nn.init.constant_(field.density_network[-1].bias, 40.0)
+    field.log_initial_density = 40.0
     density, _ = field.get_density(torch.zeros(1, 3))
-    (gradient,) = torch.autograd.grad(density.sum(), field.density_network[-1].bias)
+    (gradient,) = torch.autograd.grad(density.sum(), field.density_network[-1].weight)
     assert torch.isfinite(density).all()
-    assert gradient[0] > 0
+    assert gradient[0].abs().max() > 1
 
 
 def test_direction_features_are_orthogonal_over_the_sphere():

@@ -73,9 +73,9 @@ class CoefficientRenderer(nn.Module):
         In training mode the samples of each ray are shifted at random, drawn from torch's global generator.
         """
         samples = self._march(ray_bundle)
-        kept = samples.select(self._carries_weight(field, samples, ray_bundle))
+        kept, encoded = self._carrying_weight(field, samples, ray_bundle)
         positions, along = _points(kept, ray_bundle)
-        densities, features = field.get_density(positions)
+        densities, features = field.density_of(field.encode(positions, encoded))
         weights = volume_weights(densities * self.step, kept.packed_info)
         outputs = field.get_outputs(positions, along, features)
         names = ("abundances", "scaled_abundances", "specular_coefficients")
@@ -125,11 +125,14 @@ class CoefficientRenderer(nn.Module):
         return march(unit_origins, unit_directions, t_near, t_far, jitter, self.grid.occupied, self.step)
 
     @torch.no_grad()
-    def _carries_weight(
+    def _carrying_weight(
         self, field: UnmixField, samples: PackedSamples, ray_bundle: RayBundle
-    ) -> Bool[Tensor, "S"]:
-        densities, _ = field.get_density(_points(samples, ray_bundle)[0])
-        return volume_weights(densities * self.step, samples.packed_info) > self.config.smallest_weight
+    ) -> tuple[PackedSamples, Float[Tensor, "kept LF"]]:
+        """The samples that send enough of their ray's light to the camera, and their encodings."""
+        encoded = field.encode(_points(samples, ray_bundle)[0])
+        densities, _ = field.density_of(encoded)
+        keep = volume_weights(densities * self.step, samples.packed_info) > self.config.smallest_weight
+        return samples.select(keep), encoded[keep]
 
 
 def sample_distance(config: RendererConfig, scene_box: SceneBox) -> float:

@@ -104,3 +104,15 @@ def test_a_table_of_another_shape_is_refused():
 def test_impossible_layouts_are_refused(sizes, message):
     with pytest.raises(ValueError, match=message):
         HashGridLayout(*sizes)
+
+
+def test_a_known_encoding_is_taken_over_with_the_gradients_of_a_computed_one():
+    positions, table = make(HASHED, 60)
+    for tensor in (positions, table):
+        tensor.requires_grad_()
+    computed = hash_encode(positions, table, HASHED)
+    taken = hash_encode(positions, table, HASHED, known=computed.detach())
+    assert torch.equal(taken, computed)
+    cotangent = torch.randn_like(computed)
+    inputs = (positions, table)
+    assert_close(*(torch.autograd.grad(encoded, inputs, cotangent) for encoded in (taken, computed)))

@@ -27,6 +27,7 @@ from unmix_plugin.engine.load_run import (
     scene_record_to_json,
     write_config,
 )
+from unmix_plugin.engine.memory import keep_freed_memory
 from unmix_plugin.engine.optimizers import build_optimizer, set_learning_rates
 from unmix_plugin.engine.pipeline import Pipeline
 from unmix_plugin.engine.progress import ProgressDisplay, TrainingStatus
@@ -68,6 +69,7 @@ class Trainer:
         config_to_json(config)  # settings that can't be written down are refused before anything is
         self.config = _with_absolute_data(config)
         self.console = console or Console()
+        keep_freed_memory()
         device = resolve_device(config.device)
         seed_everything(config.seed)
         resumed = None if config.load_run is None else open_run_folder(config.load_run)

@@ -65,7 +65,10 @@ class HashGridLayout:
 
 
 def hash_encode(
-    positions: Float[Tensor, "S 3"], table: Float[Tensor, "R F"], layout: HashGridLayout
+    positions: Float[Tensor, "S 3"],
+    table: Float[Tensor, "R F"],
+    layout: HashGridLayout,
+    known: Float[Tensor, "S LF"] | None = None,
 ) -> Float[Tensor, "S LF"]:
     """Interpolated features of every level, concatenated; differentiable once in both tensors.
 
@@ -73,13 +76,15 @@ def hash_encode(
         positions: Points in [0, 1]^3; a point outside takes the extension of the nearest cell.
         table: Features at the vertices, rows laid out as `layout.levels` says.
         layout: The grid's sizes.
+        known: The encoding of these positions, where it was computed before from the same table: it is taken as it
+            is, and only gradients are computed.
     Returns:
         Level after level of `features_per_level` features.
     Raises:
         ValueError: the table's shape isn't the layout's.
     """
     _check_table(table, layout)
-    return _HashEncode.apply(positions.contiguous(), table.contiguous(), layout)  # type: ignore[no-any-return]
+    return _HashEncode.apply(positions.contiguous(), table.contiguous(), layout, known)  # type: ignore[no-any-return]
 
 
 def hash_encode_twin(
@@ -112,13 +117,19 @@ def _check_table(table: Tensor, layout: HashGridLayout) -> None:
 
 class _HashEncode(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, positions: Tensor, table: Tensor, layout: HashGridLayout) -> Tensor:
+    def forward(
+        ctx: Any, positions: Tensor, table: Tensor, layout: HashGridLayout, known: Tensor | None
+    ) -> Tensor:
         from unmix_plugin.rendering._hash_kernels import encode_kernel
 
-        num_samples, (num_levels, width) = len(positions), (layout.num_levels, layout.features_per_level)
         levels = layout.levels.to(positions.device)
-        encoded = positions.new_empty(num_samples, num_levels * width)
-        feature_vector = vector_type(width, table.dtype)
+        ctx.width = layout.features_per_level
+        ctx.save_for_backward(positions, table, levels)
+        if known is not None:
+            return known.view_as(known)
+        num_samples, num_levels = len(positions), layout.num_levels
+        encoded = positions.new_empty(num_samples, num_levels * ctx.width)
+        feature_vector = vector_type(ctx.width, table.dtype)
         launch(
             encode_kernel,
             num_samples * num_levels,
@@ -127,18 +138,16 @@ class _HashEncode(torch.autograd.Function):
                 as_warp(positions, vector_type(3, positions.dtype)),
                 as_warp(table, feature_vector),
                 as_warp(levels),
-                as_warp(encoded.view(num_samples, num_levels, width), feature_vector),
+                as_warp(encoded.view(num_samples, num_levels, ctx.width), feature_vector),
             ],
             positions.device,
             unit=num_samples,
         )
-        ctx.save_for_backward(positions, table, levels)
-        ctx.width = width
         return encoded
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
         from unmix_plugin.rendering._hash_kernels import position_gradient_kernel, table_gradient_kernel
 
         positions, table, levels = ctx.saved_tensors
@@ -175,4 +184,4 @@ class _HashEncode(torch.autograd.Function):
                 ],
                 positions.device,
             )
-        return position_gradient, table_gradient, None
+        return position_gradient, table_gradient, None, None
