@@ -13,7 +13,9 @@ from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.scenes.demo_scene import make_demo_scene
 from unmix_plugin.scenes.scene import SceneOptions
 
-CONFIG = HyperspectralDataManagerConfig(train_num_rays_per_batch=64, carving_resolution=16)
+CONFIG = HyperspectralDataManagerConfig(
+    train_num_rays_per_batch=64, carving_resolution=16, single_ray_until=0.0
+)
 
 
 @pytest.fixture(scope="module")
@@ -112,3 +114,15 @@ def test_the_number_of_rays_can_be_changed(scene_folder):
 def test_impossible_settings_are_refused(settings, message):
     with pytest.raises(ConfigError, match=message):
         replace(CONFIG, **settings)
+
+
+def test_rays_a_pixel_grow_after_the_first_part_of_training_at_the_same_number_of_rays(scene_folder):
+    manager = make(scene_folder, single_ray_until=0.5)
+    (callback,) = manager.get_training_callbacks()
+    pixels = []
+    for progress in (0.0, 0.49, 0.5, 1.0):
+        callback.func(0, progress)
+        bundle, batch = manager.next_train(0)
+        assert len(bundle) == manager.get_train_rays_per_batch() == 64
+        pixels.append(len(batch["spectra"]))
+    assert pixels == [64, 64, 16, 16]

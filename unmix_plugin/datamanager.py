@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from unmix_plugin.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.engine.cameras import Cameras
 from unmix_plugin.engine.data_manager import DataManager, DataManagerConfig
 from unmix_plugin.engine.instantiate import Target
@@ -43,6 +44,8 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
     """How the files are read and split."""
     subpixels: int = 2
     """Rays cast through a pixel, along each of its edges; their mean is the pixel, in training and in rendering."""
+    single_ray_until: float = 0.4
+    """Part of the training in which one ray a pixel has to do: coarse shape needs many pixels rather than exact ones."""
     carving_resolution: int = 128
     """Cells along an edge of the grid in which space that the views show to be empty is carved away."""
     max_initial_pixels: int = 50_000
@@ -58,6 +61,7 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
             "train-num-rays-per-batch of at least 1": self.train_num_rays_per_batch >= 1,
             "eval-num-rays-per-batch of at least 1": self.eval_num_rays_per_batch >= 1,
             "subpixels of 1 to 8": 1 <= self.subpixels <= 8,
+            "single-ray-until in [0, 1]": 0 <= self.single_ray_until <= 1,
             "carving-resolution of 8 to 512": 8 <= self.carving_resolution <= 512,
             "max-initial-pixels of at least 1": self.max_initial_pixels >= 1,
         }
@@ -93,12 +97,13 @@ class HyperspectralDataManager(DataManager):
         self.eval_cameras = self.scene.cameras[list(self.scene.eval_indices)]
         self._device_cameras = self.train_cameras.to(device)
         self._pixels = _PixelTable(self.scene, device)
-        self.set_train_rays_per_batch(config.train_num_rays_per_batch)
+        self._num_rays = config.train_num_rays_per_batch
+        self._subpixels = 1 if config.single_ray_until > 0 else config.subpixels
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
         """Random valid pixels of the training views; the draw depends on (seed, step) only."""
         generator = step_generator(self.seed, step)
-        chosen = self._pixels.draw(self._num_pixels, generator)
+        chosen = self._pixels.draw(self._pixels_for(self._num_rays), generator)
         return self._batch(self._device_cameras, self._pixels, chosen, generator)
 
     def next_eval(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
@@ -135,11 +140,15 @@ class HyperspectralDataManager(DataManager):
 
     def get_train_rays_per_batch(self) -> int:
         """Rays of the next training batch."""
-        return self._num_pixels * self.options.subpixels**2
+        return self._pixels_for(self._num_rays) * self._subpixels**2
 
     def set_train_rays_per_batch(self, num_rays: int) -> None:
         """Let the next training batches have `num_rays` rays, but whole pixels and at least one."""
-        self._num_pixels = self._pixels_for(num_rays)
+        self._num_rays = num_rays
+
+    def get_training_callbacks(self) -> list[TrainingCallback]:
+        """Cast more rays through a pixel once the first part of the training is over."""
+        return [TrainingCallback(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, self._choose_subpixels)]
 
     def metadata(self) -> dict[str, Any]:
         """Bands, light and kind of the scene, and the size of the carving grid."""
@@ -164,7 +173,10 @@ class HyperspectralDataManager(DataManager):
         return self.scene.summary()
 
     def _pixels_for(self, num_rays: int) -> int:
-        return max(1, num_rays // self.options.subpixels**2)
+        return max(1, num_rays // self._subpixels**2)
+
+    def _choose_subpixels(self, step: int, progress: float) -> None:
+        self._subpixels = 1 if progress < self.options.single_ray_until else self.options.subpixels
 
     @property
     def _image_shape(self) -> tuple[int, int]:
@@ -176,7 +188,7 @@ class HyperspectralDataManager(DataManager):
         height, width = self._image_shape
         within = chosen % (height * width)
         corners = torch.stack([within % width, within // width], dim=-1)
-        offsets = _scattered_offsets(len(chosen), self.options.subpixels, generator).to(corners.device)
+        offsets = _scattered_offsets(len(chosen), self._subpixels, generator).to(corners.device)
         points = (corners[:, None] + offsets).flatten(0, 1)
         views = (chosen // (height * width)).repeat_interleave(offsets.shape[1])
         bundle = cameras.generate_rays(views, points)

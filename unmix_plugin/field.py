@@ -36,7 +36,7 @@ class UnmixFieldConfig:
     """Cells along an edge of the scene box on the coarsest level."""
     finest_resolution: int = 256
     """Cells along an edge of the scene box on the finest level."""
-    log2_rows_per_level: int = 17
+    log2_rows_per_level: int = 16
     """Largest number of vertices that a level stores, as a power of two; finer levels share rows by a hash."""
     hidden_width: int = 64
     """Width of the hidden layers."""

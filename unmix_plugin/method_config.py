@@ -19,9 +19,9 @@ unmix_nerf = MethodSpecification(
             model=UnmixModelConfig(),
         ),
         optimizers={
-            "grid": OptimizerConfig(lr=1e-2, final_factor=0.03),
-            "networks": OptimizerConfig(lr=1e-2, final_factor=0.03),
-            "spectra": OptimizerConfig(lr=1e-3, final_factor=0.03),
+            "grid": OptimizerConfig(lr=2e-2, final_factor=0.03),
+            "networks": OptimizerConfig(lr=2e-2, final_factor=0.03),
+            "spectra": OptimizerConfig(lr=2e-3, final_factor=0.03),
         },
     ),
     description="radiance field of spectral images whose every point is a mixture of a few materials",

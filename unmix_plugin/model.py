@@ -66,7 +66,7 @@ class UnmixModelConfig(ModelConfig):
     """Weight of the mean squared error of spectra."""
     rgb_loss_weight: float = 0.0
     """Weight of the mean squared error of their sRGB colours."""
-    samples_per_step: int = 20_000
+    samples_per_step: int = 30_000
     """Samples marched in a training step; the number of rays adapts to it."""
     initial_opacity: float = 0.05
     """Opacity of one sample's interval in the untrained field where a hull of the objects is known."""

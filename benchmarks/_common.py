@@ -1,0 +1,243 @@
+"""What every benchmark needs: verdicts on figures, results as JSON and as a table, commands.
+
+A benchmark is one command without obligatory arguments. It prints a table and writes `results/NAME.json` and
+`results/NAME.md`; a figure that is missed is a result like any other, so the exit code is 0. A `--quick` run shows that
+the benchmark works: its figures mean nothing, and it writes only where `--results` says.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sysconfig
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any, Literal, TypeAlias
+
+from rich.console import Console
+from rich.table import Table
+
+import unmix_plugin.commands  # noqa: F401 - settles how threads wait, which must be before torch is imported
+
+if TYPE_CHECKING:
+    from unmix_plugin.engine.trainer import Trainer
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+RESULTS = Path(__file__).resolve().parent / "results"
+
+Verdict: TypeAlias = Literal["aim reached", "pass", "MISS", "reported"]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One line of a benchmark's table."""
+
+    what: str
+    asked: str
+    reached: str
+    verdict: Verdict
+
+
+@dataclass(frozen=True)
+class Limit:
+    """What a number has to keep to."""
+
+    required: float
+    aim: float | None = None
+    is_upper: bool = False
+    """Whether smaller is better."""
+    unit: str = ""
+
+    def judge(self, what: str, value: float | None) -> Figure:
+        """The line of `value`; one that is not there is missed."""
+        asked = f"{'at most' if self.is_upper else 'at least'} {self._with_unit(self.required)}"
+        if self.aim is not None:
+            asked += f"; aim {self._with_unit(self.aim)}"
+        reached = "nothing measured" if value is None else self._with_unit(value)
+        return Figure(what, asked, reached, self._verdict(value))
+
+    def _verdict(self, value: float | None) -> Verdict:
+        if value is None or not self._keeps(value, self.required):
+            return "MISS"
+        return "aim reached" if self.aim is not None and self._keeps(value, self.aim) else "pass"
+
+    def _keeps(self, value: float, bound: float) -> bool:
+        return value <= bound if self.is_upper else value >= bound
+
+    def _with_unit(self, value: float) -> str:
+        return f"{value:.4g}{self.unit}"
+
+
+def reported(what: str, reached: str) -> Figure:
+    """A line of which nothing is asked."""
+    return Figure(what, "", reached, "reported")
+
+
+def required(what: str, asked: str, holds: bool, reached: str) -> Figure:
+    """A line of something that holds or does not."""
+    return Figure(what, asked, reached, "pass" if holds else "MISS")
+
+
+@dataclass(frozen=True)
+class DetailTable:
+    """A further table, for whoever looks closer."""
+
+    title: str
+    headers: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True)
+class Report:
+    """All that a benchmark found."""
+
+    name: str
+    question: str
+    setting: Mapping[str, Any]
+    """What was run, in JSON's types; no paths."""
+    machine: Mapping[str, Any]
+    figures: Sequence[Figure]
+    measured: Any
+    """Every number behind the figures, in JSON's types."""
+    tables: Sequence[DetailTable] = field(default=())
+
+
+def publish(report: Report, results: Path | None) -> None:
+    """Print the table, and write JSON and Markdown into the folder `results`, if there is one."""
+    console = Console()
+    console.print(_rich_table(report.question, _FIGURE_HEADERS, _figure_rows(report)))
+    for table in report.tables:
+        console.print(_rich_table(table.title, table.headers, table.rows))
+    if results is None:
+        return
+    results.mkdir(parents=True, exist_ok=True)
+    values = asdict(report)
+    (results / f"{report.name}.json").write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
+    (results / f"{report.name}.md").write_text(_markdown(report), encoding="utf-8")
+    print(f"written: {results / report.name}.json and .md")
+
+
+def results_folder(given: Path | None, quick: bool) -> Path | None:
+    """Where to write: where it was said, else `results/` beside the benchmarks; nowhere after a quick run."""
+    return given if given is not None else None if quick else RESULTS
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A command that came to its end."""
+
+    status: int
+    """Exit code; minus the signal's number if it was killed."""
+    output: str
+    """Standard output and standard error."""
+    seconds: float
+    peak_bytes: int
+    """Largest resident size. Linux counts what this process had at the start of the child, so it can be too large."""
+
+    @property
+    def run(self) -> Path:
+        """The run folder that training printed at its end."""
+        named = [line.removeprefix("run: ") for line in self.output.splitlines() if line.startswith("run: ")]
+        return Path(named[-1])
+
+
+def console_script(name: str) -> str:
+    """Path of an installed command of ours."""
+    path = Path(sysconfig.get_path("scripts")) / name
+    if not path.exists():
+        raise SystemExit(
+            f"{name} is not installed beside this Python; run make test once, or pip install -e ."
+        )
+    return str(path)
+
+
+def start(
+    words: Sequence[str], output: IO[bytes], cwd: Path | None = None, env: Mapping[str, str] | None = None
+) -> subprocess.Popen[bytes]:
+    """Start a command whose standard output and standard error go to the file `output`."""
+    return subprocess.Popen(
+        words, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, cwd=cwd, env=env
+    )
+
+
+def run_command(
+    words: Sequence[str],
+    cwd: Path | None = None,
+    env: Mapping[str, str] | None = None,
+    must_succeed: bool = True,
+) -> Ended:
+    """Run a command to its end.
+
+    Raises:
+        SystemExit: it failed but must not; the message has the end of its output.
+    """
+    with tempfile.TemporaryFile() as log:
+        started = time.perf_counter()
+        process = start(words, log, cwd, env)
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        seconds = time.perf_counter() - started
+        log.seek(0)
+        output = log.read().decode(errors="replace")
+    if must_succeed and process.returncode != 0:
+        tail = "\n".join(output.splitlines()[-20:])
+        raise SystemExit(f"{Path(words[0]).name} ended with {process.returncode}:\n{tail}")
+    # macOS gives bytes, Linux units of 1024.
+    unit = 1 if platform.system() == "Darwin" else 1024
+    return Ended(process.returncode, output, seconds, usage.ru_maxrss * unit)
+
+
+def quiet_trainer(words: Sequence[str]) -> Trainer:
+    """What `unmix-train` with these words would train, without its display."""
+    from unmix_plugin.commands.train import parse
+    from unmix_plugin.engine.trainer import Trainer
+
+    with open(os.devnull, "w") as nowhere:  # noqa: PTH123 - a device, not a path
+        return Trainer(parse(list(words)), console=Console(file=nowhere, quiet=True))
+
+
+def json_lines(path: Path) -> list[dict[str, Any]]:
+    """The whole lines of a JSON-lines file that may still be written to; none if it is not there yet."""
+    if not path.exists():
+        return []
+    text = path.read_text(encoding="utf-8")
+    return [json.loads(line) for line in text.splitlines(keepends=True) if line.endswith("\n")]
+
+
+_FIGURE_HEADERS = ("what", "asked", "reached", "verdict")
+
+
+def _figure_rows(report: Report) -> list[tuple[str, ...]]:
+    return [(figure.what, figure.asked, figure.reached, figure.verdict) for figure in report.figures]
+
+
+def _rich_table(title: str, headers: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    table = Table(*headers, title=title, title_justify="left")
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def _markdown(report: Report) -> str:
+    lines = [
+        f"# {report.name}",
+        "",
+        report.question,
+        "",
+        *_markdown_table(_FIGURE_HEADERS, _figure_rows(report)),
+    ]
+    for table in report.tables:
+        lines += ["", f"## {table.title}", "", *_markdown_table(table.headers, table.rows)]
+    lines += ["", "## Setting", "", *(f"- {key}: {value}" for key, value in report.setting.items())]
+    lines += ["", "## Machine", "", *(f"- {key}: {value}" for key, value in report.machine.items())]
+    return "\n".join([*lines, "", f"Made by `python benchmarks/{report.name}.py`.", ""])
+
+
+def _markdown_table(headers: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    cells = [headers, ["---"] * len(headers), *rows]
+    return ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in cells]
