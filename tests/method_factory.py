@@ -20,9 +20,9 @@ BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 CONFIG = UnmixModelConfig(
     num_endmembers=3,
     field=UnmixFieldConfig(
-        num_levels=2, coarsest_resolution=4, finest_resolution=8, log2_rows_per_level=10, hidden_width=16
+        num_levels=2, coarsest_resolution=4, cells_per_pixel=0.34, log2_rows_per_level=10, hidden_width=16
     ),
-    renderer=RendererConfig(samples_across=40, smallest_weight=0.0),
+    renderer=RendererConfig(samples_per_pixel=1.0, smallest_weight=0.0),
 )
 
 
@@ -37,6 +37,7 @@ def make_model(
         "has_alpha": has_alpha,
         "grid_resolution": 8,
         "subpixels": 2,
+        "pixel_size": 0.087,
     }
     model: UnmixModel = replace(CONFIG, **settings).setup(scene_box=BOX, metadata=metadata)
     with torch.no_grad():

@@ -65,7 +65,9 @@ def test_masked_and_invalid_pixels_are_never_drawn(scene_folder, tmp_path):
         cube = np.load(path)
         cube[:, :8] = np.nan
         np.save(path, cube)
-    with pytest.raises(SceneError, match="NaN"):
+    with pytest.raises(
+        SceneError, match=r"(?s)NaN.*invalid_pixels is --pipeline\.datamanager\.scene\.invalid-pixels"
+    ):
         make(folder)
     manager = make(folder, scene=SceneOptions(invalid_pixels="mask"))
     bundle, batch = manager.next_train(0)
@@ -109,7 +111,10 @@ def test_the_number_of_rays_can_be_changed(scene_folder):
 
 @pytest.mark.parametrize(
     ("settings", "message"),
-    [({"subpixels": 0}, "subpixels of 1 to 8"), ({"carving_resolution": 4}, "carving-resolution of 8 to 512")],
+    [
+        ({"subpixels": 0}, "subpixels of 1 to 8"),
+        ({"carving_resolution": 4}, "carving-resolution of 8 to 512"),
+    ],
 )
 def test_impossible_settings_are_refused(settings, message):
     with pytest.raises(ConfigError, match=message):

@@ -5,7 +5,7 @@ import torch
 from torch.testing import assert_close
 
 from tests.method_factory import BOX, CONFIG
-from unmix_plugin.field import UnmixField, direction_features
+from unmix_plugin.field import UnmixField, UnmixFieldConfig, direction_features, finest_resolution
 
 
 def make_field(num_specular: int = 2, scale: str = "shared", temperature: float = 1.0) -> UnmixField:
@@ -13,7 +13,7 @@ def make_field(num_specular: int = 2, scale: str = "shared", temperature: float 
 
     torch.manual_seed(0)
     config = replace(CONFIG.field, scale=scale, temperature=temperature)
-    field = UnmixField(config, BOX, 3, num_specular, initial_density=2.0)
+    field = UnmixField(config, BOX, 3, num_specular, initial_density=2.0, pixel_size=0.087)
     torch.nn.init.normal_(field.table)
     torch.nn.init.normal_(field.material_network[-1].weight)  # pyright: ignore[reportArgumentType]
     return field
@@ -80,3 +80,10 @@ def test_direction_features_are_orthogonal_over_the_sphere():
     correlation = torch.corrcoef(features.T)
     assert_close(correlation, torch.eye(15, dtype=torch.float64), atol=0.02, rtol=0)
     assert features.mean(0).abs().max() < 0.02
+
+
+def test_the_finest_level_follows_the_size_of_a_pixel():
+    sharp, blurred = (
+        finest_resolution(UnmixFieldConfig(cells_per_pixel=2.0), BOX, size) for size in (0.01, 0.04)
+    )
+    assert (sharp, blurred) == (400, 100)

@@ -7,7 +7,7 @@ its area, so several rays are cast through it, one in each cell of a grid on it;
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from unmix_plugin.engine.data_manager import DataManager, DataManagerConfig
 from unmix_plugin.engine.instantiate import Target
 from unmix_plugin.engine.rays import RayBundle
 from unmix_plugin.engine.seeding import step_generator
-from unmix_plugin.errors import ConfigError
+from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.scenes.carving import carve
 from unmix_plugin.scenes.loader import load_scene
 from unmix_plugin.scenes.scene import Scene, SceneOptions
@@ -45,9 +45,11 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
     subpixels: int = 2
     """Rays cast through a pixel, along each of its edges; their mean is the pixel, in training and in rendering."""
     single_ray_until: float = 0.4
-    """Part of the training in which one ray a pixel has to do: coarse shape needs many pixels rather than exact ones."""
+    """Part of the training in which one ray a pixel has to do: coarse shape needs many pixels, not exact ones."""
     carving_resolution: int = 128
     """Cells along an edge of the grid in which space that the views show to be empty is carved away."""
+    open_grid_resolution: int = 64
+    """The same in scenes without alpha, of which nothing can be carved but what no camera sees."""
     max_initial_pixels: int = 50_000
     """Pixels, drawn from all training views, from which the endmembers are initialised."""
 
@@ -63,6 +65,7 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
             "subpixels of 1 to 8": 1 <= self.subpixels <= 8,
             "single-ray-until in [0, 1]": 0 <= self.single_ray_until <= 1,
             "carving-resolution of 8 to 512": 8 <= self.carving_resolution <= 512,
+            "open-grid-resolution of 8 to 512": 8 <= self.open_grid_resolution <= 512,
             "max-initial-pixels of at least 1": self.max_initial_pixels >= 1,
         }
         broken = [rule for rule, holds in rules.items() if not holds]
@@ -91,7 +94,7 @@ class HyperspectralDataManager(DataManager):
         """
         super().__init__(config, data=data, device=device, seed=seed)
         self.options = config
-        self.scene = load_scene(_scene_folder(data), config.scene)
+        self.scene = _load(_scene_folder(data), config.scene)
         self.scene_box = self.scene.scene_box
         self.train_cameras = self.scene.cameras[list(self.scene.train_indices)]
         self.eval_cameras = self.scene.cameras[list(self.scene.eval_indices)]
@@ -157,7 +160,8 @@ class HyperspectralDataManager(DataManager):
             "wavelengths_nm": self.scene.wavelengths_nm.tolist(),
             "illuminant": None if illuminant is None else illuminant.tolist(),
             "has_alpha": self.scene.has_alpha,
-            "grid_resolution": self.options.carving_resolution,
+            "grid_resolution": self._grid_resolution,
+            "pixel_size": self._pixel_size(),
             "subpixels": self.options.subpixels,
         }
 
@@ -165,7 +169,7 @@ class HyperspectralDataManager(DataManager):
         """`pixels`: spectra pooled over all training views; `reachable`: where matter may be."""
         return {
             "pixels": self._pixels.sample_opaque(self.options.max_initial_pixels, self.seed),
-            "reachable": carve(self.scene, self.options.carving_resolution),
+            "reachable": carve(self.scene, self._grid_resolution),
         }
 
     def summary(self) -> dict[str, Any]:
@@ -177,6 +181,17 @@ class HyperspectralDataManager(DataManager):
 
     def _choose_subpixels(self, step: int, progress: float) -> None:
         self._subpixels = 1 if progress < self.options.single_ray_until else self.options.subpixels
+
+    @property
+    def _grid_resolution(self) -> int:
+        options = self.options
+        return options.carving_resolution if self.scene.has_alpha else options.open_grid_resolution
+
+    def _pixel_size(self) -> float:
+        """Edge of a pixel where it looks at the middle of the scene box, median over the training views."""
+        centre = self.scene_box.aabb.mean(dim=0)
+        distances = (self.train_cameras.camera_to_world[:, :, 3] - centre).norm(dim=-1)
+        return float((distances / self.train_cameras.focal_px.mean(dim=-1)).median())
 
     @property
     def _image_shape(self) -> tuple[int, int]:
@@ -238,6 +253,16 @@ class _PixelTable:
         opaque = pool[(self.alpha.cpu()[pool] > 0.99)]
         chosen = opaque[torch.randperm(len(opaque), generator=step_generator(seed, 0))[:count]]
         return self.spectra[chosen.to(self.spectra.device)].cpu().numpy()
+
+
+def _load(folder: Path, options: SceneOptions) -> Scene:
+    """The scene; where an error names an option of it, the option's flag is added."""
+    try:
+        return load_scene(folder, options)
+    except SceneError as error:
+        named = [item.name for item in fields(SceneOptions) if item.name in str(error)]
+        flags = [f"{name} is --pipeline.datamanager.scene.{name.replace('_', '-')}" for name in named]
+        raise SceneError("\n".join([str(error), *flags])) from error
 
 
 def _scene_folder(data: Path) -> Path:

@@ -34,8 +34,9 @@ class UnmixFieldConfig:
     """Features that the hash grid holds at each vertex of a level."""
     coarsest_resolution: int = 16
     """Cells along an edge of the scene box on the coarsest level."""
-    finest_resolution: int = 256
-    """Cells along an edge of the scene box on the finest level."""
+    cells_per_pixel: float = 1.7
+    """Cells of the finest level along the edge of a pixel where it meets the middle of the scene box: finer ones would
+    fit what the views don't show."""
     log2_rows_per_level: int = 16
     """Largest number of vertices that a level stores, as a power of two; finer levels share rows by a hash."""
     hidden_width: int = 64
@@ -62,6 +63,7 @@ class UnmixField(Field):
         num_endmembers: int,
         num_specular: int,
         initial_density: float,
+        pixel_size: float,
     ) -> None:
         """
         Args:
@@ -70,6 +72,7 @@ class UnmixField(Field):
             num_endmembers: K.
             num_specular: J; 0 leaves the view-dependent part out.
             initial_density: Density of the untrained field, per scene unit.
+            pixel_size: Edge of a pixel in the middle of the scene, scene units.
         """
         super().__init__()
         self.config = config
@@ -79,7 +82,7 @@ class UnmixField(Field):
             config.num_levels,
             config.features_per_level,
             config.coarsest_resolution,
-            config.finest_resolution,
+            max(config.coarsest_resolution, finest_resolution(config, scene_box, pixel_size)),
             config.log2_rows_per_level,
         )
         self.register_buffer("aabb", scene_box.aabb.clone())
@@ -139,6 +142,13 @@ class UnmixField(Field):
         return factors[:, :1] * factors[:, 1:]
 
 
+def finest_resolution(config: UnmixFieldConfig, scene_box: SceneBox, pixel_size: float) -> int:
+    """Cells along the scene box's longest edge that give `cells_per_pixel`."""
+    cells = config.cells_per_pixel * float(scene_box.size.max()) / pixel_size
+    return min(math.ceil(cells), LARGEST_RESOLUTION)
+
+
+LARGEST_RESOLUTION = 4096
 NUM_DIRECTION_FEATURES = 15
 
 
@@ -171,5 +181,7 @@ def direction_features(directions: Float[Tensor, "S 3"]) -> Float[Tensor, "S 15"
 def _network(num_inputs: int, width: int, num_outputs: int) -> nn.Sequential:
     # Without biases, as in Mueller et al. 2022: torch copies a bias into the output first, a fifth of the layer's time.
     return nn.Sequential(
-        nn.Linear(num_inputs, width, bias=False), nn.ReLU(inplace=True), nn.Linear(width, num_outputs, bias=False)
+        nn.Linear(num_inputs, width, bias=False),
+        nn.ReLU(inplace=True),
+        nn.Linear(width, num_outputs, bias=False),
     )

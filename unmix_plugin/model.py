@@ -30,7 +30,7 @@ from unmix_plugin.engine.model import Model, ModelConfig
 from unmix_plugin.engine.rays import RayBundle
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.field import UnmixField, UnmixFieldConfig
-from unmix_plugin.renderer import CoefficientRenderer, RendererConfig, sample_distance
+from unmix_plugin.renderer import CoefficientRenderer, RendererConfig
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour import rgb_matrix
 from unmix_plugin.spectral.composition import Coefficients, Materials, SegmentationMethod, compose, spectral
@@ -60,8 +60,9 @@ class UnmixModelConfig(ModelConfig):
     """Spectra of the specular dictionary. The first is the light's, a highlight's colour on anything but metal."""
     segmentation: SegmentationMethod = "abundances"
     """Material of a ray: its largest abundance, or the endmember of smallest angle to its spectrum as published."""
-    background: Literal["random", "black", "white", "last"] = "random"
-    """What lies behind the scene in training: a random grey a ray, black, white, or the colour of the last sample."""
+    background: Literal["auto", "random", "black", "white", "last"] = "auto"
+    """What lies behind the scene in training: a random grey a ray, black, white, or the colour of the last sample. Auto
+    is random where alpha says what is transparent, else black: random greys would reward fog before the cameras."""
     spectral_loss_weight: float = 1.0
     """Weight of the mean squared error of spectra."""
     rgb_loss_weight: float = 0.0
@@ -123,15 +124,20 @@ class UnmixModel(Model):
         num_dictionary = config.num_specular_spectra if config.specular == "dictionary" else 0
         self.specular_spectra = nn.Parameter(torch.zeros(num_dictionary, num_bands))
         opacity = config.initial_opacity if metadata["has_alpha"] else config.initial_opacity_unknown
+        self.renderer = CoefficientRenderer(
+            config.renderer,
+            self.scene_box,
+            pixel_size=metadata["pixel_size"],
+            grid_resolution=metadata["grid_resolution"],
+            close_rays=config.background == "last",
+        )
         self.field = UnmixField(
             config.field,
             self.scene_box,
             config.num_endmembers,
             num_bands if config.specular == "full" else num_dictionary,
-            initial_density=-math.log1p(-opacity) / sample_distance(config.renderer, self.scene_box),
-        )
-        self.renderer = CoefficientRenderer(
-            config.renderer, self.scene_box, metadata["grid_resolution"], config.background == "last"
+            initial_density=-math.log1p(-opacity) / self.renderer.step,
+            pixel_size=metadata["pixel_size"],
         )
         self.register_buffer("rgb_weights", rgb_matrix(self.bands), persistent=False)
         self.register_buffer("every_band", torch.eye(num_bands), persistent=False)
@@ -292,9 +298,10 @@ class UnmixModel(Model):
 
     def _background(self, accumulation: Float[Tensor, "R"]) -> Float[Tensor, "R 1"]:
         shade = torch.zeros_like(accumulation)[:, None]
-        if self.config.background == "random":
+        chosen = self.config.background
+        if chosen == "random" or (chosen == "auto" and self.metadata["has_alpha"]):
             return torch.rand_like(shade)
-        return shade + 1 if self.config.background == "white" else shade
+        return shade + 1 if chosen == "white" else shade
 
     def _depth(self, camera: Cameras, coefficients: Coefficients) -> Float[Tensor, "H W"]:
         bundle = camera.to(self.device).image_rays(0)

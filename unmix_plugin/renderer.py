@@ -27,14 +27,14 @@ from unmix_plugin.spectral.composition import Coefficients
 class RendererConfig:
     """How finely rays are sampled and what is left out."""
 
-    samples_across: int = 384
-    """Samples along the diagonal of the scene box: what sets their distance."""
+    samples_per_pixel: float = 1.5
+    """Samples of a ray along the length of a pixel's edge where it meets the middle of the scene box."""
     smallest_weight: float = 1e-3
     """Samples that send less than this part of their ray's light to the camera are left out."""
     grid_update_interval: int = 16
     """Steps between updates of the occupancy grid."""
-    grid_probed_share: float = 1 / 32
-    """Part of the grid's cells that an update probes."""
+    grid_probed_cells: int = 32_768
+    """Cells of the grid that an update probes."""
     grid_decay: float = 0.5
     """Factor on the remembered density of a probed cell: lower forgets emptied space sooner."""
     grid_smallest_opacity: float = 0.01
@@ -47,19 +47,25 @@ class CoefficientRenderer(nn.Module):
     aabb: Tensor
 
     def __init__(
-        self, config: RendererConfig, scene_box: SceneBox, grid_resolution: int, close_rays: bool
+        self,
+        config: RendererConfig,
+        scene_box: SceneBox,
+        pixel_size: float,
+        grid_resolution: int,
+        close_rays: bool,
     ) -> None:
         """
         Args:
             config: Sampling.
             scene_box: What is rendered, model space.
+            pixel_size: Edge of a pixel in the middle of the scene, scene units.
             grid_resolution: Cells along an edge of the occupancy grid.
             close_rays: The last sample of a ray takes all the light that is left.
         """
         super().__init__()
         self.config = config
         self.close_rays = close_rays
-        self.step = sample_distance(config, scene_box)
+        self.step = pixel_size / config.samples_per_pixel
         self.grid = OccupancyGrid(torch.ones((grid_resolution,) * 3, dtype=torch.bool))
         self.register_buffer("aabb", scene_box.aabb.clone(), persistent=False)
 
@@ -88,16 +94,15 @@ class CoefficientRenderer(nn.Module):
         return Coefficients(parts[0][:, 0], parts[1][:, 0], *parts[2:]), len(samples)
 
     def update_grid(self, field: UnmixField, step: int) -> None:
-        """Probe the field where the grid's turn has come; the first updates of a run probe every cell."""
+        """Probe the field where the grid's turn has come."""
         interval = self.config.grid_update_interval
         if step % interval:
             return
-        num_cells = int(self.grid.occupied.numel() * self.config.grid_probed_share)
         self.grid.update(
             lambda points: field.get_density(points * self._size + self.aabb[0])[0],
             threshold=-math.log1p(-self.config.grid_smallest_opacity) / self.step,
             decay=self.config.grid_decay,
-            num_cells=None if step < 4 * interval else num_cells,
+            num_cells=self.config.grid_probed_cells,
             generator=torch.Generator().manual_seed(int(torch.randint(2**62, (1,)))),
         )
 
@@ -133,11 +138,6 @@ class CoefficientRenderer(nn.Module):
         densities, _ = field.density_of(encoded)
         keep = volume_weights(densities * self.step, samples.packed_info) > self.config.smallest_weight
         return samples.select(keep), encoded[keep]
-
-
-def sample_distance(config: RendererConfig, scene_box: SceneBox) -> float:
-    """Distance of neighbouring samples, scene units."""
-    return float(scene_box.size.norm()) / config.samples_across
 
 
 def _points(

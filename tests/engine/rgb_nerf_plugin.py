@@ -90,7 +90,7 @@ class GridField(Field):
         values = values.T.reshape(*positions.shape[:-1], 4)
         return 10.0 * nn.functional.softplus(values[..., 0]), values[..., 1:]
 
-    def get_outputs(self, positions: Tensor, directions: Tensor, features: Tensor) -> dict[str, Tensor]:  # noqa: ARG002
+    def get_outputs(self, positions: Tensor, directions: Tensor, features: Tensor) -> dict[str, Tensor]:
         return {"rgb": features.sigmoid()}
 
 
@@ -135,7 +135,7 @@ class RgbNerf(Model):
         self,
         outputs: dict[str, Tensor],
         batch: dict[str, Tensor],
-        metrics_dict: dict[str, Tensor] | None = None,  # noqa: ARG002
+        metrics_dict: dict[str, Tensor] | None = None,
     ) -> dict[str, Tensor]:
         return {"rgb_loss": (outputs["rgb"] - batch["rgb"]).square().mean()}
 
@@ -144,7 +144,7 @@ class RgbNerf(Model):
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         return {"psnr": float(self.get_metrics_dict(outputs, batch)["psnr"])}, {"rgb": outputs["rgb"]}
 
-    def next_num_rays(self, outputs: dict[str, Tensor], current: int) -> int | None:  # noqa: ARG002
+    def next_num_rays(self, outputs: dict[str, Tensor], current: int) -> int | None:
         return min(current + 1, 600)
 
 

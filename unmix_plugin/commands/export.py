@@ -34,7 +34,7 @@ class ExportOptions:
     run: Path | None = None
     """Run folder, as training printed it; None takes the newest under --output-dir."""
     output: Path | None = None
-    """Folder to write to; None: exports/ in the run folder."""
+    """Folder to write to; None: exports/ and the product's name, in the run folder."""
     output_dir: Path = Path("outputs")
     """Folder in which to look for the newest run."""
     device: DeviceName = "auto"

@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-_SMALLEST_PART = 256
+_SMALLEST_PART = 512
 """Work items under which a part costs more to hand over than to run."""
 
 
@@ -76,8 +76,7 @@ def launch(kernel: Any, size: int, arguments: Sequence[Any], device: torch.devic
         wp.launch(kernel, dim=size, inputs=[0, *arguments], stream=stream)
         return
     threads = min(torch.get_num_threads(), os.cpu_count() or 1)
-    # Four parts a thread even out parts of unequal cost (rays that leave early, coarse levels).
-    part = unit if unit > 1 else max(_SMALLEST_PART, -(-size // (4 * threads)))
+    part = unit if unit > 1 else max(_SMALLEST_PART, -(-size // threads))
     # Packing parameters and loading modules is not thread-safe in Warp, running a packed launch is.
     commands = [
         wp.launch(

@@ -45,7 +45,10 @@ class Faults:
         """
         if not self._places:
             return
-        lines = [f"{_name_places(places)}: {message}" for message, places in self._places.items()]
+        lines = [
+            message if places == [str(self._root)] else f"{_name_places(places)}: {message}"
+            for message, places in self._places.items()
+        ]
         if len(lines) == 1:
             raise SceneError(f"{self._root}: {lines[0]}")
         listed = [f"  {number}. {line}" for number, line in enumerate(lines[:MAX_LISTED], start=1)]
