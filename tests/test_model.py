@@ -241,3 +241,22 @@ def test_the_same_weights_render_alike_on_cpu_and_gpu():
     on_cpu = model.get_outputs_for_camera(CAMERA, ["spectral"])["spectral"]
     on_gpu = model.to("cuda").get_outputs_for_camera(CAMERA, ["spectral"])["spectral"].cpu()
     assert_close(on_gpu, on_cpu, rtol=1e-3, atol=1e-4)
+
+
+def test_transparency_is_penalised_only_where_no_alpha_says_what_is_solid():
+    batch = {"spectra": torch.zeros(2, NUM_BANDS), "alpha": torch.ones(2)}
+    outputs = {"spectral": torch.zeros(2, NUM_BANDS), "accumulation": torch.tensor([1.0, 0.5])}
+    closed = make_model(has_alpha=False, opacity_loss_weight=0.2).get_loss_dict(outputs, batch)
+    assert float(closed["spectral"]) == 0
+    assert_close(closed["opacity"], torch.tensor(0.2 * 0.125))
+    assert "opacity" not in make_model(has_alpha=True, opacity_loss_weight=0.2).get_loss_dict(outputs, batch)
+
+
+def test_the_automatic_background_is_black_without_alpha_and_random_with_it():
+    batch = {"spectra": torch.zeros(50, NUM_BANDS), "alpha": torch.ones(50)}
+    outputs = {"spectral": torch.zeros(50, NUM_BANDS), "accumulation": torch.zeros(50)}
+    losses = [
+        float(make_model(has_alpha=has).get_loss_dict(outputs, batch)["spectral"]) for has in (False, True)
+    ]
+    assert losses[0] == 0
+    assert 0.2 < losses[1] < 0.5  # the mean square of a grey drawn evenly from [0, 1]

@@ -76,8 +76,8 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
 class HyperspectralDataManager(DataManager):
     """Serves pixels of the training views, drawn evenly from all valid ones.
 
-    A training batch has R P rays, `spectra` (R, B) and `alpha` (R); an image batch has `spectra` (H, W, B), `alpha` (H, W),
-    `valid` (H, W) and, where the scene has them, `labels` (H, W) and `abundances` (H, W, K).
+    A training batch has R P rays, `spectra` (R, B) and `alpha` (R); an image batch has `spectra` (H, W, B),
+    `alpha` (H, W), `valid` (H, W) and, where the scene has them, `labels` (H, W) and `abundances` (H, W, K).
     """
 
     def __init__(

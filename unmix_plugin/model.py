@@ -67,6 +67,8 @@ class UnmixModelConfig(ModelConfig):
     """Weight of the mean squared error of spectra."""
     rgb_loss_weight: float = 0.0
     """Weight of the mean squared error of their sRGB colours."""
+    opacity_loss_weight: float = 0.01
+    """Weight of the mean squared transparency in scenes without alpha, of which every pixel shows something solid."""
     samples_per_step: int = 30_000
     """Samples marched in a training step; the number of rays adapts to it."""
     initial_opacity: float = 0.05
@@ -88,7 +90,10 @@ class UnmixModelConfig(ModelConfig):
             "num-endmembers of 1 to 255": 1 <= self.num_endmembers <= 255,
             "num-specular-spectra of at least 1": self.num_specular_spectra >= 1,
             "samples-per-step of at least 1": self.samples_per_step >= 1,
-            "loss weights of at least 0": min(self.spectral_loss_weight, self.rgb_loss_weight) >= 0,
+            "loss weights of at least 0": min(
+                self.spectral_loss_weight, self.rgb_loss_weight, self.opacity_loss_weight
+            )
+            >= 0,
             "initial opacities in (0, 1)": 0 < self.initial_opacity < 1
             and 0 < self.initial_opacity_unknown < 1,
             "endmember-file exactly when endmember-init is file": (self.endmember_init == "file")
@@ -194,6 +199,8 @@ class UnmixModel(Model):
         losses = {"spectral": self.config.spectral_loss_weight * (predicted - target).square().mean()}
         if self.config.rgb_loss_weight > 0:
             losses["rgb"] = self.config.rgb_loss_weight * srgb_error(predicted, target, self.rgb_weights)
+        if self.config.opacity_loss_weight > 0 and not self.metadata["has_alpha"]:
+            losses["opacity"] = self.config.opacity_loss_weight * (1 - opacities).square().mean()
         return losses
 
     def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:

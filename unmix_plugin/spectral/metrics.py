@@ -47,7 +47,7 @@ def rmse(
     difference = _clamped(pred_image) - target_image.double()
     if valid_mask is not None:
         difference = difference[valid_mask]
-    return math.sqrt(difference.square().mean()) if difference.numel() else math.nan
+    return math.sqrt(float(difference.detach().square().mean())) if difference.numel() else math.nan
 
 
 def rgb_psnr(
@@ -199,7 +199,7 @@ def abundance_rmse(
     if mask is None:
         mask = target.sum(dim=-1) > 0
     difference = (pred - target)[mask]
-    return math.sqrt(difference.square().mean()) if difference.numel() else math.nan
+    return math.sqrt(float(difference.detach().square().mean())) if difference.numel() else math.nan
 
 
 def _clamped(prediction: Tensor) -> Tensor:
