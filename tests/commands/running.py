@@ -16,7 +16,7 @@ from unmix_plugin.commands.entry import run_command
 SMALL_METHOD = [
     "--pipeline.model.samples-per-step=2000",
     "--pipeline.model.field.log2-rows-per-level=10",
-    "--pipeline.model.field.finest-resolution=32",
+    "--pipeline.model.field.cells-per-pixel=1.0",
     "--pipeline.model.field.hidden-width=16",
     "--pipeline.datamanager.carving-resolution=32",
     "--device=cpu",
