@@ -29,7 +29,7 @@ class RendererConfig:
 
     samples_per_pixel: float = 1.5
     """Samples of a ray along the length of a pixel's edge where it meets the middle of the scene box."""
-    smallest_weight: float = 1e-3
+    smallest_weight: float = 4e-3
     """Samples that send less than this part of their ray's light to the camera are left out."""
     grid_update_interval: int = 16
     """Steps between updates of the occupancy grid."""
