@@ -244,11 +244,14 @@ def test_the_same_weights_render_alike_on_cpu_and_gpu():
 
 
 def test_transparency_is_penalised_only_where_no_alpha_says_what_is_solid():
-    batch = {"spectra": torch.zeros(2, NUM_BANDS), "alpha": torch.ones(2)}
-    outputs = {"spectral": torch.zeros(2, NUM_BANDS), "accumulation": torch.tensor([1.0, 0.5])}
+    spectra = torch.tensor([0.5, 0.5, 0.0])[:, None].repeat(
+        1, NUM_BANDS
+    )  # the last pixel is black: it may be void
+    batch = {"spectra": spectra, "alpha": torch.ones(3)}
+    outputs = {"spectral": spectra, "accumulation": torch.tensor([1.0, 0.5, 0.0])}
     closed = make_model(has_alpha=False, opacity_loss_weight=0.2).get_loss_dict(outputs, batch)
     assert float(closed["spectral"]) == 0
-    assert_close(closed["opacity"], torch.tensor(0.2 * 0.125))
+    assert_close(closed["opacity"], torch.tensor(0.2 * 0.25 / 3))
     assert "opacity" not in make_model(has_alpha=True, opacity_loss_weight=0.2).get_loss_dict(outputs, batch)
 
 

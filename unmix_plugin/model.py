@@ -35,7 +35,7 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour import rgb_matrix
 from unmix_plugin.spectral.composition import Coefficients, Materials, SegmentationMethod, compose, spectral
 from unmix_plugin.spectral.endmembers import EndmemberMethod, initialise_endmembers
-from unmix_plugin.spectral.losses import forgive_saturation, over_background, srgb_error
+from unmix_plugin.spectral.losses import forgive_saturation, over_background, solid_evidence, srgb_error
 from unmix_plugin.spectral.metrics import psnr
 from unmix_plugin.spectral.spectra_csv import read_spectra_csv
 
@@ -68,7 +68,8 @@ class UnmixModelConfig(ModelConfig):
     rgb_loss_weight: float = 0.0
     """Weight of the mean squared error of their sRGB colours."""
     opacity_loss_weight: float = 0.01
-    """Weight of the mean squared transparency in scenes without alpha, of which every pixel shows something solid."""
+    """Weight of the mean squared transparency in scenes without alpha, where pixels aren't dark: light comes from
+    something solid, but black may be the void."""
     samples_per_step: int = 30_000
     """Samples marched in a training step; the number of rays adapts to it."""
     initial_opacity: float = 0.05
@@ -200,7 +201,8 @@ class UnmixModel(Model):
         if self.config.rgb_loss_weight > 0:
             losses["rgb"] = self.config.rgb_loss_weight * srgb_error(predicted, target, self.rgb_weights)
         if self.config.opacity_loss_weight > 0 and not self.metadata["has_alpha"]:
-            losses["opacity"] = self.config.opacity_loss_weight * (1 - opacities).square().mean()
+            shown = solid_evidence(batch["spectra"])
+            losses["opacity"] = self.config.opacity_loss_weight * (shown * (1 - opacities).square()).mean()
         return losses
 
     def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:

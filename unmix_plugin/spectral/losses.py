@@ -29,6 +29,18 @@ def forgive_saturation(
     return torch.where((measured >= 1) & (pred_spectra > target_spectra), target_spectra, pred_spectra)
 
 
+_SURELY_LIT = 0.05
+"""Root mean square over bands from which a pixel surely shows something."""
+
+
+def solid_evidence(measured: Float[Tensor, "R B"]) -> Float[Tensor, "R"]:
+    """How far a pixel's light says that it shows something solid, [0, 1]: in proportion to its brightness up to 0.05.
+
+    A black pixel may show a black thing or nothing, such as what lies beside an open room.
+    """
+    return (measured.square().mean(dim=-1).sqrt() / _SURELY_LIT).clamp(max=1)
+
+
 def srgb_error(
     pred_spectra: Float[Tensor, "R B"],
     target_spectra: Float[Tensor, "R B"],
