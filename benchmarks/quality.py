@@ -62,7 +62,8 @@ class Options:
     scenes: Path = _common.REPOSITORY.parent / "shared" / "scenes"
     """Folder of scene folders."""
     only: tuple[str, ...] = ()
-    """Names of the scenes to run; all if none is given."""
+    """Names of the scenes to run; all if none is given. The others keep their earlier results, if they have the same
+    setting."""
     max_seconds: float = 180.0
     """Seconds of training a scene."""
     device: Literal["cpu", "cuda"] = "cpu"
@@ -86,21 +87,32 @@ def main(options: Options) -> None:
         return
     machine = _machine.describe_machine(options.device)
     seconds = 3.0 if options.quick else options.max_seconds
-    measured: dict[str, dict[str, Any]] = {}
-    with ExitStack() as stack:
-        runs = options.runs or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="unmix-quality-")))
-        for folder in folders:
-            measured[folder.name] = measure(folder, seconds, options.device, runs)
     setting = {
         "max_seconds": seconds,
         "device": options.device,
         "options": "defaults, but --pipeline.model.num-endmembers = number of materials",
         "baseline_seeds": list(BASELINE_SEEDS),
     }
+    results = _common.results_folder(options.results, options.quick)
+    measured = earlier(results, setting) if options.only else {}
+    with ExitStack() as stack:
+        runs = options.runs or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="unmix-quality-")))
+        for folder in folders:
+            measured[folder.name] = measure(folder, seconds, options.device, runs)
+    measured = dict(sorted(measured.items()))
     figures = [figure for name, values in measured.items() for figure in judge(name, values)]
     question = f"Evaluation views after {seconds:g} s of training"
     report = _common.Report("quality", question, setting, machine, figures, measured, (details(measured),))
-    _common.publish(report, _common.results_folder(options.results, options.quick))
+    _common.publish(report, results)
+
+
+def earlier(results: Path | None, setting: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """What was measured before with the same setting, by scene."""
+    path = None if results is None else results / "quality.json"
+    if path is None or not path.is_file():
+        return {}
+    report = json.loads(path.read_text(encoding="utf-8"))
+    return report["measured"] if report["setting"] == setting else {}
 
 
 def measure(folder: Path, max_seconds: float, device: str, runs: Path) -> dict[str, Any]:
