@@ -240,3 +240,20 @@ def test_the_model_box_is_centred_and_its_longest_edge_is_two(tmp_path, has_alph
     assert (high - low).max() == pytest.approx(2.0)
     world = scene.normalisation.to_world(scene.scene_box.aabb.double().numpy())
     assert ((world[0] < [500.0, -20.0, 3.0]) & (world[1] > [500.0, -20.0, 3.0])).all()
+
+
+def test_cells_that_too_few_views_see_are_carved_and_the_others_stay():
+    poses = [look_at(np.array([x, -2.0, 0.2]), np.array([x, 0.0, 0.0])) for x in (-0.6, 0.0, 0.6)]
+    cameras = make_cameras(poses)
+    matter = [np.ones((SIDE, SIDE), bool)] * 3
+    kept = [carve_box(cameras, matter, BOX, 24, fewest_views=n) for n in (1, 2, 3)]
+    points = torch.from_numpy(centres(BOX, 24).reshape(-1, 3)).float()
+    count = torch.zeros(len(points))
+    for index in range(3):
+        pixels, depths = cameras.project(points, index)
+        count += ((pixels >= 0) & (pixels <= SIDE)).all(-1) & (depths > 0.1)
+    for n, cells in enumerate(kept, start=1):
+        assert cells.reshape(-1)[(count >= n).numpy()].all()
+    assert kept[0].sum() > kept[1].sum() > kept[2].sum() > 0
+    assert (kept[0] >= kept[1]).all()
+    assert (kept[1] >= kept[2]).all()

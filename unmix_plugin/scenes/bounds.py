@@ -25,6 +25,7 @@ from unmix_plugin.engine.rays import RayBundle
 from unmix_plugin.engine.scene_box import SceneBox
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.carving import carve_box
+from unmix_plugin.scenes.matter_rays import MIN_EXPLAINED, rays_to_matter, share_through
 
 MIN_CONVERGENCE = 1e-3
 """Least mean squared sine between optical axes and their spread direction that still fixes a focus, (1.8 deg)^2."""
@@ -41,10 +42,6 @@ them, as long as the box still explains the images."""
 MIN_CONSISTENT = 0.5
 """Least share of the pixels with matter that must have hull behind them: only gross contradictions fall below, since
 masks that are a little off keep far more."""
-MAX_RAYS = 20_000
-"""Pixels that are asked for this and the next share."""
-MIN_EXPLAINED = 0.999
-"""Share of the pixels with matter whose rays must cross the box."""
 HULL_START = 1.25
 """The first box of the hull over the cameras' cube: room for things that reach out of the images."""
 SEEN_SHARE = 1.0 / 3.0
@@ -68,12 +65,12 @@ def find_bounds(root: Path, cameras: Cameras, matter: list[Bool[np.ndarray, "H W
     centre, half = _cube_of_views(cameras)
     if matter is None:
         return _cut_to_shared_view(cameras, _box(centre - half, centre + half))
-    rays = _rays_to_matter(cameras, matter)
+    rays = rays_to_matter(cameras, matter)
     box = _box(centre - HULL_START * half, centre + HULL_START * half)
     hull = carve_box(cameras, matter, box, HULL_CELLS)
     # Near a camera that looks out of the others' images everything is consistent, so only shared places count.
     count = _count_views(cameras, box, HULL_CELLS)
-    explained = _share_through(rays, box, hull & (count >= HULL_SHARES[0] * count.max()))
+    explained = share_through(rays, box, hull & (count >= HULL_SHARES[0] * count.max()))
     if explained < MIN_CONSISTENT:
         raise SceneError(
             f"{root}: alpha and poses contradict: only {explained:.0%} of the pixels that are not transparent have "
@@ -140,30 +137,6 @@ def _tighten(cameras: Cameras, rays: RayBundle, box: SceneBox, hull: Bool[np.nda
         if float((t_far > t_near).double().mean()) >= MIN_EXPLAINED:
             return tight
     return _extent(box, hull, margin_cells=1)
-
-
-def _rays_to_matter(cameras: Cameras, matter: list[Bool[np.ndarray, "H W"]]) -> RayBundle:
-    """Rays through pixels that may show matter, evenly thinned out to at most `MAX_RAYS`."""
-    flat = np.flatnonzero(np.stack(matter))
-    chosen = torch.from_numpy(flat[:: max(1, -(-len(flat) // MAX_RAYS))])
-    pixel = chosen % (cameras.height * cameras.width)
-    coords = torch.stack([pixel % cameras.width, pixel // cameras.width], dim=-1).float() + 0.5
-    return cameras.generate_rays(chosen // (cameras.height * cameras.width), coords)
-
-
-def _share_through(rays: RayBundle, box: SceneBox, hull: Bool[np.ndarray, "R R R"]) -> float:
-    """Share of the rays that meet a cell of the hull; 0 without rays."""
-    if len(rays) == 0:
-        return 0.0
-    cells = hull.shape[0]
-    t_near, t_far = box.intersect(rays.origins, rays.directions)
-    kept = torch.from_numpy(hull)
-    meets = torch.zeros(len(rays), dtype=torch.bool)
-    for step in torch.linspace(0.0, 1.0, 2 * cells):
-        points = rays.origins + (t_near + step * (t_far - t_near))[:, None] * rays.directions
-        x, y, z = (box.normalise(points) * cells).long().clamp(0, cells - 1).unbind(-1)
-        meets |= kept[x, y, z] & (t_far > t_near)
-    return float(meets.double().mean())
 
 
 def _cell_centres(box: SceneBox, cells: int) -> Float[Tensor, "P 3"]:

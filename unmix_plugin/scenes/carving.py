@@ -4,11 +4,15 @@ A cell stays if some training camera sees it and, where pictures have alpha, no 
 looks through a cell if the cell's whole footprint, widened by a margin, lies in the image on pixels of alpha 0. The
 footprint is the bounding rectangle of the cell's projection, rounded outwards, so the hull errs only towards matter.
 
+With alpha a cell must also be seen by a fair share of the training views: what one or two see is not held by the
+others, and floats there fit single images only.
+
 Notation: `M` cells, `R` cells along an edge; cells are indexed [x, y, z] from the box's smallest corner.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +23,7 @@ from torch import Tensor
 from unmix_plugin.engine.camera_distortion import distort, undistort
 from unmix_plugin.engine.cameras import Cameras
 from unmix_plugin.engine.scene_box import SceneBox
+from unmix_plugin.scenes.matter_rays import MIN_EXPLAINED, rays_to_matter, share_through
 from unmix_plugin.scenes.scene import Scene
 
 PIXEL_MARGIN = 1.0
@@ -29,6 +34,8 @@ COARSEST_CELLS = 16
 """Cells along an edge of the coarsest grid; finer ones look only inside what the coarser left."""
 BORDER_POINTS = 65
 """Points along each image edge when its undistorted bounds are sought."""
+FAIR_SHARE = 0.5
+"""Share of the training views that must see a cell of a scene with alpha, unless that leaves matter unexplained."""
 BLOCK_CELLS = 1 << 15
 """Cells projected together; keeps temporaries within the processor's cache."""
 
@@ -43,8 +50,16 @@ def carve(scene: Scene, resolution: int) -> Bool[np.ndarray, "R R R"]:
         True where matter may be.
     """
     indices = list(scene.train_indices)
-    matter = [matter_mask(scene, index) for index in indices] if scene.has_alpha else None
-    return carve_box(scene.cameras[indices], matter, scene.scene_box, resolution)
+    cameras, box = scene.cameras[indices], scene.scene_box
+    if not scene.has_alpha:
+        return carve_box(cameras, None, box, resolution)
+    matter = [matter_mask(scene, index) for index in indices]
+    fair = carve_box(
+        cameras, matter, box, resolution, fewest_views=max(1, math.ceil(FAIR_SHARE * len(indices)))
+    )
+    if share_through(rays_to_matter(cameras, matter), box, fair) >= MIN_EXPLAINED:
+        return fair
+    return carve_box(cameras, matter, box, resolution)
 
 
 def matter_mask(scene: Scene, index: int) -> Bool[np.ndarray, "H W"]:
@@ -55,7 +70,11 @@ def matter_mask(scene: Scene, index: int) -> Bool[np.ndarray, "H W"]:
 
 
 def carve_box(
-    cameras: Cameras, matter: list[Bool[np.ndarray, "H W"]] | None, box: SceneBox, resolution: int
+    cameras: Cameras,
+    matter: list[Bool[np.ndarray, "H W"]] | None,
+    box: SceneBox,
+    resolution: int,
+    fewest_views: int = 1,
 ) -> Bool[np.ndarray, "R R R"]:
     """Cells of a box that may hold matter, by the given views.
 
@@ -64,6 +83,7 @@ def carve_box(
         matter: For each view True on pixels that may show matter; None where there is no alpha.
         box: What is divided into cells.
         resolution: Cells along each edge, >= 1.
+        fewest_views: Views that must see a cell for it to stay.
     """
     if resolution < 1:
         raise ValueError(f"resolution must be at least 1; got {resolution}")
@@ -79,28 +99,33 @@ def carve_box(
         candidates = np.flatnonzero(kept)
         for first in range(0, len(candidates), BLOCK_CELLS):
             block = candidates[first : first + BLOCK_CELLS]
-            kept.reshape(-1)[block] = _may_hold_matter(block, cells, views, box, near)
+            kept.reshape(-1)[block] = _may_hold_matter(block, cells, views, box, near, fewest_views)
     return kept
 
 
 def _may_hold_matter(
-    flat_cells: Int64[np.ndarray, " M"], cells: int, views: list[_View], box: SceneBox, near: float
+    flat_cells: Int64[np.ndarray, " M"],
+    cells: int,
+    views: list[_View],
+    box: SceneBox,
+    near: float,
+    fewest_views: int,
 ) -> Bool[np.ndarray, " M"]:
     low, size = box.aabb[0].numpy(), box.size.numpy()
     index = np.stack(np.unravel_index(flat_cells, (cells, cells, cells))).astype(np.float32)
     centres = low[:, None] + (index + np.float32(0.5)) * (size / np.float32(cells))[:, None]
     half = size * np.float32(0.5 / cells)
-    seen = np.zeros(len(flat_cells), dtype=bool)
+    seen_by = np.zeros(len(flat_cells), dtype=np.int64)
     alive = np.arange(len(flat_cells))
     for view in views:
-        # With alpha every cell left is looked at by every view; without, only those nobody has seen yet.
-        looked_at = alive if view.covered is not None else alive[~seen[alive]]
+        # With alpha every cell left is looked at by every view; without, only those too few have seen yet.
+        looked_at = alive if view.covered is not None else alive[seen_by[alive] < fewest_views]
         footprint = view.footprint(centres.take(looked_at, axis=1), half)
-        seen[looked_at] |= view.sees(footprint, near)
+        seen_by[looked_at] += view.sees(footprint, near)
         if view.covered is not None:
             alive = alive[~view.looks_through(footprint)]
     result = np.zeros(len(flat_cells), dtype=bool)
-    result[alive] = seen[alive]
+    result[alive] = seen_by[alive] >= fewest_views
     return result
 
 
