@@ -49,7 +49,7 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
     carving_resolution: int = 128
     """Cells along an edge of the grid in which space that the views show to be empty is carved away."""
     open_grid_resolution: int = 64
-    """The same in scenes without alpha, of which nothing can be carved but what no camera sees."""
+    """The same in scenes without alpha, of which nothing can be carved but what few cameras see."""
     max_initial_pixels: int = 50_000
     """Pixels, drawn from all training views, from which the endmembers are initialised."""
 

@@ -1,11 +1,11 @@
 """Which cells of space may hold matter, judged by the training views alone and before any training.
 
-A cell stays if some training camera sees it and, where pictures have alpha, no training view looks through it: a view
+A cell stays if enough training cameras see it and, where pictures have alpha, no training view looks through it: a view
 looks through a cell if the cell's whole footprint, widened by a margin, lies in the image on pixels of alpha 0. The
 footprint is the bounding rectangle of the cell's projection, rounded outwards, so the hull errs only towards matter.
 
-With alpha a cell must also be seen by a fair share of the training views: what one or two see is not held by the
-others, and floats there fit single images only.
+What one or two views see is not held by the others, and what grows there fits single images only: with alpha half of
+the views must see a cell, unless that leaves pixels unexplained, without alpha a tenth.
 
 Notation: `M` cells, `R` cells along an edge; cells are indexed [x, y, z] from the box's smallest corner.
 """
@@ -36,6 +36,9 @@ BORDER_POINTS = 65
 """Points along each image edge when its undistorted bounds are sought."""
 FAIR_SHARE = 0.5
 """Share of the training views that must see a cell of a scene with alpha, unless that leaves matter unexplained."""
+FAIR_SHARE_OPEN = 0.1
+"""The same without alpha, where nothing tells what it leaves unexplained: only what hardly any view sees is carved,
+since walls would be continued there into the void beside a room."""
 BLOCK_CELLS = 1 << 15
 """Cells projected together; keeps temporaries within the processor's cache."""
 
@@ -44,7 +47,7 @@ def carve(scene: Scene, resolution: int) -> Bool[np.ndarray, "R R R"]:
     """Cells of the scene box that may hold matter.
 
     Args:
-        scene: With alpha its hull is carved; without, what no training camera sees.
+        scene: With alpha its hull is carved; without, what hardly any training camera sees.
         resolution: Cells along each edge of the box.
     Returns:
         True where matter may be.
@@ -52,7 +55,8 @@ def carve(scene: Scene, resolution: int) -> Bool[np.ndarray, "R R R"]:
     indices = list(scene.train_indices)
     cameras, box = scene.cameras[indices], scene.scene_box
     if not scene.has_alpha:
-        return carve_box(cameras, None, box, resolution)
+        fewest_views = max(1, math.ceil(FAIR_SHARE_OPEN * len(indices)))
+        return carve_box(cameras, None, box, resolution, fewest_views)
     matter = [matter_mask(scene, index) for index in indices]
     fair = carve_box(
         cameras, matter, box, resolution, fewest_views=max(1, math.ceil(FAIR_SHARE * len(indices)))
