@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -99,7 +100,6 @@ class HyperspectralDataManager(DataManager):
         self.train_cameras = self.scene.cameras[list(self.scene.train_indices)]
         self.eval_cameras = self.scene.cameras[list(self.scene.eval_indices)]
         self._device_cameras = self.train_cameras.to(device)
-        self._pixels = _PixelTable(self.scene, device)
         self._num_rays = config.train_num_rays_per_batch
         self._subpixels = 1 if config.single_ray_until > 0 else config.subpixels
 
@@ -150,7 +150,11 @@ class HyperspectralDataManager(DataManager):
         self._num_rays = num_rays
 
     def get_training_callbacks(self) -> list[TrainingCallback]:
-        """Cast more rays through a pixel once the first part of the training is over."""
+        """Cast more rays through a pixel once the first part of the training is over.
+
+        Asked for before the training clock starts, hence the place to read the training pixels.
+        """
+        _ = self._pixels
         return [TrainingCallback(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, self._choose_subpixels)]
 
     def metadata(self) -> dict[str, Any]:
@@ -175,6 +179,11 @@ class HyperspectralDataManager(DataManager):
     def summary(self) -> dict[str, Any]:
         """The scene's own record: files, splits, normalisation, truth, hashes."""
         return self.scene.summary()
+
+    @cached_property
+    def _pixels(self) -> _PixelTable:
+        """Read when training asks: evaluation needs none of it."""
+        return _PixelTable(self.scene, self.device)
 
     def _pixels_for(self, num_rays: int) -> int:
         return max(1, num_rays // self._subpixels**2)

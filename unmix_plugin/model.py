@@ -33,7 +33,14 @@ from unmix_plugin.field import UnmixField, UnmixFieldConfig
 from unmix_plugin.renderer import CoefficientRenderer, RendererConfig
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour import rgb_matrix
-from unmix_plugin.spectral.composition import Coefficients, Materials, SegmentationMethod, compose, spectral
+from unmix_plugin.spectral.composition import (
+    OCCUPIED_ACCUMULATION,
+    Coefficients,
+    Materials,
+    SegmentationMethod,
+    compose,
+    spectral,
+)
 from unmix_plugin.spectral.endmembers import EndmemberMethod, initialise_endmembers
 from unmix_plugin.spectral.losses import forgive_saturation, over_background, solid_evidence, srgb_error
 from unmix_plugin.spectral.metrics import psnr
@@ -326,7 +333,7 @@ class UnmixModel(Model):
             self.renderer.normals(self.field, bundle[i : i + chunk], distance[i : i + chunk])
             for i in range(0, len(bundle), chunk)
         ]
-        normals = torch.cat(parts) * (coefficients.accumulation.flatten() > 0.5)[:, None]
+        normals = torch.cat(parts) * (coefficients.accumulation.flatten() > OCCUPIED_ACCUMULATION)[:, None]
         return normals.unflatten(0, (camera.height, camera.width))
 
     @torch.no_grad()

@@ -11,7 +11,7 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import cache
 from typing import Any
 
@@ -29,13 +29,9 @@ def warp() -> Any:
     settings: Any = wp.config
     settings.quiet = True
     settings.log_level = getattr(wp, "LOG_ERROR", None)
-    if torch.cuda.is_available():
+    # Without a GPU the native library warns on standard error that there is no driver.
+    with nullcontext() if torch.cuda.is_available() else _standard_error_closed():
         wp.init()
-    else:
-        with (
-            _standard_error_closed()
-        ):  # the native library warns there that a machine without a GPU has no driver
-            wp.init()
     return wp
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 DensityFn = Callable[[Float[Tensor, "S 3"]], Float[Tensor, "S"]]
@@ -30,10 +30,6 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("reachable", reachable.clone())
         self.register_buffer("peak_densities", torch.full(reachable.shape, torch.inf))
         self.register_buffer("occupied", reachable.to(torch.uint8))
-
-    def occupied_cells(self) -> UInt8[Tensor, "X Y Z"]:
-        """Non-zero where rays are to be sampled."""
-        return self.occupied
 
     @property
     def occupied_fraction(self) -> float:
