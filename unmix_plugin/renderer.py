@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from unmix_plugin.engine.rays import RayBundle
 from unmix_plugin.engine.scene_box import SceneBox
-from unmix_plugin.field import UnmixField
+from unmix_plugin.field import CoefficientField
 from unmix_plugin.rendering.compositing import accumulate, volume_weights
 from unmix_plugin.rendering.marching import PackedSamples, march
 from unmix_plugin.rendering.occupancy import OccupancyGrid
@@ -68,12 +68,13 @@ class CoefficientRenderer(nn.Module):
         self.step = pixel_size / config.samples_per_pixel
         self.grid = OccupancyGrid(torch.ones((grid_resolution,) * 3, dtype=torch.bool))
         self.register_buffer("aabb", scene_box.aabb.clone(), persistent=False)
+        self._scene_box = scene_box
 
     def carve(self, reachable: Bool[Tensor, "X Y Z"]) -> None:
         """Start from a grid of which only some cells may ever hold matter."""
         self.grid = OccupancyGrid(reachable).to(self.aabb.device)
 
-    def forward(self, field: UnmixField, ray_bundle: RayBundle) -> tuple[Coefficients, int]:
+    def forward(self, field: CoefficientField, ray_bundle: RayBundle) -> tuple[Coefficients, int]:
         """Composited coefficients of each ray, and how many samples were marched for all.
 
         In training mode the samples of each ray are shifted at random, drawn from torch's global generator.
@@ -93,7 +94,7 @@ class CoefficientRenderer(nn.Module):
         parts = totals.split([column.shape[1] for column in columns], dim=-1)
         return Coefficients(parts[0][:, 0], parts[1][:, 0], *parts[2:]), len(samples)
 
-    def update_grid(self, field: UnmixField, step: int) -> None:
+    def update_grid(self, field: CoefficientField, step: int) -> None:
         """Probe the field where the grid's turn has come."""
         interval = self.config.grid_update_interval
         if step % interval:
@@ -108,7 +109,7 @@ class CoefficientRenderer(nn.Module):
 
     @torch.no_grad()
     def normals(
-        self, field: UnmixField, ray_bundle: RayBundle, ray_distance: Float[Tensor, "R"]
+        self, field: CoefficientField, ray_bundle: RayBundle, ray_distance: Float[Tensor, "R"]
     ) -> Float[Tensor, "R 3"]:
         """Unit normals in model space where the rays end: against the gradient of the log density."""
         with torch.enable_grad():
@@ -119,33 +120,43 @@ class CoefficientRenderer(nn.Module):
         return torch.nn.functional.normalize(-gradient, dim=-1)
 
     @property
+    def _box(self) -> SceneBox:
+        """The scene box where the model is; made once a device, since a box looks at its corners on the host."""
+        if self._scene_box.aabb is not self.aabb:
+            self._scene_box = SceneBox(self.aabb)
+        return self._scene_box
+
+    @property
     def _size(self) -> Float[Tensor, "3"]:
         return self.aabb[1] - self.aabb[0]
 
     def _march(self, ray_bundle: RayBundle) -> PackedSamples:
         origins, directions = ray_bundle.origins, ray_bundle.directions
-        t_near, t_far = SceneBox(self.aabb).intersect(origins, directions)
+        t_near, t_far = self._box.intersect(origins, directions)
         jitter = torch.rand_like(t_near) if self.training else torch.full_like(t_near, 0.5)
         unit_origins, unit_directions = (origins - self.aabb[0]) / self._size, directions / self._size
         return march(unit_origins, unit_directions, t_near, t_far, jitter, self.grid.occupied, self.step)
 
     @torch.no_grad()
     def _carrying_weight(
-        self, field: UnmixField, samples: PackedSamples, ray_bundle: RayBundle
+        self, field: CoefficientField, samples: PackedSamples, ray_bundle: RayBundle
     ) -> tuple[PackedSamples, Float[Tensor, "kept LF"]]:
         """The samples that send enough of their ray's light to the camera, and their encodings."""
         encoded = field.encode(_points(samples, ray_bundle)[0])
         densities, _ = field.density_of(encoded)
         keep = volume_weights(densities * self.step, samples.packed_info) > self.config.smallest_weight
-        return samples.select(keep), encoded[keep]
+        return samples.select(keep), encoded.index_select(0, keep.nonzero()[:, 0])
 
 
 def _points(
     samples: PackedSamples, ray_bundle: RayBundle
 ) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3"]]:
     """Positions of samples and the directions they are seen along."""
-    along = ray_bundle.directions[samples.ray_indices]
-    return ray_bundle.origins[samples.ray_indices] + samples.t[:, None] * along, along
+    # index_select: a third of the time of indexing by a tensor, and this is done for every sample.
+    origins, along = (
+        x.index_select(0, samples.ray_indices) for x in (ray_bundle.origins, ray_bundle.directions)
+    )
+    return origins + samples.t[:, None] * along, along
 
 
 def _rest_on_last_sample(
@@ -155,5 +166,5 @@ def _rest_on_last_sample(
     starts, counts = samples.packed_info.unbind(-1)
     if len(values) == 0:
         return values.new_zeros(len(starts), values.shape[1])
-    last = values[(starts + counts - 1).clamp(min=0)]
+    last = values.index_select(0, (starts + counts - 1).clamp(min=0))
     return torch.where(counts > 0, 1 - accumulation, 0.0)[:, None] * last

@@ -103,6 +103,19 @@ def test_extreme_densities_give_finite_values_and_gradients(extreme):
     assert torch.isfinite(tau.grad).all()
 
 
+def test_behind_something_opaque_there_is_exactly_no_light():
+    """Numbers between 0 and the smallest of normal exponent are a hundred times slower on a CPU than 0 itself."""
+    tau = torch.full((200,), 1.0, requires_grad=True)
+    weights = volume_weights(tau, pack([200]))
+    (gradient,) = torch.autograd.grad(
+        weights, tau, torch.randn(200, generator=torch.Generator().manual_seed(0))
+    )
+    for values in (weights.detach(), gradient):
+        assert (values[:40] != 0).all()
+        assert (values[60:] == 0).all()
+        assert (values[values != 0].abs() > 1e-30).all()
+
+
 def test_a_ray_without_samples_totals_zero():
     weights, values, packed_info = make([0, 2, 0])
     totals = accumulate(weights, values, packed_info)

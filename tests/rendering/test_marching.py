@@ -50,6 +50,30 @@ def test_a_full_grid_is_sampled_at_every_step():
     assert samples.packed_info.tolist() == [[0, 10]]
 
 
+@pytest.mark.parametrize("step", [1 / 64, 0.1, 0.05, 1 / 3, 0.013, 2.0])
+def test_every_lattice_point_in_front_of_the_far_end_is_taken_and_none_at_it(step):
+    n = 200
+    origins, directions = torch.full((n, 3), 0.5), torch.tensor([[0.25, 0.0, 0.0]]).repeat(n, 1)
+    g = torch.Generator().manual_seed(0)
+    t_near, jitter = torch.rand(n, generator=g), torch.rand(n, generator=g)
+    jitter[: n // 2] = 0.0
+    # Far ends lie on a lattice point, as little behind one as can be, or anywhere.
+    t_far = t_near + jitter * step + torch.arange(n) * step
+    t_far[1::3] = torch.nextafter(t_far[1::3], torch.tensor(torch.inf))
+    t_far[2::3] += torch.rand(len(t_far[2::3]), generator=g) * step
+    samples = march(origins, directions, t_near, t_far, jitter, torch.ones(2, 2, 2).byte(), step)
+    lattice = (t_near + jitter * step)[:, None] + torch.arange(n + 3) * step
+    assert torch.equal(samples.packed_info[:, 1], (lattice < t_far[:, None]).sum(dim=1))
+
+
+def test_a_grid_may_mark_occupied_cells_with_any_number():
+    rays = make_rays(50)
+    marked = (torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(1)) < 0.4).byte()
+    once, many = march(*rays, marked, 0.03), march(*rays, marked * 255, 0.03)
+    assert torch.equal(once.packed_info, many.packed_info)
+    assert torch.equal(once.t, many.t)
+
+
 def test_only_the_occupied_slab_is_sampled_and_its_samples_measure_it():
     occupied = torch.zeros(8, 1, 1).byte()
     occupied[2:5] = 1

@@ -62,3 +62,15 @@ def test_a_thin_density_everywhere_stays_visible():
     """The threshold never exceeds the mean, so a faint scene isn't taken for empty space."""
     grid = updated(full(4), lambda points: 0.01 + 0.01 * points[:, 0], times=3)
     assert 0 < grid.occupied_fraction < 1
+
+
+def test_a_grid_that_was_loaded_goes_on_like_the_one_that_was_saved():
+    reachable = torch.rand(6, 6, 6, generator=torch.Generator().manual_seed(0)) < 0.5
+    saved = updated(OccupancyGrid(reachable), ball, times=3, num_cells=40)
+    loaded = full(6)
+    loaded.load_state_dict(saved.state_dict())
+    for grid in (saved, loaded):
+        updated(grid, ball, times=5, num_cells=40, seed=1)
+    assert torch.equal(loaded.peak_densities, saved.peak_densities)
+    assert torch.equal(loaded.occupied, saved.occupied)
+    assert not loaded.occupied[~reachable].any()

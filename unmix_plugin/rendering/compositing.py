@@ -84,7 +84,7 @@ class _Accumulate(torch.autograd.Function):
     def forward(ctx: Any, weights: Tensor, values: Tensor, packed_info: Tensor) -> Tensor:
         from unmix_plugin.rendering._compositing_kernels import accumulate_kernel
 
-        totals = values.new_zeros(len(packed_info), values.shape[1])
+        totals = values.new_empty(len(packed_info), values.shape[1])
         arrays = [as_warp(x) for x in (weights, values, packed_info, totals)]
         launch(accumulate_kernel, len(packed_info), arrays, weights.device)
         ctx.save_for_backward(weights, values, packed_info)

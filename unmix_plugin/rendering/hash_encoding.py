@@ -9,7 +9,7 @@ Source: Mueller et al. 2022, Instant Neural Graphics Primitives, section 3.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import torch
@@ -58,7 +58,7 @@ class HashGridLayout:
             first += num_rows
         return torch.tensor(rows, dtype=torch.int32)
 
-    @property
+    @cached_property
     def num_rows(self) -> int:
         """Rows of the table over all levels."""
         return int(self.levels[-1, 1] + self.levels[-1, 2])
@@ -109,6 +109,12 @@ def hash_encode_twin(
     return torch.cat(encoded, dim=-1)
 
 
+@cache
+def _levels_on(layout: HashGridLayout, device: torch.device) -> Int[Tensor, "L 3"]:
+    """The layout's levels where the kernels read them: copied there once, not at each call."""
+    return layout.levels.to(device)
+
+
 def _check_table(table: Tensor, layout: HashGridLayout) -> None:
     expected = (layout.num_rows, layout.features_per_level)
     if tuple(table.shape) != expected:
@@ -122,7 +128,7 @@ class _HashEncode(torch.autograd.Function):
     ) -> Tensor:
         from unmix_plugin.rendering._hash_kernels import encode_kernel
 
-        levels = layout.levels.to(positions.device)
+        levels = _levels_on(layout, positions.device)
         ctx.width = layout.features_per_level
         ctx.save_for_backward(positions, table, levels)
         if known is not None:
@@ -134,14 +140,12 @@ class _HashEncode(torch.autograd.Function):
             encode_kernel,
             num_samples * num_levels,
             [
-                num_samples,
                 as_warp(positions, vector_type(3, positions.dtype)),
                 as_warp(table, feature_vector),
                 as_warp(levels),
                 as_warp(encoded.view(num_samples, num_levels, ctx.width), feature_vector),
             ],
             positions.device,
-            unit=num_samples,
         )
         return encoded
 
@@ -160,15 +164,9 @@ class _HashEncode(torch.autograd.Function):
             launch(
                 table_gradient_kernel,
                 num_samples * num_levels,
-                [
-                    num_samples,
-                    as_warp(positions, point),
-                    incoming,
-                    as_warp(levels),
-                    as_warp(table_gradient, features),
-                ],
+                [as_warp(positions, point), incoming, as_warp(levels), as_warp(table_gradient, features)],
                 positions.device,
-                unit=num_samples,
+                cpu_part=num_samples,
             )
         if ctx.needs_input_grad[0]:
             position_gradient = torch.empty_like(positions)

@@ -1,8 +1,11 @@
 """Where Warp kernels are launched from torch tensors: one call for CUDA and for CPU threads.
 
-A kernel's first parameter is the index of its first work item. On CUDA the whole range is one launch on torch's
-current stream. Warp's CPU launches are serial but release the interpreter lock, so there the range is cut into parts
-that run on a thread pool; parts must not write to the same address, which is why callers name the unit that may be cut.
+A kernel's first three parameters are `first`, `end` and `stride`: thread i works on the items `first + i`,
+`first + i + stride`, ... below `end`. On CUDA the whole range is one launch on torch's current stream, where each item
+has a thread. On a CPU a Warp launch is one loop that enters the kernel anew for each of Warp's threads; so there the
+range is cut into parts, each a launch of one thread that walks its items itself, which lets the compiler take out of
+the loop what they share. Launches release the interpreter lock and parts run on a thread pool; two parts must not write
+to the same address, which is why a caller may say where the range is cut.
 """
 
 from __future__ import annotations
@@ -12,13 +15,20 @@ import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
 from functools import cache
+from threading import Lock
 from typing import Any
 
 import torch
 
 _SMALLEST_PART = 512
 """Work items under which a part costs more to hand over than to run."""
+_PARTS_PER_THREAD = 2
+"""Parts are smaller than a thread's share, so that a thread that the machine holds up leaves its work to the others."""
+
+_PACKING = Lock()
+"""Packing parameters and loading modules is not thread-safe in Warp, running a packed launch is."""
 
 
 @cache
@@ -49,47 +59,101 @@ def _standard_error_closed() -> Iterator[None]:
         os.close(saved)
 
 
+@dataclass(frozen=True)
+class KernelArray:
+    """The memory of a tensor as a kernel takes it."""
+
+    descriptor: Any
+    """Warp's description of the memory; it keeps the tensor alive."""
+    annotation: Any
+    """Warp's type of the array."""
+
+
+def as_warp(tensor: torch.Tensor, dtype: Any = None) -> KernelArray:
+    """A tensor's memory without its gradient, since Warp must never own torch's.
+
+    Args:
+        tensor: Any tensor; for a vector `dtype` its last axis is contiguous and has the vector's length.
+        dtype: Warp type of an element; None for the tensor's own.
+    """
+    wp = warp()
+    plain = tensor.detach()
+    is_vector = dtype is not None and hasattr(dtype, "_shape_")
+    dtype = wp.dtype_from_torch(tensor.dtype) if dtype is None else dtype
+    descriptor = wp.from_torch(plain, dtype=dtype, requires_grad=False, return_ctype=True)
+    return KernelArray(descriptor, _array_type(dtype, tensor.dim() - is_vector))
+
+
+def launch(
+    kernel: Any,
+    size: int,
+    arguments: Sequence[KernelArray | float],
+    device: torch.device,
+    cpu_part: int | None = None,
+) -> None:
+    """Run `kernel(first, end, stride, *arguments)` so that each of `size` work items is done once.
+
+    Args:
+        kernel: Warp kernel with the three parameters that the head of this module describes.
+        size: Number of work items; zero launches nothing.
+        arguments: Remaining parameters.
+        device: Torch device of the arrays.
+        cpu_part: Work items of a part on a CPU, where those that write to the same address must be in one part; None
+            if the range may be cut anywhere.
+    """
+    if size == 0:
+        return
+    wp = warp()
+    types = tuple(x.annotation if isinstance(x, KernelArray) else type(x) for x in arguments)
+    values = [x.descriptor if isinstance(x, KernelArray) else x for x in arguments]
+    if device.type == "cuda":
+        with _PACKING:
+            stream = wp.stream_from_torch(torch.cuda.current_stream(device))
+            wp.launch(_specialised(kernel, types), dim=size, inputs=[0, size, size, *values], stream=stream)
+        return
+    threads = min(torch.get_num_threads(), os.cpu_count() or 1)
+    part = cpu_part or max(_SMALLEST_PART, -(-size // (_PARTS_PER_THREAD * threads)))
+    with _PACKING:
+        concrete = _specialised(kernel, types)
+        ranges = [(first, min(first + part, size)) for first in range(0, size, part)]
+        commands = [
+            wp.launch(concrete, dim=1, inputs=[first, end, 1, *values], device="cpu", record_cmd=True)
+            for first, end in ranges
+        ]
+    _run(commands, threads)
+
+
+def _run(commands: Sequence[Any], threads: int) -> None:
+    """Run packed launches on this thread and on others that have nothing else to do."""
+    # One iterator for all threads, whose steps the interpreter doesn't interrupt: each command is taken once.
+    waiting = iter(commands)
+
+    def work() -> None:
+        for command in waiting:
+            command.launch()
+
+    num_helpers = min(threads, len(commands)) - 1
+    helpers = [_pool(threads - 1).submit(work) for _ in range(num_helpers)]
+    work()
+    for helper in helpers:
+        if not helper.cancel():
+            helper.result()
+
+
 @cache
 def _pool(num_threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(num_threads, thread_name_prefix="unmix-kernel")
 
 
-def launch(kernel: Any, size: int, arguments: Sequence[Any], device: torch.device, unit: int = 1) -> None:
-    """Run `kernel(first, *arguments)` for `size` work items.
-
-    Args:
-        kernel: Warp kernel whose first parameter is an int offset to be added to `wp.tid()`.
-        size: Number of work items; zero launches nothing.
-        arguments: Remaining parameters: Warp arrays and numbers.
-        device: Torch device of the arrays.
-        unit: Work items that must stay in one CPU part, since they may write to the same address.
-    """
-    if size == 0:
-        return
-    wp = warp()
-    if device.type == "cuda":
-        stream = wp.stream_from_torch(torch.cuda.current_stream(device))
-        wp.launch(kernel, dim=size, inputs=[0, *arguments], stream=stream)
-        return
-    threads = min(torch.get_num_threads(), os.cpu_count() or 1)
-    part = unit if unit > 1 else max(_SMALLEST_PART, -(-size // threads))
-    # Packing parameters and loading modules is not thread-safe in Warp, running a packed launch is.
-    commands = [
-        wp.launch(
-            kernel, dim=min(part, size - first), inputs=[first, *arguments], device="cpu", record_cmd=True
-        )
-        for first in range(0, size, part)
-    ]
-    if threads == 1 or len(commands) == 1:
-        for command in commands:
-            command.launch()
-    else:
-        list(_pool(threads).map(lambda command: command.launch(), commands))
+@cache
+def _specialised(kernel: Any, types: tuple[Any, ...]) -> Any:
+    """The kernel for arguments of these types: found once, since Warp would infer them at each launch of a part."""
+    return warp().overload(kernel, [int, int, int, *types]) if kernel.is_generic else kernel
 
 
-def as_warp(tensor: torch.Tensor, dtype: Any = None) -> Any:
-    """A Warp view of a contiguous tensor's memory, without its gradient (Warp must never own torch's)."""
-    return warp().from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
+@cache
+def _array_type(dtype: Any, ndim: int) -> Any:
+    return warp().array(dtype=dtype, ndim=ndim)
 
 
 @cache

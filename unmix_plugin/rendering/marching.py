@@ -36,7 +36,10 @@ class PackedSamples:
         starts = kept_before[self.packed_info[:, 0]]
         ends = kept_before[self.packed_info[:, 0] + self.packed_info[:, 1]]
         packed_info = torch.stack([starts, ends - starts], dim=-1)
-        return PackedSamples(self.t[keep], self.ray_indices[keep], packed_info, self.step)
+        kept = keep.nonzero()[:, 0]
+        return PackedSamples(
+            self.t.index_select(0, kept), self.ray_indices.index_select(0, kept), packed_info, self.step
+        )
 
 
 def march(
@@ -63,28 +66,26 @@ def march(
 
     _check_step(step)
     device, point = origins.device, vector_type(3, torch.float32)
-    sides = torch.tensor(occupied.shape, dtype=torch.float32, device=device)
-    t_first = (t_near + jitter * step).contiguous()
-    cell_origins, cell_directions = origins * sides, directions * sides
     rays = [
-        as_warp(cell_origins, point),
-        as_warp(cell_directions, point),
-        as_warp(t_first),
+        as_warp(origins.contiguous(), point),
+        as_warp(directions.contiguous(), point),
+        as_warp(t_near.contiguous()),
         as_warp(t_far.contiguous()),
+        as_warp(jitter.contiguous()),
         step,
         as_warp(occupied.contiguous()),
     ]
     counts = torch.empty(len(origins), dtype=torch.int64, device=device)
     launch(count_kernel, len(origins), [*rays, as_warp(counts)], device)
     ends = counts.cumsum(0)
-    starts = ends - counts
+    packed_info = torch.stack([ends - counts, counts], dim=-1)
     total = int(ends[-1]) if len(ends) else 0
     t_samples = torch.empty(total, dtype=torch.float32, device=device)
     ray_indices = torch.empty(total, dtype=torch.int64, device=device)
     if total:
-        written = [as_warp(starts), as_warp(ray_indices), as_warp(t_samples)]
+        written = [as_warp(packed_info), as_warp(ray_indices), as_warp(t_samples)]
         launch(write_kernel, len(origins), [*rays, *written], device)
-    return PackedSamples(t_samples, ray_indices, torch.stack([starts, counts], dim=-1), step)
+    return PackedSamples(t_samples, ray_indices, packed_info, step)
 
 
 def march_twin(

@@ -23,6 +23,7 @@ class OccupancyGrid(nn.Module):
     peak_densities: Tensor
     occupied: Tensor
     reachable: Tensor
+    reachable_cells: Tensor
 
     def __init__(self, reachable: Bool[Tensor, "X Y Z"]) -> None:
         """Start with every cell occupied that `reachable` allows; the others stay empty for ever."""
@@ -30,6 +31,8 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("reachable", reachable.clone())
         self.register_buffer("peak_densities", torch.full(reachable.shape, torch.inf))
         self.register_buffer("occupied", reachable.to(torch.uint8))
+        self.register_buffer("reachable_cells", _flat_indices(reachable), persistent=False)
+        self.register_load_state_dict_post_hook(_find_reachable_cells)
 
     @property
     def occupied_fraction(self) -> float:
@@ -61,16 +64,17 @@ class OccupancyGrid(nn.Module):
         peaks = self.peak_densities.view(-1)
         known = torch.where(torch.isinf(peaks[cells]), 0.0, peaks[cells] * decay)
         peaks[cells] = torch.maximum(known, densities)
-        reachable_peaks = peaks[self.reachable.view(-1)]
-        finite = reachable_peaks[torch.isfinite(reachable_peaks)]
-        limit = min(threshold, float(finite.mean())) if len(finite) else threshold
-        self.occupied.copy_((self.peak_densities > limit) & self.reachable)
+        reachable_peaks = peaks[self.reachable_cells]
+        is_known = torch.isfinite(reachable_peaks)
+        known_peaks = reachable_peaks if bool(is_known.all()) else reachable_peaks[is_known]
+        limit = min(threshold, float(known_peaks.mean())) if len(known_peaks) else threshold
+        self.occupied.view(-1)[self.reachable_cells] = (reachable_peaks > limit).to(torch.uint8)
 
     def _choose_cells(self, num_cells: int | None, generator: torch.Generator) -> Int[Tensor, "N"]:
-        reachable = self.reachable.view(-1).nonzero()[:, 0]
+        reachable = self.reachable_cells
         if num_cells is None or num_cells >= len(reachable):
             return reachable
-        occupied = self.occupied.view(-1).nonzero()[:, 0]
+        occupied = reachable[self.occupied.view(-1)[reachable] != 0]
         chosen = [
             pool[torch.randint(len(pool), (num_cells // 2,), generator=generator).to(pool.device)]
             for pool in (reachable, occupied)
@@ -82,3 +86,12 @@ class OccupancyGrid(nn.Module):
         _, side_y, side_z = self.occupied.shape
         x, rest = cells // (side_y * side_z), cells % (side_y * side_z)
         return torch.stack([x, rest // side_z, rest % side_z], dim=-1).float()
+
+
+def _flat_indices(reachable: Bool[Tensor, "X Y Z"]) -> Int[Tensor, "N"]:
+    return reachable.view(-1).nonzero()[:, 0]
+
+
+def _find_reachable_cells(grid: OccupancyGrid, _: object) -> None:
+    """Which cells are reachable is kept as indices too: searching the whole grid takes longer than an update."""
+    grid.reachable_cells = _flat_indices(grid.reachable)

@@ -1,0 +1,48 @@
+"""The renderer of coefficients, apart from the model that owns it."""
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from unmix_plugin import renderer as renderer_module
+from unmix_plugin.engine.rays import RayBundle
+from unmix_plugin.engine.scene_box import SceneBox
+from unmix_plugin.field import UnmixField, UnmixFieldConfig
+from unmix_plugin.renderer import CoefficientRenderer, RendererConfig
+
+BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
+PIXEL = 0.1
+
+
+def make(box: SceneBox = BOX) -> tuple[CoefficientRenderer, UnmixField]:
+    torch.manual_seed(0)
+    field = UnmixField(UnmixFieldConfig(log2_rows_per_level=8), box, 3, 1, 1.0, PIXEL)
+    return CoefficientRenderer(RendererConfig(), box, PIXEL, 8, close_rays=False).eval(), field
+
+
+def rays(num_rays: int) -> RayBundle:
+    generator = torch.Generator().manual_seed(1)
+    targets = torch.rand(num_rays, 3, generator=generator) - 0.5
+    origins = torch.tensor([0.0, 0.0, 3.0]).repeat(num_rays, 1)
+    directions = torch.nn.functional.normalize(targets - origins, dim=-1)
+    return RayBundle(origins, directions, torch.zeros(num_rays, dtype=torch.int64))
+
+
+def test_a_homogeneous_box_absorbs_what_beer_lambert_says():
+    renderer, field = make()
+    bundle = rays(20)
+    with torch.no_grad():
+        field.table.zero_()  # then the network's output is zero, and the density its initial value
+        coefficients, num_samples = renderer(field, bundle)
+    t_near, t_far = BOX.intersect(bundle.origins, bundle.directions)
+    assert num_samples == pytest.approx(((t_far - t_near) / renderer.step).sum().item(), rel=0.02)
+    assert_close(coefficients.accumulation, 1 - torch.exp(-(t_far - t_near)), atol=0.02, rtol=0)
+    assert_close(coefficients.abundances.sum(-1), coefficients.accumulation)
+
+
+def test_a_render_does_not_look_at_the_corners_of_the_box_again(monkeypatch):
+    """On a GPU each look would wait for all that was asked of it before."""
+    renderer, field = make()
+    renderer(field, rays(3))
+    monkeypatch.setattr(renderer_module, "SceneBox", None)
+    assert renderer(field, rays(3))[1] > 0
