@@ -1,0 +1,239 @@
+"""`unmix-render`: that files are the model's, from any camera, edited or not, and that nothing is lost."""
+
+import json
+import os
+import shutil
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+
+from tests.commands.running import run
+from tests.exports.formats.cubes import full_disk
+from tests.exports.formats.video_reading import read_video
+from tests.exports.render_factory import read_envi, read_exr
+from unmix_plugin.commands.render import render
+from unmix_plugin.engine.load_run import load_model
+from unmix_plugin.exports.edited_run import load_edited_model
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_wait_for_the_disk():
+    """Many small files would otherwise be forced to disk one by one."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda _descriptor: None)
+        yield
+
+
+def files(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+def rendered(loaded, index, *names):
+    """What the model itself renders of an evaluation view."""
+    outputs = loaded.model.get_outputs_for_camera(loaded.scene.eval_cameras[index], names)
+    return [outputs[name].numpy() for name in names]
+
+
+def test_by_default_every_evaluation_view_is_written_in_what_suits_each_output(trained, tmp_path):
+    ended = run(render, "--run", trained.run, "--output", tmp_path, "--device", "cpu")
+    assert ended.status == 0, ended.err
+    views = ("eval_002", "eval_006")
+    assert files(tmp_path) == sorted(
+        [
+            *(f"spectral/{view}.{suffix}" for view in views for suffix in ("hdr", "img")),
+            *(f"abundances/{view}.{suffix}" for view in views for suffix in ("hdr", "img", "png")),
+            *(f"depth/{view}.{suffix}" for view in views for suffix in ("npy", "png")),
+            *(f"{name}/{view}.png" for view in views for name in ("rgb", "segmentation")),
+            *(f"{name}_legend.png" for name in ("abundances", "depth", "segmentation")),
+            "cameras-dataset-eval.json",
+        ]
+    )
+    loaded = load_model(trained.run, "cpu")
+    for index, view in enumerate(views):
+        spectra, shares, depth = rendered(loaded, index, "spectral", "abundances", "depth")
+        np.testing.assert_array_equal(read_envi(tmp_path / "spectral" / view)[0], spectra)
+        np.testing.assert_array_equal(read_envi(tmp_path / "abundances" / view)[0], shares)
+        np.testing.assert_array_equal(np.load(tmp_path / "depth" / f"{view}.npy"), depth)
+    for name in ("spectral", "abundances", "depth", "rgb", "segmentation", "cameras-dataset-eval.json"):
+        assert str(tmp_path / name) in ended.out
+
+
+def test_renders_go_into_the_run_by_default_and_need_nothing_else(trained, run_copy, tmp_path):
+    shutil.move(trained.scene, tmp_path / "elsewhere")
+    try:
+        ended = run(render, "--run", run_copy, "--outputs", "rgb")
+    finally:
+        shutil.move(tmp_path / "elsewhere", trained.scene)
+    assert ended.status == 0, ended.err
+    assert (run_copy / "exports" / "render" / "rgb" / "eval_006.png").is_file()
+
+
+def test_chosen_outputs_formats_views_and_size(trained, tmp_path):
+    words = ["--outputs", "spectral", "band:550nm", "--formats", "exr", "--view", "1", "--size", "24x12"]
+    ended = run(render, "--run", trained.run, "--output", tmp_path, *words)
+    assert ended.status == 0, ended.err
+    assert files(tmp_path) == [
+        "band-550nm/eval_006.exr",
+        "cameras-dataset-eval.json",
+        "spectral/eval_006.exr",
+    ]
+    channels = read_exr(tmp_path / "spectral" / "eval_006.exr")
+    assert {pixels.shape for pixels in channels.values()} == {(12, 24)}
+    assert sum(name.startswith("S0.") for name in channels) == 8
+
+
+def test_cameras_of_a_render_can_be_rendered_again(trained, tmp_path):
+    words = ["--run", trained.run, "--outputs", "spectral", "--formats", "npy", "--device", "cpu"]
+    first = run(render, *words, "--output", tmp_path / "a", "--cameras", "orbit", "--frames", 2)
+    assert first.status == 0, first.err
+    path = tmp_path / "a" / "cameras-orbit.json"
+    again = run(render, *words, "--output", tmp_path / "b", "--cameras", path)
+    assert again.status == 0, again.err
+    for name in ("orbit_0000.npy", "orbit_0001.npy"):
+        one, other = (np.load(tmp_path / folder / "spectral" / name) for folder in "ab")
+        assert one.max() > 0
+        assert np.abs(one - other).mean() < 1e-4
+
+
+def test_the_scenes_own_transforms_are_a_camera_file(trained, tmp_path):
+    content = json.loads((trained.scene / "transforms.json").read_text())
+    content["frames"] = [frame for frame in content["frames"] if "eval_006" in frame["file_path"]]
+    path = tmp_path / "mine.json"
+    path.write_text(json.dumps({**content, "w": 16, "h": 16}))
+    words = ["--outputs", "spectral", "--formats", "npy", "--cameras", path, "--device", "cpu"]
+    ended = run(render, "--run", trained.run, "--output", tmp_path / "out", *words)
+    assert ended.status == 0, ended.err
+    [expected] = rendered(load_model(trained.run, "cpu"), 1, "spectral")
+    found = np.load(tmp_path / "out" / "spectral" / "eval_006.npy")
+    assert np.abs(found - expected).mean() < 1e-4
+
+
+def test_a_path_becomes_a_video(trained, tmp_path):
+    words = ["--cameras", "interpolate", "--frames", 5, "--fps", 10, "--size", "16x16"]
+    ended = run(render, "--run", trained.run, "--output", tmp_path, *words)
+    assert ended.status == 0, ended.err
+    assert files(tmp_path) == ["cameras-interpolate.json", "rgb.mp4"]
+    frames, facts = read_video(tmp_path / "rgb.mp4")
+    assert frames.shape == (5, 16, 16, 3)
+    assert facts["fps"] == 10.0
+    assert f"{tmp_path / 'rgb.mp4'}  5 frames" in ended.out
+
+
+def test_another_light_is_rendered_as_the_edited_model_does(trained, tmp_path):
+    words = ["--outputs", "spectral", "--formats", "npy", "--device", "cpu"]
+    ended = run(render, "--run", trained.run, "--output", tmp_path, *words, "--illuminant", "A")
+    assert ended.status == 0, ended.err
+    [as_taken] = rendered(load_model(trained.run, "cpu"), 0, "spectral")
+    [edited] = rendered(load_edited_model(trained.run, "cpu", None, "A"), 0, "spectral")
+    found = np.load(tmp_path / "spectral" / "eval_002.npy")
+    np.testing.assert_array_equal(found, edited)
+    assert not np.allclose(found, as_taken, atol=1e-3)
+
+
+def test_a_recipe_is_applied_to_every_output(trained, tmp_path):
+    recipe = tmp_path / "recipe.yml"
+    recipe.write_text("edits:\n  - rename: {endmember: 0, name: granite}\n")
+    words = ["--outputs", "abundances", "--formats", "envi", "--edits", recipe]
+    ended = run(render, "--run", trained.run, "--output", tmp_path / "out", *words)
+    assert ended.status == 0, ended.err
+    names = read_envi(tmp_path / "out" / "abundances" / "eval_002")[1]["band names"]
+    assert names[0] == "granite"
+
+
+def test_files_of_an_earlier_render_are_kept_unless_overwrite_is_given(trained, tmp_path):
+    words = ["--run", trained.run, "--output", tmp_path, "--outputs", "rgb", "depth"]
+    assert run(render, *words).status == 0
+    for name in files(tmp_path):
+        if not name.startswith("cameras"):
+            (tmp_path / name).write_bytes(b"mine")
+    (tmp_path / "rgb" / "eval_002.png").unlink()
+    ended = run(render, *words)
+    assert ended.status == 2
+    assert "--overwrite" in ended.err
+    assert not (tmp_path / "rgb" / "eval_002.png").exists()
+    assert run(render, *words, "--overwrite").status == 0
+    assert b"mine" not in {(tmp_path / name).read_bytes() for name in files(tmp_path)}
+
+
+def test_further_outputs_of_the_same_cameras_may_join_earlier_ones(trained, tmp_path):
+    words = ["--run", trained.run, "--output", tmp_path, "--outputs"]
+    assert run(render, *words, "rgb").status == 0
+    ended = run(render, *words, "accumulation")
+    assert ended.status == 0, ended.err
+    ended = run(render, *words, "pca", "--downscale", 2)
+    assert ended.status == 2
+    assert "cameras-dataset-eval.json" in ended.err
+
+
+BAD = {
+    "output": (["--outputs", "spectrl"], "no output named 'spectrl' (did you mean spectral"),
+    "wavelength": (["--outputs", "band:2000nm"], "no band at 2000 nm: 8 bands"),
+    "format": (["--formats", "tiff"], "there is no format 'tiff'"),
+    "format that does not suit": (
+        ["--outputs", "spectral", "--formats", "png"],
+        "spectral can't be written as png",
+    ),
+    "cameras": (["--cameras", "orbits"], "unknown cameras 'orbits' (did you mean orbit?)"),
+    "camera file": (["--cameras", "none.json"], "can't read the camera file none.json"),
+    "view": (["--view", "eval_003"], "no view 'eval_003'"),
+    "size": (["--size", "64"], "--size 64: expected width and height in pixels, as in 640x480"),
+    "absurd size": (["--size", "99999x3"], "--size: 99999 x 3 pixels"),
+    "frames": (["--frames", "3"], "--frames is for the paths that are made here"),
+    "light": (["--illuminant", "sun"], "sun"),
+    "recipe": (["--edits", "none.yml"], "none.yml"),
+    "device": (["--device", "cuda"], "--device cuda, but"),
+}
+
+
+@pytest.mark.parametrize("fault", BAD)
+def test_what_cannot_be_rendered_exits_2_before_anything_is_written(trained, tmp_path, monkeypatch, fault):
+    words, said = BAD[fault]
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    ended = run(render, "--run", trained.run, "--output", tmp_path / "out", *words)
+    assert ended.status == 2
+    assert said in ended.err
+    assert len(ended.err.strip().splitlines()) <= 2
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_missing_run_is_named(tmp_path):
+    ended = run(render, "--run", tmp_path / "none")
+    assert ended.status == 2
+    assert f"no run folder at {tmp_path / 'none'}" in ended.err
+
+
+def test_a_folder_that_cannot_be_made_exits_2_before_rendering(trained, tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    ended = run(render, "--run", trained.run, "--output", tmp_path / "file" / "here")
+    assert ended.status == 2
+    assert str(tmp_path / "file" / "here") in ended.err
+    assert "rendering" not in ended.out
+
+
+def test_a_full_disk_exits_2_says_where_and_leaves_whole_files_only(trained, tmp_path, monkeypatch):
+    full_disk(monkeypatch, after=6000)
+    words = ["--outputs", "spectral", "rgb", "--formats", "npy", "png"]
+    ended = run(render, "--run", trained.run, "--output", tmp_path, *words)
+    assert ended.status == 2
+    assert (
+        f"can't write {tmp_path / 'spectral' / 'eval_002.npy'}: No space left on device; make room"
+        in ended.err
+    )
+    assert "--load-run" not in ended.err
+    assert set(files(tmp_path)) <= {"cameras-dataset-eval.json"}
+
+
+@pytest.mark.parametrize("words", [["--frames", "many"], ["--overwrite", "yes"], ["spectral"]])
+def test_words_that_do_not_parse_exit_2(words):
+    ended = run(render, *words)
+    assert ended.status == 2
+    assert ended.err
+
+
+def test_a_legend_is_a_picture(trained, tmp_path):
+    words = ["--outputs", "segmentation", "confidence"]
+    assert run(render, "--run", trained.run, "--output", tmp_path, *words).status == 0
+    for name in ("segmentation", "confidence"):
+        assert min(iio.imread(tmp_path / f"{name}_legend.png").shape[:2]) > 60

@@ -1,0 +1,214 @@
+"""`unmix-render --run PATH`: views of a trained run from any camera as files, from the run folder alone."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from unmix_plugin.commands.entry import run_command
+from unmix_plugin.engine.configs import DeviceName
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from unmix_plugin.engine.load_run import LoadedModel
+    from unmix_plugin.exports.render_cameras import CameraRequest, RenderCameras
+    from unmix_plugin.exports.render_outputs import Product
+    from unmix_plugin.exports.render_pictures import Palette
+    from unmix_plugin.exports.render_survey import Survey
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """Render views of a trained run: spectra, pictures, maps and videos, from the run folder alone."""
+
+    run: Path | None = None
+    """Run folder, as training printed it; None takes the newest under --output-dir."""
+    cameras: str = "dataset-eval"
+    """dataset-eval, dataset-train, orbit (around the scene), interpolate (through the evaluation cameras), or a file:
+    nerfstudio's camera_path.json, or poses as in transforms.json."""
+    view: tuple[str, ...] = ()
+    """Only these of the cameras, by name or by number from 0."""
+    outputs: tuple[str, ...] = ()
+    """spectral, rgb, linear_rgb, diffuse, specular, abundances, material_scores, segmentation, confidence, depth,
+    ray_distance, normals, accumulation, pca, band:650nm, false-colour:860,650,550; or all. None given: spectral rgb
+    abundances segmentation depth for single views, rgb for a path."""
+    formats: tuple[str, ...] = ()
+    """envi, exr, npy, png, mp4; each output is written in those that suit it. None given: what suits each best. mp4 of
+    spectra goes through the bands."""
+    size: str | None = None
+    """Width and height in pixels, as in 640x480; the vertical field of view stays."""
+    downscale: float | None = None
+    """Divide width and height by this."""
+    frames: int | None = None
+    """Number of cameras of orbit or interpolate; None: 120."""
+    fps: float | None = None
+    """Frames a second of videos; None: as the camera file says, or whatever suits each."""
+    edits: Path | None = None
+    """Recipe (YAML) of edits of materials and light to apply first."""
+    illuminant: str | None = None
+    """Light to show the scene under: D65, A, E, FL2, ... or a .csv file; None: the one it was taken under."""
+    output: Path | None = None
+    """Folder to write to; None: exports/render in the run folder."""
+    output_dir: Path = Path("outputs")
+    """Folder in which to look for the newest run."""
+    device: DeviceName = "auto"
+    """Where to compute; auto takes CUDA where there is one."""
+    overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Replace files of an earlier render."""
+
+
+def render(words: list[str]) -> None:
+    """Parse the words, render each view, say what is where.
+
+    Raises:
+        RunError: the run is unusable, or a file can't be written.
+        ConfigError: cameras, outputs or formats that are not there or don't fit each other, a recipe that is wrong or
+            does not fit the run, files that would be overwritten, a method that does not unmix spectra, or a device
+            that is not there.
+        SpectrumError: a wavelength outside the bands, or a light that is unknown.
+    """
+    options = tyro.cli(RenderOptions, prog="unmix-render", args=words)
+    request = _camera_request(options)
+
+    from rich.console import Console
+
+    from unmix_plugin.commands.reporting import say, working
+    from unmix_plugin.commands.run_choice import chosen_run
+    from unmix_plugin.exports.edited_run import light_note, load_edited_model
+    from unmix_plugin.exports.render_cameras import choose_cameras
+    from unmix_plugin.exports.render_outputs import choose_products, default_outputs
+    from unmix_plugin.exports.run_materials import materials_of
+
+    console = Console()
+    path = chosen_run(options.run, options.output_dir)
+    with working(console, f"reading {path}"):
+        loaded = load_edited_model(path, options.device, options.edits, options.illuminant)
+        cameras = choose_cameras(loaded.scene, request)
+    note = light_note(loaded, options.edits, options.illuminant)
+    if note is not None:
+        say(console, note)
+    outputs = options.outputs or default_outputs(cameras.is_path)
+    products = choose_products(outputs, options.formats, materials_of(loaded.model), cameras.is_path)
+    _render(options, loaded, cameras, products, console)
+
+
+def _camera_request(options: RenderOptions) -> CameraRequest:
+    from unmix_plugin.errors import ConfigError
+    from unmix_plugin.exports.render_cameras import CameraRequest
+
+    size = None
+    if options.size is not None:
+        match = re.fullmatch(r"(\d{1,9})[xX*](\d{1,9})", options.size)
+        if match is None:
+            raise ConfigError(f"--size {options.size}: expected width and height in pixels, as in 640x480")
+        size = (int(match[1]), int(match[2]))
+    return CameraRequest(options.cameras, options.view, size, options.downscale, options.frames, options.fps)
+
+
+def _render(
+    options: RenderOptions,
+    loaded: LoadedModel,
+    cameras: RenderCameras,
+    products: tuple[Product, ...],
+    console: Console,
+) -> None:
+    """Render block by block, then list what was written."""
+    from unmix_plugin.commands.reporting import follow, say
+    from unmix_plugin.exports.files import refuse_to_overwrite, write_file
+    from unmix_plugin.exports.render_job import RenderJob
+    from unmix_plugin.exports.render_legend import draw_legend
+
+    folder = (options.output or loaded.run.exports / "render").resolve()
+    legends = _legends(folder, products)
+    camera_path, camera_bytes = _camera_file(folder, options.cameras, loaded, cameras)
+    paths = [*_paths(folder, products, cameras), *legends]
+    if not camera_path.is_file() or camera_path.read_bytes() != camera_bytes:
+        paths.append(camera_path)
+    refuse_to_overwrite(paths, options.overwrite)
+    write_file(camera_path, camera_bytes)  # first, so that a folder that can't be written is noticed early
+    say(console, _announcement(cameras, products))
+    survey = _survey(loaded, cameras, products, console)
+    with RenderJob(loaded.model, cameras, products, survey, folder) as job:
+        for block in follow(console, "rendering", job.blocks()):
+            job.render(block)
+    for path, product in legends.items():
+        write_file(path, draw_legend(product.output, job.palette))
+    _list(folder, products, cameras, job.palette)
+    for path in legends:
+        print(f"{path}  what the colours mean")
+    print(f"{camera_path}  the cameras, to be given to --cameras again")
+
+
+def _survey(
+    loaded: LoadedModel, cameras: RenderCameras, products: tuple[Product, ...], console: Console
+) -> Survey:
+    from unmix_plugin.commands.reporting import working
+    from unmix_plugin.exports.render_survey import Survey, needs_survey, take_survey
+
+    names = {product.output.name for product in products}
+    if not needs_survey(names):
+        return Survey()
+    with working(console, "looking at all views for what their pictures share"):
+        return take_survey(loaded.model, cameras.views, names)
+
+
+def _legends(folder: Path, products: tuple[Product, ...]) -> dict[Path, Product]:
+    """Files of legends, each with a product that needs it."""
+    from unmix_plugin.exports.render_legend import needs_legend
+
+    return {
+        folder / f"{product.output.file_name}_legend.png": product
+        for product in products
+        if needs_legend(product)
+    }
+
+
+def _paths(folder: Path, products: tuple[Product, ...], cameras: RenderCameras) -> list[Path]:
+    from unmix_plugin.exports.render_job import product_paths
+
+    return [path for product in products for path in product_paths(folder, product, cameras)]
+
+
+def _camera_file(
+    folder: Path, source: str, loaded: LoadedModel, cameras: RenderCameras
+) -> tuple[Path, bytes]:
+    """Where the cameras are written down, and as what."""
+    from unmix_plugin.exports.camera_files import camera_file_bytes
+    from unmix_plugin.exports.world_frame import world_frame
+
+    frames_per_second = (cameras.frames_per_second or 24.0) if cameras.is_path else None
+    content = camera_file_bytes(cameras.views, frames_per_second, world_frame(loaded.scene))
+    return folder / f"cameras-{Path(source).stem}.json", content
+
+
+def _announcement(cameras: RenderCameras, products: tuple[Product, ...]) -> str:
+    names = dict.fromkeys(product.output.name for product in products)
+    width, height = cameras.size
+    views = f"{len(cameras.views)} view{'' if len(cameras.views) == 1 else 's'}"
+    return f"{views} of {width} x {height} pixels: {', '.join(names)}"
+
+
+def _list(folder: Path, products: tuple[Product, ...], cameras: RenderCameras, palette: Palette) -> None:
+    """A line for each product: where, how many, what."""
+    from unmix_plugin.exports.render_job import is_video_of_all, product_paths
+
+    for product in products:
+        paths = product_paths(folder, product, cameras)
+        what = palette.describe(product.output) if product.format in ("png", "mp4") else product.output.what
+        if is_video_of_all(product, cameras):
+            print(f"{paths[0]}  {len(cameras.views)} frames; {what}")
+        elif len(paths) == 1:
+            print(f"{paths[0]}  {what}")
+        else:
+            suffixes = " and ".join(dict.fromkeys(f"*{path.suffix}" for path in paths))
+            print(f"{paths[0].parent}  {len(paths)} files {suffixes}; {what}")
+
+
+def main() -> None:
+    """Console script."""
+    run_command(render)
