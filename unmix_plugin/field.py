@@ -10,6 +10,7 @@ Source: Perez et al. 2025, UnMix-NeRF, section 3; the coefficients replace the p
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from dataclasses import dataclass
 from typing import Literal
 
@@ -51,7 +52,25 @@ class UnmixFieldConfig:
     """Logit of the view-dependent part at the start; low, so that colour is first explained by materials."""
 
 
-class UnmixField(Field):
+class CoefficientField(Field):
+    """What the renderer asks of a field: densities by way of an encoding, and the coefficients of spectra."""
+
+    @abstractmethod
+    def encode(
+        self, positions: Float[Tensor, "S 3"], known: Float[Tensor, "S LF"] | None = None
+    ) -> Float[Tensor, "S LF"]:
+        """The encoding of positions; `known` as `hash_encode` takes it."""
+
+    @abstractmethod
+    def density_of(self, encoded: Float[Tensor, "S LF"]) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
+        """Density per scene unit and geometry features where the encoding is `encoded`."""
+
+    @abstractmethod
+    def abundances_of(self, features: Float[Tensor, "S G"]) -> Float[Tensor, "S K"]:
+        """Abundances a of points with these geometry features, summing to 1."""
+
+
+class UnmixField(CoefficientField):
     """Density, abundances, scales and specular coefficients of points in a scene box."""
 
     aabb: Tensor
@@ -123,14 +142,22 @@ class UnmixField(Field):
         features: Float[Tensor, "S G"],
     ) -> dict[str, Tensor]:
         """`abundances` (S, K), `scaled_abundances` S a (S, K) and `specular_coefficients` h u (S, J)."""
-        material = self.material_network(features)
-        abundances = torch.softmax(material[:, : self.num_endmembers] / self.config.temperature, dim=-1)
-        scales = torch.sigmoid(material[:, self.num_endmembers :])
+        abundances, scales = self._material(features)
         return {
             "abundances": abundances,
             "scaled_abundances": scales * abundances,
             "specular_coefficients": self._specular(directions, features),
         }
+
+    def abundances_of(self, features: Float[Tensor, "S G"]) -> Float[Tensor, "S K"]:
+        """Abundances a of points with these geometry features, summing to 1."""
+        return self._material(features)[0]
+
+    def _material(self, features: Float[Tensor, "S G"]) -> tuple[Float[Tensor, "S K"], Float[Tensor, "S C"]]:
+        """Abundances and scales; C is 1 or K."""
+        material = self.material_network(features)
+        abundances = torch.softmax(material[:, : self.num_endmembers] / self.config.temperature, dim=-1)
+        return abundances, torch.sigmoid(material[:, self.num_endmembers :])
 
     def _specular(
         self, directions: Float[Tensor, "S 3"], features: Float[Tensor, "S G"]

@@ -46,6 +46,16 @@ def test_a_number_out_of_bounds_exits_2_with_the_bounds(monkeypatch, capsys, tmp
     assert not (tmp_path / "scene").exists()
 
 
+def test_the_light_is_chosen_by_name(monkeypatch, capsys, tmp_path):
+    assert run(monkeypatch, tmp_path / "scene", *SMALL, "--illuminant", "a") == 0
+    powers = (tmp_path / "scene" / "illuminant.csv").read_text().splitlines()
+    assert [line.split(",")[0] for line in powers] == ["wavelength", "400", "550", "700"]
+    assert powers[-1] == "700,1"
+    assert run(monkeypatch, tmp_path / "other", *SMALL, "--illuminant", "candle") == 2
+    assert "there is no light 'candle'" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()
+
+
 @pytest.mark.parametrize("words", [[], ["--size", "large", "scene"]])
 def test_words_that_do_not_parse_exit_2(monkeypatch, capsys, words):
     assert run(monkeypatch, *words) == 2

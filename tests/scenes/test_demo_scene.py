@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from PIL import Image
 
-from unmix_plugin.errors import ConfigError, SceneError
+from unmix_plugin.errors import ConfigError, SceneError, SpectrumError
 from unmix_plugin.scenes import demo_scene
 from unmix_plugin.scenes.demo_materials import MATERIALS, band_centers_nm, lamp_power, reflectances
 from unmix_plugin.scenes.demo_scene import demo_scene_path, is_complete, make_demo_scene
@@ -34,6 +34,7 @@ from unmix_plugin.scenes.demo_views import (
     label_image,
     radiance_cube,
 )
+from unmix_plugin.spectral.spectra_csv import read_spectra_csv
 
 PLACEMENTS = tuple(thing.placement for thing in THINGS)
 TABLE, APPLE, PARCEL, _, LEMON = THINGS
@@ -279,6 +280,27 @@ def test_a_scene_has_the_layout_that_transforms_json_names(folder):
         assert cube.max() <= 1
         assert (cube[picture[..., 3] == 0] == 0).all()
         assert (labels[picture[..., 3] == 0] == 255).all()
+
+
+@pytest.mark.usefixtures("one_ray_a_pixel")
+def test_another_light_changes_each_band_of_the_scene_by_one_factor(tmp_path):
+    make_demo_scene(tmp_path / "day", size=16, bands=7, views=4)
+    make_demo_scene(tmp_path / "lamp", size=16, bands=7, views=4, illuminant="A")
+    lamps = [read_spectra_csv(tmp_path / name / "illuminant.csv").spectra[0] for name in ("day", "lamp")]
+    assert_allclose(lamps[1], lamp_power(band_centers_nm(7), "A"), rtol=1e-8)
+    assert lamps[1].argmax() == 6 != lamps[0].argmax()
+    cubes = [np.load(tmp_path / name / "cubes/eval_002.npy").astype(float) for name in ("day", "lamp")]
+    lit = (cubes[0].max(axis=-1) < 0.99) & (cubes[0].min(axis=-1) > 0.02)
+    assert lit.sum() > 20
+    assert_allclose(
+        cubes[1][lit] / cubes[0][lit], np.broadcast_to(lamps[1] / lamps[0], (lit.sum(), 7)), rtol=0.02
+    )
+
+
+def test_an_unknown_light_is_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(SpectrumError, match="there is no light 'D66'; nearest: D65"):
+        make_demo_scene(tmp_path / "scene", size=16, bands=3, views=4, illuminant="D66")
+    assert not (tmp_path / "scene").exists()
 
 
 def test_every_fourth_view_is_for_evaluation_and_has_abundances(folder):

@@ -10,7 +10,9 @@ from typing import Annotated
 import tyro
 
 from unmix_plugin.commands.entry import run_command
+from unmix_plugin.scenes.demo_materials import LAMP
 from unmix_plugin.scenes.demo_scene import DEFAULT_BANDS, DEFAULT_SIZE, DEFAULT_VIEWS, make_demo_scene
+from unmix_plugin.spectral.illuminants import parse_light
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,8 @@ class DemoSceneOptions:
     """Bands, evenly spaced over 400-700 nm."""
     views: int = DEFAULT_VIEWS
     """Images on a dome; every 4th is for evaluation."""
+    illuminant: str = LAMP
+    """What lights the scene: a CIE illuminant (D50, D65, A, E, FL2, ...) or a .csv file (wavelength,power)."""
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Accept a folder that is not empty: a demo scene in it is replaced, other files stay."""
 
@@ -33,7 +37,8 @@ def write_demo_scene(arguments: list[str]) -> None:
     """Parse the words, write the scene, say what is where."""
     options = tyro.cli(DemoSceneOptions, prog="unmix-demo-scene", args=arguments)
     started = time.perf_counter()
-    make_demo_scene(options.directory, options.size, options.bands, options.views, options.overwrite)
+    light = parse_light(options.illuminant)
+    make_demo_scene(options.directory, options.size, options.bands, options.views, options.overwrite, light)
     seconds = time.perf_counter() - started
     evaluation = len(list((options.directory / "abundances").glob("eval_*")))
     print(

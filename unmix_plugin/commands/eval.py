@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,9 +15,12 @@ from unmix_plugin.engine.configs import DeviceName
 
 if TYPE_CHECKING:
     import numpy as np
+    from jaxtyping import Float64
     from rich.console import Console
 
+    from unmix_plugin.editing.recipe import Recipe
     from unmix_plugin.engine.load_run import LoadedPipeline
+    from unmix_plugin.engine.model import Model
     from unmix_plugin.exports.evaluation import Evaluation
     from unmix_plugin.exports.evaluation_pictures import MaterialLook
     from unmix_plugin.scenes.scene import Scene
@@ -26,13 +30,18 @@ if TYPE_CHECKING:
 class EvalOptions:
     """Measure a trained run on its evaluation views: metrics.json, a table, and prediction beside truth as pictures.
 
-    They are written to `eval/` in the run folder, in place of an earlier evaluation.
+    They are written to `eval/` in the run folder, in place of an earlier evaluation; those of an edited run to a folder
+    of its own in `exports/`.
     """
 
     run: Path | None = None
     """Run folder, as training printed it; None takes the newest under --output-dir."""
     data: Path | None = None
     """Scene folder, where it is no longer where the run was trained on it."""
+    edits: Path | None = None
+    """Recipe (YAML) of edits to make first; the result is compared with the scene as it was measured."""
+    illuminant: str | None = None
+    """Light to see both in: D65, A, E, FL2, ... or a .csv file (wavelength,power); None: the scene's own."""
     output_dir: Path = Path("outputs")
     """Folder in which to look for the newest run."""
     device: DeviceName = "auto"
@@ -45,7 +54,9 @@ def evaluate(words: list[str]) -> None:
     Raises:
         RunError: the run is unusable, or its folder can't be written.
         SceneError: the scene is missing or malformed.
-        ConfigError: the method does not unmix spectra, or the device is not there.
+        ConfigError: the method does not unmix spectra, the recipe is wrong or does not fit the run, or the device is
+            not there.
+        SpectrumError: there is no such light.
     """
     options = tyro.cli(EvalOptions, prog="unmix-eval", args=words)
 
@@ -54,17 +65,52 @@ def evaluate(words: list[str]) -> None:
     from unmix_plugin.commands.reporting import working
     from unmix_plugin.commands.run_choice import chosen_run
     from unmix_plugin.engine.load_run import load_pipeline
+    from unmix_plugin.exports.edited_run import requested_recipe
 
     console = Console()
     path = chosen_run(options.run, options.output_dir)
+    recipe = requested_recipe(options.edits, options.illuminant)
     with working(console, f"reading {path} and its scene"):
         loaded = load_pipeline(path, options.device, options.data)
-    evaluation, num_pictures = _evaluate_views(loaded, console)
-    figures = _write_metrics(loaded, evaluation)
-    _show(console, figures, loaded.run.path)
-    folder = loaded.run.eval
-    print(f"{folder / 'metrics.json'}  these figures, and those of each view")
-    print(f"{folder}  {num_pictures} pictures: rgb/, segmentation/ and abundances/, truth beside prediction")
+        subject = _subject(loaded, recipe, options)
+    evaluation, num_pictures = _evaluate_views(subject, console)
+    figures = _write_metrics(subject, evaluation)
+    _show(console, figures, subject)
+    print(f"{subject.folder / 'metrics.json'}  these figures, and those of each view")
+    print(
+        f"{subject.folder}  {num_pictures} pictures: rgb/, segmentation/ and abundances/, truth beside prediction"
+    )
+
+
+@dataclass(frozen=True)
+class _Subject:
+    """What is measured."""
+
+    loaded: LoadedPipeline
+    model: Model
+    light_factors: Float64[np.ndarray, " B"] | None
+    """What measured radiance is multiplied with; None: nothing."""
+    folder: Path
+    """Where to write."""
+    edits: str | None
+    """The recipe's text."""
+
+
+def _subject(loaded: LoadedPipeline, recipe: Recipe | None, options: EvalOptions) -> _Subject:
+    from unmix_plugin.editing.yaml_writing import recipe_to_yaml
+    from unmix_plugin.exports.edited_run import apply_recipe
+
+    model = loaded.pipeline.model
+    if recipe is None:
+        return _Subject(loaded, model, None, loaded.run.eval, None)
+    edited = apply_recipe(model, recipe, loaded.scene.train_cameras)
+    if edited.note:
+        print(edited.note)
+    words = ["eval", *([options.edits.stem] if options.edits else [])]
+    words += [Path(options.illuminant).stem] if options.illuminant else []
+    folder = loaded.run.exports / re.sub(r"[^\w.-]+", "_", "-".join(words))
+    factors = None if recipe.illuminant is None else edited.light_factors
+    return _Subject(loaded, edited.model, factors, folder, recipe_to_yaml(recipe))
 
 
 def _scene_of(loaded: LoadedPipeline) -> Scene:
@@ -79,7 +125,7 @@ def _scene_of(loaded: LoadedPipeline) -> Scene:
     return scene
 
 
-def _evaluate_views(loaded: LoadedPipeline, console: Console) -> tuple[Evaluation, int]:
+def _evaluate_views(subject: _Subject, console: Console) -> tuple[Evaluation, int]:
     """Measure and draw view by view; the ids alone are kept, since their colours are known after the last view."""
     from unmix_plugin.commands.reporting import follow
     from unmix_plugin.exports.evaluation import Evaluation, scene_truth, view_truth
@@ -88,24 +134,25 @@ def _evaluate_views(loaded: LoadedPipeline, console: Console) -> tuple[Evaluatio
     from unmix_plugin.exports.run_materials import materials_of
     from unmix_plugin.exports.view_rendering import render_view
 
-    scene, model, folder = _scene_of(loaded), loaded.pipeline.model, loaded.run.eval
-    evaluation = Evaluation(scene_truth(scene), materials_of(model).endmembers)
+    scene, folder, factors = _scene_of(subject.loaded), subject.folder, subject.light_factors
+    materials = materials_of(subject.model)
+    evaluation = Evaluation(scene_truth(scene).in_light(factors), materials.endmembers, materials.names)
     look = material_look(evaluation)
     ids: dict[int, np.ndarray] = {}
     for index in follow(console, "evaluating views", scene.eval_indices):
-        truth = view_truth(scene, index)
-        predicted = render_view(model, scene.cameras[index])
+        truth = view_truth(scene, index).in_light(factors)
+        predicted = render_view(subject.model, scene.cameras[index])
         psnr_db = evaluation.add(truth, predicted)["psnr"]
         name = f"{truth.name}.png"
         write_file(folder / "rgb" / name, draw_colour(truth, predicted, evaluation.truth.bands, psnr_db))
         write_file(folder / "abundances" / name, draw_matched_abundances(truth, predicted, evaluation, look))
         ids[index] = predicted.segmentation.numpy()
-    _draw_segmentations(loaded, evaluation, look, ids, console)
+    _draw_segmentations(subject, evaluation, look, ids, console)
     return evaluation, 3 * len(ids)
 
 
 def _draw_segmentations(
-    loaded: LoadedPipeline,
+    subject: _Subject,
     evaluation: Evaluation,
     look: MaterialLook,
     ids: dict[int, np.ndarray],
@@ -115,19 +162,19 @@ def _draw_segmentations(
     from unmix_plugin.exports.evaluation_pictures import draw_matched_segmentation
     from unmix_plugin.exports.files import write_file
 
-    scene, matching = _scene_of(loaded), evaluation.segmentation().matching
+    scene, matching = _scene_of(subject.loaded), evaluation.segmentation().matching
     for index in follow(console, "drawing segmentations", list(ids)):
         name = scene.frames[index].name
         drawn = draw_matched_segmentation(name, scene.labels(index), ids[index], look, matching)
-        write_file(loaded.run.eval / "segmentation" / f"{name}.png", drawn)
+        write_file(subject.folder / "segmentation" / f"{name}.png", drawn)
 
 
-def _write_metrics(loaded: LoadedPipeline, evaluation: Evaluation) -> dict[str, Any]:
+def _write_metrics(subject: _Subject, evaluation: Evaluation) -> dict[str, Any]:
     """Write metrics.json; the scene's figures, None where there is no truth."""
     from unmix_plugin.exports.evaluation import DEFINITIONS, finite_or_none
     from unmix_plugin.exports.files import write_file
 
-    training = loaded.training
+    training = subject.loaded.training
     values = finite_or_none(
         {
             **evaluation.figures(),
@@ -138,22 +185,23 @@ def _write_metrics(loaded: LoadedPipeline, evaluation: Evaluation) -> dict[str, 
     figures = {name: values[name] for name in DEFINITIONS}
     per_view = [{"name": name, **finite_or_none(found)} for name, found in evaluation.per_view.items()]
     content = {**figures, "per_view": per_view, "definitions": DEFINITIONS}
-    write_file(
-        loaded.run.eval / "metrics.json", (json.dumps(content, indent=1, allow_nan=False) + "\n").encode()
-    )
+    content |= {} if subject.edits is None else {"edits": subject.edits}
+    text = json.dumps(content, indent=1, allow_nan=False) + "\n"
+    write_file(subject.folder / "metrics.json", text.encode())
     return figures
 
 
-def _show(console: Console, figures: dict[str, Any], path: Path) -> None:
+def _show(console: Console, figures: dict[str, Any], subject: _Subject) -> None:
     """The figures as a table."""
     from rich.table import Table
 
     from unmix_plugin.exports.evaluation import DEFINITIONS
 
-    table = Table(
-        title=f"{path.name}: {figures['views']} evaluation views, {figures['bands']} bands",
-        title_justify="left",
-    )
+    of = "" if subject.edits is None else ", edited, against the scene as measured"
+    of += "" if subject.light_factors is None else " (in the same light)"
+    name = subject.loaded.run.path.name
+    title = f"{name}: {figures['views']} evaluation views, {figures['bands']} bands{of}"
+    table = Table(title=title, title_justify="left")
     table.add_column("figure", no_wrap=True)
     table.add_column("value", justify="right", no_wrap=True)
     table.add_column("what it is")

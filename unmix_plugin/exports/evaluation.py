@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from unmix_plugin.exports.view_rendering import RenderedView
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour import linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.composition import default_names
 from unmix_plugin.spectral.metrics import (
     SSIM_WINDOW_PX,
     abundance_rmse,
@@ -89,6 +90,12 @@ class ViewTruth:
         matter = self.opacity > OPAQUE_ALPHA
         return self.valid & (matter if self.labels is None else matter | (self.labels != NOTHING_ID))
 
+    def in_light(self, factors: Float[np.ndarray, " B"] | None) -> ViewTruth:
+        """The view as the same sensor would have measured it in another light; itself where `factors` are None."""
+        if factors is None:
+            return self
+        return replace(self, spectra=(self.spectra * torch.from_numpy(factors).to(self.spectra)).clamp(0, 1))
+
 
 @dataclass(frozen=True)
 class SceneTruth:
@@ -101,17 +108,27 @@ class SceneTruth:
     """True radiance of each material: reflectance x illuminant, under flat light where the illuminant is unknown."""
     names: tuple[str, ...] | None = None
 
+    def in_light(self, factors: Float[np.ndarray, " B"] | None) -> SceneTruth:
+        """The scene in another light; itself where `factors` are None."""
+        if factors is None or self.endmembers is None:
+            return self
+        return replace(self, endmembers=self.endmembers * torch.from_numpy(factors))
+
 
 class Evaluation:
     """Figures of merit of one scene, fed view by view; keeps no image."""
 
-    def __init__(self, truth: SceneTruth, endmembers: Float[Tensor, "P B"]) -> None:
+    def __init__(
+        self, truth: SceneTruth, endmembers: Float[Tensor, "P B"], names: tuple[str, ...] | None = None
+    ) -> None:
         """
         Args:
             truth: Of the scene.
             endmembers: Of the model.
+            names: Of the endmembers; None: `default_names`.
         """
         self.truth = truth
+        self.names = default_names(len(endmembers)) if names is None else names
         self.endmembers = endmembers.detach().cpu().double()
         self.matching = (
             None if truth.endmembers is None else match_endmembers(self.endmembers, truth.endmembers)

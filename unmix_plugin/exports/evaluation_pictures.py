@@ -74,7 +74,7 @@ def material_look(evaluation: Evaluation) -> MaterialLook:
     return MaterialLook(
         truth.names or tuple(f"material {index}" for index in range(len(spectra))),
         colours[: len(spectra)],
-        tuple(f"endmember {index}" for index in range(len(endmembers))),
+        evaluation.names,
         colours[len(spectra) :],
     )
 

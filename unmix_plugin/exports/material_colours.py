@@ -28,7 +28,7 @@ _LEVELS = 21
 
 def own_colours(spectra: Float[Tensor, "K B"], bands: Bands) -> Float64[np.ndarray, "K 3"]:
     """The sRGB colour of each spectrum, [0, 1]: what a surface of it looks like, or its false colour."""
-    linear = spectra.detach().cpu().double().clamp(0, 1) @ rgb_matrix(bands, torch.float64)
+    linear = spectra.detach().cpu().double().clamp(min=0) @ rgb_matrix(bands, torch.float64)
     return linear_to_srgb(linear.clamp(0, 1)).numpy()
 
 

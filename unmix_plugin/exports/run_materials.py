@@ -34,11 +34,6 @@ def materials_of(model: Model) -> Materials:
     return materials
 
 
-def endmember_names(count: int) -> tuple[str, ...]:
-    """`endmember_0`, `endmember_1`, ...: as they are called in every file."""
-    return tuple(f"endmember_{index}" for index in range(count))
-
-
 def endmember_colours(materials: Materials) -> Float64[np.ndarray, "K 3"]:
     """sRGB colours that stand for the endmembers in all pictures of a run: near their own, and told apart."""
     return distinct_colours(own_colours(materials.endmembers, materials.bands))
@@ -47,11 +42,11 @@ def endmember_colours(materials: Materials) -> Float64[np.ndarray, "K 3"]:
 def endmember_table(materials: Materials) -> SpectraTable:
     """The endmembers with names: spectra under the scene's light, [0, 1]."""
     spectra = materials.endmembers.detach().to("cpu", torch.float64).numpy()
-    return SpectraTable(materials.bands, endmember_names(len(spectra)), spectra)
+    return SpectraTable(materials.bands, materials.names, spectra)
 
 
 def write_endmembers_csv(path: Path, materials: Materials) -> Path:
-    """Write `wavelength,endmember_0,...`, one row a band.
+    """Write `wavelength` and a column for each endmember under its name, one row a band.
 
     Raises:
         RunError: the disk is full or refuses.

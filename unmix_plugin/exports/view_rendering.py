@@ -44,7 +44,7 @@ def render_view(model: Model, camera: Cameras) -> RenderedView:
 
 def picture(spectra: Float[Tensor, "H W B"], opacity: Float[Tensor, "H W"], bands: Bands) -> Picture:
     """Spectra seen on black as an sRGB picture over neutral grey."""
-    linear = spectra.double().clamp(0, 1) @ rgb_matrix(bands).double()
+    linear = spectra.double().clamp(min=0) @ rgb_matrix(bands).double()
     return premultiplied_over_neutral(linear.clamp(0, 1).numpy(), as_numpy(opacity))
 
 

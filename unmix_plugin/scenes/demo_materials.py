@@ -8,9 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.illuminants import illuminant_power
 
 MATERIALS = ("white", "red", "yellow", "green", "cyan", "purple")
 """Six patches of the ColorChecker chart; the spectral angle between any two under the lamp is at least 0.45 rad."""
@@ -18,6 +22,9 @@ MATERIALS = ("white", "red", "yellow", "green", "cyan", "purple")
 _PATCHES = ("white 9.5 (.05 D)", "red", "yellow", "green", "cyan", "purple")
 
 RANGE_NM = (400.0, 700.0)
+
+LAMP = "D50"
+"""CIE illuminant of the lamp and of the sky."""
 
 Blend = Callable[[Float[np.ndarray, "P 3"]], Float[np.ndarray, " P"]]
 """Share of the second material at points in a shape's own coordinates."""
@@ -43,13 +50,18 @@ def reflectances(wavelengths_nm: Float[np.ndarray, " B"]) -> Float[np.ndarray, "
     )
 
 
-def lamp_power(wavelengths_nm: Float[np.ndarray, " B"]) -> Float[np.ndarray, " B"]:
-    """Relative power of the lamp and of the sky, which share CIE illuminant D50: largest value 1."""
-    from colour.colorimetry import SDS_ILLUMINANTS
+def lamp_power(
+    wavelengths_nm: Float[np.ndarray, " B"], illuminant: str | Path = LAMP
+) -> Float[np.ndarray, " B"]:
+    """Relative power of the lamp and of the sky, which share one spectrum: largest value 1.
 
-    daylight = SDS_ILLUMINANTS["D50"]
-    power = np.interp(wavelengths_nm, daylight.wavelengths, daylight.values)
-    return power / power.max()
+    Args:
+        wavelengths_nm: Band centres.
+        illuminant: Name of a known light, or a CSV file, as `spectral.illuminants.illuminant_power` takes it.
+    Raises:
+        SpectrumError: an unknown light, or one that is not known at all bands.
+    """
+    return illuminant_power(illuminant, Bands.of(wavelengths_nm))
 
 
 @dataclass(frozen=True)

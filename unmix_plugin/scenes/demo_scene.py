@@ -24,7 +24,7 @@ from jaxtyping import Float
 
 from unmix_plugin.engine.cameras import Cameras
 from unmix_plugin.errors import ConfigError, SceneError
-from unmix_plugin.scenes.demo_materials import MATERIALS, band_centers_nm, lamp_power, reflectances
+from unmix_plugin.scenes.demo_materials import LAMP, MATERIALS, band_centers_nm, lamp_power, reflectances
 from unmix_plugin.scenes.demo_shading import ViewCoefficients, render_view
 from unmix_plugin.scenes.demo_views import demo_cameras, frame_name, label_image, radiance_cube
 from unmix_plugin.spectral.bands import Bands
@@ -72,6 +72,7 @@ def make_demo_scene(
     bands: int = DEFAULT_BANDS,
     views: int = DEFAULT_VIEWS,
     overwrite: bool = False,
+    illuminant: str | Path = LAMP,
 ) -> None:
     """Write a demo scene. It is built beside the folder and moved in when complete.
 
@@ -79,8 +80,10 @@ def make_demo_scene(
         directory: Made if absent, parents too.
         overwrite: Whether a folder with something in it is accepted: an older demo scene there is replaced, other
             files stay.
+        illuminant: What the scene is lit by: the name of a known light, or a CSV file (wavelength,power).
     Raises:
         ConfigError: a number out of bounds; a folder with something in it, or no folder at all.
+        SpectrumError: an unknown light, or one that is not known at all bands.
         OSError: the place can't be written.
     """
     _check_bounds(size, bands, views)
@@ -91,7 +94,7 @@ def make_demo_scene(
             f"{directory} is not empty; choose another folder, or replace the scene with --overwrite"
         )
     with _staging_beside(directory) as staging:
-        _write_scene(staging / "scene", size, bands, views)
+        _write_scene(staging / "scene", size, bands, views, illuminant)
         _move_files(staging / "scene", directory)
 
 
@@ -108,11 +111,11 @@ def is_complete(directory: Path) -> bool:
     return all((directory / path).is_file() for path in paths)
 
 
-def _write_scene(folder: Path, size: int, bands: int, views: int) -> None:
+def _write_scene(folder: Path, size: int, bands: int, views: int, illuminant: str | Path = LAMP) -> None:
+    sampling = Bands.of(band_centers_nm(bands))
+    spectra, lamp = reflectances(sampling.centers_nm), lamp_power(sampling.centers_nm, illuminant)
     for name in _FOLDERS:
         (folder / name).mkdir(parents=True)
-    sampling = Bands.of(band_centers_nm(bands))
-    spectra, lamp = reflectances(sampling.centers_nm), lamp_power(sampling.centers_nm)
     to_rgb = rgb_matrix(sampling)
     write_spectra_csv(folder / "endmembers.csv", SpectraTable(sampling, MATERIALS, spectra))
     write_spectra_csv(folder / "illuminant.csv", SpectraTable(sampling, ("power",), lamp[None]))

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from unmix_plugin.errors import ConfigError
+from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour import band_composite_matrix, linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.segmentation import material_ids, material_scores
@@ -55,6 +55,16 @@ class Coefficients:
 
 SegmentationMethod = Literal["abundances", "probe"]
 
+
+def default_names(count: int) -> tuple[str, ...]:
+    """What endmembers are called that nobody has named.
+
+    >>> default_names(2)
+    ('endmember_0', 'endmember_1')
+    """
+    return tuple(f"endmember_{index}" for index in range(count))
+
+
 _FIELDS = ("accumulation", "distance", "abundances", "scaled_abundances", "specular")
 
 
@@ -68,6 +78,20 @@ class Materials:
     segmentation: SegmentationMethod = "abundances"
     """How a ray's material is chosen: its largest abundance, or the paper's probe, the endmember of smallest angle
     to the ray's spectrum."""
+    names: tuple[str, ...] = ()
+    """One for each endmember, distinct: what it is called in every file and figure. None given: `default_names`."""
+
+    def __post_init__(self) -> None:
+        """Give names where there are none.
+
+        Raises:
+            SpectrumError: another number of names than of endmembers, or two the same.
+        """
+        count = len(self.endmembers)
+        if not self.names:
+            object.__setattr__(self, "names", default_names(count))
+        if len(set(self.names)) != count or len(self.names) != count:
+            raise SpectrumError(f"{count} endmembers need {count} distinct names; found {list(self.names)}")
 
     def diffuse(self, coefficients: Coefficients) -> Float[Tensor, "*rays B"]:
         """Spectra without the view-dependent part."""
@@ -129,7 +153,8 @@ def spectral(coefficients: Coefficients, materials: Materials) -> Float[Tensor, 
 
 def _linear_rgb(coefficients: Coefficients, materials: Materials) -> Float[Tensor, "*rays 3"]:
     matrix = rgb_matrix(materials.bands).to(coefficients.abundances)
-    return (spectral(coefficients, materials).clamp(0, 1) @ matrix).clamp(0, 1)
+    # Not clamped at 1 before the colours are: in another light a band may exceed the sensor's full scale.
+    return (spectral(coefficients, materials).clamp(min=0) @ matrix).clamp(0, 1)
 
 
 def _rgb(coefficients: Coefficients, materials: Materials) -> Float[Tensor, "*rays 3"]:

@@ -1,0 +1,58 @@
+"""A tiny model to edit, and the camera that looks at it."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from tests.method_factory import make_model
+from unmix_plugin.editing import Recipe, edit_model, recipe_from_yaml
+from unmix_plugin.engine.cameras import Cameras
+from unmix_plugin.model import UnmixModel
+from unmix_plugin.spectral.composition import Coefficients
+
+LIGHT = [0.5, 0.7, 1.0, 0.9, 0.6]
+
+CAMERAS = Cameras(
+    camera_to_world=torch.tensor(
+        [
+            [[1.0, 0, 0, 0.2], [0, 1, 0, 0], [0, 0, 1, 4.0]],
+            [[0.0, 0, 1, 4.0], [0, 1, 0, 0.3], [-1, 0, 0, 0]],
+        ]
+    ),
+    focal_px=torch.full((2, 2), 20.0),
+    center_px=torch.tensor([[6.0, 5.0]] * 2),
+    distortion=torch.zeros(2, 4),
+    width=12,
+    height=10,
+)
+"""Two views of the box, from the front and from the side."""
+
+OUTPUTS = ("spectral", "diffuse", "specular", "abundances", "accumulation", "rgb")
+
+
+def lit_model(**settings) -> UnmixModel:
+    """Three materials in a light that is not flat, with some gloss."""
+    model = make_model(light=LIGHT, **settings)
+    with torch.no_grad():
+        for weights in model.field.material_network.parameters():
+            weights.mul_(6)  # else every point is about a third of each
+    model.field.log_initial_density += 1.5
+    return model
+
+
+def edited(model: UnmixModel, *edits: str, seen: Coefficients | None = None, light: str = "") -> UnmixModel:
+    """The model after edits, each written as in a recipe."""
+    return edit_model(model, recipe(*edits, light=light), seen)
+
+
+def recipe(*edits: str, light: str = "") -> Recipe:
+    """A recipe of edits, each written as in a file."""
+    lines = [f"illuminant: {light}"] if light else []
+    lines += ["edits:", *(f"- {edit}" for edit in edits)] if edits else []
+    return recipe_from_yaml("\n".join(lines), "edits.yml")
+
+
+def rendered(model: UnmixModel, view: int = 0) -> dict[str, Tensor]:
+    """What a camera sees."""
+    return model.get_outputs_for_camera(CAMERAS[view], OUTPUTS)

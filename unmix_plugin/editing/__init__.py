@@ -1,0 +1,51 @@
+"""Edits of materials and light as plain data, and the models that render them: one code for exports and the viewer.
+
+They act on endmembers, densities and gloss, never on pixels, so they look the same in every view.
+"""
+
+from unmix_plugin.editing.apply import assumption_of_light, changes_geometry, edit_model, relight
+from unmix_plugin.editing.operations import (
+    Colour,
+    Endmember,
+    FileSpectrum,
+    Gloss,
+    Isolate,
+    LibrarySpectrum,
+    Operation,
+    Remove,
+    Rename,
+    Replace,
+    Retint,
+    Scale,
+    Swap,
+)
+from unmix_plugin.editing.recipe import Light, Recipe
+from unmix_plugin.editing.seen import sample_seen
+from unmix_plugin.editing.yaml_reading import read_recipe, recipe_from_yaml
+from unmix_plugin.editing.yaml_writing import recipe_to_yaml
+
+__all__ = [
+    "Colour",
+    "Endmember",
+    "FileSpectrum",
+    "Gloss",
+    "Isolate",
+    "LibrarySpectrum",
+    "Light",
+    "Operation",
+    "Recipe",
+    "Remove",
+    "Rename",
+    "Replace",
+    "Retint",
+    "Scale",
+    "Swap",
+    "assumption_of_light",
+    "changes_geometry",
+    "edit_model",
+    "read_recipe",
+    "recipe_from_yaml",
+    "recipe_to_yaml",
+    "relight",
+    "sample_seen",
+]

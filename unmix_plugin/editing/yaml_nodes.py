@@ -1,0 +1,181 @@
+"""YAML as plain data whose every value knows its line: nothing of it is ever constructed but numbers and words."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Collection
+from typing import Any
+
+import yaml
+
+_MAX_CHARACTERS = 1_000_000
+
+_PLAIN_TAGS = frozenset(
+    f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "timestamp")
+)
+
+_HEXADECIMAL = re.compile(r"#?([0-9a-fA-F]{6})")
+
+
+class NodeError(Exception):
+    """Something in a YAML text is not what it should be."""
+
+    def __init__(self, line: int | None, message: str) -> None:
+        super().__init__(message)
+        self.line = line
+        """From 1; None where the text as a whole is meant."""
+
+
+def compose(text: str) -> yaml.Node | None:
+    """The text's only document as nodes; None if it is empty.
+
+    Raises:
+        NodeError: it is no YAML, more than one document, too long or too deep.
+    """
+    if len(text) > _MAX_CHARACTERS:
+        raise NodeError(None, f"{len(text)} characters are too many; at most {_MAX_CHARACTERS}")
+    try:
+        return yaml.compose(text, Loader=yaml.SafeLoader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        raise NodeError(
+            mark.line + 1 if mark else None, f"not YAML: {error.problem or error.context}"
+        ) from error
+    except (yaml.YAMLError, RecursionError) as error:
+        raise NodeError(None, f"not YAML: {str(error).splitlines()[0]}") from error
+
+
+def line_of(node: yaml.Node) -> int:
+    """The line on which a node begins, from 1."""
+    return node.start_mark.line + 1
+
+
+def fault(node: yaml.Node, message: str) -> NodeError:
+    """A fault at a node."""
+    return NodeError(line_of(node), message)
+
+
+def mapping(
+    node: yaml.Node, what: str, required: Collection[str], optional: Collection[str] = ()
+) -> dict[str, yaml.Node]:
+    """The values of a mapping by key.
+
+    Raises:
+        NodeError: it is no mapping; a key is unknown, repeated or missing.
+    """
+    known = [*required, *optional]
+    if not isinstance(node, yaml.MappingNode):
+        raise fault(node, f"{what} takes {', '.join(known)}; found {describe(node)}")
+    found: dict[str, yaml.Node] = {}
+    for key_node, value in node.value:
+        key = text(key_node, "a key")
+        if key not in known:
+            raise fault(key_node, f"{what} has no {key!r}; {nearest(key, known)}")
+        if key in found:
+            raise fault(key_node, f"{what} has {key!r} twice")
+        found[key] = value
+    missing = [key for key in required if key not in found]
+    if missing:
+        raise fault(node, f"{what} needs {' and '.join(missing)}")
+    return found
+
+
+def sequence(node: yaml.Node, what: str) -> list[yaml.Node]:
+    """The items of a list.
+
+    Raises:
+        NodeError: it is no list.
+    """
+    if not isinstance(node, yaml.SequenceNode):
+        raise fault(node, f"{what} must be a list; found {describe(node)}")
+    return list(node.value)
+
+
+def text(node: yaml.Node, what: str) -> str:
+    """A word.
+
+    Raises:
+        NodeError: it is something else, such as a number without quotes.
+    """
+    value = scalar(node)
+    if not isinstance(value, str):
+        raise fault(node, f"{what} must be text; found {describe(node)}; put it in quotes if it is text")
+    return value
+
+
+def number(node: yaml.Node, what: str) -> float:
+    """A number.
+
+    Raises:
+        NodeError: it is something else.
+    """
+    value = scalar(node)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise fault(node, f"{what} must be a number; found {describe(node)}")
+    return float(value)
+
+
+def boolean(node: yaml.Node, what: str) -> bool:
+    """True or false.
+
+    Raises:
+        NodeError: it is something else.
+    """
+    value = scalar(node)
+    if not isinstance(value, bool):
+        raise fault(node, f"{what} must be true or false; found {describe(node)}")
+    return value
+
+
+def colour(node: yaml.Node, what: str) -> tuple[float, float, float]:
+    """An sRGB colour in [0, 1], from '#rrggbb' or three numbers in [0, 1].
+
+    Raises:
+        NodeError: it is neither.
+    """
+    expected = f"{what} must be '#rrggbb' in quotes, or three numbers in [0, 1]"
+    if isinstance(node, yaml.SequenceNode):
+        values = [number(item, what) for item in node.value]
+        if len(values) != 3:
+            raise fault(node, f"{expected}; found {len(values)} numbers")
+        return values[0], values[1], values[2]
+    value = scalar(node)
+    if value is None:
+        raise fault(node, f"{expected}; found nothing (without quotes, # begins a comment)")
+    digits = _HEXADECIMAL.fullmatch(value) if isinstance(value, str) else None
+    if digits is None:
+        raise fault(node, f"{expected}; found {describe(node)}")
+    red, green, blue = (int(digits[1][i : i + 2], 16) / 255 for i in (0, 2, 4))
+    return red, green, blue
+
+
+def scalar(node: yaml.Node) -> Any:
+    """A word, number, true, false, date or None; None, too, for anything that is no single value of these.
+
+    Raises:
+        NodeError: its tag asks for something else to be constructed.
+    """
+    if not isinstance(node, yaml.ScalarNode):
+        return None
+    if node.tag not in _PLAIN_TAGS:
+        raise fault(node, f"only plain data is read; found a value with the tag {node.tag}")
+    try:
+        return yaml.constructor.SafeConstructor().construct_object(node)
+    except (yaml.YAMLError, ValueError) as error:
+        raise fault(node, f"can't read {node.value!r} as a value: {error}") from error
+
+
+def describe(node: yaml.Node) -> str:
+    """What a message says that it found."""
+    if isinstance(node, yaml.MappingNode):
+        return "a mapping"
+    if isinstance(node, yaml.SequenceNode):
+        return f"a list of {len(node.value)}"
+    return repr(node.value) if node.value else "nothing"
+
+
+def nearest(word: str, known: Collection[str]) -> str:
+    """Words that a reader may have meant, for the end of a message."""
+    near = difflib.get_close_matches(word, known, n=3, cutoff=0.6)
+    return f"did you mean {' or '.join(near)}?" if near else f"known: {', '.join(known)}"
