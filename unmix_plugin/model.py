@@ -39,11 +39,13 @@ from unmix_plugin.spectral.composition import (
     Materials,
     SegmentationMethod,
     compose,
+    default_names,
     spectral,
 )
 from unmix_plugin.spectral.endmembers import EndmemberMethod, initialise_endmembers
 from unmix_plugin.spectral.losses import forgive_saturation, over_background, solid_evidence, srgb_error
 from unmix_plugin.spectral.metrics import psnr
+from unmix_plugin.spectral.mixture_guide import MixtureGuide
 from unmix_plugin.spectral.spectra_csv import read_spectra_csv
 
 _FEWEST_RAYS, _MOST_RAYS = 64, 8192
@@ -57,7 +59,7 @@ class UnmixModelConfig(ModelConfig):
     _target: Target = field(default_factory=lambda: UnmixModel)
     num_endmembers: int = 6
     """K, the number of materials to unmix into."""
-    endmember_init: EndmemberMethod | Literal["file"] = "kmeans"
+    endmember_init: EndmemberMethod | Literal["file"] = "pairs"
     """First guess of the endmembers from the pixels of all training views, or spectra from `endmember_file`."""
     endmember_file: Path | None = None
     """CSV of reflectances (wavelength,name,...) for `endmember_init` file; multiplied by the scene's light if known."""
@@ -77,6 +79,12 @@ class UnmixModelConfig(ModelConfig):
     opacity_loss_weight: float = 0.01
     """Weight of the mean squared transparency in scenes without alpha, where pixels aren't dark: light comes from
     something solid, but black may be the void."""
+    abundance_loss_weight: float = 0.1
+    """Weight of the mean squared distance of composited abundances to those of the measured spectra, unmixed one by
+    one with the first endmembers; 0 as published."""
+    mixing_penalty: float = 2.0
+    """By how much a further material must improve the fit of such a spectrum, in multiples of the mean angle that
+    mixtures of two leave unexplained."""
     samples_per_step: int = 30_000
     """Samples marched in a training step; the number of rays adapts to it."""
     initial_opacity: float = 0.05
@@ -98,8 +106,12 @@ class UnmixModelConfig(ModelConfig):
             "num-endmembers of 1 to 255": 1 <= self.num_endmembers <= 255,
             "num-specular-spectra of at least 1": self.num_specular_spectra >= 1,
             "samples-per-step of at least 1": self.samples_per_step >= 1,
-            "loss weights of at least 0": min(
-                self.spectral_loss_weight, self.rgb_loss_weight, self.opacity_loss_weight
+            "loss weights and the mixing-penalty of at least 0": min(
+                self.spectral_loss_weight,
+                self.rgb_loss_weight,
+                self.opacity_loss_weight,
+                self.abundance_loss_weight,
+                self.mixing_penalty,
             )
             >= 0,
             "initial opacities in (0, 1)": 0 < self.initial_opacity < 1
@@ -134,6 +146,7 @@ class UnmixModel(Model):
                 f"choose at most {num_bands}"
             )
         self.endmembers = nn.Parameter(torch.zeros(config.num_endmembers, num_bands))
+        self.endmember_names = default_names(config.num_endmembers)
         num_dictionary = config.num_specular_spectra if config.specular == "dictionary" else 0
         self.specular_spectra = nn.Parameter(torch.zeros(num_dictionary, num_bands))
         opacity = config.initial_opacity if metadata["has_alpha"] else config.initial_opacity_unknown
@@ -153,6 +166,7 @@ class UnmixModel(Model):
             pixel_size=metadata["pixel_size"],
         )
         self.register_buffer("rgb_weights", rgb_matrix(self.bands), persistent=False)
+        self.mixture_guide = MixtureGuide(config.num_endmembers, num_bands)
         self.register_buffer("every_band", torch.eye(num_bands), persistent=False)
 
     def initialise(self, initial_data: Mapping[str, np.ndarray]) -> None:
@@ -164,7 +178,9 @@ class UnmixModel(Model):
         """
         light = self.metadata["illuminant"]
         lamp = torch.ones(len(self.bands)) if light is None else torch.tensor(light, dtype=torch.float32)
-        self.endmembers.copy_(self._first_endmembers(torch.from_numpy(initial_data["pixels"]), lamp))
+        pixels = torch.from_numpy(initial_data["pixels"])
+        self.endmembers.copy_(self._guess_endmembers(pixels, lamp))
+        self.mixture_guide.start(pixels, self.endmembers.detach(), self.config.mixing_penalty)
         for row in range(len(self.specular_spectra)):
             self.specular_spectra[row] = (
                 lamp if row == 0 else self.endmembers[(row - 1) % len(self.endmembers)]
@@ -181,14 +197,17 @@ class UnmixModel(Model):
     def materials(self) -> Materials:
         """The spectra that coefficients are multiplied with."""
         specular_spectra = self.every_band if self.config.specular == "full" else self.specular_spectra
-        return Materials(self.bands, self.endmembers, specular_spectra, self.config.segmentation)
+        return Materials(
+            self.bands, self.endmembers, specular_spectra, self.config.segmentation, self.endmember_names
+        )
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
-        """`spectral` (R, B) on black, `accumulation` (R) and, as one number, the `num_samples` marched."""
+        """`spectral` (R, B) on black, `abundances` (R, K), `accumulation` (R) and `num_samples`, one number."""
         coefficients, num_samples = self.renderer(self.field, ray_bundle)
         return {
             "spectral": spectral(coefficients, self.materials),
             "accumulation": coefficients.accumulation,
+            "abundances": coefficients.abundances,
             "num_samples": torch.tensor(num_samples),
         }
 
@@ -199,7 +218,9 @@ class UnmixModel(Model):
         metrics_dict: dict[str, Tensor] | None = None,
     ) -> dict[str, Tensor]:
         """Weighted errors of spectra and, if asked, of their sRGB colours, over a common background."""
-        spectra, opacities = _pixel_means(outputs, len(batch["spectra"]))
+        num_pixels = len(batch["spectra"])
+        spectra = _pixel_mean(outputs["spectral"], num_pixels)
+        opacities = _pixel_mean(outputs["accumulation"], num_pixels)
         background = self._background(opacities)
         target = over_background(batch["spectra"], batch["alpha"], background)
         predicted = over_background(spectra, opacities, background)
@@ -210,11 +231,15 @@ class UnmixModel(Model):
         if self.config.opacity_loss_weight > 0 and not self.metadata["has_alpha"]:
             shown = solid_evidence(batch["spectra"])
             losses["opacity"] = self.config.opacity_loss_weight * (shown * (1 - opacities).square()).mean()
+        if self.config.abundance_loss_weight > 0:
+            abundances = _pixel_mean(outputs["abundances"], num_pixels)
+            error = self.mixture_guide.error(abundances, batch["spectra"], batch["alpha"])
+            losses["abundances"] = self.config.abundance_loss_weight * error
         return losses
 
     def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """`psnr` of the batch in dB, on black."""
-        spectra, _ = _pixel_means(outputs, len(batch["spectra"]))
+        spectra = _pixel_mean(outputs["spectral"], len(batch["spectra"]))
         error = (spectra.detach().clamp(0, 1) - batch["spectra"]).square().mean()
         return {"psnr": -10 * torch.log10(error.clamp(min=1e-12))}
 
@@ -296,7 +321,7 @@ class UnmixModel(Model):
         parts = [self.renderer(self.field, bundle[i : i + chunk])[0] for i in range(0, len(bundle), chunk)]
         return Coefficients.concatenate(parts)
 
-    def _first_endmembers(
+    def _guess_endmembers(
         self, pixels: Float[Tensor, "N B"], lamp: Float[Tensor, "B"]
     ) -> Float[Tensor, "K B"]:
         config = self.config
@@ -342,9 +367,6 @@ class UnmixModel(Model):
         self.specular_spectra.clamp_(0, 1)
 
 
-def _pixel_means(
-    outputs: dict[str, Tensor], num_pixels: int
-) -> tuple[Float[Tensor, "R B"], Float[Tensor, "R"]]:
-    """Spectra and opacities of pixels from those of the rays cast through them, which follow each other."""
-    spectra, accumulation = outputs["spectral"], outputs["accumulation"]
-    return spectra.unflatten(0, (num_pixels, -1)).mean(1), accumulation.unflatten(0, (num_pixels, -1)).mean(1)
+def _pixel_mean(values: Float[Tensor, "S *channels"], num_pixels: int) -> Float[Tensor, "R *channels"]:
+    """Means over the rays cast through each pixel, which follow each other."""
+    return values.unflatten(0, (num_pixels, -1)).mean(dim=1)

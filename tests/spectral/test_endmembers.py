@@ -1,13 +1,13 @@
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.spectral.mixtures import mixed_pixels, seeded, smooth_endmembers
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral import drop_uninformative_pixels, initialise_endmembers, spectral_angle
 
-METHODS = ["kmeans", "vca", "nfindr"]
+METHODS = ["kmeans", "vca", "nfindr", "minimum-volume", "pairs"]
 
 
 def shaded_scene(num_endmembers, num_mixtures=200, seed=0):
@@ -35,6 +35,7 @@ def test_extreme_pixels_have_the_shapes_of_the_materials_among_many_mixtures(met
 
 
 @pytest.mark.parametrize("method", METHODS)
+@settings(max_examples=25)
 @given(num_endmembers=st.integers(1, 6), seed=st.integers(0, 50))
 def test_every_method_finds_materials_of_which_most_pixels_are_pure(method, num_endmembers, seed):
     pixels, materials = shaded_scene(num_endmembers, num_mixtures=5, seed=seed)

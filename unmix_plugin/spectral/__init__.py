@@ -4,6 +4,7 @@ Importing this package costs torch and numpy; scipy, scikit-image and colour-sci
 need them.
 """
 
+from unmix_plugin.spectral.abundance_estimation import fcls, nnls, sunsal
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour import (
     band_composite_matrix,
@@ -28,7 +29,9 @@ from unmix_plugin.spectral.metrics import (
     spectral_angle,
     ssim,
 )
+from unmix_plugin.spectral.minimum_volume import minimum_volume_simplex
 from unmix_plugin.spectral.nfindr_winter1999 import nfindr, simplex_volume
+from unmix_plugin.spectral.num_materials import MaterialCount, hysime, propose_num_materials
 from unmix_plugin.spectral.segmentation import (
     SegmentationScores,
     SegmentationTally,
@@ -42,6 +45,11 @@ from unmix_plugin.spectral.spectra_csv import (
     resample_spectra,
     write_spectra_csv,
 )
+from unmix_plugin.spectral.two_material_mixtures import (
+    TwoMaterialFit,
+    two_material_endmembers,
+    two_material_fits,
+)
 from unmix_plugin.spectral.vca_nascimento2005 import VcaResult, estimate_snr_db, vca
 
 __all__ = [
@@ -49,9 +57,11 @@ __all__ = [
     "EndmemberMatching",
     "EndmemberMethod",
     "KmeansResult",
+    "MaterialCount",
     "SegmentationScores",
     "SegmentationTally",
     "SpectraTable",
+    "TwoMaterialFit",
     "VcaResult",
     "abundance_rmse",
     "band_composite_matrix",
@@ -60,13 +70,18 @@ __all__ = [
     "drop_uninformative_pixels",
     "endmember_angle",
     "estimate_snr_db",
+    "fcls",
+    "hysime",
     "initialise_endmembers",
     "linear_to_srgb",
     "match_endmembers",
     "material_ids",
     "material_scores",
+    "minimum_volume_simplex",
     "nfindr",
+    "nnls",
     "normalised_kmeans",
+    "propose_num_materials",
     "psnr",
     "read_illuminant_csv",
     "read_spectra_csv",
@@ -80,6 +95,9 @@ __all__ = [
     "spectral_angle",
     "srgb_to_linear",
     "ssim",
+    "sunsal",
+    "two_material_endmembers",
+    "two_material_fits",
     "vca",
     "write_spectra_csv",
     "xyz_matrix",

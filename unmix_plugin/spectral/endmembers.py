@@ -8,15 +8,17 @@ from __future__ import annotations
 from typing import Literal
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.kmeans_normalised import normalised_kmeans, scale_to_lit_pixels
+from unmix_plugin.spectral.minimum_volume import minimum_volume_simplex
 from unmix_plugin.spectral.nfindr_winter1999 import nfindr
+from unmix_plugin.spectral.two_material_mixtures import two_material_endmembers
 from unmix_plugin.spectral.vca_nascimento2005 import vca
 
-EndmemberMethod = Literal["kmeans", "vca", "nfindr"]
+EndmemberMethod = Literal["kmeans", "vca", "nfindr", "minimum-volume", "pairs"]
 
 DARK_RMS = 0.005
 """Root mean square over bands below which a pixel counts as black: its direction is noise."""
@@ -37,21 +39,20 @@ def initialise_endmembers(
     Args:
         pixels: Spectra of all training views, background left out where it is known.
         method: `kmeans` takes the mean shapes of clusters, which serves scenes whose materials each cover some area;
-            `vca` and `nfindr` take extreme pixels, which serves mixtures of which pure pixels exist.
+            `vca` and `nfindr` take extreme pixels, which serves mixtures of which pure pixels exist;
+            `minimum-volume` takes the corners of the smallest simplex around nearly all pixels, which serves mixtures
+            without pure pixels; `pairs` takes the mean shapes that explain the pixels best as mixtures of two, which
+            serves surfaces whose materials meet.
         generator: On the CPU; the only source of randomness.
         max_pixels: More are thinned out at random to this number.
     Raises:
         SpectrumError: NaN or infinite values, more endmembers than bands or than distinct pixels neither dark nor
-            saturated, or pixels that span too few dimensions.
+            saturated, pixels that span too few dimensions, or more than 64 endmembers for `pairs`.
     """
     usable = _usable_pixels(pixels, num_endmembers, generator, max_pixels)
     if method == "kmeans" or num_endmembers == 1:
         return normalised_kmeans(usable, num_endmembers, generator).endmembers.clamp(0, 1)
-    if method == "vca":
-        spectra = vca(usable, num_endmembers, generator).endmembers.clamp(min=0)
-    else:
-        # On spectra of one brightness: otherwise the darkest pixels are the corners of the largest simplex.
-        spectra = usable[nfindr(usable / usable.sum(dim=1, keepdim=True), num_endmembers, generator)]
+    spectra = _shapes(usable, num_endmembers, method, generator)
     return scale_to_lit_pixels(spectra, usable, _most_similar(usable, spectra)).clamp(0, 1)
 
 
@@ -67,6 +68,28 @@ def drop_uninformative_pixels(pixels: Float[Tensor, "N B"]) -> Float[Tensor, "ke
     rms = unsaturated.square().mean(dim=1).sqrt()
     bright = float(rms.kthvalue(max(1, round(0.99 * len(rms)))).values)
     return unsaturated[rms > max(DARK_RMS, _DARK_SHARE * bright)]
+
+
+def shows_a_shape(pixels: Float[Tensor, "N B"]) -> Bool[Tensor, " N"]:
+    """Where a pixel is neither black (root mean square over bands at most 0.005) nor saturated (1 or above)."""
+    return (pixels.amax(dim=1) < 1) & (pixels.square().mean(dim=1).sqrt() > DARK_RMS)
+
+
+def _shapes(
+    usable: Float[Tensor, "N B"],
+    num_endmembers: int,
+    method: Literal["vca", "nfindr", "minimum-volume", "pairs"],
+    generator: torch.Generator,
+) -> Float[Tensor, "K B"]:
+    """Endmembers of any brightness."""
+    if method == "vca":
+        return vca(usable, num_endmembers, generator).endmembers.clamp(min=0)
+    if method == "minimum-volume":
+        return minimum_volume_simplex(usable, num_endmembers, generator)
+    if method == "pairs":
+        return two_material_endmembers(usable, num_endmembers, generator)
+    # On spectra of one brightness: otherwise the darkest pixels are the corners of the largest simplex.
+    return usable[nfindr(usable / usable.sum(dim=1, keepdim=True), num_endmembers, generator)]
 
 
 def _usable_pixels(

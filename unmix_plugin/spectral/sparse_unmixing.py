@@ -1,0 +1,77 @@
+"""Abundances of single spectra that are mixtures of few materials.
+
+With all endmembers free to take part, a spectrum that is a little off is explained by a mixture of many: white by a
+bit of every colour. A spectrum here shows at most three materials, and each beyond the first must bring it nearer by
+a fixed angle. All choices of materials are tried, which is exact; brightness takes no part.
+
+Source: least squares with an l0 penalty, as in sparse unmixing (Iordache, Bioucas-Dias and Plaza 2011), whose l1
+relaxation is needed only for libraries of hundreds.
+
+Notation: `N` spectra, `B` bands, `K` endmembers, `C` choices of `m` endmembers.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+from math import comb
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+_MOST_MATERIALS = 3
+_MOST_CHOICES = 2000
+"""Choices of endmembers that are tried: with more than 22 endmembers only pairs are."""
+
+_RIDGE = 1e-6
+"""Added to the diagonal of normal equations, so that endmembers of one shape can be solved for."""
+
+
+def sparse_abundances(
+    spectra: Float[Tensor, "N B"], endmembers: Float[Tensor, "K B"], mixing_penalty: float
+) -> Float[Tensor, "N K"]:
+    """Abundances of each spectrum, at least 0 with sum 1; zeros where a spectrum or what explains it is zero.
+
+    Args:
+        endmembers: Their brightness matters: a dark one must cover more than a bright one to send the same light.
+        mixing_penalty: Sine of the angle by which each material beyond the first must improve the fit.
+    """
+    shapes = torch.nn.functional.normalize(spectra, dim=1)
+    corners = torch.nn.functional.normalize(endmembers, dim=1)
+    cosines, gram = shapes @ corners.T, corners @ corners.T
+    smallest = torch.full_like(cosines[:, 0], torch.inf)
+    shares = torch.zeros_like(cosines)
+    for size in _sizes(len(endmembers)):
+        choices = torch.tensor(list(combinations(range(len(endmembers)), size)), device=cosines.device)
+        misfit, found = _best_choice(cosines, gram, choices)
+        misfit = misfit + mixing_penalty * (size - 1)
+        shares = torch.where((misfit < smallest)[:, None], found, shares)
+        smallest = torch.minimum(misfit, smallest)
+    covered = shares / endmembers.norm(dim=1).clamp(min=1e-6)
+    return covered / covered.sum(dim=1, keepdim=True).clamp(min=1e-9)
+
+
+def _sizes(num_endmembers: int) -> list[int]:
+    """How many materials a mixture may have, so that the choices stay few."""
+    largest = min(num_endmembers, _MOST_MATERIALS)
+    return [
+        size for size in range(1, largest + 1) if size <= 2 or comb(num_endmembers, size) <= _MOST_CHOICES
+    ]
+
+
+def _best_choice(
+    cosines: Float[Tensor, "N K"], gram: Float[Tensor, "K K"], choices: Tensor
+) -> tuple[Float[Tensor, " N"], Float[Tensor, "N K"]]:
+    """Sine of the angle to the best mixture of one of the choices (C, m) with positive shares, and its shares.
+
+    Infinite where no choice has only positive shares.
+    """
+    size = choices.shape[1]
+    among = gram[choices[:, :, None], choices[:, None, :]].double()
+    inverse = torch.linalg.inv(among + _RIDGE * torch.eye(size, device=gram.device)).to(gram)
+    own = cosines[:, choices]
+    shares = torch.einsum("ncm,cml->ncl", own, inverse)
+    misfits = (1 - (shares * own).sum(dim=-1)).clamp(min=0).sqrt()
+    misfit, best = torch.where((shares > 0).all(dim=-1), misfits, torch.inf).min(dim=1)
+    chosen = shares.gather(1, best[:, None, None].expand(-1, 1, size))[:, 0].clamp(min=0)
+    return misfit, torch.zeros_like(cosines).scatter(1, choices[best], chosen)
