@@ -90,7 +90,7 @@ def test_a_last_colour_background_closes_every_ray_that_meets_something():
 
 @pytest.mark.parametrize("background", ["random", "black", "white"])
 def test_a_perfect_prediction_has_no_loss_over_any_background(background):
-    model = make_model(background=background, rgb_loss_weight=1.0)
+    model = make_model(background=background, rgb_loss_weight=1.0, abundance_loss_weight=0.0)
     spectra, alpha = torch.rand(8, NUM_BANDS), torch.rand(8)
     losses = model.get_loss_dict(
         {"spectral": spectra, "accumulation": alpha}, {"spectra": spectra, "alpha": alpha}
@@ -103,14 +103,16 @@ def test_a_bright_background_penalises_missing_opacity():
     batch = {"spectra": torch.zeros(4, NUM_BANDS), "alpha": torch.ones(4)}
     outputs = {"spectral": torch.zeros(4, NUM_BANDS), "accumulation": torch.zeros(4)}
     losses = {
-        b: float(make_model(background=b).get_loss_dict(outputs, batch)["spectral"])
+        b: float(
+            make_model(background=b, abundance_loss_weight=0.0).get_loss_dict(outputs, batch)["spectral"]
+        )
         for b in ("black", "white")
     }
     assert losses == {"black": 0.0, "white": 1.0}
 
 
 def test_brighter_than_a_saturated_sensor_is_no_error_but_darker_is():
-    model = make_model(background="black")
+    model = make_model(background="black", abundance_loss_weight=0.0)
     batch = {"spectra": torch.ones(1, NUM_BANDS), "alpha": torch.ones(1)}
     error = [
         float(
@@ -193,7 +195,8 @@ def test_more_endmembers_than_bands_or_distinct_pixels_are_refused():
         ({"num_endmembers": 0}, "num-endmembers of 1 to 255"),
         ({"endmember_init": "file"}, "endmember-file exactly when endmember-init is file"),
         ({"initial_opacity": 1.0}, r"initial opacities in \(0, 1\)"),
-        ({"rgb_loss_weight": -1.0}, "loss weights of at least 0"),
+        ({"rgb_loss_weight": -1.0}, "loss weights and the mixing-penalty of at least 0"),
+        ({"mixing_penalty": -0.1}, "loss weights and the mixing-penalty of at least 0"),
     ],
 )
 def test_impossible_settings_are_refused(settings, message):
@@ -249,17 +252,37 @@ def test_transparency_is_penalised_only_where_no_alpha_says_what_is_solid():
     )  # the last pixel is black: it may be void
     batch = {"spectra": spectra, "alpha": torch.ones(3)}
     outputs = {"spectral": spectra, "accumulation": torch.tensor([1.0, 0.5, 0.0])}
-    closed = make_model(has_alpha=False, opacity_loss_weight=0.2).get_loss_dict(outputs, batch)
+    settings = {"opacity_loss_weight": 0.2, "abundance_loss_weight": 0.0}
+    closed = make_model(has_alpha=False, **settings).get_loss_dict(outputs, batch)
     assert float(closed["spectral"]) == 0
     assert_close(closed["opacity"], torch.tensor(0.2 * 0.25 / 3))
-    assert "opacity" not in make_model(has_alpha=True, opacity_loss_weight=0.2).get_loss_dict(outputs, batch)
+    assert "opacity" not in make_model(has_alpha=True, **settings).get_loss_dict(outputs, batch)
 
 
 def test_the_automatic_background_is_black_without_alpha_and_random_with_it():
     batch = {"spectra": torch.zeros(50, NUM_BANDS), "alpha": torch.ones(50)}
     outputs = {"spectral": torch.zeros(50, NUM_BANDS), "accumulation": torch.zeros(50)}
     losses = [
-        float(make_model(has_alpha=has).get_loss_dict(outputs, batch)["spectral"]) for has in (False, True)
+        float(make_model(has_alpha=has, abundance_loss_weight=0.0).get_loss_dict(outputs, batch)["spectral"])
+        for has in (False, True)
     ]
     assert losses[0] == 0
     assert 0.2 < losses[1] < 0.5  # the mean square of a grey drawn evenly from [0, 1]
+
+
+def test_abundances_are_drawn_to_those_that_measured_spectra_show():
+    model = make_model(abundance_loss_weight=0.5)
+    shown = torch.tensor([0, 2, 1])
+    spectra = 0.5 * model.mixture_guide.endmembers[shown]
+    batch = {"spectra": spectra, "alpha": torch.ones(3)}
+    right = torch.eye(3)[shown]
+    losses = [
+        float(
+            model.get_loss_dict(
+                {"spectral": spectra, "accumulation": torch.ones(3), "abundances": abundances}, batch
+            )["abundances"]
+        )
+        for abundances in (right, right.roll(1, dims=1))
+    ]
+    assert losses[0] < 1e-6
+    assert_close(losses[1], 0.5 * 2.0, atol=1e-2, rtol=0)

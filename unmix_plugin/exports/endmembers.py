@@ -1,10 +1,13 @@
-"""Endmember spectra: a table and a plot over wavelength."""
+"""Endmember spectra: a table, a spectral library and a plot over wavelength."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from unmix_plugin.exports.files import figure_bytes, make_folder, write_file
+from unmix_plugin.exports.formats.envi_library import envi_library_paths, write_envi_library
 from unmix_plugin.exports.run_materials import endmember_colours, write_endmembers_csv
 from unmix_plugin.spectral.composition import Materials
 
@@ -15,17 +18,30 @@ _DPI = 130
 
 def endmember_paths(folder: Path) -> list[Path]:
     """Files that `write_endmembers` makes."""
-    return [folder / "endmembers.csv", folder / "endmembers.png"]
+    return [
+        folder / "endmembers.csv",
+        *envi_library_paths(folder / "endmembers"),
+        folder / "endmembers.png",
+    ]
 
 
 def write_endmembers(folder: Path, materials: Materials) -> list[Path]:
-    """Write the endmembers as CSV (wavelength in nm, one column a spectrum) and as a plot.
+    """Write the endmembers as CSV (wavelength in nm, one column a spectrum), as an ENVI spectral library and as a plot.
 
     Raises:
         RunError: the disk is full or refuses.
     """
-    table_path, plot_path = endmember_paths(make_folder(folder))
-    return [write_endmembers_csv(table_path, materials), write_file(plot_path, draw_endmembers(materials))]
+    table_path, *_, plot_path = endmember_paths(make_folder(folder))
+    spectra = materials.endmembers.detach().cpu().numpy().astype(np.float32)
+    library = write_envi_library(
+        folder / "endmembers",
+        spectra,
+        materials.bands,
+        materials.names,
+        "endmembers: radiance, 1 = full scale",
+    )
+    plot = draw_endmembers(materials)
+    return [write_endmembers_csv(table_path, materials), *library, write_file(plot_path, plot)]
 
 
 def draw_endmembers(materials: Materials) -> bytes:
@@ -48,7 +64,7 @@ def draw_endmembers(materials: Materials) -> bytes:
             linewidth=2.0,
             marker="o" if len(wavelengths) <= 40 else None,
             markersize=3.5,
-            label=f"endmember {index}",
+            label=materials.names[index],
         )
     axes.set(xlabel="wavelength (nm)", ylabel="radiance under the scene's light (1 = full scale)")
     axes.set_ylim(bottom=0.0)

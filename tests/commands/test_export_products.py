@@ -1,0 +1,296 @@
+"""`unmix-export` of every product: from a run alone, with its scene, edited, relit, never over other files."""
+
+import csv
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import spectral.io.envi as envi
+from plyfile import PlyData
+
+from tests.commands.running import SMALL_METHOD, picture_size, run
+from tests.exports.mesh_reading import loaded_mesh
+from tests.exports.test_html_page import assert_self_contained
+from unmix_plugin.commands.export import PRODUCTS, export
+from unmix_plugin.commands.train import train
+from unmix_plugin.engine.load_run import load_model
+from unmix_plugin.exports.run_materials import materials_of
+from unmix_plugin.scenes import load_scene
+from unmix_plugin.scenes.demo_scene import make_demo_scene
+from unmix_plugin.scenes.scene import SceneOptions
+
+SMALL = {
+    "cubes": ["--formats", "envi", "exr", "npy"],
+    "mesh": ["--formats", "ply", "obj", "glb", "--resolution", 24],
+    "point-cloud": ["--num-points", 500],
+    "report": ["--max-views", 1],
+    "spectrum": ["--view", "eval_002", "--pixel", "8,8"],
+    "volume": ["--resolution", 8],
+}
+NAMES = [product.name for product in PRODUCTS]
+
+
+def words(name, *more):
+    return [name, *SMALL.get(name, []), "--device", "cpu", *more]
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A run and its scene."""
+
+    run: Path
+    scene: Path
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A run whose hull is opaque from its first step on, so that there is a surface; twenty steps."""
+    folder = tmp_path_factory.mktemp("solid")
+    make_demo_scene(folder / "scene", 16, 8, 8)
+    given = ["--data", folder / "scene", "--output-dir", folder / "outputs", "--max-num-iterations", 20]
+    opaque = ["--pipeline.model.initial-opacity", 0.6, "--steps-per-log", 5]
+    ended = run(train, "unmix-nerf", *given, *opaque, *SMALL_METHOD)
+    assert ended.status == 0, ended.err
+    return Solid(Path(ended.last_line.removeprefix("run: ")), folder / "scene")
+
+
+@pytest.fixture
+def run_copy(trained, tmp_path):
+    """A copy of the run that a test may spoil."""
+    return Path(shutil.copytree(trained.run, tmp_path / "copy" / trained.run.name))
+
+
+@pytest.fixture(scope="module")
+def exported(trained, tmp_path_factory):
+    """A folder of every product."""
+    root = tmp_path_factory.mktemp("exported")
+    said = {}
+    for name in NAMES:
+        ended = run(export, *words(name, "--run", trained.run, "--output", root / name))
+        assert ended.status == 0, (name, ended.err)
+        said[name] = ended.out
+    return root, said
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_file_written_is_named_and_nothing_else_is_there(exported, name):
+    root, said = exported
+    files = sorted(str(path) for path in (root / name).rglob("*") if path.is_file())
+    assert files
+    lines = said[name].splitlines()
+    assert sorted(line for line in lines if line.startswith(str(root))) == files
+    assert lines[-1] == f"{len(files)} files written to {root / name}"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_file_is_replaced_unless_overwrite_is_given(trained, exported, tmp_path, name):
+    copy = shutil.copytree(exported[0] / name, tmp_path / name)
+    victim = sorted(path for path in copy.rglob("*") if path.is_file())[-1]
+    for path in copy.rglob("*"):
+        if path.is_file() and path != victim:
+            path.unlink()
+    victim.write_bytes(b"mine")
+    ended = run(export, *words(name, "--run", trained.run, "--output", copy))
+    assert ended.status == 2
+    assert str(victim) in ended.err
+    assert "--overwrite" in ended.err
+    assert [path.read_bytes() for path in copy.rglob("*") if path.is_file()] == [b"mine"]
+    assert run(export, *words(name, "--run", trained.run, "--output", copy, "--overwrite")).status == 0
+    assert victim.read_bytes() != b"mine"
+
+
+def test_every_product_comes_from_the_run_folder_alone(trained, run_copy, tmp_path):
+    shutil.move(trained.scene, tmp_path / "elsewhere")
+    try:
+        for name in NAMES:
+            ended = run(export, *words(name, "--run", run_copy))
+            assert ended.status == 0, (name, ended.err)
+            assert list((run_copy / "exports" / name).iterdir())
+    finally:
+        shutil.move(tmp_path / "elsewhere", trained.scene)
+    with (run_copy / "exports/spectrum/eval_002_x8_y8.csv").open() as file:
+        assert next(csv.reader(file)) == ["wavelength", "predicted", "diffuse", "specular"]
+    page = (run_copy / "exports/report/report.html").read_text()
+    assert "Not evaluated: run unmix-eval" in page
+    assert_self_contained(page)
+
+
+def test_more_views_are_segmented_into_a_folder_with_the_same_legend(trained, tmp_path):
+    common = ["--run", trained.run, "--output", tmp_path, "--device", "cpu"]
+    assert run(export, "segmentation", *common).status == 0
+    assert run(export, "segmentation", "--views", "train", *common).status == 0
+    assert len(list((tmp_path / "labels").iterdir())) == 8
+    (tmp_path / "legend.csv").write_text("mine")
+    shutil.rmtree(tmp_path / "labels")
+    for path in (*tmp_path.glob("*.npy"), *tmp_path.glob("*.png")):
+        path.unlink()
+    ended = run(export, "segmentation", *common)
+    assert ended.status == 2
+    assert "legend.csv exist" in ended.err
+
+
+def test_cubes_are_what_the_model_renders(trained, exported):
+    loaded = load_model(trained.run, "cpu")
+    expected = loaded.model.get_outputs_for_camera(loaded.scene.eval_cameras[0], ["spectral"])["spectral"]
+    base = exported[0] / "cubes" / "eval_002"
+    np.testing.assert_array_equal(np.load(f"{base}.npy"), expected)
+    from_envi: Any = envi.open(f"{base}.hdr", f"{base}.img")
+    np.testing.assert_array_equal(from_envi.open_memmap(), expected)
+
+
+def test_points_and_mesh_lie_where_the_scene_is(trained, exported):
+    scene = load_scene(trained.scene, SceneOptions())
+    corners = scene.normalisation.to_world(scene.scene_box.aabb.numpy())
+    low, high = corners.min(axis=0) - 1e-4, corners.max(axis=0) + 1e-4
+    vertices = PlyData.read(exported[0] / "point-cloud" / "points.ply")["vertex"]
+    points = np.stack([vertices[axis] for axis in "xyz"], axis=1)
+    assert 100 < len(points) <= 500
+    assert ((points >= low) & (points <= high)).all()
+    for kind in ("ply", "obj", "glb"):
+        mesh = loaded_mesh(exported[0] / "mesh" / f"mesh.{kind}")
+        assert ((mesh.vertices >= low - 0.2) & (mesh.vertices <= high + 0.2)).all()
+
+
+def test_a_pixel_has_what_was_measured_there_beside_what_is_predicted(trained, exported):
+    scene = load_scene(trained.scene, SceneOptions())
+    index = [frame.name for frame in scene.frames].index("eval_002")
+    base = exported[0] / "spectrum" / "eval_002_x8_y8"
+    with base.with_suffix(".csv").open() as file:
+        rows = list(csv.DictReader(file))
+    measured = [float(row["measured"]) for row in rows]
+    np.testing.assert_allclose(measured, scene.cube(index)[8, 8], rtol=1e-7)
+    for row in rows:
+        parts = float(row["diffuse"]) + float(row["specular"])
+        assert float(row["predicted"]) == pytest.approx(parts, abs=1e-6)
+    facts = json.loads(base.with_suffix(".json").read_text())
+    assert (facts["view"], facts["pixel"]) == ("eval_002", [8, 8])
+    assert sum(facts["abundances"].values()) == pytest.approx(1, abs=1e-4)
+    assert facts["material"] == max(facts["abundances"], key=facts["abundances"].get)
+    assert len(facts["library"]) == 3
+    assert min(picture_size(base.with_suffix(".png"))) > 300
+
+
+def test_a_view_goes_by_its_number_too_and_a_point_by_its_coordinates(trained, tmp_path):
+    common = ["--run", trained.run, "--output", tmp_path, "--device", "cpu"]
+    assert run(export, "spectrum", "--view", 2, "--pixel", "8,8", *common).status == 0
+    assert (tmp_path / "eval_002_x8_y8.csv").is_file()
+    assert run(export, "spectrum", "--point", "-0.0,0.05,0.2", *common).status == 0
+    with (tmp_path / "point_0_0.05_0.2.csv").open() as file:
+        assert next(csv.reader(file)) == ["wavelength", "predicted"]
+
+
+def test_own_reflectances_are_compared_with_too(trained, tmp_path):
+    wavelengths = load_model(trained.run, "cpu").scene.metadata["wavelengths_nm"]
+    lines = [f"{wavelength},{0.1 + 0.05 * index}" for index, wavelength in enumerate(wavelengths)]
+    (tmp_path / "mine.csv").write_text("\n".join(["wavelength,my very own", *lines]))
+    common = [
+        "--run",
+        trained.run,
+        "--output",
+        tmp_path / "out",
+        "--device",
+        "cpu",
+        "--library",
+        tmp_path / "mine.csv",
+    ]
+    assert (
+        run(export, "spectrum", "--view", 2, "--pixel", "8,8", "--compare", "continuum", *common).status == 0
+    )
+    assert run(export, "report", "--max-views", 1, *common).status == 0
+    assert "184 known" in (tmp_path / "out" / "report.html").read_text()
+    ended = run(export, "spectrum", "--view", 2, "--pixel", "9,9", *common[:-1], tmp_path / "none.csv")
+    assert ended.status == 2
+    assert "none.csv: can't read" in ended.err
+
+
+def test_a_report_with_the_scene_at_hand_compares_and_is_self_contained(exported):
+    page = (exported[0] / "report" / "report.html").read_text()
+    outline = assert_self_contained(page)
+    assert outline.ids == [
+        "scene", "views", "materials", "abundances", "segmentation", "figures", "error", "worst", "training",
+        "settings", "versions",
+    ]  # fmt: skip
+    assert "Rendered: 1 of 2 evaluation views." in outline.text
+    assert "Of the 1 views rendered for this report." in outline.text
+    assert "intersection over union" in outline.text
+    assert "seconds of training" in outline.text
+    assert "num_endmembers" in outline.text
+
+
+def test_a_report_quotes_the_figures_that_eval_found(run_copy):
+    (run_copy / "eval").mkdir()
+    (run_copy / "eval" / "metrics.json").write_text(
+        json.dumps({"psnr": 12.34, "miou": None, "definitions": {}})
+    )
+    assert run(export, *words("report", "--run", run_copy)).status == 0
+    page = (run_copy / "exports" / "report" / "report.html").read_text()
+    assert "eval/metrics.json" in page
+    assert "12.34" in page
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in ("mesh", "point-cloud")])
+def test_every_product_can_be_edited_and_relit(trained, tmp_path, name):
+    recipe = tmp_path / "recipe.yml"
+    recipe.write_text("edits:\n  - rename: {endmember: 0, name: old oak}\n")
+    common = ["--run", trained.run, "--output", tmp_path / "out", "--edits", recipe, "--illuminant", "A"]
+    ended = run(export, *words(name, *common))
+    assert ended.status == 0, ended.err
+    if name == "endmembers":
+        plain, lit = (materials_of(load_model(trained.run, "cpu").model), tmp_path / "out" / "endmembers.csv")
+        with lit.open() as file:
+            rows = list(csv.DictReader(file))
+        assert "old oak" in rows[0]
+        reddened = np.array([float(row["old oak"]) for row in rows]) / plain.endmembers[0].detach().numpy()
+        assert reddened[-1] > 3 * reddened[0]
+    if name == "report":
+        page = (tmp_path / "out" / "report.html").read_text()
+        assert "old oak" in page
+        assert "Edited: what is rendered here" in page
+        assert "Worst views" not in page
+
+
+def test_removed_matter_leaves_the_surface(trained, tmp_path):
+    recipe = tmp_path / "recipe.yml"
+    assert run(export, *words("point-cloud", "--run", trained.run, "--output", tmp_path / "all")).status == 0
+    vertices = PlyData.read(tmp_path / "all" / "points.ply")["vertex"]
+    material = int(np.bincount(vertices["material"]).argmax())
+    recipe.write_text(f"edits:\n  - remove: {material}\n")
+    ended = run(
+        export, *words("point-cloud", "--run", trained.run, "--output", tmp_path / "some", "--edits", recipe)
+    )
+    assert ended.status == 0, ended.err
+    left = PlyData.read(tmp_path / "some" / "points.ply")["vertex"]
+    assert (left["material"] == material).mean() < 0.5 * (vertices["material"] == material).mean()
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["spectrum"], "give a pixel with --view and --pixel, or else a point with --point"),
+        (["spectrum", "--view", "2", "--point", "1,2,3"], "give a pixel with --view and --pixel"),
+        (["spectrum", "--view", "eval_003", "--pixel", "1,1"], "no view 'eval_003'; nearest:"),
+        (["spectrum", "--view", "8", "--pixel", "1,1"], "a number from 0 to 7"),
+        (["spectrum", "--view", "2", "--pixel", "16,1"], "columns are 0 to 15, rows 0 to 15"),
+        (["spectrum", "--view", "2", "--pixel", "1"], "--pixel 1 is not a column and a row"),
+        (["spectrum", "--point", "1,2"], "--point 1,2 is not 3 numbers"),
+        (["spectrum", "--point", "1,2,nan"], "--point 1,2,nan is not 3 numbers"),
+        (["spectrum", "--point", "99,0,0"], "outside the scene box"),
+        (["point-cloud", "--num-points", "0"], "--num-points is 0"),
+        (["mesh", "--resolution", "2000"], "--resolution is 2000"),
+        (["mesh", "--density", "-1"], "--density is -1"),
+        (["mesh", "--smoothing", "99"], "--smoothing is 99"),
+        (["volume", "--resolution", "1"], "--resolution is 1"),
+        (["report", "--max-views", "0"], "--max-views is 0"),
+        (["cubes", "--illuminant", "D66"], "D65"),
+        (["cubes", "--edits", "none.yml"], "none.yml"),
+    ],
+)
+def test_bad_options_are_refused_with_what_to_do(trained, tmp_path, given, said):
+    ended = run(export, *given, "--run", trained.run, "--output", tmp_path / "out", "--device", "cpu")
+    assert ended.status == 2
+    assert said in ended.err
+    assert not (tmp_path / "out").exists()

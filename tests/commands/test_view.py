@@ -1,0 +1,288 @@
+"""`unmix-view`, and the viewer beside `unmix-train`: what is printed, what is served, and how they end."""
+
+import io
+import json
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from benchmarks._viewer_page import Page
+from tests.commands.running import SMALL_METHOD, run
+from tests.commands.test_bad_runs import SPOILT, contents
+from unmix_plugin.commands import train as train_module
+from unmix_plugin.commands.train import parse_all, train
+from unmix_plugin.commands.view import ViewOptions, prepared, view
+from unmix_plugin.spectral.spectra_csv import read_spectra_csv
+from unmix_plugin.viewer.options import ViewerOptions
+
+START_S = 90.0
+
+
+class Started:
+    """A command in a process of its own, its output read line by line."""
+
+    def __init__(self, command, *words):
+        launch = f"from unmix_plugin.commands.{command} import main; main()"
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", launch, *map(str, words)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        self.lines = []
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self):
+        for line in self.process.stdout:
+            self.lines.append(line.rstrip())
+
+    def wait_for_line(self, pattern):
+        until = time.monotonic() + START_S
+        while time.monotonic() < until:
+            for line in list(self.lines):
+                found = re.search(pattern, line)
+                if found:
+                    return found
+            assert self.process.poll() is None or self._reader.is_alive(), self.lines
+            time.sleep(0.02)
+        raise AssertionError(self.lines)
+
+    @property
+    def address(self):
+        """Of the viewer's websocket."""
+        return "ws://" + self.wait_for_line(r"viewer: http://(\S+)")[1]
+
+    def close(self):
+        """Let go of its output."""
+        self._reader.join(10)
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+
+    def end(self):
+        status = self.process.wait(START_S)
+        self._reader.join(10)
+        return status
+
+
+@contextmanager
+def started(command, *words):
+    """A command that is not left behind."""
+    one = Started(command, *words)
+    try:
+        yield one
+    finally:
+        if one.process.poll() is None:
+            one.process.kill()
+        one.process.wait()
+        one.close()
+
+
+@contextmanager
+def looking(address):
+    """A page with its first picture."""
+    with Page(address) as page:
+        page.look_from(0.3)
+        page.wait_until(lambda: bool(page.pictures), START_S)
+        yield page
+
+
+@pytest.mark.parametrize("spoil", SPOILT)
+def test_a_run_that_cannot_be_used_is_refused_with_one_message(run_copy, spoil):
+    change, message = SPOILT[spoil]
+    change(run_copy)
+    before = contents(run_copy)
+    ended = run(view, "--run", run_copy, "--device", "cpu")
+    assert (ended.status, len(ended.err.splitlines())) == (2, 1)
+    assert message in ended.err
+    assert contents(run_copy) == before
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--viewer.port", "99999"], "--viewer.port is a number from 0"),
+        (["--viewer.host", "203.0.113.7"], "can't listen at --viewer.host 203.0.113.7"),
+        (["--viewer.token", ""], "--viewer.token is empty"),
+    ],
+)
+def test_an_address_that_is_none_is_refused(trained, words, message):
+    ended = run(view, "--run", trained.run, "--device", "cpu", *words)
+    assert ended.status == 2
+    assert message in ended.err
+
+
+def test_a_run_is_served_until_ctrl_c(trained):
+    with started("view", "--run", trained.run, "--device", "cpu", "--viewer.port", "0") as command:
+        with looking(command.address) as page:
+            page.wait_until(lambda: any(one.get("label") == "layer" for one in page.controls.values()))
+            command.process.send_signal(signal.SIGINT)
+            page.wait_until(lambda: page.is_closed)
+        assert command.end() == 0
+        assert command.lines[-2:] == ["stop with Ctrl-C", "stopped"]
+        assert not any("viser" in line for line in command.lines)
+
+
+@pytest.fixture
+def served(trained):
+    """The viewer of a run whose scene is at hand."""
+    viewer = prepared(ViewOptions(run=trained.run, device="cpu", viewer=ViewerOptions(port=0)))
+    viewer.start()
+    yield viewer
+    viewer.stop()
+
+
+def test_what_was_measured_is_shown_where_the_scene_is_at_hand(served):
+    with looking(f"ws://127.0.0.1:{served.port}") as page:
+        until = time.monotonic() + START_S
+        while served.services.measured is None:
+            assert time.monotonic() < until, served.services.why_not_measured
+            time.sleep(0.05)
+        page.set("layer", "error against a training view")
+        page.wait_until(lambda: "mean absolute error of the bands against training view" in page.texts)
+        page.set("cameras", True)
+        page.wait_until(lambda: page.last_depth is not None)
+
+
+def test_a_run_whose_scene_has_gone_is_shown_without_what_was_measured(run_copy):
+    config = json.loads((run_copy / "config.json").read_text())
+    config["config"]["data"] = "/nowhere/at/all"
+    (run_copy / "config.json").write_text(json.dumps(config))
+    viewer = prepared(ViewOptions(run=run_copy, device="cpu", viewer=ViewerOptions(port=0)))
+    viewer.start()
+    try:
+        with looking(f"ws://127.0.0.1:{viewer.port}") as page:
+            page.set("layer", "error against a training view")
+            page.wait_until(lambda: "no error to show: the scene is not at hand" in page.texts)
+            assert "/nowhere/at/all" in page.texts
+    finally:
+        viewer.stop()
+
+
+def test_nothing_is_written_into_a_run_that_is_only_looked_at(run_copy):
+    before = contents(run_copy)
+    viewer = prepared(ViewOptions(run=run_copy, device="cpu", viewer=ViewerOptions(port=0)))
+    viewer.start()
+    with looking(f"ws://127.0.0.1:{viewer.port}"):
+        pass
+    viewer.stop()
+    assert contents(run_copy) == before
+
+
+def test_a_method_that_does_not_unmix_has_no_viewer_and_says_so(run_copy, monkeypatch):
+    monkeypatch.setattr("unmix_plugin.viewer.model_source.UnmixModel", type("OtherModel", (), {}))
+    ended = run(view, "--run", run_copy, "--device", "cpu")
+    assert ended.status == 2
+    assert "the viewer shows runs of methods that unmix spectra" in ended.err
+
+
+def training_words(trained, folder, *words):
+    return [
+        *("unmix-nerf", "--data", trained.scene, "--output-dir", folder, *SMALL_METHOD),
+        *("--viewer.enabled", "--viewer.port", "0", *words),
+    ]
+
+
+def test_a_training_is_watched_while_it_runs_and_ends_as_without(trained, tmp_path):
+    words = training_words(trained, tmp_path, "--max-num-iterations", "20")
+    with started("train", *words, "--viewer.keep-open") as command:
+        with looking(command.address) as page:
+            command.wait_for_line("the viewer stays open")
+            page.wait_until(lambda: "finished" in page.texts, START_S)
+            count = len(page.pictures)
+            page.look_from(1.0)
+            page.wait_until(lambda: len(page.pictures) > count)
+        command.process.send_signal(signal.SIGINT)
+        assert command.end() == 0
+        assert command.lines[-1].startswith("run: ")
+        found = read_spectra_csv(
+            type(trained.run)(command.lines[-1].removeprefix("run: ")) / "endmembers.csv"
+        )
+        np.testing.assert_array_equal(found.spectra, read_spectra_csv(trained.run / "endmembers.csv").spectra)
+
+
+def test_without_keep_open_the_process_ends_with_the_training(trained, tmp_path):
+    ended = run(train, *training_words(trained, tmp_path, "--max-num-iterations", 3))
+    assert ended.status == 0
+    assert "viewer: http://127.0.0.1:" in ended.out
+    assert ended.last_line.startswith("run: ")
+    assert not [thread for thread in threading.enumerate() if "viewer" in thread.name]
+
+
+def test_a_training_that_is_stopped_from_the_page_can_go_on(trained, tmp_path):
+    with started("train", *training_words(trained, tmp_path, "--max-seconds", "300")) as command:
+        with looking(command.address) as page:
+            page.wait_until(lambda: any(one.get("label") == "really stop" for one in page.controls.values()))
+            page.set("really stop", True)
+            page.set("stop training", True)
+            assert command.end() == 130
+        assert any("go on with: unmix-train unmix-nerf --load-run" in line for line in command.lines)
+        path = type(trained.run)(command.lines[-1].removeprefix("run: "))
+    resumed = run(train, "unmix-nerf", "--load-run", path, "--max-num-iterations", 2)
+    assert resumed.status == 0
+
+
+def test_a_page_that_is_loaded_again_while_training_goes_on(trained, tmp_path):
+    with started("train", *training_words(trained, tmp_path, "--max-seconds", "300")) as command:
+        for _ in range(4):
+            with looking(command.address):
+                pass
+        with looking(command.address):
+            assert command.process.poll() is None
+        command.process.send_signal(signal.SIGINT)
+        assert command.end() == 130
+        assert not any("Traceback" in line for line in command.lines)
+
+
+def test_the_viewer_is_off_where_the_output_is_no_terminal_and_on_where_it_is(tmp_path, monkeypatch):
+    words = ["unmix-nerf", "--data", str(tmp_path)]
+    monkeypatch.setattr(train_module.sys, "stdout", io.StringIO())
+    assert not parse_all(words)[1].enabled
+    monkeypatch.setattr(train_module.sys, "stdout", Terminal())
+    assert parse_all(words)[1].enabled
+    assert not parse_all([*words, "--viewer.no-enabled"])[1].enabled
+
+
+class Terminal:
+    """Says that it is one."""
+
+    def isatty(self):
+        return True
+
+
+def test_words_of_the_viewer_are_no_settings_of_the_training(trained, tmp_path):
+    words = ["unmix-nerf", "--data", str(trained.scene), "--viewer.host", "::1", "--viewer.share", "0.2"]
+    config, viewing = parse_all([*words, "--max-seconds", "7"])
+    assert (viewing.host, viewing.share, viewing.port, viewing.token) == ("::1", 0.2, 7007, None)
+    assert (config.max_seconds, config.max_num_iterations) == (7.0, None)
+    assert "viewer" not in (trained.run / "config.json").read_text()
+
+
+def test_impossible_words_of_the_viewer_end_before_training(trained, tmp_path):
+    ended = run(train, *training_words(trained, tmp_path / "out", "--viewer.share", "2"))
+    assert ended.status == 2
+    assert "--viewer.share is a part" in ended.err
+    ended = run(train, *training_words(trained, tmp_path / "out", "--viewer.host", "203.0.113.7"))
+    assert ended.status == 2
+    assert "can't listen" in ended.err
+
+
+def test_a_recipe_of_the_viewer_is_taken_by_other_commands(run_copy):
+    from unmix_plugin.commands.export import export
+    from unmix_plugin.editing import Recipe, Scale, recipe_to_yaml
+
+    recipe = run_copy / "recipe.yml"
+    recipe.write_text(recipe_to_yaml(Recipe((Scale(0, 0.5),))))
+    ended = run(export, "endmembers", "--run", run_copy, "--edits", recipe, "--output", run_copy / "edited")
+    assert ended.status == 0, ended.err
+    before = read_spectra_csv(run_copy / "endmembers.csv").spectra
+    after = read_spectra_csv(run_copy / "edited" / "endmembers.csv").spectra
+    np.testing.assert_allclose(after[0], before[0] / 2, rtol=1e-5)

@@ -1,0 +1,54 @@
+import torch
+from torch.testing import assert_close
+
+from tests.spectral.mixtures import seeded, smooth_endmembers
+from unmix_plugin.spectral.mixture_guide import MixtureGuide
+from unmix_plugin.spectral.sparse_unmixing import sparse_abundances
+
+
+def started(noise=0.0):
+    endmembers = smooth_endmembers(4).float() * 0.8
+    shares = torch.eye(4).repeat(30, 1)
+    pixels = shares @ endmembers + noise * torch.rand(120, endmembers.shape[1], generator=seeded(0))
+    guide = MixtureGuide(4, endmembers.shape[1])
+    guide.start(pixels, endmembers, 2.0)
+    return guide, endmembers
+
+
+def test_abundances_that_the_measured_spectra_show_are_no_error():
+    guide, endmembers = started()
+    measured = 0.5 * endmembers
+    assert float(guide.error(torch.eye(4), measured, torch.ones(4))) < 1e-6
+    wrong = torch.eye(4).roll(1, dims=1)
+    assert_close(guide.error(wrong, measured, torch.ones(4)), torch.tensor(2.0), atol=1e-2, rtol=0)
+
+
+def test_a_half_transparent_pixel_shows_half_of_its_mixture():
+    guide, endmembers = started()
+    alpha = torch.full((4,), 0.5)
+    assert float(guide.error(0.5 * torch.eye(4), 0.5 * endmembers, alpha)) < 1e-6
+    assert float(guide.error(torch.eye(4), 0.5 * endmembers, alpha)) > 0.1
+
+
+def test_black_and_saturated_pixels_say_nothing():
+    guide, endmembers = started()
+    silent = torch.stack([torch.zeros_like(endmembers[0]), torch.ones_like(endmembers[0])])
+    assert float(guide.error(torch.rand(2, 4, generator=seeded(2)), silent, torch.ones(2))) == 0
+
+
+def test_what_pairs_leave_unexplained_sets_the_penalty_of_further_materials():
+    assert float(started()[0].mixing_penalty) < 1e-3
+    assert float(started(noise=0.2)[0].mixing_penalty) > float(started(noise=0.05)[0].mixing_penalty) > 1e-3
+
+
+def test_a_saved_guide_guides_as_before():
+    guide, endmembers = started(noise=0.05)
+    other = MixtureGuide(4, endmembers.shape[1])
+    other.load_state_dict(guide.state_dict())
+    measured = torch.rand(50, 4, generator=seeded(5)) @ endmembers * 0.3
+    abundances = torch.full((50, 4), 0.25)
+    assert_close(
+        other.error(abundances, measured, torch.ones(50)), guide.error(abundances, measured, torch.ones(50))
+    )
+    unmixed = sparse_abundances(measured, endmembers, float(guide.mixing_penalty))
+    assert_close(other.error(unmixed, measured, torch.ones(50)), torch.tensor(0.0), atol=1e-9, rtol=0)

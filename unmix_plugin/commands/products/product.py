@@ -1,0 +1,149 @@
+"""What a product of `unmix-export` is, and what it is given to do its work."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, ClassVar, TypeVar
+
+import tyro
+
+from unmix_plugin.engine.configs import DeviceName
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from unmix_plugin.engine.load_run import LoadedModel
+    from unmix_plugin.exports.run_views import RunView, ViewChoice
+    from unmix_plugin.exports.seen_surface import SeenSurface
+    from unmix_plugin.model import UnmixModel
+    from unmix_plugin.scenes.scene import Normalisation
+    from unmix_plugin.spectral.composition import Materials
+
+ItemT = TypeVar("ItemT")
+
+
+@dataclass(frozen=True)
+class Product(ABC):
+    """What every product is told."""
+
+    name: ClassVar[str]
+    """Of the product, and of its folder."""
+
+    run: Path | None = None
+    """Run folder, as training printed it; None takes the newest under --output-dir."""
+    output: Path | None = None
+    """Folder to write to; None: exports/ and the product's name, in the run folder."""
+    edits: Path | None = None
+    """Recipe (YAML) of edits of materials and light to apply first."""
+    illuminant: str | None = None
+    """Light to show the scene under: D65, A, E, FL2, ... or a .csv file; None: the one it was taken under."""
+    output_dir: Path = Path("outputs")
+    """Folder in which to look for the newest run."""
+    device: DeviceName = "auto"
+    """Where to compute; auto takes CUDA where there is one."""
+    overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Replace files of an earlier export."""
+
+    @abstractmethod
+    def write(self, job: Job) -> list[Path]:
+        """Write the product.
+
+        Returns:
+            Its files.
+        Raises:
+            UnmixError: whatever a user can mend.
+        """
+
+
+@dataclass(frozen=True)
+class Job:
+    """A loaded run, a folder to write to, and a place to show how far things are."""
+
+    loaded: LoadedModel
+    folder: Path
+    """Absolute."""
+    overwrite: bool
+    console: Console
+
+    @property
+    def materials(self) -> Materials:
+        """Of the model.
+
+        Raises:
+            ConfigError: its method does not unmix spectra.
+        """
+        from unmix_plugin.exports.run_materials import materials_of
+
+        return materials_of(self.loaded.model)
+
+    @property
+    def model(self) -> UnmixModel:
+        """The model, where more is asked of it than every method that unmixes spectra has.
+
+        Raises:
+            ConfigError: it is not of this method.
+        """
+        from unmix_plugin.errors import ConfigError
+        from unmix_plugin.model import UnmixModel
+
+        model = self.loaded.model
+        if not isinstance(model, UnmixModel):
+            raise ConfigError(
+                f"this needs a run of unmix-nerf; {self.loaded.run.path} is of {type(model).__name__}"
+            )
+        return model
+
+    @property
+    def frame(self) -> Normalisation:
+        """How the scene's world became the run's model space."""
+        from unmix_plugin.exports.world_frame import world_frame
+
+        return world_frame(self.loaded.scene)
+
+    def claim(self, paths: Collection[Path]) -> None:
+        """Refuse to overwrite files, before anything is computed.
+
+        Raises:
+            ConfigError: one of them exists, and overwriting was not asked for.
+        """
+        from unmix_plugin.exports.files import refuse_to_overwrite
+
+        refuse_to_overwrite(paths, self.overwrite)
+
+    def views(self, choice: ViewChoice) -> list[RunView]:
+        """Views of the run."""
+        from unmix_plugin.exports.run_views import views_of
+
+        return views_of(self.loaded.scene, choice)
+
+    def surface(self, num_rays: int) -> SeenSurface:
+        """What all cameras of the run see, with about so many rays."""
+        from unmix_plugin.exports.seen_surface import SeenSurface
+
+        cameras = [view.camera for view in self.views("all")]
+        surface = SeenSurface(self.model, num_rays, cameras)
+        for camera in self.follow("looking at the surface", cameras):
+            surface.look(camera)
+        return surface
+
+    def follow(self, doing: str, items: Sequence[ItemT]) -> Iterator[ItemT]:
+        """The items, while it is shown how many are done."""
+        from unmix_plugin.commands.reporting import follow
+
+        return follow(self.console, doing, items)
+
+    def working(self, doing: str) -> AbstractContextManager[None]:
+        """Context that shows that something of unknown length is under way."""
+        from unmix_plugin.commands.reporting import working
+
+        return working(self.console, doing)
+
+    def say(self, text: str) -> None:
+        """A line for the user."""
+        from unmix_plugin.commands.reporting import say
+
+        say(self.console, text)

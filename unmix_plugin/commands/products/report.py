@@ -1,0 +1,99 @@
+"""`unmix-export report`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from unmix_plugin.commands.products.product import Job, Product
+
+if TYPE_CHECKING:
+    from unmix_plugin.exports.report_views import ReportViews
+    from unmix_plugin.exports.run_views import RunView
+    from unmix_plugin.scenes.scene import Scene
+
+_VIEWS_WITH_SHARES = 2
+
+
+@dataclass(frozen=True)
+class Report(Product):
+    """One HTML file about the run, report.html, which needs nothing else: scene, views, materials with their nearest
+    known ones, abundances, segmentation, figures of merit, errors, training, settings. Measured images and labels are
+    shown where the scene is at hand."""
+
+    name = "report"
+
+    max_views: int = 24
+    """Most evaluation views to render; of more, an even choice."""
+    data: Path | None = None
+    """Scene folder, where it is no longer where the run was trained on it."""
+    library: tuple[Path, ...] = ()
+    """Own reflectances to compare with too: .csv files or ENVI spectral libraries."""
+
+    def write(self, job: Job) -> list[Path]:
+        """Render, compare and lay out."""
+        from unmix_plugin.errors import ConfigError
+        from unmix_plugin.exports.report import report_path, write_report
+        from unmix_plugin.exports.report_views import evenly
+        from unmix_plugin.spectral.library import library_with
+
+        if self.max_views < 1:
+            raise ConfigError(f"--max-views is {self.max_views}; choose at least 1")
+        job.claim([report_path(job.folder)])
+        library = library_with(self.library)
+        chosen = evenly(job.views("eval"), self.max_views)
+        views, notes = self._look(job, chosen), []
+        if self._is_edited:
+            notes.append(
+                "Edited: what is rendered here is the run with the edits or the light asked for; figures and training "
+                "are those of the run itself."
+            )
+        if len(chosen) < len(job.loaded.scene.eval_cameras):
+            notes.append(f"Rendered: {len(chosen)} of {len(job.loaded.scene.eval_cameras)} evaluation views.")
+        with job.working("laying out the report"):
+            return [write_report(job.folder, job.loaded, views, library, _stored_figures(job), notes)]
+
+    @property
+    def _is_edited(self) -> bool:
+        return self.edits is not None or self.illuminant is not None
+
+    def _look(self, job: Job, chosen: list[RunView]) -> ReportViews:
+        """Render the views, and compare each with what was measured, if that is at hand and still fits."""
+        from unmix_plugin.exports.evaluation import Evaluation, scene_truth, view_truth
+        from unmix_plugin.exports.report_views import ReportViews, evenly
+        from unmix_plugin.exports.view_rendering import render_view
+
+        materials, scene = job.materials, self._scene(job)
+        evaluation = None
+        if scene is not None:
+            evaluation = Evaluation(scene_truth(scene), materials.endmembers, materials.names)
+        with_shares = {view.name for view in evenly(chosen, _VIEWS_WITH_SHARES)}
+        views = ReportViews(materials, evaluation, with_shares)
+        indices = {} if scene is None else {frame.name: index for index, frame in enumerate(scene.frames)}
+        for view in job.follow("rendering views", chosen):
+            truth = None if scene is None else view_truth(scene, indices[view.name])
+            views.add(view.name, render_view(job.loaded.model, view.camera), truth)
+        return views
+
+    def _scene(self, job: Job) -> Scene | None:
+        from unmix_plugin.exports.scene_at_hand import scene_at_hand
+
+        if self._is_edited:
+            return None
+        with job.working("looking for the scene"):
+            scene = scene_at_hand(job.loaded.scene.summary, job.loaded.run.path, self.data)
+        if scene is None:
+            job.say("the scene is not at hand: nothing measured in the report (--data says where it is)")
+        return scene
+
+
+def _stored_figures(job: Job) -> dict[str, Any] | None:
+    """What `unmix-eval` found, if it was run."""
+    path = job.loaded.run.eval / "metrics.json"
+    try:
+        found = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return None
+    return found if isinstance(found, dict) else None

@@ -1,0 +1,100 @@
+"""The field of a trained model on a regular grid, slice by slice: density, and what there is of each endmember.
+
+Only cells that the model renders are asked: elsewhere the field was never trained, and what it says there is nothing.
+
+Notation: `X x Y x Z` grid points, `P` points, `K` endmembers. Model space.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32
+from torch import Tensor
+
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.model import UnmixModel
+
+_RESOLUTIONS = (8, 1024)
+_CHUNK = 1 << 16
+
+
+@dataclass(frozen=True)
+class GridPoints:
+    """Points of a regular grid over a scene box; the outermost lie on its faces, but for a fraction of a cell."""
+
+    origin: Float32[np.ndarray, "3"]
+    """First point."""
+    cell: float
+    """Distance of neighbours along each axis."""
+    shape: tuple[int, int, int]
+    """Points along x, y and z."""
+
+    @staticmethod
+    def over(aabb: Float[Tensor, "2 3"], resolution: int) -> GridPoints:
+        """A grid with `resolution` cells along the longest edge of a box.
+
+        Raises:
+            ConfigError: fewer than 8 cells, or more than 1024.
+        """
+        low, high = _RESOLUTIONS
+        if not low <= resolution <= high:
+            raise ConfigError(
+                f"--resolution is {resolution}; choose {low} to {high} cells along the longest edge"
+            )
+        corners = aabb.detach().cpu().double().numpy()
+        size = corners[1] - corners[0]
+        cell = float(size.max()) / resolution
+        x, y, z = (int(np.floor(edge / cell + 1e-6)) + 1 for edge in size)
+        return GridPoints(corners[0].astype(np.float32), cell, (x, y, z))
+
+    def slice_points(self, index: int) -> Float[Tensor, "Y Z 3"]:
+        """Points of the slice at `index` along x."""
+        axes = [
+            float(self.origin[axis]) + self.cell * torch.arange(count, dtype=torch.float64)
+            for axis, count in enumerate(self.shape)
+        ]
+        y, z = torch.meshgrid(axes[1], axes[2], indexing="ij")
+        return torch.stack([axes[0][index].expand_as(y), y, z], dim=-1).float()
+
+
+@torch.no_grad()
+def sample_slice(
+    model: UnmixModel, points: Float[Tensor, "Y Z 3"]
+) -> tuple[Float32[np.ndarray, "Y Z"], Float32[np.ndarray, "Y Z K"]]:
+    """Densities per model unit, and abundances, which sum to 1; both 0 in cells that are never rendered."""
+    flat = points.flatten(0, 1).to(model.device)
+    densities = torch.zeros(len(flat), device=model.device)
+    abundances = torch.zeros(len(flat), len(model.materials.names), device=model.device)
+    rendered = is_rendered(model, flat).nonzero()[:, 0]
+    for chosen in rendered.split(_CHUNK):
+        found, features = model.field.get_density(flat[chosen])
+        densities[chosen] = found
+        # Abundances don't depend on the direction that the interface asks for.
+        towards = torch.zeros_like(flat[chosen])
+        abundances[chosen] = model.field.get_outputs(flat[chosen], towards, features)["abundances"]
+    shape = points.shape[:2]
+    return densities.cpu().unflatten(0, shape).numpy(), abundances.cpu().unflatten(0, shape).numpy()
+
+
+@torch.no_grad()
+def sample_densities(model: UnmixModel, positions: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
+    """Densities per model unit of any points of the box, 0 in cells that are never rendered; on the CPU."""
+    flat = positions.to(model.device)
+    densities = torch.zeros(len(flat), device=model.device)
+    for chosen in is_rendered(model, flat).nonzero()[:, 0].split(_CHUNK):
+        densities[chosen] = model.field.get_density(flat[chosen])[0]
+    return densities.cpu()
+
+
+def is_rendered(model: UnmixModel, positions: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:
+    """Which points lie in the box, in cells that the renderer marches through."""
+    low, high = model.renderer.aabb
+    occupied = model.renderer.grid.occupied
+    unit = (positions - low) / (high - low)
+    inside = ((unit >= 0) & (unit <= 1)).all(dim=-1)
+    sizes = torch.tensor(occupied.shape, device=positions.device)
+    cells = torch.minimum((unit.clamp(0, 1) * sizes).long(), sizes - 1)
+    return inside & (occupied[cells[:, 0], cells[:, 1], cells[:, 2]] > 0)
