@@ -36,7 +36,12 @@ demo: $(VENV)/.installed
 	$(BIN)/unmix-export abundances --run "$$run"; \
 	echo; echo "pictures: $${run}eval (true, predicted, error) and $${run}exports (abundance maps)"
 
-test: $(VENV)/.installed-dev
+# A browser, where it can be had; tried once.
+$(VENV)/.system-packages: scripts/install_system_packages.sh | $(BIN)/python
+	@scripts/install_system_packages.sh
+	@touch $@
+
+test: $(VENV)/.installed-dev $(VENV)/.system-packages
 	$(BIN)/python -m pytest
 
 lint: $(VENV)/.installed-dev

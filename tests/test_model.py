@@ -8,7 +8,7 @@ from torch.testing import assert_close
 from tests.method_factory import NUM_BANDS, WAVELENGTHS_NM, initial_data, make_model, make_rays
 from unmix_plugin.engine.cameras import Cameras
 from unmix_plugin.errors import ConfigError, SpectrumError
-from unmix_plugin.model import UnmixModel
+from unmix_plugin.model import UnmixModel, UnmixModelConfig
 from unmix_plugin.renderer import _points
 from unmix_plugin.rendering.compositing import volume_weights_twin
 
@@ -286,3 +286,22 @@ def test_abundances_are_drawn_to_those_that_measured_spectra_show():
     ]
     assert losses[0] < 1e-6
     assert_close(losses[1], 0.5 * 2.0, atol=1e-2, rtol=0)
+
+
+def test_an_automatic_number_of_endmembers_is_that_of_the_pixels_said_with_evidence():
+    config, reasons = UnmixModelConfig(num_endmembers="auto").settled(initial_data)
+    assert config.num_endmembers == 3
+    assert "proposed" in reasons
+
+
+def test_a_given_number_of_endmembers_reads_no_data():
+    def unread():
+        raise AssertionError
+
+    config = UnmixModelConfig(num_endmembers=4)
+    assert config.settled(unread) == (config, "")
+
+
+def test_no_model_is_made_before_its_number_of_endmembers_is_settled():
+    with pytest.raises(ConfigError, match="num-endmembers is auto"):
+        make_model(num_endmembers="auto")

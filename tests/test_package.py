@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = ("colour", "scipy", "skimage", "matplotlib", "warp", "OpenEXR", "viser", "pandas", "tensorboard")
-COMMANDS = ("train", "eval", "export", "demo_scene")
+COMMANDS = ("train", "eval", "export", "render", "demo_scene", "view")
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,9 @@ def test_a_wheel_declares_commands_and_the_method(wheel):
         "unmix-train": "unmix_plugin.commands.train:main",
         "unmix-eval": "unmix_plugin.commands.eval:main",
         "unmix-export": "unmix_plugin.commands.export:main",
+        "unmix-render": "unmix_plugin.commands.render:main",
         "unmix-demo-scene": "unmix_plugin.commands.demo_scene:main",
+        "unmix-view": "unmix_plugin.commands.view:main",
     }
     assert dict(entry_points["unmix_plugin.method_configs"]) == {
         "unmix-nerf": "unmix_plugin.method_config:unmix_nerf"

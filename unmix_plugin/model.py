@@ -13,8 +13,8 @@ Source: Perez et al. 2025, UnMix-NeRF, eqs. 4 to 9.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -42,13 +42,19 @@ from unmix_plugin.spectral.composition import (
     default_names,
     spectral,
 )
-from unmix_plugin.spectral.endmembers import EndmemberMethod, initialise_endmembers
+from unmix_plugin.spectral.endmembers import (
+    EndmemberMethod,
+    drop_uninformative_pixels,
+    initialise_endmembers,
+)
 from unmix_plugin.spectral.losses import forgive_saturation, over_background, solid_evidence, srgb_error
 from unmix_plugin.spectral.metrics import psnr
 from unmix_plugin.spectral.mixture_guide import MixtureGuide
+from unmix_plugin.spectral.num_materials import propose_num_materials
 from unmix_plugin.spectral.spectra_csv import read_spectra_csv
 
 _FEWEST_RAYS, _MOST_RAYS = 64, 8192
+_PIXELS_TO_COUNT_BY = 20_000
 DEFAULT_OUTPUTS = ("spectral", "rgb", "abundances", "segmentation", "accumulation")
 
 
@@ -57,8 +63,8 @@ class UnmixModelConfig(ModelConfig):
     """Settings of the model of UnMix-NeRF."""
 
     _target: Target = field(default_factory=lambda: UnmixModel)
-    num_endmembers: int = 6
-    """K, the number of materials to unmix into."""
+    num_endmembers: int | Literal["auto"] = 6
+    """K, the number of materials to unmix into; auto proposes it from the training pixels, with its evidence."""
     endmember_init: EndmemberMethod | Literal["file"] = "pairs"
     """First guess of the endmembers from the pixels of all training views, or spectra from `endmember_file`."""
     endmember_file: Path | None = None
@@ -103,7 +109,8 @@ class UnmixModelConfig(ModelConfig):
             ConfigError: a number out of its range or settings that contradict each other.
         """
         rules = {
-            "num-endmembers of 1 to 255": 1 <= self.num_endmembers <= 255,
+            "num-endmembers of 1 to 255 or auto": self.num_endmembers == "auto"
+            or 1 <= self.num_endmembers <= 255,
             "num-specular-spectra of at least 1": self.num_specular_spectra >= 1,
             "samples-per-step of at least 1": self.samples_per_step >= 1,
             "loss weights and the mixing-penalty of at least 0": min(
@@ -123,6 +130,20 @@ class UnmixModelConfig(ModelConfig):
         if broken:
             raise ConfigError(f"the model needs {' and '.join(broken)}")
 
+    def settled(self, initial_data: Callable[[], Mapping[str, np.ndarray]]) -> tuple[UnmixModelConfig, str]:
+        """With `num_endmembers` auto, the number that the training pixels propose, and the evidence for it.
+
+        Raises:
+            SpectrumError: no pixel is neither dark nor saturated.
+        """
+        if self.num_endmembers != "auto":
+            return self, ""
+        generator = torch.Generator().manual_seed(torch.initial_seed() % 2**63)
+        pixels = drop_uninformative_pixels(torch.from_numpy(initial_data()["pixels"]))
+        kept = torch.randperm(len(pixels), generator=generator)[:_PIXELS_TO_COUNT_BY]
+        count = propose_num_materials(pixels[kept], generator)
+        return replace(self, num_endmembers=count.number), count.evidence()
+
 
 class UnmixModel(Model):
     """A mixture of materials at every point of a scene box."""
@@ -140,13 +161,18 @@ class UnmixModel(Model):
         config, metadata = self.config, self.metadata
         self.bands = Bands.of(metadata["wavelengths_nm"])
         num_bands = len(self.bands)
-        if config.num_endmembers > num_bands:
+        if config.num_endmembers == "auto":
             raise ConfigError(
-                f"num-endmembers is {config.num_endmembers} but the scene has {num_bands} bands; "
+                "num-endmembers is auto: a model is made from settled settings, see ModelConfig.settled"
+            )
+        self.num_endmembers = config.num_endmembers
+        if self.num_endmembers > num_bands:
+            raise ConfigError(
+                f"num-endmembers is {self.num_endmembers} but the scene has {num_bands} bands; "
                 f"choose at most {num_bands}"
             )
-        self.endmembers = nn.Parameter(torch.zeros(config.num_endmembers, num_bands))
-        self.endmember_names = default_names(config.num_endmembers)
+        self.endmembers = nn.Parameter(torch.zeros(self.num_endmembers, num_bands))
+        self.endmember_names = default_names(self.num_endmembers)
         num_dictionary = config.num_specular_spectra if config.specular == "dictionary" else 0
         self.specular_spectra = nn.Parameter(torch.zeros(num_dictionary, num_bands))
         opacity = config.initial_opacity if metadata["has_alpha"] else config.initial_opacity_unknown
@@ -160,13 +186,13 @@ class UnmixModel(Model):
         self.field = UnmixField(
             config.field,
             self.scene_box,
-            config.num_endmembers,
+            self.num_endmembers,
             num_bands if config.specular == "full" else num_dictionary,
             initial_density=-math.log1p(-opacity) / self.renderer.step,
             pixel_size=metadata["pixel_size"],
         )
         self.register_buffer("rgb_weights", rgb_matrix(self.bands), persistent=False)
-        self.mixture_guide = MixtureGuide(config.num_endmembers, num_bands)
+        self.mixture_guide = MixtureGuide(self.num_endmembers, num_bands)
         self.register_buffer("every_band", torch.eye(num_bands), persistent=False)
 
     def initialise(self, initial_data: Mapping[str, np.ndarray]) -> None:
@@ -328,12 +354,12 @@ class UnmixModel(Model):
         if config.endmember_file is None:
             assert config.endmember_init != "file"
             generator = torch.Generator().manual_seed(torch.initial_seed() % 2**63)
-            return initialise_endmembers(pixels, config.num_endmembers, config.endmember_init, generator)
+            return initialise_endmembers(pixels, self.num_endmembers, config.endmember_init, generator)
         table = read_spectra_csv(config.endmember_file).resampled(self.bands)
-        if len(table.names) != config.num_endmembers:
+        if len(table.names) != self.num_endmembers:
             raise ConfigError(
                 f"{config.endmember_file} has {len(table.names)} spectra but num-endmembers is "
-                f"{config.num_endmembers}; give both the same number"
+                f"{self.num_endmembers}; give both the same number"
             )
         return (torch.as_tensor(table.spectra, dtype=torch.float32) * lamp).clamp(0, 1)
 

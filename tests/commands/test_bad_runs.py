@@ -8,6 +8,7 @@ import torch
 from tests.commands.running import run
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import export
+from unmix_plugin.commands.render import render
 from unmix_plugin.commands.train import train
 
 COMMANDS = [
@@ -15,6 +16,7 @@ COMMANDS = [
     (export, ["abundances", "--run"]),
     (export, ["endmembers", "--run"]),
     (export, ["segmentation", "--run"]),
+    (render, ["--run"]),
     (train, ["unmix-nerf", "--load-run"]),
 ]
 

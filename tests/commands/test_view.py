@@ -42,6 +42,7 @@ class Started:
         self._reader.start()
 
     def _read(self):
+        assert self.process.stdout is not None
         for line in self.process.stdout:
             self.lines.append(line.rstrip())
 
@@ -153,9 +154,9 @@ def test_what_was_measured_is_shown_where_the_scene_is_at_hand(served):
 
 
 def test_a_run_whose_scene_has_gone_is_shown_without_what_was_measured(run_copy):
-    config = json.loads((run_copy / "config.json").read_text())
-    config["config"]["data"] = "/nowhere/at/all"
-    (run_copy / "config.json").write_text(json.dumps(config))
+    scene = json.loads((run_copy / "scene.json").read_text())
+    scene["summary"]["root"] = "/nowhere/at/all"
+    (run_copy / "scene.json").write_text(json.dumps(scene))
     viewer = prepared(ViewOptions(run=run_copy, device="cpu", viewer=ViewerOptions(port=0)))
     viewer.start()
     try:
@@ -258,7 +259,7 @@ class Terminal:
         return True
 
 
-def test_words_of_the_viewer_are_no_settings_of_the_training(trained, tmp_path):
+def test_words_of_the_viewer_are_no_settings_of_the_training(trained):
     words = ["unmix-nerf", "--data", str(trained.scene), "--viewer.host", "::1", "--viewer.share", "0.2"]
     config, viewing = parse_all([*words, "--max-seconds", "7"])
     assert (viewing.host, viewing.share, viewing.port, viewing.token) == ("::1", 0.2, 7007, None)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import shlex
 import sys
-from contextlib import nullcontext
-from dataclasses import replace
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import make_dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -16,11 +17,13 @@ from unmix_plugin.commands.entry import INTERRUPTED, run_command
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.registry import MethodSpecification, discover_methods, find_method
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.viewer.options import TrainingViewerOptions
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from unmix_plugin.engine.trainer import Trainer
+    from unmix_plugin.scenes.scene import Scene
 
 _PROGRAM = "unmix-train"
 _USAGE = f"""usage: {_PROGRAM} METHOD --data DIR [options]
@@ -45,14 +48,24 @@ def train(words: list[str]) -> None:
     if words and words[0] in ("-h", "--help"):
         print(_overview(methods))
         return
-    config = parse(words)
+    config, viewing = parse_all(words)
     console = Console()
     trainer = _prepared(config, console)
-    _run(trainer, console)
+    with _shown(trainer, viewing, console):
+        _run(trainer, console)
     print(f"run: {trainer.run.path}", flush=True)
 
 
 def parse(words: list[str]) -> TrainerConfig:
+    """The settings of a training, without how it is shown: see `parse_all`.
+
+    Raises:
+        ConfigError, RunError: as there.
+    """
+    return parse_all(words)[0]
+
+
+def parse_all(words: list[str]) -> tuple[TrainerConfig, TrainingViewerOptions]:
     """All settings: the method's defaults, or those of the run to go on with, changed by the words given.
 
     A limit given alone is the only one: with `--max-seconds` the method's number of iterations does not end training,
@@ -70,13 +83,25 @@ def parse(words: list[str]) -> TrainerConfig:
     name, options = words[0], words[1:]
     method = find_method(name)
     default = _stored_config(name, options) or method.config
-    config = tyro.cli(
-        type(default),
-        default=default,
+    viewing = TrainingViewerOptions(enabled=sys.stdout.isatty())
+    found: Any = tyro.cli(
+        _words_of(type(default)),
+        default=_words_of(type(default))(default, viewing),
         args=options,
         prog=f"{_PROGRAM} {name}",
         description=f"Train {name}: {method.description}.",
     )
+    return _with_given_limit(found.config, options), found.viewer
+
+
+def _words_of(kind: type[TrainerConfig]) -> type[Any]:
+    """What the command takes: the settings of a training as they are, and those of the viewer under their name."""
+    fields = [("config", Annotated[kind, tyro.conf.arg(name="")]), ("viewer", TrainingViewerOptions)]
+    return make_dataclass("TrainWords", fields, frozen=True)
+
+
+def _with_given_limit(config: TrainerConfig, options: list[str]) -> TrainerConfig:
+    """The config with the other limit lifted where one limit was given alone."""
     has_iterations, has_seconds = (_is_given(flag, options) for flag in ("max-num-iterations", "max-seconds"))
     if has_seconds and not has_iterations and config.max_seconds is not None:
         return replace(config, max_num_iterations=None)
@@ -117,6 +142,8 @@ def _prepared(config: TrainerConfig, console: Console) -> Trainer:
     reading = working(console, f"reading {config.data}") if config.data is not None else nullcontext()
     with reading:
         trainer = Trainer(config, console=console)
+    if trainer.pipeline.reasons:
+        say(console, trainer.pipeline.reasons)
     with working(console, "compiling kernels (once on a machine)"):
         trainer.pipeline.model.warm_up()
     num_train, num_eval = (
@@ -159,13 +186,62 @@ def _run(trainer: Trainer, console: Console) -> None:
     _write_endmembers(trainer)
 
 
+@contextmanager
+def _shown(trainer: Trainer, viewing: TrainingViewerOptions, console: Console) -> Iterator[None]:
+    """Context in which the training can be watched in the browser, if it is to be.
+
+    Raises:
+        ConfigError: nothing can listen at the address.
+    """
+    if not viewing.enabled:
+        yield
+        return
+    from unmix_plugin.commands.reporting import say
+    from unmix_plugin.engine.load_run import read_scene_record
+    from unmix_plugin.viewer.model_source import source_of_training
+    from unmix_plugin.viewer.server import Viewer
+
+    try:
+        source = source_of_training(trainer, read_scene_record(trainer.run))
+    except ConfigError as error:
+        say(console, f"no viewer: {error}")
+        yield
+        return
+    source.device.guest_share = viewing.share
+    viewer = Viewer(source, viewing, lambda: _scene_of(trainer), lambda line: say(console, line))
+    viewer.start()
+    try:
+        yield
+        if viewing.keep_open:
+            say(console, "training is done, the viewer stays open; end it with Ctrl-C")
+            with suppress(KeyboardInterrupt):
+                viewer.wait()
+    finally:
+        viewer.stop()
+
+
+def _scene_of(trainer: Trainer) -> Scene:
+    """The scene under training.
+
+    Raises:
+        ConfigError: its data manager has none.
+    """
+    from unmix_plugin.scenes.scene import Scene
+
+    scene = getattr(trainer.pipeline.datamanager, "scene", None)
+    if not isinstance(scene, Scene):
+        raise ConfigError(f"{trainer.config.method_name} has no spectral scene")
+    return scene
+
+
 def _write_endmembers(trainer: Trainer) -> None:
     """Write the endmembers that evaluation and exports will use, if the method has any."""
     from unmix_plugin.exports.run_materials import has_materials, materials_of, write_endmembers_csv
 
     model = trainer.pipeline.model
     if has_materials(model):
-        with nullcontext() if trainer.average is None else trainer.average.swapped_in():
+        averaged = nullcontext() if trainer.average is None else trainer.average.swapped_in()
+        with trainer.control.device.training_turn(), averaged:
             write_endmembers_csv(trainer.run.path / "endmembers.csv", materials_of(model))
 
 

@@ -1,7 +1,9 @@
 """The interface of a model: from rays to outputs, losses, metrics and pictures."""
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,6 +26,14 @@ class ModelConfig(InstantiateConfig):
     _target: Target = field(default_factory=lambda: Model)
     eval_num_rays_per_chunk: int = 8192
     """Rays rendered at once for a whole image; fewer take less memory."""
+
+    def settled(self, initial_data: Callable[[], Mapping[str, np.ndarray]]) -> tuple[ModelConfig, str]:
+        """These settings with all that was left to the data decided, and for people what speaks for the decision.
+
+        Called for every new run and every loaded one, whose settings are settled already: read `initial_data`, which
+        takes seconds, only to decide something.
+        """
+        return self, ""
 
 
 class Model(nn.Module, ABC):

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -37,14 +37,17 @@ class Pipeline(nn.Module):
     def __init__(self, config: PipelineConfig, *, data: Path, device: torch.device, seed: int = 0) -> None:
         """Read the scene, then make the model for it, with parameters not yet initialised from the scene.
 
+        Afterwards `config` holds what the scene decided where that was left to it, and `reasons` why.
+
         Raises:
             SceneError: the scene is missing or malformed.
             ConfigError: the model does not fit the scene.
         """
         super().__init__()
-        self.config = config
         self.datamanager: DataManager = config.datamanager.setup(data=data, device=device, seed=seed)
-        self.model: Model = config.model.setup(
+        model_config, self.reasons = config.model.settled(self.datamanager.initial_data)
+        self.config = replace(config, model=model_config)
+        self.model: Model = model_config.setup(
             scene_box=self.datamanager.scene_box, metadata=self.datamanager.metadata()
         ).to(device)
 

@@ -33,6 +33,7 @@ from unmix_plugin.engine.pipeline import Pipeline
 from unmix_plugin.engine.progress import ProgressDisplay, TrainingStatus
 from unmix_plugin.engine.run_folder import RunFolder, create_run_folder, open_run_folder
 from unmix_plugin.engine.seeding import seed_everything, step_seed
+from unmix_plugin.engine.training_control import TrainingControl
 from unmix_plugin.engine.training_state import (
     AVERAGE,
     TrainingRecord,
@@ -56,12 +57,15 @@ class Trainer:
     so a run stopped and resumed takes the very steps of a straight one (while limits are given in steps).
     """
 
-    def __init__(self, config: TrainerConfig, *, console: Console | None = None) -> None:
+    def __init__(
+        self, config: TrainerConfig, *, console: Console | None = None, control: TrainingControl | None = None
+    ) -> None:
         """Read the scene, make the model, then make the run folder or reopen the one in `config.load_run`.
 
         Args:
             config: All settings; to resume, `load_config(path)`, in which limits may be changed.
             console: Where progress is shown; standard output if None.
+            control: Through which other threads watch and steer this training.
         Raises:
             SceneError, ConfigError: scene or settings are wrong; nothing has been written.
             RunError: the run to resume is unusable, or the folder can't be made.
@@ -69,6 +73,7 @@ class Trainer:
         config_to_json(config)  # settings that can't be written down are refused before anything is
         self.config = _with_absolute_data(config)
         self.console = console or Console()
+        self.control = control or TrainingControl()
         keep_freed_memory()
         device = resolve_device(config.device)
         seed_everything(config.seed)
@@ -76,6 +81,7 @@ class Trainer:
         self.pipeline: Pipeline = config.pipeline.setup(
             data=require_data(self.config), device=device, seed=config.seed
         )
+        self.config = replace(self.config, pipeline=self.pipeline.config)
         if resumed is None:
             self.pipeline.initialise()
         self.optimizer = build_optimizer(self.pipeline.get_param_groups(), config.optimizers)
@@ -95,6 +101,8 @@ class Trainer:
             self._resume()
         self.writer = MetricsWriter(self.run, self.step)
         self.log.write(f"{'resumed' if resumed else 'started'} on {device}, torch {torch.__version__}")
+        for line in self.pipeline.reasons.splitlines():
+            self.log.write(line)
 
     @property
     def progress(self) -> float:
@@ -119,14 +127,14 @@ class Trainer:
         """Train to the limit, save, and write `training.json`.
 
         Raises:
-            Interrupted: Ctrl-C or SIGTERM; the step under way was ended and saved. A second one stops at once,
-                and then the newest checkpoint is an older one.
+            Interrupted: Ctrl-C, SIGTERM or a stop through `control`; the step under way was ended and saved. A second
+                signal stops at once, and then the newest checkpoint is an older one.
             RunError: the disk is full, or loss and gradients stay non-finite.
         """
         self.pipeline.train()
         try:
             self.pipeline.model.warm_up()
-            with StopSignals() as stop, ProgressDisplay(self.console) as display:
+            with StopSignals() as stop, ProgressDisplay(self.console) as display, self.control.running():
                 self._loop(stop, display)
         except KeyboardInterrupt as error:
             steps = checkpoint_steps(self.run.checkpoints)
@@ -161,19 +169,35 @@ class Trainer:
         self.log.write(f"saved step {self.step}")
 
     def _loop(self, stop: StopSignals, display: ProgressDisplay) -> None:
-        while not self.limits.reached(self.step, self.clock.seconds) and not stop.requested:
-            loss, metrics = self._train_step()
-            if display.is_due or self.progress >= 1.0:
-                display.show(self._status(loss, metrics))
-            if self._is_time_for(self.config.steps_per_log):
-                self._write_metrics(loss, metrics)
-            if self._is_time_for(self.config.steps_per_save):
-                self.save()
-            self._evaluate(display)
-        self.save()
-        if stop.requested and not self.limits.reached(self.step, self.clock.seconds):
+        while not (self._is_at_limit or stop.requested or self.control.is_stop_requested):
+            if not self.control.is_paused:
+                with self.control.device.training_turn():
+                    self._iterate(display)
+            elif self.control.wait_while_paused():
+                with self.control.device.training_turn():
+                    self.save()
+        with self.control.device.training_turn():
+            self.save()
+        if not self._is_at_limit:
             self.log.write(f"stopped on request at step {self.step}")
             raise Interrupted(self.run.path, self.step)
+
+    def _iterate(self, display: ProgressDisplay) -> None:
+        """A step, and whatever is shown, written or measured after it."""
+        loss, metrics = self._train_step()
+        if self.control.is_status_due:
+            self.control.show(self._status(loss, metrics))
+        if display.is_due or self.progress >= 1.0:
+            display.show(self._status(loss, metrics))
+        if self._is_time_for(self.config.steps_per_log):
+            self._write_metrics(loss, metrics)
+        if self._is_time_for(self.config.steps_per_save) or self.control.take_save_request():
+            self.save()
+        self._evaluate(display)
+
+    @property
+    def _is_at_limit(self) -> bool:
+        return self.limits.reached(self.step, self.clock.seconds)
 
     def _train_step(self) -> tuple[float, dict[str, Tensor]]:
         """One step; its loss, and all losses and metrics without their graphs."""
@@ -251,7 +275,7 @@ class Trainer:
         return run
 
     def _resume(self) -> None:
-        """Take back everything that the newest complete checkpoint holds."""
+        """Take back all that the newest complete checkpoint holds."""
         datamanager = self.pipeline.datamanager
         check_same_scene(read_scene_record(self.run), datamanager, self.run)
         checkpoint = require_checkpoint(self.run)

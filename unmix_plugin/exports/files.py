@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8
 
 from unmix_plugin.engine.atomic_files import write_atomically
 from unmix_plugin.errors import ConfigError, RunError
@@ -63,15 +62,6 @@ def array_bytes(array: np.ndarray) -> bytes:
     """An array as the bytes of an .npy file."""
     buffer = io.BytesIO()
     np.save(buffer, array, allow_pickle=False)
-    return buffer.getvalue()
-
-
-def label_image_bytes(ids: UInt8[np.ndarray, "H W"]) -> bytes:
-    """Ids as the bytes of a PNG of 8-bit grey values."""
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    Image.fromarray(ids).save(buffer, format="PNG")
     return buffer.getvalue()
 
 

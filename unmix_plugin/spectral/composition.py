@@ -18,6 +18,7 @@ from torch import Tensor
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour import band_composite_matrix, linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.pca import PcaColours
 from unmix_plugin.spectral.segmentation import material_ids, material_scores
 
 
@@ -188,20 +189,8 @@ def _ray_distance(coefficients: Coefficients, _: Materials) -> Float[Tensor, "*r
 def _pca(coefficients: Coefficients, materials: Materials) -> Float[Tensor, "*rays 3"]:
     """First three principal components of the image's spectra, each stretched between its 1st and 99th percentile."""
     spectra = spectral(coefficients, materials)
-    flat, seen = spectra.flatten(0, -2), coefficients.accumulation.flatten() > OCCUPIED_ACCUMULATION
-    if int(seen.sum()) < 4:
-        return torch.zeros(*spectra.shape[:-1], 3).to(spectra)
-    centred = flat - flat[seen].mean(dim=0)
-    _, axes = torch.linalg.eigh(centred[seen].T @ centred[seen])
-    axes = axes[:, -3:].flip(-1)
-    # The sign of an eigenvector is arbitrary: its largest component is made positive.
-    signs = axes.gather(0, axes.abs().argmax(dim=0, keepdim=True)).sign()
-    scores = centred @ (axes * signs)
-    if scores.shape[1] < 3:
-        scores = torch.nn.functional.pad(scores, (0, 3 - scores.shape[1]))
-    low, high = torch.quantile(scores[seen], torch.tensor([0.01, 0.99]).to(scores), dim=0)
-    stretched = ((scores - low) / (high - low).clamp(min=1e-9)).clamp(0, 1)
-    return (stretched * seen[:, None]).unflatten(0, spectra.shape[:-1])
+    seen = coefficients.accumulation > OCCUPIED_ACCUMULATION
+    return PcaColours.fit(spectra[seen])(spectra) * seen[..., None]
 
 
 _COMPOSERS = {

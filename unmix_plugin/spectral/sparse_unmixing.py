@@ -21,7 +21,7 @@ from torch import Tensor
 
 _MOST_MATERIALS = 3
 _MOST_CHOICES = 2000
-"""Choices of endmembers that are tried: with more than 22 endmembers only pairs are."""
+"""Choices of endmembers that are tried: with more than 23 endmembers only pairs are."""
 
 _RIDGE = 1e-6
 """Added to the diagonal of normal equations, so that endmembers of one shape can be solved for."""

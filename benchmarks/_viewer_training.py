@@ -1,0 +1,104 @@
+"""What the viewer costs a training: the same steps, timed by the clock on the wall, with and without it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import NoReturn
+
+import _common
+
+from unmix_plugin.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from unmix_plugin.engine.load_run import read_scene_record
+from unmix_plugin.viewer.model_source import source_of_training
+from unmix_plugin.viewer.options import TrainingViewerOptions
+from unmix_plugin.viewer.server import Viewer
+
+WAYS = ("no viewer", "no page", "one page at rest", "one page always moving")
+UNTIMED_STEPS = 10
+
+_PAGE = """
+import sys, time
+sys.path.insert(0, {folder!r})
+from _viewer_page import Page
+with Page({address!r}, width=512, height=512) as page:
+    page.look_from(0.3)
+    print("there", flush=True)
+    step = 0
+    while not page.is_closed:
+        time.sleep(0.03)
+        step += 1
+        if {moves}:
+            page.look_from(0.3 + 0.01 * step)
+"""
+
+
+@dataclass(frozen=True)
+class TrainingSpeed:
+    """Steps a second of each way, one value a round."""
+
+    values: dict[str, list[float]]
+    share: float
+    """Of the viewer, while a page moves."""
+
+    def relative(self, way: str) -> float:
+        """Speed relative to that without a viewer, median over the rounds: each round is compared with itself."""
+        pairs = zip(self.values[way], self.values["no viewer"], strict=True)
+        return median(speed / alone for speed, alone in pairs)
+
+
+def measure_training(folder: Path, data: Path, device: str, steps: int, rounds: int) -> TrainingSpeed:
+    """Train the same steps in each way, in turn, so that a busy moment of the machine hits all of them."""
+    options = TrainingViewerOptions(port=0)
+    values: dict[str, list[float]] = {way: [] for way in WAYS}
+    for number in range(rounds):
+        for way in WAYS:
+            words = ["unmix-nerf", "--data", str(data), "--output-dir", str(folder / f"{way}-{number}")]
+            words += ["--device", device, "--max-num-iterations", str(steps + UNTIMED_STEPS)]
+            values[way].append(steps / _seconds(words, way, options))
+            print(f"  {way}: {values[way][-1]:.1f} steps/s", flush=True)
+    return TrainingSpeed(values, options.share)
+
+
+def _seconds(words: list[str], way: str, options: TrainingViewerOptions) -> float:
+    """Seconds on the wall that the timed steps took."""
+    trainer = _common.quiet_trainer(words)
+    times: list[float] = []
+    where = TrainingCallbackLocation.AFTER_TRAIN_ITERATION
+    trainer.callbacks.append(TrainingCallback(where, lambda *_: times.append(time.perf_counter())))
+    if way == "no viewer":
+        trainer.train()
+    else:
+        source = source_of_training(trainer, read_scene_record(trainer.run))
+        source.device.guest_share = options.share
+        viewer = Viewer(source, options, _no_scene)
+        viewer.start()
+        page = None if way == "no page" else _page(viewer.port, moves=way.endswith("moving"))
+        try:
+            trainer.train()
+        finally:
+            viewer.stop()
+            if page is not None:
+                page.wait(30)
+    return times[-1] - times[UNTIMED_STEPS - 1]
+
+
+def _page(port: int, moves: bool) -> subprocess.Popen[str]:
+    """A page in a process of its own, as a browser is; there before this returns."""
+    folder = str(Path(__file__).resolve().parent)
+    code = _PAGE.format(folder=folder, address=f"ws://127.0.0.1:{port}", moves=moves)
+    page = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert page.stdout is not None
+    page.stdout.readline()
+    return page
+
+
+def _no_scene() -> NoReturn:
+    """A training has its scene at hand, but nobody asks for it here."""
+    from unmix_plugin.errors import SceneError
+
+    raise SceneError("not read")

@@ -1,0 +1,172 @@
+"""The viewer in a real browser: every layer, the camera, a probe, an edit, a recipe and a screenshot."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import shutil
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from unmix_plugin.commands.view import ViewOptions, prepared
+from unmix_plugin.viewer.layers import LAYERS
+from unmix_plugin.viewer.options import ViewerOptions
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+MISSING = [
+    name
+    for name, is_there in (
+        ("the package playwright", importlib.util.find_spec("playwright") is not None),
+        ("the program chromium", CHROMIUM is not None),
+    )
+    if not is_there
+]
+pytestmark = pytest.mark.skipif(bool(MISSING), reason=f"needs {' and '.join(MISSING)}")
+
+FLAGS = (
+    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
+    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+)
+WIDTH, HEIGHT, PANEL = 1000, 700, 400
+WAIT_MS = 60_000
+LEAST_SPREAD = 4.0
+"""Standard deviation of 8-bit values under which a picture counts as blank."""
+
+
+class Browser:
+    """One page, and what of it is picture."""
+
+    def __init__(self, page, folder):
+        self.page, self.folder = page, folder
+
+    def picture(self):
+        """The canvas without the panel, as 8-bit values."""
+        clip = {"x": 0, "y": 0, "width": WIDTH - PANEL, "height": HEIGHT}
+        return np.asarray(Image.open(io.BytesIO(self.page.screenshot(clip=clip))).convert("RGB")).astype(
+            float
+        )
+
+    def keep(self, name):
+        """Keep a screenshot of all of the page for whoever looks at it."""
+        self.page.screenshot(path=str(self.folder / f"{name.replace(' ', '_')}.png"))
+
+    def wait_for_picture(self, holds):
+        """The first picture for which something holds."""
+        until = time.monotonic() + WAIT_MS / 1000
+        while time.monotonic() < until:
+            picture = self.picture()
+            if holds(picture):
+                return picture
+            time.sleep(0.1)
+        raise AssertionError(f"no such picture came; see {self.folder}")
+
+    def wait_for_other(self, before):
+        """The first picture that differs from one before and is not blank."""
+        return self.wait_for_picture(
+            lambda picture: np.abs(picture - before).mean() > 0.3 and picture.std() > LEAST_SPREAD
+        )
+
+    def open_tab(self, name):
+        self.page.get_by_role("tab", name=name).click()
+
+    def choose(self, label, option):
+        """Choose from the list with a label in the tab that is open."""
+        self.field(label).click()
+        self.page.get_by_role("option", name=option, exact=True).click()
+
+    def type(self, label, value):
+        """Type into the field with a label in the tab that is open."""
+        self.field(label).fill(value)
+        self.field(label).press("Tab")
+
+    def field(self, label):
+        return self.page.get_by_label(label, exact=True).locator("visible=true").first
+
+
+@pytest.fixture
+def viewer(run_copy):
+    served = prepared(ViewOptions(run=run_copy, device="cpu", viewer=ViewerOptions(port=0)))
+    served.start()
+    yield served
+    served.stop()
+
+
+@pytest.fixture
+def browser(viewer, tmp_path):
+    from playwright.sync_api import sync_playwright
+
+    folder = tmp_path / "screenshots"
+    folder.mkdir()
+    with sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
+        page = chromium.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+        page.set_default_timeout(WAIT_MS)
+        errors = []
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.goto(f"http://127.0.0.1:{viewer.port}")
+        page.get_by_role("tab", name="capture").wait_for()
+        yield Browser(page, folder)
+        assert errors == []
+        chromium.close()
+
+
+def wait_for_file(folder: Path, pattern: str) -> Path:
+    until = time.monotonic() + WAIT_MS / 1000
+    while time.monotonic() < until:
+        found = list(folder.glob(pattern)) if folder.is_dir() else []
+        if found:
+            return found[0]
+        time.sleep(0.05)
+    raise AssertionError(f"no {pattern} in {folder}")
+
+
+def test_a_run_is_looked_at_probed_edited_and_saved(viewer, browser):
+    page = browser.page
+    shown = browser.wait_for_picture(lambda picture: picture.std() > LEAST_SPREAD)
+    browser.keep("first")
+    while viewer.services.measured is None:
+        time.sleep(0.05)
+
+    for name, layer in list(LAYERS.items())[1:]:
+        browser.choose("layer", layer.title)
+        shown = browser.wait_for_other(shown)
+        browser.keep(f"layer_{name}")
+    browser.choose("layer", LAYERS["rgb"].title)
+    shown = browser.wait_for_other(shown)
+
+    middle = ((WIDTH - PANEL) / 2, HEIGHT / 2)
+    page.mouse.move(*middle)
+    page.mouse.down()
+    page.mouse.move(middle[0] + 120, middle[1] + 40, steps=5)
+    page.mouse.up()
+    browser.wait_for_other(shown)
+    browser.keep("moved")
+
+    browser.open_tab("probe")
+    page.mouse.click(WIDTH / 2, HEIGHT / 2)
+    page.get_by_text("position", exact=True).wait_for()
+    page.locator("canvas:visible").nth(1).wait_for()  # the chart, beside the scene
+    browser.keep("probe")
+
+    browser.open_tab("materials")
+    shown = browser.picture()
+    browser.choose("light", "A")
+    shown = browser.wait_for_other(shown)
+    browser.keep("edited")
+    page.get_by_role("button", name="save", exact=True).click()
+    recipe = wait_for_file(viewer.services.recipes_folder, "*.yml")
+    assert "illuminant: A" in recipe.read_text()
+
+    browser.open_tab("capture")
+    browser.type("width", "240")
+    browser.type("height", "160")
+    page.get_by_role("button", name="save a screenshot (PNG)").click()
+    saved = wait_for_file(viewer.services.folder, "*.png")
+    with Image.open(saved) as picture:
+        assert picture.size == (240, 160)
+        assert np.asarray(picture).std() > LEAST_SPREAD
+    browser.keep("captured")

@@ -1,0 +1,108 @@
+"""`unmix-view --run PATH`: a trained run in the browser."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+
+from unmix_plugin.commands.entry import run_command
+from unmix_plugin.engine.configs import DeviceName
+from unmix_plugin.viewer.options import ViewerOptions
+
+if TYPE_CHECKING:
+    from unmix_plugin.scenes.scene import Scene
+    from unmix_plugin.viewer.model_source import ModelSource
+    from unmix_plugin.viewer.server import Viewer
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """Show a trained run in the browser: fly around, choose what to see, probe spectra, change materials and light."""
+
+    run: Path | None = None
+    """Run folder, as training printed it; None takes the newest under --output-dir."""
+    data: Path | None = None
+    """Scene folder, where it is no longer where the run was trained on it; without the scene only what was measured is
+    missing."""
+    output_dir: Path = Path("outputs")
+    """Folder in which to look for the newest run."""
+    device: DeviceName = "auto"
+    """Where to compute; auto takes CUDA where there is one."""
+    viewer: ViewerOptions = ViewerOptions()
+    """How the viewer is served."""
+
+
+def view(words: list[str]) -> None:
+    """Parse the words, serve until Ctrl-C.
+
+    Raises:
+        RunError: the run is unusable.
+        ConfigError: the method does not unmix spectra, the device is not there, or nothing can listen at the address.
+    """
+    options = tyro.cli(ViewOptions, prog="unmix-view", args=words)
+    viewer = prepared(options)
+    viewer.start()
+    print("stop with Ctrl-C", flush=True)
+    try:
+        viewer.wait()
+    except KeyboardInterrupt:
+        print("stopped", flush=True)
+    finally:
+        viewer.stop()
+
+
+def prepared(options: ViewOptions) -> Viewer:
+    """The viewer of a run, not yet listening.
+
+    Raises:
+        RunError: the run is unusable.
+        ConfigError: the method does not unmix spectra, or the device is not there.
+    """
+    from rich.console import Console
+
+    from unmix_plugin.commands.reporting import working
+    from unmix_plugin.commands.run_choice import chosen_run
+    from unmix_plugin.engine.load_run import load_model
+    from unmix_plugin.viewer.model_source import source_of_run
+    from unmix_plugin.viewer.server import Viewer
+
+    console = Console()
+    path = chosen_run(options.run, options.output_dir)
+    with working(console, f"reading {path}"):
+        source = source_of_run(load_model(path, options.device))
+    with working(console, "looking at the scene"):
+        with source.borrowed() as model:
+            model.warm_up()
+        return Viewer(
+            source,
+            options.viewer,
+            lambda: _scene_of(source, options.data),
+            lambda line: print(line, flush=True),
+        )
+
+
+def _scene_of(source: ModelSource, data: Path | None) -> Scene:
+    """The scene that the run was trained on.
+
+    Raises:
+        SceneError: it is not at hand.
+        RunError: it is another one.
+    """
+    from unmix_plugin.errors import SceneError
+    from unmix_plugin.exports.scene_at_hand import scene_at_hand
+
+    summary = source.scene.summary
+    scene = scene_at_hand(summary, source.run.path, data)
+    if scene is None:
+        raise SceneError(
+            f"it is no longer, or no longer the same, at {summary.get('root')}; name it with --data"
+        )
+    return scene
+
+
+def main() -> None:
+    """Console script."""
+    run_command(view)
