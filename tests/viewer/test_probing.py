@@ -1,0 +1,78 @@
+"""What a point is made of, and its CSV."""
+
+import csv
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.viewer.view_factory import make_frame
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.spectral.composition import spectral
+from unmix_plugin.viewer.probing import abundances_csv, probe, spectra_csv
+from unmix_plugin.viewer.view_cameras import camera_of, pose_of
+
+
+@pytest.fixture
+def camera(source):
+    return camera_of(pose_of(source.scene.train_cameras[0]), 200)
+
+
+@pytest.fixture
+def taken(source, camera):
+    with source.borrowed() as model:
+        return probe(model, camera, camera.width / 2, camera.height / 2, 1)
+
+
+def test_a_probe_is_what_the_picture_shows_there(source, camera, taken):
+    frame = make_frame(source, camera)
+    row, column = camera.height // 2, camera.width // 2
+    opacity = float(frame.coefficients.accumulation[row, column])
+    shown = spectral(frame.coefficients, frame.materials)[row, column].numpy() / opacity
+    np.testing.assert_allclose(taken.predicted, shown, rtol=0.05)
+    assert taken.abundances.sum() == pytest.approx(1)
+    assert taken.material == int(frame.coefficients.abundances[row, column].argmax())
+
+
+def test_a_probe_lies_on_the_ray_through_the_click(camera, taken):
+    coords, depth = camera.project(taken.position[None], 0)
+    assert depth[0] > 0
+    assert coords[0].tolist() == pytest.approx([camera.width / 2, camera.height / 2], abs=1.0)
+
+
+def test_where_nothing_is_there_is_nothing_to_probe(source, camera):
+    away = camera.camera_to_world.clone()
+    away[0, :, 3] *= 50
+    away[0, :, 1:3] *= -1  # looks the other way
+    with source.borrowed() as model, pytest.raises(ConfigError, match="nothing is there to probe"):
+        probe(model, replace(camera, camera_to_world=away), 100.0, 100.0, 1)
+
+
+def test_the_files_of_probes_hold_every_number(taken):
+    measured = replace(taken, number=2, measured=taken.predicted * 2, measured_in="train_003")
+    rows = list(csv.reader(io.StringIO(spectra_csv([taken, measured]).decode())))
+    assert rows[0] == ["wavelength", "probe_1_predicted", "probe_2_predicted", "probe_2_measured"]
+    values = np.array(rows[1:], dtype=float)
+    np.testing.assert_allclose(values[:, 0], taken.bands.centers_nm)
+    np.testing.assert_allclose(values[:, 3], 2 * taken.predicted, rtol=1e-7)
+    rows = list(csv.reader(io.StringIO(abundances_csv([taken, measured]).decode())))
+    assert rows[0][:6] == ["probe", "x", "y", "z", "material", "measured_in"]
+    assert rows[0][6:] == list(taken.names)
+    assert rows[2][5] == "train_003"
+    np.testing.assert_allclose([float(value) for value in rows[1][6:]], taken.abundances, atol=1e-5)
+    np.testing.assert_allclose([float(value) for value in rows[1][1:4]], taken.point, rtol=1e-7)
+
+
+def test_names_with_commas_stay_one_field(taken):
+    odd = replace(taken, names=("a,b", 'c"d', "e"))
+    rows = list(csv.reader(io.StringIO(abundances_csv([odd]).decode())))
+    assert rows[0][6:] == ["a,b", 'c"d', "e"]
+
+
+def test_a_probe_changes_no_random_state(source, camera):
+    before = torch.get_rng_state()
+    with source.borrowed() as model:
+        probe(model, camera, camera.width / 2, camera.height / 2, 1)
+    assert torch.equal(torch.get_rng_state(), before)

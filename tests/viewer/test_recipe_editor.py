@@ -1,0 +1,114 @@
+"""Recipes as a panel builds them: one change of a kind an endmember, all of it undoable."""
+
+import pytest
+
+from unmix_plugin.editing import (
+    Gloss,
+    Isolate,
+    LibrarySpectrum,
+    Light,
+    Recipe,
+    Remove,
+    Rename,
+    Replace,
+    Retint,
+    Scale,
+    Swap,
+    recipe_from_yaml,
+    recipe_to_yaml,
+)
+from unmix_plugin.viewer.recipe_editor import (
+    RecipeHistory,
+    change_of,
+    numbered,
+    visibility,
+    with_change,
+    with_light,
+    with_swap,
+    with_visible,
+)
+
+
+def test_the_last_change_of_a_kind_to_an_endmember_counts():
+    recipe = with_change(Recipe(), Scale(0, 2.0))
+    recipe = with_change(recipe, Scale(1, 3.0))
+    recipe = with_change(recipe, Retint(0, (0.1, 0.2, 0.3)))
+    recipe = with_change(recipe, Scale(0, 5.0))
+    assert recipe.operations == (Scale(1, 3.0), Retint(0, (0.1, 0.2, 0.3)), Scale(0, 5.0))
+    assert change_of(recipe, Scale, 0) == Scale(0, 5.0)
+    assert change_of(recipe, Gloss, 0) is None
+
+
+def test_the_same_swap_twice_in_a_row_takes_it_back():
+    recipe = with_swap(Recipe((Scale(0, 2.0),)), Swap(0, 1))
+    assert with_swap(recipe, Swap(1, 0)).operations == (Scale(0, 2.0),)
+    assert len(with_swap(recipe, Swap(0, 2)).operations) == 3
+
+
+def test_visibility_is_one_edit_whatever_was_hidden_before():
+    recipe = with_visible(Recipe((Scale(0, 2.0),)), {2, 1}, None)
+    assert recipe.operations == (Scale(0, 2.0), Remove((1, 2)))
+    assert visibility(recipe) == (frozenset({1, 2}), frozenset())
+    alone = with_visible(recipe, {1}, 3)
+    assert alone.operations == (Scale(0, 2.0), Isolate((3,)))
+    assert visibility(alone) == (frozenset(), frozenset({3}))
+    assert with_visible(alone, set(), None).operations == (Scale(0, 2.0),)
+
+
+def test_light_is_set_and_taken_away():
+    lit = with_light(Recipe((Scale(0, 2.0),)), Light("A"))
+    assert lit.illuminant == Light("A")
+    assert with_light(lit, None) == Recipe((Scale(0, 2.0),))
+
+
+def test_changes_are_undone_and_redone_in_order():
+    history = RecipeHistory()
+    recipes = [Recipe((Scale(0, float(factor)),)) for factor in range(1, 4)]
+    for recipe in recipes:
+        history.take(recipe)
+    assert [history.undone(), history.undone(), history.undone()] == [recipes[1], recipes[0], Recipe()]
+    assert history.undone() is None
+    assert history.redone() == recipes[0]
+    history.take(recipes[2])
+    assert history.redone() is None
+    assert history.undone() == recipes[0]
+
+
+def test_a_recipe_that_changes_nothing_is_no_step():
+    history = RecipeHistory()
+    history.take(Recipe((Scale(0, 2.0),)))
+    history.take(Recipe((Scale(0, 2.0),)))
+    assert history.undone() == Recipe()
+
+
+def test_names_become_numbers_also_where_they_were_given_in_the_recipe():
+    recipe = recipe_from_yaml(
+        """
+edits:
+  - rename: {endmember: b, name: clay}
+  - swap: [clay, a]
+  - remove: [clay, 2]
+  - gloss: {scale: 0.5}
+  - replace: {endmember: a, library: pmc/Carrot}
+""",
+    )
+    assert numbered(recipe, ("a", "b", "c")).operations == (
+        Rename(1, "clay"),
+        Swap(1, 0),
+        Remove((1, 2)),
+        Gloss(None, 0.5),
+        Replace(0, LibrarySpectrum("pmc/Carrot")),
+    )
+
+
+def test_unknown_names_are_left_for_whoever_applies_the_recipe():
+    assert numbered(Recipe((Scale("x", 2.0),)), ("a",)).operations == (Scale("x", 2.0),)
+
+
+@pytest.mark.parametrize("isolated", [None, 2])
+def test_what_a_panel_builds_is_what_is_read_from_its_file(isolated):
+    recipe = with_light(Recipe(), Light("FL2"))
+    recipe = with_change(recipe, Retint(0, (0.2, 0.4, 0.6)))
+    recipe = with_change(recipe, Rename(1, "clay"))
+    recipe = with_visible(with_swap(recipe, Swap(0, 2)), {0}, isolated)
+    assert recipe_from_yaml(recipe_to_yaml(recipe)) == recipe

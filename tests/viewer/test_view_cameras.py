@@ -1,0 +1,127 @@
+"""Between a browser's camera and ours: conversions undo each other, and nothing absurd gets in."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.testing import assert_close
+
+from tests.viewer.view_factory import ring, some_pose
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.viewer.view_cameras import (
+    camera_of,
+    checked_pose,
+    depth_along_axis,
+    pixel_rays,
+    pose_of,
+    quaternion,
+    resized,
+    rotation_matrix,
+    up_direction,
+)
+
+components = st.floats(-1, 1, allow_nan=False)
+quaternions = st.tuples(components, components, components, components).filter(lambda q: math.hypot(*q) > 0.1)
+
+
+@given(quaternions)
+def test_a_rotation_keeps_its_quaternion_up_to_sign(wxyz):
+    unit = np.array(wxyz) / np.linalg.norm(wxyz)
+    rotation = rotation_matrix(unit)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+    assert abs(np.dot(quaternion(rotation), unit)) == pytest.approx(1, abs=1e-9)
+
+
+@given(quaternions, st.floats(0.2, 2.5), st.floats(0.3, 3.0))
+def test_a_pose_survives_the_way_to_a_camera_and_back(wxyz, fov, aspect):
+    pose = checked_pose(wxyz, (0.3, -2.0, 1.5), fov, aspect)
+    back = pose_of(camera_of(pose, 240))
+    assert abs(np.dot(back.wxyz, pose.wxyz)) == pytest.approx(1, abs=1e-5)
+    np.testing.assert_allclose(back.position, pose.position, rtol=1e-6)
+    assert (back.fov, back.aspect) == (
+        pytest.approx(pose.fov, rel=1e-5),
+        pytest.approx(pose.aspect, rel=0.02),
+    )
+
+
+def test_a_browser_looking_along_its_z_is_a_camera_looking_along_minus_z():
+    camera = camera_of(checked_pose((1, 0, 0, 0), (0, 0, -3), math.radians(60), 1.0), 3)
+    middle = camera.image_rays(0).directions[4]
+    assert_close(middle, torch.tensor([0.0, 0.0, 1.0]))
+    above = camera.image_rays(0).directions[1]
+    assert above[1] < 0  # OpenCV: y points down, so what is above has smaller y
+
+
+def test_the_vertical_field_of_view_spans_the_height():
+    camera = camera_of(checked_pose((1, 0, 0, 0), (0, 0, 0), math.radians(90), 2.0), 100)
+    assert (camera.width, camera.height) == (200, 100)
+    assert camera.focal_px[0].tolist() == pytest.approx([50, 50])
+
+
+@pytest.mark.parametrize(
+    ("wxyz", "position", "fov", "aspect"),
+    [
+        ((math.nan, 0, 0, 1), (0, 0, 0), 1.0, 1.0),
+        ((1, 0, 0, 0), (math.inf, 0, 0), 1.0, 1.0),
+        ((1, 0, 0, 0), (0, 0, 0), math.nan, 1.0),
+        ((1, 0, 0, 0), (0, 0, 0), 1.0, math.nan),
+        ((1, 0, 0, 0), (0, 0, 0), 1.0, 0.0),
+        ((0, 0, 0, 0), (0, 0, 0), 1.0, 1.0),
+        ((1, 0, 0, 0), (0, 1e9, 0), 1.0, 1.0),
+        ((1, 0, 0), (0, 0, 0), 1.0, 1.0),
+        (("x", 0, 0, 0), (0, 0, 0), 1.0, 1.0),
+        ((1, 0, 0, 0), (0, 0), 1.0, 1.0),
+        ((1, 0, 0, 0), (0, None, 0), 1.0, 1.0),
+    ],
+)
+def test_a_camera_that_is_none_is_refused(wxyz, position, fov, aspect):
+    with pytest.raises(ConfigError, match="the browser sent a camera"):
+        checked_pose(wxyz, position, fov, aspect)
+
+
+def test_absurd_fields_of_view_and_shapes_are_brought_within_bounds():
+    wide = checked_pose((1, 0, 0, 0), (0, 0, 0), 100.0, 1e6)
+    assert wide.fov < math.pi
+    assert wide.aspect == 10
+    assert checked_pose((1, 0, 0, 0), (0, 0, 0), -5.0, 1e-9).fov > 0
+
+
+@given(st.integers(1, 100_000), st.floats(0.1, 10))
+def test_a_picture_never_has_more_pixels_than_allowed_nor_none(height, aspect):
+    camera = camera_of(checked_pose((1, 0, 0, 0), (0, 0, 0), 1.0, aspect), height, largest_pixels=5000)
+    assert 1 <= camera.width * camera.height <= 5000
+
+
+def test_rays_of_pixels_are_those_of_the_whole_image():
+    camera = camera_of(some_pose(), 10)
+    whole = camera.image_rays(0, (0.25, 0.75))
+    chosen = torch.tensor([0, 7, 33, 149])
+    some = pixel_rays(camera, chosen, (0.25, 0.75))
+    assert_close(some.directions, whole.directions[chosen])
+    assert_close(some.origins, whole.origins[chosen])
+
+
+def test_depth_along_the_axis_is_the_depth_of_a_projection():
+    camera = camera_of(some_pose(), 12)
+    bundle = camera.image_rays(0)
+    distance = torch.rand(len(bundle), generator=torch.Generator().manual_seed(0)) + 1
+    _, expected = camera.project(bundle.origins + distance[:, None] * bundle.directions, 0)
+    depth = depth_along_axis(camera, distance.view(camera.height, camera.width))
+    assert_close(depth.flatten(), expected, atol=1e-5, rtol=1e-5)
+
+
+def test_a_resized_camera_sees_the_same_corners():
+    camera = ring()[0]
+    larger = resized(camera, 64)
+    corners = [camera.generate_rays(torch.tensor([0]), torch.tensor([[0.0, 0.0]])).directions]
+    corners.append(larger.generate_rays(torch.tensor([0]), torch.tensor([[0.0, 0.0]])).directions)
+    assert_close(*corners)
+    assert (larger.width, larger.height) == (96, 64)
+
+
+def test_up_is_the_axis_of_the_world_that_the_cameras_hold_upright():
+    assert up_direction(ring(8)) == (0.0, 0.0, 1.0)

@@ -1,0 +1,120 @@
+"""Sources, cameras and render loops for tests of the viewer."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from tests.method_factory import BOX, make_model
+from tests.scenes.scene_factory import ring_poses
+from unmix_plugin.engine.cameras import Cameras
+from unmix_plugin.engine.device_share import DeviceShare
+from unmix_plugin.engine.load_run import SceneRecord
+from unmix_plugin.engine.run_folder import RunFolder
+from unmix_plugin.engine.training_control import TrainingControl
+from unmix_plugin.errors import SceneError
+from unmix_plugin.scenes.scene import Scene
+from unmix_plugin.viewer.frames import Frame, render_frame
+from unmix_plugin.viewer.layer_settings import LayerAids
+from unmix_plugin.viewer.model_source import ModelSource
+from unmix_plugin.viewer.reference import render_reference
+from unmix_plugin.viewer.services import Services
+from unmix_plugin.viewer.view import Shown, View
+from unmix_plugin.viewer.view_cameras import ViewPose, pose_of
+
+WIDTH, HEIGHT, FOCAL = 24, 16, 20.0
+
+
+def ring(count: int = 4) -> Cameras:
+    """Cameras around the origin that see the whole box."""
+    poses = np.stack(ring_poses(count, distance=4.0))[:, :3]
+    return Cameras(
+        torch.tensor(poses, dtype=torch.float32),
+        torch.full((count, 2), FOCAL),
+        torch.tensor([[WIDTH / 2, HEIGHT / 2]]).expand(count, 2).contiguous(),
+        torch.zeros(count, 4),
+        WIDTH,
+        HEIGHT,
+    )
+
+
+def make_source(
+    folder: Path, control: TrainingControl | None = None, seed: int = 0, **settings: Any
+) -> ModelSource:
+    """A model of random blobs as a finished run, or as one under training."""
+    model = make_model(seed, **settings)
+    cameras = ring()
+    scene = SceneRecord(BOX, dict(model.metadata), cameras, cameras[[1, 3]], {})
+    device = DeviceShare() if control is None else control.device
+    return ModelSource(RunFolder(folder), scene, device, model, control=control)
+
+
+def no_scene() -> Scene:
+    """A reader of a scene that is not at hand."""
+    raise SceneError("the scene has gone")
+
+
+def make_services(source: ModelSource) -> Services:
+    """What sessions share, rendering."""
+    services = Services(source, no_scene)
+    services.start()
+    return services
+
+
+def make_frame(source: ModelSource, camera: Cameras | None = None) -> Frame:
+    """A rendered view."""
+    with source.borrowed() as model:
+        return render_frame(model, source.scene.train_cameras[0] if camera is None else camera)
+
+
+def make_aids(source: ModelSource) -> LayerAids:
+    """What layers need."""
+    with source.borrowed() as model:
+        return LayerAids(render_reference(model, source.scene.train_cameras), source.scene.scene_box)
+
+
+def some_pose(index: int = 0) -> ViewPose:
+    """Where one of the ring's cameras stands."""
+    return pose_of(ring()[index])
+
+
+class Screen:
+    """Stands in for a browser: keeps what is shown and what is said."""
+
+    def __init__(self) -> None:
+        self.shown: list[Shown] = []
+        self.times: list[float] = []
+        self.reports: list[str] = []
+        self._changed = threading.Condition()
+        self.view = View(show=self._show, report=self._report)
+
+    def wait_until(self, holds: Callable[[], bool], timeout_s: float = 20.0) -> None:
+        """Wait for something to become true; fails the test if it does not."""
+        with self._changed:
+            assert self._changed.wait_for(holds, timeout_s), (len(self.shown), self.reports)
+
+    def wait_for_pictures(self, count: int) -> None:
+        """Wait until so many pictures were shown in all."""
+        self.wait_until(lambda: len(self.shown) >= count)
+
+    def wait_for_finest(self) -> Shown:
+        """Wait until the newest picture is the finest; that one."""
+        self.wait_until(lambda: bool(self.shown) and not self.shown[-1].is_moving)
+        return self.shown[-1]
+
+    def _show(self, shown: Shown) -> None:
+        with self._changed:
+            self.shown.append(shown)
+            self.times.append(time.monotonic())
+            self._changed.notify_all()
+
+    def _report(self, text: str) -> None:
+        with self._changed:
+            self.reports.append(text)
+            self._changed.notify_all()

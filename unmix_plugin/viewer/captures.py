@@ -1,0 +1,186 @@
+"""Pictures of any size, rendered strip by strip beside the views, so that memory does not grow with resolution.
+
+Notation: `H x W` pixels, `B` bands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from unmix_plugin.engine.cameras import Cameras
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.exports.camera_paths import rows_of
+from unmix_plugin.exports.files import write_file
+from unmix_plugin.exports.formats.png import rgba_png_bytes
+from unmix_plugin.exports.formats.spectral_exr import write_spectral_exr
+from unmix_plugin.spectral.colour import rgb_matrix
+from unmix_plugin.spectral.composition import spectral
+from unmix_plugin.viewer.edits import Edit
+from unmix_plugin.viewer.frames import Frame, FrameRender
+from unmix_plugin.viewer.layers import linear_light
+from unmix_plugin.viewer.render_loop import RenderLoop
+from unmix_plugin.viewer.view import Capture
+
+SIDE_BOUNDS = (16, 8192)
+"""Least and greatest width and height of a picture."""
+
+_MOST_PIXELS = 1 << 25
+_LARGEST_SPECTRA_BYTES = 1 << 29
+_STRIP_PIXELS = 1 << 17
+
+
+@dataclass(frozen=True)
+class PictureRequest:
+    """A picture asked for."""
+
+    camera: Cameras
+    """One camera."""
+    edit: Edit
+    subpixels: int
+    """Rays through a pixel along each of its edges."""
+
+
+class StripCapture:
+    """Renders a picture in strips from top to bottom and hands each on."""
+
+    def __init__(
+        self,
+        loop: RenderLoop,
+        request: PictureRequest,
+        take: Callable[[int, Frame], None],
+        done: Callable[[str], None],
+        progress: Callable[[float], None],
+    ) -> None:
+        """
+        Args:
+            loop: Renders between what is more urgent.
+            request: What to render.
+            take: Takes the first row of a strip and the strip.
+            done: Told the end: an empty text, or what went wrong.
+            progress: Told the part that is rendered.
+        """
+        self._loop, self._request = loop, request
+        self._take, self._done, self._progress = take, done, progress
+        self._rows = max(1, _STRIP_PIXELS // request.camera.width)
+        self._first_row = 0
+        self._capture: Capture | None = None
+        self._is_cancelled = False
+
+    def start(self) -> None:
+        """Begin with the first strip, or go on with the next."""
+        camera = self._request.camera
+        last = min(self._first_row + self._rows, camera.height)
+        strip = rows_of(camera, self._first_row, last)
+        render = FrameRender(strip, self._request.subpixels)
+        share = (last - self._first_row) / camera.height
+        begun = self._first_row / camera.height
+        self._capture = Capture(
+            render,
+            self._request.edit,
+            self._strip_done,
+            lambda fraction: self._progress(begun + share * fraction),
+        )
+        self._loop.capture(self._capture)
+
+    def cancel(self) -> None:
+        """Stop after the block under way."""
+        self._is_cancelled = True
+        if self._capture is not None:
+            self._capture.is_cancelled = True
+
+    def _strip_done(self, frame: Frame | None, reason: str) -> None:
+        if frame is None:
+            self._done(reason)
+            return
+        try:
+            self._take(self._first_row, frame)
+            self._first_row += frame.camera.height
+            if self._is_cancelled:
+                self._done("cancelled")
+            elif self._first_row < self._request.camera.height:
+                self.start()
+            else:
+                self._done("")
+        except Exception as error:
+            self._done(f"{type(error).__name__}: {error}")
+            raise
+
+
+class PictureCanvas:
+    """Collects strips of a painted picture."""
+
+    def __init__(self, camera: Cameras) -> None:
+        self.pixels: UInt8[np.ndarray, "H W 3"] = np.zeros((camera.height, camera.width, 3), np.uint8)
+
+    def take(self, first_row: int, strip: UInt8[np.ndarray, "rows W 3"]) -> None:
+        """Put a strip in its place."""
+        self.pixels[first_row : first_row + len(strip)] = strip
+
+    def write(self, path: Path, description: str) -> bytes:
+        """Write a PNG; its bytes.
+
+        Raises:
+            RunError: the disk is full or refuses.
+        """
+        content = rgba_png_bytes(self.pixels, description)
+        write_file(path, content)
+        return content
+
+
+class SpectraCanvas:
+    """Collects strips of spectra."""
+
+    def __init__(self, camera: Cameras, num_bands: int) -> None:
+        shape = (camera.height, camera.width)
+        self.spectra: Float32[np.ndarray, "H W B"] = np.zeros((*shape, num_bands), np.float32)
+        self.linear_rgb: Float32[np.ndarray, "H W 3"] = np.zeros((*shape, 3), np.float32)
+        self.opacity: Float32[np.ndarray, "H W"] = np.zeros(shape, np.float32)
+        self._bands = None
+
+    def take(self, first_row: int, frame: Frame) -> None:
+        """Put a strip in its place."""
+        rows = slice(first_row, first_row + frame.camera.height)
+        self._bands = frame.materials.bands
+        self.spectra[rows] = spectral(frame.coefficients, frame.materials).cpu().numpy()
+        self.linear_rgb[rows] = linear_light(frame, rgb_matrix(self._bands)).cpu().numpy()
+        self.opacity[rows] = frame.coefficients.accumulation.cpu().numpy()
+
+    def write(self, path: Path) -> Path:
+        """Write a spectral EXR.
+
+        Raises:
+            RunError: the disk is full or refuses.
+        """
+        assert self._bands is not None
+        return write_spectral_exr(
+            path,
+            self.spectra,
+            self._bands,
+            self.linear_rgb,
+            self.opacity,
+            "radiance on black, 1 = full scale",
+        )
+
+
+def check_size(width: int, height: int, num_bands: int | None = None) -> None:
+    """Refuse pictures that would take too much memory.
+
+    Raises:
+        ConfigError: too many pixels, or too many numbers where spectra are kept.
+    """
+    if width * height > _MOST_PIXELS:
+        raise ConfigError(
+            f"{width} x {height} pixels are too many for one picture; choose at most {_MOST_PIXELS / 1e6:.0f} million, "
+            "or render with unmix-render"
+        )
+    if num_bands is not None and width * height * num_bands * 4 > _LARGEST_SPECTRA_BYTES:
+        most = _LARGEST_SPECTRA_BYTES // (4 * num_bands)
+        raise ConfigError(
+            f"spectra of {width} x {height} pixels are too much for the viewer; choose at most "
+            f"{most / 1e6:.1f} million pixels, or render with unmix-render"
+        )

@@ -1,0 +1,73 @@
+"""Recipes as the viewer applies them: to a model that may still be training, again and again, and cheaply."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from unmix_plugin.editing import Recipe, changes_geometry, edit_model
+from unmix_plugin.model import UnmixModel
+from unmix_plugin.spectral.composition import Coefficients
+
+_RENEWAL_S = 0.5
+"""An edited model is made anew so long after the last time, where training changes what it was made from."""
+
+See = Callable[[UnmixModel], Coefficients]
+"""What cameras see of a model, for edits that depend on it."""
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """The edited model made last."""
+
+    original: UnmixModel
+    edited: UnmixModel
+    version: int
+    made_at: float
+
+    def serves(self, model: UnmixModel, version: int) -> bool:
+        is_new = self.version == version or time.monotonic() - self.made_at < _RENEWAL_S
+        return self.original is model and is_new
+
+
+@dataclass(frozen=True, eq=False)
+class Edit:
+    """A recipe, and the model that it last gave; compared by identity."""
+
+    recipe: Recipe = Recipe()
+    _kept: list[_Kept] = field(default_factory=list, repr=False)
+    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
+
+    @property
+    def is_none(self) -> bool:
+        """Whether nothing is changed."""
+        return not self.recipe.operations and self.recipe.illuminant is None
+
+    @property
+    def changes_geometry(self) -> bool:
+        """Whether pictures must be rendered for it: shape or gloss change."""
+        return changes_geometry(self.recipe)
+
+    def reuses(self, other: Edit) -> bool:
+        """Whether what was rendered with `other` can be shown with this edit's materials."""
+        return self is other or (not self.changes_geometry and not other.changes_geometry)
+
+    def apply(self, model: UnmixModel, version: int, see: See) -> UnmixModel:
+        """The edited model, sharing weights with `model`; must be called while the model is lent.
+
+        Args:
+            model: The unedited one.
+            version: Rises as training changes it.
+            see: Asked only if the recipe depends on pictures.
+        Raises:
+            ConfigError: the recipe does not fit the run.
+        """
+        if self.is_none:
+            return model
+        with self._lock:
+            if not self._kept or not self._kept[0].serves(model, version):
+                edited = edit_model(model, self.recipe, see(model) if self.recipe.wants_pictures else None)
+                self._kept[:] = [_Kept(model, edited, version, time.monotonic())]
+            return self._kept[0].edited

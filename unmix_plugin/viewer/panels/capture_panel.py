@@ -1,0 +1,228 @@
+"""What leaves the viewer: pictures of any size, spectra of the view, camera paths and their videos."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from unmix_plugin.editing import recipe_to_yaml
+from unmix_plugin.engine.cameras import Cameras
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.exports.camera_files import camera_file_bytes
+from unmix_plugin.exports.files import write_file
+from unmix_plugin.exports.world_frame import world_frame
+from unmix_plugin.viewer.camera_path import (
+    FPS_BOUNDS,
+    MOST_KEY_FRAMES,
+    SECONDS_BOUNDS,
+    path_poses,
+    path_views,
+)
+from unmix_plugin.viewer.captures import (
+    SIDE_BOUNDS,
+    PictureCanvas,
+    PictureRequest,
+    SpectraCanvas,
+    StripCapture,
+    check_size,
+)
+from unmix_plugin.viewer.inputs import new_file, number
+from unmix_plugin.viewer.session import Session
+from unmix_plugin.viewer.video_job import output_of, render_words
+from unmix_plugin.viewer.view_cameras import ViewPose, camera_of, sized_camera
+
+_PREVIEW_FPS = 12
+_LARGEST_DOWNLOAD = 1 << 26
+_NO_KEY = "none yet"
+
+
+class CapturePanel:
+    """Saves what a client sees."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._capture: StripCapture | None = None
+        self._keys: list[ViewPose] = []
+        self._preview = threading.Event()
+        gui = session.client.gui
+        with gui.add_folder("picture"):
+            self._width = gui.add_number("width", 1024, min=SIDE_BOUNDS[0], max=SIDE_BOUNDS[1], step=1)
+            self._height = gui.add_number("height", 1024, min=SIDE_BOUNDS[0], max=SIDE_BOUNDS[1], step=1)
+            self._name = gui.add_text("name", "view")
+            self._progress = gui.add_progress_bar(0.0)
+            gui.add_button("save a screenshot (PNG)").on_click(session.guarded(self._save_picture))
+            gui.add_button("save the spectra (EXR)").on_click(session.guarded(self._save_spectra))
+            gui.add_button("cancel").on_click(session.guarded(self._cancel))
+        with gui.add_folder("camera path"):
+            gui.add_button("add a key frame here").on_click(session.guarded(self._add_key))
+            self._key = gui.add_dropdown("key frame", _no_keys())
+            keys = gui.add_button_group("this one", ("look", "replace", "remove"))
+            keys.on_click(session.guarded(lambda: self._change_key(str(keys.value))))
+            self._seconds = gui.add_number(
+                "seconds", 4.0, min=SECONDS_BOUNDS[0], max=SECONDS_BOUNDS[1], step=0.5
+            )
+            self._fps = gui.add_number("frames a second", 24, min=FPS_BOUNDS[0], max=FPS_BOUNDS[1], step=1)
+            preview = gui.add_button_group("preview", ("play", "stop"))
+            preview.on_click(session.guarded(lambda: self._play(preview.value == "play")))
+            gui.add_button("save the path").on_click(
+                session.guarded(lambda: self._say_saved(self._save_path()))
+            )
+            gui.add_button("render a video").on_click(session.guarded(self._render_video))
+
+        session.on_close.append(self._abandon)
+
+    def _abandon(self) -> None:
+        """Nobody waits for what is under way."""
+        self._preview.set()
+        self._cancel()
+
+    def _cancel(self) -> None:
+        if self._capture is not None:
+            self._capture.cancel()
+
+    def _size(self) -> tuple[int, int]:
+        width, height = (
+            int(number(control.value, *SIDE_BOUNDS, fallback=1024)) for control in (self._width, self._height)
+        )
+        return width, height
+
+    def _camera(self, num_bands: int | None = None) -> Cameras:
+        """What the client sees, in the size asked for: the vertical field of view stays.
+
+        Raises:
+            ConfigError: too large a picture, or one with too many spectra.
+        """
+        width, height = self._size()
+        check_size(width, height, num_bands)
+        return sized_camera(self._session.pose(), width, height)
+
+    def _save_picture(self) -> None:
+        camera = self._camera()
+        session, canvas = self._session, PictureCanvas(camera)
+        settings, maker = session.view.settings, session.services.maker
+        path = self._new_file(".png")
+
+        def finish() -> None:
+            content = canvas.write(path, f"{settings.layer}, {camera.width} x {camera.height} pixels")
+            self._hand_over(path, content)
+
+        self._begin(
+            camera,
+            lambda row, frame: canvas.take(row, maker.paint(frame, settings, False, False).picture),
+            finish,
+        )
+
+    def _save_spectra(self) -> None:
+        bands = self._session.materials().bands
+        camera = self._camera(len(bands))
+        canvas, path = SpectraCanvas(camera, len(bands)), self._new_file(".exr")
+        self._begin(camera, canvas.take, lambda: self._say_saved(canvas.write(path)))
+
+    def _begin(self, camera: Cameras, take: Callable[..., None], finish: Callable[[], None]) -> None:
+        if self._capture is not None:
+            raise ConfigError("a picture is being rendered already; wait for it or cancel it")
+        session = self._session
+
+        def done(reason: str) -> None:
+            self._capture = None
+            self._show_progress(0.0)
+            if reason:
+                session.say("no picture", reason, is_warning=True)
+            else:
+                session.guarded(finish)()
+
+        request = PictureRequest(camera, session.view.edit, session.view.subpixels)
+        self._capture = StripCapture(session.services.loop, request, take, done, self._show_progress)
+        self._capture.start()
+
+    def _show_progress(self, fraction: float | int) -> None:
+        if not self._session.is_closed:
+            self._progress.value = 100.0 * fraction
+
+    def _new_file(self, suffix: str) -> Path:
+        return new_file(self._session.services.folder, self._name.value, suffix, "view")
+
+    def _hand_over(self, path: Path, content: bytes) -> None:
+        if len(content) <= _LARGEST_DOWNLOAD:
+            self._session.client.send_file_download(path.name, content)
+        self._say_saved(path)
+
+    def _say_saved(self, path: Path) -> None:
+        self._session.say("saved", str(path))
+
+    def _add_key(self) -> None:
+        if len(self._keys) >= MOST_KEY_FRAMES:
+            raise ConfigError(f"a path has at most {MOST_KEY_FRAMES} key frames")
+        self._keys.append(self._session.pose())
+        self._list_keys(len(self._keys) - 1)
+
+    def _list_keys(self, chosen: int) -> None:
+        count = len(self._keys)
+        names = tuple(f"{index + 1} of {count}" for index in range(count)) or _no_keys()
+        self._key.options = names
+        self._key.value = names[min(max(chosen, 0), len(names) - 1)]
+
+    def _change_key(self, action: str) -> None:
+        names = tuple(self._key.options)
+        if not self._keys or self._key.value not in names:
+            raise ConfigError("there is no key frame yet; add one")
+        index = names.index(self._key.value)
+        if action == "look":
+            self._session.look_from(camera_of(self._keys[index], 64))
+        elif action == "replace":
+            self._keys[index] = self._session.pose()
+        elif action == "remove":
+            del self._keys[index]
+            self._list_keys(index)
+
+    def _play(self, is_on: bool) -> None:
+        """Move the client's camera along the path, in a thread of its own."""
+        self._preview.set()
+        if not is_on:
+            return
+        poses = path_poses(self._keys, max(2, int(self._duration() * _PREVIEW_FPS)))
+        stopped = self._preview = threading.Event()
+
+        def play() -> None:
+            for pose in poses:
+                if stopped.is_set() or self._session.is_closed:
+                    return
+                self._session.guarded(lambda pose=pose: self._session.look_from(camera_of(pose, 64)))()
+                time.sleep(1 / _PREVIEW_FPS)
+
+        threading.Thread(target=play, name="unmix-viewer-preview", daemon=True).start()
+
+    def _duration(self) -> float:
+        return number(self._seconds.value, *SECONDS_BOUNDS, fallback=4.0)
+
+    def _save_path(self) -> Path:
+        """Write the path as a camera file for `unmix-render`."""
+        frames_per_second = number(self._fps.value, *FPS_BOUNDS, fallback=24)
+        poses = path_poses(self._keys, max(2, round(self._duration() * frames_per_second)))
+        width, height = self._size()
+        services = self._session.services
+        views = path_views(poses, width - width % 2, height - height % 2)
+        path = new_file(services.folder, f"{self._name.value}-path", ".json", "path")
+        space = world_frame(services.source.scene)
+        return write_file(path, camera_file_bytes(views, frames_per_second, space))
+
+    def _render_video(self) -> None:
+        session, services = self._session, self._session.services
+        output = output_of(session.view.settings)
+        width, height = self._size()
+        check_size(width, height)
+        cameras = self._save_path()
+        recipe = None
+        if not session.view.edit.is_none:
+            text = recipe_to_yaml(session.view.edit.recipe).encode()
+            recipe = write_file(cameras.with_suffix(".yml"), text)
+        folder = cameras.with_suffix("")
+        words = render_words(services.source.run.path, cameras, output, folder, recipe)
+        services.video.start(words, folder, lambda text: session.say("video", text))
+        session.say("video", f"unmix-render writes it to {folder}")
+
+
+def _no_keys() -> tuple[str, ...]:
+    return (_NO_KEY,)

@@ -1,0 +1,183 @@
+"""Click a point: its spectrum, what it is made of, and what training views measured there; several are compared."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.exports.files import write_file
+from unmix_plugin.viewer import html
+from unmix_plugin.viewer.charts import Chart, Line
+from unmix_plugin.viewer.inputs import new_file, number
+from unmix_plugin.viewer.probing import Probe, abundances_csv, spectra_csv
+from unmix_plugin.viewer.scene_objects import add_probe
+from unmix_plugin.viewer.session import Session
+from unmix_plugin.viewer.view_cameras import camera_of
+
+if TYPE_CHECKING:
+    import viser
+
+MOST_PROBES = 12
+"""Probes that a client keeps; the first goes when another comes."""
+
+_COLOURS = (
+    (0.9, 0.1, 0.3),
+    (0.1, 0.45, 0.9),
+    (0.1, 0.6, 0.2),
+    (0.85, 0.5, 0.0),
+    (0.5, 0.2, 0.8),
+    (0.0, 0.6, 0.6),
+)
+_SHOWN_SHARE = 0.08
+"""Endmembers of at least this share are drawn beside a probe's spectrum."""
+
+_PROBED_ROWS = 512
+_NONE = "none yet"
+
+
+class ProbePanel:
+    """Keeps the probes of a client."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._probes: list[Probe] = []
+        self._markers: dict[int, viser.IcosphereHandle] = {}
+        self._taken = 0
+        gui = session.client.gui
+        self._is_on = gui.add_checkbox("probe where I click", True)
+        self._chosen = gui.add_dropdown("probe", _no_probes())
+        self._chosen.on_update(session.guarded(self._show_chosen))
+        self._text = gui.add_html(html.paragraph("Click a point of the picture."))
+        self._bars = gui.add_html("")
+        self._chart = Chart(gui, "spectrum")
+        self._comparison = Chart(gui, "all probes")
+        gui.add_button("save as CSV").on_click(session.guarded(self._save))
+        gui.add_button("forget all").on_click(session.guarded(self._forget))
+        self._listen()
+
+    def _listen(self) -> None:
+        scene = self._session.client.scene
+        # viser 1.1 has on_click, whose event has one position; 1.0 has on_pointer_event, with a tuple of positions.
+        if hasattr(scene, "on_click"):
+            scene.on_click()(self._clicked)
+        else:
+            scene.on_pointer_event("click")(self._clicked)
+
+    def _clicked(self, event: Any) -> None:
+        position = event.screen_pos
+        x, y = position[0] if isinstance(position[0], tuple | list) else position
+        self._session.guarded(lambda: self._take(x, y))()
+
+    def _take(self, x: Any, y: Any) -> None:
+        """Probe a point of the canvas, given in parts of its width and height."""
+        if self._is_on.value is not True:
+            return
+        column, row = (number(value, 0.0, 1.0, fallback=0.5) for value in (x, y))
+        session, services = self._session, self._session.services
+        camera = camera_of(session.pose(), _PROBED_ROWS)
+        taken = services.maker.probe(
+            session.view.edit, camera, column * camera.width, row * camera.height, self._taken + 1
+        )
+        taken = self._with_measurement(taken)
+        self._taken += 1
+        self._probes.append(taken)
+        while len(self._probes) > MOST_PROBES:
+            self._drop(self._probes[0])
+        self._markers[taken.number] = add_probe(session.client, taken.number, taken.point, _marker(taken))
+        session.show_objects("probe", True)
+        self._chosen.options = tuple(_label(one) for one in self._probes)
+        self._chosen.value = _label(taken)
+        self._show(taken)
+
+    def _with_measurement(self, taken: Probe) -> Probe:
+        """With what a training view measured there, where the scene is at hand."""
+        session = self._session
+        if session.services.measured is None:
+            return taken
+        camera = camera_of(session.pose(), _PROBED_ROWS)
+        found = session.services.measured.measurement(taken.position, camera)
+        if found is None:
+            return taken
+        return replace(taken, measured=found.spectrum.double().numpy(), measured_in=found.view)
+
+    def _show_chosen(self) -> None:
+        chosen = next((one for one in self._probes if _label(one) == self._chosen.value), None)
+        if chosen is not None:
+            self._show(chosen)
+
+    def _show(self, shown: Probe) -> None:
+        rows = [
+            ("material", shown.names[shown.material]),
+            ("position", ", ".join(f"{value:.3f}" for value in shown.point)),
+            ("measured in", shown.measured_in or "no training view at hand sees the point"),
+            *self._library_rows(shown),
+        ]
+        self._text.content = html.table(rows)
+        colours = self._session.colours()
+        entries = zip(shown.names, shown.abundances.tolist(), colours, strict=True)
+        self._bars.content = html.bars(sorted(entries, key=lambda entry: -entry[1])[:16])
+        lines = [Line("predicted", shown.predicted, _colour(shown))]
+        if shown.measured is not None:
+            lines.append(
+                Line(f"measured, {shown.measured_in}", shown.measured, (0.35, 0.35, 0.35), is_dashed=True)
+            )
+        lines += [
+            Line(shown.names[index], shown.endmembers[index], colours[index], is_thin=True)
+            for index in np.flatnonzero(shown.abundances >= _SHOWN_SHARE)
+        ]
+        self._chart.draw(shown.bands, lines)
+        self._comparison.draw(
+            shown.bands, [Line(f"probe {one.number}", one.predicted, _colour(one)) for one in self._probes]
+        )
+
+    def _library_rows(self, shown: Probe) -> list[tuple[str, str]]:
+        matches = self._session.nearest_materials(shown.predicted[None], shown.bands)[0]
+        return [
+            ("like" if rank == 0 else "", f"{match.name} ({match.angle_rad:.3f} rad)")
+            for rank, match in enumerate(matches)
+        ]
+
+    def _save(self) -> None:
+        if not self._probes:
+            raise ConfigError("there is no probe to save; click a point of the picture first")
+        folder = self._session.services.folder
+        for name, content in (
+            ("probes", spectra_csv(self._probes)),
+            ("probe-abundances", abundances_csv(self._probes)),
+        ):
+            path = write_file(new_file(folder, name, ".csv", name), content)
+            self._session.client.send_file_download(path.name, content)
+        self._session.say("saved", f"{path.parent}: spectra and abundances of {len(self._probes)} probes")
+
+    def _forget(self) -> None:
+        for one in list(self._probes):
+            self._drop(one)
+        self._session.show_objects("probe", False)
+        self._chosen.options = _no_probes()
+        self._text.content, self._bars.content = html.paragraph("Click a point of the picture."), ""
+        self._chart.clear()
+        self._comparison.clear()
+
+    def _drop(self, one: Probe) -> None:
+        self._probes.remove(one)
+        self._markers.pop(one.number).remove()
+
+
+def _label(one: Probe) -> str:
+    return f"{one.number}: {one.names[one.material]}"
+
+
+def _colour(one: Probe) -> tuple[float, float, float]:
+    return _COLOURS[(one.number - 1) % len(_COLOURS)]
+
+
+def _marker(one: Probe) -> tuple[int, int, int]:
+    red, green, blue = (int(255 * value) for value in _colour(one))
+    return red, green, blue
+
+
+def _no_probes() -> tuple[str, ...]:
+    return (_NONE,)

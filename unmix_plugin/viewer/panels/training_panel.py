@@ -1,0 +1,110 @@
+"""How training goes, and what can be asked of it."""
+
+from __future__ import annotations
+
+from unmix_plugin.engine.device_share import SHARE_BOUNDS
+from unmix_plugin.engine.progress import TrainingStatus
+from unmix_plugin.viewer import html
+from unmix_plugin.viewer.charts import Chart, Line
+from unmix_plugin.viewer.inputs import number
+from unmix_plugin.viewer.services import Services
+from unmix_plugin.viewer.session import Session
+
+_LOSS_COLOUR, _PSNR_COLOUR = (0.85, 0.3, 0.1), (0.1, 0.4, 0.8)
+_TICKS_A_CHART = 4
+
+
+class TrainingPanel:
+    """Shows and steers the training under way."""
+
+    def __init__(self, session: Session) -> None:
+        control = session.services.source.control
+        assert control is not None
+        self._session, self._control = session, control
+        self._ticks = 0
+        gui = session.client.gui
+        self._state = gui.add_html("")
+        self._bar = gui.add_progress_bar(0.0)
+        self._pause = gui.add_button("pause")
+        self._pause.on_click(session.guarded(self._toggle))
+        gui.add_button("save a checkpoint").on_click(session.guarded(self._save))
+        self._sure = gui.add_checkbox("really stop", False)
+        gui.add_button("stop training", color="red").on_click(session.guarded(self._stop))
+        low, high = SHARE_BOUNDS
+        self._share = gui.add_slider(
+            "viewer's share",
+            low,
+            high,
+            0.05,
+            control.device.guest_share,
+            hint="Of the device's time, while someone moves.",
+        )
+        self._share.on_update(session.guarded(self._change_share))
+        self._loss, self._psnr = (Chart(gui, title, "step") for title in ("loss", "PSNR (dB)"))
+        self._tick()
+        session.on_tick.append(self._tick)
+
+    def _tick(self) -> None:
+        """Renew the figures, and now and then the curves."""
+        control, status = self._control, self._control.status
+        self._pause.label = "resume" if control.is_paused else "pause"
+        self._state.content = html.table(_rows(status, self._condition()))
+        self._bar.value = 0.0 if status is None else 100 * status.progress
+        if self._ticks % _TICKS_A_CHART == 0:
+            self._draw_curves()
+        self._ticks += 1
+
+    def _condition(self) -> str:
+        control = self._control
+        if not control.is_running:
+            return "has not begun" if control.status is None else "finished"
+        if control.is_stop_requested:
+            return "stopping"
+        return "paused" if control.is_paused else "running"
+
+    def _draw_curves(self) -> None:
+        curve = self._session.services.curve
+        for chart, name, colour in ((self._loss, "loss", _LOSS_COLOUR), (self._psnr, "psnr", _PSNR_COLOUR)):
+            steps, values = curve.line(name)
+            chart.plot(steps, [Line(name, values, colour)])
+
+    def _toggle(self) -> None:
+        if self._control.is_paused:
+            self._control.resume()
+        else:
+            self._control.pause()
+        self._tick()
+
+    def _save(self) -> None:
+        self._control.request_save()
+        self._session.say("saving", "a checkpoint is saved after the step under way")
+
+    def _stop(self) -> None:
+        if self._sure.value is not True:
+            self._session.say("stop?", "tick the box above first: training ends, saved, and can be resumed")
+            return
+        self._control.request_stop()
+
+    def _change_share(self) -> None:
+        self._control.device.guest_share = number(
+            self._share.value, *SHARE_BOUNDS, fallback=self._control.device.guest_share
+        )
+
+
+def is_training(services: Services) -> bool:
+    """Whether there is a training to show."""
+    return services.source.control is not None
+
+
+def _rows(status: TrainingStatus | None, condition: str) -> list[tuple[str, str]]:
+    if status is None:
+        return [("training", condition)]
+    left = status.seconds_left
+    return [
+        ("training", condition),
+        ("step", f"{status.step}, {100 * status.progress:.0f} %"),
+        ("loss", f"{status.loss:.4g}"),
+        ("PSNR of the batch", "-" if status.psnr is None else f"{status.psnr:.2f} dB"),
+        ("speed", f"{status.rays_per_second / 1000:.1f} k rays/s"),
+        ("time left", "-" if left is None else f"{left:.0f} s of training"),
+    ]

@@ -1,0 +1,154 @@
+"""Recipes as a panel builds them: each change is an edit of the recipe, and can be undone.
+
+Endmembers are meant by their number, which no edit changes. A second change of the same kind to the same endmember
+takes the place of the first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+from unmix_plugin.editing import (
+    Gloss,
+    Isolate,
+    Light,
+    Operation,
+    Recipe,
+    Remove,
+    Rename,
+    Replace,
+    Retint,
+    Scale,
+    Swap,
+)
+
+_MOST_UNDONE = 200
+_MOST_OPERATIONS = 500
+
+
+class RecipeHistory:
+    """The recipe in force, those before it, and those that were undone."""
+
+    def __init__(self) -> None:
+        self._past: list[Recipe] = []
+        self._future: list[Recipe] = []
+        self.present = Recipe()
+
+    def take(self, recipe: Recipe) -> None:
+        """Put another recipe in force."""
+        if recipe == self.present:
+            return
+        self._past = [*self._past, self.present][-_MOST_UNDONE:]
+        self._future.clear()
+        self.present = recipe
+
+    def undone(self) -> Recipe | None:
+        """Go back by one; None at the beginning."""
+        if not self._past:
+            return None
+        self._future.append(self.present)
+        self.present = self._past.pop()
+        return self.present
+
+    def redone(self) -> Recipe | None:
+        """Go forward again by one; None at the end."""
+        if not self._future:
+            return None
+        self._past.append(self.present)
+        self.present = self._future.pop()
+        return self.present
+
+
+def with_change(recipe: Recipe, change: Replace | Retint | Scale | Rename | Gloss) -> Recipe:
+    """The recipe with a change of one endmember, in place of an earlier one of the same kind."""
+    others = [one for one in recipe.operations if not (type(one) is type(change) and _same(one, change))]
+    return _with_operations(recipe, [*others, change])
+
+
+def with_swap(recipe: Recipe, swap: Swap) -> Recipe:
+    """The recipe with two endmembers swapped; swapping the same two again at once takes it back."""
+    last = recipe.operations[-1] if recipe.operations else None
+    if isinstance(last, Swap) and {last.first, last.second} == {swap.first, swap.second}:
+        return _with_operations(recipe, recipe.operations[:-1])
+    return _with_operations(recipe, [*recipe.operations, swap])
+
+
+def with_light(recipe: Recipe, light: Light | None) -> Recipe:
+    """The recipe in another light; None for the scene's own."""
+    return replace(recipe, illuminant=light)
+
+
+def with_visible(recipe: Recipe, hidden: Iterable[int], isolated: int | None) -> Recipe:
+    """The recipe that shows all endmembers but the hidden ones, or the isolated one alone."""
+    others = [one for one in recipe.operations if not isinstance(one, Remove | Isolate)]
+    if isolated is not None:
+        return _with_operations(recipe, [*others, Isolate((isolated,))])
+    gone = tuple(sorted(set(hidden)))
+    return _with_operations(recipe, [*others, Remove(gone)] if gone else others)
+
+
+def visibility(recipe: Recipe) -> tuple[frozenset[int], frozenset[int]]:
+    """Numbers of the endmembers that a numbered recipe removes, and of those that it isolates."""
+    removed, isolated = (
+        frozenset(
+            index
+            for one in recipe.operations
+            if isinstance(one, kind)
+            for index in one.endmembers
+            if isinstance(index, int)
+        )
+        for kind in (Remove, Isolate)
+    )
+    return removed, isolated
+
+
+def numbered(recipe: Recipe, names: tuple[str, ...]) -> Recipe:
+    """The same recipe with endmembers meant by their numbers; unknown names are left for whoever applies it to refuse.
+
+    Args:
+        recipe: As written by hand, perhaps.
+        names: Of the run's endmembers before any edit.
+    """
+    present = list(names)
+
+    def number_of(endmember: str | int) -> str | int:
+        return present.index(endmember) if endmember in present else endmember
+
+    def with_numbers(one: Operation) -> Operation:
+        if isinstance(one, Swap):
+            return replace(one, first=number_of(one.first), second=number_of(one.second))
+        if isinstance(one, Remove | Isolate):
+            return replace(one, endmembers=tuple(number_of(name) for name in one.endmembers))
+        if isinstance(one, Gloss) and one.endmember is None:
+            return one
+        assert isinstance(one, Replace | Retint | Scale | Rename | Gloss)
+        assert one.endmember is not None
+        return replace(one, endmember=number_of(one.endmember))
+
+    operations: list[Operation] = []
+    for one in recipe.operations:
+        operations.append(changed := with_numbers(one))
+        if isinstance(changed, Rename) and changed.endmember in range(len(present)):
+            present[int(changed.endmember)] = changed.name
+    return replace(recipe, operations=tuple(operations))
+
+
+def change_of(recipe: Recipe, kind: type[Operation], endmember: int) -> Operation | None:
+    """The change of a kind that a recipe makes to an endmember by its number."""
+    return next(
+        (
+            one
+            for one in recipe.operations
+            if type(one) is kind and getattr(one, "endmember", None) == endmember
+        ),
+        None,
+    )
+
+
+def _same(one: Operation, other: Operation) -> bool:
+    return getattr(one, "endmember", None) == getattr(other, "endmember", None)
+
+
+def _with_operations(recipe: Recipe, operations: Iterable[Operation]) -> Recipe:
+    return replace(recipe, operations=tuple(operations)[-_MOST_OPERATIONS:])

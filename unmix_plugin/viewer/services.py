@@ -1,0 +1,147 @@
+"""What all clients of a viewer share: the model, the render loop, the scene's measurements, the folder for files."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from unmix_plugin.editing import sample_seen
+from unmix_plugin.exports.run_views import RunView, views_of
+from unmix_plugin.model import UnmixModel
+from unmix_plugin.scenes.scene import Scene
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.colour import linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.composition import Coefficients
+from unmix_plugin.viewer.failures import failures_said
+from unmix_plugin.viewer.frames import num_channels
+from unmix_plugin.viewer.layer_settings import LayerAids
+from unmix_plugin.viewer.measured import MeasuredViews
+from unmix_plugin.viewer.model_source import ModelSource
+from unmix_plugin.viewer.picture_maker import PictureMaker
+from unmix_plugin.viewer.reference import render_reference
+from unmix_plugin.viewer.render_loop import RenderLoop
+from unmix_plugin.viewer.scene_objects import Thumbnail
+from unmix_plugin.viewer.training_curve import TrainingCurve
+from unmix_plugin.viewer.video_job import VideoJob
+
+_REFERENCE_STEPS = 200
+"""Training steps after which the reference rays are rendered again."""
+
+_THUMBNAIL_HEIGHT = 96
+
+SceneReader = Callable[[], Scene]
+"""Reads the scene that a run was trained on.
+
+Raises:
+    UnmixError: it is not at hand, or another one.
+"""
+
+
+class Services:
+    """Shared by the sessions of all clients."""
+
+    def __init__(self, source: ModelSource, read_scene: SceneReader) -> None:
+        """Computes nothing yet; the scene is read beside everything else once `start` is called."""
+        self.source = source
+        self.views = views_of(source.scene, "train") + views_of(source.scene, "eval")
+        self.num_train = len(source.scene.train_cameras)
+        self.scene: Scene | None = None
+        """The scene, once it is read."""
+        self.measured: MeasuredViews | None = None
+        self.why_not_measured = "the scene is still being read"
+        self.video = VideoJob()
+        self.curve = TrainingCurve()
+        self._read_scene = read_scene
+        self._reader = threading.Thread(target=self._read, name="unmix-viewer-scene", daemon=True)
+        with source.borrowed() as model:
+            self.maker = PictureMaker(source, self.aids, self._see, num_channels(model))
+        self._seen: tuple[int, Coefficients] | None = None
+        self.loop = RenderLoop(self.maker)
+        self._reference_version = 0
+        self._aids: LayerAids | None = None
+
+    @property
+    def folder(self) -> Path:
+        """Where files go that clients ask for: in the run folder, and nowhere else."""
+        return self.source.run.exports / "viewer"
+
+    @property
+    def recipes_folder(self) -> Path:
+        """Where recipes of this run are kept."""
+        return self.source.run.path / "recipes"
+
+    def start(self) -> None:
+        """Begin to render, and to read the scene."""
+        self.loop.start()
+        self._reader.start()
+
+    def tick(self) -> None:
+        """Note how training goes; called twice a second."""
+        if self.source.control is not None:
+            self.curve.add(self.source.control.status)
+
+    def stop(self) -> None:
+        """End rendering; waits for the scene if it is still being read."""
+        self.video.stop()
+        self.loop.stop()
+        if self._reader.is_alive():
+            # Not left behind: a thread in native code when the interpreter ends takes the process down with it.
+            self._reader.join()
+
+    def aids(self) -> LayerAids:
+        """What layers need; its reference rays follow a training. Must not be called while the model is lent."""
+        version = self.source.version
+        age = version - self._reference_version
+        is_stale = age >= _REFERENCE_STEPS or (age > 0 and not self.source.is_changing)
+        if self._aids is None or is_stale:
+            self._reference_version = version
+            self._aids = self._new_aids()
+        return self._aids
+
+    def view_named(self, name: str) -> RunView | None:
+        """A view of the scene by its name."""
+        return next((view for view in self.views if view.name == name), None)
+
+    def _see(self, model: UnmixModel) -> Coefficients:
+        """What the training cameras see of the unedited model, not long ago."""
+        version = self.source.version
+        if self._seen is None or version - self._seen[0] >= _REFERENCE_STEPS:
+            self._seen = (version, sample_seen(model, self.source.scene.train_cameras))
+        return self._seen[1]
+
+    def _new_aids(self) -> LayerAids:
+        with self.source.borrowed() as model:
+            reference = render_reference(model, self.source.scene.train_cameras)
+        error_of = None if self.measured is None else self.measured.error
+        return LayerAids(reference, self.source.scene.scene_box, error_of, self.why_not_measured)
+
+    def _read(self) -> None:
+        """Read the scene; without it the viewer only lacks what was measured."""
+        with failures_said("the scene could not be read", self._note_missing):
+            scene = self._read_scene()
+            self.scene = scene
+            self.measured = MeasuredViews(scene, self.source)
+        self._reference_version = -_REFERENCE_STEPS
+
+    def _note_missing(self, reason: str) -> None:
+        self.why_not_measured = f"the scene is not at hand: {reason}"
+
+
+def thumbnail(scene: Scene, name: str) -> Thumbnail | None:
+    """A view as measured, in few pixels; None for a name that the scene does not have."""
+    index = next((index for index, frame in enumerate(scene.frames) if frame.name == name), None)
+    if index is None:
+        return None
+    picture = scene.srgb(index)
+    if picture is not None:
+        step = max(1, picture.shape[0] // _THUMBNAIL_HEIGHT)
+        return np.ascontiguousarray((picture[::step, ::step] * 255 + 0.5).astype(np.uint8))
+    cube = scene.cube(index)
+    step = max(1, cube.shape[0] // _THUMBNAIL_HEIGHT)
+    spectra = torch.from_numpy(np.ascontiguousarray(cube[::step, ::step]))
+    linear = (spectra @ rgb_matrix(Bands.of(scene.wavelengths_nm))).clamp(0, 1)
+    return (linear_to_srgb(linear) * 255 + 0.5).to(torch.uint8).numpy()

@@ -1,0 +1,199 @@
+"""One client: its view, its panels, and what it is told. Nothing that a client does harms another one or the server."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.library import LibraryMatch, measured_library
+from unmix_plugin.viewer import html
+from unmix_plugin.viewer.edits import Edit
+from unmix_plugin.viewer.failures import failures_said
+from unmix_plugin.viewer.layer_settings import LayerSettings
+from unmix_plugin.viewer.services import Services
+from unmix_plugin.viewer.view import Shown, View
+from unmix_plugin.viewer.view_cameras import ViewPose, checked_pose, pose_of
+
+if TYPE_CHECKING:
+    import viser
+
+    from unmix_plugin.engine.cameras import Cameras
+    from unmix_plugin.spectral.composition import Materials
+    from unmix_plugin.viewer.panels import Panel
+
+_MOVING_QUALITY, _RESTING_QUALITY = 60, 90
+"""JPEG quality of pictures that are soon replaced, and of those that stay."""
+
+_NOTICE_S = 8.0
+
+
+class Session:
+    """What the server keeps for a client, from its unlocking to its disconnection."""
+
+    def __init__(self, client: viser.ClientHandle, services: Services) -> None:
+        self.client = client
+        self.services = services
+        self.view = View(show=self._show, report=self._report)
+        self.is_closed = False
+        self._lock = threading.RLock()
+        self.on_tick: list[Callable[[], None]] = []
+        """Called twice a second."""
+        self.on_edit: list[Callable[[], None]] = []
+        """Called when materials or light have changed."""
+        self.on_close: list[Callable[[], None]] = []
+        """Called when the client has gone."""
+        self._legend: viser.GuiHtmlHandle | None = None
+        self._status: viser.GuiHtmlHandle | None = None
+        self._legend_shown = ""
+        self._object_owners: set[str] = set()
+
+    def open(self, panels: Sequence[Panel]) -> None:
+        """Build the panels, in the order of their tabs, and begin to render."""
+        gui = self.client.gui
+        self._status = gui.add_html(html.paragraph("waiting for the first picture"))
+        self._legend = gui.add_html("")
+        tabs = gui.add_tab_group()
+        for panel in panels:
+            if panel.applies(self.services):
+                with tabs.add_tab(panel.title):
+                    panel.build(self)
+        self.services.loop.add(self.view)
+        self.client.camera.on_update(self._moved)
+        self._moved(self.client.camera)
+
+    def close(self) -> None:
+        """Stop rendering for the client."""
+        self.is_closed = True
+        self.services.loop.remove(self.view)
+        for tell in self.on_close:
+            tell()
+
+    def tick(self) -> None:
+        """Renew what panels show of a run that goes on."""
+        for tell in self.on_tick:
+            self.guarded(tell)()
+
+    def guarded(self, work: Callable[[], None]) -> Callable[..., None]:
+        """A callback for the browser's events: one at a time a client, and what goes wrong is said to the client."""
+
+        def callback(_event: Any = None) -> None:
+            with self._lock, failures_said("that failed", self._warn):
+                if not self.is_closed:
+                    work()
+
+        return callback
+
+    def say(self, title: str, text: str, is_warning: bool = False) -> None:
+        """Show a notice."""
+        if not self.is_closed:
+            self.client.add_notification(
+                title, text[:2000], auto_close_seconds=_NOTICE_S, color="red" if is_warning else "teal"
+            )
+
+    def _warn(self, text: str) -> None:
+        self.say("not done", text, is_warning=True)
+
+    def restyle(self, settings: LayerSettings) -> None:
+        """Show another layer, or the same otherwise."""
+        self.services.loop.restyle(self.view, settings)
+
+    def materials(self) -> Materials:
+        """The materials as this client sees them."""
+        return self.services.maker.edited(self.view.edit)
+
+    def nearest_materials(
+        self, spectra: Float[np.ndarray, "N B"], bands: Bands, count: int = 3
+    ) -> list[list[LibraryMatch]]:
+        """Known materials that spectra resemble, seen in the light that this client sees them in."""
+        light = self.services.maker.light_of(self.view.edit)
+        return measured_library().nearest(spectra, bands, light, count)
+
+    def colours(self) -> list[tuple[float, ...]]:
+        """sRGB colours that stand for the materials as this client sees them."""
+        return [tuple(row) for row in self.services.aids().colours_of(self.materials()).tolist()]
+
+    def change_edit(self, edit: Edit) -> None:
+        """Show the scene with other materials or light.
+
+        Raises:
+            UnmixError: the edit does not fit the run; nothing has changed.
+        """
+        self.services.maker.edited(edit)
+        self.services.loop.change_edit(self.view, edit)
+        for tell in self.on_edit:
+            tell()
+
+    def show_objects(self, owner: str, has_some: bool) -> None:
+        """Note whether a panel shows objects of the browser's own, which need depth to be hidden behind the picture."""
+        (self._object_owners.add if has_some else self._object_owners.discard)(owner)
+        self.services.loop.want_depth(self.view, bool(self._object_owners))
+
+    def pose(self) -> ViewPose:
+        """Where the client looks from now.
+
+        Raises:
+            ConfigError: its camera is no camera.
+        """
+        return pose_from(self.client.camera)
+
+    def look_from(self, camera: Cameras) -> None:
+        """Move the client's camera to one of ours."""
+        pose = pose_of(camera)
+        middle = self.services.source.scene.scene_box.aabb.mean(dim=0)
+        place = camera.camera_to_world[0, :, 3]
+        forward = -camera.camera_to_world[0, :, 2]
+        reach = max(float((middle - place) @ forward), 0.1)
+        with self.client.atomic():
+            self.client.camera.wxyz = pose.wxyz
+            self.client.camera.position = pose.position
+            self.client.camera.look_at = tuple((place + reach * forward).tolist())
+            self.client.camera.fov = pose.fov
+
+    def _moved(self, camera: viser.CameraHandle) -> None:
+        """The client's camera moved; what it sends may be anything."""
+        if self.is_closed:
+            return
+        with failures_said("the camera could not be read", self._report):
+            self.services.loop.move(self.view, pose_from(camera))
+
+    def _show(self, shown: Shown) -> None:
+        if self.is_closed:
+            return
+        self.client.scene.set_background_image(
+            shown.picture,
+            format="jpeg",
+            jpeg_quality=_MOVING_QUALITY if shown.is_moving else _RESTING_QUALITY,
+            depth=shown.depth,
+        )
+        if self._legend is not None:
+            text = html.legend(shown.legend)
+            if text != self._legend_shown:
+                self._legend_shown = self._legend.content = text
+        if self._status is not None and not self.view.has_reported:
+            height, width = shown.picture.shape[:2]
+            speed = self.services.maker.speed.rays_per_second
+            more = ", refining" if shown.is_moving else ""
+            self._status.content = html.paragraph(f"{width} x {height}, {speed / 1000:.0f} k rays/s{more}")
+
+    def _report(self, text: str) -> None:
+        """What is wrong with the picture, in the panel until it is mended."""
+        if self._status is not None and not self.is_closed and text:
+            self._status.content = html.paragraph(text, is_warning=True)
+
+
+def pose_from(camera: viser.CameraHandle) -> ViewPose:
+    """The pose of a client's camera.
+
+    Raises:
+        ConfigError: it is no camera, or its canvas has no size.
+    """
+    height, width = camera.image_height, camera.image_width
+    has_size = isinstance(height, int) and isinstance(width, int) and height > 0 and width > 0
+    return checked_pose(
+        camera.wxyz, camera.position, camera.fov, width / height if has_size else float("nan")
+    )

@@ -1,0 +1,174 @@
+"""Between a browser's camera and ours: axes, field of view, image size; everything that comes in is checked here.
+
+Notation: a browser's pose has OpenCV axes (+x right, +y down, +z forward) as a quaternion w, x, y, z and a position in
+model space, and the vertical field of view in radians; ours has OpenGL axes and focal lengths in pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64, Int
+from torch import Tensor
+
+from unmix_plugin.engine.cameras import Cameras
+from unmix_plugin.engine.rays import RayBundle
+from unmix_plugin.errors import ConfigError
+
+FOV_BOUNDS = (math.radians(1.0), math.radians(170.0))
+"""Least and greatest vertical field of view."""
+
+_ASPECT_BOUNDS = (0.1, 10.0)
+_LARGEST_COORDINATE = 1e4
+_OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0])
+
+
+@dataclass(frozen=True)
+class ViewPose:
+    """Where a browser looks from; always finite and within bounds."""
+
+    wxyz: tuple[float, float, float, float]
+    """Rotation from camera (OpenCV axes) to model space, unit quaternion."""
+    position: tuple[float, float, float]
+    """Model space."""
+    fov: float
+    """Vertical, radians."""
+    aspect: float
+    """Width over height of the canvas."""
+
+
+def checked_pose(wxyz: Any, position: Any, fov: Any, aspect: Any) -> ViewPose:
+    """The pose that a browser sent, whatever that is; see `ViewPose` for what the values should be.
+
+    Raises:
+        ConfigError: a number is missing, not finite or absurd; nothing can be shown from there.
+    """
+    try:
+        rotation = np.array([float(value) for value in wxyz])
+        place = np.array([float(value) for value in position])
+        angle, shape = float(fov), float(aspect)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"the browser sent a camera that is no camera: {error}") from error
+    numbers = np.concatenate([rotation, place, [angle, shape]])
+    if len(rotation) != 4 or len(place) != 3 or not np.isfinite(numbers).all():
+        raise ConfigError(f"the browser sent a camera with numbers that are missing or not finite: {numbers}")
+    length = float(np.linalg.norm(rotation))
+    if length < 1e-6 or np.abs(place).max() > _LARGEST_COORDINATE or shape <= 0:
+        raise ConfigError(f"the browser sent a camera that sees nothing: {numbers}; reset the camera")
+    w, x, y, z = (rotation / length).tolist()
+    return ViewPose(
+        (w, x, y, z),
+        (float(place[0]), float(place[1]), float(place[2])),
+        min(max(angle, FOV_BOUNDS[0]), FOV_BOUNDS[1]),
+        min(max(shape, _ASPECT_BOUNDS[0]), _ASPECT_BOUNDS[1]),
+    )
+
+
+def camera_of(pose: ViewPose, height: int, largest_pixels: int = 1 << 24) -> Cameras:
+    """The pinhole camera of a pose for pictures of `height` rows, fewer where they would exceed `largest_pixels`."""
+    height = max(1, min(height, int(math.sqrt(largest_pixels / pose.aspect))))
+    return sized_camera(pose, max(1, min(round(height * pose.aspect), largest_pixels // height)), height)
+
+
+def sized_camera(pose: ViewPose, width: int, height: int) -> Cameras:
+    """The pinhole camera of a pose for pictures of a size: the vertical field of view stays, whatever the aspect."""
+    focal = height / 2 / math.tan(pose.fov / 2)
+    camera_to_world = np.concatenate(
+        [rotation_matrix(pose.wxyz) @ _OPENCV_TO_OPENGL, np.array(pose.position)[:, None]], axis=1
+    )
+    return Cameras(
+        torch.tensor(camera_to_world, dtype=torch.float32)[None],
+        torch.tensor([[focal, focal]], dtype=torch.float32),
+        torch.tensor([[width / 2, height / 2]], dtype=torch.float32),
+        torch.zeros(1, 4),
+        width,
+        height,
+    )
+
+
+def pose_of(camera: Cameras) -> ViewPose:
+    """The pose from which a browser sees about what one of our cameras sees: centred, without distortion."""
+    pose = camera.camera_to_world[0].double().cpu().numpy()
+    fov = 2 * math.atan(camera.height / 2 / float(camera.focal_px[0, 1]))
+    return checked_pose(
+        quaternion(pose[:, :3] @ _OPENCV_TO_OPENGL), pose[:, 3], fov, camera.width / camera.height
+    )
+
+
+def resized(camera: Cameras, height: int) -> Cameras:
+    """The same view with `height` rows."""
+    factor = height / camera.height
+    return replace(
+        camera,
+        focal_px=camera.focal_px * factor,
+        center_px=camera.center_px * factor,
+        width=max(1, round(camera.width * factor)),
+        height=height,
+    )
+
+
+def pixel_rays(
+    camera: Cameras, pixels: Int[Tensor, " R"], offset: tuple[float, float] = (0.5, 0.5)
+) -> RayBundle:
+    """Rays through some pixels of a camera, given as row * width + column."""
+    rows = torch.div(pixels, camera.width, rounding_mode="floor")
+    coords = torch.stack([pixels - rows * camera.width + offset[0], rows + offset[1]], dim=-1)
+    return camera.generate_rays(torch.zeros_like(pixels), coords.to(torch.float32))
+
+
+def depth_along_axis(camera: Cameras, ray_distance: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
+    """Distance along the viewing axis, of distances along the rays; for cameras without distortion."""
+    x = (torch.arange(camera.width, device=ray_distance.device) + 0.5 - camera.center_px[0, 0].item()) / (
+        camera.focal_px[0, 0].item()
+    )
+    y = (torch.arange(camera.height, device=ray_distance.device) + 0.5 - camera.center_px[0, 1].item()) / (
+        camera.focal_px[0, 1].item()
+    )
+    return ray_distance / torch.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2)
+
+
+def up_direction(cameras: Cameras) -> tuple[float, float, float]:
+    """What is up in model space: the cameras' mean upward axis, or the axis of model space that it nearly is."""
+    mean = cameras.camera_to_world[:, :, 1].double().mean(dim=0)
+    length = float(mean.norm())
+    if length < 1e-3:
+        return (0.0, 0.0, 1.0)
+    up = (mean / length).cpu().numpy()
+    axis = int(np.abs(up).argmax())
+    if abs(up[axis]) > math.cos(math.radians(20)):
+        up = np.eye(3)[axis] * np.sign(up[axis])
+    return (float(up[0]), float(up[1]), float(up[2]))
+
+
+def rotation_matrix(wxyz: Sequence[float] | np.ndarray) -> Float64[np.ndarray, "3 3"]:
+    """Rotation of a unit quaternion."""
+    w, x, y, z = wxyz
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def quaternion(rotation: Float[np.ndarray, "3 3"]) -> tuple[float, float, float, float]:
+    """Unit quaternion w, x, y, z of a rotation, by its largest component so that nothing small is divided by."""
+    r = np.asarray(rotation, dtype=np.float64)
+    products = np.array(
+        [
+            [r[0, 0] + r[1, 1] + r[2, 2], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
+            [0.0, r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]],
+            [0.0, 0.0, r[1, 1] - r[0, 0] - r[2, 2], r[1, 2] + r[2, 1]],
+            [0.0, 0.0, 0.0, r[2, 2] - r[0, 0] - r[1, 1]],
+        ]
+    )
+    products = products + np.triu(products, 1).T + np.eye(4)  # 4 q q^T
+    column = products[:, int(np.diag(products).argmax())]
+    w, x, y, z = (column / np.linalg.norm(column)).tolist()
+    return (w, x, y, z)
