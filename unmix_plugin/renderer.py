@@ -37,7 +37,7 @@ class RendererConfig:
     """Cells of the grid that an update probes."""
     grid_decay: float = 0.5
     """Factor on the remembered density of a probed cell: lower forgets emptied space sooner."""
-    grid_smallest_opacity: float = 0.01
+    grid_smallest_opacity: float = 0.03
     """Opacity of one sample's interval from which a cell counts as occupied."""
 
 

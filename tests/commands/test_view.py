@@ -16,6 +16,7 @@ import pytest
 from benchmarks._viewer_page import Page
 from tests.commands.running import SMALL_METHOD, run
 from tests.commands.test_bad_runs import SPOILT, contents
+from tests.exports.formats.video_reading import read_video
 from unmix_plugin.commands import train as train_module
 from unmix_plugin.commands.train import parse_all, train
 from unmix_plugin.commands.view import ViewOptions, prepared, view
@@ -168,6 +169,34 @@ def test_a_run_whose_scene_has_gone_is_shown_without_what_was_measured(run_copy)
         viewer.stop()
 
 
+def test_a_path_becomes_a_video_of_the_edited_scene(run_copy):
+    viewer = prepared(ViewOptions(run=run_copy, device="cpu", viewer=ViewerOptions(port=0)))
+    viewer.start()
+    try:
+        with looking(f"ws://127.0.0.1:{viewer.port}") as page:
+            page.wait_until(
+                lambda: any(one.get("label") == "render a video" for one in page.controls.values())
+            )
+            for number, angle in enumerate((0.3, 0.6), start=1):
+                page.look_from(angle)
+                page.set("add a key frame here", True)
+                key = page.controls[page.control("key frame")]
+                page.wait_until(lambda key=key, number=number: key.get("value") == f"{number} of {number}")
+            page.set("light", "A")
+            for label, value in (("width", 33), ("height", 32), ("seconds", 0.5), ("frames a second", 6)):
+                page.set(label, value)
+            page.wait_until(lambda: "illuminant: A" in page.controls[page.control("recipe")]["value"])
+            page.set("render a video", True)
+            page.wait_until(lambda: any("the video is in" in text for _, text in page.notices), START_S)
+        (video,) = (run_copy / "exports" / "viewer").rglob("*.mp4")
+        frames, _ = read_video(video)
+        assert frames.shape == (3, 32, 32, 3)
+        assert frames.std() > 4
+        assert "illuminant: A" in (run_copy / "exports" / "viewer" / "view-path.yml").read_text()
+    finally:
+        viewer.stop()
+
+
 def test_nothing_is_written_into_a_run_that_is_only_looked_at(run_copy):
     before = contents(run_copy)
     viewer = prepared(ViewOptions(run=run_copy, device="cpu", viewer=ViewerOptions(port=0)))
@@ -183,6 +212,40 @@ def test_a_method_that_does_not_unmix_has_no_viewer_and_says_so(run_copy, monkey
     ended = run(view, "--run", run_copy, "--device", "cpu")
     assert ended.status == 2
     assert "the viewer shows runs of methods that unmix spectra" in ended.err
+
+
+def test_a_run_is_shown_with_the_edits_and_the_light_asked_for(run_copy):
+    recipe = run_copy / "recipe.yml"
+    recipe.write_text("edits:\n  - rename: {endmember: endmember_1, name: clay}\n")
+    options = ViewOptions(
+        run=run_copy, device="cpu", edits=recipe, illuminant="fl2", viewer=ViewerOptions(port=0)
+    )
+    viewer = prepared(options)
+    viewer.start()
+    try:
+        with looking(f"ws://127.0.0.1:{viewer.port}") as page:
+            page.wait_until(
+                lambda: any(one.get("label") == "render a video" for one in page.controls.values())
+            )
+            assert page.controls[page.control("light")]["value"] == "FL2"
+            assert "clay" in page.controls[page.control("other endmember")]["options"]
+            page.set("changes", "start anew")
+            page.wait_until(lambda: page.controls[page.control("light")]["value"] == "as recorded")
+    finally:
+        viewer.stop()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--illuminant", "D66"], "there is no light 'D66'; nearest: D65"),
+        (["--edits", "nowhere.yml"], "can't read the recipe nowhere.yml"),
+    ],
+)
+def test_edits_that_are_none_are_refused(trained, words, message):
+    ended = run(view, "--run", trained.run, "--device", "cpu", *words)
+    assert ended.status == 2
+    assert message in ended.err
 
 
 def training_words(trained, folder, *words):

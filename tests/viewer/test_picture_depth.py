@@ -24,6 +24,16 @@ def test_depth_is_along_the_axis_where_something_is_and_far_elsewhere(source):
     assert np.abs(depth[seen] - expected[seen]).max() < 0.003
 
 
+def test_fine_pictures_have_the_depth_of_every_nth_pixel(source):
+    camera = camera_of(pose_of(source.scene.train_cameras[0]), 300)
+    frame = make_frame(source, camera)
+    coefficients = frame.coefficients
+    depth = picture_depth(frame)
+    assert depth.shape == (150, camera.width // 2)
+    far = coefficients.accumulation[1::2, 1::2].numpy() <= 0.5
+    assert ((depth > 100) == far).all()
+
+
 def test_depths_have_empty_low_bits_in_the_units_of_the_browser(source):
     depth = picture_depth(make_frame(source))
     units = np.round(depth.astype(np.float64) * 100_000).astype(np.int64)

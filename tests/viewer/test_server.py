@@ -147,6 +147,40 @@ def test_materials_are_edited_undone_saved_and_loaded(viewer):
         assert len(other.pictures) == count  # another page's materials are its own
 
 
+@pytest.mark.parametrize(
+    ("label", "value", "written"),
+    [
+        ("visible", False, "remove"),
+        ("only this one", True, "isolate"),
+        ("gloss", 0.5, "gloss"),
+        ("colour of gloss", (255, 200, 0), "gloss"),
+        ("colour", (120, 110, 100), "retint"),
+        ("name", "clay", "name: clay"),
+        ("replace by the known material", True, "library: pmc/"),
+        ("swap with the other", True, "swap: [0, 2]"),
+        ("light", "FL2", "illuminant: FL2"),
+    ],
+)
+def test_every_change_is_an_edit_of_the_recipe_and_can_be_undone(viewer, label, value, written):
+    with opened(viewer) as page:
+        page.set(label, value)
+        recipe = page.controls[page.control("recipe")]
+        page.wait_until(lambda: written in recipe["value"])
+        page.set("changes", "undo")
+        page.wait_until(lambda: recipe["value"] == "edits: []\n")
+        assert not any(title == "not done" for title, _ in page.notices)
+        page.set("changes", "redo")
+        page.wait_until(lambda: written in recipe["value"])
+
+
+def test_a_name_that_is_taken_is_refused_and_the_field_goes_back(viewer):
+    with opened(viewer) as page:
+        page.set("name", "endmember_1")
+        page.wait_until(lambda: any("is called 'endmember_1' already" in text for _, text in page.notices))
+        assert page.controls[page.control("recipe")]["value"] == "edits: []\n"
+        page.wait_until(lambda: page.controls[page.control("name")]["value"] == "endmember_0")
+
+
 def test_an_edit_that_does_not_fit_is_said_and_changes_nothing(viewer):
     recipes = viewer.services.recipes_folder
     recipes.mkdir()
@@ -176,7 +210,7 @@ def test_files_outside_the_folder_of_recipes_are_not_read(viewer, tmp_path):
 
 def test_a_screenshot_has_the_size_asked_for_and_lies_in_the_run_folder(viewer):
     with opened(viewer) as page:
-        for label, value in (("width", 60), ("height", 40), ("name", "../../../evil/../shot")):
+        for label, value in (("width", 60), ("height", 40), ("file name", "../../../evil/../shot")):
             page.set(label, value)
         page.set("save a screenshot (PNG)", True)
         page.wait_until(lambda: bool(page.downloads))

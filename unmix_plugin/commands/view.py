@@ -27,6 +27,10 @@ class ViewOptions:
     data: Path | None = None
     """Scene folder, where it is no longer where the run was trained on it; without the scene only what was measured is
     missing."""
+    edits: Path | None = None
+    """Recipe (YAML) of edits of materials and light to start with."""
+    illuminant: str | None = None
+    """Light to start with: its name, such as D65, A or FL2, or a CSV file (wavelength,power)."""
     output_dir: Path = Path("outputs")
     """Folder in which to look for the newest run."""
     device: DeviceName = "auto"
@@ -59,20 +63,27 @@ def prepared(options: ViewOptions) -> Viewer:
 
     Raises:
         RunError: the run is unusable.
-        ConfigError: the method does not unmix spectra, or the device is not there.
+        ConfigError: the method does not unmix spectra, the device is not there, or the recipe does not fit the run.
+        SpectrumError: there is no such light.
     """
     from rich.console import Console
 
     from unmix_plugin.commands.reporting import working
     from unmix_plugin.commands.run_choice import chosen_run
     from unmix_plugin.engine.load_run import load_model
+    from unmix_plugin.exports.edited_run import light_note, requested_recipe
     from unmix_plugin.viewer.model_source import source_of_run
     from unmix_plugin.viewer.server import Viewer
 
     console = Console()
+    recipe = requested_recipe(options.edits, options.illuminant)
     path = chosen_run(options.run, options.output_dir)
     with working(console, f"reading {path}"):
-        source = source_of_run(load_model(path, options.device))
+        loaded = load_model(path, options.device)
+        source = source_of_run(loaded)
+    note = light_note(loaded, options.edits, options.illuminant)
+    if note is not None:
+        print(note, flush=True)
     with working(console, "looking at the scene"):
         with source.borrowed() as model:
             model.warm_up()
@@ -81,6 +92,7 @@ def prepared(options: ViewOptions) -> Viewer:
             options.viewer,
             lambda: _scene_of(source, options.data),
             lambda line: print(line, flush=True),
+            recipe,
         )
 
 

@@ -30,10 +30,10 @@ _MOST_OPERATIONS = 500
 class RecipeHistory:
     """The recipe in force, those before it, and those that were undone."""
 
-    def __init__(self) -> None:
+    def __init__(self, present: Recipe | None = None) -> None:
         self._past: list[Recipe] = []
         self._future: list[Recipe] = []
-        self.present = Recipe()
+        self.present = present or Recipe()
 
     def take(self, recipe: Recipe) -> None:
         """Put another recipe in force."""

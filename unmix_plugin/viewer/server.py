@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
+from unmix_plugin.editing import Recipe
 from unmix_plugin.engine.cameras import Cameras
 from unmix_plugin.viewer import html
 from unmix_plugin.viewer.address import free_port, notices
@@ -37,6 +38,7 @@ class Viewer:
         options: ViewerOptions,
         read_scene: SceneReader,
         say: Callable[[str], None] = lambda _: None,
+        recipe: Recipe | None = None,
     ) -> None:
         """
         Args:
@@ -44,11 +46,14 @@ class Viewer:
             options: Where to listen, and the word to ask for.
             read_scene: Reads the scene that the run was trained on.
             say: Takes lines for the user's terminal.
+            recipe: Edits that every page starts with.
+        Raises:
+            ConfigError: the recipe does not fit the run.
         """
         self._options = options
         self._say = say
         self._gate = Gate(options.token)
-        self._services = Services(source, read_scene)
+        self._services = Services(source, read_scene, recipe)
         self._sessions: dict[int, Session] = {}
         self._lock = threading.Lock()
         self._stopped = threading.Event()

@@ -9,19 +9,21 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from unmix_plugin.editing import sample_seen
+from unmix_plugin.editing import Recipe, sample_seen
 from unmix_plugin.exports.run_views import RunView, views_of
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.composition import Coefficients
+from unmix_plugin.viewer.edits import Edit
 from unmix_plugin.viewer.failures import failures_said
 from unmix_plugin.viewer.frames import num_channels
 from unmix_plugin.viewer.layer_settings import LayerAids
 from unmix_plugin.viewer.measured import MeasuredViews
 from unmix_plugin.viewer.model_source import ModelSource
 from unmix_plugin.viewer.picture_maker import PictureMaker
+from unmix_plugin.viewer.recipe_editor import numbered
 from unmix_plugin.viewer.reference import render_reference
 from unmix_plugin.viewer.render_loop import RenderLoop
 from unmix_plugin.viewer.scene_objects import Thumbnail
@@ -44,8 +46,16 @@ Raises:
 class Services:
     """Shared by the sessions of all clients."""
 
-    def __init__(self, source: ModelSource, read_scene: SceneReader) -> None:
-        """Computes nothing yet; the scene is read beside everything else once `start` is called."""
+    def __init__(self, source: ModelSource, read_scene: SceneReader, recipe: Recipe | None = None) -> None:
+        """Computes nothing yet; the scene is read beside everything else once `start` is called.
+
+        Args:
+            source: The model.
+            read_scene: Reads the scene.
+            recipe: What every client sees the scene with at first.
+        Raises:
+            ConfigError: the recipe does not fit the run.
+        """
         self.source = source
         self.views = views_of(source.scene, "train") + views_of(source.scene, "eval")
         self.num_train = len(source.scene.train_cameras)
@@ -61,6 +71,11 @@ class Services:
             self.maker = PictureMaker(source, self.aids, self._see, num_channels(model))
         self._seen: tuple[int, Coefficients] | None = None
         self.loop = RenderLoop(self.maker)
+        self.first_recipe = Recipe()
+        """What every client sees the scene with at first; endmembers are meant by their numbers."""
+        if recipe is not None:
+            self.first_recipe = numbered(recipe, self.maker.edited(Edit()).names)
+            self.maker.edited(Edit(self.first_recipe))
         self._reference_version = 0
         self._aids: LayerAids | None = None
 

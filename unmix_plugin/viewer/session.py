@@ -38,7 +38,7 @@ class Session:
     def __init__(self, client: viser.ClientHandle, services: Services) -> None:
         self.client = client
         self.services = services
-        self.view = View(show=self._show, report=self._report)
+        self.view = View(show=self._show, report=self._report, edit=Edit(services.first_recipe))
         self.is_closed = False
         self._lock = threading.RLock()
         self.on_tick: list[Callable[[], None]] = []

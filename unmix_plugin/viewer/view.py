@@ -25,8 +25,9 @@ class Shown:
 
     picture: UInt8[np.ndarray, "H W 3"]
     """sRGB."""
-    depth: Float32[np.ndarray, "H W"] | None
-    """Along the viewing axis, scene units, far where nothing is; None where the client needs none."""
+    depth: Float32[np.ndarray, "rows columns"] | None
+    """Along the viewing axis, scene units, far where nothing is, perhaps in fewer pixels; None where the client needs
+    none."""
     legend: Legend
     is_moving: bool
     """Whether a finer picture follows at once."""

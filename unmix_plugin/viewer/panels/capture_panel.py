@@ -50,7 +50,7 @@ class CapturePanel:
         with gui.add_folder("picture"):
             self._width = gui.add_number("width", 1024, min=SIDE_BOUNDS[0], max=SIDE_BOUNDS[1], step=1)
             self._height = gui.add_number("height", 1024, min=SIDE_BOUNDS[0], max=SIDE_BOUNDS[1], step=1)
-            self._name = gui.add_text("name", "view")
+            self._name = gui.add_text("file name", "view")
             self._progress = gui.add_progress_bar(0.0)
             gui.add_button("save a screenshot (PNG)").on_click(session.guarded(self._save_picture))
             gui.add_button("save the spectra (EXR)").on_click(session.guarded(self._save_spectra))

@@ -11,29 +11,24 @@ from unmix_plugin.editing import (
     Gloss,
     LibrarySpectrum,
     Light,
-    Recipe,
     Rename,
     Replace,
     Retint,
     Scale,
     Swap,
     assumption_of_light,
-    read_recipe,
-    recipe_to_yaml,
 )
-from unmix_plugin.errors import ConfigError, UnmixError
-from unmix_plugin.exports.files import write_file
+from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.colour import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.composition import Materials
+from unmix_plugin.spectral.illuminants import illuminant_names
 from unmix_plugin.spectral.library import measured_library
 from unmix_plugin.viewer import html
 from unmix_plugin.viewer.charts import Chart, Line
-from unmix_plugin.viewer.edits import Edit
-from unmix_plugin.viewer.inputs import new_file, number, text
+from unmix_plugin.viewer.inputs import number, text
+from unmix_plugin.viewer.panels.recipe_controls import RecipeControls
 from unmix_plugin.viewer.recipe_editor import (
-    RecipeHistory,
     change_of,
-    numbered,
     visibility,
     with_change,
     with_light,
@@ -43,108 +38,68 @@ from unmix_plugin.viewer.recipe_editor import (
 from unmix_plugin.viewer.session import Session
 
 _OWN_LIGHT = "as recorded"
-_LIGHTS: tuple[str, ...] = ("D65", "D50", "A", "E", "C", "FL2", "FL7", "FL11", "LED-B1", "LED-B5", "HP1")
+_COMMON_LIGHTS = ("D65", "D50", "A", "E", "C", "FL2", "FL7", "FL11")
 _FACTOR_BOUNDS = (0.0, 5.0)
-_NO_RECIPE = "none saved yet"
+_WHITE = (255, 255, 255)
 _LONGEST_LIST = 64
-"""Endmembers that are listed with their nearest known materials."""
+"""Endmembers that are listed with their nearest known material."""
 
 
 class MaterialsPanel:
-    """Builds the recipe of one client."""
+    """Changes materials and light of one client."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._history = RecipeHistory()
         self._is_showing = False
         self._gui = session.client.gui
+        self._recipe = RecipeControls(session, refused=self._show_chosen)
         self._listing = self._gui.add_html("")
-        self._light = self._gui.add_dropdown("light", (_OWN_LIGHT, *_LIGHTS))
+        self._light = self._gui.add_dropdown("light", _lights())
         self._on(self._light, self._change_light)
-        self._add_history()
+        self._recipe.add_history()
         names = session.materials().names
         self._chosen = self._gui.add_dropdown("endmember", names)
         self._on(self._chosen, self._show_chosen)
         self._add_changes(names)
         self._chart = Chart(self._gui, "spectra under the light")
-        self._add_files()
+        self._recipe.add_files()
         self._show_materials()
         session.on_edit.append(self._show_materials)
-
-    def _show_materials(self) -> None:
-        """Show the materials as they are now."""
-        materials = self._session.materials()
-        for menu in (self._chosen, self._other):
-            if tuple(menu.options) != materials.names:
-                index = tuple(menu.options).index(menu.value)
-                menu.options = materials.names
-                menu.value = materials.names[index]
-        colours, spectra = self._session.colours(), materials.endmembers.double().cpu().numpy()
-        lines = zip(materials.names, spectra, colours, strict=True)
-        self._chart.draw(materials.bands, [Line(name, row, colour) for name, row, colour in lines])
-        self._listing.content = self._list()
-        self._show_chosen()
-
-    def _add_history(self) -> None:
-        buttons = self._gui.add_button_group("changes", ("undo", "redo", "start anew"))
-        steps: dict[str, Callable[[], Recipe | None]] = {
-            "undo": self._history.undone,
-            "redo": self._history.redone,
-            "start anew": lambda: self._taken(Recipe()),
-        }
-
-        def step() -> None:
-            recipe = steps.get(str(buttons.value), lambda: None)()
-            if recipe is None:
-                raise ConfigError("there is nothing more to undo or redo")
-            self._session.change_edit(Edit(recipe))
-
-        buttons.on_click(self._session.guarded(step))
 
     def _add_changes(self, names: tuple[str, ...]) -> None:
         gui = self._gui
         with gui.add_folder("this endmember"):
+            self._alike = gui.add_html("")
             self._is_visible = gui.add_checkbox("visible", True)
             self._is_alone = gui.add_checkbox("only this one", False)
             self._factor = gui.add_slider("brightness", *_FACTOR_BOUNDS, 0.05, 1.0)
-            self._gloss = gui.add_slider("gloss", *_FACTOR_BOUNDS, 0.05, 1.0)
             self._colour = gui.add_rgb("colour", (128, 128, 128))
+            self._gloss = gui.add_slider("gloss", *_FACTOR_BOUNDS, 0.05, 1.0)
+            self._gloss_colour = gui.add_rgb("colour of gloss", _WHITE)
             self._name = gui.add_text("name", names[0])
             self._library = gui.add_dropdown("known material", measured_library().names)
             replace_button = gui.add_button("replace by the known material")
             self._other = gui.add_dropdown("other endmember", names, initial_value=names[-1])
             swap_button = gui.add_button("swap with the other")
         for control, make in (
-            (self._factor, lambda index: Scale(index, self._number(self._factor))),
-            (self._gloss, lambda index: Gloss(index, self._number(self._gloss))),
+            (self._factor, lambda index: Scale(index, _factor(self._factor.value))),
             (self._colour, lambda index: Retint(index, _srgb(self._colour.value))),
+            (self._gloss, self._glossed),
+            (self._gloss_colour, self._glossed),
             (self._name, lambda index: Rename(index, text(self._name.value).strip())),
         ):
-            self._on(control, lambda make=make: self._change(with_change(self._recipe, make(self._index))))
+            self._on(control, lambda make=make: self._change_endmember(make(self._index)))
         for control in (self._is_visible, self._is_alone):
             self._on(control, lambda control=control: self._change_visibility(control))
         replace_button.on_click(
-            self._session.guarded(lambda: self._change(with_change(self._recipe, self._replacement())))
+            self._session.guarded(lambda: self._change_endmember(self._replacement(self._index)))
         )
         swap_button.on_click(self._session.guarded(self._swap))
-
-    def _add_files(self) -> None:
-        gui = self._gui
-        with gui.add_folder("recipes"):
-            self._recipe_text = gui.add_text("recipe", "", multiline=True, disabled=True)
-            self._recipe_name = gui.add_text("save as", "recipe")
-            gui.add_button("save").on_click(self._session.guarded(self._save))
-            self._saved = gui.add_dropdown("saved", self._recipe_files())
-            gui.add_button("load").on_click(self._session.guarded(self._load))
-
-    @property
-    def _recipe(self) -> Recipe:
-        return self._history.present
 
     @property
     def _index(self) -> int:
         """Number of the endmember chosen."""
-        return self._index_in(self._chosen)
+        return _index_in(self._chosen)
 
     def _on(self, control: Any, work: Callable[[], None]) -> None:
         """Do something when a user changes a control, not when the panel itself does."""
@@ -155,118 +110,103 @@ class MaterialsPanel:
 
         control.on_update(self._session.guarded(change))
 
-    def _change(self, recipe: Recipe) -> None:
-        """Put a recipe in force if it fits the run; else the controls go back to what is in force."""
-        edit = Edit(recipe)
-        try:
-            self._session.services.maker.edited(edit)
-        except UnmixError:
-            self._show_chosen()
-            raise
-        self._taken(recipe)
-        self._session.change_edit(edit)
-
-    def _taken(self, recipe: Recipe) -> Recipe:
-        self._history.take(recipe)
-        return recipe
+    def _change_endmember(self, change: Replace | Retint | Scale | Rename | Gloss) -> None:
+        self._recipe.change(with_change(self._recipe.recipe, change))
 
     def _change_light(self) -> None:
         name = str(self._light.value)
-        light = None if name == _OWN_LIGHT or name not in _LIGHTS else Light(name)
-        self._change(with_light(self._recipe, light))
+        if name != _OWN_LIGHT and name not in illuminant_names():
+            raise ConfigError(f"there is no light {name[:40]!r} to choose")
+        self._recipe.change(with_light(self._recipe.recipe, None if name == _OWN_LIGHT else Light(name)))
         metadata = self._session.services.source.scene.metadata
-        assumed = assumption_of_light(metadata, self._recipe)
+        assumed = assumption_of_light(metadata, self._recipe.recipe)
         if assumed is not None:
             self._session.say("light", assumed)
 
     def _change_visibility(self, control: Any) -> None:
-        hidden, _ = visibility(self._recipe)
+        hidden, _ = visibility(self._recipe.recipe)
         index = self._index
         if control is self._is_alone:
             alone = index if self._is_alone.value is True else None
-            self._change(with_visible(self._recipe, hidden - {index}, alone))
+            changed = with_visible(self._recipe.recipe, hidden - {index}, alone)
         else:
             now_hidden = hidden - {index} if self._is_visible.value is True else hidden | {index}
-            self._change(with_visible(self._recipe, now_hidden, None))
+            changed = with_visible(self._recipe.recipe, now_hidden, None)
+        self._recipe.change(changed)
 
-    def _replacement(self) -> Replace:
-        return Replace(self._index, LibrarySpectrum(text(self._library.value)), extrapolate=True)
+    def _glossed(self, index: int) -> Gloss:
+        red, green, blue = self._gloss_colour.value[:3]
+        colour = None if (red, green, blue) == _WHITE else _srgb(self._gloss_colour.value)
+        return Gloss(index, _factor(self._gloss.value), colour)
+
+    def _replacement(self, index: int) -> Replace:
+        return Replace(index, LibrarySpectrum(text(self._library.value)), extrapolate=True)
 
     def _swap(self) -> None:
-        self._change(with_swap(self._recipe, Swap(self._index, self._index_in(self._other))))
+        self._recipe.change(with_swap(self._recipe.recipe, Swap(self._index, _index_in(self._other))))
 
-    def _save(self) -> None:
-        content = recipe_to_yaml(self._recipe).encode()
-        path = write_file(
-            new_file(self._session.services.recipes_folder, self._recipe_name.value, ".yml", "recipe"),
-            content,
-        )
-        self._saved.options = self._recipe_files()
-        self._saved.value = path.name
-        self._session.client.send_file_download(path.name, content)
-        self._session.say("saved", f"{path}; other commands take it as --edits {path}")
+    def _show_materials(self) -> None:
+        """Show the materials as they are now."""
+        materials = self._session.materials()
+        self._show_names(materials.names)
+        colours, spectra = self._session.colours(), materials.endmembers.double().cpu().numpy()
+        lines = zip(materials.names, spectra, colours, strict=True)
+        self._chart.draw(materials.bands, [Line(name, row, colour) for name, row, colour in lines])
+        self._listing.content = self._list(materials, colours)
+        self._show_chosen()
 
-    def _load(self) -> None:
-        files = self._recipe_files()
-        self._saved.options = files
-        if self._saved.value not in files or self._saved.value == _NO_RECIPE:
-            raise ConfigError("choose one of the recipes saved in the run folder")
-        recipe = read_recipe(self._session.services.recipes_folder / str(self._saved.value))
-        self._change(numbered(recipe, self._session.services.maker.edited(Edit()).names))
-
-    def _recipe_files(self) -> tuple[str, ...]:
-        folder = self._session.services.recipes_folder
-        found = sorted(path.name for path in folder.glob("*.y*ml")) if folder.is_dir() else []
-        return tuple(found) or (_NO_RECIPE,)
-
-    def _index_in(self, menu: Any) -> int:
-        names = tuple(menu.options)
-        if menu.value not in names:
-            raise ConfigError(f"there is no endmember {str(menu.value)[:40]!r}")
-        return names.index(menu.value)
-
-    def _number(self, control: Any) -> float:
-        return number(control.value, *_FACTOR_BOUNDS, fallback=1.0)
+    def _show_names(self, names: tuple[str, ...]) -> None:
+        """Let the menus have the names of the endmembers, each with the same one chosen as before."""
+        self._is_showing = True
+        try:
+            for menu in (self._chosen, self._other):
+                index = _index_in(menu)
+                if tuple(menu.options) != names:
+                    menu.options = names
+                    menu.value = names[index]
+        finally:
+            self._is_showing = False
 
     def _show_chosen(self) -> None:
         """Let the controls say what the recipe does to the endmember chosen."""
         self._is_showing = True
         try:
-            materials, index = self._session.materials(), self._index
-            hidden, isolated = visibility(self._recipe)
+            materials, index, recipe = self._session.materials(), self._index, self._recipe.recipe
+            hidden, isolated = visibility(recipe)
             self._is_visible.value = index not in hidden and (not isolated or index in isolated)
             self._is_alone.value = index in isolated
-            scale, gloss = (change_of(self._recipe, kind, index) for kind in (Scale, Gloss))
+            scale, gloss = (change_of(recipe, kind, index) for kind in (Scale, Gloss))
             self._factor.value = scale.factor if isinstance(scale, Scale) else 1.0
             self._gloss.value = gloss.scale if isinstance(gloss, Gloss) else 1.0
+            tint = gloss.colour if isinstance(gloss, Gloss) else None
+            self._gloss_colour.value = _WHITE if tint is None else _bytes(torch.tensor(tint))
             self._colour.value = self._colour_of(materials, index)
             self._name.value = materials.names[index]
-            light = self._recipe.illuminant
-            self._light.value = (
-                str(light.light) if light is not None and light.light in _LIGHTS else _OWN_LIGHT
+            self._light.options = _lights(recipe.illuminant)
+            self._light.value = _OWN_LIGHT if recipe.illuminant is None else str(recipe.illuminant.light)
+            spectrum = materials.endmembers[index : index + 1].double().cpu().numpy()
+            alike = self._session.nearest_materials(spectrum, materials.bands)[0]
+            self._alike.content = html.table(
+                [("like", f"{one.name} ({one.angle_rad:.3f} rad)") for one in alike]
             )
-            self._recipe_text.value = recipe_to_yaml(self._recipe)
+            self._recipe.show()
         finally:
             self._is_showing = False
 
     def _colour_of(self, materials: Materials, index: int) -> tuple[int, int, int]:
         """8-bit sRGB colour that was asked for an endmember, or else that of its spectrum in full light."""
-        retint = change_of(self._recipe, Retint, index)
+        retint = change_of(self._recipe.recipe, Retint, index)
         if isinstance(retint, Retint):
-            shown = torch.tensor(retint.colour)
-        else:
-            linear = materials.endmembers[index] @ rgb_matrix(materials.bands).to(materials.endmembers)
-            shown = linear_to_srgb(linear.clamp(0, 1)).cpu()
-        red, green, blue = (shown * 255).round().int().tolist()
-        return red, green, blue
+            return _bytes(torch.tensor(retint.colour))
+        linear = materials.endmembers[index] @ rgb_matrix(materials.bands).to(materials.endmembers)
+        return _bytes(linear_to_srgb(linear.clamp(0, 1)).cpu())
 
-    def _list(self) -> str:
+    def _list(self, materials: Materials, colours: list[tuple[float, ...]]) -> str:
         """Every endmember with its colour, its nearest known material, and whether it is hidden."""
-        materials = self._session.materials()
-        hidden, isolated = visibility(self._recipe)
+        hidden, isolated = visibility(self._recipe.recipe)
         spectra = materials.endmembers[:_LONGEST_LIST].double().cpu().numpy()
         matches = self._session.nearest_materials(spectra, materials.bands, 1)
-        entries, colours = [], self._session.colours()
+        entries = []
         for index, (name, found) in enumerate(zip(materials.names, matches, strict=False)):
             is_gone = index in hidden or (isolated and index not in isolated)
             like = f", like {found[0].name} ({found[0].angle_rad:.2f} rad)" if found else ""
@@ -274,7 +214,31 @@ class MaterialsPanel:
         return html.swatches(entries)
 
 
+def _lights(present: Light | None = None) -> tuple[str, ...]:
+    """Names to choose from, usual ones first; that of the present light is among them."""
+    others = (name for name in illuminant_names() if name not in _COMMON_LIGHTS)
+    names = (_OWN_LIGHT, *_COMMON_LIGHTS, *others)
+    shown = _OWN_LIGHT if present is None else str(present.light)
+    return names if shown in names else (*names, shown)
+
+
+def _index_in(menu: Any) -> int:
+    names = tuple(menu.options)
+    if menu.value not in names:
+        raise ConfigError(f"there is no endmember {str(menu.value)[:40]!r}")
+    return names.index(menu.value)
+
+
+def _factor(value: Any) -> float:
+    return number(value, *_FACTOR_BOUNDS, fallback=1.0)
+
+
 def _srgb(value: Any) -> tuple[float, float, float]:
     """A colour picker's value as sRGB in [0, 1]."""
     red, green, blue = (number(part, 0, 255, fallback=128) / 255 for part in tuple(value)[:3])
+    return red, green, blue
+
+
+def _bytes(srgb: torch.Tensor) -> tuple[int, int, int]:
+    red, green, blue = (srgb * 255).round().int().tolist()
     return red, green, blue
