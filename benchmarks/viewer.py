@@ -98,7 +98,12 @@ def main(options: Options) -> None:
             load = measure_load(server, load_s)
         print(f"training {steps} steps {rounds} times, four ways ...", flush=True)
         training = measure_training(folder, options.data, options.device, steps, rounds)
-    measured = {"answers": answers, "load": load, "training": training.values}
+    measured = {
+        "answers": answers,
+        "load": load,
+        "training": training.values,
+        "training by processor time": training.processor,
+    }
     setting = {
         "run": "45 s on the built-in scene" if options.run is None else f"{run.parent.parent.name}, given",
         "scene of the trainings": options.data.name,
@@ -141,10 +146,12 @@ def judge(
         figures.insert(
             4, FULL_RATE.judge("full pictures a second while moving", 1 / median(answers["full_s"]))
         )
-    return figures + [
+    figures += [
         limit.judge(f"training speed with the viewer, {name}", 100 * training.relative(name))
         for name, limit in SHARES.items()
     ]
+    undisturbed = 100 * training.relative_by_processor("no page")
+    return [*figures, SHARES["no page"].judge("the same by processor time, no page", undisturbed)]
 
 
 @dataclass(frozen=True)

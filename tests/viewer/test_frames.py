@@ -10,7 +10,7 @@ from unmix_plugin.viewer.view_cameras import camera_of, pose_of
 
 
 @pytest.mark.parametrize("subpixels", [1, 2])
-@pytest.mark.parametrize("block", [1, 37, 10_000])
+@pytest.mark.parametrize("block", [7, 10_000])
 @pytest.mark.parametrize("specular", ["none", "dictionary", "full"])
 def test_blocks_give_what_the_model_gives_at_once(tmp_path, subpixels, block, specular):
     source = make_source(tmp_path, specular=specular)

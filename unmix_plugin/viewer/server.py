@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import threading
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -68,6 +69,8 @@ class Viewer:
         Raises:
             ConfigError: the host is no address of this machine, or no port near is free.
         """
+        # A page that is closed while it is being sent something is no reason to print anything.
+        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         port = free_port(self._options.host, self._options.port)
         with _quiet():
             self._server = _server_at(self._options.host, port)
@@ -183,6 +186,8 @@ class Viewer:
                 return
             self._sessions[client.client_id] = session
         session.open(PANELS)
+        if self._server is not None and client.client_id not in self._server.get_clients():
+            self._disconnected(client)  # it left before it was noted
 
     def _disconnected(self, client: viser.ClientHandle) -> None:
         with self._lock:

@@ -63,6 +63,9 @@ class Session:
                 with tabs.add_tab(panel.title):
                     panel.build(self)
         self.services.loop.add(self.view)
+        if self.is_closed:  # the client left while its panels were built
+            self.services.loop.remove(self.view)
+            return
         self.client.camera.on_update(self._moved)
         self._moved(self.client.camera)
 
