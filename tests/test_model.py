@@ -1,5 +1,7 @@
 """The method's equations, its outputs and its settings."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -252,7 +254,7 @@ def test_transparency_is_penalised_only_where_no_alpha_says_what_is_solid():
     )  # the last pixel is black: it may be void
     batch = {"spectra": spectra, "alpha": torch.ones(3)}
     outputs = {"spectral": spectra, "accumulation": torch.tensor([1.0, 0.5, 0.0])}
-    settings = {"opacity_loss_weight": 0.2, "abundance_loss_weight": 0.0}
+    settings: dict[str, Any] = {"opacity_loss_weight": 0.2, "abundance_loss_weight": 0.0}
     closed = make_model(has_alpha=False, **settings).get_loss_dict(outputs, batch)
     assert float(closed["spectral"]) == 0
     assert_close(closed["opacity"], torch.tensor(0.2 * 0.25 / 3))
