@@ -23,7 +23,7 @@ class DeviceShare:
     goes before the next training step, one without waits; with no training it never waits.
     """
 
-    def __init__(self, guest_share: float = 0.35) -> None:
+    def __init__(self, guest_share: float = 0.3) -> None:
         """Start with nobody computing.
 
         Args:

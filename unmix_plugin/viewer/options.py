@@ -43,9 +43,9 @@ class TrainingViewerOptions(ViewerOptions):
     """Serve the viewer while training; on by default where the output is a terminal."""
     keep_open: bool = False
     """Serve on after training, until Ctrl-C."""
-    share: float = 0.35
+    share: float = 0.3
     """Part of the device's time that the viewer may take while someone moves the camera; at rest it takes about a
-    third of that."""
+    quarter of that."""
 
     def __post_init__(self) -> None:
         """Refuse impossible settings.
