@@ -52,6 +52,6 @@ class MixtureGuide(nn.Module):
             abundances: Composited, so that they sum to the opacity.
             measured: Premultiplied by `alpha`.
         """
-        mixtures = sparse_abundances(measured, self.endmembers, float(self.mixing_penalty))
+        mixtures = sparse_abundances(measured, self.endmembers, self.mixing_penalty)
         distances = (abundances - alpha[:, None] * mixtures).square().sum(dim=1)
         return (shows_a_shape(measured) * distances).mean()

@@ -12,7 +12,6 @@ Notation: `N` spectra, `B` bands, `K` endmembers, `C` choices of `m` endmembers.
 
 from __future__ import annotations
 
-from itertools import combinations
 from math import comb
 
 import torch
@@ -28,7 +27,7 @@ _RIDGE = 1e-6
 
 
 def sparse_abundances(
-    spectra: Float[Tensor, "N B"], endmembers: Float[Tensor, "K B"], mixing_penalty: float
+    spectra: Float[Tensor, "N B"], endmembers: Float[Tensor, "K B"], mixing_penalty: float | Float[Tensor, ""]
 ) -> Float[Tensor, "N K"]:
     """Abundances of each spectrum, at least 0 with sum 1; zeros where a spectrum or what explains it is zero.
 
@@ -42,7 +41,7 @@ def sparse_abundances(
     smallest = torch.full_like(cosines[:, 0], torch.inf)
     shares = torch.zeros_like(cosines)
     for size in _sizes(len(endmembers)):
-        choices = torch.tensor(list(combinations(range(len(endmembers)), size)), device=cosines.device)
+        choices = torch.combinations(torch.arange(len(endmembers), device=cosines.device), size)
         misfit, found = _best_choice(cosines, gram, choices)
         misfit = misfit + mixing_penalty * (size - 1)
         shares = torch.where((misfit < smallest)[:, None], found, shares)
