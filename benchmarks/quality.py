@@ -143,6 +143,7 @@ def measure(folder: Path, max_seconds: float, device: str, runs: Path) -> dict[s
 def baselines(folder: Path, num_endmembers: int) -> dict[str, list[float]]:
     """mIoU of each method that sees single images only, by seed; empty without labels."""
     import torch
+    from _unmixing_2d import opaque_pixels
 
     from unmix_plugin.scenes.loader import load_scene
     from unmix_plugin.scenes.scene import SceneOptions
@@ -159,15 +160,6 @@ def baselines(folder: Path, num_endmembers: int) -> dict[str, list[float]]:
             spectra = initialise_endmembers(pixels, num_endmembers, method, generator)
             found.setdefault(name, []).append(segmentation_miou(scene, spectra))
     return found
-
-
-def opaque_pixels(scene: Scene, index: int) -> torch.Tensor:
-    """Spectra of a view's valid pixels that show matter only, (N, B)."""
-    import torch
-
-    alpha = scene.alpha(index)
-    shows_matter = scene.valid_mask(index) if alpha is None else scene.valid_mask(index) & (alpha > 0.99)
-    return torch.from_numpy(scene.cube(index)[shows_matter])
 
 
 def segmentation_miou(scene: Scene, spectra: torch.Tensor) -> float:
