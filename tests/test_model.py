@@ -97,8 +97,8 @@ def test_a_perfect_prediction_has_no_loss_over_any_background(background):
     losses = model.get_loss_dict(
         {"spectral": spectra, "accumulation": alpha}, {"spectra": spectra, "alpha": alpha}
     )
-    assert set(losses) == {"spectral", "rgb"}
-    assert all(float(loss) < 1e-12 for loss in losses.values())
+    assert set(losses) == {"spectral", "rgb", "features"}
+    assert all(float(losses[name]) < 1e-12 for name in ("spectral", "rgb"))
 
 
 def test_a_bright_background_penalises_missing_opacity():
@@ -254,7 +254,11 @@ def test_transparency_is_penalised_only_where_no_alpha_says_what_is_solid():
     )  # the last pixel is black: it may be void
     batch = {"spectra": spectra, "alpha": torch.ones(3)}
     outputs = {"spectral": spectra, "accumulation": torch.tensor([1.0, 0.5, 0.0])}
-    settings: dict[str, Any] = {"opacity_loss_weight": 0.2, "abundance_loss_weight": 0.0}
+    settings: dict[str, Any] = {
+        "opacity_loss_weight": 0.2,
+        "haze_loss_weight": 0.0,
+        "abundance_loss_weight": 0.0,
+    }
     closed = make_model(has_alpha=False, **settings).get_loss_dict(outputs, batch)
     assert float(closed["spectral"]) == 0
     assert_close(closed["opacity"], torch.tensor(0.2 * 0.25 / 3))
@@ -265,11 +269,44 @@ def test_the_automatic_background_is_black_without_alpha_and_random_with_it():
     batch = {"spectra": torch.zeros(50, NUM_BANDS), "alpha": torch.ones(50)}
     outputs = {"spectral": torch.zeros(50, NUM_BANDS), "accumulation": torch.zeros(50)}
     losses = [
-        float(make_model(has_alpha=has, abundance_loss_weight=0.0).get_loss_dict(outputs, batch)["spectral"])
+        float(
+            make_model(has_alpha=has, abundance_loss_weight=0.0, haze_loss_weight=0.0).get_loss_dict(
+                outputs, batch
+            )["spectral"]
+        )
         for has in (False, True)
     ]
     assert losses[0] == 0
     assert 0.2 < losses[1] < 0.5  # the mean square of a grey drawn evenly from [0, 1]
+
+
+def test_haze_is_penalised_early_and_only_where_no_alpha_says_what_is_empty():
+    batch = {"spectra": torch.zeros(4, NUM_BANDS), "alpha": torch.ones(4)}
+    outputs = {
+        "spectral": torch.zeros(4, NUM_BANDS),
+        "accumulation": torch.zeros(4),
+        "haze": torch.tensor(3.0),
+    }
+    settings: dict[str, Any] = {"haze_loss_weight": 0.2, "haze_loss_until": 0.5, "abundance_loss_weight": 0.0}
+    model = make_model(has_alpha=False, **settings)
+    begin_step = model.get_training_callbacks()[0].func
+    found = []
+    for progress in (0.0, 0.25, 0.5, 1.0):
+        begin_step(1, progress)
+        found.append(float(model.get_loss_dict(outputs, batch).get("haze", 0.0)))
+    assert found == pytest.approx([0.6, 0.15, 0.0, 0.0])
+    assert "haze" not in make_model(has_alpha=True, **settings).get_loss_dict(outputs, batch)
+
+
+def test_features_are_drawn_to_where_the_untrained_field_has_them():
+    model = make_model(feature_loss_weight=0.5, abundance_loss_weight=0.0)
+    batch = {"spectra": torch.zeros(1, NUM_BANDS), "alpha": torch.ones(1)}
+    outputs = {"spectral": torch.zeros(1, NUM_BANDS), "accumulation": torch.zeros(1)}
+    loss = model.get_loss_dict(outputs, batch)["features"]
+    assert_close(loss, 0.5 * model.field.table.square().mean())
+    loss.backward()
+    assert model.field.table.grad is not None
+    assert_close(model.field.table.grad, model.field.table.detach() / model.field.table.numel())
 
 
 def test_abundances_are_drawn_to_those_that_measured_spectra_show():

@@ -1,5 +1,7 @@
 """The renderer of coefficients, apart from the model that owns it."""
 
+import math
+
 import pytest
 import torch
 from torch.testing import assert_close
@@ -33,11 +35,42 @@ def test_a_homogeneous_box_absorbs_what_beer_lambert_says():
     bundle = rays(20)
     with torch.no_grad():
         field.table.zero_()  # then the network's output is zero, and the density its initial value
-        coefficients, num_samples = renderer(field, bundle)
+        rendered = renderer(field, bundle)
     t_near, t_far = BOX.intersect(bundle.origins, bundle.directions)
-    assert num_samples == pytest.approx(((t_far - t_near) / renderer.step).sum().item(), rel=0.02)
-    assert_close(coefficients.accumulation, 1 - torch.exp(-(t_far - t_near)), atol=0.02, rtol=0)
-    assert_close(coefficients.abundances.sum(-1), coefficients.accumulation)
+    assert rendered.num_samples == pytest.approx(((t_far - t_near) / renderer.step).sum().item(), rel=0.02)
+    found = rendered.coefficients
+    assert_close(found.accumulation, 1 - torch.exp(-(t_far - t_near)), atol=0.02, rtol=0)
+    assert_close(found.abundances.sum(-1), found.accumulation)
+
+
+@pytest.mark.parametrize("density", [0.1, 10.0])
+def test_haze_counts_the_samples_that_matter_is_spread_over(density):
+    """Closed form in a homogeneous box; a sample of depth 10 counts a few times one of depth 0.1, not a hundred times."""
+    renderer, field = make()
+    bundle = rays(20)
+    with torch.no_grad():
+        field.table.zero_()
+        field.log_initial_density = math.log(density / renderer.step)
+        haze = renderer(field, bundle).haze
+    t_near, t_far = BOX.intersect(bundle.origins, bundle.directions)
+    carrying = [
+        sum(
+            math.exp(-i * density) * (1 - math.exp(-density)) > renderer.config.smallest_weight
+            for i in range(int(length / renderer.step))
+        )
+        for length in (t_far - t_near).tolist()
+    ]
+    expected = sum(carrying) / 20 * math.log1p(density / 0.03)
+    assert float(haze) == pytest.approx(expected, rel=0.05)
+
+
+def test_rays_rendered_in_chunks_are_those_rendered_together():
+    renderer, field = make()
+    bundle = rays(20)
+    with torch.no_grad():
+        together, in_chunks = renderer(field, bundle).coefficients, renderer.in_chunks(field, bundle, 7)
+    assert_close(in_chunks.accumulation, together.accumulation)
+    assert_close(in_chunks.scaled_abundances, together.scaled_abundances)
 
 
 def test_a_render_does_not_look_at_the_corners_of_the_box_again(monkeypatch):
@@ -45,4 +78,4 @@ def test_a_render_does_not_look_at_the_corners_of_the_box_again(monkeypatch):
     renderer, field = make()
     renderer(field, rays(3))
     monkeypatch.setattr(renderer_module, "SceneBox", None)
-    assert renderer(field, rays(3))[1] > 0
+    assert renderer(field, rays(3)).num_samples > 0

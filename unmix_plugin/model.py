@@ -30,7 +30,7 @@ from unmix_plugin.engine.model import Model, ModelConfig
 from unmix_plugin.engine.rays import RayBundle
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.field import UnmixField, UnmixFieldConfig
-from unmix_plugin.renderer import CoefficientRenderer, RendererConfig
+from unmix_plugin.renderer import CoefficientRenderer, RenderedRays, RendererConfig
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour import rgb_matrix
 from unmix_plugin.spectral.composition import (
@@ -85,6 +85,13 @@ class UnmixModelConfig(ModelConfig):
     opacity_loss_weight: float = 0.01
     """Weight of the mean squared transparency in scenes without alpha, where pixels aren't dark: light comes from
     something solid, but black may be the void."""
+    haze_loss_weight: float = 1e-3
+    """Weight at the start of training of matter spread along rays in scenes without alpha, where no hull keeps fog out;
+    falls to 0 at `haze_loss_until`."""
+    haze_loss_until: float = 0.25
+    """Part of the training in which haze is penalised: later it would thin out surfaces."""
+    feature_loss_weight: float = 0.08
+    """Weight of the mean square of the hash table's features: what pixels do not ask for stays as it began."""
     abundance_loss_weight: float = 0.1
     """Weight of the mean squared distance of composited abundances to those of the measured spectra, unmixed one by
     one with the first endmembers; 0 as published."""
@@ -117,10 +124,13 @@ class UnmixModelConfig(ModelConfig):
                 self.spectral_loss_weight,
                 self.rgb_loss_weight,
                 self.opacity_loss_weight,
+                self.haze_loss_weight,
+                self.feature_loss_weight,
                 self.abundance_loss_weight,
                 self.mixing_penalty,
             )
             >= 0,
+            "haze-loss-until in (0, 1]": 0 < self.haze_loss_until <= 1,
             "initial opacities in (0, 1)": 0 < self.initial_opacity < 1
             and 0 < self.initial_opacity_unknown < 1,
             "endmember-file exactly when endmember-init is file": (self.endmember_init == "file")
@@ -194,6 +204,7 @@ class UnmixModel(Model):
         self.register_buffer("rgb_weights", rgb_matrix(self.bands), persistent=False)
         self.mixture_guide = MixtureGuide(self.num_endmembers, num_bands)
         self.register_buffer("every_band", torch.eye(num_bands), persistent=False)
+        self._progress = 0.0
 
     def initialise(self, initial_data: Mapping[str, np.ndarray]) -> None:
         """Endmembers from the training pixels or a file, the light in the dictionary, and the carved grid.
@@ -228,13 +239,16 @@ class UnmixModel(Model):
         )
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
-        """`spectral` (R, B) on black, `abundances` (R, K), `accumulation` (R) and `num_samples`, one number."""
-        coefficients, num_samples = self.renderer(self.field, ray_bundle)
+        """`spectral` (R, B) on black, `abundances` (R, K), `accumulation` (R), and `haze` and `num_samples`, one
+        number each."""
+        rendered: RenderedRays = self.renderer(self.field, ray_bundle)
+        coefficients = rendered.coefficients
         return {
             "spectral": spectral(coefficients, self.materials),
             "accumulation": coefficients.accumulation,
             "abundances": coefficients.abundances,
-            "num_samples": torch.tensor(num_samples),
+            "haze": rendered.haze,
+            "num_samples": torch.tensor(rendered.num_samples),
         }
 
     def get_loss_dict(
@@ -257,6 +271,11 @@ class UnmixModel(Model):
         if self.config.opacity_loss_weight > 0 and not self.metadata["has_alpha"]:
             shown = solid_evidence(batch["spectra"])
             losses["opacity"] = self.config.opacity_loss_weight * (shown * (1 - opacities).square()).mean()
+        haze_weight = self._haze_weight()
+        if haze_weight > 0:
+            losses["haze"] = haze_weight * outputs["haze"]
+        if self.config.feature_loss_weight > 0:
+            losses["features"] = self.config.feature_loss_weight * self.field.mean_square_feature()
         if self.config.abundance_loss_weight > 0:
             abundances = _pixel_mean(outputs["abundances"], num_pixels)
             error = self.mixture_guide.error(abundances, batch["spectra"], batch["alpha"])
@@ -316,10 +335,21 @@ class UnmixModel(Model):
         return [
             TrainingCallback(
                 TrainingCallbackLocation.BEFORE_TRAIN_ITERATION,
-                lambda step, _: self.renderer.update_grid(self.field, step),
+                self._begin_step,
             ),
             TrainingCallback(TrainingCallbackLocation.AFTER_TRAIN_ITERATION, self._keep_spectra_physical),
         ]
+
+    def _begin_step(self, step: int, progress: float) -> None:
+        self._progress = progress
+        self.renderer.update_grid(self.field, step)
+
+    def _haze_weight(self) -> float:
+        """Weight of the haze now: none with alpha, else falling with the square of what is left of its time."""
+        if self.metadata["has_alpha"]:
+            return 0.0
+        left = max(1 - self._progress / self.config.haze_loss_until, 0.0)
+        return self.config.haze_loss_weight * left**2
 
     def num_samples(self, outputs: dict[str, Tensor]) -> int:
         """Samples marched for `outputs`."""
@@ -343,9 +373,7 @@ class UnmixModel(Model):
 
     def _coefficients_through(self, camera: Cameras, offset: tuple[float, float]) -> Coefficients:
         bundle = camera.to(self.device).image_rays(0, offset)
-        chunk = self.config.eval_num_rays_per_chunk
-        parts = [self.renderer(self.field, bundle[i : i + chunk])[0] for i in range(0, len(bundle), chunk)]
-        return Coefficients.concatenate(parts)
+        return self.renderer.in_chunks(self.field, bundle, self.config.eval_num_rays_per_chunk)
 
     def _guess_endmembers(
         self, pixels: Float[Tensor, "N B"], lamp: Float[Tensor, "B"]

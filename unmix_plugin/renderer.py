@@ -22,6 +22,9 @@ from unmix_plugin.rendering.marching import PackedSamples, march
 from unmix_plugin.rendering.occupancy import OccupancyGrid
 from unmix_plugin.spectral.composition import Coefficients
 
+_HAZE_DEPTH = 0.03
+"""Optical depth of a sample from which on haze grows slower than matter does."""
+
 
 @dataclass(frozen=True)
 class RendererConfig:
@@ -39,6 +42,18 @@ class RendererConfig:
     """Factor on the remembered density of a probed cell: lower forgets emptied space sooner."""
     grid_smallest_opacity: float = 0.03
     """Opacity of one sample's interval from which a cell counts as occupied."""
+
+
+@dataclass(frozen=True)
+class RenderedRays:
+    """What rendering a bundle of rays gives."""
+
+    coefficients: Coefficients
+    num_samples: int
+    """Samples marched for all rays."""
+    haze: Float[Tensor, ""]
+    """Sum of log(1 + tau / 0.03) over the samples of a ray that carry weight, tau their optical depth; mean over rays.
+    The same light stopped by few samples gives less of it than by many: surfaces little, fog much."""
 
 
 class CoefficientRenderer(nn.Module):
@@ -74,8 +89,8 @@ class CoefficientRenderer(nn.Module):
         """Start from a grid of which only some cells may ever hold matter."""
         self.grid = OccupancyGrid(reachable).to(self.aabb.device)
 
-    def forward(self, field: CoefficientField, ray_bundle: RayBundle) -> tuple[Coefficients, int]:
-        """Composited coefficients of each ray, and how many samples were marched for all.
+    def forward(self, field: CoefficientField, ray_bundle: RayBundle) -> RenderedRays:
+        """Composited coefficients of each ray.
 
         In training mode the samples of each ray are shifted at random, drawn from torch's global generator.
         """
@@ -83,7 +98,8 @@ class CoefficientRenderer(nn.Module):
         kept, encoded = self._carrying_weight(field, samples, ray_bundle)
         positions, along = _points(kept, ray_bundle)
         densities, features = field.density_of(field.encode(positions, encoded))
-        weights = volume_weights(densities * self.step, kept.packed_info)
+        depths = densities * self.step
+        weights = volume_weights(depths, kept.packed_info)
         outputs = field.get_outputs(positions, along, features)
         names = ("abundances", "scaled_abundances", "specular_coefficients")
         columns = [torch.ones_like(kept.t)[:, None], kept.t[:, None], *(outputs[name] for name in names)]
@@ -92,7 +108,13 @@ class CoefficientRenderer(nn.Module):
         if self.close_rays:
             totals = totals + _rest_on_last_sample(totals[:, 0], values, kept)
         parts = totals.split([column.shape[1] for column in columns], dim=-1)
-        return Coefficients(parts[0][:, 0], parts[1][:, 0], *parts[2:]), len(samples)
+        haze = torch.log1p(depths / _HAZE_DEPTH).sum() / max(len(ray_bundle), 1)
+        return RenderedRays(Coefficients(parts[0][:, 0], parts[1][:, 0], *parts[2:]), len(samples), haze)
+
+    def in_chunks(self, field: CoefficientField, ray_bundle: RayBundle, chunk: int) -> Coefficients:
+        """Composited coefficients of each ray, with `chunk` rays at a time in memory."""
+        bundles = (ray_bundle[i : i + chunk] for i in range(0, len(ray_bundle), chunk))
+        return Coefficients.concatenate([self(field, bundle).coefficients for bundle in bundles])
 
     def update_grid(self, field: CoefficientField, step: int) -> None:
         """Probe the field where the grid's turn has come."""

@@ -143,11 +143,10 @@ def look_from_above(
     above = positions + float(model.metadata["pixel_size"]) * normals
     indices = torch.zeros(len(above), dtype=torch.int64)
     rays = RayBundle(above, -normals, indices).to(model.device)
-    chunk = model.config.eval_num_rays_per_chunk
-    parts = [model.renderer(model.field, rays[i : i + chunk])[0] for i in range(0, len(rays), chunk)]
-    if not parts:
+    if len(rays) == 0:
         return torch.zeros(0, len(model.materials.names)), torch.zeros(0, len(model.bands))
-    return _looks(model, Coefficients.concatenate(parts), torch.ones(len(above), dtype=torch.bool))
+    found = model.renderer.in_chunks(model.field, rays, model.config.eval_num_rays_per_chunk)
+    return _looks(model, found, torch.ones(len(above), dtype=torch.bool))
 
 
 def _looks(

@@ -79,7 +79,7 @@ class FrameRender:
         # Spread over the picture, so that every block has its share of what is empty and of what is costly.
         pixels = torch.arange(start, end, device=model.device) * self._stride % self._num_pixels
         bundle = pixel_rays(self.camera.to(model.device), pixels, self._offsets[turn])
-        block = channels_of(model.renderer(model.field, bundle)[0]) / len(self._offsets)
+        block = channels_of(model.renderer(model.field, bundle).coefficients) / len(self._offsets)
         if self._channels is None:
             self._channels = block.new_zeros(self._num_pixels, block.shape[1])
         self._channels[pixels] += block

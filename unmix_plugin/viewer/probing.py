@@ -74,7 +74,7 @@ def probe(model: UnmixModel, camera: Cameras, column: float, row: float, number:
     offsets = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), dim=-1).reshape(-1, 2)
     coords = torch.tensor([column, row]) + offsets
     bundle: RayBundle = camera.generate_rays(torch.zeros(len(coords), dtype=torch.int64), coords)
-    coefficients, _ = model.renderer(model.field, bundle.to(model.device))
+    coefficients = model.renderer(model.field, bundle.to(model.device)).coefficients
     opacity = float(coefficients.accumulation.mean())
     if opacity < OCCUPIED_ACCUMULATION:
         raise ConfigError("nothing is there to probe: less than half of the light ends on something")
