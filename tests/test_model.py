@@ -97,8 +97,8 @@ def test_a_perfect_prediction_has_no_loss_over_any_background(background):
     losses = model.get_loss_dict(
         {"spectral": spectra, "accumulation": alpha}, {"spectra": spectra, "alpha": alpha}
     )
-    assert set(losses) == {"spectral", "rgb", "features"}
-    assert all(float(losses[name]) < 1e-12 for name in ("spectral", "rgb"))
+    assert set(losses) == {"spectral", "rgb"}
+    assert all(float(loss) < 1e-12 for loss in losses.values())
 
 
 def test_a_bright_background_penalises_missing_opacity():
@@ -296,17 +296,6 @@ def test_haze_is_penalised_early_and_only_where_no_alpha_says_what_is_empty():
         found.append(float(model.get_loss_dict(outputs, batch).get("haze", 0.0)))
     assert found == pytest.approx([0.6, 0.15, 0.0, 0.0])
     assert "haze" not in make_model(has_alpha=True, **settings).get_loss_dict(outputs, batch)
-
-
-def test_features_are_drawn_to_where_the_untrained_field_has_them():
-    model = make_model(feature_loss_weight=0.5, abundance_loss_weight=0.0)
-    batch = {"spectra": torch.zeros(1, NUM_BANDS), "alpha": torch.ones(1)}
-    outputs = {"spectral": torch.zeros(1, NUM_BANDS), "accumulation": torch.zeros(1)}
-    loss = model.get_loss_dict(outputs, batch)["features"]
-    assert_close(loss, 0.5 * model.field.table.square().mean())
-    loss.backward()
-    assert model.field.table.grad is not None
-    assert_close(model.field.table.grad, model.field.table.detach() / model.field.table.numel())
 
 
 def test_abundances_are_drawn_to_those_that_measured_spectra_show():

@@ -45,7 +45,7 @@ def test_a_homogeneous_box_absorbs_what_beer_lambert_says():
 
 @pytest.mark.parametrize("density", [0.1, 10.0])
 def test_haze_counts_the_samples_that_matter_is_spread_over(density):
-    """Closed form in a homogeneous box; a sample of depth 10 counts a few times one of depth 0.1, not a hundred times."""
+    """Closed form in a homogeneous box; a sample of depth 10 counts a few times one of depth 0.1, not 100 times."""
     renderer, field = make()
     bundle = rays(20)
     with torch.no_grad():

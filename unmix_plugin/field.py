@@ -123,11 +123,6 @@ class UnmixField(CoefficientField):
         unit_positions = (positions - self.aabb[0]) / (self.aabb[1] - self.aabb[0])
         return hash_encode(unit_positions, self.table, self.layout, known)
 
-    def mean_square_feature(self) -> Float[Tensor, ""]:
-        """Mean square of the hash table's features; a dot product, since it makes no copy of the table."""
-        features = self.table.flatten()
-        return features.dot(features) / len(features)
-
     def get_density(self, positions: Float[Tensor, "S 3"]) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
         """Density per scene unit and geometry features."""
         return self.density_of(self.encode(positions))

@@ -19,7 +19,8 @@ unmix_nerf = MethodSpecification(
             model=UnmixModelConfig(),
         ),
         optimizers={
-            "grid": OptimizerConfig(lr=2e-2, final_factor=0.03),
+            # Without decay, floaters grow before single cameras: what few pixels ask for is as good as free.
+            "grid": OptimizerConfig(lr=2e-2, final_factor=0.03, weight_decay=1e-7),
             "networks": OptimizerConfig(lr=2e-2, final_factor=0.03),
             "spectra": OptimizerConfig(lr=2e-3, final_factor=0.03),
         },

@@ -90,8 +90,6 @@ class UnmixModelConfig(ModelConfig):
     falls to 0 at `haze_loss_until`."""
     haze_loss_until: float = 0.25
     """Part of the training in which haze is penalised: later it would thin out surfaces."""
-    feature_loss_weight: float = 0.08
-    """Weight of the mean square of the hash table's features: what pixels do not ask for stays as it began."""
     abundance_loss_weight: float = 0.1
     """Weight of the mean squared distance of composited abundances to those of the measured spectra, unmixed one by
     one with the first endmembers; 0 as published."""
@@ -125,7 +123,6 @@ class UnmixModelConfig(ModelConfig):
                 self.rgb_loss_weight,
                 self.opacity_loss_weight,
                 self.haze_loss_weight,
-                self.feature_loss_weight,
                 self.abundance_loss_weight,
                 self.mixing_penalty,
             )
@@ -234,8 +231,14 @@ class UnmixModel(Model):
     def materials(self) -> Materials:
         """The spectra that coefficients are multiplied with."""
         specular_spectra = self.every_band if self.config.specular == "full" else self.specular_spectra
+        light = self.metadata["illuminant"]
         return Materials(
-            self.bands, self.endmembers, specular_spectra, self.config.segmentation, self.endmember_names
+            self.bands,
+            self.endmembers,
+            specular_spectra,
+            self.config.segmentation,
+            self.endmember_names,
+            None if light is None else self.endmembers.new_tensor(light),
         )
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
@@ -274,8 +277,6 @@ class UnmixModel(Model):
         haze_weight = self._haze_weight()
         if haze_weight > 0:
             losses["haze"] = haze_weight * outputs["haze"]
-        if self.config.feature_loss_weight > 0:
-            losses["features"] = self.config.feature_loss_weight * self.field.mean_square_feature()
         if self.config.abundance_loss_weight > 0:
             abundances = _pixel_mean(outputs["abundances"], num_pixels)
             error = self.mixture_guide.error(abundances, batch["spectra"], batch["alpha"])

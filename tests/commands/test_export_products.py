@@ -155,6 +155,20 @@ def test_points_and_mesh_lie_where_the_scene_is(trained, exported):
         assert ((mesh.vertices >= low - 0.2) & (mesh.vertices <= high + 0.2)).all()
 
 
+def test_points_have_the_indices_asked_for_of_reflectance(trained, tmp_path):
+    outputs = ["--outputs", "index:redness", "index:r650/r450"]
+    ended = run(export, *words("point-cloud", "--run", trained.run, "--output", tmp_path, *outputs))
+    assert ended.status == 0, ended.err
+    ply = PlyData.read(tmp_path / "points.ply")
+    redness, ratio = (np.asarray(ply["vertex"][name]) for name in ("index_redness", "index_1"))
+    assert redness.dtype == ratio.dtype == np.float32
+    assert np.isfinite(redness).all()
+    assert (np.abs(redness) <= 1).all()
+    assert redness.std() > 0
+    assert [line.split(":")[0] for line in ply.comments[-2:]] == ["index_redness", "index_1"]
+    assert "of radiance" not in ply.comments[-1]
+
+
 def test_a_pixel_has_what_was_measured_there_beside_what_is_predicted(trained, exported):
     scene = load_scene(trained.scene, SceneOptions())
     index = [frame.name for frame in scene.frames].index("eval_002")
@@ -280,6 +294,9 @@ def test_removed_matter_leaves_the_surface(trained, tmp_path):
         (["spectrum", "--point", "1,2,nan"], "--point 1,2,nan is not 3 numbers"),
         (["spectrum", "--point", "99,0,0"], "outside the scene box"),
         (["point-cloud", "--num-points", "0"], "--num-points is 0"),
+        (["point-cloud", "--outputs", "rgb"], "--outputs rgb: points take spectral indices, index:NAME"),
+        (["point-cloud", "--outputs", "index:nvdi"], "there is no index 'nvdi'; nearest:"),
+        (["point-cloud", "--outputs", "target:none.csv"], "none.csv"),
         (["mesh", "--resolution", "2000"], "--resolution is 2000"),
         (["mesh", "--density", "-1"], "--density is -1"),
         (["mesh", "--smoothing", "99"], "--smoothing is 99"),

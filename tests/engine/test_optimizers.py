@@ -83,6 +83,18 @@ def test_a_step_is_adams():
     torch.testing.assert_close(param.detach(), torch.tensor([0.9, -1.9, 2.9]))
 
 
+def test_weight_decay_draws_what_has_no_gradient_to_zero_and_hardly_moves_the_rest():
+    param = nn.Parameter(torch.tensor([1.0, -1.0]))
+    optimizer = build_optimizer({"a": [param]}, {"a": OptimizerConfig(lr=0.01, weight_decay=1e-3)})
+    for _ in range(50):
+        param.grad = torch.tensor([0.0, -1.0])  # the second is asked to grow
+        optimizer.step()
+    assert 0.4 < float(param.detach()[0]) < 0.6
+    torch.testing.assert_close(param.detach()[1], torch.tensor(-0.5), atol=1e-3, rtol=0)
+    with pytest.raises(ConfigError, match="weight_decay >= 0"):
+        OptimizerConfig(weight_decay=-1.0)
+
+
 def test_a_group_without_settings_is_refused_by_name():
     with pytest.raises(ConfigError, match="group heads; configs: fields"):
         build_optimizer({"heads": [nn.Parameter(torch.ones(1))]}, {"fields": OptimizerConfig()})

@@ -7,7 +7,9 @@ from tests.exports.ball_model import ALL_ROUND, RADIUS, ball_model, cameras_arou
 from tests.exports.camera_scenes import FRAME
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.exports.point_cloud import require_count, write_point_cloud
+from unmix_plugin.exports.point_scores import require_point_scores
 from unmix_plugin.exports.seen_surface import SeenSurface
+from unmix_plugin.spectral import SpectraTable, write_spectra_csv
 from unmix_plugin.spectral.colour import linear_to_srgb, rgb_matrix
 
 MODEL = ball_model()
@@ -72,6 +74,28 @@ def test_the_file_says_what_it_is(cloud):
     assert ply.comments[0] == "surface points of an unmix-nerf run"
     assert "coordinates: world of the scene's transforms.json" in ply.comments[1]
     assert ply.comments[2:] == [f"material {index}: endmember_{index}" for index in range(3)]
+
+
+def test_indices_and_targets_are_written_for_each_point(points, tmp_path):
+    spectra = MODEL.materials.endmembers.detach().double().numpy()
+    write_spectra_csv(tmp_path / "top.csv", SpectraTable(MODEL.bands, ("top",), spectra[:1]))
+    asked = ["index:r650/r500", "index:pri", f"target:{tmp_path / 'top.csv'}<0.1"]
+    scores = require_point_scores(asked, MODEL.bands)
+    path, count = write_point_cloud(tmp_path, points, 300, MODEL.materials, FRAME, scores)
+    ply = PlyData.read(path)
+    written = [ply["vertex"].properties[index].name for index in (-3, -2, -1)]
+    assert written == ["index_1", "index_pri", "target_1"]
+    found = columns(ply, written)
+    assert found.dtype == np.float32
+    assert found.shape == (count, 3)
+    shares = columns(ply, [f"abundance_endmember_{index}" for index in range(3)])
+    seen = shares @ spectra
+    np.testing.assert_allclose(found[:, 0], seen[:, 4] / seen[:, 1], rtol=1e-4)
+    material = np.asarray(ply["vertex"]["material"])
+    pure = shares.max(axis=1) > 0.999
+    np.testing.assert_array_equal(found[pure, 2], material[pure] == 0)
+    assert "index_1: index:r650/r500, formula r650/r500" in ply.comments[-3]
+    assert ply.comments[-3].endswith("of radiance, since the scene's light is unknown")
 
 
 def test_nothing_to_export_is_said(points, tmp_path):

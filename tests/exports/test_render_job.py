@@ -286,3 +286,46 @@ def test_an_error_while_rendering_leaves_no_video(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         render(tmp_path, ["rgb", "accumulation"], ["mp4"], cameras)
     assert list(tmp_path.iterdir()) == []
+
+
+INDEX = "index:(r650-r500)/(r650+r500)"
+
+
+@pytest.mark.parametrize("pixels", [None, 30])
+def test_indices_and_targets_are_those_of_the_rendered_spectra_in_every_block(tmp_path, pixels):
+    target = tmp_path / "paint.csv"
+    target.write_text("wavelength,paint\n450,0.1\n650,0.9\n")
+    cameras = views()
+    matched, angle = f"target:mf:{target}", f"target:{target}"
+    products, survey, _ = render(tmp_path, [INDEX, matched, angle, "spectral"], ["npy"], cameras, pixels)
+    read = {
+        product.output.name: np.load(still_paths(tmp_path, product, cameras.views[0].name)[0])
+        for product in products
+    }
+    opacity = MODEL.get_outputs_for_camera(cameras.views[0].camera, ["accumulation"])["accumulation"].numpy()
+    seen = opacity >= 0.5
+    spectra = read["spectral"]
+    expected = (spectra[..., 4] - spectra[..., 1]) / (spectra[..., 4] + spectra[..., 1])
+    np.testing.assert_allclose(read[INDEX][seen], expected[seen], rtol=1e-4, atol=1e-6)
+    assert np.isnan(read[INDEX][~seen]).all()
+    direction = np.interp([450, 500, 550, 600, 650], [450, 650], [0.1, 0.9])
+    cosine = spectra @ direction / (np.linalg.norm(spectra, axis=-1) * np.linalg.norm(direction) + 1e-12)
+    np.testing.assert_allclose(read[angle][seen], np.arccos(np.clip(cosine[seen], -1, 1)), atol=1e-3)
+    assert np.isfinite(read[matched][seen]).all()
+    assert set(survey.scores) == {INDEX, matched, angle}
+
+
+def test_pictures_of_an_index_are_transparent_where_it_is_undefined_and_have_a_legend(tmp_path):
+    from unmix_plugin.exports.render_legend import draw_legend, needs_legend
+
+    cameras = views()
+    products, survey, job = render(tmp_path, [INDEX], ["png"], cameras)
+    [product] = products
+    [path] = still_paths(tmp_path, product, cameras.views[0].name)
+    pixels = np.asarray(Image.open(path))
+    opacity = MODEL.get_outputs_for_camera(cameras.views[0].camera, ["accumulation"])["accumulation"].numpy()
+    assert (pixels[opacity < 0.002][:, 3] == 0).all()
+    assert pixels[opacity > 0.55][:, :3].std() > 1
+    assert survey.scales[INDEX].low < survey.scales[INDEX].high
+    assert needs_legend(product)
+    assert draw_legend(product.output, job.palette).startswith(b"\x89PNG")

@@ -57,6 +57,32 @@ def test_names_of_files_have_no_odd_letters():
     assert product.output.file_name == "false-colour-650-550-450"
 
 
+def test_an_index_is_a_map_and_says_so_where_the_light_is_unknown():
+    [png, npy] = choose_products(["index:(r650-r500)/(r650+r500)"], [], MATERIALS, False)
+    assert (png.format, npy.format) == ("png", "npy")
+    assert "of radiance, since the scene's light is unknown" in png.output.what
+    [known, _] = choose_products(["index:r650/r500"], [], make_model(light=[1.0] * 5).materials, False)
+    assert "radiance" not in known.output.what
+
+
+def test_a_target_is_named_for_its_file_not_for_where_that_lies(tmp_path):
+    (tmp_path / "paint.csv").write_text("wavelength,gold,red\n450,0.1,0.3\n650,0.9,0.8\n")
+    [output] = {
+        product.output
+        for product in choose_products([f"target:ace:{tmp_path}/paint.csv#gold>0.5"], [], MATERIALS, False)
+    }
+    assert output.file_name == "target-ace-paint.csv-gold-0.5"
+
+
+def test_a_long_formula_has_a_file_name_of_its_own():
+    long = "index:" + "+".join(["r500"] * 60)
+    one, other = (
+        choose_products([name], ["npy"], MATERIALS, False)[0].output for name in (long, long + "+r600")
+    )
+    assert len(one.file_name) < 120
+    assert one.file_name != other.file_name
+
+
 BAD = {
     "unknown output": (
         ["spectrl"],
@@ -64,6 +90,10 @@ BAD = {
         r"no output named 'spectrl' \(did you mean spectral.*\?\); known are spectral",
     ),
     "unknown kind": (["ban:650nm"], [], r"no output named 'ban:650nm' \(did you mean band\?\)"),
+    "index of none": (["index"], [], "the output index needs to know which, as in index:ndvi"),
+    "index beyond the bands": (["index:ndvi"], [], "ndvi needs .* nothing is extrapolated"),
+    "target without file": (["target:"], [], "the output target needs to know which, as in target:paint.csv"),
+    "nearly an index": (["indx:ndvi"], [], "did you mean index or band"),
     "argument of none": (["rgb:1"], [], "no output named 'rgb:1'"),
     "band without wavelength": (["band"], [], "the output band needs wavelengths, as in band:650nm"),
     "band of no number": (["band:red"], [], "'red' in the output band:red is not a wavelength"),

@@ -6,6 +6,7 @@ from dataclasses import fields
 from hypothesis import given
 from hypothesis import strategies as st
 
+from unmix_plugin.spectral.index_formula import MAX_LENGTH
 from unmix_plugin.viewer.layer_settings import EXPOSURE_BOUNDS, GAMMA_BOUNDS, LayerSettings
 from unmix_plugin.viewer.painting import BACKGROUNDS, COLOUR_MAPS
 from unmix_plugin.viewer.view_transforms import VIEW_TRANSFORMS
@@ -29,6 +30,7 @@ def test_settings_are_always_valid(name, value):
     assert settings.view_transform in VIEW_TRANSFORMS
     assert all(math.isfinite(value) for value in (settings.wavelength_nm, *settings.false_colour_nm))
     assert 0 <= settings.endmember < 255
+    assert len(settings.index) <= 1000
     assert settings.value_range is None or settings.value_range[0] < settings.value_range[1]
 
 
@@ -39,6 +41,7 @@ def test_sound_values_are_taken_as_they_are():
         "wavelength_nm": 610.0,
         "false_colour_nm": (700.0, 600.0, 500.0),
         "endmember": 4,
+        "index": "(r800-r670)/(r800+r670)",
         "colour_map": "magma",
         "value_range": (-1.0, 2.0),
         "exposure_ev": -2.5,
@@ -55,3 +58,11 @@ def test_a_range_that_is_none_leaves_the_one_before():
     settings = LayerSettings().changed("value_range", (0.0, 2.0))
     for nonsense in ((2.0, 1.0), (math.nan, 1.0), "ab", 3, (1.0,)):
         assert settings.changed("value_range", nonsense).value_range == (0.0, 2.0)
+
+
+def test_a_formula_that_is_too_long_stays_too_long_rather_than_becoming_another_one():
+    cut = LayerSettings().changed("index", "r600" + " " * 900 + "+r650" * 400)
+    assert len(cut.index) == 1000 > MAX_LENGTH
+    kept = LayerSettings().changed("index", "r600" + " " * 2000 + "/ r650")
+    assert kept.index == "r600 / r650"
+    assert kept.changed("index", 3.0).index == "r600 / r650"

@@ -46,7 +46,7 @@ def aids(scene):
 
 def painted(frame, aids, layer, **settings) -> tuple[Any, Any]:
     """The picture of a layer, and its legend."""
-    return paint_layer(frame, replace(LayerSettings(layer=layer), **settings), aids)
+    return paint_layer(frame, replace(LayerSettings(layer=layer, index="r600/r500"), **settings), aids)
 
 
 def solid(frame):

@@ -1,5 +1,6 @@
 """The viewer as pages see it: over its own protocol, without a browser."""
 
+import html
 import io
 import math
 import socket
@@ -15,6 +16,8 @@ from PIL import Image
 from benchmarks._viewer_page import Page
 from tests.viewer.view_factory import make_source, no_scene
 from unmix_plugin.engine.training_control import TrainingControl
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.indices import available_indices
 from unmix_plugin.viewer.gate import MOST_CLIENTS
 from unmix_plugin.viewer.options import ViewerOptions
 from unmix_plugin.viewer.server import Viewer
@@ -99,6 +102,45 @@ def test_a_layer_that_cannot_be_shown_says_why(viewer):
         page.wait_until(lambda: "no error to show" in page.texts)
         assert "the scene has gone" in page.texts
         show_layer(page, "colour")
+
+
+def test_an_index_is_chosen_by_name_or_typed_as_a_formula_and_a_wrong_one_says_what_is_wrong(viewer):
+    with opened(viewer) as page:
+        names = page.controls[page.control("index")]["options"]
+        assert "pri" in names
+        assert "ndvi" not in names
+        first = show_layer(page, "spectral index")
+        page.set("index", "redness")
+        page.wait_until(lambda: "redness index of soils" in page.texts)
+        page.set("formula", " r650/r450 ")
+        page.wait_until(lambda: "formula r650/r450" in page.texts)
+        assert "of radiance: light unknown" in page.texts
+        for wrong, said in (
+            ("r650/(r450", "expected"),
+            ("r650/r900", "needs 900 nm"),
+            ("r650" + "+r650" * 300, "at most 500 characters"),
+            ("nvdi", "there is no index"),
+        ):
+            page.set("formula", wrong)
+            page.wait_until(lambda said=said: html.escape(said) in page.texts)
+        page.set("formula", "")
+        page.set("index", names[0])
+        page.wait_until(lambda: "characters" not in page.texts and "photochemical" in page.texts)
+        page.wait_until(lambda: np.abs(decoded(page.last_picture) - first).mean() < 3)
+
+
+def test_bands_that_no_named_index_takes_say_so_and_a_formula_is_shown(tmp_path):
+    source = make_source(tmp_path)
+    narrow = Bands.of([1000.0, 1010.0, 1020.0, 1030.0, 1040.0])
+    assert available_indices(narrow) == []
+    source._model.bands = narrow
+    source._model.metadata = {**source._model.metadata, "wavelengths_nm": narrow.centers_nm.tolist()}
+    with serving(source) as (viewer, _), opened(viewer) as page:
+        assert page.controls[page.control("index")]["options"] == ["none for these bands"]
+        page.set("layer", "spectral index")
+        page.wait_until(lambda: "type a formula of the wavelengths from 995 to 1045 nm" in page.texts)
+        page.set("formula", "r1040/r1000")
+        page.wait_until(lambda: "formula r1040/r1000" in page.texts)
 
 
 def test_a_click_is_a_probe_with_a_chart_and_bars(viewer):
@@ -292,7 +334,17 @@ def test_a_camera_that_is_none_harms_nobody(viewer, changes):
 
 @pytest.mark.parametrize(
     "label",
-    ["layer", "exposure (stops)", "low", "finest picture (rows)", "known material", "width", "brightness"],
+    [
+        "layer",
+        "index",
+        "formula",
+        "exposure (stops)",
+        "low",
+        "finest picture (rows)",
+        "known material",
+        "width",
+        "brightness",
+    ],
 )
 def test_values_that_no_control_would_send_harm_nobody(viewer, label):
     with opened(viewer) as page:

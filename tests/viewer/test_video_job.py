@@ -2,6 +2,7 @@
 
 import sys
 import threading
+from dataclasses import replace
 
 import pytest
 
@@ -16,7 +17,8 @@ from unmix_plugin.viewer.video_job import VideoJob, output_of, render_words
 def test_every_layer_that_renders_know_is_an_output_of_theirs(layer, source):
     from unmix_plugin.exports.render_outputs import choose_products
 
-    output = output_of(LayerSettings(layer=layer, wavelength_nm=500.0, false_colour_nm=(650.0, 550.0, 450.0)))
+    chosen = LayerSettings(wavelength_nm=500.0, false_colour_nm=(650.0, 550.0, 450.0), index="r650 / r500")
+    output = output_of(replace(chosen, layer=layer))
     products = choose_products((output,), ("mp4",), source._model.materials, True)
     assert [product.format for product in products] == ["mp4"]
 
@@ -24,6 +26,11 @@ def test_every_layer_that_renders_know_is_an_output_of_theirs(layer, source):
 def test_the_error_is_no_output():
     with pytest.raises(ConfigError, match="videos can't show the layer error"):
         output_of(LayerSettings(layer="error"))
+
+
+def test_an_index_that_is_not_chosen_is_no_output():
+    with pytest.raises(ConfigError, match="videos can't show the layer index"):
+        output_of(LayerSettings(layer="index"))
 
 
 def test_the_words_are_those_of_the_command(tmp_path):

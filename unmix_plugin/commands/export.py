@@ -38,6 +38,9 @@ PRODUCTS: tuple[Product, ...] = (
 )
 """All there is, with the defaults of its options."""
 
+_IN_THE_RUNS_BANDS = ("metamerism", "report", "spectrum")
+"""Products that compare with spectra and lights known in the run's own bands, and that no sensor can come between."""
+
 
 def export(words: list[str]) -> None:
     """Parse the words, write the product, say what is where.
@@ -46,7 +49,8 @@ def export(words: list[str]) -> None:
         RunError: the run is unusable, or the folder can't be written.
         ConfigError: files would be overwritten, options that don't fit the run or each other, the method does not unmix
             spectra, or the device is not there.
-        SpectrumError: a spectrum or a light that is unknown or does not cover the bands.
+        SpectrumError: a spectrum or a light that is unknown or does not cover the bands, or a sensor that sees nothing
+            in them.
     """
     choices = tyro.extras.subcommand_type_from_defaults(
         {product.name: product for product in PRODUCTS},
@@ -68,17 +72,30 @@ def _open(product: Product) -> Job:
 
     from unmix_plugin.commands.reporting import say, working
     from unmix_plugin.commands.run_choice import chosen_run
-    from unmix_plugin.exports.edited_run import light_note, load_edited_model
+    from unmix_plugin.exports.edited_run import light_note, load_edited_model, sensor_notes
 
+    _refuse_sensor(product)
     console = Console()
     path = chosen_run(product.run, product.output_dir)
     with working(console, f"reading {path}"):
-        loaded = load_edited_model(path, product.device, product.edits, product.illuminant)
+        loaded = load_edited_model(path, product.device, product.edits, product.illuminant, product.sensor)
     folder = (product.output or loaded.run.exports / product.name).resolve()
     note = light_note(loaded, product.edits, product.illuminant)
-    if note is not None:
-        say(console, note)
+    for line in (*([] if note is None else [note]), *sensor_notes(loaded, product.sensor)):
+        say(console, line)
     return Job(loaded, folder, product.overwrite, console)
+
+
+def _refuse_sensor(product: Product) -> None:
+    """Refuse a sensor where it would mix bands."""
+    from unmix_plugin.errors import ConfigError
+
+    if product.sensor is not None and product.name in _IN_THE_RUNS_BANDS:
+        able = ", ".join(one.name for one in PRODUCTS if one.name not in _IN_THE_RUNS_BANDS)
+        raise ConfigError(
+            f"{product.name} compares with what is known in the run's own bands and can't be seen through another "
+            f"sensor; leave out --sensor. It goes with {able}"
+        )
 
 
 def main() -> None:

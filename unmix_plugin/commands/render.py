@@ -35,8 +35,9 @@ class RenderOptions:
     """Only these of the cameras, by name or by number from 0."""
     outputs: tuple[str, ...] = ()
     """spectral, rgb, linear_rgb, diffuse, specular, abundances, material_scores, segmentation, confidence, depth,
-    ray_distance, normals, accumulation, pca, band:650nm, false-colour:860,650,550; or all. None given: spectral rgb
-    abundances segmentation depth for single views, rgb for a path."""
+    ray_distance, normals, accumulation, pca, band:650nm, false-colour:860,650,550; index:ndvi or
+    index:(r800-r670)/(r800+r670), target:paint.csv or target:ace:paint.csv>0.5; or all (but those with a colon). None
+    given: spectral rgb abundances segmentation depth for single views, rgb for a path."""
     formats: tuple[str, ...] = ()
     """envi, exr, npy, png, mp4; each output is written in those that suit it. None given: what suits each best. mp4 of
     spectra goes through the bands."""
@@ -52,6 +53,8 @@ class RenderOptions:
     """Recipe (YAML) of edits of materials and light to apply first."""
     illuminant: str | None = None
     """Light to show the scene under: D65, A, E, FL2, ... or a .csv file; None: the one it was taken under."""
+    sensor: Path | None = None
+    """CSV file (wavelength,NAME,...) of the spectral responses of another camera, to see the result with."""
     output: Path | None = None
     """Folder to write to; None: exports/render in the run folder."""
     output_dir: Path = Path("outputs")
@@ -70,7 +73,7 @@ def render(words: list[str]) -> None:
         ConfigError: cameras, outputs or formats that are not there or don't fit each other, a recipe that is wrong or
             does not fit the run, files that would be overwritten, a method that does not unmix spectra, or a device
             that is not there.
-        SpectrumError: a wavelength outside the bands, or a light that is unknown.
+        SpectrumError: a wavelength outside the bands, a light that is unknown, or a sensor that sees nothing in them.
     """
     options = tyro.cli(RenderOptions, prog="unmix-render", args=words)
     request = _camera_request(options)
@@ -79,7 +82,7 @@ def render(words: list[str]) -> None:
 
     from unmix_plugin.commands.reporting import say, working
     from unmix_plugin.commands.run_choice import chosen_run
-    from unmix_plugin.exports.edited_run import light_note, load_edited_model
+    from unmix_plugin.exports.edited_run import light_note, load_edited_model, sensor_notes
     from unmix_plugin.exports.render_cameras import choose_cameras
     from unmix_plugin.exports.render_outputs import choose_products, default_outputs
     from unmix_plugin.exports.run_materials import materials_of
@@ -87,11 +90,11 @@ def render(words: list[str]) -> None:
     console = Console()
     path = chosen_run(options.run, options.output_dir)
     with working(console, f"reading {path}"):
-        loaded = load_edited_model(path, options.device, options.edits, options.illuminant)
+        loaded = load_edited_model(path, options.device, options.edits, options.illuminant, options.sensor)
         cameras = choose_cameras(loaded.scene, request)
     note = light_note(loaded, options.edits, options.illuminant)
-    if note is not None:
-        say(console, note)
+    for line in (*([] if note is None else [note]), *sensor_notes(loaded, options.sensor)):
+        say(console, line)
     outputs = options.outputs or default_outputs(cameras.is_path)
     products = choose_products(outputs, options.formats, materials_of(loaded.model), cameras.is_path)
     _render(options, loaded, cameras, products, console)

@@ -31,6 +31,8 @@ class OptimizerConfig:
     """Step size at the end of training as a part of `lr`; 1 keeps it constant."""
     warmup_fraction: float = 0.0
     """Part of the training over which the step size rises linearly from 1 % of `lr`."""
+    weight_decay: float = 0.0
+    """Times the parameters, added to their gradient: draws what the data leaves open to 0."""
     max_gradient_norm: float | None = None
     """Gradients of the group longer than this are shortened to it."""
 
@@ -46,6 +48,7 @@ class OptimizerConfig:
             "eps > 0": self.eps > 0,
             "final_factor in (0, 1]": 0 < self.final_factor <= 1,
             "warmup_fraction in [0, 1)": 0 <= self.warmup_fraction < 1,
+            "weight_decay >= 0": self.weight_decay >= 0,
             "max_gradient_norm > 0": self.max_gradient_norm is None or self.max_gradient_norm > 0,
         }
         broken = [rule for rule, holds in rules.items() if not holds]
@@ -94,6 +97,7 @@ def build_optimizer(
             "lr": configs[name].lr,
             "betas": configs[name].betas,
             "eps": configs[name].eps,
+            "weight_decay": configs[name].weight_decay,
         }
         for name, params in param_groups.items()
         if params

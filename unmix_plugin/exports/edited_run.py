@@ -1,6 +1,7 @@
-"""A run with edits applied: what commands load for `--edits` and `--illuminant`.
+"""A run with edits applied: what commands load for `--edits`, `--illuminant` and `--sensor`.
 
-Without either it is the run as it is. A light given on the command line goes before that of the recipe.
+Without any of them it is the run as it is. A light given on the command line goes before that of the recipe; the sensor
+looks at what edits and light have made.
 """
 
 from __future__ import annotations
@@ -14,13 +15,16 @@ from jaxtyping import Float64
 from unmix_plugin.editing.apply import assumption_of_light, edit_model
 from unmix_plugin.editing.recipe import Light, Recipe
 from unmix_plugin.editing.seen import sample_seen
+from unmix_plugin.editing.simulated_sensor import with_sensor
 from unmix_plugin.editing.yaml_reading import read_recipe
 from unmix_plugin.engine.cameras import Cameras
-from unmix_plugin.engine.load_run import LoadedModel, load_model
+from unmix_plugin.engine.load_run import LoadedModel, load_model, read_scene_record
 from unmix_plugin.engine.model import Model
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.model import UnmixModel
+from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.illuminants import parse_light
+from unmix_plugin.spectral.sensor import read_sensor
 
 
 @dataclass(frozen=True)
@@ -35,28 +39,42 @@ class EditedModel:
 
 
 def load_edited_model(
-    path: Path, device: str = "auto", edits: Path | None = None, illuminant: str | None = None
+    path: Path,
+    device: str = "auto",
+    edits: Path | None = None,
+    illuminant: str | None = None,
+    sensor: Path | None = None,
 ) -> LoadedModel:
-    """A run's newest model as `engine.load_run.load_model` gives it, edited; its scene record has the new light.
+    """A run's newest model as `engine.load_run.load_model` gives it, edited; its scene record has the new light and the
+    sensor's wavelengths.
 
     Args:
         path: Run folder.
         device: Where to compute.
         edits: Recipe to apply.
         illuminant: Name of a light, or a CSV file (wavelength,power), to see the scene in.
+        sensor: CSV file (wavelength,NAME,...) of the spectral responses of another camera, to see the result with.
     Raises:
         RunError: the run is missing, half-written, damaged, or from a newer version.
         ConfigError: the recipe is wrong or does not fit the run, the method does not unmix spectra, or the device is
             not there.
-        SpectrumError: there is no such light.
+        SpectrumError: there is no such light, or the sensor is malformed or sees nothing in the run's bands.
     """
     recipe = requested_recipe(edits, illuminant)
+    camera = None if sensor is None else read_sensor(sensor)
     loaded = load_model(path, device)
-    if recipe is None:
+    edited = loaded.model
+    if recipe is not None:
+        edited = apply_recipe(edited, recipe, loaded.scene.train_cameras).model
+    if camera is not None:
+        if not isinstance(edited, UnmixModel):
+            raise ConfigError(f"{type(edited).__name__} has no spectra; leave out --sensor")
+        edited = with_sensor(edited, camera)[0]
+    if edited is loaded.model:
         return loaded
-    edited = apply_recipe(loaded.model, recipe, loaded.scene.train_cameras).model
-    metadata = {**loaded.scene.metadata, "illuminant": edited.metadata["illuminant"]}
-    return replace(loaded, model=edited, scene=replace(loaded.scene, metadata=metadata))
+    new = {key: edited.metadata[key] for key in ("wavelengths_nm", "illuminant")}
+    scene = replace(loaded.scene, metadata={**loaded.scene.metadata, **new})
+    return replace(loaded, model=edited, scene=scene)
 
 
 def requested_recipe(edits: Path | None, illuminant: str | None) -> Recipe | None:
@@ -111,3 +129,17 @@ def light_note(loaded: LoadedModel, edits: Path | None, illuminant: str | None) 
     if recipe is None:
         return None
     return assumption_of_light({"illuminant": loaded.scene.summary.get("illuminant")}, recipe)
+
+
+def sensor_notes(loaded: LoadedModel, sensor: Path | None) -> list[str]:
+    """What a command should say of the sensor that a run is seen through; nothing without one.
+
+    Args:
+        loaded: The run, seen through it or not: its bands are in its folder.
+        sensor: As `load_edited_model` takes it.
+    """
+    if sensor is None:
+        return []
+    bands = Bands.of(read_scene_record(loaded.run).metadata["wavelengths_nm"])
+    seen = read_sensor(sensor).seen_by(bands)
+    return [seen.description, *seen.notes]

@@ -60,11 +60,12 @@ class ColourScale:
 
 
 def paint(values: Float[np.ndarray, "H W"], scale: ColourScale) -> Picture:
-    """Values as colours of a scale."""
+    """Values as colours of a scale; undefined ones are the neutral grey."""
     from matplotlib import colormaps
 
     fraction = (values - scale.low) / (scale.high - scale.low)
-    return colormaps[scale.colour_map](np.clip(fraction, 0, 1))[..., :3]
+    colours = colormaps[scale.colour_map](np.clip(fraction, 0, 1))[..., :3]
+    return np.where(np.isnan(values)[..., None], NEUTRAL, colours)
 
 
 def over_neutral(picture: Picture, opacity: Float[np.ndarray, "H W"]) -> Picture:

@@ -8,6 +8,7 @@ Notation: `P` points.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ import torch
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.exports.cloud import plane_normals, stands_alone, thinned
 from unmix_plugin.exports.formats.ply import write_ply
+from unmix_plugin.exports.point_scores import PointScore
 from unmix_plugin.exports.seen_surface import SurfacePoints
 from unmix_plugin.exports.surface_looks import SurfaceLooks
 from unmix_plugin.exports.world_frame import directions_to_world
@@ -46,10 +48,15 @@ def require_count(num_points: int) -> int:
 
 
 def write_point_cloud(
-    folder: Path, points: SurfacePoints, num_points: int, materials: Materials, frame: Normalisation
+    folder: Path,
+    points: SurfacePoints,
+    num_points: int,
+    materials: Materials,
+    frame: Normalisation,
+    scores: Sequence[PointScore] = (),
 ) -> tuple[Path, int]:
     """Write `points.ply`, binary: x y z nx ny nz (float32, world), red green blue (uint8, sRGB of the diffuse
-    spectrum), material (uint8) and every abundance (float32).
+    spectrum), material (uint8), every abundance and every score (float32).
 
     Args:
         folder: Where to write; it is made.
@@ -57,10 +64,12 @@ def write_point_cloud(
         num_points: The most to write.
         materials: Of the model.
         frame: Of the run.
+        scores: More numbers for every point, of its diffuse spectrum, judged against the points of the cloud.
     Returns:
         The file, and how many points are in it.
     Raises:
         RunError: there is no point, or the disk is full or refuses.
+        SpectrumError: too few points to judge a target against, or all are alike.
     """
     points = points.select(torch.from_numpy(~stands_alone(points.positions.numpy())))
     if len(points) == 0:
@@ -78,6 +87,8 @@ def write_point_cloud(
         **{name: world[:, axis] for axis, name in enumerate("xyz")},
         **{f"n{name}": turned[:, axis] for axis, name in enumerate("xyz")},
         **looks.properties(),
+        **{score.property: score.values(kept.diffuse, materials.light) for score in scores},
     }
     comments = looks.comments("surface points of an unmix-nerf run")
+    comments += [score.comment(materials) for score in scores]
     return write_ply(point_cloud_path(folder), vertices, comments=comments), len(chosen)

@@ -34,6 +34,7 @@ from unmix_plugin.exports.render_pictures import Palette
 from unmix_plugin.exports.render_survey import Survey
 from unmix_plugin.exports.run_materials import materials_of
 from unmix_plugin.spectral.composition import OCCUPIED_ACCUMULATION
+from unmix_plugin.spectral.reflectance_maps import is_reflectance_map, seen_reflectance
 
 _PATH_FPS, _VIEWS_FPS = 24.0, 2.0
 """Frames a second of a path, and of views that don't follow each other."""
@@ -157,6 +158,16 @@ class RenderJob:
             spectra = rendered["spectral"]
             seen = (rendered["accumulation"] > OCCUPIED_ACCUMULATION)[..., None]
             rendered["pca"] = self._survey.pca(spectra.cpu()) * seen.cpu()
+        if self._survey.scores:
+            light = self._setting.materials.light
+            opacity = rendered["accumulation"].cpu()
+            reflectance = seen_reflectance(
+                rendered["spectral"].cpu(),
+                opacity,
+                None if light is None else light.cpu(),
+                OCCUPIED_ACCUMULATION,
+            )
+            rendered |= {name: score(reflectance) for name, score in self._survey.scores.items()}
         return {name: values.detach().cpu().numpy() for name, values in rendered.items()}
 
 
@@ -176,7 +187,7 @@ def product_paths(folder: Path, product: Product, cameras: RenderCameras) -> lis
 
 def _asked_of_model(products: Sequence[Product]) -> tuple[str, ...]:
     names = {product.output.name: None for product in products}
-    if "pca" in names:
-        names.pop("pca")
+    for name in [name for name in names if name == "pca" or is_reflectance_map(name)]:
+        names.pop(name)
         names["spectral"] = None
     return (*names, *(() if "accumulation" in names else ("accumulation",)))

@@ -6,6 +6,7 @@ Notation: `H x W` pixels, `B` bands, `K` endmembers.
 from __future__ import annotations
 
 import difflib
+import hashlib
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -15,12 +16,15 @@ import torch
 
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.composition import Coefficients, Materials, compose
+from unmix_plugin.spectral.reflectance_maps import is_reflectance_map, parse_reflectance_map
 
 Format = Literal["envi", "exr", "npy", "png", "mp4"]
 FORMATS: tuple[Format, ...] = ("envi", "exr", "npy", "png", "mp4")
 
+_LONGEST_FILE_NAME = 100
+
 EVERY_OUTPUT = "all"
-"""Stands for every output that takes no wavelengths."""
+"""Stands for every output that takes no argument."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +80,8 @@ _WITH_WAVELENGTHS: dict[str, tuple[OutputKind, str, str]] = {
     ),
 }
 
+_REFLECTANCE_EXAMPLES = {"index": "index:ndvi", "target": "target:paint.csv"}
+
 _REASONS = {
     ("spectra", "png"): "a PNG shows colours: ask for rgb, band:NMnm, false-colour:NM,NM,NM or pca",
     ("srgb", "exr"): "it is encoded for displays and EXR holds linear light: ask for linear_rgb",
@@ -97,12 +103,16 @@ class RenderOutput:
 
     @property
     def file_name(self) -> str:
-        """The name with whatever a file name had better not have replaced by `-`.
+        """The name with whatever a file name had better not have replaced by `-`, without folders of a target's file.
 
         >>> RenderOutput("false-colour:860,650,550", _COMPOSITE, "").file_name
         'false-colour-860-650-550'
         """
-        return re.sub(r"[^\w.+-]+", "-", self.name).strip("-.")
+        short = re.sub(r"[^:]*/", "", self.name) if self.name.startswith("target:") else self.name
+        plain = re.sub(r"[^\w.+-]+", "-", short).strip("-.")
+        if len(plain) <= _LONGEST_FILE_NAME:
+            return plain
+        return f"{plain[:_LONGEST_FILE_NAME]}-{hashlib.sha256(self.name.encode()).hexdigest()[:8]}"
 
 
 @dataclass(frozen=True)
@@ -162,11 +172,14 @@ def _output(name: str, materials: Materials) -> RenderOutput:
         kind, what = _NAMED[name]
         return RenderOutput(name, kind, what)
     prefix, _, argument = name.partition(":")
+    if is_reflectance_map(name):
+        return _reflectance_output(name, argument, materials)
     if prefix not in _WITH_WAVELENGTHS:
-        known = [*_NAMED, *_WITH_WAVELENGTHS, EVERY_OUTPUT]
+        known = [*_NAMED, *_WITH_WAVELENGTHS, *_REFLECTANCE_EXAMPLES, EVERY_OUTPUT]
         near = difflib.get_close_matches(prefix, known, n=3, cutoff=0.5)
         hint = f" (did you mean {' or '.join(near)}?)" if near else ""
         examples = [example for _, _, example in _WITH_WAVELENGTHS.values()]
+        examples += _REFLECTANCE_EXAMPLES.values()
         raise ConfigError(
             f"there is no output named {name!r}{hint}; known are {', '.join([*_NAMED, *examples, EVERY_OUTPUT])}"
         )
@@ -175,6 +188,15 @@ def _output(name: str, materials: Materials) -> RenderOutput:
         raise ConfigError(f"the output {prefix} needs wavelengths, as in {example}")
     compose(name, _nothing(materials), materials)
     return RenderOutput(name, kind, f"{what}: {argument}")
+
+
+def _reflectance_output(name: str, argument: str, materials: Materials) -> RenderOutput:
+    kind = name.partition(":")[0]
+    if not argument:
+        raise ConfigError(f"the output {kind} needs to know which, as in {_REFLECTANCE_EXAMPLES[kind]}")
+    what = parse_reflectance_map(name, materials.bands).what
+    caveat = "" if materials.light is not None else "; of radiance, since the scene's light is unknown"
+    return RenderOutput(name, _MAP, f"{what}{caveat}; NaN where undefined")
 
 
 def _nothing(materials: Materials) -> Coefficients:

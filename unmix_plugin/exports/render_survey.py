@@ -14,9 +14,16 @@ from unmix_plugin.engine.cameras import Cameras
 from unmix_plugin.engine.model import Model
 from unmix_plugin.exports.camera_paths import resized
 from unmix_plugin.exports.figures import ColourScale
+from unmix_plugin.exports.run_materials import materials_of
 from unmix_plugin.exports.run_views import RunView
 from unmix_plugin.spectral.composition import OCCUPIED_ACCUMULATION
 from unmix_plugin.spectral.pca import PcaColours
+from unmix_plugin.spectral.reflectance_maps import (
+    Score,
+    is_reflectance_map,
+    parse_reflectance_map,
+    seen_reflectance,
+)
 
 SURVEYED_OUTPUTS = {
     "depth": "depth along the viewing axis (model units)",
@@ -37,32 +44,57 @@ class Survey:
     """What all pictures of a render share."""
 
     scales: dict[str, ColourScale] = field(default_factory=dict)
-    """Colours of `SURVEYED_OUTPUTS`, as far as asked for."""
+    """Colours of `SURVEYED_OUTPUTS` and of indices and targets, as far as asked for."""
     pca: PcaColours | None = None
     """Colours of the output `pca`, if asked for."""
+    scores: dict[str, Score] = field(default_factory=dict)
+    """From reflectance to each index and target that is asked for."""
 
 
 def needs_survey(outputs: Collection[str]) -> bool:
     """Whether pictures of `outputs` share anything that has to be found out first."""
-    return "pca" in outputs or any(name in outputs for name in SURVEYED_OUTPUTS)
+    return "pca" in outputs or any(name in SURVEYED_OUTPUTS or is_reflectance_map(name) for name in outputs)
 
 
 def take_survey(model: Model, views: Sequence[RunView], outputs: Collection[str]) -> Survey:
     """Look at up to twelve views, evenly spread over all, and find what `outputs` of all views share."""
     ranged = [name for name in SURVEYED_OUTPUTS if name in outputs]
     seen = _seen(model, views, [*ranged, "spectral"])
+    scores, scales = _scores(model, seen, [name for name in outputs if is_reflectance_map(name)])
     return Survey(
-        {name: _scale(seen[name], SURVEYED_OUTPUTS[name]) for name in ranged},
+        {**{name: _scale(seen[name], SURVEYED_OUTPUTS[name]) for name in ranged}, **scales},
         PcaColours.fit(seen["spectral"]) if "pca" in outputs else None,
+        scores,
     )
+
+
+def _scores(
+    model: Model, seen: dict[str, Tensor], names: Sequence[str]
+) -> tuple[dict[str, Score], dict[str, ColourScale]]:
+    """How indices and targets are computed, judged against what is seen of the scene, and their colours."""
+    materials = materials_of(model)
+    light = None if materials.light is None else materials.light.cpu()
+    found = seen_reflectance(seen["spectral"], seen["accumulation"], light, OCCUPIED_ACCUMULATION)
+    scores: dict[str, Score] = {}
+    scales: dict[str, ColourScale] = {}
+    for name in names:
+        asked = parse_reflectance_map(name, materials.bands)
+        scores[name] = asked.fit(found)
+        if asked.usual_range is None:
+            values = scores[name](found)
+            scales[name] = _scale(values[values.isfinite()], asked.what)
+        else:
+            scales[name] = ColourScale("viridis", *asked.usual_range, asked.what)
+    return scores, scales
 
 
 def _seen(model: Model, views: Sequence[RunView], outputs: Sequence[str]) -> dict[str, Tensor]:
     """Outputs of the pixels in which something is, of all views looked at, on the CPU."""
     every = -(-len(views) // _MOST_VIEWS)
+    outputs = [*outputs, "accumulation"]
     found: dict[str, list[Tensor]] = {name: [] for name in outputs}
     for view in views[::every]:
-        rendered = model.get_outputs_for_camera(_small(view.camera), [*outputs, "accumulation"])
+        rendered = model.get_outputs_for_camera(_small(view.camera), outputs)
         occupied = rendered["accumulation"] > OCCUPIED_ACCUMULATION
         for name in outputs:
             found[name].append(rendered[name][occupied].cpu())

@@ -19,6 +19,11 @@ from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour import band_composite_matrix, linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.pca import PcaColours
+from unmix_plugin.spectral.reflectance_maps import (
+    is_reflectance_map,
+    parse_reflectance_map,
+    seen_reflectance,
+)
 from unmix_plugin.spectral.segmentation import material_ids, material_scores
 
 
@@ -81,6 +86,8 @@ class Materials:
     to the ray's spectrum."""
     names: tuple[str, ...] = ()
     """One for each endmember, distinct: what it is called in every file and figure. None given: `default_names`."""
+    light: Float[Tensor, "B"] | None = None
+    """Relative power of the light that the spectra are seen in; None where it is unknown."""
 
     def __post_init__(self) -> None:
         """Give names where there are none.
@@ -107,7 +114,12 @@ SPECTRUM_OUTPUTS = ("spectral", "diffuse", "specular")
 COLOUR_OUTPUTS = ("rgb", "linear_rgb", "pca")
 MATERIAL_OUTPUTS = ("abundances", "material_scores", "segmentation", "confidence")
 GEOMETRY_OUTPUTS = ("accumulation", "depth", "ray_distance")
-PARAMETRIC_OUTPUTS = ("band:<nm>", "false-colour:<red nm>,<green nm>,<blue nm>")
+PARAMETRIC_OUTPUTS = (
+    "band:<nm>",
+    "false-colour:<red nm>,<green nm>,<blue nm>",
+    "index:<name or formula>",
+    "target:<file.csv>",
+)
 OUTPUT_NAMES = (*SPECTRUM_OUTPUTS, *COLOUR_OUTPUTS, *MATERIAL_OUTPUTS, *GEOMETRY_OUTPUTS)
 
 OCCUPIED_ACCUMULATION = 0.5
@@ -118,7 +130,8 @@ def compose(name: str, coefficients: Coefficients, materials: Materials) -> Tens
     """One output of a render by its name.
 
     Args:
-        name: One of `OUTPUT_NAMES` but `depth`, which needs a camera, or `band:650nm`, `false-colour:860,650,550`.
+        name: One of `OUTPUT_NAMES` but `depth`, which needs a camera, or `band:650nm`, `false-colour:860,650,550`,
+            `index:ndvi`, `target:ace:paint.csv`.
         coefficients: What was composited along the rays.
         materials: The spectra to use.
     Returns:
@@ -126,9 +139,10 @@ def compose(name: str, coefficients: Coefficients, materials: Materials) -> Tens
         `pca` (*rays, 3) in [0, 1]; `abundances`, `material_scores` (*rays, K); `segmentation` (*rays) uint8, 255 where
         nothing is; `confidence` (*rays) in [0, 1]: lead of the largest share over the second; `accumulation`,
         `ray_distance` (*rays) in scene units, 0 where nothing is; `band:` (*rays); `false-colour:` (*rays, 3) in
-        [0, 1], not gamma-encoded.
+        [0, 1], not gamma-encoded; `index:`, `target:` (*rays), NaN where nothing is.
     Raises:
-        ConfigError: an unknown name, or a wavelength outside the bands.
+        ConfigError: an unknown name, or an argument that can't be read.
+        SpectrumError: a wavelength outside the bands.
     """
     kind, _, argument = name.partition(":")
     if kind == "band" and argument:
@@ -141,6 +155,8 @@ def compose(name: str, coefficients: Coefficients, materials: Materials) -> Tens
             )
         matrix = band_composite_matrix(materials.bands, (wavelengths[0], wavelengths[1], wavelengths[2]))
         return (spectral(coefficients, materials) @ matrix.to(coefficients.abundances)).clamp(0, 1)
+    if is_reflectance_map(name) and argument:
+        return _reflectance_map(name, coefficients, materials)
     if name not in _COMPOSERS:
         known = ", ".join((*OUTPUT_NAMES, *PARAMETRIC_OUTPUTS))
         raise ConfigError(f"there is no output named {name}; known: {known}")
@@ -150,6 +166,18 @@ def compose(name: str, coefficients: Coefficients, materials: Materials) -> Tens
 def spectral(coefficients: Coefficients, materials: Materials) -> Float[Tensor, "*rays B"]:
     """Spectra seen along the rays, on black."""
     return materials.diffuse(coefficients) + materials.specular(coefficients)
+
+
+def reflectance(coefficients: Coefficients, materials: Materials) -> Float[Tensor, "*rays B"]:
+    """Reflectance of what is seen, in the sense of `seen_reflectance`."""
+    spectra = spectral(coefficients, materials)
+    return seen_reflectance(spectra, coefficients.accumulation, materials.light, OCCUPIED_ACCUMULATION)
+
+
+def _reflectance_map(name: str, coefficients: Coefficients, materials: Materials) -> Float[Tensor, "*rays"]:
+    """An index, or a target's score against the other pixels of the same view."""
+    asked, seen = parse_reflectance_map(name, materials.bands), reflectance(coefficients, materials)
+    return asked.fit(seen[coefficients.accumulation >= OCCUPIED_ACCUMULATION])(seen)
 
 
 def _linear_rgb(coefficients: Coefficients, materials: Materials) -> Float[Tensor, "*rays 3"]:

@@ -17,7 +17,7 @@ from unmix_plugin.exports.run_materials import endmember_colours
 from unmix_plugin.spectral.composition import Materials
 from unmix_plugin.spectral.pca import PcaColours
 from unmix_plugin.viewer.frames import Frame
-from unmix_plugin.viewer.inputs import choice, number
+from unmix_plugin.viewer.inputs import choice, number, text
 from unmix_plugin.viewer.painting import BACKGROUNDS, COLOUR_MAPS
 from unmix_plugin.viewer.reference import Reference
 from unmix_plugin.viewer.view_transforms import VIEW_TRANSFORMS, ViewTransform
@@ -25,6 +25,8 @@ from unmix_plugin.viewer.view_transforms import VIEW_TRANSFORMS, ViewTransform
 EXPOSURE_BOUNDS, GAMMA_BOUNDS = (-8.0, 8.0), (0.2, 5.0)
 _WAVELENGTH_BOUNDS = (1.0, 1e5)
 _VALUE_BOUNDS = (-1e6, 1e6)
+_LONGEST_INDEX = 1000
+"""Letters that are kept: more than a formula may have, so that none becomes another one by being cut."""
 _MOST_REMEMBERED = 32
 _ValueT = TypeVar("_ValueT")
 
@@ -40,6 +42,8 @@ class LayerSettings:
     """Shown as red, green, blue by the layer `false-colour`."""
     endmember: int = 0
     """Of the layer `abundance`."""
+    index: str = ""
+    """Of the layer `index`: a name or a formula, as the output `index:` takes it; empty where none is chosen."""
     colour_map: str = "viridis"
     value_range: tuple[float, float] | None = None
     """Values at the ends of the colour map; None for the layer's own."""
@@ -82,6 +86,9 @@ _CHECKS: dict[str, Callable[[Any, Any], Any]] = {
     "wavelength_nm": lambda value, before: number(value, *_WAVELENGTH_BOUNDS, fallback=before),
     "false_colour_nm": _checked_wavelengths,
     "endmember": lambda value, before: int(number(value, 0, 254, fallback=before)),
+    "index": lambda value, before: (
+        " ".join(text(value).split())[:_LONGEST_INDEX] if isinstance(value, str) else before
+    ),
     "colour_map": lambda value, before: choice(value, COLOUR_MAPS, before),
     "value_range": _checked_range,
     "exposure_ev": lambda value, before: number(value, *EXPOSURE_BOUNDS, fallback=before),

@@ -21,6 +21,7 @@ from unmix_plugin.spectral.colour import band_composite_matrix, describe_colour,
 from unmix_plugin.spectral.composition import compose
 from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.viewer.frames import Frame
+from unmix_plugin.viewer.index_layer import paint_index
 from unmix_plugin.viewer.layer_settings import LayerAids, LayerSettings
 from unmix_plugin.viewer.painting import (
     ColourMapLegend,
@@ -47,7 +48,7 @@ class Layer:
     """What users read."""
     paint: Painter
     controls: frozenset[str]
-    """Which of `wavelength`, `false-colour`, `endmember`, `tone`, `scale` apply."""
+    """Which of `wavelength`, `false-colour`, `endmember`, `index`, `tone`, `scale` apply."""
 
 
 def paint_layer(frame: Frame, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
@@ -227,6 +228,7 @@ LAYERS: dict[str, Layer] = {
         Layer("rgb", "colour", _paint_colour(True, True), frozenset({_TONE})),
         Layer("false-colour", "false colour", _paint_false_colour, frozenset({_TONE, "false-colour"})),
         Layer("band", "one band", _paint_band, frozenset({_SCALE, "wavelength"})),
+        Layer("index", "spectral index", paint_index, frozenset({_SCALE, "index"})),
         Layer("abundance", "abundance of one endmember", _paint_abundance, frozenset({_SCALE, "endmember"})),
         Layer("abundances", "all abundances", _paint_abundances, frozenset()),
         Layer("segmentation", "segmentation", _paint_segmentation, frozenset()),

@@ -37,6 +37,8 @@ def output_of(settings: LayerSettings) -> str:
         return f"band:{settings.wavelength_nm:g}nm"
     if settings.layer == "false-colour":
         return "false-colour:" + ",".join(f"{value:g}" for value in settings.false_colour_nm)
+    if settings.layer == "index" and settings.index:
+        return f"index:{settings.index}"
     if settings.layer == "abundance":
         return "abundances"
     if settings.layer in _OUTPUTS:

@@ -41,6 +41,8 @@ class Product(ABC):
     """Recipe (YAML) of edits of materials and light to apply first."""
     illuminant: str | None = None
     """Light to show the scene under: D65, A, E, FL2, ... or a .csv file; None: the one it was taken under."""
+    sensor: Path | None = None
+    """CSV file (wavelength,NAME,...) of the spectral responses of another camera, to see the result with."""
     output_dir: Path = Path("outputs")
     """Folder in which to look for the newest run."""
     device: DeviceName = "auto"

@@ -6,6 +6,9 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.indices import available_indices
+from unmix_plugin.viewer.inputs import text
 from unmix_plugin.viewer.layer_settings import EXPOSURE_BOUNDS, GAMMA_BOUNDS, LayerSettings
 from unmix_plugin.viewer.layers import LAYERS, covered, layer_named
 from unmix_plugin.viewer.painting import BACKGROUNDS, COLOUR_MAPS
@@ -17,6 +20,7 @@ if TYPE_CHECKING:
 
 _TITLES = {layer.title: name for name, layer in LAYERS.items()}
 _TRANSFORMS = {title: name for name, title in VIEW_TRANSFORMS.items()}
+_NO_INDEX = "none for these bands"
 
 
 class LayerPanel:
@@ -39,6 +43,7 @@ class LayerPanel:
         self._add_false_colour(bands.centers_nm.tolist())
         self._endmember = self._gui.add_dropdown("endmember", materials.names)
         self._connect(self._endmember, "endmember", self._chosen_endmember, "endmember")
+        self._add_index(bands)
         self._add_scale()
         self._add_tone()
         background = self._gui.add_dropdown("background", tuple(BACKGROUNDS))
@@ -70,6 +75,23 @@ class LayerPanel:
     def _wavelength_slider(self, label: str, start: float) -> viser.GuiSliderHandle[float]:
         step = max((self._high_nm - self._low_nm) / 500, 0.01)
         return self._gui.add_slider(label, self._low_nm, self._high_nm, round(step, 2), start)
+
+    def _add_index(self, bands: Bands) -> None:
+        """The named indices that the bands allow, and a formula that goes before them."""
+        names = tuple(available_indices(bands))
+        known = self._gui.add_dropdown("index", names or (_NO_INDEX,))
+        formula = self._gui.add_text(
+            "formula",
+            "",
+            hint="Such as (r650-r550)/(r650+r550), where r650 is the reflectance at 650 nm; empty: the index above.",
+        )
+
+        def chosen() -> str:
+            return text(formula.value).strip() or (text(known.value) if names else "")
+
+        self._settings = self._settings.changed("index", chosen())
+        for control in (known, formula):
+            self._connect(control, "index", chosen, "index")
 
     def _add_scale(self) -> None:
         colour_map = self._gui.add_dropdown("colours", COLOUR_MAPS)

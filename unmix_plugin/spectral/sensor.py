@@ -1,0 +1,159 @@
+"""Another camera, simulated from its spectral response: what its channels would have measured of a spectrum.
+
+A channel measures the mean of the radiance weighted with its response, so a flat spectrum 1 is 1 in every channel. That
+is linear in the spectrum: one matrix for each sampling of it.
+
+Notation: `B` bands of the spectrum, `S` channels of the sensor, `N` wavelengths of its table. A response is relative,
+piecewise linear between the wavelengths of its table, and 0 outside.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from unmix_plugin.errors import SpectrumError
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.spectra_csv import SpectraTable, read_spectra_csv
+
+_MOST_UNSEEN = 0.01
+"""Largest part of a channel's response that may lie where there are no bands."""
+
+_CENTER_DECIMALS = 3
+"""Digits of a centre in nm: more would be noise of the integration, and the names of files' channels have to differ."""
+
+_SPAN = (0.005, 0.995)
+"""Parts of a response up to which the span of a channel reaches in messages."""
+
+
+@dataclass(frozen=True)
+class SensorBands:
+    """What a sensor makes of spectra on given bands."""
+
+    sensor: str
+    """Its name."""
+    matrix: Float64[np.ndarray, "B S"]
+    """`spectra @ matrix` are the channels' values; columns are not negative and sum to 1."""
+    bands: Bands
+    """Centres of the channels."""
+    names: tuple[str, ...]
+    """Of the channels, shortest wavelength first."""
+    notes: tuple[str, ...]
+    """A line for each channel that was left out, and why."""
+
+    @property
+    def description(self) -> str:
+        """A line that says which wavelength is which channel's."""
+        channels = zip(self.names, self.bands.centers_nm, strict=True)
+        return f"seen through {self.sensor}: " + ", ".join(f"{name} {nm:g} nm" for name, nm in channels)
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """Relative spectral responses of the channels of a camera."""
+
+    name: str
+    responses: SpectraTable
+    """A row for each channel; sorted by centre, in whatever order they were given."""
+
+    def __post_init__(self) -> None:
+        """Sort the channels.
+
+        Raises:
+            SpectrumError: a single wavelength, a channel that responds to nothing, or two with the same centre.
+        """
+        table = self.responses
+        if len(table.bands) < 2:
+            raise SpectrumError("a spectral response needs at least two wavelengths; found one")
+        for name, response in zip(table.names, table.spectra, strict=True):
+            if not response.max() > 0:
+                raise SpectrumError(f"channel '{name}' is zero at all wavelengths; leave its column out")
+        centers = self._mean_wavelengths(table)
+        order = np.argsort(centers, kind="stable")
+        for one, other in pairwise(order):
+            if centers[one] == centers[other]:
+                raise SpectrumError(
+                    f"channels '{table.names[one]}' and '{table.names[other]}' have the same centre, "
+                    f"{centers[one]:g} nm; bands are known by their wavelengths, so leave one of the columns out"
+                )
+        names = tuple(table.names[index] for index in order)
+        object.__setattr__(self, "responses", SpectraTable(table.bands, names, table.spectra[order]))
+
+    @cached_property
+    def bands(self) -> Bands:
+        """Centres of the channels: mean wavelength, weighted with the response."""
+        return Bands(self._mean_wavelengths(self.responses))
+
+    def seen_by(self, bands: Bands) -> SensorBands:
+        """The channels as means over the bands of a spectrum.
+
+        A band weighs as much as of the channel's response lies in its interval, so channels narrower than the bands
+        count too; they get what the band has. A channel of which more than 1 % lies where there are no bands is left
+        out.
+
+        Args:
+            bands: Of the spectra to be seen; their intervals say what is covered.
+        Raises:
+            SpectrumError: no channel is left.
+        """
+        in_bands = np.diff(self._responses_up_to(bands.edges_nm), axis=1)
+        seen = in_bands.sum(axis=1)
+        [total] = self._responses_up_to(self.responses.bands.centers_nm[-1:]).T
+        is_covered = seen >= (1 - _MOST_UNSEEN) * total
+        covered = f"the bands cover {bands.edges_nm[0]:g}-{bands.edges_nm[-1]:g} nm"
+        names = self.responses.names
+        left_out = [f"{names[s]} ({self._span(s)})" for s in np.flatnonzero(~is_covered).tolist()]
+        if not is_covered.any():
+            raise SpectrumError(f"the sensor '{self.name}' sees nothing: {covered}, {', '.join(left_out)}")
+        return SensorBands(
+            self.name,
+            (in_bands[is_covered] / seen[is_covered, None]).T,
+            Bands(self.bands.centers_nm[is_covered]),
+            tuple(name for name, covers in zip(names, is_covered, strict=True) if covers),
+            tuple(f"left out {channel}: {covered}" for channel in left_out),
+        )
+
+    @staticmethod
+    def _mean_wavelengths(table: SpectraTable) -> Float64[np.ndarray, " S"]:
+        nm, values = table.bands.centers_nm, table.spectra
+        low, high, steps = nm[:-1], nm[1:], np.diff(nm)
+        first, second = values[:, :-1], values[:, 1:]
+        # Exact: the integrand is quadratic in each piece.
+        moments = (low * (2 * first + second) + high * (first + 2 * second)) @ steps / 6
+        return np.round(moments / ((first + second) @ steps / 2), _CENTER_DECIMALS)
+
+    def _responses_up_to(self, wavelengths_nm: Float64[np.ndarray, " M"]) -> Float64[np.ndarray, "S M"]:
+        """Integral of each response up to each wavelength, exactly."""
+        table = self.responses.bands.centers_nm
+        wanted = wavelengths_nm.clip(table[0], table[-1])
+        nodes = np.union1d(table, wanted)
+        values = np.stack([np.interp(nodes, table, response) for response in self.responses.spectra])
+        areas = np.diff(nodes) * (values[:, 1:] + values[:, :-1]) / 2
+        integrals = np.concatenate([np.zeros((len(areas), 1)), np.cumsum(areas, axis=1)], axis=1)
+        return integrals[:, np.searchsorted(nodes, wanted)]
+
+    def _span(self, channel: int) -> str:
+        """From where to where a channel responds, for a message."""
+        table = self.responses.bands.centers_nm
+        wavelengths = np.linspace(table[0], table[-1], 2001)
+        integral = self._responses_up_to(wavelengths)[channel]
+        low, high = np.interp(np.array(_SPAN) * integral[-1], integral, wavelengths)
+        return f"{low:.0f}-{high:.0f} nm"
+
+
+def read_sensor(path: Path) -> Sensor:
+    """A sensor from a CSV file, `wavelength,NAME,NAME,...`, of relative spectral responses; its name is the file's.
+
+    Raises:
+        SpectrumError: as `spectra_csv.read_spectra_csv` and `Sensor`.
+    """
+    table = read_spectra_csv(path)
+    try:
+        return Sensor(path.stem, table)
+    except SpectrumError as error:
+        raise SpectrumError(f"{path}: {error}") from error
