@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from tests.scenes.scene_factory import make_scene
 from unmix_plugin.datamanager import HyperspectralDataManager, HyperspectralDataManagerConfig
 from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.scenes.demo_scene import make_demo_scene
@@ -131,3 +132,14 @@ def test_rays_a_pixel_grow_after_the_first_part_of_training_at_the_same_number_o
         assert len(bundle) == manager.get_train_rays_per_batch() == 64
         pixels.append(len(batch["spectra"]))
     assert pixels == [64, 64, 16, 16]
+
+
+def test_without_alpha_one_ray_a_pixel_has_to_do_for_longer(tmp_path):
+    closed = make_scene(tmp_path / "closed", alpha=False)
+    manager = make(closed.root, single_ray_until=0.2, open_single_ray_until=0.8)
+    (callback,) = manager.get_training_callbacks()
+    pixels = []
+    for progress in (0.0, 0.2, 0.79, 0.8):
+        callback.func(0, progress)
+        pixels.append(len(manager.next_train(0)[1]["spectra"]))
+    assert pixels == [64, 64, 64, 16]

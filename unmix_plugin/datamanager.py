@@ -47,6 +47,8 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
     """Rays cast through a pixel, along each of its edges; their mean is the pixel, in training and in rendering."""
     single_ray_until: float = 0.4
     """Part of the training in which one ray a pixel has to do: coarse shape needs many pixels, not exact ones."""
+    open_single_ray_until: float = 0.8
+    """The same in scenes without alpha, where coarse shape takes longer to find."""
     carving_resolution: int = 128
     """Cells along an edge of the grid in which space that the views show to be empty is carved away."""
     open_grid_resolution: int = 64
@@ -64,7 +66,8 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
             "train-num-rays-per-batch of at least 1": self.train_num_rays_per_batch >= 1,
             "eval-num-rays-per-batch of at least 1": self.eval_num_rays_per_batch >= 1,
             "subpixels of 1 to 8": 1 <= self.subpixels <= 8,
-            "single-ray-until in [0, 1]": 0 <= self.single_ray_until <= 1,
+            "single-ray-until and open-single-ray-until in [0, 1]": 0 <= self.single_ray_until <= 1
+            and 0 <= self.open_single_ray_until <= 1,
             "carving-resolution of 8 to 512": 8 <= self.carving_resolution <= 512,
             "open-grid-resolution of 8 to 512": 8 <= self.open_grid_resolution <= 512,
             "max-initial-pixels of at least 1": self.max_initial_pixels >= 1,
@@ -101,7 +104,7 @@ class HyperspectralDataManager(DataManager):
         self.eval_cameras = self.scene.cameras[list(self.scene.eval_indices)]
         self._device_cameras = self.train_cameras.to(device)
         self._num_rays = config.train_num_rays_per_batch
-        self._subpixels = 1 if config.single_ray_until > 0 else config.subpixels
+        self._choose_subpixels(step=0, progress=0.0)
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
         """Random valid pixels of the training views; the draw depends on (seed, step) only."""
@@ -189,7 +192,9 @@ class HyperspectralDataManager(DataManager):
         return max(1, num_rays // self._subpixels**2)
 
     def _choose_subpixels(self, step: int, progress: float) -> None:
-        self._subpixels = 1 if progress < self.options.single_ray_until else self.options.subpixels
+        options = self.options
+        until = options.single_ray_until if self.scene.has_alpha else options.open_single_ray_until
+        self._subpixels = 1 if progress < until else options.subpixels
 
     @property
     def _grid_resolution(self) -> int:
