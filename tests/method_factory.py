@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from unmix_plugin.engine.cameras import Cameras
 from unmix_plugin.engine.rays import RayBundle
 from unmix_plugin.engine.scene_box import SceneBox
 from unmix_plugin.field import UnmixFieldConfig
@@ -16,6 +17,14 @@ from unmix_plugin.renderer import RendererConfig
 
 NUM_BANDS = 5
 WAVELENGTHS_NM = [450.0, 500.0, 550.0, 600.0, 650.0]
+CAMERA = Cameras(
+    camera_to_world=torch.tensor([[[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4.0]]]),
+    focal_px=torch.tensor([[20.0, 20.0]]),
+    center_px=torch.tensor([[6.0, 5.0]]),
+    distortion=torch.zeros(1, 4),
+    width=12,
+    height=10,
+)
 BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 CONFIG = UnmixModelConfig(
     num_endmembers=3,

@@ -7,21 +7,11 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.method_factory import NUM_BANDS, WAVELENGTHS_NM, initial_data, make_model, make_rays
-from unmix_plugin.engine.cameras import Cameras
+from tests.method_factory import CAMERA, NUM_BANDS, WAVELENGTHS_NM, initial_data, make_model, make_rays
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.model import UnmixModel, UnmixModelConfig
 from unmix_plugin.renderer import _points
 from unmix_plugin.rendering.compositing import volume_weights_twin
-
-CAMERA = Cameras(
-    camera_to_world=torch.tensor([[[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4.0]]]),
-    focal_px=torch.tensor([[20.0, 20.0]]),
-    center_px=torch.tensor([[6.0, 5.0]]),
-    distortion=torch.zeros(1, 4),
-    width=12,
-    height=10,
-)
 
 
 def naive_spectra(model: UnmixModel, rays) -> torch.Tensor:

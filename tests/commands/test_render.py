@@ -1,7 +1,6 @@
 """`unmix-render`: that files are the model's, from any camera, edited or not, and that nothing is lost."""
 
 import json
-import os
 import shutil
 
 import imageio.v3 as iio
@@ -17,13 +16,7 @@ from unmix_plugin.commands.render import render
 from unmix_plugin.engine.load_run import load_model
 from unmix_plugin.exports.edited_run import load_edited_model
 
-
-@pytest.fixture(scope="module", autouse=True)
-def no_wait_for_the_disk():
-    """Many small files would otherwise be forced to disk one by one."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, "fsync", lambda _descriptor: None)
-        yield
+pytestmark = pytest.mark.usefixtures("no_wait_for_the_disk")
 
 
 def files(folder):

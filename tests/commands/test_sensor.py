@@ -1,6 +1,5 @@
 """`--sensor`: files have the sensor's bands, materials stay, and products that would mix bands refuse."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,8 @@ from unmix_plugin.scenes.demo_scene import make_demo_scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.sensor import read_sensor
 
+pytestmark = pytest.mark.usefixtures("no_wait_for_the_disk")
+
 RESPONSES = """wavelength,red,green,blue,nir
 430,0,0,1,0
 480,0,0.2,1,0
@@ -29,14 +30,6 @@ RESPONSES = """wavelength,red,green,blue,nir
 900,0,0,0,1
 950,0,0,0,1
 """
-
-
-@pytest.fixture(scope="module", autouse=True)
-def no_wait_for_the_disk():
-    """Many small files would otherwise be forced to disk one by one."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, "fsync", lambda _descriptor: None)
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -16,15 +16,9 @@ from unmix_plugin.exports.render_files import still_paths
 from unmix_plugin.exports.render_job import RenderJob, product_paths
 from unmix_plugin.exports.render_survey import Survey
 
+pytestmark = pytest.mark.usefixtures("no_wait_for_the_disk")
+
 NUMBERS = ["all", "band:550nm", "false-colour:650,550,450"]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def no_wait_for_the_disk():
-    """Hundreds of small files would otherwise be forced to disk one by one."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, "fsync", lambda _descriptor: None)
-        yield
 
 
 @pytest.fixture(scope="module")

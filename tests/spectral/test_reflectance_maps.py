@@ -5,22 +5,13 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.method_factory import WAVELENGTHS_NM, make_model
+from tests.method_factory import CAMERA, WAVELENGTHS_NM, make_model
 from unmix_plugin.editing.apply import relight
 from unmix_plugin.editing.recipe import Light
-from unmix_plugin.engine.cameras import Cameras
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.composition import reflectance
 from unmix_plugin.spectral.reflectance_maps import parse_reflectance_map, seen_reflectance
 
-CAMERA = Cameras(
-    camera_to_world=torch.tensor([[[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4.0]]]),
-    focal_px=torch.tensor([[20.0, 20.0]]),
-    center_px=torch.tensor([[6.0, 5.0]]),
-    distortion=torch.zeros(1, 4),
-    width=12,
-    height=10,
-)
 LIGHT = [0.5, 0.8, 1.0, 0.9, 0.6]
 INDEX = "index:(r650-r500)/(r650+r500)"
 
