@@ -72,7 +72,7 @@ def _open(product: Product) -> Job:
 
     from unmix_plugin.commands.reporting import say, working
     from unmix_plugin.commands.run_choice import chosen_run
-    from unmix_plugin.exports.edited_run import light_note, load_edited_model, sensor_notes
+    from unmix_plugin.exports.edited_run import edit_notes, load_edited_model
 
     _refuse_sensor(product)
     console = Console()
@@ -80,8 +80,7 @@ def _open(product: Product) -> Job:
     with working(console, f"reading {path}"):
         loaded = load_edited_model(path, product.device, product.edits, product.illuminant, product.sensor)
     folder = (product.output or loaded.run.exports / product.name).resolve()
-    note = light_note(loaded, product.edits, product.illuminant)
-    for line in (*([] if note is None else [note]), *sensor_notes(loaded, product.sensor)):
+    for line in edit_notes(loaded, product.edits, product.illuminant, product.sensor):
         say(console, line)
     return Job(loaded, folder, product.overwrite, console)
 

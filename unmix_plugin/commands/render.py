@@ -82,7 +82,7 @@ def render(words: list[str]) -> None:
 
     from unmix_plugin.commands.reporting import say, working
     from unmix_plugin.commands.run_choice import chosen_run
-    from unmix_plugin.exports.edited_run import light_note, load_edited_model, sensor_notes
+    from unmix_plugin.exports.edited_run import edit_notes, load_edited_model
     from unmix_plugin.exports.render_cameras import choose_cameras
     from unmix_plugin.exports.render_outputs import choose_products, default_outputs
     from unmix_plugin.exports.run_materials import materials_of
@@ -92,8 +92,7 @@ def render(words: list[str]) -> None:
     with working(console, f"reading {path}"):
         loaded = load_edited_model(path, options.device, options.edits, options.illuminant, options.sensor)
         cameras = choose_cameras(loaded.scene, request)
-    note = light_note(loaded, options.edits, options.illuminant)
-    for line in (*([] if note is None else [note]), *sensor_notes(loaded, options.sensor)):
+    for line in edit_notes(loaded, options.edits, options.illuminant, options.sensor):
         say(console, line)
     outputs = options.outputs or default_outputs(cameras.is_path)
     products = choose_products(outputs, options.formats, materials_of(loaded.model), cameras.is_path)

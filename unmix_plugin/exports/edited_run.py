@@ -131,6 +131,14 @@ def light_note(loaded: LoadedModel, edits: Path | None, illuminant: str | None) 
     return assumption_of_light({"illuminant": loaded.scene.summary.get("illuminant")}, recipe)
 
 
+def edit_notes(
+    loaded: LoadedModel, edits: Path | None, illuminant: str | None, sensor: Path | None
+) -> list[str]:
+    """All that a command should say of a run that was loaded with these."""
+    note = light_note(loaded, edits, illuminant)
+    return [*([] if note is None else [note]), *sensor_notes(loaded, sensor)]
+
+
 def sensor_notes(loaded: LoadedModel, sensor: Path | None) -> list[str]:
     """What a command should say of the sensor that a run is seen through; nothing without one.
 

@@ -49,7 +49,7 @@ class PointScore:
             SpectrumError: too few points to judge a target against, or all are alike.
         """
         opaque = torch.ones(len(diffuse), dtype=diffuse.dtype)
-        reflectance = seen_reflectance(diffuse, opaque, None if light is None else light.cpu(), 0.5)
+        reflectance = seen_reflectance(diffuse, opaque, light, 0.5)
         return self.map.fit(reflectance)(reflectance).numpy().astype(np.float32)
 
     def comment(self, materials: Materials) -> str:

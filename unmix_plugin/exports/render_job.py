@@ -33,8 +33,8 @@ from unmix_plugin.exports.render_outputs import Product
 from unmix_plugin.exports.render_pictures import Palette
 from unmix_plugin.exports.render_survey import Survey
 from unmix_plugin.exports.run_materials import materials_of
-from unmix_plugin.spectral.composition import OCCUPIED_ACCUMULATION
-from unmix_plugin.spectral.reflectance_maps import is_reflectance_map, seen_reflectance
+from unmix_plugin.spectral.composition import OCCUPIED_ACCUMULATION, reflectance_of
+from unmix_plugin.spectral.reflectance_maps import is_reflectance_map
 
 _PATH_FPS, _VIEWS_FPS = 24.0, 2.0
 """Frames a second of a path, and of views that don't follow each other."""
@@ -159,14 +159,8 @@ class RenderJob:
             seen = (rendered["accumulation"] > OCCUPIED_ACCUMULATION)[..., None]
             rendered["pca"] = self._survey.pca(spectra.cpu()) * seen.cpu()
         if self._survey.scores:
-            light = self._setting.materials.light
-            opacity = rendered["accumulation"].cpu()
-            reflectance = seen_reflectance(
-                rendered["spectral"].cpu(),
-                opacity,
-                None if light is None else light.cpu(),
-                OCCUPIED_ACCUMULATION,
-            )
+            spectra, opacity = rendered["spectral"].cpu(), rendered["accumulation"].cpu()
+            reflectance = reflectance_of(spectra, opacity, self._setting.materials)
             rendered |= {name: score(reflectance) for name, score in self._survey.scores.items()}
         return {name: values.detach().cpu().numpy() for name, values in rendered.items()}
 

@@ -16,13 +16,12 @@ from unmix_plugin.exports.camera_paths import resized
 from unmix_plugin.exports.figures import ColourScale
 from unmix_plugin.exports.run_materials import materials_of
 from unmix_plugin.exports.run_views import RunView
-from unmix_plugin.spectral.composition import OCCUPIED_ACCUMULATION
+from unmix_plugin.spectral.composition import OCCUPIED_ACCUMULATION, reflectance_of
 from unmix_plugin.spectral.pca import PcaColours
 from unmix_plugin.spectral.reflectance_maps import (
     Score,
     is_reflectance_map,
     parse_reflectance_map,
-    seen_reflectance,
 )
 
 SURVEYED_OUTPUTS = {
@@ -73,8 +72,7 @@ def _scores(
 ) -> tuple[dict[str, Score], dict[str, ColourScale]]:
     """How indices and targets are computed, judged against what is seen of the scene, and their colours."""
     materials = materials_of(model)
-    light = None if materials.light is None else materials.light.cpu()
-    found = seen_reflectance(seen["spectral"], seen["accumulation"], light, OCCUPIED_ACCUMULATION)
+    found = reflectance_of(seen["spectral"], seen["accumulation"], materials)
     scores: dict[str, Score] = {}
     scales: dict[str, ColourScale] = {}
     for name in names:

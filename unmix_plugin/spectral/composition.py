@@ -170,8 +170,14 @@ def spectral(coefficients: Coefficients, materials: Materials) -> Float[Tensor, 
 
 def reflectance(coefficients: Coefficients, materials: Materials) -> Float[Tensor, "*rays B"]:
     """Reflectance of what is seen, in the sense of `seen_reflectance`."""
-    spectra = spectral(coefficients, materials)
-    return seen_reflectance(spectra, coefficients.accumulation, materials.light, OCCUPIED_ACCUMULATION)
+    return reflectance_of(spectral(coefficients, materials), coefficients.accumulation, materials)
+
+
+def reflectance_of(
+    spectra: Float[Tensor, "*rays B"], opacity: Float[Tensor, "*rays"], materials: Materials
+) -> Float[Tensor, "*rays B"]:
+    """The same of spectra that are composed already, on any device."""
+    return seen_reflectance(spectra, opacity, materials.light, OCCUPIED_ACCUMULATION)
 
 
 def _reflectance_map(name: str, coefficients: Coefficients, materials: Materials) -> Float[Tensor, "*rays"]:

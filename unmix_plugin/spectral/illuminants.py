@@ -18,6 +18,7 @@ from jaxtyping import Float64
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour import colour_mode, xyz_matrix
+from unmix_plugin.spectral.integrals import integrals_up_to
 from unmix_plugin.spectral.spectra_csv import read_spectra_csv, resample_spectra
 
 _FORMULA_RANGE_NM = (250.0, 3000.0)
@@ -93,10 +94,7 @@ def _read(path: Path) -> tuple[Bands, Float64[np.ndarray, " N"]]:
 def _band_means(power: Float64[np.ndarray, " N"], source: Bands, bands: Bands) -> Float64[np.ndarray, " B"]:
     """Means of the piecewise linear function through the table over each band's interval, exactly."""
     edges = bands.edges_nm
-    nodes = np.union1d(source.centers_nm, edges)
-    values = np.interp(nodes, source.centers_nm, power)
-    areas = np.diff(nodes) * (values[1:] + values[:-1]) / 2
-    integrals = np.concatenate([[0.0], np.cumsum(areas)])[np.searchsorted(nodes, edges)]
+    [integrals] = integrals_up_to(edges, power[None], source.centers_nm)
     return np.diff(integrals) / np.diff(edges)
 
 

@@ -19,6 +19,7 @@ from jaxtyping import Float64
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.integrals import integrals_up_to
 from unmix_plugin.spectral.spectra_csv import SpectraTable, read_spectra_csv
 
 _MOST_UNSEEN = 0.01
@@ -128,14 +129,9 @@ class Sensor:
         return np.round(moments / ((first + second) @ steps / 2), _CENTER_DECIMALS)
 
     def _responses_up_to(self, wavelengths_nm: Float64[np.ndarray, " M"]) -> Float64[np.ndarray, "S M"]:
-        """Integral of each response up to each wavelength, exactly."""
+        """Integral of each response up to each wavelength, exactly; outside the table nothing is added."""
         table = self.responses.bands.centers_nm
-        wanted = wavelengths_nm.clip(table[0], table[-1])
-        nodes = np.union1d(table, wanted)
-        values = np.stack([np.interp(nodes, table, response) for response in self.responses.spectra])
-        areas = np.diff(nodes) * (values[:, 1:] + values[:, :-1]) / 2
-        integrals = np.concatenate([np.zeros((len(areas), 1)), np.cumsum(areas, axis=1)], axis=1)
-        return integrals[:, np.searchsorted(nodes, wanted)]
+        return integrals_up_to(wavelengths_nm.clip(table[0], table[-1]), self.responses.spectra, table)
 
     def _span(self, channel: int) -> str:
         """From where to where a channel responds, for a message."""

@@ -16,6 +16,7 @@ from unmix_plugin.spectral.indices import SpectralIndex, parse_index
 from unmix_plugin.viewer.frames import Frame
 from unmix_plugin.viewer.layer_settings import LayerAids, LayerSettings
 from unmix_plugin.viewer.painting import ColourMapLegend, Legend, Picture, over_background, paint_values
+from unmix_plugin.viewer.reference import percentile_range
 
 _CHUNK = 1 << 16
 """Pixels whose spectra are held at once."""
@@ -63,8 +64,4 @@ def _index_values(index: SpectralIndex, frame: Frame) -> Float[Tensor, "H W"]:
 def _seen_range(index: SpectralIndex, reference: Frame) -> tuple[float, float]:
     """From the 1st to the 99th percentile of the index of the reference rays."""
     values = index(reflectance(reference.coefficients, reference.materials))
-    values = values[values.isfinite()]
-    if len(values) == 0:
-        return (0.0, 1.0)
-    low, high = torch.quantile(values.float(), values.new_tensor([0.01, 0.99]).float()).tolist()
-    return (low, high if high > low + 1e-6 else low + 1.0)
+    return percentile_range(values[values.isfinite()])

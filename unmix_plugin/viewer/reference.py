@@ -6,6 +6,7 @@ Notation: `N` reference rays that end on something, `B` bands.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -37,11 +38,16 @@ class Reference:
 
     def range_of(self, values: Float[Tensor, "N"]) -> tuple[float, float]:
         """From 0, or the 1st percentile of values that may be negative, to the 99th percentile."""
-        if len(values) == 0:
-            return (0.0, 1.0)
-        low, high = torch.quantile(values.float(), values.new_tensor([0.01, 0.99])).tolist()
-        low = min(low, 0.0)
-        return (low, high if high > low + 1e-6 else low + 1.0)
+        return percentile_range(values, low_at_most=0.0)
+
+
+def percentile_range(values: Float[Tensor, "N"], low_at_most: float = math.inf) -> tuple[float, float]:
+    """From the 1st percentile, or `low_at_most` if that is less, to the 99th; never empty."""
+    if len(values) == 0:
+        return (0.0, 1.0)
+    low, high = torch.quantile(values.float(), values.new_tensor([0.01, 0.99]).float()).tolist()
+    low = min(low, low_at_most)
+    return (low, high if high > low + 1e-6 else low + 1.0)
 
 
 @torch.no_grad()
