@@ -31,7 +31,7 @@ CONFIG = UnmixModelConfig(
     field=UnmixFieldConfig(
         num_levels=2, coarsest_resolution=4, cells_per_pixel=0.34, log2_rows_per_level=10, hidden_width=16
     ),
-    renderer=RendererConfig(samples_per_pixel=1.0, smallest_weight=0.0),
+    renderer=RendererConfig(samples_per_pixel=1.0, smallest_weight=0.0, open_smallest_weight=0.0),
 )
 
 

@@ -64,7 +64,7 @@ def test_samples_without_weight_change_little_when_left_out():
 
     model, rays = make_model(), make_rays(40)
     everything = model.get_outputs(rays)["spectral"]
-    model.renderer.config = replace(CONFIG.renderer, smallest_weight=1e-3)
+    model.renderer.config = replace(CONFIG.renderer, smallest_weight=1e-3, open_smallest_weight=1e-3)
     assert_close(model.get_outputs(rays)["spectral"], everything, rtol=0, atol=0.04)
 
 

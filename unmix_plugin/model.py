@@ -188,6 +188,7 @@ class UnmixModel(Model):
             self.scene_box,
             pixel_size=metadata["pixel_size"],
             grid_resolution=metadata["grid_resolution"],
+            is_open=not metadata["has_alpha"],
             close_rays=config.background == "last",
         )
         self.field = UnmixField(

@@ -34,6 +34,8 @@ class RendererConfig:
     """Samples of a ray along the length of a pixel's edge where it meets the middle of the scene box."""
     smallest_weight: float = 4e-3
     """Samples that send less than this part of their ray's light to the camera are left out."""
+    open_smallest_weight: float = 1e-3
+    """The same in scenes without alpha, where matter has to be found far behind fog: a sample left out can't grow."""
     grid_update_interval: int = 16
     """Steps between updates of the occupancy grid."""
     grid_probed_cells: int = 32_768
@@ -67,6 +69,7 @@ class CoefficientRenderer(nn.Module):
         scene_box: SceneBox,
         pixel_size: float,
         grid_resolution: int,
+        is_open: bool,
         close_rays: bool,
     ) -> None:
         """
@@ -75,11 +78,12 @@ class CoefficientRenderer(nn.Module):
             scene_box: What is rendered, model space.
             pixel_size: Edge of a pixel in the middle of the scene, scene units.
             grid_resolution: Cells along an edge of the occupancy grid.
+            is_open: No hull of the objects is known.
             close_rays: The last sample of a ray takes all the light that is left.
         """
         super().__init__()
         self.config = config
-        self.close_rays = close_rays
+        self.is_open, self.close_rays = is_open, close_rays
         self.step = pixel_size / config.samples_per_pixel
         self.grid = OccupancyGrid(torch.ones((grid_resolution,) * 3, dtype=torch.bool))
         self.register_buffer("aabb", scene_box.aabb.clone(), persistent=False)
@@ -166,7 +170,8 @@ class CoefficientRenderer(nn.Module):
         """The samples that send enough of their ray's light to the camera, and their encodings."""
         encoded = field.encode(_points(samples, ray_bundle)[0])
         densities, _ = field.density_of(encoded)
-        keep = volume_weights(densities * self.step, samples.packed_info) > self.config.smallest_weight
+        smallest = self.config.open_smallest_weight if self.is_open else self.config.smallest_weight
+        keep = volume_weights(densities * self.step, samples.packed_info) > smallest
         return samples.select(keep), encoded.index_select(0, keep.nonzero()[:, 0])
 
 

@@ -61,7 +61,7 @@ class BallField(CoefficientField):
 
 def ball_model(has_wall: bool = False, **settings: Any) -> UnmixModel:
     """A model that renders the ball in steps of a hundredth."""
-    renderer = RendererConfig(samples_per_pixel=8.7, smallest_weight=0.0)
+    renderer = RendererConfig(samples_per_pixel=8.7, smallest_weight=0.0, open_smallest_weight=0.0)
     model = make_model(specular="none", renderer=renderer, **settings)
     model.field = BallField(has_wall)  # type: ignore[assignment]
     model.requires_grad_(False)
