@@ -306,6 +306,22 @@ def test_abundances_are_drawn_to_those_that_measured_spectra_show():
     assert_close(losses[1], 0.5 * 2.0, atol=1e-2, rtol=0)
 
 
+def test_the_guide_of_abundances_lets_go_of_them_as_training_goes_on():
+    model = make_model(abundance_loss_weight=0.5, abundance_loss_final_factor=0.01)
+    begin_step = model.get_training_callbacks()[0].func
+    batch = {"spectra": 0.5 * model.mixture_guide.endmembers, "alpha": torch.ones(3)}
+    outputs = {
+        "spectral": batch["spectra"],
+        "accumulation": torch.ones(3),
+        "abundances": torch.eye(3).roll(1, dims=1),
+    }
+    found = []
+    for progress in (0.0, 0.5, 1.0):
+        begin_step(1, progress)
+        found.append(float(model.get_loss_dict(outputs, batch)["abundances"]))
+    assert found == pytest.approx([1.0, 0.1, 0.01], rel=0.01)
+
+
 def test_an_automatic_number_of_endmembers_is_that_of_the_pixels_said_with_evidence():
     config, reasons = UnmixModelConfig(num_endmembers="auto").settled(initial_data)
     assert config.num_endmembers == 3

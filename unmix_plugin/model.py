@@ -93,6 +93,9 @@ class UnmixModelConfig(ModelConfig):
     abundance_loss_weight: float = 0.1
     """Weight of the mean squared distance of composited abundances to those of the measured spectra, unmixed one by
     one with the first endmembers; 0 as published."""
+    abundance_loss_final_factor: float = 0.03
+    """Factor on that weight at the end of training, reached exponentially: once materials are found, what is left of
+    their disagreement with single pixels would only hold spectra back."""
     mixing_penalty: float = 2.0
     """By how much a further material must improve the fit of such a spectrum, in multiples of the mean angle that
     mixtures of two leave unexplained."""
@@ -128,6 +131,7 @@ class UnmixModelConfig(ModelConfig):
             )
             >= 0,
             "haze-loss-until in (0, 1]": 0 < self.haze_loss_until <= 1,
+            "abundance-loss-final-factor in (0, 1]": 0 < self.abundance_loss_final_factor <= 1,
             "initial opacities in (0, 1)": 0 < self.initial_opacity < 1
             and 0 < self.initial_opacity_unknown < 1,
             "endmember-file exactly when endmember-init is file": (self.endmember_init == "file")
@@ -279,9 +283,12 @@ class UnmixModel(Model):
         if haze_weight > 0:
             losses["haze"] = haze_weight * outputs["haze"]
         if self.config.abundance_loss_weight > 0:
+            weight = (
+                self.config.abundance_loss_weight * self.config.abundance_loss_final_factor**self._progress
+            )
             abundances = _pixel_mean(outputs["abundances"], num_pixels)
             error = self.mixture_guide.error(abundances, batch["spectra"], batch["alpha"])
-            losses["abundances"] = self.config.abundance_loss_weight * error
+            losses["abundances"] = weight * error
         return losses
 
     def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:

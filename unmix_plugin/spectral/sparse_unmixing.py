@@ -15,7 +15,7 @@ from __future__ import annotations
 from math import comb
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 _MOST_MATERIALS = 3
@@ -35,18 +35,18 @@ def sparse_abundances(
         endmembers: Their brightness matters: a dark one must cover more than a bright one to send the same light.
         mixing_penalty: Sine of the angle by which each material beyond the first must improve the fit.
     """
-    shapes = torch.nn.functional.normalize(spectra, dim=1)
+    # Spectra are columns here: what is done to every choice then runs along memory.
     corners = torch.nn.functional.normalize(endmembers, dim=1)
-    cosines, gram = shapes @ corners.T, corners @ corners.T
-    smallest = torch.full_like(cosines[:, 0], torch.inf)
+    cosines, gram = corners @ torch.nn.functional.normalize(spectra, dim=1).T, corners @ corners.T
+    smallest = torch.full_like(cosines[0], torch.inf)
     shares = torch.zeros_like(cosines)
     for size in _sizes(len(endmembers)):
         choices = torch.combinations(torch.arange(len(endmembers), device=cosines.device), size)
         misfit, found = _best_choice(cosines, gram, choices)
         misfit = misfit + mixing_penalty * (size - 1)
-        shares = torch.where((misfit < smallest)[:, None], found, shares)
+        shares = torch.where(misfit < smallest, found, shares)
         smallest = torch.minimum(misfit, smallest)
-    covered = shares / endmembers.norm(dim=1).clamp(min=1e-6)
+    covered = shares.T / endmembers.norm(dim=1).clamp(min=1e-6)
     return covered / covered.sum(dim=1, keepdim=True).clamp(min=1e-9)
 
 
@@ -59,18 +59,18 @@ def _sizes(num_endmembers: int) -> list[int]:
 
 
 def _best_choice(
-    cosines: Float[Tensor, "N K"], gram: Float[Tensor, "K K"], choices: Tensor
-) -> tuple[Float[Tensor, " N"], Float[Tensor, "N K"]]:
-    """Sine of the angle to the best mixture of one of the choices (C, m) with positive shares, and its shares.
+    cosines: Float[Tensor, "K N"], gram: Float[Tensor, "K K"], choices: Int[Tensor, "C m"]
+) -> tuple[Float[Tensor, " N"], Float[Tensor, "K N"]]:
+    """Sine of the angle to the best mixture of one of the choices with positive shares, and its shares.
 
     Infinite where no choice has only positive shares.
     """
-    size = choices.shape[1]
+    num_choices, size = choices.shape
     among = gram[choices[:, :, None], choices[:, None, :]].double()
     inverse = torch.linalg.inv(among + _RIDGE * torch.eye(size, device=gram.device)).to(gram)
-    own = cosines[:, choices]
-    shares = torch.einsum("ncm,cml->ncl", own, inverse)
-    misfits = (1 - (shares * own).sum(dim=-1)).clamp(min=0).sqrt()
-    misfit, best = torch.where((shares > 0).all(dim=-1), misfits, torch.inf).min(dim=1)
-    chosen = shares.gather(1, best[:, None, None].expand(-1, 1, size))[:, 0].clamp(min=0)
-    return misfit, torch.zeros_like(cosines).scatter(1, choices[best], chosen)
+    own = cosines.index_select(0, choices.flatten()).view(num_choices, size, -1)
+    shares = inverse @ own
+    misfits = 1 - (shares * own).sum(dim=1)
+    misfit, best = misfits.masked_fill_(shares.amin(dim=1) <= 0, torch.inf).min(dim=0)
+    chosen = shares.gather(0, best.expand(1, size, -1))[0].clamp(min=0)
+    return misfit.clamp(min=0).sqrt(), torch.zeros_like(cosines).scatter(0, choices[best].T, chosen)
