@@ -1,4 +1,4 @@
-"""UnMix-NeRF: rays to coefficients to spectra, its losses, metrics and pictures.
+"""UnMix-NeRF: rays to coefficients to spectra, metrics and pictures.
 
 Notation: `R` rays, `B` bands, `K` endmembers, `J` specular coefficients. The renderer composites abundances, scaled
 abundances and specular coefficients; endmembers E and specular spectra D are applied once a ray:
@@ -47,11 +47,11 @@ from unmix_plugin.spectral.endmembers import (
     drop_uninformative_pixels,
     initialise_endmembers,
 )
-from unmix_plugin.spectral.losses import forgive_saturation, over_background, solid_evidence, srgb_error
 from unmix_plugin.spectral.metrics import psnr
 from unmix_plugin.spectral.mixture_guide import MixtureGuide
 from unmix_plugin.spectral.num_materials import propose_num_materials
 from unmix_plugin.spectral.spectra_csv import read_spectra_csv
+from unmix_plugin.training_losses import LossSettings, pixel_mean, training_losses
 
 _FEWEST_RAYS, _MOST_RAYS = 64, 8192
 _PIXELS_TO_COUNT_BY = 20_000
@@ -59,7 +59,7 @@ DEFAULT_OUTPUTS = ("spectral", "rgb", "abundances", "segmentation", "accumulatio
 
 
 @dataclass(frozen=True)
-class UnmixModelConfig(ModelConfig):
+class UnmixModelConfig(ModelConfig, LossSettings):
     """Settings of the model of UnMix-NeRF."""
 
     _target: Target = field(default_factory=lambda: UnmixModel)
@@ -75,30 +75,6 @@ class UnmixModelConfig(ModelConfig):
     """Spectra of the specular dictionary. The first is the light's, a highlight's colour on anything but metal."""
     segmentation: SegmentationMethod = "abundances"
     """Material of a ray: its largest abundance, or the endmember of smallest angle to its spectrum as published."""
-    background: Literal["auto", "random", "black", "white", "last"] = "auto"
-    """What lies behind the scene in training: a random grey a ray, black, white, or the colour of the last sample. Auto
-    is random where alpha says what is transparent, else black: random greys would reward fog before the cameras."""
-    spectral_loss_weight: float = 1.0
-    """Weight of the mean squared error of spectra."""
-    rgb_loss_weight: float = 0.0
-    """Weight of the mean squared error of their sRGB colours."""
-    opacity_loss_weight: float = 0.01
-    """Weight of the mean squared transparency in scenes without alpha, where pixels aren't dark: light comes from
-    something solid, but black may be the void."""
-    haze_loss_weight: float = 1e-3
-    """Weight at the start of training of matter spread along rays in scenes without alpha, where no hull keeps fog out;
-    falls to 0 at `haze_loss_until`."""
-    haze_loss_until: float = 0.25
-    """Part of the training in which haze is penalised: later it would thin out surfaces."""
-    abundance_loss_weight: float = 0.1
-    """Weight of the mean squared distance of composited abundances to those of the measured spectra, unmixed one by
-    one with the first endmembers; 0 as published."""
-    abundance_loss_final_factor: float = 0.03
-    """Factor on that weight at the end of training, reached exponentially: once materials are found, what is left of
-    their disagreement with single pixels would only hold spectra back."""
-    mixing_penalty: float = 2.0
-    """By how much a further material must improve the fit of such a spectrum, in multiples of the mean angle that
-    mixtures of two leave unexplained."""
     samples_per_step: int = 30_000
     """Samples marched in a training step; the number of rays adapts to it."""
     initial_opacity: float = 0.05
@@ -121,17 +97,7 @@ class UnmixModelConfig(ModelConfig):
             or 1 <= self.num_endmembers <= 255,
             "num-specular-spectra of at least 1": self.num_specular_spectra >= 1,
             "samples-per-step of at least 1": self.samples_per_step >= 1,
-            "loss weights and the mixing-penalty of at least 0": min(
-                self.spectral_loss_weight,
-                self.rgb_loss_weight,
-                self.opacity_loss_weight,
-                self.haze_loss_weight,
-                self.abundance_loss_weight,
-                self.mixing_penalty,
-            )
-            >= 0,
-            "haze-loss-until in (0, 1]": 0 < self.haze_loss_until <= 1,
-            "abundance-loss-final-factor in (0, 1]": 0 < self.abundance_loss_final_factor <= 1,
+            **self.loss_rules(),
             "initial opacities in (0, 1)": 0 < self.initial_opacity < 1
             and 0 < self.initial_opacity_unknown < 1,
             "endmember-file exactly when endmember-init is file": (self.endmember_init == "file")
@@ -265,35 +231,20 @@ class UnmixModel(Model):
         batch: dict[str, Tensor],
         metrics_dict: dict[str, Tensor] | None = None,
     ) -> dict[str, Tensor]:
-        """Weighted errors of spectra and, if asked, of their sRGB colours, over a common background."""
-        num_pixels = len(batch["spectra"])
-        spectra = _pixel_mean(outputs["spectral"], num_pixels)
-        opacities = _pixel_mean(outputs["accumulation"], num_pixels)
-        background = self._background(opacities)
-        target = over_background(batch["spectra"], batch["alpha"], background)
-        predicted = over_background(spectra, opacities, background)
-        predicted = forgive_saturation(predicted, target, batch["spectra"])
-        losses = {"spectral": self.config.spectral_loss_weight * (predicted - target).square().mean()}
-        if self.config.rgb_loss_weight > 0:
-            losses["rgb"] = self.config.rgb_loss_weight * srgb_error(predicted, target, self.rgb_weights)
-        if self.config.opacity_loss_weight > 0 and not self.metadata["has_alpha"]:
-            shown = solid_evidence(batch["spectra"])
-            losses["opacity"] = self.config.opacity_loss_weight * (shown * (1 - opacities).square()).mean()
-        haze_weight = self._haze_weight()
-        if haze_weight > 0:
-            losses["haze"] = haze_weight * outputs["haze"]
-        if self.config.abundance_loss_weight > 0:
-            weight = (
-                self.config.abundance_loss_weight * self.config.abundance_loss_final_factor**self._progress
-            )
-            abundances = _pixel_mean(outputs["abundances"], num_pixels)
-            error = self.mixture_guide.error(abundances, batch["spectra"], batch["alpha"])
-            losses["abundances"] = weight * error
-        return losses
+        """Weighted errors of spectra and what else training asks for, see training_losses.py."""
+        return training_losses(
+            self.config,
+            outputs,
+            batch,
+            has_alpha=self.metadata["has_alpha"],
+            progress=self._progress,
+            rgb_weights=self.rgb_weights,
+            guide=self.mixture_guide,
+        )
 
     def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """`psnr` of the batch in dB, on black."""
-        spectra = _pixel_mean(outputs["spectral"], len(batch["spectra"]))
+        spectra = pixel_mean(outputs["spectral"], len(batch["spectra"]))
         error = (spectra.detach().clamp(0, 1) - batch["spectra"]).square().mean()
         return {"psnr": -10 * torch.log10(error.clamp(min=1e-12))}
 
@@ -353,13 +304,6 @@ class UnmixModel(Model):
         self._progress = progress
         self.renderer.update_grid(self.field, step)
 
-    def _haze_weight(self) -> float:
-        """Weight of the haze now: none with alpha, else falling with the square of what is left of its time."""
-        if self.metadata["has_alpha"]:
-            return 0.0
-        left = max(1 - self._progress / self.config.haze_loss_until, 0.0)
-        return self.config.haze_loss_weight * left**2
-
     def num_samples(self, outputs: dict[str, Tensor]) -> int:
         """Samples marched for `outputs`."""
         return int(outputs["num_samples"])
@@ -400,13 +344,6 @@ class UnmixModel(Model):
             )
         return (torch.as_tensor(table.spectra, dtype=torch.float32) * lamp).clamp(0, 1)
 
-    def _background(self, accumulation: Float[Tensor, "R"]) -> Float[Tensor, "R 1"]:
-        shade = torch.zeros_like(accumulation)[:, None]
-        chosen = self.config.background
-        if chosen == "random" or (chosen == "auto" and self.metadata["has_alpha"]):
-            return torch.rand_like(shade)
-        return shade + 1 if chosen == "white" else shade
-
     def _depth(self, camera: Cameras, coefficients: Coefficients) -> Float[Tensor, "H W"]:
         bundle = camera.to(self.device).image_rays(0)
         forward = -camera.camera_to_world[0, :, 2].to(self.device)
@@ -428,8 +365,3 @@ class UnmixModel(Model):
     def _keep_spectra_physical(self, step: int, progress: float) -> None:
         self.endmembers.clamp_(0, 1)
         self.specular_spectra.clamp_(0, 1)
-
-
-def _pixel_mean(values: Float[Tensor, "S *channels"], num_pixels: int) -> Float[Tensor, "R *channels"]:
-    """Means over the rays cast through each pixel, which follow each other."""
-    return values.unflatten(0, (num_pixels, -1)).mean(dim=1)
