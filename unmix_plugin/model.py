@@ -210,6 +210,7 @@ class UnmixModel(Model):
             self.config.segmentation,
             self.endmember_names,
             None if light is None else self.endmembers.new_tensor(light),
+            self.mixture_guide.lead_error if self.config.abundance_loss_weight > 0 else None,
         )
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:

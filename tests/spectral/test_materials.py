@@ -1,4 +1,6 @@
-"""Names of endmembers, and colours of spectra beyond the sensor's full scale."""
+"""Names of endmembers, colours of spectra beyond the sensor's full scale, and confidence in materials."""
+
+from dataclasses import replace
 
 import pytest
 import torch
@@ -35,3 +37,25 @@ def test_a_band_beyond_full_scale_counts_in_the_colour_with_all_that_it_has():
     expected = (spectrum @ rgb_matrix(BANDS)).clamp(0, 1)
     assert_close(compose("linear_rgb", seen, materials(spectrum)), expected)
     assert not torch.allclose(expected, (spectrum.clamp(max=1) @ rgb_matrix(BANDS)).clamp(0, 1), atol=0.05)
+
+
+def shared(*shares, opacity=1.0):
+    """Rays of these abundances, one each."""
+    abundances = opacity * torch.tensor(shares)
+    accumulation = torch.full((len(shares),), opacity)
+    return Coefficients(accumulation, accumulation, abundances, abundances, torch.zeros(len(shares), 0))
+
+
+def test_confidence_is_how_probably_the_largest_share_is_so_in_truth():
+    spectra = torch.eye(3, 5)
+    known = replace(materials(spectra), lead_error=torch.tensor(0.2))
+    mixtures = ([0.4, 0.4, 0.2], [0.5, 0.3, 0.2], [0.1, 0.1, 0.8])
+    for opacity in (1.0, 0.7):
+        found = compose("confidence", shared(*mixtures, opacity=opacity), known)
+        assert found.tolist() == pytest.approx([0.5, 0.8413, 0.9998], abs=1e-3)
+    assert compose("confidence", shared(*mixtures, opacity=0.2), known).tolist() == [0, 0, 0]
+
+
+def test_confidence_without_known_errors_is_the_lead():
+    found = compose("confidence", shared([0.5, 0.3, 0.2], opacity=0.8), materials(torch.eye(3, 5)))
+    assert found.tolist() == pytest.approx([0.2])

@@ -52,3 +52,37 @@ def test_a_saved_guide_guides_as_before():
     )
     unmixed = sparse_abundances(measured, endmembers, float(guide.mixing_penalty))
     assert_close(other.error(unmixed, measured, torch.ones(50)), torch.tensor(0.0), atol=1e-9, rtol=0)
+
+
+def observed(guide, endmembers, deviation, steps=60, seed=6):
+    """The guide after steps in which leads are off by a normal error: shares of two materials, one too large."""
+    for step in range(steps):
+        generator = seeded(seed + step)
+        share = 0.5 + 0.4 * torch.rand(200, 1, generator=generator)
+        pure = torch.eye(4)[torch.randint(4, (200,), generator=generator)]
+        mixed = share * pure + (1 - share) * pure.roll(1, dims=1)
+        error = deviation / 2 * torch.randn(200, 1, generator=generator)
+        guide.error(mixed + error * (pure - pure.roll(1, dims=1)), 0.5 * mixed @ endmembers, torch.ones(200))
+    return guide
+
+
+def test_the_error_of_leads_is_what_field_and_pixels_differ_by_widened_for_what_both_get_wrong():
+    guide, endmembers = started()
+    assert guide.lead_error.isinf()
+    one_material = endmembers / endmembers.norm(dim=1, keepdim=True)  # then shares are those of light
+    guide.endmembers.copy_(one_material)
+    small = float(observed(guide, one_material, 0.02).lead_error)
+    assert abs(small - 2**0.5 * 0.02) < 0.005
+    assert float(observed(guide, one_material, 0.2, steps=300).lead_error) > 3 * small
+
+
+def test_rendering_a_view_does_not_change_what_is_known_of_errors():
+    guide, endmembers = started()
+    known = float(observed(guide, endmembers, 0.05, steps=3).lead_error)
+    assert float(observed(guide.eval(), endmembers, 0.5, steps=3).lead_error) == known
+
+
+def test_pixels_that_say_nothing_leave_the_error_of_leads_unknown():
+    guide, endmembers = started()
+    guide.error(torch.full((4, 4), 0.25), torch.zeros_like(endmembers), torch.ones(4))
+    assert guide.lead_error.isinf()

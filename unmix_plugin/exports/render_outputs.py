@@ -64,7 +64,7 @@ _NAMED: dict[str, tuple[OutputKind, str]] = {
     "abundances": (_SHARES, "abundances, summing to the opacity"),
     "material_scores": (_SHARES, "cosine of the spectrum to each endmember"),
     "segmentation": (_LABELS, "index of the material, 255 where nothing is"),
-    "confidence": (_MAP, "lead of the largest abundance over the second"),
+    "confidence": (_MAP, "estimated probability that the material is right"),
     "depth": (_MAP, "distance along the viewing axis in model units, 0 where nothing is"),
     "ray_distance": (_MAP, "distance along the ray in model units, 0 where nothing is"),
     "accumulation": (_MAP, "opacity, 0 to 1"),

@@ -29,7 +29,7 @@ from unmix_plugin.spectral.composition import Materials
 
 _FIXED_SCALES = {
     "accumulation": ColourScale("gray", 0.0, 1.0, "opacity"),
-    "confidence": ColourScale("viridis", 0.0, 1.0, "lead of the largest abundance"),
+    "confidence": ColourScale("viridis", 0.0, 1.0, "probability of the material"),
     "abundances": SHARE_SCALE,
     "material_scores": ColourScale("viridis", 0.0, 1.0, "cosine to the endmember"),
 }

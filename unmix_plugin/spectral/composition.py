@@ -88,6 +88,8 @@ class Materials:
     """One for each endmember, distinct: what it is called in every file and figure. None given: `default_names`."""
     light: Float[Tensor, "B"] | None = None
     """Relative power of the light that the spectra are seen in; None where it is unknown."""
+    lead_error: Float[Tensor, ""] | None = None
+    """Standard error of the lead of the largest abundance over the second; None where nothing says it."""
 
     def __post_init__(self) -> None:
         """Give names where there are none.
@@ -137,9 +139,9 @@ def compose(name: str, coefficients: Coefficients, materials: Materials) -> Tens
     Returns:
         `spectral`, `diffuse`, `specular` (*rays, B); `rgb` sRGB and `linear_rgb` (*rays, 3) in [0, 1];
         `pca` (*rays, 3) in [0, 1]; `abundances`, `material_scores` (*rays, K); `segmentation` (*rays) uint8, 255 where
-        nothing is; `confidence` (*rays) in [0, 1]: lead of the largest share over the second; `accumulation`,
-        `ray_distance` (*rays) in scene units, 0 where nothing is; `band:` (*rays); `false-colour:` (*rays, 3) in
-        [0, 1], not gamma-encoded; `index:`, `target:` (*rays), NaN where nothing is.
+        nothing is; `confidence` (*rays) in [0, 1]: estimated probability that the largest share is so in truth, 0 where
+        nothing is; `accumulation`, `ray_distance` (*rays) in scene units, 0 where nothing is; `band:` (*rays);
+        `false-colour:` (*rays, 3) in [0, 1], not gamma-encoded; `index:`, `target:` (*rays), NaN where nothing is.
     Raises:
         ConfigError: an unknown name, or an argument that can't be read.
         SpectrumError: a wavelength outside the bands.
@@ -209,11 +211,15 @@ def _segmentation(coefficients: Coefficients, materials: Materials) -> Tensor:
     return material_ids(scores, coefficients.accumulation, OCCUPIED_ACCUMULATION)
 
 
-def _confidence(coefficients: Coefficients, _: Materials) -> Float[Tensor, "*rays"]:
+def _confidence(coefficients: Coefficients, materials: Materials) -> Float[Tensor, "*rays"]:
+    """How probably the largest abundance is so in truth, its lead having a normal error; the lead if none is known."""
     if coefficients.abundances.shape[-1] == 1:
         return coefficients.accumulation
     largest = coefficients.abundances.topk(2, dim=-1).values
-    return largest[..., 0] - largest[..., 1]
+    lead = (largest[..., 0] - largest[..., 1]) / coefficients.accumulation.clamp(min=OCCUPIED_ACCUMULATION)
+    if materials.lead_error is not None:
+        lead = torch.special.ndtr(lead / materials.lead_error.clamp(min=1e-3))
+    return lead * (coefficients.accumulation > OCCUPIED_ACCUMULATION)
 
 
 def _ray_distance(coefficients: Coefficients, _: Materials) -> Float[Tensor, "*rays"]:

@@ -10,12 +10,20 @@ Notation: `R` pixels, `B` bands, `K` endmembers.
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from unmix_plugin.spectral.endmembers import drop_uninformative_pixels, shows_a_shape
 from unmix_plugin.spectral.sparse_unmixing import sparse_abundances
 from unmix_plugin.spectral.two_material_mixtures import mean_pair_distance
+
+_OBSERVED_PIXELS = 256
+"""Pixels of a batch by which the error of leads is followed."""
+_CLEAR_LEAD = 0.9
+"""Lead from which on a pixel is left out of that: nearly pure ones hardly err, and would hide what the others do."""
+_KEPT_A_STEP = 0.99
+_SHARED_ERROR = 2.0
+"""Variance of a lead's error in multiples of that of field against pixels: errors that both make aren't seen in it."""
 
 
 class MixtureGuide(nn.Module):
@@ -23,11 +31,13 @@ class MixtureGuide(nn.Module):
 
     endmembers: Tensor
     mixing_penalty: Tensor
+    lead_variance: Tensor
 
     def __init__(self, num_endmembers: int, num_bands: int) -> None:
         super().__init__()
         self.register_buffer("endmembers", torch.zeros(num_endmembers, num_bands))
         self.register_buffer("mixing_penalty", torch.zeros(()))
+        self.register_buffer("lead_variance", torch.full((), torch.inf))
 
     def start(
         self, pixels: Float[Tensor, "N B"], endmembers: Float[Tensor, "K B"], relative_penalty: float
@@ -53,5 +63,31 @@ class MixtureGuide(nn.Module):
             measured: Premultiplied by `alpha`.
         """
         mixtures = sparse_abundances(measured, self.endmembers, self.mixing_penalty)
+        if self.training:
+            few = slice(_OBSERVED_PIXELS)
+            self._follow_leads(
+                abundances[few].detach(), mixtures[few], shows_a_shape(measured[few]) & (alpha[few] > 0.99)
+            )
         distances = (abundances - alpha[:, None] * mixtures).square().sum(dim=1)
         return (shows_a_shape(measured) * distances).mean()
+
+    @property
+    def lead_error(self) -> Float[Tensor, ""]:
+        """Standard error of the lead of a ray's largest abundance over its second; infinite before any training."""
+        return (_SHARED_ERROR * self.lead_variance).sqrt()
+
+    def _follow_leads(
+        self, abundances: Float[Tensor, "R K"], mixtures: Float[Tensor, "R K"], counts: Bool[Tensor, "R"]
+    ) -> None:
+        """Take in by how much leads differ from those of the measured spectra, a moving mean of the squares."""
+        if abundances.shape[1] == 1:
+            return
+        leading = abundances.topk(2, dim=1)
+        leads = leading.values[:, 0] - leading.values[:, 1]
+        first, second = mixtures.gather(1, leading.indices).unbind(1)
+        counts = counts & (leads < _CLEAR_LEAD)
+        variance = (counts * (leads - first + second).square()).sum() / counts.sum().clamp(min=1)
+        moved = torch.where(
+            self.lead_variance.isinf(), variance, self.lead_variance.lerp(variance, 1 - _KEPT_A_STEP)
+        )
+        self.lead_variance.copy_(torch.where(counts.sum() > 0, moved, self.lead_variance))

@@ -137,10 +137,8 @@ def _paint_abundance(frame: Frame, settings: LayerSettings, _: LayerAids) -> tup
 
 
 def _paint_confidence(frame: Frame, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
-    values = compose("confidence", frame.coefficients, frame.materials)
-    return _paint_premultiplied(
-        values, frame, settings, (0.0, 1.0), "lead of the largest abundance over the second"
-    )
+    values = compose("confidence", frame.coefficients, frame.materials) * frame.coefficients.accumulation
+    return _paint_premultiplied(values, frame, settings, (0.0, 1.0), "estimated probability of the material")
 
 
 def _paint_abundances(frame: Frame, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
