@@ -4,6 +4,9 @@ A message says what, where (file, frame, band), found against expected, and what
 traceback and exit with status 2; anything else that escapes is our own defect and exits with status 1.
 """
 
+import difflib
+from collections.abc import Iterable
+
 
 class UnmixError(Exception):
     """Base of every error whose cause a user can mend."""
@@ -23,3 +26,13 @@ class ConfigError(UnmixError):
 
 class SpectrumError(UnmixError):
     """Spectra, wavelengths or endmembers do not fit each other or the request."""
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """A question for the end of a message that names what may have been meant; empty if nothing is near.
+
+    >>> did_you_mean("segmentaton", ["segmentation", "depth"])
+    'did you mean segmentation?'
+    """
+    near = difflib.get_close_matches(word, list(known), n=3, cutoff=0.6)
+    return f"did you mean {' or '.join(near)}?" if near else ""

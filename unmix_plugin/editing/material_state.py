@@ -5,7 +5,6 @@ Notation: `B` bands, `K` endmembers, `J` specular spectra.
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float64
 
 from unmix_plugin.editing.operations import Colour, Endmember
-from unmix_plugin.errors import ConfigError
+from unmix_plugin.errors import ConfigError, did_you_mean
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.composition import Coefficients, Materials
 
@@ -74,9 +73,10 @@ class MaterialState:
             raise ConfigError(f"there is no endmember {endmember}; the run has {self._listed()}")
         if endmember in self.names:
             return self.names.index(endmember)
-        near = difflib.get_close_matches(endmember, self.names, n=3, cutoff=0.6)
-        hint = f"did you mean {' or '.join(near)}? " if near else ""
-        raise ConfigError(f"there is no endmember {endmember!r}; {hint}the run has {self._listed()}")
+        hint = did_you_mean(endmember, self.names)
+        raise ConfigError(
+            f"there is no endmember {endmember!r}; {hint}{' ' if hint else ''}the run has {self._listed()}"
+        )
 
     def note(self, what: str, index: int, edit: str) -> None:
         """Remember that an edit did something to an endmember, which may be done once.

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Collection
 from typing import Any
 
 import yaml
+
+from unmix_plugin.errors import did_you_mean
 
 _MAX_CHARACTERS = 1_000_000
 
@@ -177,5 +178,4 @@ def describe(node: yaml.Node) -> str:
 
 def nearest(word: str, known: Collection[str]) -> str:
     """Words that a reader may have meant, for the end of a message."""
-    near = difflib.get_close_matches(word, known, n=3, cutoff=0.6)
-    return f"did you mean {' or '.join(near)}?" if near else f"known: {', '.join(known)}"
+    return did_you_mean(word, known) or f"known: {', '.join(known)}"

@@ -1,11 +1,10 @@
 """Finding methods: ours and any third party's, through entry points."""
 
-import difflib
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 
 from unmix_plugin.engine.configs import TrainerConfig
-from unmix_plugin.errors import ConfigError
+from unmix_plugin.errors import ConfigError, did_you_mean
 
 METHOD_GROUP = "unmix_plugin.method_configs"
 """Entry-point group; each entry names a `MethodSpecification`."""
@@ -60,8 +59,8 @@ def find_method(name: str) -> MethodSpecification:
     methods, broken = discover_methods()
     if name in methods:
         return methods[name]
-    near = difflib.get_close_matches(name, methods, n=3, cutoff=0.5)
-    lines = [f"unknown method {name!r}" + (f"; did you mean {' or '.join(near)}?" if near else "")]
+    question = did_you_mean(name, methods)
+    lines = [f"unknown method {name!r}" + (f"; {question}" if question else "")]
     lines.append(f"installed: {', '.join(sorted(methods)) or 'none'}")
     raise ConfigError("\n".join(lines + [str(plugin) for plugin in broken]))
 

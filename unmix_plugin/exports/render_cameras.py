@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from unmix_plugin.engine.cameras import Cameras
 from unmix_plugin.engine.load_run import SceneRecord
-from unmix_plugin.errors import ConfigError
+from unmix_plugin.errors import ConfigError, did_you_mean
 from unmix_plugin.exports.camera_files import read_camera_file
 from unmix_plugin.exports.camera_json import check_frames_per_second, check_size
 from unmix_plugin.exports.camera_paths import interpolated, orbit, resized
@@ -135,8 +134,8 @@ def _only(views: Sequence[RunView], wanted: Sequence[str]) -> tuple[RunView, ...
 
 def _near(word: str, known: Sequence[str]) -> str:
     """The nearest names, as part of a sentence."""
-    near = difflib.get_close_matches(word, known, n=3, cutoff=0.5)
-    return f" (did you mean {' or '.join(near)}?)" if near else ""
+    question = did_you_mean(word, known)
+    return f" ({question})" if question else ""
 
 
 def _size(size: tuple[int, int], request: CameraRequest) -> tuple[int, int]:

@@ -5,7 +5,6 @@ Notation: `H x W` pixels, `B` bands, `K` endmembers.
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import re
 from collections.abc import Iterable, Sequence
@@ -14,7 +13,7 @@ from typing import Literal
 
 import torch
 
-from unmix_plugin.errors import ConfigError
+from unmix_plugin.errors import ConfigError, did_you_mean
 from unmix_plugin.spectral.composition import Coefficients, Materials, compose
 from unmix_plugin.spectral.reflectance_maps import is_reflectance_map, parse_reflectance_map
 
@@ -176,8 +175,8 @@ def _output(name: str, materials: Materials) -> RenderOutput:
         return _reflectance_output(name, argument, materials)
     if prefix not in _WITH_WAVELENGTHS:
         known = [*_NAMED, *_WITH_WAVELENGTHS, *_REFLECTANCE_EXAMPLES, EVERY_OUTPUT]
-        near = difflib.get_close_matches(prefix, known, n=3, cutoff=0.5)
-        hint = f" (did you mean {' or '.join(near)}?)" if near else ""
+        question = did_you_mean(prefix, known)
+        hint = f" ({question})" if question else ""
         examples = [example for _, _, example in _WITH_WAVELENGTHS.values()]
         examples += _REFLECTANCE_EXAMPLES.values()
         raise ConfigError(
@@ -211,8 +210,8 @@ def _format(name: str) -> Format:
     for known in FORMATS:
         if name == known:
             return known
-    near = difflib.get_close_matches(name, FORMATS, n=2, cutoff=0.5)
-    hint = f" (did you mean {' or '.join(near)}?)" if near else ""
+    question = did_you_mean(name, FORMATS)
+    hint = f" ({question})" if question else ""
     raise ConfigError(f"there is no format {name!r}{hint}; known are {', '.join(FORMATS)}")
 
 

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from unmix_plugin.errors import ConfigError, SpectrumError
+from unmix_plugin.errors import ConfigError, SpectrumError, did_you_mean
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.detectors import Background, adaptive_coherence, is_defined, matched_filter
 from unmix_plugin.spectral.metrics import spectral_angle
@@ -204,9 +204,8 @@ def _chosen(name: str | None, table: SpectraTable, file: str) -> str:
         raise ConfigError(f"{file} has {len(table.names)} spectra; say which, as in {file}#NAME: {listed}")
     if name in table.names:
         return name
-    near = difflib.get_close_matches(name, table.names, n=3, cutoff=0.6)
-    hint = f"did you mean {' or '.join(near)}? " if near else ""
-    raise ConfigError(f"{file} has no spectrum {name!r}; {hint}it has {listed}")
+    hint = did_you_mean(name, table.names)
+    raise ConfigError(f"{file} has no spectrum {name!r}; {hint}{' ' if hint else ''}it has {listed}")
 
 
 def _validate(reflectance: np.ndarray, method: DetectionMethod, what: str) -> None:
