@@ -93,7 +93,7 @@ BAD = {
     "index of none": (["index"], [], "the output index needs to know which, as in index:ndvi"),
     "index beyond the bands": (["index:ndvi"], [], "ndvi needs .* nothing is extrapolated"),
     "target without file": (["target:"], [], "the output target needs to know which, as in target:paint.csv"),
-    "nearly an index": (["indx:ndvi"], [], "did you mean index\\?"),
+    "nearly an index": (["indx:ndvi"], [], "did you mean index or band"),
     "argument of none": (["rgb:1"], [], "no output named 'rgb:1'"),
     "band without wavelength": (["band"], [], "the output band needs wavelengths, as in band:650nm"),
     "band of no number": (["band:red"], [], "'red' in the output band:red is not a wavelength"),

@@ -63,13 +63,12 @@ class MixtureGuide(nn.Module):
             measured: Premultiplied by `alpha`.
         """
         mixtures = sparse_abundances(measured, self.endmembers, self.mixing_penalty)
+        speaks = shows_a_shape(measured)
         if self.training:
             few = slice(_OBSERVED_PIXELS)
-            self._follow_leads(
-                abundances[few].detach(), mixtures[few], shows_a_shape(measured[few]) & (alpha[few] > 0.99)
-            )
+            self._follow_leads(abundances[few].detach(), mixtures[few], speaks[few] & (alpha[few] > 0.99))
         distances = (abundances - alpha[:, None] * mixtures).square().sum(dim=1)
-        return (shows_a_shape(measured) * distances).mean()
+        return (speaks * distances).mean()
 
     @property
     def lead_error(self) -> Float[Tensor, ""]:

@@ -126,19 +126,21 @@ def _paint_band(frame: Frame, settings: LayerSettings, aids: LayerAids) -> tuple
     reference = aids.reference_frame(frame.materials)
     scale = aids.reference.range_of(_unpremultiplied(band_values(reference, band), reference)[:, 0])
     label = f"radiance at {bands.centers_nm[band]:.0f} nm"
-    return _paint_premultiplied(band_values(frame, band), frame, settings, scale, label)
+    return _paint_seen(
+        _unpremultiplied(band_values(frame, band), frame)[..., 0], frame, settings, scale, label
+    )
 
 
 def _paint_abundance(frame: Frame, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
     index = min(max(settings.endmember, 0), len(frame.materials.names) - 1)
-    values = frame.coefficients.abundances[..., index]
+    values = _unpremultiplied(frame.coefficients.abundances[..., index], frame)[..., 0]
     label = f"abundance of {frame.materials.names[index]}"
-    return _paint_premultiplied(values, frame, settings, (0.0, 1.0), label)
+    return _paint_seen(values, frame, settings, (0.0, 1.0), label)
 
 
 def _paint_confidence(frame: Frame, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
-    values = compose("confidence", frame.coefficients, frame.materials) * frame.coefficients.accumulation
-    return _paint_premultiplied(values, frame, settings, (0.0, 1.0), "estimated probability of the material")
+    values = compose("confidence", frame.coefficients, frame.materials)
+    return _paint_seen(values, frame, settings, (0.0, 1.0), "estimated probability of the material")
 
 
 def _paint_abundances(frame: Frame, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
@@ -188,16 +190,16 @@ def _paint_error(frame: Frame, settings: LayerSettings, aids: LayerAids) -> tupl
     return over_background(picture, is_known.to(picture.dtype), settings), legend
 
 
-def _paint_premultiplied(
+def _paint_seen(
     values: Float[Tensor, "H W"],
     frame: Frame,
     settings: LayerSettings,
     scale: tuple[float, float],
     label: str,
 ) -> tuple[Picture, Legend]:
-    """Values seen on black in the colours of a scale, as if what is seen were opaque, over the background."""
+    """Values of what is seen in the colours of a scale, over the background."""
     shown = settings.value_range or scale
-    picture = paint_values(_unpremultiplied(values, frame)[..., 0], shown, settings.colour_map)
+    picture = paint_values(values, shown, settings.colour_map)
     legend = ColourMapLegend(settings.colour_map, *shown, label)
     return over_background(picture, frame.coefficients.accumulation, settings), legend
 
