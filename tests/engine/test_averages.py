@@ -8,6 +8,7 @@ from rich.console import Console
 from torch import nn
 
 from unmix_plugin.engine.averages import ParameterAverage
+from unmix_plugin.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.load_run import load_model
 from unmix_plugin.engine.trainer import Trainer
@@ -38,9 +39,25 @@ def test_an_interval_of_two_updates_at_every_second_step_with_the_decay_squared(
     module = nn.Linear(1, 1, bias=False)
     average = ParameterAverage(module, decay=0.9, interval=2)
     assert average.decay == 0.9**2
-    for step in range(1, 6):
+    average.update(1)
+    average.update(2)
+    before = average.updates
+    for step in range(3, 8):
         average.update(step)
-    assert average.updates == 2
+    assert average.updates - before == 2
+
+
+def test_the_steps_of_the_first_interval_are_each_taken_in_so_that_a_short_training_shows():
+    module = nn.Linear(1, 1, bias=False)
+    with torch.no_grad():
+        module.weight.fill_(0.0)
+    average = ParameterAverage(module, decay=0.99, interval=8)
+    with torch.no_grad():
+        module.weight.fill_(1.0)
+    for step in range(1, 4):
+        average.update(step)
+    assert average.updates == 3
+    assert average.values["weight"].item() > 0.95
 
 
 def test_swapping_in_shows_the_average_and_gives_the_parameters_back():
@@ -67,3 +84,19 @@ def test_a_run_with_an_average_is_evaluated_and_loaded_with_it(short_config: Tra
     line = trainer.run.metrics_path.read_text().splitlines()[-1]
     with trainer.average.swapped_in():
         assert f'"psnr": {trainer.pipeline.get_average_eval_image_metrics()["psnr"]}' in line
+
+
+def test_the_average_takes_parameters_as_callbacks_after_the_step_leave_them(short_config: TrainerConfig):
+    trainer = Trainer(
+        replace(short_config, average_decay=0.0, average_interval=1), console=Console(file=io.StringIO())
+    )
+    grid = dict(trainer.pipeline.model.named_parameters())["field.grid"]
+
+    def bound(step: int, progress: float) -> None:  # noqa: ARG001
+        with torch.no_grad():
+            grid.clamp_(-1e-6, 1e-6)
+
+    trainer.callbacks.append(TrainingCallback(TrainingCallbackLocation.AFTER_TRAIN_ITERATION, bound))
+    trainer.train()
+    assert trainer.average is not None
+    assert torch.equal(trainer.average.values["field.grid"], grid)

@@ -2,8 +2,10 @@ import torch
 from torch.testing import assert_close
 
 from tests.spectral.mixtures import seeded, smooth_endmembers
+from unmix_plugin.spectral.endmembers import drop_uninformative_pixels
 from unmix_plugin.spectral.mixture_guide import MixtureGuide
 from unmix_plugin.spectral.sparse_unmixing import sparse_abundances
+from unmix_plugin.spectral.two_material_mixtures import mean_pair_distance
 
 
 def started(noise=0.0):
@@ -39,6 +41,21 @@ def test_black_and_saturated_pixels_say_nothing():
 def test_what_pairs_leave_unexplained_sets_the_penalty_of_further_materials():
     assert float(started()[0].mixing_penalty) < 1e-3
     assert float(started(noise=0.2)[0].mixing_penalty) > float(started(noise=0.05)[0].mixing_penalty) > 1e-3
+
+
+def test_the_penalty_grows_with_the_square_of_what_is_unexplained_and_then_in_proportion():
+    endmembers = smooth_endmembers(4).float() * 0.8
+    off = torch.rand(120, endmembers.shape[1], generator=seeded(0))
+    seen = []
+    for noise in (0.01, 0.02, 0.4):
+        pixels = torch.eye(4).repeat(30, 1) @ endmembers + noise * off
+        angle = mean_pair_distance(drop_uninformative_pixels(pixels), endmembers)
+        seen.append(angle)
+        guide = MixtureGuide(4, endmembers.shape[1])
+        guide.start(pixels, endmembers, 2.0)
+        expected = 100 * angle**2 if angle < 0.03 else 3 * angle
+        assert_close(float(guide.mixing_penalty), expected, rtol=1e-4, atol=0)
+    assert seen[0] < seen[1] < 0.03 < seen[2]
 
 
 def test_a_saved_guide_guides_as_before():

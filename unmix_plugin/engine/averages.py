@@ -11,7 +11,8 @@ class ParameterAverage:
     """Exponential moving average of a module's trained parameters.
 
     The average over the first steps is plain: the part of itself that it keeps rises as (1 + n) / (10 + n) with the
-    number n of updates until it reaches the decay asked for, so that the first values do not linger.
+    number n of updates until it reaches the decay asked for, so that the first values do not linger. The steps of the
+    first interval are each taken in, so that a training of few steps isn't shown as it began.
     """
 
     def __init__(self, module: nn.Module, decay: float, interval: int = 1) -> None:
@@ -20,7 +21,7 @@ class ParameterAverage:
         Args:
             module: Whose parameters to follow.
             decay: Part of itself that the average keeps a step, in [0, 1).
-            interval: Steps between updates; each then counts for so many steps.
+            interval: Steps between updates after the first interval; each then counts for so many steps.
         """
         self.interval = interval
         self.decay = decay**interval
@@ -30,8 +31,8 @@ class ParameterAverage:
 
     @torch.no_grad()
     def update(self, step: int) -> None:
-        """Take in the parameters after `step` steps, if that is a multiple of the interval."""
-        if step % self.interval != 0:
+        """Take in the parameters after `step` steps, if that is a multiple of the interval or none has passed yet."""
+        if step > self.interval and step % self.interval != 0:
             return
         self.updates += 1
         decay = min(self.decay, (1 + self.updates) / (10 + self.updates))

@@ -52,7 +52,8 @@ class TrainerConfig:
     average_decay: float | None = None
     """Evaluate and render with a moving average of the parameters that keeps this part of itself each step."""
     average_interval: int = 8
-    """Update that average every so many steps; each update costs about as much as one of the optimiser."""
+    """Update that average every so many steps, after the first so many; an update costs about as much as one of the
+    optimiser."""
     load_run: Path | None = None
     """Run folder to continue instead of starting a new one."""
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)

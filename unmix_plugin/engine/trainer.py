@@ -218,9 +218,9 @@ class Trainer:
                 self.log.write(f"step {step} skipped: non-finite loss ({loss:g}) or gradient")
             self.step += 1
             self.total_rays += num_rays
-            if self.average is not None:
-                self.average.update(self.step)
             run_callbacks(self.callbacks, TrainingCallbackLocation.AFTER_TRAIN_ITERATION, step, progress)
+            if self.average is not None:
+                self.average.update(self.step)  # after the callbacks, which keep parameters in their bounds
             next_num_rays = self.pipeline.model.next_num_rays(outputs, num_rays)
             if next_num_rays is not None:
                 datamanager.set_train_rays_per_batch(next_num_rays)

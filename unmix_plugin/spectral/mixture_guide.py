@@ -17,6 +17,11 @@ from unmix_plugin.spectral.endmembers import drop_uninformative_pixels, shows_a_
 from unmix_plugin.spectral.sparse_unmixing import sparse_abundances
 from unmix_plugin.spectral.two_material_mixtures import mean_pair_distance
 
+_PLAIN_UNEXPLAINED = 0.02
+"""Mean angle that mixtures of two leave in scenes of little coloured light, of that order; there the mixing penalty is
+so many angles as asked for."""
+_MOST_STRICT = 1.5
+"""Largest factor on that number where light is more coloured; noise too leaves angles, and is no light."""
 _OBSERVED_PIXELS = 256
 """Pixels of a batch by which the error of leads is followed."""
 _CLEAR_LEAD = 0.9
@@ -46,12 +51,14 @@ class MixtureGuide(nn.Module):
 
         Args:
             pixels: Spectra of all training views.
-            relative_penalty: The mixing penalty in multiples of the mean angle that mixtures of two materials leave
-                unexplained: where light is coloured by what it met before, that angle and the penalty are larger.
+            relative_penalty: The mixing penalty where mixtures of two materials leave a mean angle of 0.02 unexplained,
+                in multiples of it. It grows with the square of the angle, up to 0.03, and then in proportion: light
+                that is coloured by what it met before leaves more, and makes more mixtures that are none.
         """
         self.endmembers.copy_(endmembers)
         unexplained = mean_pair_distance(drop_uninformative_pixels(pixels), endmembers.to(pixels))
-        self.mixing_penalty.fill_(relative_penalty * unexplained)
+        strictness = min(unexplained / _PLAIN_UNEXPLAINED, _MOST_STRICT)
+        self.mixing_penalty.fill_(relative_penalty * strictness * unexplained)
 
     def error(
         self, abundances: Float[Tensor, "R K"], measured: Float[Tensor, "R B"], alpha: Float[Tensor, "R"]
