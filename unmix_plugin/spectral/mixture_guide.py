@@ -18,10 +18,10 @@ from unmix_plugin.spectral.sparse_unmixing import sparse_abundances
 from unmix_plugin.spectral.two_material_mixtures import mean_pair_distance
 
 _PLAIN_UNEXPLAINED = 0.02
-"""Mean angle that mixtures of two leave in scenes of little coloured light, of that order; there the mixing penalty is
-so many angles as asked for."""
+"""Mean angle, in radians, at which the mixing penalty is as many such angles as asked for. Of three scenes, two of
+little coloured light leave 0.014 and 0.015, one whose walls colour each other 0.029."""
 _MOST_STRICT = 1.5
-"""Largest factor on that number where light is more coloured; noise too leaves angles, and is no light."""
+"""Largest factor on that number: noise leaves angles too, and is no coloured light."""
 _OBSERVED_PIXELS = 256
 """Pixels of a batch by which the error of leads is followed."""
 _CLEAR_LEAD = 0.9
