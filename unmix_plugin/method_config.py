@@ -14,16 +14,17 @@ unmix_nerf = MethodSpecification(
         method_name="unmix-nerf",
         output_dir=Path("outputs"),
         max_num_iterations=10_000,
-        # With an average over about 100 steps, steps may stay large: what they overshoot averages out.
-        average_decay=0.99,
+        # With an average, steps may stay large: what they overshoot averages out. Its ramp decides, not the decay: it
+        # spans about a ninth of the steps so far, short trainings and long ones alike.
+        average_decay=0.999,
         pipeline=PipelineConfig(
             datamanager=HyperspectralDataManagerConfig(),
             model=UnmixModelConfig(),
         ),
         optimizers={
             # Without decay, floaters grow before single cameras: what few pixels ask for is as good as free.
-            "grid": OptimizerConfig(lr=2e-2, final_factor=0.1, weight_decay=1e-7),
-            "networks": OptimizerConfig(lr=2e-2, final_factor=0.3),
+            "grid": OptimizerConfig(lr=2e-2, final_factor=0.05, weight_decay=1e-7),
+            "networks": OptimizerConfig(lr=2e-2, final_factor=0.15),
             "spectra": OptimizerConfig(lr=2e-3, final_factor=0.03),
         },
     ),

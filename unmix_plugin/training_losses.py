@@ -38,7 +38,7 @@ class LossSettings:
     abundance_loss_weight: float = 0.1
     """Weight of the mean squared distance of composited abundances to those of the measured spectra, unmixed one by
     one with the first endmembers; 0 as published."""
-    abundance_loss_final_factor: float = 0.3
+    abundance_loss_final_factor: float = 0.1
     """Factor on that weight at the end of training, reached exponentially: once materials are found, what is left of
     their disagreement with single pixels holds spectra back."""
     mixing_penalty: float = 2.0
