@@ -3,6 +3,7 @@
 import io
 from dataclasses import replace
 
+import pytest
 import torch
 from rich.console import Console
 from torch import nn
@@ -58,6 +59,21 @@ def test_the_steps_of_the_first_interval_are_each_taken_in_so_that_a_short_train
         average.update(step)
     assert average.updates == 3
     assert average.values["weight"].item() > 0.95
+
+
+@pytest.mark.parametrize("num_steps", [400, 4000])
+@pytest.mark.parametrize("interval", [1, 8])
+def test_before_the_decay_bites_the_average_spans_the_same_part_of_a_training_of_any_length(
+    num_steps, interval
+):
+    module = nn.Linear(1, 1, bias=False)
+    average = ParameterAverage(module, decay=0.99999, interval=interval)
+    for step in range(1, num_steps + 1):
+        with torch.no_grad():
+            module.weight.fill_(step / num_steps)
+        average.update(step)
+    # A mean in which the weight of a step grows with its number to the 8th lags a tenth of the way behind.
+    assert average.values["weight"].item() == pytest.approx(0.9, abs=0.02)
 
 
 def test_swapping_in_shows_the_average_and_gives_the_parameters_back():

@@ -10,9 +10,10 @@ from torch import Tensor, nn
 class ParameterAverage:
     """Exponential moving average of a module's trained parameters.
 
-    The average over the first steps is plain: the part of itself that it keeps rises as (1 + n) / (10 + n) with the
-    number n of updates until it reaches the decay asked for, so that the first values do not linger. The steps of the
-    first interval are each taken in, so that a training of few steps isn't shown as it began.
+    The part of itself that it keeps rises as (1 + n) / (10 + n) with the number n of updates until it reaches the decay
+    asked for: until then it spans about the last ninth of the training so far, however long that is, and the first
+    values do not linger. The steps of the first interval are each taken in, so that a training of few steps isn't shown
+    as it began.
     """
 
     def __init__(self, module: nn.Module, decay: float, interval: int = 1) -> None:

@@ -50,7 +50,8 @@ class TrainerConfig:
     max_skipped_steps: int = 20
     """Training fails after so many steps in a row with a non-finite loss or gradient."""
     average_decay: float | None = None
-    """Evaluate and render with a moving average of the parameters that keeps this part of itself each step."""
+    """Evaluate and render with a moving average of the parameters that keeps at most this part of itself each step; it
+    never spans more than about a ninth of the training so far. None: with the last step's."""
     average_interval: int = 8
     """Update that average every so many steps, after the first so many; an update costs about as much as one of the
     optimiser."""
