@@ -28,14 +28,15 @@ class SpectrumError(UnmixError):
     """Spectra, wavelengths or endmembers do not fit each other or the request."""
 
 
-def did_you_mean(word: str, known: Iterable[str], likeness: float = 0.6) -> str:
-    """A question for the end of a message that names what may have been meant; empty if nothing is near.
+def did_you_mean(word: str, known: Iterable[str], likeness: float = 0.6, form: str = "{}") -> str:
+    """A question for a message that names what may have been meant; empty if nothing is near.
 
     Args:
         likeness: How near is near, from 0 to 1 for the same; lower among few names that hardly resemble each other.
+        form: How the question stands in its message, {} being the question; nothing of it is there without one.
 
     >>> did_you_mean("segmentaton", ["segmentation", "depth"])
     'did you mean segmentation?'
     """
     near = difflib.get_close_matches(word, list(known), n=3, cutoff=likeness)
-    return f"did you mean {' or '.join(near)}?" if near else ""
+    return form.format(f"did you mean {' or '.join(near)}?") if near else ""

@@ -73,10 +73,8 @@ class MaterialState:
             raise ConfigError(f"there is no endmember {endmember}; the run has {self._listed()}")
         if endmember in self.names:
             return self.names.index(endmember)
-        hint = did_you_mean(endmember, self.names)
-        raise ConfigError(
-            f"there is no endmember {endmember!r}; {hint}{' ' if hint else ''}the run has {self._listed()}"
-        )
+        hint = did_you_mean(endmember, self.names, form="{} ")
+        raise ConfigError(f"there is no endmember {endmember!r}; {hint}the run has {self._listed()}")
 
     def note(self, what: str, index: int, edit: str) -> None:
         """Remember that an edit did something to an endmember, which may be done once.

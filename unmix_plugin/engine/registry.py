@@ -59,8 +59,7 @@ def find_method(name: str) -> MethodSpecification:
     methods, broken = discover_methods()
     if name in methods:
         return methods[name]
-    question = did_you_mean(name, methods, likeness=0.5)
-    lines = [f"unknown method {name!r}" + (f"; {question}" if question else "")]
+    lines = [f"unknown method {name!r}{did_you_mean(name, methods, likeness=0.5, form='; {}')}"]
     lines.append(f"installed: {', '.join(sorted(methods)) or 'none'}")
     raise ConfigError("\n".join(lines + [str(plugin) for plugin in broken]))
 

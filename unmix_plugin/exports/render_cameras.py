@@ -134,8 +134,7 @@ def _only(views: Sequence[RunView], wanted: Sequence[str]) -> tuple[RunView, ...
 
 def _near(word: str, known: Sequence[str]) -> str:
     """The nearest names, as part of a sentence."""
-    question = did_you_mean(word, known, likeness=0.5)
-    return f" ({question})" if question else ""
+    return did_you_mean(word, known, likeness=0.5, form=" ({})")
 
 
 def _size(size: tuple[int, int], request: CameraRequest) -> tuple[int, int]:

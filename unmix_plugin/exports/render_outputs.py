@@ -175,8 +175,7 @@ def _output(name: str, materials: Materials) -> RenderOutput:
         return _reflectance_output(name, argument, materials)
     if prefix not in _WITH_WAVELENGTHS:
         known = [*_NAMED, *_WITH_WAVELENGTHS, *_REFLECTANCE_EXAMPLES, EVERY_OUTPUT]
-        question = did_you_mean(prefix, known, likeness=0.5)
-        hint = f" ({question})" if question else ""
+        hint = did_you_mean(prefix, known, likeness=0.5, form=" ({})")
         examples = [example for _, _, example in _WITH_WAVELENGTHS.values()]
         examples += _REFLECTANCE_EXAMPLES.values()
         raise ConfigError(
@@ -210,8 +209,7 @@ def _format(name: str) -> Format:
     for known in FORMATS:
         if name == known:
             return known
-    question = did_you_mean(name, FORMATS, likeness=0.5)
-    hint = f" ({question})" if question else ""
+    hint = did_you_mean(name, FORMATS, likeness=0.5, form=" ({})")
     raise ConfigError(f"there is no format {name!r}{hint}; known are {', '.join(FORMATS)}")
 
 

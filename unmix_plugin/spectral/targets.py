@@ -204,8 +204,8 @@ def _chosen(name: str | None, table: SpectraTable, file: str) -> str:
         raise ConfigError(f"{file} has {len(table.names)} spectra; say which, as in {file}#NAME: {listed}")
     if name in table.names:
         return name
-    hint = did_you_mean(name, table.names)
-    raise ConfigError(f"{file} has no spectrum {name!r}; {hint}{' ' if hint else ''}it has {listed}")
+    hint = did_you_mean(name, table.names, form="{} ")
+    raise ConfigError(f"{file} has no spectrum {name!r}; {hint}it has {listed}")
 
 
 def _validate(reflectance: np.ndarray, method: DetectionMethod, what: str) -> None:
