@@ -91,6 +91,19 @@ def test_a_perfect_prediction_has_no_loss_over_any_background(background):
     assert all(float(loss) < 1e-12 for loss in losses.values())
 
 
+def test_colours_count_by_default_where_alpha_tells_black_from_the_void():
+    spectra, alpha = torch.rand(8, NUM_BANDS), torch.ones(8)
+    outputs = {"spectral": spectra / 2, "accumulation": alpha, "haze": torch.zeros(())}
+    losses = {
+        has_alpha: make_model(has_alpha=has_alpha, abundance_loss_weight=0.0).get_loss_dict(
+            outputs, {"spectra": spectra, "alpha": alpha}
+        )
+        for has_alpha in (True, False)
+    }
+    assert float(losses[True]["rgb"]) > 0
+    assert "rgb" not in losses[False]
+
+
 def test_a_bright_background_penalises_missing_opacity():
     batch = {"spectra": torch.zeros(4, NUM_BANDS), "alpha": torch.ones(4)}
     outputs = {"spectral": torch.zeros(4, NUM_BANDS), "accumulation": torch.zeros(4)}

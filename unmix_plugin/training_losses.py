@@ -15,6 +15,8 @@ from torch import Tensor
 from unmix_plugin.spectral.losses import forgive_saturation, over_background, solid_evidence, srgb_error
 from unmix_plugin.spectral.mixture_guide import MixtureGuide
 
+_RGB_WEIGHT_WITH_ALPHA = 0.2
+
 
 @dataclass(frozen=True)
 class LossSettings:
@@ -25,8 +27,9 @@ class LossSettings:
     is random where alpha says what is transparent, else black: random greys would reward fog before the cameras."""
     spectral_loss_weight: float = 1.0
     """Weight of the mean squared error of spectra."""
-    rgb_loss_weight: float = 0.0
-    """Weight of the mean squared error of their sRGB colours."""
+    rgb_loss_weight: float | Literal["auto"] = "auto"
+    """Weight of the mean squared error of their sRGB colours, in which dark pixels count more. Auto is 0.2 where alpha
+    is known, else 0: where black may be the void, it costs quality."""
     opacity_loss_weight: float = 0.01
     """Weight of the mean squared transparency in scenes without alpha, where pixels aren't dark: light comes from
     something solid, but black may be the void."""
@@ -50,7 +53,7 @@ class LossSettings:
         return {
             "loss weights and the mixing-penalty of at least 0": min(
                 self.spectral_loss_weight,
-                self.rgb_loss_weight,
+                self.rgb_weight(has_alpha=True),
                 self.opacity_loss_weight,
                 self.haze_loss_weight,
                 self.abundance_loss_weight,
@@ -60,6 +63,12 @@ class LossSettings:
             "haze-loss-until in (0, 1]": 0 < self.haze_loss_until <= 1,
             "abundance-loss-final-factor in (0, 1]": 0 < self.abundance_loss_final_factor <= 1,
         }
+
+    def rgb_weight(self, has_alpha: bool) -> float:
+        """Weight of the error of colours in a scene with or without alpha."""
+        if self.rgb_loss_weight == "auto":
+            return _RGB_WEIGHT_WITH_ALPHA if has_alpha else 0.0
+        return self.rgb_loss_weight
 
     def haze_weight(self, progress: float) -> float:
         """Weight of the haze when that part of the training is over: falls with the square of the time left."""
@@ -99,8 +108,9 @@ def training_losses(
     predicted = over_background(spectra, opacities, background)
     predicted = forgive_saturation(predicted, target, batch["spectra"])
     losses = {"spectral": settings.spectral_loss_weight * (predicted - target).square().mean()}
-    if settings.rgb_loss_weight > 0:
-        losses["rgb"] = settings.rgb_loss_weight * srgb_error(predicted, target, rgb_weights)
+    rgb_weight = settings.rgb_weight(has_alpha)
+    if rgb_weight > 0:
+        losses["rgb"] = rgb_weight * srgb_error(predicted, target, rgb_weights)
     if settings.opacity_loss_weight > 0 and not has_alpha:
         shown = solid_evidence(batch["spectra"])
         losses["opacity"] = settings.opacity_loss_weight * (shown * (1 - opacities).square()).mean()
