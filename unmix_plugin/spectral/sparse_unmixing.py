@@ -2,7 +2,8 @@
 
 With all endmembers free to take part, a spectrum that is a little off is explained by a mixture of many: white by a
 bit of every colour. A spectrum here shows at most three materials, and each beyond the first must bring it nearer by
-a fixed angle. All choices of materials are tried, which is exact; brightness takes no part.
+a fixed angle. All choices of materials that could cost less than what was found are tried, which is exact; brightness
+takes no part.
 
 Source: least squares with an l0 penalty, as in sparse unmixing (Iordache, Bioucas-Dias and Plaza 2011), whose l1
 relaxation is needed only for libraries of hundreds.
@@ -12,6 +13,7 @@ Notation: `N` spectra, `B` bands, `K` endmembers, `C` choices of `m` endmembers.
 
 from __future__ import annotations
 
+from functools import cache
 from math import comb
 
 import torch
@@ -40,21 +42,26 @@ def sparse_abundances(
     cosines, gram = corners @ torch.nn.functional.normalize(spectra, dim=1).T, corners @ corners.T
     smallest = torch.full_like(cosines[0], torch.inf)
     shares = torch.zeros_like(cosines)
-    for size in _sizes(len(endmembers)):
-        choices = torch.combinations(torch.arange(len(endmembers), device=cosines.device), size)
-        misfit, found = _best_choice(cosines, gram, choices)
-        misfit = misfit + mixing_penalty * (size - 1)
-        shares = torch.where(misfit < smallest, found, shares)
-        smallest = torch.minimum(misfit, smallest)
+    for choices in _choices(len(endmembers), str(cosines.device)):
+        price = mixing_penalty * (choices.shape[1] - 1)
+        # The others are explained so well that even a perfect fit would cost more.
+        open_to = (smallest > price).nonzero()[:, 0]
+        misfit, found = _best_choice(cosines.index_select(1, open_to), gram, choices)
+        before = smallest.index_select(0, open_to)
+        better = misfit + price < before
+        smallest[open_to] = torch.where(better, misfit + price, before)
+        shares[:, open_to] = torch.where(better, found, shares.index_select(1, open_to))
     covered = shares.T / endmembers.norm(dim=1).clamp(min=1e-6)
     return covered / covered.sum(dim=1, keepdim=True).clamp(min=1e-9)
 
 
-def _sizes(num_endmembers: int) -> list[int]:
-    """How many materials a mixture may have, so that the choices stay few."""
-    largest = min(num_endmembers, _MOST_MATERIALS)
+@cache
+def _choices(num_endmembers: int, device: str) -> list[Int[Tensor, "C m"]]:
+    """All choices of one, two and three of the endmembers; of three only while they stay few."""
     return [
-        size for size in range(1, largest + 1) if size <= 2 or comb(num_endmembers, size) <= _MOST_CHOICES
+        torch.combinations(torch.arange(num_endmembers, device=device), size)
+        for size in range(1, min(num_endmembers, _MOST_MATERIALS) + 1)
+        if size <= 2 or comb(num_endmembers, size) <= _MOST_CHOICES
     ]
 
 
