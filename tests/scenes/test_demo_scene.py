@@ -1,51 +1,25 @@
-"""The built-in scene: its geometry, its light, its truth, and the folder that it becomes."""
+"""The built-in scene as a folder, and the folder that is kept."""
 
 import json
 from functools import partial
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
-from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from PIL import Image
 
 from unmix_plugin.errors import ConfigError, SceneError, SpectrumError
 from unmix_plugin.scenes import demo_scene
-from unmix_plugin.scenes.demo_materials import MATERIALS, band_centers_nm, lamp_power, reflectances
+from unmix_plugin.scenes.demo_materials import MATERIALS, band_centers_nm, lamp_power
 from unmix_plugin.scenes.demo_scene import demo_scene_path, is_complete, make_demo_scene
 from unmix_plugin.scenes.demo_shading import (
-    COAT_REFLECTANCE,
-    LAMP_IRRADIANCE,
-    LAMP_POSITION,
-    THINGS,
-    coat_highlight,
-    direct_light,
-    lamp_point,
     render_view,
-    sky_light,
-    trace,
 )
-from unmix_plugin.scenes.demo_shapes import Placement, first_hits
 from unmix_plugin.scenes.demo_views import (
     CAMERA_DISTANCE,
-    demo_cameras,
     frame_name,
-    label_image,
-    radiance_cube,
 )
 from unmix_plugin.spectral.spectra_csv import read_spectra_csv
-
-PLACEMENTS = tuple(thing.placement for thing in THINGS)
-TABLE, APPLE, PARCEL, _, LEMON = THINGS
-LAMP = np.array(LAMP_POSITION, dtype=np.float32)
-coordinates = st.floats(-0.9, 0.9)
-
-
-@pytest.fixture(scope="module")
-def view():
-    """One evaluation view at a size where every material and every kind of pixel occurs."""
-    return render_view(demo_cameras(48, 8), 2)
 
 
 @pytest.fixture(scope="module")
@@ -60,209 +34,6 @@ def folder(tmp_path_factory):
 def one_ray_a_pixel(monkeypatch):
     """Coarser views, for tests of files rather than pixels."""
     monkeypatch.setattr(demo_scene, "render_view", partial(render_view, subpixels=1))
-
-
-def row(*values):
-    return np.array([values], dtype=np.float32)
-
-
-def spectral_angle(a, b):
-    return np.arccos(np.clip(a @ b / np.linalg.norm(a) / np.linalg.norm(b), -1, 1))
-
-
-# Geometry
-
-
-@given(coordinates, coordinates, st.floats(0.2, 3.0))
-def test_a_sphere_is_hit_where_the_quadratic_formula_says(x, y, radius):
-    sphere = Placement("sphere", (0.5, -0.25, 1.0), (radius,) * 3, turn_deg=40.0, tilt_deg=-20.0)
-    origin, direction = row(0.5 + radius * x, -0.25 + radius * y, 9.0), row(0, 0, -1)
-    distance = sphere.entry_distances(origin, direction)
-    reach = 1 - x**2 - y**2
-    assume(abs(reach) > 1e-3)
-    expected = 8 - radius * np.sqrt(reach) if reach > 0 else np.inf
-    assert_allclose(distance, expected, rtol=1e-3)
-
-
-@pytest.mark.parametrize("primitive", ["sphere", "cylinder", "box"])
-@given(azimuth=st.floats(0, 6.28), height=st.floats(-0.95, 0.95), x=coordinates, y=coordinates, z=coordinates)
-def test_a_ray_enters_a_shape_through_its_surface_against_the_normal(primitive, azimuth, height, x, y, z):
-    placement = Placement(primitive, (0.3, -0.2, 0.1), (0.5, 0.7, 0.4), turn_deg=25.0, tilt_deg=50.0)
-    flat = np.sqrt(1 - height**2)
-    origin = 5 * row(flat * np.cos(azimuth), flat * np.sin(azimuth), height)
-    inside = placement.axes @ (np.array([x, y, z]) * 0.55 * placement.half_sizes) + placement.center
-    direction = (inside - origin).astype(np.float32)
-    distance = placement.entry_distances(origin, direction)
-    assert 0 < distance[0] < 1
-    local = placement.to_local(origin + distance[:, None] * direction)[0]
-    extent = {
-        "sphere": np.linalg.norm(local),
-        "cylinder": max(np.hypot(local[0], local[1]), abs(local[2])),
-        "box": np.abs(local).max(),
-    }[primitive]
-    assert extent == pytest.approx(1, abs=1e-3)
-    normal = placement.normals_at(local[None])[0]
-    assert np.linalg.norm(normal) == pytest.approx(1, abs=1e-5)
-    assert normal @ direction[0] < 0
-
-
-def test_a_cylinder_is_hit_on_its_cap_from_above_and_on_its_side_from_the_side():
-    cylinder = Placement("cylinder", (1.0, 0.0, 0.0), (0.5, 0.5, 2.0))
-    origins, directions = (
-        np.vstack([row(1.2, 0.1, 7), row(-3, 0, 1)]),
-        np.vstack([row(0, 0, -1), row(1, 0, 0)]),
-    )
-    distances = cylinder.entry_distances(origins, directions)
-    assert_allclose(distances, [5.0, 3.5], rtol=1e-6)
-    normals = cylinder.normals_at(cylinder.to_local(origins + distances[:, None] * directions))
-    assert_allclose(normals, [[0, 0, 1], [-1, 0, 0]], atol=1e-6)
-
-
-def test_a_normal_of_a_squeezed_sphere_is_the_gradient_of_its_equation():
-    sizes = np.array([0.5, 0.25, 1.0])
-    sphere = Placement("sphere", (0.0, 0.0, 0.0), (0.5, 0.25, 1.0))
-    local = np.array([[0.48, 0.6, 0.64]], dtype=np.float32)
-    gradient = local[0] * sizes / sizes**2
-    assert_allclose(sphere.normals_at(local)[0], gradient / np.linalg.norm(gradient), rtol=1e-5)
-
-
-def test_a_ray_that_misses_or_looks_away_hits_nothing():
-    origins, directions = np.vstack([row(0, 0, 5), row(0, 0, 5)]), np.vstack([row(0, 0, 1), row(1, 0, 0)])
-    distances, _ = first_hits(PLACEMENTS, origins, directions)
-    assert np.isinf(distances).all()
-
-
-# Light
-
-
-def test_direct_light_follows_the_cosine_where_nothing_is_in_the_way():
-    point = row(1.1, -0.3, 0)
-    towards = LAMP - point[0]
-    expected = LAMP_IRRADIANCE * towards[2] / np.linalg.norm(towards)
-    assert_allclose(direct_light(point, row(0, 0, 1), LAMP), expected, rtol=1e-5)
-
-
-def test_a_point_behind_the_apple_lies_in_its_shadow():
-    center = np.array(APPLE.placement.center)
-    along = center - LAMP
-    shadow = (LAMP + along * (LAMP[2] / -along[2])).astype(np.float32)
-    assert np.hypot(shadow[0], shadow[1]) < 1.3, "the shadow's middle falls on the table"
-    assert direct_light(shadow[None], row(0, 0, 1), LAMP) == 0
-
-
-def test_the_sky_is_darker_beside_a_thing_than_in_the_open():
-    beside, away = row(-0.5, -0.3, 0), row(0.0, -1.2, 0)
-    up = row(0, 0, 1)
-    near, far = sky_light(beside, up, TABLE)[0], sky_light(away, up, TABLE)[0]
-    assert 0 <= near < 0.3 * far
-
-
-def test_a_highlight_seen_head_on_is_the_fresnel_reflectance_over_four_squared_roughness():
-    # Eye, lamp and normal coincide: D = 1 / (pi a^2), both Smith terms 1, cosines 1.
-    normal = LAMP[None] / np.linalg.norm(LAMP)
-    got = coat_highlight(np.zeros((1, 3), np.float32), normal, normal, roughness=0.2)
-    assert_allclose(got, COAT_REFLECTANCE / (4 * 0.2**2), rtol=1e-4)
-
-
-def test_the_lamps_points_fill_its_disc_evenly():
-    offsets = np.array([lamp_point(i, 9) for i in range(9)]) - LAMP
-    assert len(np.unique(offsets.round(4), axis=0)) == 9
-    assert_allclose(offsets.mean(axis=0), 0, atol=0.06)
-
-
-def spectra_of(bands):
-    wavelengths = band_centers_nm(bands)
-    return reflectances(wavelengths), lamp_power(wavelengths)
-
-
-def test_a_lit_matt_pixel_of_one_material_is_reflectance_times_lamp_times_shading(view):
-    spectra, lamp = spectra_of(31)
-    cube = radiance_cube(view, spectra, lamp)
-    for k in range(len(MATERIALS)):
-        pure = (view.alpha == 1) & (view.abundances[..., k] > 0.9999) & (view.specular == 0)
-        if MATERIALS[k] == "green":  # the glossy apple only: no pixel of it is without a trace of highlight
-            continue
-        assert pure.any(), MATERIALS[k]
-        shading = view.diffuse[pure][:, k]
-        assert_allclose(cube[pure], shading[:, None] * (spectra[k] * lamp), atol=1e-4)
-        assert ((shading > 0) & (shading <= 1.05)).all()
-
-
-def test_what_a_highlight_adds_to_the_same_point_has_the_lamps_colour():
-    spectra, lamp = spectra_of(31)
-    rays = demo_cameras(64, 8).image_rays(2)
-    origins, directions = rays.origins.numpy(), rays.directions.numpy()
-    brightest = trace(origins, directions, LAMP).specular.argmax()
-    distances, _ = first_hits(PLACEMENTS, origins, directions)
-    point = origins[brightest] + distances[brightest] * directions[brightest]
-    eyes = np.stack([origins[brightest], point + 2 * np.array([0, 0.3, 1], dtype=np.float32)])
-    towards = (point - eyes) / np.linalg.norm(point - eyes, axis=1, keepdims=True)
-    seen = trace(eyes, towards.astype(np.float32), LAMP)
-    assert seen.specular[0] > 0.5
-    assert seen.specular[1] < 0.1
-    radiances = (seen.diffuse @ spectra + seen.specular[:, None]) * lamp
-    assert spectral_angle(radiances[0] - radiances[1], lamp) < 0.01
-    assert spectral_angle(radiances[1], lamp) > 0.2
-
-
-def test_two_cameras_see_the_same_diffuse_light_at_the_same_point():
-    cameras = demo_cameras(32, 8)
-    rays = cameras.image_rays(0)
-    origins, directions = rays.origins.numpy(), rays.directions.numpy()
-    distances, _ = first_hits(PLACEMENTS, origins, directions)
-    points = (origins + distances[:, None] * directions)[np.isfinite(distances)]
-    seen = trace(origins, directions, LAMP)
-    eye = cameras.camera_to_world[5, :, 3].numpy()
-    lengths = np.linalg.norm(points - eye, axis=1)
-    towards = (points - eye) / lengths[:, None]
-    others, _ = first_hits(PLACEMENTS, np.broadcast_to(eye, points.shape), towards)
-    common = np.abs(others - lengths) < 1e-4
-    assert common.sum() > 50
-    again = trace(np.broadcast_to(eye, points.shape)[common], towards[common], LAMP)
-    first = seen.diffuse[seen.is_hit][common]
-    # A shadow's border can fall to either side by rounding.
-    assert np.mean(np.abs(again.diffuse - first).max(axis=1) < 2e-3) > 0.98
-
-
-# Truth
-
-
-def test_abundances_lie_on_the_simplex_where_something_is(view):
-    sums = view.abundances.sum(axis=-1)
-    assert (view.abundances >= 0).all()
-    assert_allclose(sums[view.alpha > 0], 1, atol=1e-5)
-    assert (sums[view.alpha == 0] == 0).all()
-
-
-def test_labels_are_the_largest_abundance_where_half_a_pixel_is_covered(view):
-    labels = label_image(view)
-    labelled = view.alpha >= 0.5
-    assert (labels[~labelled] == 255).all()
-    assert (labels[labelled] == view.abundances[labelled].argmax(axis=-1)).all()
-    assert set(np.unique(labels[labelled])) == set(range(len(MATERIALS)))
-
-
-def test_a_view_has_pure_pixels_mixed_pixels_and_soft_edges(view):
-    largest = view.abundances.max(axis=-1)[view.alpha == 1]
-    assert 0.1 < np.mean(largest < 0.95) < 0.8
-    assert np.mean(largest > 0.999) > 0.15
-    assert ((view.alpha > 0) & (view.alpha < 1)).sum() > 50
-
-
-def test_materials_are_told_apart_by_their_spectra_under_the_lamp():
-    spectra, lamp = spectra_of(31)
-    angles = [spectral_angle(a * lamp, b * lamp) for i, a in enumerate(spectra) for b in spectra[:i]]
-    assert min(angles) > 0.45
-
-
-def test_a_highlight_is_brighter_than_the_matt_surface_yet_nothing_saturates_beside_it(view):
-    spectra, lamp = spectra_of(31)
-    unclipped = (view.diffuse @ spectra + view.specular[..., None]) * lamp
-    assert view.specular.max() > 0.2
-    assert np.mean(unclipped.max(axis=-1) > 1) < 0.01
-
-
-# The folder
 
 
 def test_a_scene_has_the_layout_that_transforms_json_names(folder):
@@ -379,9 +150,6 @@ def test_overwriting_replaces_the_older_scene_and_spares_other_files(tmp_path):
     assert (directory / "notes.txt").read_text() == "mine"
     assert (directory / "images" / "mine.png").exists()
     assert [path.name for path in tmp_path.iterdir()] == ["scene"], "nothing temporary is left"
-
-
-# The cache
 
 
 @pytest.fixture

@@ -1,0 +1,149 @@
+"""Pages that send nonsense, leave, come in crowds or are not allowed in: the others go on."""
+
+import math
+import time
+
+import msgspec
+import pytest
+
+from tests.viewer.pages import has_control, opened, page_of, serving, show_layer
+from unmix_plugin.viewer.gate import MOST_CLIENTS
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"wxyz": (math.nan, 0.0, 0.0, 1.0)},
+        {"position": (math.inf, 0.0, 0.0)},
+        {"fov": -math.inf},
+        {"image_height": 0},
+        {"image_width": 0, "image_height": 0},
+        {"image_height": -5},
+        {"image_height": 10**9, "image_width": 10**9},
+        {"wxyz": ()},
+    ],
+)
+@pytest.mark.filterwarnings("ignore:.viser. .* does not match annotation")
+def test_a_camera_that_is_none_harms_nobody(viewer, changes):
+    with opened(viewer) as page:
+        page.look_from(0.5, **changes)
+        time.sleep(0.1)
+        count = len(page.pictures)
+        page.look_from(0.9)
+        page.wait_until(lambda: len(page.pictures) > count)
+
+
+@pytest.mark.parametrize(
+    "label",
+    [
+        "layer",
+        "index",
+        "formula",
+        "exposure (stops)",
+        "low",
+        "finest picture (rows)",
+        "known material",
+        "width",
+        "brightness",
+    ],
+)
+def test_values_that_no_control_would_send_harm_nobody(viewer, label):
+    with opened(viewer) as page:
+        page.set("own range", True)
+        for value in (math.nan, math.inf, -1e300, "x" * 1000, None, [1, 2], {"a": 1}, True):
+            page.set(label, value)
+        time.sleep(0.1)
+        count = len(page.pictures)
+        page.set("layer", "colour")
+        page.look_from(1.3)
+        page.wait_until(lambda: len(page.pictures) > count)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"\xff\xff",
+        b"\x81",
+        "text",
+        b"\x81\xa4type\xa4Nope",
+        msgspec.msgpack.encode({"type": "ViewerCameraMessage", "position": ("a", "b", "c")}),
+    ],
+)
+def test_a_page_that_sends_nonsense_loses_its_connection_and_others_go_on(viewer, data):
+    with opened(viewer) as good, page_of(viewer) as bad:
+        bad.look_from(0.3)
+        bad.send_raw(data)
+        bad.wait_until(lambda: bad.is_closed)
+        count = len(good.pictures)
+        good.look_from(2.0)
+        good.wait_until(lambda: len(good.pictures) > count)
+
+
+def test_pages_that_leave_in_mid_render_are_forgotten(viewer):
+    for _ in range(5):
+        with page_of(viewer) as page:
+            page.look_from(0.3)
+            page.look_from(0.4)
+    with opened(viewer):
+        deadline = time.monotonic() + 20
+        while viewer.num_clients > 1 or viewer.services.loop.num_views > 1:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+
+
+def test_no_more_pages_are_served_than_there_is_room_for(viewer, monkeypatch):
+    monkeypatch.setattr("unmix_plugin.viewer.server.MOST_CLIENTS", 1)
+    assert MOST_CLIENTS > 1
+    with opened(viewer), page_of(viewer) as second:
+        second.look_from(0.3)
+        second.wait_until(lambda: "pages are open already" in second.texts)
+        assert second.pictures == []
+
+
+def test_a_page_must_give_the_token_before_it_sees_anything(source):
+    with serving(source, token="sesame") as (viewer, _), page_of(viewer) as page:
+        page.look_from(0.3)
+        page.wait_until(lambda: has_control(page, "token"))
+        page.set("token", "barley")
+        page.set("enter", True)
+        page.wait_until(lambda: "That is not the token" in page.texts)
+        assert page.pictures == []
+        assert not has_control(page, "layer")
+        assert viewer.num_clients == 0
+        time.sleep(0.6)
+        page.set("token", "sesame")
+        page.set("enter", True)
+        page.wait_until(lambda: bool(page.pictures))
+        assert not has_control(page, "token")
+
+
+def test_tokens_cannot_be_tried_quickly(source):
+    with serving(source, token="sesame") as (viewer, _), page_of(viewer) as page:
+        page.look_from(0.3)
+        page.wait_until(lambda: has_control(page, "token"))
+        page.set("token", "barley")
+        page.set("enter", True)
+        page.wait_until(lambda: "That is not the token" in page.texts)
+        page.set("token", "sesame")
+        page.set("enter", True)
+        time.sleep(0.2)
+        assert page.pictures == []
+
+
+def test_a_page_of_another_site_is_refused_and_one_of_its_own_is_served(source):
+    with serving(source) as (viewer, lines):
+        with page_of(viewer, origin="http://evil.example") as foreign:
+            foreign.look_from(0.3)
+            foreign.wait_until(lambda: "this page is from another site" in foreign.texts)
+            assert foreign.pictures == []
+        assert any("another site" in line for line in lines)
+        with opened(viewer, origin=f"http://127.0.0.1:{viewer.port}"):
+            pass
+
+
+def test_nobody_can_ask_for_a_public_tunnel(viewer, monkeypatch):
+    monkeypatch.setattr("viser._viser.ViserTunnel", lambda *_, **__: pytest.fail("a tunnel was opened"))
+    with opened(viewer) as page:
+        page.send("ShareUrlRequest")
+        show_layer(page, "depth")

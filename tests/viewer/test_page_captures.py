@@ -1,0 +1,69 @@
+"""Files that a page asks for."""
+
+import math
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.viewer.pages import opened
+
+
+def test_a_screenshot_has_the_size_asked_for_and_lies_in_the_run_folder(viewer):
+    with opened(viewer) as page:
+        for label, value in (("width", 60), ("height", 40), ("file name", "../../../evil/../shot")):
+            page.set(label, value)
+        page.set("save a screenshot (PNG)", True)
+        page.wait_until(lambda: bool(page.downloads))
+        (path,) = viewer.services.folder.iterdir()
+        assert path.name == "evil_.._shot.png"
+        picture = Image.open(path)
+        assert picture.size == (60, 40)
+        assert np.asarray(picture).std() > 5
+
+
+def test_spectra_are_saved_as_exr(viewer):
+    import OpenEXR
+
+    with opened(viewer) as page:
+        page.set("width", 32)
+        page.set("height", 24)
+        page.set("save the spectra (EXR)", True)
+        page.wait_until(lambda: any(title == "saved" for title, _ in page.notices))
+        (path,) = viewer.services.folder.iterdir()
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = file.channels()
+            assert sum(name.startswith("S0.") for name in channels) == 5
+            assert channels["S0.450,000000nm"].pixels.shape == (24, 32)
+
+
+def test_pictures_too_large_are_refused(viewer):
+    with opened(viewer) as page:
+        page.set("width", 8192)
+        page.set("height", 1e9)
+        page.set("save a screenshot (PNG)", True)
+        page.wait_until(lambda: bool(page.notices))
+        assert "8192 x 8192 pixels are too many" in page.notices[0][1]
+
+
+def test_a_path_through_key_frames_is_a_camera_file(viewer):
+    from unmix_plugin.exports.camera_files import read_camera_file
+    from unmix_plugin.exports.world_frame import world_frame
+
+    with opened(viewer) as page:
+        for number, angle in enumerate((0.3, 0.8, 1.3), start=1):
+            page.look_from(angle)
+            page.set("add a key frame here", True)
+            key = page.controls[page.control("key frame")]
+            page.wait_until(lambda key=key, number=number: key.get("value") == f"{number} of {number}")
+        page.set("seconds", 1.0)
+        page.set("frames a second", 10)
+        time.sleep(0.3)
+        page.set("save the path", True)
+        page.wait_until(lambda: any(title == "saved" for title, _ in page.notices))
+        (path,) = viewer.services.folder.iterdir()
+        found = read_camera_file(path, world_frame(viewer.services.source.scene))
+        assert (len(found.views), found.frames_per_second) == (10, 10.0)
+        first = found.views[0].camera.camera_to_world[0, :, 3].tolist()
+        assert first == pytest.approx([4 * math.cos(0.3), 4 * math.sin(0.3), 1.5], abs=1e-4)

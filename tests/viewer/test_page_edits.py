@@ -1,0 +1,85 @@
+"""Edits of materials and light, made in a page."""
+
+import numpy as np
+import pytest
+
+from tests.viewer.pages import decoded, opened, show_layer
+
+
+def test_materials_are_edited_undone_saved_and_loaded(viewer):
+    with opened(viewer) as page, opened(viewer) as other:
+        before, count = decoded(page.last_picture), len(other.pictures)
+        page.set("brightness", 4.0)
+        page.wait_until(lambda: np.abs(decoded(page.last_picture) - before).max() > 10)
+        page.wait_until(lambda: "scale" in page.controls[page.control("recipe")]["value"])
+        page.set("save as", "../../bright")
+        page.set("save", True)
+        page.wait_until(lambda: bool(page.downloads))
+        saved = list((viewer.services.source.run.path / "recipes").iterdir())
+        assert [path.name for path in saved] == ["bright.yml"]
+        page.set("changes", "undo")
+        page.wait_until(lambda: np.abs(decoded(page.last_picture) - before).max() < 3)
+        page.set("load", True)
+        page.wait_until(lambda: np.abs(decoded(page.last_picture) - before).max() > 10)
+        assert len(other.pictures) == count  # another page's materials are its own
+
+
+@pytest.mark.parametrize(
+    ("label", "value", "written"),
+    [
+        ("visible", False, "remove"),
+        ("only this one", True, "isolate"),
+        ("gloss", 0.5, "gloss"),
+        ("colour of gloss", (255, 200, 0), "gloss"),
+        ("colour", (120, 110, 100), "retint"),
+        ("name", "clay", "name: clay"),
+        ("replace by the known material", True, "library: pmc/"),
+        ("swap with the other", True, "swap: [0, 2]"),
+        ("light", "FL2", "illuminant: FL2"),
+    ],
+)
+def test_every_change_is_an_edit_of_the_recipe_and_can_be_undone(viewer, label, value, written):
+    with opened(viewer) as page:
+        page.set(label, value)
+        recipe = page.controls[page.control("recipe")]
+        page.wait_until(lambda: written in recipe["value"])
+        page.set("changes", "undo")
+        page.wait_until(lambda: recipe["value"] == "edits: []\n")
+        assert not any(title == "not done" for title, _ in page.notices)
+        page.set("changes", "redo")
+        page.wait_until(lambda: written in recipe["value"])
+
+
+def test_a_name_that_is_taken_is_refused_and_the_field_goes_back(viewer):
+    with opened(viewer) as page:
+        page.set("name", "endmember_1")
+        page.wait_until(lambda: any("is called 'endmember_1' already" in text for _, text in page.notices))
+        assert page.controls[page.control("recipe")]["value"] == "edits: []\n"
+        page.wait_until(lambda: page.controls[page.control("name")]["value"] == "endmember_0")
+
+
+def test_an_edit_that_does_not_fit_is_said_and_changes_nothing(viewer):
+    recipes = viewer.services.recipes_folder
+    recipes.mkdir()
+    (recipes / "wrong.yml").write_text("edits:\n  - scale: {endmember: granite, factor: 2}\n")
+    (recipes / "broken.yml").write_text("edits: [")
+    with opened(viewer) as page:
+        for name in ("wrong.yml", "broken.yml"):
+            page.set("saved", name)
+            count = len(page.notices)
+            page.set("load", True)
+            page.wait_until(lambda count=count: len(page.notices) > count)
+        texts = [text for _, text in page.notices]
+        assert "there is no endmember 'granite'" in texts[0]
+        assert "broken.yml" in texts[1]
+        show_layer(page, "depth")
+
+
+def test_files_outside_the_folder_of_recipes_are_not_read(viewer, tmp_path):
+    secret = tmp_path / "secret.yml"
+    secret.write_text("edits:\n  - scale: {endmember: 0, factor: 3}\n")
+    with opened(viewer) as page:
+        page.set("saved", "../secret.yml")
+        page.set("load", True)
+        page.wait_until(lambda: bool(page.notices))
+        assert "choose one of the recipes" in page.notices[0][1]
