@@ -46,6 +46,14 @@ def test_deferred_composition_equals_compositing_a_spectrum_a_sample(specular, s
         assert_close(spectra, naive_spectra(model, rays), rtol=1e-5, atol=1e-6)
 
 
+def test_where_no_alpha_is_known_highlights_may_have_the_colours_of_all_materials():
+    lamp = [0.2, 0.4, 0.6, 0.8, 1.0]
+    alone, coloured = (make_model(has_alpha=has_alpha, light=lamp) for has_alpha in (True, False))
+    assert_close(alone.specular_spectra.detach(), torch.tensor([lamp]))
+    assert_close(coloured.specular_spectra[0].detach(), torch.tensor(lamp))
+    assert_close(coloured.specular_spectra[1:].detach(), coloured.endmembers.detach())
+
+
 def test_spectrum_is_diffuse_plus_specular_and_abundances_sum_to_accumulation():
     model = make_model()
     outputs = model.get_outputs_for_camera(

@@ -71,8 +71,10 @@ class UnmixModelConfig(ModelConfig, LossSettings):
     """CSV of reflectances (wavelength,name,...) for `endmember_init` file; multiplied by the scene's light if known."""
     specular: Literal["none", "dictionary", "full"] = "dictionary"
     """View-dependent part: none, multiples of a few spectra, or one value a band as published."""
-    num_specular_spectra: int = 1
-    """Spectra of the specular dictionary. The first is the light's, a highlight's colour on anything but metal."""
+    num_specular_spectra: int | Literal["auto"] = "auto"
+    """Spectra of the specular dictionary. The first is the light's, a highlight's colour on anything but metal; then
+    come the endmembers', as light that they send on has. Auto is 1 where alpha is known, else all: in rooms, light is
+    coloured by the walls."""
     segmentation: SegmentationMethod = "abundances"
     """Material of a ray: its largest abundance, or the endmember of smallest angle to its spectrum as published."""
     samples_per_step: int = 30_000
@@ -95,7 +97,8 @@ class UnmixModelConfig(ModelConfig, LossSettings):
         rules = {
             "num-endmembers of 1 to 255 or auto": self.num_endmembers == "auto"
             or 1 <= self.num_endmembers <= 255,
-            "num-specular-spectra of at least 1": self.num_specular_spectra >= 1,
+            "num-specular-spectra of at least 1 or auto": self.num_specular_spectra == "auto"
+            or self.num_specular_spectra >= 1,
             "samples-per-step of at least 1": self.samples_per_step >= 1,
             **self.loss_rules(),
             "initial opacities in (0, 1)": 0 < self.initial_opacity < 1
@@ -151,6 +154,8 @@ class UnmixModel(Model):
         self.endmembers = nn.Parameter(torch.zeros(self.num_endmembers, num_bands))
         self.endmember_names = default_names(self.num_endmembers)
         num_dictionary = config.num_specular_spectra if config.specular == "dictionary" else 0
+        if num_dictionary == "auto":
+            num_dictionary = 1 if metadata["has_alpha"] else 1 + self.num_endmembers
         self.specular_spectra = nn.Parameter(torch.zeros(num_dictionary, num_bands))
         opacity = config.initial_opacity if metadata["has_alpha"] else config.initial_opacity_unknown
         self.renderer = CoefficientRenderer(
