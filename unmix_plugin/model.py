@@ -153,9 +153,7 @@ class UnmixModel(Model):
             )
         self.endmembers = nn.Parameter(torch.zeros(self.num_endmembers, num_bands))
         self.endmember_names = default_names(self.num_endmembers)
-        num_dictionary = config.num_specular_spectra if config.specular == "dictionary" else 0
-        if num_dictionary == "auto":
-            num_dictionary = 1 if metadata["has_alpha"] else 1 + self.num_endmembers
+        num_dictionary = self._num_dictionary_spectra()
         self.specular_spectra = nn.Parameter(torch.zeros(num_dictionary, num_bands))
         opacity = config.initial_opacity if metadata["has_alpha"] else config.initial_opacity_unknown
         self.renderer = CoefficientRenderer(
@@ -333,6 +331,13 @@ class UnmixModel(Model):
     def _coefficients_through(self, camera: Cameras, offset: tuple[float, float]) -> Coefficients:
         bundle = camera.to(self.device).image_rays(0, offset)
         return self.renderer.in_chunks(self.field, bundle, self.config.eval_num_rays_per_chunk)
+
+    def _num_dictionary_spectra(self) -> int:
+        if self.config.specular != "dictionary":
+            return 0
+        if self.config.num_specular_spectra == "auto":
+            return 1 if self.metadata["has_alpha"] else 1 + self.num_endmembers
+        return self.config.num_specular_spectra
 
     def _guess_endmembers(
         self, pixels: Float[Tensor, "N B"], lamp: Float[Tensor, "B"]

@@ -12,13 +12,8 @@ from unmix_plugin.errors import ConfigError, SceneError, SpectrumError
 from unmix_plugin.scenes import demo_scene
 from unmix_plugin.scenes.demo_materials import MATERIALS, band_centers_nm, lamp_power
 from unmix_plugin.scenes.demo_scene import demo_scene_path, is_complete, make_demo_scene
-from unmix_plugin.scenes.demo_shading import (
-    render_view,
-)
-from unmix_plugin.scenes.demo_views import (
-    CAMERA_DISTANCE,
-    frame_name,
-)
+from unmix_plugin.scenes.demo_shading import render_view
+from unmix_plugin.scenes.demo_views import CAMERA_DISTANCE, frame_name
 from unmix_plugin.spectral.spectra_csv import read_spectra_csv
 
 

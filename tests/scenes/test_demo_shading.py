@@ -3,23 +3,15 @@
 import numpy as np
 from numpy.testing import assert_allclose
 
+from tests.scenes.demo_parts import APPLE, LAMP, TABLE, row
 from unmix_plugin.scenes.demo_shading import (
     COAT_REFLECTANCE,
     LAMP_IRRADIANCE,
-    LAMP_POSITION,
-    THINGS,
     coat_highlight,
     direct_light,
     lamp_point,
     sky_light,
 )
-
-TABLE, APPLE, PARCEL, _, LEMON = THINGS
-LAMP = np.array(LAMP_POSITION, dtype=np.float32)
-
-
-def row(*values):
-    return np.array([values], dtype=np.float32)
 
 
 def test_direct_light_follows_the_cosine_where_nothing_is_in_the_way():

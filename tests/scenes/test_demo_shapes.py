@@ -6,18 +6,10 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from unmix_plugin.scenes.demo_shading import (
-    THINGS,
-)
+from tests.scenes.demo_parts import PLACEMENTS, row
 from unmix_plugin.scenes.demo_shapes import Placement, first_hits
 
-PLACEMENTS = tuple(thing.placement for thing in THINGS)
-TABLE, APPLE, PARCEL, _, LEMON = THINGS
 coordinates = st.floats(-0.9, 0.9)
-
-
-def row(*values):
-    return np.array([values], dtype=np.float32)
 
 
 @given(coordinates, coordinates, st.floats(0.2, 3.0))

@@ -4,23 +4,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from tests.scenes.demo_parts import LAMP, PLACEMENTS
 from unmix_plugin.scenes.demo_materials import MATERIALS, band_centers_nm, lamp_power, reflectances
-from unmix_plugin.scenes.demo_shading import (
-    LAMP_POSITION,
-    THINGS,
-    render_view,
-    trace,
-)
+from unmix_plugin.scenes.demo_shading import render_view, trace
 from unmix_plugin.scenes.demo_shapes import first_hits
-from unmix_plugin.scenes.demo_views import (
-    demo_cameras,
-    label_image,
-    radiance_cube,
-)
-
-PLACEMENTS = tuple(thing.placement for thing in THINGS)
-TABLE, APPLE, PARCEL, _, LEMON = THINGS
-LAMP = np.array(LAMP_POSITION, dtype=np.float32)
+from unmix_plugin.scenes.demo_views import demo_cameras, label_image, radiance_cube
 
 
 @pytest.fixture(scope="module")

@@ -101,32 +101,34 @@ def test_no_more_pages_are_served_than_there_is_room_for(viewer, monkeypatch):
         assert second.pictures == []
 
 
+def enter_token(page, token):
+    page.set("token", token)
+    page.set("enter", True)
+
+
+def try_a_wrong_token(page):
+    page.look_from(0.3)
+    page.wait_until(lambda: has_control(page, "token"))
+    enter_token(page, "barley")
+    page.wait_until(lambda: "That is not the token" in page.texts)
+
+
 def test_a_page_must_give_the_token_before_it_sees_anything(source):
     with serving(source, token="sesame") as (viewer, _), page_of(viewer) as page:
-        page.look_from(0.3)
-        page.wait_until(lambda: has_control(page, "token"))
-        page.set("token", "barley")
-        page.set("enter", True)
-        page.wait_until(lambda: "That is not the token" in page.texts)
+        try_a_wrong_token(page)
         assert page.pictures == []
         assert not has_control(page, "layer")
         assert viewer.num_clients == 0
         time.sleep(0.6)
-        page.set("token", "sesame")
-        page.set("enter", True)
+        enter_token(page, "sesame")
         page.wait_until(lambda: bool(page.pictures))
         assert not has_control(page, "token")
 
 
 def test_tokens_cannot_be_tried_quickly(source):
     with serving(source, token="sesame") as (viewer, _), page_of(viewer) as page:
-        page.look_from(0.3)
-        page.wait_until(lambda: has_control(page, "token"))
-        page.set("token", "barley")
-        page.set("enter", True)
-        page.wait_until(lambda: "That is not the token" in page.texts)
-        page.set("token", "sesame")
-        page.set("enter", True)
+        try_a_wrong_token(page)
+        enter_token(page, "sesame")
         time.sleep(0.2)
         assert page.pictures == []
 

@@ -42,21 +42,22 @@ def sparse_abundances(
     cosines, gram = corners @ torch.nn.functional.normalize(spectra, dim=1).T, corners @ corners.T
     smallest = torch.full_like(cosines[0], torch.inf)
     shares = torch.zeros_like(cosines)
-    for choices in _choices(len(endmembers), str(cosines.device)):
+    for choices in _choices(len(endmembers), cosines.device):
         price = mixing_penalty * (choices.shape[1] - 1)
         # The others are explained so well that even a perfect fit would cost more.
         open_to = (smallest > price).nonzero()[:, 0]
         misfit, found = _best_choice(cosines.index_select(1, open_to), gram, choices)
         before = smallest.index_select(0, open_to)
-        better = misfit + price < before
-        smallest[open_to] = torch.where(better, misfit + price, before)
+        cost = misfit + price
+        better = cost < before
+        smallest[open_to] = torch.where(better, cost, before)
         shares[:, open_to] = torch.where(better, found, shares.index_select(1, open_to))
     covered = shares.T / endmembers.norm(dim=1).clamp(min=1e-6)
     return covered / covered.sum(dim=1, keepdim=True).clamp(min=1e-9)
 
 
 @cache
-def _choices(num_endmembers: int, device: str) -> list[Int[Tensor, "C m"]]:
+def _choices(num_endmembers: int, device: torch.device) -> list[Int[Tensor, "C m"]]:
     """All choices of one, two and three of the endmembers; of three only while they stay few."""
     return [
         torch.combinations(torch.arange(num_endmembers, device=device), size)
