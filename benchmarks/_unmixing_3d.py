@@ -38,13 +38,13 @@ temperatures that its authors chose by scene. An ablation changes one thing of o
 
 
 def train_and_score(
-    folder: Path, row: str, seed: int, max_seconds: float, device: str, runs: Path
+    folder: Path, row: str, seed: int, max_seconds: float | None, device: str, runs: Path
 ) -> dict[str, float | None]:
-    """Figures of one trained run, as its eval/metrics.json has them."""
+    """Figures of one run, as its eval/metrics.json has them; trained to the end if no time is given."""
     materials = json.loads((folder / "transforms.json").read_text(encoding="utf-8"))["materials"]
-    print(f"{folder.name}: {row}, seed {seed}, {max_seconds:g} s ...", flush=True)
+    print(f"{folder.name}: {row}, seed {seed} ...", flush=True)
     words = ["unmix-nerf", "--data", str(folder), "--output-dir", str(runs), "--device", device]
-    words += ["--max-seconds", str(max_seconds), "--seed", str(seed)]
+    words += ["--seed", str(seed), *([] if max_seconds is None else ["--max-seconds", str(max_seconds)])]
     words += [f"{_MODEL}.num-endmembers", str(len(materials)), *TRAINED_ROWS[row]]
     trained = _common.run_command([_common.console_script("unmix-train"), *words])
     _common.run_command([_common.console_script("unmix-eval"), "--run", str(trained.run), "--device", device])
