@@ -98,3 +98,35 @@ def test_a_render_does_not_look_at_the_corners_of_the_box_again(monkeypatch):
     renderer(field, rays(3))
     monkeypatch.setattr(renderer_module, "SceneBox", None)
     assert renderer(field, rays(3)).num_samples > 0
+
+
+def occupied_after_training(is_open: bool = False, seen_weight: float = 0.05) -> torch.Tensor:
+    """Share of each layer of cells, from the cameras' side on, that is occupied in dense matter seen from one side."""
+    torch.manual_seed(0)
+    field = UnmixField(UnmixFieldConfig(log2_rows_per_level=8), BOX, 3, 1, 10.0 / PIXEL, PIXEL)
+    config = RendererConfig(seen_weight=seen_weight)
+    renderer = CoefficientRenderer(config, BOX, PIXEL, 8, is_open=is_open, close_rays=False).train()
+    views = torch.arange(2000) % 2
+    targets = torch.rand(2000, 3) * 2 - 1
+    origins = torch.tensor([[0.5, 0.0, 3.0], [-0.5, 0.0, 3.0]])[views]
+    bundle = RayBundle(origins, torch.nn.functional.normalize(targets - origins, dim=-1), views)
+    renderer(field, bundle)
+    renderer.update_grid(field, step=0)
+    return renderer.grid.occupied.float().mean(dim=(0, 1)).flip(0)
+
+
+def test_what_no_training_ray_reaches_is_left_out():
+    layers = occupied_after_training()
+    assert layers[0] > 0.9
+    assert not layers[3:].any()
+
+
+def test_nothing_is_left_out_of_rooms_or_by_request():
+    assert occupied_after_training(is_open=True).all()
+    assert occupied_after_training(seen_weight=1.0).all()
+
+
+def test_rendering_without_training_notes_nothing():
+    renderer, field = make()
+    renderer(field, rays(20))
+    assert int(renderer.grid.sight.num_rays) == 0

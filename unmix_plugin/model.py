@@ -324,9 +324,12 @@ class UnmixModel(Model):
         direction = torch.nn.functional.normalize(high - low, dim=0)
         indices = torch.zeros(1, dtype=torch.int64, device=low.device)
         bundle = RayBundle((low - direction)[None], direction[None], indices)
+        was_training = self.training
+        self.eval()  # a ray of no view is nothing to be remembered
         with torch.enable_grad():
             parameters = [value for group in self.get_param_groups().values() for value in group]
             torch.autograd.grad(self.get_outputs(bundle)["spectral"].sum(), parameters, allow_unused=True)
+        self.train(was_training)
 
     def _coefficients_through(self, camera: Cameras, offset: tuple[float, float]) -> Coefficients:
         bundle = camera.to(self.device).image_rays(0, offset)

@@ -44,6 +44,9 @@ class RendererConfig:
     """Factor on the remembered density of a probed cell: lower forgets emptied space sooner."""
     grid_smallest_opacity: float = 0.03
     """Opacity of one sample's interval from which a cell counts as occupied."""
+    seen_weight: float = 0.05
+    """Part of its ray's light from which on a sample is seen. In scenes with alpha, cells that no two training views
+    have lately seen are left out; 1 leaves none out."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +107,7 @@ class CoefficientRenderer(nn.Module):
         densities, features = field.density_of(field.encode(positions, encoded))
         depths = densities * self.step
         weights = volume_weights(depths, kept.packed_info)
+        self._note_what_is_seen(kept, positions, weights, ray_bundle)
         outputs = field.get_outputs(positions, along, features)
         names = ("abundances", "scaled_abundances", "specular_coefficients")
         columns = [torch.ones_like(kept.t)[:, None], kept.t[:, None], *(outputs[name] for name in names)]
@@ -156,12 +160,29 @@ class CoefficientRenderer(nn.Module):
     def _size(self) -> Float[Tensor, "3"]:
         return self.aabb[1] - self.aabb[0]
 
+    def _unit(self, positions: Float[Tensor, "S 3"]) -> Float[Tensor, "S 3"]:
+        """Positions with the box as the unit cube."""
+        return (positions - self.aabb[0]) / self._size
+
     def _march(self, ray_bundle: RayBundle) -> PackedSamples:
         origins, directions = ray_bundle.origins, ray_bundle.directions
         t_near, t_far = self._box.intersect(origins, directions)
         jitter = torch.rand_like(t_near) if self.training else torch.full_like(t_near, 0.5)
-        unit_origins, unit_directions = (origins - self.aabb[0]) / self._size, directions / self._size
+        unit_origins, unit_directions = self._unit(origins), directions / self._size
         return march(unit_origins, unit_directions, t_near, t_far, jitter, self.grid.occupied, self.step)
+
+    def _note_what_is_seen(
+        self,
+        samples: PackedSamples,
+        positions: Float[Tensor, "S 3"],
+        weights: Float[Tensor, "S"],
+        ray_bundle: RayBundle,
+    ) -> None:
+        """While training, where a hull of the objects is known: in a room, walls must be found far behind fog."""
+        if self.training and not self.is_open and self.config.seen_weight < 1:
+            views = ray_bundle.camera_indices.index_select(0, samples.ray_indices)
+            seen = weights.detach() > self.config.seen_weight
+            self.grid.sight.record(self._unit(positions), views, seen, len(ray_bundle))
 
     @torch.no_grad()
     def _carrying_weight(

@@ -21,6 +21,7 @@ from unmix_plugin.exports.density_grid import GridPoints, sample_slice
 from unmix_plugin.exports.mesh import (
     Mesh,
     extract_mesh,
+    filled,
     mesh_paths,
     require_sound,
     surface_density,
@@ -86,6 +87,22 @@ def test_insides_that_no_camera_sees_are_trimmed_and_the_rest_stays_whole(outsid
     shape = trimesh.Trimesh(outside.vertices, outside.faces, process=False)
     assert shape.area == pytest.approx(4 * np.pi * RADIUS**2, rel=0.12)
     assert shape.is_watertight
+
+
+def test_what_no_camera_sees_into_is_solid(densities):
+    """Where nothing is rendered inside the ball there is no second surface, and the outer one stays where it was; what
+    stands in the shadow of the ball for the cameras that might see it is cut away later."""
+    points = np.stack([GRID.slice_points(index).numpy() for index in range(GRID.shape[0])])
+    rendered = np.where(np.linalg.norm(points, axis=-1) < INNER_RADIUS + 0.1, 0, densities)
+    rendered[rendered < 1e-3 * THRESHOLD] = 0
+    shell = extract_mesh(rendered, GRID, THRESHOLD, 0.0, PIXEL)
+    surface = seen(ALL_ROUND)
+    solid = extract_mesh(filled(rendered, GRID, MODEL, surface), GRID, THRESHOLD, 0.0, PIXEL)
+    assert radii(shell).min() < INNER_RADIUS + 0.15
+    assert radii(solid).min() > RADIUS - 0.05
+    seen_from_outside = trim_unseen(solid, surface)
+    assert len(seen_from_outside.vertices) == int((radii(shell) > RADIUS - 0.05).sum())
+    assert radii(seen_from_outside).max() < RADIUS + 0.05
 
 
 def test_undersides_that_no_camera_sees_are_trimmed(whole):

@@ -82,6 +82,17 @@ def test_only_what_a_camera_sees_counts_as_seen(ball):
     assert seen(FROM_ABOVE).shows(places).tolist() == [True, False, False, False, False]
 
 
+def test_hidden_is_what_lies_behind_a_surface_for_every_camera(ball):
+    """The middle and a place just inside are; places on the surface and in the air aren't, nor what no image shows."""
+    places = torch.tensor(
+        [[0.0, 0.0, 0.0], [0.0, 0.0, 0.35], [0.0, 0.0, 0.6], [0.5, 0.5, 0.5], [0.0, 0.0, -50.0]]
+    )
+    assert ball.hides(places).tolist() == [True, True, False, False, False]
+    below = torch.tensor([[0.0, 0.0, -0.6]])
+    assert seen(FROM_ABOVE).hides(below).tolist() == [True]
+    assert ball.hides(below).tolist() == [False]
+
+
 def test_the_number_of_rays_is_what_was_asked_for_whatever_the_image_size():
     for num_rays in (4_000, 30_000):
         surface = seen(FROM_ABOVE, num_rays=num_rays)

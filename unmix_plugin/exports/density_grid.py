@@ -91,10 +91,21 @@ def sample_densities(model: UnmixModel, positions: Float[Tensor, "P 3"]) -> Floa
 
 def is_rendered(model: UnmixModel, positions: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:
     """Which points lie in the box, in cells that the renderer marches through."""
+    return _lie_in(model.renderer.grid.occupied > 0, model, positions)
+
+
+def may_hold_matter(model: UnmixModel, positions: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:
+    """Which points lie in the box, in cells that were not carved before training."""
+    return _lie_in(model.renderer.grid.reachable, model, positions)
+
+
+def _lie_in(
+    chosen: Bool[Tensor, "X Y Z"], model: UnmixModel, positions: Float[Tensor, "P 3"]
+) -> Bool[Tensor, " P"]:
+    """Which points lie in chosen cells of the box."""
     low, high = model.renderer.aabb
-    occupied = model.renderer.grid.occupied
     unit = (positions - low) / (high - low)
     inside = ((unit >= 0) & (unit <= 1)).all(dim=-1)
-    sizes = torch.tensor(occupied.shape, device=positions.device)
+    sizes = torch.tensor(chosen.shape, device=positions.device)
     cells = torch.minimum((unit.clamp(0, 1) * sizes).long(), sizes - 1)
-    return inside & (occupied[cells[:, 0], cells[:, 1], cells[:, 2]] > 0)
+    return inside & chosen[cells[:, 0], cells[:, 1], cells[:, 2]]

@@ -1,8 +1,8 @@
 """The scene's surface as a mesh: marching cubes through the density, trimmed to what the run's cameras see.
 
 The surface is where the density is that rays end at, softened a little since the field is trained on images and not
-on surfaces. What no camera sees (insides, undersides) was never learnt: it is cut away unless asked for, and so are
-crumbs.
+on surfaces. What no camera sees (insides, undersides) was never learnt: it is taken for solid and its surfaces are cut
+away unless asked for, and so are crumbs.
 
 Notation: `V` vertices, `F` faces.
 """
@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int
 
 from unmix_plugin.errors import ConfigError, RunError
-from unmix_plugin.exports.density_grid import GridPoints, sample_densities
+from unmix_plugin.exports.density_grid import GridPoints, may_hold_matter, sample_densities
 from unmix_plugin.exports.formats.glb import write_glb
 from unmix_plugin.exports.formats.obj import obj_paths, write_obj
 from unmix_plugin.exports.formats.ply import write_ply
@@ -136,6 +136,26 @@ def extract_mesh(
     vertices, faces, _, _ = marching_cubes(opacities, level, gradient_direction="ascent")
     # The padding put the grid's first point at index 1.
     return Mesh((vertices.astype(np.float64) - 1) * grid.cell + grid.origin, faces.astype(np.int64))
+
+
+def filled(
+    densities: Float32[np.ndarray, "X Y Z"], grid: GridPoints, model: UnmixModel, surface: SeenSurface
+) -> Float32[np.ndarray, "X Y Z"]:
+    """Densities with what no camera sees into as solid as the densest point, so that surfaces have no inner side.
+
+    Args:
+        densities: At the grid's points, 0 where nothing is rendered.
+        grid: Of the densities, model space.
+        surface: What the cameras see.
+    """
+    result, solid = densities.copy(), densities.max()
+    for index in range(len(result)):
+        points = grid.slice_points(index)
+        unknown = torch.from_numpy(result[index] == 0)
+        unknown[unknown.clone()] = may_hold_matter(model, points[unknown].to(model.device)).cpu()
+        unknown[unknown.clone()] = surface.hides(points[unknown])
+        result[index][unknown.numpy()] = solid
+    return result
 
 
 def trim_unseen(mesh: Mesh, surface: SeenSurface) -> Mesh:

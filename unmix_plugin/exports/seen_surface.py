@@ -112,21 +112,41 @@ class SeenSurface:
         confirmed, seen_through = self._votes(positions)
         return (confirmed >= 1) & (seen_through <= confirmed)
 
+    def hides(self, positions: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:
+        """Which points lie behind what the cameras see, for every camera that has them in its image."""
+        hidden = torch.zeros(len(positions), dtype=torch.bool)
+        left = torch.arange(len(positions))
+        for camera, distances in self._views:
+            inside, excess = _excess_px(camera, distances, positions[left])
+            hidden[left[inside]] |= excess < -_TOLERANCE_PX
+            # What one camera sees, or sees through, isn't asked for again: most points are in the air.
+            in_sight = torch.zeros(len(left), dtype=torch.bool)
+            in_sight[inside] = excess >= -_TOLERANCE_PX
+            hidden[left[in_sight]] = False
+            left = left[~in_sight]
+        return hidden
+
     def _votes(self, positions: Float[Tensor, "P 3"]) -> tuple[Int64[Tensor, " P"], Int64[Tensor, " P"]]:
         """How many cameras see something at each point, and how many see something only behind it."""
         confirmed = torch.zeros(len(positions), dtype=torch.int64)
         seen_through = torch.zeros_like(confirmed)
         for camera, distances in self._views:
-            coords, depths = camera.project(positions, 0)
-            size = torch.tensor([camera.width, camera.height])
-            inside = (depths > 0) & (coords >= 0).all(dim=-1) & (coords < size).all(dim=-1)
-            columns, rows = coords[inside].long().unbind(-1)
-            own = (positions[inside] - camera.camera_to_world[0, :, 3]).norm(dim=-1)
-            behind = distances[rows, columns] - own
-            tolerance = _TOLERANCE_PX * depths[inside] / camera.focal_px[0].min()
-            confirmed[inside] += behind.abs() <= tolerance
-            seen_through[inside] += behind > tolerance
+            inside, excess = _excess_px(camera, distances, positions)
+            confirmed[inside] += excess.abs() <= _TOLERANCE_PX
+            seen_through[inside] += excess > _TOLERANCE_PX
         return confirmed, seen_through
+
+
+def _excess_px(
+    camera: Cameras, distances: Float[Tensor, "H W"], positions: Float[Tensor, "P 3"]
+) -> tuple[Bool[Tensor, " P"], Float[Tensor, " inside"]]:
+    """Which points are in the image, and by how many pixels, as large as they are there, it sees farther than each."""
+    coords, depths = camera.project(positions, 0)
+    size = torch.tensor([camera.width, camera.height])
+    inside = (depths > 0) & (coords >= 0).all(dim=-1) & (coords < size).all(dim=-1)
+    columns, rows = coords[inside].long().unbind(-1)
+    own = (positions[inside] - camera.camera_to_world[0, :, 3]).norm(dim=-1)
+    return inside, (distances[rows, columns] - own) * camera.focal_px[0].min() / depths[inside]
 
 
 @torch.no_grad()

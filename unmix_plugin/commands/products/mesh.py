@@ -39,6 +39,7 @@ class Mesh(Product):
         from unmix_plugin.exports.density_grid import GridPoints, sample_slice
         from unmix_plugin.exports.mesh import (
             extract_mesh,
+            filled,
             mesh_paths,
             require_sound,
             surface_density,
@@ -65,6 +66,8 @@ class Mesh(Product):
                 else self.density / frame.scale
             )
             pixel_size = float(model.metadata["pixel_size"])
+            if self.unseen == "drop":
+                densities = filled(densities, grid, model, surface)
             mesh = extract_mesh(densities, grid, threshold, self.smoothing, pixel_size)
             mesh = without_crumbs(mesh if self.unseen == "keep" else trim_unseen(mesh, surface))
             written = write_mesh(job.folder, self.formats, mesh, model, frame)

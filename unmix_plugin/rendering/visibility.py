@@ -1,0 +1,87 @@
+"""Which cells training rays have lately ended in: elsewhere nothing was learnt, and nothing is shown.
+
+Behind every surface lies space that no training ray reaches. What a field says there was never compared with a picture:
+from another side it stands before the scene as grey fog. It costs time too, since it isn't empty. What one view alone
+sees isn't held by the others, and grows into shapes that fit a single picture.
+
+So rays note where they end, and once enough of them were cast, cells stay visible if two views saw them or a neighbour
+of theirs. A surface that moves by a cell takes the open cells with it.
+
+Source: the visibility masks of Warburg et al. 2023, Nerfbusters, which evaluate a field only where training views saw
+it; here they are kept while training.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor, nn
+
+_RAYS_A_CELL = 16
+"""Rays to cast for each cell of a face of the grid before cells are judged."""
+_NUM_IDS = 255
+"""Views are told apart by their number modulo this, which takes one byte a cell; `_NO_VIEW` is the number left."""
+_NO_VIEW = 255
+
+
+class VisibleCells(nn.Module):
+    """Cells that two training views have seen, by the rays cast since they were judged last."""
+
+    visible: Bool[Tensor, "X Y Z"]
+    lowest_view: UInt8[Tensor, "X Y Z"]
+    highest_view: UInt8[Tensor, "X Y Z"]
+    num_rays: Int[Tensor, ""]
+
+    def __init__(self, shape: Sequence[int]) -> None:
+        """Start with every cell of a grid of this shape visible."""
+        super().__init__()
+        self.register_buffer("visible", torch.ones(*shape, dtype=torch.bool))
+        self.register_buffer("lowest_view", torch.full(tuple(shape), _NO_VIEW, dtype=torch.uint8))
+        self.register_buffer("highest_view", torch.zeros(*shape, dtype=torch.uint8))
+        self.register_buffer("num_rays", torch.zeros((), dtype=torch.int64))
+
+    @torch.no_grad()
+    def record(
+        self, points: Float[Tensor, "S 3"], views: Int[Tensor, "S"], seen: Bool[Tensor, "S"], num_rays: int
+    ) -> None:
+        """Note which views see which cells.
+
+        Args:
+            points: Samples in the unit cube.
+            views: Number of the view of each.
+            seen: Samples that send enough of their ray's light to the camera.
+            num_rays: Rays that the samples are of.
+        """
+        sides = torch.tensor(self.visible.shape, device=points.device)
+        x, y, z = torch.minimum((points * sides).long().clamp(min=0), sides - 1).unbind(-1)
+        cells = (x * sides[1] + y) * sides[2] + z
+        ids = (views % _NUM_IDS).to(torch.uint8)
+        # Unseen samples take part with a number that changes nothing: to choose would be to wait for the device.
+        self.lowest_view.view(-1).scatter_reduce_(0, cells, ids.masked_fill(~seen, _NO_VIEW), "amin")
+        self.highest_view.view(-1).scatter_reduce_(0, cells, ids.masked_fill(~seen, 0), "amax")
+        self.num_rays += num_rays
+
+    @torch.no_grad()
+    def judge(self) -> None:
+        """Keep only what two views saw, or one where no cell was seen by two, if enough rays were cast; then forget."""
+        sides = sorted(self.visible.shape)
+        if int(self.num_rays) < _RAYS_A_CELL * sides[1] * sides[2]:
+            return
+        seen_by_two = self.lowest_view < self.highest_view
+        seen = seen_by_two if bool(seen_by_two.any()) else self.lowest_view <= self.highest_view
+        self.visible.copy_(_with_neighbours(seen))
+        self.lowest_view.fill_(_NO_VIEW)
+        self.highest_view.zero_()
+        self.num_rays.zero_()
+
+
+def _with_neighbours(cells: Bool[Tensor, "X Y Z"]) -> Bool[Tensor, "X Y Z"]:
+    """And the cells that share a face, an edge or a corner with one of them."""
+    for axis in range(3):
+        grown = cells.clone()
+        grown.narrow(axis, 1, cells.shape[axis] - 1).logical_or_(cells.narrow(axis, 0, cells.shape[axis] - 1))
+        grown.narrow(axis, 0, cells.shape[axis] - 1).logical_or_(cells.narrow(axis, 1, cells.shape[axis] - 1))
+        cells = grown
+    return cells
