@@ -1,6 +1,8 @@
 """Exit codes and error messages, shared by all commands."""
 
 import errno
+import subprocess
+import sys
 
 import pytest
 
@@ -39,6 +41,26 @@ def test_words_default_to_those_of_the_process(monkeypatch):
     with pytest.raises(SystemExit):
         run_command(seen.extend)
     assert seen == ["unmix-nerf"]
+
+
+@pytest.mark.parametrize("lines", [1, 100_000])
+def test_output_that_nobody_reads_to_the_end_is_no_error(lines):
+    """As after `| head -1`, whether all of it waits in the buffer or not."""
+    code = (
+        "from unmix_plugin.commands.entry import run_command; "
+        f"run_command(lambda _: [print('line') for _ in range({lines})], [])"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 141
+
+
+def test_a_broken_pipe_to_anything_else_is_told(capsys):
+    assert end_of(raising(BrokenPipeError("ffmpeg"))) == 1
+    assert "ffmpeg" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("error", [ConfigError("no such method"), SceneError("no such method")])
