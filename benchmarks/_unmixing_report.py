@@ -129,10 +129,11 @@ def _judge_ours(scene: str, rows: dict[str, Seeds]) -> list[_common.Figure]:
         if row is not None
     ]
     if OURS in rows:
-        figures += [
-            _common.Limit(round(mean(rows[best]), 3)).judge(f"{scene}: mIoU of ours", mean(rows[OURS])),
-            _DEVIATION.judge(f"{scene}: deviation of its mIoU over seeds", deviation(rows[OURS])),
-        ]
+        limit = _common.Limit(round(mean(rows[best]), 3))
+        figures.append(limit.judge(f"{scene}: mIoU of ours", mean(rows[OURS])))
+        if len(rows[OURS]) > 1:
+            spread = deviation(rows[OURS])
+            figures.append(_DEVIATION.judge(f"{scene}: deviation of its mIoU over seeds", spread))
         best_psnr = max(mean(seeds, "psnr") for name, seeds in rows.items() if name.startswith("3d:"))
         limit = _common.Limit(round(best_psnr - _PSNR_LOSS_DB, 2), unit=" dB")
         figures.append(
