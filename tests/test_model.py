@@ -54,6 +54,22 @@ def test_where_no_alpha_is_known_highlights_may_have_the_colours_of_all_material
     assert_close(coloured.specular_spectra[1:].detach(), coloured.endmembers.detach())
 
 
+@pytest.mark.parametrize("trained", [True, False])
+def test_endmembers_are_taught_or_held_by_request(trained):
+    model = make_model(train_endmembers=trained)
+    spectra = model.get_param_groups()["spectra"]
+    assert any(value is model.endmembers for value in spectra) == trained
+    model.get_outputs(make_rays(40))["spectral"].sum().backward()
+    assert (model.endmembers.grad is not None) == trained
+    assert model.specular_spectra.grad is not None
+
+
+def test_a_model_without_spectra_to_learn_still_compiles_its_kernels():
+    model = make_model(specular="none", train_endmembers=False)
+    assert model.get_param_groups()["spectra"] == []
+    model.warm_up()
+
+
 def test_spectrum_is_diffuse_plus_specular_and_abundances_sum_to_accumulation():
     model = make_model()
     outputs = model.get_outputs_for_camera(

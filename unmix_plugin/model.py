@@ -75,6 +75,8 @@ class UnmixModelConfig(ModelConfig, LossSettings):
     """Spectra of the specular dictionary. The first is the light's, a highlight's colour on anything but metal; then
     come the endmembers', as light that they send on has. Auto is 1 where alpha is known, else all: in rooms, light is
     coloured by the walls."""
+    train_endmembers: bool = True
+    """Whether endmembers change while training; else they stay the first guess, or the spectra from a file."""
     segmentation: SegmentationMethod = "abundances"
     """Material of a ray: its largest abundance, or the endmember of smallest angle to its spectrum as published."""
     samples_per_step: int = 30_000
@@ -151,7 +153,9 @@ class UnmixModel(Model):
                 f"num-endmembers is {self.num_endmembers} but the scene has {num_bands} bands; "
                 f"choose at most {num_bands}"
             )
-        self.endmembers = nn.Parameter(torch.zeros(self.num_endmembers, num_bands))
+        self.endmembers = nn.Parameter(
+            torch.zeros(self.num_endmembers, num_bands), requires_grad=config.train_endmembers
+        )
         self.endmember_names = default_names(self.num_endmembers)
         num_dictionary = self._num_dictionary_spectra()
         self.specular_spectra = nn.Parameter(torch.zeros(num_dictionary, num_bands))
@@ -198,7 +202,8 @@ class UnmixModel(Model):
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """The hash table, the networks and the spectra."""
         networks = [value for name, value in self.field.named_parameters() if name != "table"]
-        spectra = [value for value in (self.endmembers, self.specular_spectra) if value.numel()]
+        spectra = [self.endmembers] if self.endmembers.requires_grad else []
+        spectra += [self.specular_spectra] if self.specular_spectra.numel() else []
         return {"grid": [self.field.table], "networks": networks, "spectra": spectra}
 
     @property
