@@ -105,6 +105,13 @@ class Report:
     measured: Any
     """Every number behind the figures, in JSON's types."""
     tables: Sequence[DetailTable] = field(default=())
+    variant: str = ""
+    """What tells its files from others that the same benchmark writes."""
+
+    @property
+    def file_name(self) -> str:
+        """Of what is written, without the ending."""
+        return f"{self.name}-{self.variant}" if self.variant else self.name
 
 
 def publish(report: Report, results: Path | None) -> None:
@@ -117,9 +124,9 @@ def publish(report: Report, results: Path | None) -> None:
         return
     results.mkdir(parents=True, exist_ok=True)
     values = asdict(report)
-    (results / f"{report.name}.json").write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
-    (results / f"{report.name}.md").write_text(_markdown(report), encoding="utf-8")
-    print(f"written: {results / report.name}.json and .md")
+    (results / f"{report.file_name}.json").write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
+    (results / f"{report.file_name}.md").write_text(_markdown(report), encoding="utf-8")
+    print(f"written: {results / report.file_name}.json and .md")
 
 
 def results_folder(given: Path | None, quick: bool) -> Path | None:
@@ -225,7 +232,7 @@ def _rich_table(title: str, headers: Sequence[str], rows: Sequence[Sequence[str]
 
 def _markdown(report: Report) -> str:
     lines = [
-        f"# {report.name}",
+        f"# {report.file_name}",
         "",
         report.question,
         "",

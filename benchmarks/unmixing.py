@@ -101,7 +101,7 @@ def publish(
     }
     training = "to the end" if seconds is None else f"for {seconds:g} s"
     report = _common.Report(
-        report_name(seconds),
+        "unmixing",
         "Materials found by methods that see single pixels (2d) and by a field over many views (3d), trained "
         f"{training}: means over seeds, with the standard deviation of mIoU",
         setting,
@@ -109,17 +109,18 @@ def publish(
         judge(measured),
         {scene: asdict(found) for scene, found in measured.items()},
         tables(measured),
+        variant(seconds),
     )
     _common.publish(report, results)
 
 
-def report_name(max_seconds: float | None) -> str:
-    """What the written files are called.
+def variant(max_seconds: float | None) -> str:
+    """What tells files of runs that are broken off from those of whole ones.
 
-    >>> report_name(90.0)
-    'unmixing-90s'
+    >>> variant(90.0)
+    '90s'
     """
-    return "unmixing" if max_seconds is None else f"unmixing-{max_seconds:g}s"
+    return "" if max_seconds is None else f"{max_seconds:g}s"
 
 
 def every_row() -> list[str]:
@@ -180,7 +181,8 @@ def measure_pixels(folder: Path, names: list[str], seeds: tuple[int, ...], found
 
 def earlier(results: Path | None, setting: dict[str, Any]) -> dict[str, SceneFigures]:
     """What was measured before, by scene: 2-D rows, which no setting touches, and 3-D rows of the same words."""
-    path = None if results is None else results / f"{report_name(setting['max_seconds'])}.json"
+    name = "-".join(filter(None, ("unmixing", variant(setting["max_seconds"]))))
+    path = None if results is None else results / f"{name}.json"
     if path is None or not path.is_file():
         return {}
     report = json.loads(path.read_text(encoding="utf-8"))
