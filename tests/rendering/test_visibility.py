@@ -45,8 +45,17 @@ def test_of_a_single_view_all_that_it_sees_stays():
 
 
 def test_samples_that_send_too_little_light_see_nothing():
+    cells = VisibleCells((SIDE, SIDE, SIDE))
+    record(cells, ((6, 6, 6), 0), ((6, 6, 6), 1), seen=False)
+    record(cells, ((1, 1, 1), 0), ((1, 1, 1), 1))
+    cells.judge()
+    assert cells.visible[1, 1, 1]
+    assert not cells.visible[6, 6, 6]
+
+
+def test_fog_too_thin_for_any_sample_to_be_seen_is_not_put_out():
     cells = looked_at(((6, 6, 6), 0), ((6, 6, 6), 1), seen=False)
-    assert not cells.visible.any()
+    assert cells.visible.all()
 
 
 def test_nothing_is_judged_before_enough_rays_were_cast():

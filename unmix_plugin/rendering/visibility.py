@@ -65,13 +65,18 @@ class VisibleCells(nn.Module):
 
     @torch.no_grad()
     def judge(self) -> None:
-        """Keep only what two views saw, or one where no cell was seen by two, if enough rays were cast; then forget."""
+        """Keep only what two views saw, if enough rays were cast, and forget who saw what.
+
+        Where two views saw no cell, what one saw is kept; where none saw any, as in fog that is thin everywhere, all
+        that was visible.
+        """
         sides = sorted(self.visible.shape)
         if int(self.num_rays) < _RAYS_A_CELL * sides[1] * sides[2]:
             return
         seen_by_two = self.lowest_view < self.highest_view
         seen = seen_by_two if bool(seen_by_two.any()) else self.lowest_view <= self.highest_view
-        self.visible.copy_(_with_neighbours(seen))
+        if bool(seen.any()):
+            self.visible.copy_(_with_neighbours(seen))
         self.lowest_view.fill_(_NO_VIEW)
         self.highest_view.zero_()
         self.num_rays.zero_()
