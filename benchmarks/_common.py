@@ -111,7 +111,12 @@ class Report:
     @property
     def file_name(self) -> str:
         """Of what is written, without the ending."""
-        return f"{self.name}-{self.variant}" if self.variant else self.name
+        return results_name(self.name, self.variant)
+
+
+def results_name(name: str, variant: str) -> str:
+    """What a variant's files are called, without the ending."""
+    return f"{name}-{variant}" if variant else name
 
 
 def publish(report: Report, results: Path | None) -> None:

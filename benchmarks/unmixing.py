@@ -181,7 +181,7 @@ def measure_pixels(folder: Path, names: list[str], seeds: tuple[int, ...], found
 
 def earlier(results: Path | None, setting: dict[str, Any]) -> dict[str, SceneFigures]:
     """What was measured before, by scene: 2-D rows, which no setting touches, and 3-D rows of the same words."""
-    name = "-".join(filter(None, ("unmixing", variant(setting["max_seconds"]))))
+    name = _common.results_name("unmixing", variant(setting["max_seconds"]))
     path = None if results is None else results / f"{name}.json"
     if path is None or not path.is_file():
         return {}

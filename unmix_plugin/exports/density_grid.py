@@ -16,6 +16,7 @@ from torch import Tensor
 
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.model import UnmixModel
+from unmix_plugin.rendering.grid_cells import cells_at
 
 _RESOLUTIONS = (8, 1024)
 _CHUNK = 1 << 16
@@ -106,6 +107,4 @@ def _lie_in(
     low, high = model.renderer.aabb
     unit = (positions - low) / (high - low)
     inside = ((unit >= 0) & (unit <= 1)).all(dim=-1)
-    sizes = torch.tensor(chosen.shape, device=positions.device)
-    cells = torch.minimum((unit.clamp(0, 1) * sizes).long(), sizes - 1)
-    return inside & chosen[cells[:, 0], cells[:, 1], cells[:, 2]]
+    return inside & chosen[cells_at(unit, chosen.shape).unbind(-1)]

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from unmix_plugin.rendering.grid_cells import cells_at
 from unmix_plugin.rendering.launching import as_warp, launch, vector_type
 
 
@@ -104,8 +105,7 @@ def march_twin(
     index = torch.arange(max(int(longest / step) + 2, 1), device=origins.device)
     t = t_first[:, None] + index * step
     points = origins[:, None] + t[..., None] * directions[:, None]
-    sides = torch.tensor(occupied.shape, device=origins.device)
-    cells = torch.minimum((points * sides).floor().long().clamp(min=0), sides - 1)
+    cells = cells_at(points, occupied.shape)
     hit = (t < t_far[:, None]) & (occupied[tuple(cells.unbind(-1))] != 0)
     counts = hit.sum(dim=1)
     starts = counts.cumsum(0) - counts

@@ -19,11 +19,12 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
+from unmix_plugin.rendering.grid_cells import cells_at
+
 _RAYS_A_CELL = 16
 """Rays to cast for each cell of a face of the grid before cells are judged."""
-_NUM_IDS = 255
-"""Views are told apart by their number modulo this, which takes one byte a cell; `_NO_VIEW` is the number left."""
 _NO_VIEW = 255
+"""Views are told apart by their number modulo this, which takes one byte a cell and leaves this number for none."""
 
 
 class VisibleCells(nn.Module):
@@ -54,10 +55,10 @@ class VisibleCells(nn.Module):
             seen: Samples that send enough of their ray's light to the camera.
             num_rays: Rays that the samples are of.
         """
-        sides = torch.tensor(self.visible.shape, device=points.device)
-        x, y, z = torch.minimum((points * sides).long().clamp(min=0), sides - 1).unbind(-1)
-        cells = (x * sides[1] + y) * sides[2] + z
-        ids = (views % _NUM_IDS).to(torch.uint8)
+        _, side_y, side_z = self.visible.shape
+        x, y, z = cells_at(points, self.visible.shape).unbind(-1)
+        cells = (x * side_y + y) * side_z + z
+        ids = (views % _NO_VIEW).to(torch.uint8)
         # Unseen samples take part with a number that changes nothing: to choose would be to wait for the device.
         self.lowest_view.view(-1).scatter_reduce_(0, cells, ids.masked_fill(~seen, _NO_VIEW), "amin")
         self.highest_view.view(-1).scatter_reduce_(0, cells, ids.masked_fill(~seen, 0), "amax")
