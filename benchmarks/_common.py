@@ -25,7 +25,7 @@ from rich.table import Table
 import unmix_plugin.commands  # noqa: F401 - settles how threads wait, which must be before torch is imported
 
 if TYPE_CHECKING:
-    from unmix_plugin.engine.trainer import Trainer
+    from unmix_plugin.engine.training.trainer import Trainer
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 RESULTS = Path(__file__).resolve().parent / "results"
@@ -207,7 +207,7 @@ def run_command(
 def quiet_trainer(words: Sequence[str]) -> Trainer:
     """What `unmix-train` with these words would train, without its display."""
     from unmix_plugin.commands.train import parse
-    from unmix_plugin.engine.trainer import Trainer
+    from unmix_plugin.engine.training.trainer import Trainer
 
     with open(os.devnull, "w") as nowhere:  # noqa: PTH123 - a device, not a path
         return Trainer(parse(list(words)), console=Console(file=nowhere, quiet=True))

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from unmix_plugin.editing.recipe import Recipe
-    from unmix_plugin.engine.load_run import LoadedModel
+    from unmix_plugin.engine.runs.load_run import LoadedModel
     from unmix_plugin.model import UnmixModel
     from unmix_plugin.scenes.scene import Scene
     from unmix_plugin.spectral.composition import Coefficients, Materials
@@ -48,9 +48,9 @@ class Subject:
         import torch
 
         from unmix_plugin.editing import sample_seen
-        from unmix_plugin.engine.load_run import load_model
+        from unmix_plugin.engine.runs.load_run import load_model
         from unmix_plugin.model import UnmixModel
-        from unmix_plugin.scenes.loader import load_scene
+        from unmix_plugin.scenes.reading.loader import load_scene
         from unmix_plugin.scenes.scene import SceneOptions
         from unmix_plugin.spectral.composition import compose
         from unmix_plugin.spectral.segmentation import SegmentationTally
@@ -170,7 +170,7 @@ def measure_relighting(run: Path, folder: Path, device: str) -> dict[str, float]
     import torch
 
     from unmix_plugin.editing import Light, relight
-    from unmix_plugin.engine.load_run import load_model
+    from unmix_plugin.engine.runs.load_run import load_model
     from unmix_plugin.model import UnmixModel
     from unmix_plugin.spectral.metrics import psnr
 
@@ -205,8 +205,8 @@ def measure_relighting(run: Path, folder: Path, device: str) -> dict[str, float]
 
 def built_in_scene(run: LoadedModel, folder: Path, illuminant: str) -> Scene:
     """The scene that a run of it learnt, made in a light."""
-    from unmix_plugin.scenes.demo_scene import make_demo_scene
-    from unmix_plugin.scenes.loader import load_scene
+    from unmix_plugin.scenes.demo.scene import make_demo_scene
+    from unmix_plugin.scenes.reading.loader import load_scene
     from unmix_plugin.scenes.scene import SceneOptions
 
     cameras = run.scene.train_cameras
@@ -219,7 +219,7 @@ def built_in_scene(run: LoadedModel, folder: Path, illuminant: str) -> Scene:
 
 def view_colour_error(shown: Tensor, true: Tensor, model: UnmixModel) -> Any:
     """CIEDE2000 of each pixel, as sRGB."""
-    from unmix_plugin.spectral.colour_difference import ciede2000, srgb_to_lab
+    from unmix_plugin.spectral.colour.difference import ciede2000, srgb_to_lab
 
     first, second = (srgb_to_lab(srgb_of(spectra, model.materials).numpy()) for spectra in (shown, true))
     return ciede2000(first, second)
@@ -229,7 +229,7 @@ def srgb_of(spectra: Tensor, materials: Materials) -> Tensor:
     """sRGB colours of spectra."""
     import torch
 
-    from unmix_plugin.spectral.colour import linear_to_srgb, rgb_matrix
+    from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 
     linear = spectra.detach().cpu().double().clamp(min=0) @ rgb_matrix(materials.bands, torch.float64)
     return linear_to_srgb(linear.clamp(0, 1))
@@ -244,7 +244,7 @@ def colour_error(srgb: Tensor, asked: str) -> float:
     """CIEDE2000 of a colour to `#rrggbb`."""
     import numpy as np
 
-    from unmix_plugin.spectral.colour_difference import ciede2000, srgb_to_lab
+    from unmix_plugin.spectral.colour.difference import ciede2000, srgb_to_lab
 
     wanted = np.array([int(asked[i : i + 2], 16) / 255 for i in (1, 3, 5)])
     return float(ciede2000(srgb_to_lab(srgb.detach().cpu().double().numpy()), srgb_to_lab(wanted)))

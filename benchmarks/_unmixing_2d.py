@@ -17,15 +17,19 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor
 
-from unmix_plugin.exports.evaluation import Evaluation, SceneTruth, ViewTruth, scene_truth, view_truth
-from unmix_plugin.exports.view_rendering import RenderedView
 from unmix_plugin.model import UnmixModelConfig
-from unmix_plugin.spectral.abundance_estimation import fcls, nnls, sunsal
-from unmix_plugin.spectral.endmembers import EndmemberMethod, drop_uninformative_pixels, initialise_endmembers
-from unmix_plugin.spectral.mixture_guide import MixtureGuide
-from unmix_plugin.spectral.num_materials import propose_num_materials
 from unmix_plugin.spectral.segmentation import material_scores
-from unmix_plugin.spectral.sparse_unmixing import sparse_abundances
+from unmix_plugin.spectral.unmixing.abundance_estimation import fcls, nnls, sunsal
+from unmix_plugin.spectral.unmixing.endmembers import (
+    EndmemberMethod,
+    drop_uninformative_pixels,
+    initialise_endmembers,
+)
+from unmix_plugin.spectral.unmixing.mixture_guide import MixtureGuide
+from unmix_plugin.spectral.unmixing.num_materials import propose_num_materials
+from unmix_plugin.spectral.unmixing.sparse_unmixing import sparse_abundances
+from unmix_plugin.trained.evaluation import Evaluation, SceneTruth, ViewTruth, scene_truth, view_truth
+from unmix_plugin.trained.view_rendering import RenderedView
 
 if TYPE_CHECKING:
     from unmix_plugin.scenes.scene import Scene

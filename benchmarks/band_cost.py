@@ -24,11 +24,11 @@ import _machine
 import torch
 import tyro
 
-from unmix_plugin.engine.callbacks import TrainingCallbackLocation, run_callbacks
-from unmix_plugin.engine.seeding import step_seed
-from unmix_plugin.engine.trainer import MODEL_STREAM, Trainer
+from unmix_plugin.engine.training.callbacks import TrainingCallbackLocation, run_callbacks
+from unmix_plugin.engine.training.seeding import step_seed
+from unmix_plugin.engine.training.trainer import MODEL_STREAM, Trainer
 from unmix_plugin.model import UnmixModel
-from unmix_plugin.scenes.demo_scene import make_demo_scene
+from unmix_plugin.scenes.demo.scene import make_demo_scene
 
 RATIO = _common.Limit(1.3, 1.1, is_upper=True)
 UNTIMED_STEPS = 5

@@ -53,11 +53,11 @@ def main(options: Options) -> None:
 
 def measure(path: Path, device: str) -> tuple[str, dict[str, Any]]:
     """Scene name and figures of a run."""
-    from unmix_plugin.engine.load_run import load_pipeline
-    from unmix_plugin.exports.evaluation import Evaluation, scene_truth, view_truth
-    from unmix_plugin.exports.run_materials import materials_of
-    from unmix_plugin.exports.view_rendering import render_view
+    from unmix_plugin.engine.runs.load_run import load_pipeline
     from unmix_plugin.spectral.segmentation import NOTHING_ID
+    from unmix_plugin.trained.evaluation import Evaluation, scene_truth, view_truth
+    from unmix_plugin.trained.run_materials import materials_of
+    from unmix_plugin.trained.view_rendering import render_view
 
     loaded = load_pipeline(path, device)
     scene, model = loaded.pipeline.datamanager.scene, loaded.pipeline.model  # type: ignore[attr-defined]

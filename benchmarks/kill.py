@@ -23,10 +23,10 @@ import _common
 import _machine
 import tyro
 
-from unmix_plugin.engine.checkpoints import checkpoint_steps, newest_complete_checkpoint
-from unmix_plugin.engine.load_run import load_model
+from unmix_plugin.engine.runs.checkpoints import checkpoint_steps, newest_complete_checkpoint
+from unmix_plugin.engine.runs.load_run import load_model
 from unmix_plugin.errors import UnmixError
-from unmix_plugin.scenes.demo_scene import make_demo_scene
+from unmix_plugin.scenes.demo.scene import make_demo_scene
 
 SIZE, BANDS, VIEWS = 32, 8, 8
 STEPS_PER_SAVE, STEPS_RESUMED = 10, 15

@@ -26,11 +26,11 @@ import tyro
 from torch import Tensor
 
 from unmix_plugin import rendering
-from unmix_plugin.engine.scene_box import SceneBox
-from unmix_plugin.engine.trainer import Trainer
+from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.rendering import HashGridLayout, PackedSamples
-from unmix_plugin.scenes.demo_scene import DEFAULT_SIZE, DEFAULT_VIEWS, make_demo_scene
+from unmix_plugin.scenes.demo.scene import DEFAULT_SIZE, DEFAULT_VIEWS, make_demo_scene
 
 SPEED_UP = _common.Limit(8.0, unit=" x")
 WHOLE = "all together, forward and backward"

@@ -145,9 +145,9 @@ def baselines(folder: Path, num_endmembers: int) -> dict[str, list[float]]:
     import torch
     from _unmixing_2d import opaque_pixels
 
-    from unmix_plugin.scenes.loader import load_scene
+    from unmix_plugin.scenes.reading.loader import load_scene
     from unmix_plugin.scenes.scene import SceneOptions
-    from unmix_plugin.spectral.endmembers import initialise_endmembers
+    from unmix_plugin.spectral.unmixing.endmembers import initialise_endmembers
 
     scene = load_scene(folder, SceneOptions())
     if not scene.has_labels:

@@ -22,8 +22,8 @@ import torch
 import tyro
 
 from unmix_plugin.commands.entry import INTERRUPTED
-from unmix_plugin.engine.checkpoints import Checkpoint, newest_complete_checkpoint
-from unmix_plugin.scenes.demo_scene import make_demo_scene
+from unmix_plugin.engine.runs.checkpoints import Checkpoint, newest_complete_checkpoint
+from unmix_plugin.scenes.demo.scene import make_demo_scene
 
 LOSS_DIFFERENCE = _common.Limit(1e-6, is_upper=True)
 SEED = 7

@@ -162,9 +162,9 @@ def measure_pixels(folder: Path, names: list[str], seeds: tuple[int, ...], found
         return
     from _unmixing_2d import METHODS, PixelBaselines
 
-    from unmix_plugin.exports.evaluation import finite_or_none
-    from unmix_plugin.scenes.loader import load_scene
+    from unmix_plugin.scenes.reading.loader import load_scene
     from unmix_plugin.scenes.scene import SceneOptions
+    from unmix_plugin.trained.evaluation import finite_or_none
 
     baselines = PixelBaselines(load_scene(folder, SceneOptions()))
     if baselines.truth.endmembers is None:

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from unmix_plugin.engine.cameras import Cameras
-from unmix_plugin.engine.rays import RayBundle
-from unmix_plugin.engine.scene_box import SceneBox
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.rays import RayBundle
+from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.field import UnmixFieldConfig
 from unmix_plugin.model import UnmixModel, UnmixModelConfig
 from unmix_plugin.renderer import RendererConfig

@@ -11,7 +11,7 @@ from torch.testing import assert_close
 from tests.scenes.scene_factory import make_scene
 from unmix_plugin.datamanager import HyperspectralDataManager, HyperspectralDataManagerConfig
 from unmix_plugin.errors import ConfigError, SceneError
-from unmix_plugin.scenes.demo_scene import make_demo_scene
+from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.scenes.scene import SceneOptions
 
 CONFIG = HyperspectralDataManagerConfig(

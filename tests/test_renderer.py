@@ -7,8 +7,8 @@ import torch
 from torch.testing import assert_close
 
 from unmix_plugin import renderer as renderer_module
-from unmix_plugin.engine.rays import RayBundle
-from unmix_plugin.engine.scene_box import SceneBox
+from unmix_plugin.engine.geometry.rays import RayBundle
+from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.field import UnmixField, UnmixFieldConfig
 from unmix_plugin.renderer import CoefficientRenderer, RendererConfig
 

@@ -17,15 +17,15 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from unmix_plugin.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-from unmix_plugin.engine.cameras import Cameras
 from unmix_plugin.engine.data_manager import DataManager, DataManagerConfig
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.instantiate import Target
-from unmix_plugin.engine.rays import RayBundle
-from unmix_plugin.engine.seeding import step_generator
+from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
+from unmix_plugin.engine.training.seeding import step_generator
 from unmix_plugin.errors import ConfigError, SceneError
-from unmix_plugin.scenes.carving import carve
-from unmix_plugin.scenes.loader import load_scene
+from unmix_plugin.scenes.geometry.carving import carve
+from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import Scene, SceneOptions
 
 DEMO = Path("demo")
@@ -281,7 +281,7 @@ def _load(folder: Path, options: SceneOptions) -> Scene:
 
 def _scene_folder(data: Path) -> Path:
     if data == DEMO:
-        from unmix_plugin.scenes.demo_scene import demo_scene_path
+        from unmix_plugin.scenes.demo.scene import demo_scene_path
 
         return demo_scene_path()
     return data

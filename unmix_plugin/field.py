@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from unmix_plugin.engine.field import Field
-from unmix_plugin.engine.scene_box import SceneBox
+from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.rendering.hash_encoding import HashGridLayout, hash_encode
 
 _LARGEST_LOG_DENSITY = 15.0

@@ -4,9 +4,9 @@ from pathlib import Path
 
 from unmix_plugin.datamanager import HyperspectralDataManagerConfig
 from unmix_plugin.engine.configs import TrainerConfig
-from unmix_plugin.engine.optimizers import OptimizerConfig
 from unmix_plugin.engine.pipeline import PipelineConfig
 from unmix_plugin.engine.registry import MethodSpecification
+from unmix_plugin.engine.training.optimizers import OptimizerConfig
 from unmix_plugin.model import UnmixModelConfig
 
 unmix_nerf = MethodSpecification(

@@ -23,16 +23,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from unmix_plugin.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-from unmix_plugin.engine.cameras import Cameras
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.instantiate import Target
 from unmix_plugin.engine.model import Model, ModelConfig
-from unmix_plugin.engine.rays import RayBundle
+from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.field import UnmixField, UnmixFieldConfig
 from unmix_plugin.renderer import CoefficientRenderer, RenderedRays, RendererConfig
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour import rgb_matrix
+from unmix_plugin.spectral.colour.conversion import rgb_matrix
 from unmix_plugin.spectral.composition import (
     OCCUPIED_ACCUMULATION,
     Coefficients,
@@ -42,15 +42,15 @@ from unmix_plugin.spectral.composition import (
     default_names,
     spectral,
 )
-from unmix_plugin.spectral.endmembers import (
+from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
+from unmix_plugin.spectral.metrics import psnr
+from unmix_plugin.spectral.unmixing.endmembers import (
     EndmemberMethod,
     drop_uninformative_pixels,
     initialise_endmembers,
 )
-from unmix_plugin.spectral.metrics import psnr
-from unmix_plugin.spectral.mixture_guide import MixtureGuide
-from unmix_plugin.spectral.num_materials import propose_num_materials
-from unmix_plugin.spectral.spectra_csv import read_spectra_csv
+from unmix_plugin.spectral.unmixing.mixture_guide import MixtureGuide
+from unmix_plugin.spectral.unmixing.num_materials import propose_num_materials
 from unmix_plugin.training_losses import LossSettings, pixel_mean, training_losses
 
 _FEWEST_RAYS, _MOST_RAYS = 64, 8192

@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from unmix_plugin.engine.rays import RayBundle
-from unmix_plugin.engine.scene_box import SceneBox
+from unmix_plugin.engine.geometry.rays import RayBundle
+from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.rendering.compositing import accumulate, volume_weights
 from unmix_plugin.rendering.marching import PackedSamples, march

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.spectral.losses import forgive_saturation, over_background, solid_evidence, srgb_error
-from unmix_plugin.spectral.mixture_guide import MixtureGuide
+from unmix_plugin.spectral.unmixing.mixture_guide import MixtureGuide
 
 _RGB_WEIGHT_WITH_ALPHA = 0.2
 

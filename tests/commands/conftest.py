@@ -8,7 +8,7 @@ import pytest
 
 from tests.commands.running import SMALL_METHOD, Ended, run
 from unmix_plugin.commands.train import train
-from unmix_plugin.scenes.demo_scene import make_demo_scene
+from unmix_plugin.scenes.demo.scene import make_demo_scene
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ import torch
 from tests.commands.running import picture_size, run
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.datamanager import HyperspectralDataManager
-from unmix_plugin.engine.load_run import load_pipeline
-from unmix_plugin.exports.evaluation import DEFINITIONS
+from unmix_plugin.engine.runs.load_run import load_pipeline
 from unmix_plugin.spectral.metrics import psnr
+from unmix_plugin.trained.evaluation import DEFINITIONS
 
 KEYS = [
     *("psnr", "rmse", "ssim", "sam", "rgb_psnr", "miou", "macro_f1", "accuracy", "abundance_rmse"),

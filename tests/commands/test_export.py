@@ -10,8 +10,8 @@ from PIL import Image
 
 from tests.commands.running import picture_size, run
 from unmix_plugin.commands.export import export
-from unmix_plugin.engine.load_run import load_model
-from unmix_plugin.spectral.spectra_csv import read_spectra_csv
+from unmix_plugin.engine.runs.load_run import load_model
+from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 
 
 @pytest.fixture(scope="module")

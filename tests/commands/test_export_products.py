@@ -13,15 +13,15 @@ import spectral.io.envi as envi
 from plyfile import PlyData
 
 from tests.commands.running import SMALL_METHOD, picture_size, run
-from tests.exports.mesh_reading import loaded_mesh
-from tests.exports.test_html_page import assert_self_contained
+from tests.figures.test_html_page import assert_self_contained
+from tests.products.mesh_reading import loaded_mesh
 from unmix_plugin.commands.export import PRODUCTS, export
 from unmix_plugin.commands.train import train
-from unmix_plugin.engine.load_run import load_model
-from unmix_plugin.exports.run_materials import materials_of
+from unmix_plugin.engine.runs.load_run import load_model
 from unmix_plugin.scenes import load_scene
-from unmix_plugin.scenes.demo_scene import make_demo_scene
+from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.scenes.scene import SceneOptions
+from unmix_plugin.trained.run_materials import materials_of
 
 SMALL = {
     "cubes": ["--formats", "envi", "exr", "npy"],

@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from tests.commands.running import run
-from tests.exports.formats.cubes import full_disk
-from tests.exports.formats.video_reading import read_video
-from tests.exports.render_factory import read_envi, read_exr
+from tests.formats.cubes import full_disk
+from tests.formats.video_reading import read_video
+from tests.products.render.render_factory import read_envi, read_exr
 from unmix_plugin.commands.render import render
-from unmix_plugin.engine.load_run import load_model
-from unmix_plugin.exports.edited_run import load_edited_model
+from unmix_plugin.editing.edited_run import load_edited_model
+from unmix_plugin.engine.runs.load_run import load_model
 
 pytestmark = pytest.mark.usefixtures("no_wait_for_the_disk")
 

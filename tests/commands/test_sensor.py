@@ -7,13 +7,13 @@ import pytest
 from plyfile import PlyData
 
 from tests.commands.running import SMALL_METHOD, run
-from tests.exports.render_factory import read_envi
+from tests.products.render.render_factory import read_envi
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.render import render
 from unmix_plugin.commands.train import train
-from unmix_plugin.engine.load_run import load_model
-from unmix_plugin.exports.edited_run import load_edited_model, sensor_notes
-from unmix_plugin.scenes.demo_scene import make_demo_scene
+from unmix_plugin.editing.edited_run import load_edited_model, sensor_notes
+from unmix_plugin.engine.runs.load_run import load_model
+from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.sensor import read_sensor
 

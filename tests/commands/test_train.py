@@ -17,11 +17,11 @@ from tests.commands.running import SMALL_METHOD, run
 from unmix_plugin.commands import train as train_module
 from unmix_plugin.commands.train import parse, train
 from unmix_plugin.engine import registry
-from unmix_plugin.engine.load_run import load_model
-from unmix_plugin.engine.trainer import Trainer
+from unmix_plugin.engine.runs.load_run import load_model
+from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.model import UnmixModel, UnmixModelConfig
-from unmix_plugin.spectral.spectra_csv import read_spectra_csv
+from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 
 
 def small_training(trained, output_dir, *words):

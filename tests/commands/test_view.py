@@ -16,11 +16,11 @@ import pytest
 from benchmarks._viewer_page import Page
 from tests.commands.running import SMALL_METHOD, run
 from tests.commands.test_bad_runs import SPOILT, contents
-from tests.exports.formats.video_reading import read_video
+from tests.formats.video_reading import read_video
 from unmix_plugin.commands import train as train_module
 from unmix_plugin.commands.train import parse_all, train
 from unmix_plugin.commands.view import ViewOptions, prepared, view
-from unmix_plugin.spectral.spectra_csv import read_spectra_csv
+from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 from unmix_plugin.viewer.options import ViewerOptions
 
 START_S = 90.0
@@ -208,7 +208,7 @@ def test_nothing_is_written_into_a_run_that_is_only_looked_at(run_copy):
 
 
 def test_a_method_that_does_not_unmix_has_no_viewer_and_says_so(run_copy, monkeypatch):
-    monkeypatch.setattr("unmix_plugin.viewer.model_source.UnmixModel", type("OtherModel", (), {}))
+    monkeypatch.setattr("unmix_plugin.viewer.rendering.model_source.UnmixModel", type("OtherModel", (), {}))
     ended = run(view, "--run", run_copy, "--device", "cpu")
     assert ended.status == 2
     assert "the viewer shows runs of methods that unmix spectra" in ended.err

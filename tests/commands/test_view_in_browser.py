@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from unmix_plugin.commands.view import ViewOptions, prepared
-from unmix_plugin.viewer.layers import LAYERS
+from unmix_plugin.viewer.layers.layers import LAYERS
 from unmix_plugin.viewer.options import ViewerOptions
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")

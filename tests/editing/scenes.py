@@ -7,7 +7,7 @@ from torch import Tensor
 
 from tests.method_factory import make_model
 from unmix_plugin.editing import Recipe, edit_model, recipe_from_yaml
-from unmix_plugin.engine.cameras import Cameras
+from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.spectral.composition import Coefficients
 

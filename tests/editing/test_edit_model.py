@@ -10,10 +10,10 @@ from tests.method_factory import NUM_BANDS, WAVELENGTHS_NM, make_model
 from unmix_plugin.editing import Light, changes_geometry, edit_model, relight
 from unmix_plugin.editing.apply import assumption_of_light
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.exports.run_materials import endmember_table
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.composition import compose
-from unmix_plugin.spectral.library import measured_library
+from unmix_plugin.spectral.library.material_library import measured_library
+from unmix_plugin.trained.run_materials import endmember_table
 
 BANDS = Bands.of(WAVELENGTHS_NM)
 EVERY_KIND = [

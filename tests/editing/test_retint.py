@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from unmix_plugin.editing.retint import Surface, hexadecimal, retinted
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour import rgb_matrix
-from unmix_plugin.spectral.illuminants import illuminant_power
-from unmix_plugin.spectral.library import measured_library
+from unmix_plugin.spectral.colour.conversion import rgb_matrix
+from unmix_plugin.spectral.colour.illuminants import illuminant_power
+from unmix_plugin.spectral.library.material_library import measured_library
 
 BANDS = Bands.of(np.linspace(400, 700, 31))
 LIGHT = illuminant_power("D50", BANDS)

@@ -9,9 +9,9 @@ from tests.editing.scenes import CAMERAS, edited, lit_model
 from unmix_plugin.editing import sample_seen
 from unmix_plugin.editing.material_state import MaterialState
 from unmix_plugin.editing.seen import Look, look_at
-from unmix_plugin.engine.cameras import Cameras
+from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.spectral.colour import linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.composition import Coefficients, compose
 
 

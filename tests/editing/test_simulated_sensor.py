@@ -10,10 +10,10 @@ from tests.method_factory import WAVELENGTHS_NM, make_model
 from unmix_plugin.editing.simulated_sensor import with_sensor
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour import rgb_matrix
+from unmix_plugin.spectral.colour.conversion import rgb_matrix
 from unmix_plugin.spectral.composition import OUTPUT_NAMES
+from unmix_plugin.spectral.library.spectra_csv import SpectraTable
 from unmix_plugin.spectral.sensor import Sensor
-from unmix_plugin.spectral.spectra_csv import SpectraTable
 
 BANDS = Bands.of(WAVELENGTHS_NM)
 SENSOR = Sensor(

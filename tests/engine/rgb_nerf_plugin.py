@@ -9,16 +9,16 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from unmix_plugin.engine.cameras import Cameras
 from unmix_plugin.engine.configs import OptimizerConfig, Target, TrainerConfig
 from unmix_plugin.engine.data_manager import DataManager, DataManagerConfig
 from unmix_plugin.engine.field import Field
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.rays import RayBundle
+from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.engine.model import Model, ModelConfig
 from unmix_plugin.engine.pipeline import PipelineConfig
-from unmix_plugin.engine.rays import RayBundle
 from unmix_plugin.engine.registry import MethodSpecification
-from unmix_plugin.engine.scene_box import SceneBox
-from unmix_plugin.engine.seeding import step_generator
+from unmix_plugin.engine.training.seeding import step_generator
 
 VIEWS, SIZE = 12, 20
 

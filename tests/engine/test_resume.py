@@ -12,12 +12,12 @@ import pytest
 import torch
 from rich.console import Console
 
-from unmix_plugin.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-from unmix_plugin.engine.checkpoints import Checkpoint, checkpoint_steps, newest_complete_checkpoint
 from unmix_plugin.engine.configs import TrainerConfig
-from unmix_plugin.engine.interrupts import Interrupted
-from unmix_plugin.engine.load_run import load_config, load_model
-from unmix_plugin.engine.trainer import Trainer
+from unmix_plugin.engine.runs.checkpoints import Checkpoint, checkpoint_steps, newest_complete_checkpoint
+from unmix_plugin.engine.runs.load_run import load_config, load_model
+from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
+from unmix_plugin.engine.training.interrupts import Interrupted
+from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.errors import RunError
 
 

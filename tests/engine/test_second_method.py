@@ -12,9 +12,9 @@ from rich.console import Console
 
 from tests.engine import rgb_nerf_plugin
 from unmix_plugin.engine.configs import TrainerConfig
-from unmix_plugin.engine.load_run import load_model, load_pipeline
 from unmix_plugin.engine.registry import find_method
-from unmix_plugin.engine.trainer import Trainer
+from unmix_plugin.engine.runs.load_run import load_model, load_pipeline
+from unmix_plugin.engine.training.trainer import Trainer
 
 
 @pytest.mark.usefixtures("registered")

@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour import rgb_matrix
+from unmix_plugin.spectral.colour.conversion import rgb_matrix
 from unmix_plugin.spectral.composition import Coefficients, Materials, compose, default_names
 
 BANDS = Bands.of([450, 500, 550, 600, 650])

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.library.spectra_csv import SpectraTable
 from unmix_plugin.spectral.sensor import Sensor, read_sensor
-from unmix_plugin.spectral.spectra_csv import SpectraTable
 
 BANDS = Bands.of(np.linspace(400, 700, 31))
 """Cover 395-705 nm."""

@@ -9,7 +9,7 @@ import pytest
 
 from tests.viewer.pages import serving
 from tests.viewer.view_factory import make_source
-from unmix_plugin.viewer.model_source import ModelSource
+from unmix_plugin.viewer.rendering.model_source import ModelSource
 from unmix_plugin.viewer.server import Viewer
 
 

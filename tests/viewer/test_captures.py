@@ -16,8 +16,8 @@ from unmix_plugin.viewer.captures import (
     StripCapture,
     check_size,
 )
-from unmix_plugin.viewer.edits import Edit
-from unmix_plugin.viewer.layer_settings import LayerSettings
+from unmix_plugin.viewer.layers.layer_settings import LayerSettings
+from unmix_plugin.viewer.rendering.edits import Edit
 from unmix_plugin.viewer.view_cameras import sized_camera
 
 

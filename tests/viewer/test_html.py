@@ -5,7 +5,7 @@ from html.parser import HTMLParser
 import pytest
 
 from unmix_plugin.viewer import html
-from unmix_plugin.viewer.painting import ColourMapLegend, SwatchLegend, TextLegend
+from unmix_plugin.viewer.layers.painting import ColourMapLegend, SwatchLegend, TextLegend
 
 EVIL = "<script>alert(1)</script><img src=x onerror='alert(2)'> & \"quotes\""
 

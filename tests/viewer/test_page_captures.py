@@ -48,8 +48,8 @@ def test_pictures_too_large_are_refused(viewer):
 
 
 def test_a_path_through_key_frames_is_a_camera_file(viewer):
-    from unmix_plugin.exports.camera_files import read_camera_file
-    from unmix_plugin.exports.world_frame import world_frame
+    from unmix_plugin.trained.camera_files.camera_files import read_camera_file
+    from unmix_plugin.trained.world_frame import world_frame
 
     with opened(viewer) as page:
         for number, angle in enumerate((0.3, 0.8, 1.3), start=1):

@@ -8,7 +8,7 @@ import pytest
 from tests.viewer.pages import decoded, opened, serving, show_layer
 from tests.viewer.view_factory import make_source
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.indices import available_indices
+from unmix_plugin.spectral.maps.indices import available_indices
 
 
 def test_a_page_gets_a_picture_of_its_shape_that_shows_something(viewer):

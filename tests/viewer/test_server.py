@@ -6,7 +6,7 @@ import time
 
 from tests.viewer.pages import has_control, opened, serving
 from tests.viewer.view_factory import make_source
-from unmix_plugin.engine.training_control import TrainingControl
+from unmix_plugin.engine.training.training_control import TrainingControl
 
 
 def test_stopping_frees_the_port_and_every_thread(source):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from unmix_plugin.engine.progress import TrainingStatus
+from unmix_plugin.engine.training.progress import TrainingStatus
 from unmix_plugin.viewer.training_curve import TrainingCurve
 
 

@@ -13,19 +13,19 @@ import torch
 
 from tests.method_factory import BOX, make_model
 from tests.scenes.scene_factory import ring_poses
-from unmix_plugin.engine.cameras import Cameras
-from unmix_plugin.engine.device_share import DeviceShare
-from unmix_plugin.engine.load_run import SceneRecord
-from unmix_plugin.engine.run_folder import RunFolder
-from unmix_plugin.engine.training_control import TrainingControl
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.runs.load_run import SceneRecord
+from unmix_plugin.engine.runs.run_folder import RunFolder
+from unmix_plugin.engine.training.device_share import DeviceShare
+from unmix_plugin.engine.training.training_control import TrainingControl
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.scene import Scene
-from unmix_plugin.viewer.frames import Frame, render_frame
-from unmix_plugin.viewer.layer_settings import LayerAids
-from unmix_plugin.viewer.model_source import ModelSource
-from unmix_plugin.viewer.reference import render_reference
+from unmix_plugin.viewer.layers.layer_settings import LayerAids
+from unmix_plugin.viewer.rendering.frames import Frame, render_frame
+from unmix_plugin.viewer.rendering.model_source import ModelSource
+from unmix_plugin.viewer.rendering.reference import render_reference
+from unmix_plugin.viewer.rendering.view import Shown, View
 from unmix_plugin.viewer.services import Services
-from unmix_plugin.viewer.view import Shown, View
 from unmix_plugin.viewer.view_cameras import ViewPose, pose_of
 
 WIDTH, HEIGHT, FOCAL = 24, 16, 20.0

@@ -10,9 +10,9 @@ from typing import Annotated
 import tyro
 
 from unmix_plugin.commands.entry import run_command
-from unmix_plugin.scenes.demo_materials import LAMP
-from unmix_plugin.scenes.demo_scene import DEFAULT_BANDS, DEFAULT_SIZE, DEFAULT_VIEWS, make_demo_scene
-from unmix_plugin.spectral.illuminants import parse_light
+from unmix_plugin.scenes.demo.materials import LAMP
+from unmix_plugin.scenes.demo.scene import DEFAULT_BANDS, DEFAULT_SIZE, DEFAULT_VIEWS, make_demo_scene
+from unmix_plugin.spectral.colour.illuminants import parse_light
 
 
 @dataclass(frozen=True)

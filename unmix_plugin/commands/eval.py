@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from unmix_plugin.editing.recipe import Recipe
-    from unmix_plugin.engine.load_run import LoadedPipeline
     from unmix_plugin.engine.model import Model
-    from unmix_plugin.exports.evaluation import Evaluation
-    from unmix_plugin.exports.evaluation_pictures import MaterialLook
+    from unmix_plugin.engine.runs.load_run import LoadedPipeline
+    from unmix_plugin.products.evaluation_pictures import MaterialLook
     from unmix_plugin.scenes.scene import Scene
+    from unmix_plugin.trained.evaluation import Evaluation
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,8 @@ def evaluate(words: list[str]) -> None:
 
     from unmix_plugin.commands.reporting import working
     from unmix_plugin.commands.run_choice import chosen_run
-    from unmix_plugin.engine.load_run import load_pipeline
-    from unmix_plugin.exports.edited_run import requested_recipe
+    from unmix_plugin.editing.edited_run import requested_recipe
+    from unmix_plugin.engine.runs.load_run import load_pipeline
 
     console = Console()
     path = chosen_run(options.run, options.output_dir)
@@ -97,8 +97,8 @@ class _Subject:
 
 
 def _subject(loaded: LoadedPipeline, recipe: Recipe | None, options: EvalOptions) -> _Subject:
+    from unmix_plugin.editing.edited_run import apply_recipe
     from unmix_plugin.editing.yaml_writing import recipe_to_yaml
-    from unmix_plugin.exports.edited_run import apply_recipe
 
     model = loaded.pipeline.model
     if recipe is None:
@@ -128,11 +128,11 @@ def _scene_of(loaded: LoadedPipeline) -> Scene:
 def _evaluate_views(subject: _Subject, console: Console) -> tuple[Evaluation, int]:
     """Measure and draw view by view; the ids alone are kept, since their colours are known after the last view."""
     from unmix_plugin.commands.reporting import follow
-    from unmix_plugin.exports.evaluation import Evaluation, scene_truth, view_truth
-    from unmix_plugin.exports.evaluation_pictures import draw_colour, draw_matched_abundances, material_look
-    from unmix_plugin.exports.files import write_file
-    from unmix_plugin.exports.run_materials import materials_of
-    from unmix_plugin.exports.view_rendering import render_view
+    from unmix_plugin.formats.files import write_file
+    from unmix_plugin.products.evaluation_pictures import draw_colour, draw_matched_abundances, material_look
+    from unmix_plugin.trained.evaluation import Evaluation, scene_truth, view_truth
+    from unmix_plugin.trained.run_materials import materials_of
+    from unmix_plugin.trained.view_rendering import render_view
 
     scene, folder, factors = _scene_of(subject.loaded), subject.folder, subject.light_factors
     materials = materials_of(subject.model)
@@ -159,8 +159,8 @@ def _draw_segmentations(
     console: Console,
 ) -> None:
     from unmix_plugin.commands.reporting import follow
-    from unmix_plugin.exports.evaluation_pictures import draw_matched_segmentation
-    from unmix_plugin.exports.files import write_file
+    from unmix_plugin.formats.files import write_file
+    from unmix_plugin.products.evaluation_pictures import draw_matched_segmentation
 
     scene, matching = _scene_of(subject.loaded), evaluation.segmentation().matching
     for index in follow(console, "drawing segmentations", list(ids)):
@@ -171,8 +171,8 @@ def _draw_segmentations(
 
 def _write_metrics(subject: _Subject, evaluation: Evaluation) -> dict[str, Any]:
     """Write metrics.json; the scene's figures, None where there is no truth."""
-    from unmix_plugin.exports.evaluation import DEFINITIONS, finite_or_none
-    from unmix_plugin.exports.files import write_file
+    from unmix_plugin.formats.files import write_file
+    from unmix_plugin.trained.evaluation import DEFINITIONS, finite_or_none
 
     training = subject.loaded.training
     values = finite_or_none(
@@ -195,7 +195,7 @@ def _show(console: Console, figures: dict[str, Any], subject: _Subject) -> None:
     """The figures as a table."""
     from rich.table import Table
 
-    from unmix_plugin.exports.evaluation import DEFINITIONS
+    from unmix_plugin.trained.evaluation import DEFINITIONS
 
     of = "" if subject.edits is None else ", edited, against the scene as measured"
     of += "" if subject.light_factors is None else " (in the same light)"

@@ -72,7 +72,7 @@ def _open(product: Product) -> Job:
 
     from unmix_plugin.commands.reporting import say, working
     from unmix_plugin.commands.run_choice import chosen_run
-    from unmix_plugin.exports.edited_run import edit_notes, load_edited_model
+    from unmix_plugin.editing.edited_run import edit_notes, load_edited_model
 
     _refuse_sensor(product)
     console = Console()

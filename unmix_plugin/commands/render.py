@@ -15,11 +15,11 @@ from unmix_plugin.engine.configs import DeviceName
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from unmix_plugin.engine.load_run import LoadedModel
-    from unmix_plugin.exports.render_cameras import CameraRequest, RenderCameras
-    from unmix_plugin.exports.render_outputs import Product
-    from unmix_plugin.exports.render_pictures import Palette
-    from unmix_plugin.exports.render_survey import Survey
+    from unmix_plugin.engine.runs.load_run import LoadedModel
+    from unmix_plugin.products.render.cameras import CameraRequest, RenderCameras
+    from unmix_plugin.products.render.outputs import Product
+    from unmix_plugin.products.render.pictures import Palette
+    from unmix_plugin.products.render.survey import Survey
 
 
 @dataclass(frozen=True)
@@ -82,10 +82,10 @@ def render(words: list[str]) -> None:
 
     from unmix_plugin.commands.reporting import say, working
     from unmix_plugin.commands.run_choice import chosen_run
-    from unmix_plugin.exports.edited_run import edit_notes, load_edited_model
-    from unmix_plugin.exports.render_cameras import choose_cameras
-    from unmix_plugin.exports.render_outputs import choose_products, default_outputs
-    from unmix_plugin.exports.run_materials import materials_of
+    from unmix_plugin.editing.edited_run import edit_notes, load_edited_model
+    from unmix_plugin.products.render.cameras import choose_cameras
+    from unmix_plugin.products.render.outputs import choose_products, default_outputs
+    from unmix_plugin.trained.run_materials import materials_of
 
     console = Console()
     path = chosen_run(options.run, options.output_dir)
@@ -101,7 +101,7 @@ def render(words: list[str]) -> None:
 
 def _camera_request(options: RenderOptions) -> CameraRequest:
     from unmix_plugin.errors import ConfigError
-    from unmix_plugin.exports.render_cameras import CameraRequest
+    from unmix_plugin.products.render.cameras import CameraRequest
 
     size = None
     if options.size is not None:
@@ -121,9 +121,9 @@ def _render(
 ) -> None:
     """Render block by block, then list what was written."""
     from unmix_plugin.commands.reporting import follow, say
-    from unmix_plugin.exports.files import refuse_to_overwrite, write_file
-    from unmix_plugin.exports.render_job import RenderJob
-    from unmix_plugin.exports.render_legend import draw_legend
+    from unmix_plugin.formats.files import refuse_to_overwrite, write_file
+    from unmix_plugin.products.render.job import RenderJob
+    from unmix_plugin.products.render.legend import draw_legend
 
     folder = (options.output or loaded.run.exports / "render").resolve()
     legends = _legends(folder, products)
@@ -150,7 +150,7 @@ def _survey(
     loaded: LoadedModel, cameras: RenderCameras, products: tuple[Product, ...], console: Console
 ) -> Survey:
     from unmix_plugin.commands.reporting import working
-    from unmix_plugin.exports.render_survey import Survey, needs_survey, take_survey
+    from unmix_plugin.products.render.survey import Survey, needs_survey, take_survey
 
     names = {product.output.name for product in products}
     if not needs_survey(names):
@@ -161,7 +161,7 @@ def _survey(
 
 def _legends(folder: Path, products: tuple[Product, ...]) -> dict[Path, Product]:
     """Files of legends, each with a product that needs it."""
-    from unmix_plugin.exports.render_legend import needs_legend
+    from unmix_plugin.products.render.legend import needs_legend
 
     return {
         folder / f"{product.output.file_name}_legend.png": product
@@ -171,7 +171,7 @@ def _legends(folder: Path, products: tuple[Product, ...]) -> dict[Path, Product]
 
 
 def _paths(folder: Path, products: tuple[Product, ...], cameras: RenderCameras) -> list[Path]:
-    from unmix_plugin.exports.render_job import product_paths
+    from unmix_plugin.products.render.job import product_paths
 
     return [path for product in products for path in product_paths(folder, product, cameras)]
 
@@ -180,8 +180,8 @@ def _camera_file(
     folder: Path, source: str, loaded: LoadedModel, cameras: RenderCameras
 ) -> tuple[Path, bytes]:
     """Where the cameras are written down, and as what."""
-    from unmix_plugin.exports.camera_files import camera_file_bytes
-    from unmix_plugin.exports.world_frame import world_frame
+    from unmix_plugin.trained.camera_files.camera_files import camera_file_bytes
+    from unmix_plugin.trained.world_frame import world_frame
 
     frames_per_second = (cameras.frames_per_second or 24.0) if cameras.is_path else None
     content = camera_file_bytes(cameras.views, frames_per_second, world_frame(loaded.scene))
@@ -197,7 +197,7 @@ def _announcement(cameras: RenderCameras, products: tuple[Product, ...]) -> str:
 
 def _list(folder: Path, products: tuple[Product, ...], cameras: RenderCameras, palette: Palette) -> None:
     """A line for each product: where, how many, what."""
-    from unmix_plugin.exports.render_job import is_video_of_all, product_paths
+    from unmix_plugin.products.render.job import is_video_of_all, product_paths
 
     for product in products:
         paths = product_paths(folder, product, cameras)

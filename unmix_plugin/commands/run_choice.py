@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from unmix_plugin.engine.run_folder import newest_run
+from unmix_plugin.engine.runs.run_folder import newest_run
 
 
 def chosen_run(run: Path | None, output_dir: Path) -> Path:

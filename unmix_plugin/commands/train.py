@@ -22,7 +22,7 @@ from unmix_plugin.viewer.options import TrainingViewerOptions
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from unmix_plugin.engine.trainer import Trainer
+    from unmix_plugin.engine.training.trainer import Trainer
     from unmix_plugin.scenes.scene import Scene
 
 _PROGRAM = "unmix-train"
@@ -124,7 +124,7 @@ def _stored_config(name: str, options: list[str]) -> TrainerConfig | None:
     path = _value_of("load-run", options)
     if path is None:
         return None
-    from unmix_plugin.engine.load_run import load_config
+    from unmix_plugin.engine.runs.load_run import load_config
 
     stored = load_config(Path(path))
     if stored.method_name != name:
@@ -137,7 +137,7 @@ def _stored_config(name: str, options: list[str]) -> TrainerConfig | None:
 def _prepared(config: TrainerConfig, console: Console) -> Trainer:
     """The trainer, with everything read and compiled that training needs."""
     from unmix_plugin.commands.reporting import say, working
-    from unmix_plugin.engine.trainer import Trainer
+    from unmix_plugin.engine.training.trainer import Trainer
 
     reading = working(console, f"reading {config.data}") if config.data is not None else nullcontext()
     with reading:
@@ -170,7 +170,7 @@ def _run(trainer: Trainer, console: Console) -> None:
         SystemExit: 130, after a stop on request.
     """
     from unmix_plugin.commands.reporting import say
-    from unmix_plugin.engine.interrupts import Interrupted
+    from unmix_plugin.engine.training.interrupts import Interrupted
 
     try:
         record = trainer.train()
@@ -197,8 +197,8 @@ def _shown(trainer: Trainer, viewing: TrainingViewerOptions, console: Console) -
         yield
         return
     from unmix_plugin.commands.reporting import say
-    from unmix_plugin.engine.load_run import read_scene_record
-    from unmix_plugin.viewer.model_source import source_of_training
+    from unmix_plugin.engine.runs.load_run import read_scene_record
+    from unmix_plugin.viewer.rendering.model_source import source_of_training
     from unmix_plugin.viewer.server import Viewer
 
     try:
@@ -236,7 +236,7 @@ def _scene_of(trainer: Trainer) -> Scene:
 
 def _write_endmembers(trainer: Trainer) -> None:
     """Write the endmembers that evaluation and exports will use, if the method has any."""
-    from unmix_plugin.exports.run_materials import has_materials, materials_of, write_endmembers_csv
+    from unmix_plugin.trained.run_materials import has_materials, materials_of, write_endmembers_csv
 
     model = trainer.pipeline.model
     if has_materials(model):

@@ -14,7 +14,7 @@ from unmix_plugin.viewer.options import ViewerOptions
 
 if TYPE_CHECKING:
     from unmix_plugin.scenes.scene import Scene
-    from unmix_plugin.viewer.model_source import ModelSource
+    from unmix_plugin.viewer.rendering.model_source import ModelSource
     from unmix_plugin.viewer.server import Viewer
 
 
@@ -70,9 +70,9 @@ def prepared(options: ViewOptions) -> Viewer:
 
     from unmix_plugin.commands.reporting import working
     from unmix_plugin.commands.run_choice import chosen_run
-    from unmix_plugin.engine.load_run import load_model
-    from unmix_plugin.exports.edited_run import light_note, requested_recipe
-    from unmix_plugin.viewer.model_source import source_of_run
+    from unmix_plugin.editing.edited_run import light_note, requested_recipe
+    from unmix_plugin.engine.runs.load_run import load_model
+    from unmix_plugin.viewer.rendering.model_source import source_of_run
     from unmix_plugin.viewer.server import Viewer
 
     console = Console()
@@ -104,7 +104,7 @@ def _scene_of(source: ModelSource, data: Path | None) -> Scene:
         RunError: it is another one.
     """
     from unmix_plugin.errors import SceneError
-    from unmix_plugin.exports.scene_at_hand import scene_at_hand
+    from unmix_plugin.trained.find_scene import scene_at_hand
 
     summary = source.scene.summary
     scene = scene_at_hand(summary, source.run.path, data)

@@ -26,8 +26,13 @@ from unmix_plugin.editing.recipe import Recipe
 from unmix_plugin.editing.retint import Surface, hexadecimal, retinted
 from unmix_plugin.editing.seen import look_at
 from unmix_plugin.errors import ConfigError, SpectrumError, UnmixError
-from unmix_plugin.spectral.colour import srgb_to_linear
-from unmix_plugin.spectral.library import DARK_LIGHT, MaterialLibrary, measured_library, read_library_table
+from unmix_plugin.spectral.colour.conversion import srgb_to_linear
+from unmix_plugin.spectral.library.material_library import (
+    DARK_LIGHT,
+    MaterialLibrary,
+    measured_library,
+    read_library_table,
+)
 
 _GREATEST_REFLECTANCE = 2.0
 """What a table of reflectances may hold; more is a sign of per cent. Fluorescent ones exceed 1."""

@@ -17,8 +17,8 @@ from jaxtyping import Float64
 from unmix_plugin.editing.recipe import Light
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.illuminants import brightness, illuminant_power
-from unmix_plugin.spectral.library import DARK_LIGHT
+from unmix_plugin.spectral.colour.illuminants import brightness, illuminant_power
+from unmix_plugin.spectral.library.material_library import DARK_LIGHT
 
 
 def relighting_factors(

@@ -20,7 +20,7 @@ from jaxtyping import Float, Float64
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour import linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 
 _FLOOR = 0.05
 """f: reflectance below which a change counts as absolute rather than relative."""

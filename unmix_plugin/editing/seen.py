@@ -20,9 +20,9 @@ from torch import Tensor
 
 from unmix_plugin.editing.material_state import MaterialState
 from unmix_plugin.editing.operations import Colour
-from unmix_plugin.engine.cameras import Cameras
+from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.model import UnmixModel
-from unmix_plugin.spectral.colour import linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.composition import OCCUPIED_ACCUMULATION, Coefficients
 
 _NUM_VIEWS = 8

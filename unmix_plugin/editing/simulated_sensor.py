@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from unmix_plugin.editing.apply import edit_model
 from unmix_plugin.editing.recipe import Recipe
 from unmix_plugin.model import UnmixModel
-from unmix_plugin.spectral.colour import rgb_matrix
+from unmix_plugin.spectral.colour.conversion import rgb_matrix
 from unmix_plugin.spectral.sensor import Sensor
 
 

@@ -115,7 +115,7 @@ def _read_operation(node: yaml.Node, folder: Path) -> Operation:
 
 
 def _read_light(node: yaml.Node, folder: Path) -> Light:
-    from unmix_plugin.spectral.illuminants import parse_light
+    from unmix_plugin.spectral.colour.illuminants import parse_light
 
     extrapolate = False
     word = node

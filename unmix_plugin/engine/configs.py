@@ -9,8 +9,8 @@ from typing import Literal
 import tyro
 
 from unmix_plugin.engine.instantiate import InstantiateConfig, Target
-from unmix_plugin.engine.optimizers import OptimizerConfig
 from unmix_plugin.engine.pipeline import PipelineConfig
+from unmix_plugin.engine.training.optimizers import OptimizerConfig
 from unmix_plugin.errors import ConfigError
 
 __all__ = ["DeviceName", "InstantiateConfig", "OptimizerConfig", "Target", "TrainerConfig"]

@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from unmix_plugin.engine.callbacks import TrainingCallback
-from unmix_plugin.engine.cameras import Cameras
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.rays import RayBundle
+from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.engine.instantiate import InstantiateConfig, Target
-from unmix_plugin.engine.rays import RayBundle
-from unmix_plugin.engine.scene_box import SceneBox
+from unmix_plugin.engine.training.callbacks import TrainingCallback
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,11 @@ from typing import TypeAlias
 import torch
 from torch import Tensor, nn
 
-from unmix_plugin.engine.callbacks import TrainingCallback
 from unmix_plugin.engine.data_manager import DataManager, DataManagerConfig
+from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.instantiate import InstantiateConfig, Target
 from unmix_plugin.engine.model import Model, ModelConfig
-from unmix_plugin.engine.rays import RayBundle
+from unmix_plugin.engine.training.callbacks import TrainingCallback
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, UInt8
 
-from unmix_plugin.engine.cameras import Cameras
-from unmix_plugin.engine.scene_box import SceneBox
-from unmix_plugin.scenes.arrays import map_array
-from unmix_plugin.scenes.images import read_colour, read_labels, read_mask
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.scenes.reading.arrays import map_array
+from unmix_plugin.scenes.reading.images import read_colour, read_labels, read_mask
 
 UNLABELLED = 255
 """Label of a pixel whose material is unknown."""

@@ -4,9 +4,8 @@ Importing this package costs torch and numpy; scipy, scikit-image and colour-sci
 need them.
 """
 
-from unmix_plugin.spectral.abundance_estimation import fcls, nnls, sunsal
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour import (
+from unmix_plugin.spectral.colour.conversion import (
     band_composite_matrix,
     colour_mode,
     describe_colour,
@@ -15,8 +14,13 @@ from unmix_plugin.spectral.colour import (
     srgb_to_linear,
     xyz_matrix,
 )
-from unmix_plugin.spectral.endmembers import EndmemberMethod, drop_uninformative_pixels, initialise_endmembers
-from unmix_plugin.spectral.kmeans_normalised import KmeansResult, normalised_kmeans, scale_to_lit_pixels
+from unmix_plugin.spectral.library.spectra_csv import (
+    SpectraTable,
+    read_illuminant_csv,
+    read_spectra_csv,
+    resample_spectra,
+    write_spectra_csv,
+)
 from unmix_plugin.spectral.metrics import (
     EndmemberMatching,
     abundance_rmse,
@@ -29,28 +33,32 @@ from unmix_plugin.spectral.metrics import (
     spectral_angle,
     ssim,
 )
-from unmix_plugin.spectral.minimum_volume import minimum_volume_simplex
-from unmix_plugin.spectral.nfindr_winter1999 import nfindr, simplex_volume
-from unmix_plugin.spectral.num_materials import MaterialCount, hysime, propose_num_materials
 from unmix_plugin.spectral.segmentation import (
     SegmentationScores,
     SegmentationTally,
     material_ids,
     material_scores,
 )
-from unmix_plugin.spectral.spectra_csv import (
-    SpectraTable,
-    read_illuminant_csv,
-    read_spectra_csv,
-    resample_spectra,
-    write_spectra_csv,
+from unmix_plugin.spectral.unmixing.abundance_estimation import fcls, nnls, sunsal
+from unmix_plugin.spectral.unmixing.endmembers import (
+    EndmemberMethod,
+    drop_uninformative_pixels,
+    initialise_endmembers,
 )
-from unmix_plugin.spectral.two_material_mixtures import (
+from unmix_plugin.spectral.unmixing.kmeans_normalised import (
+    KmeansResult,
+    normalised_kmeans,
+    scale_to_lit_pixels,
+)
+from unmix_plugin.spectral.unmixing.minimum_volume import minimum_volume_simplex
+from unmix_plugin.spectral.unmixing.nfindr_winter1999 import nfindr, simplex_volume
+from unmix_plugin.spectral.unmixing.num_materials import MaterialCount, hysime, propose_num_materials
+from unmix_plugin.spectral.unmixing.two_material_mixtures import (
     TwoMaterialFit,
     two_material_endmembers,
     two_material_fits,
 )
-from unmix_plugin.spectral.vca_nascimento2005 import VcaResult, estimate_snr_db, vca
+from unmix_plugin.spectral.unmixing.vca_nascimento2005 import VcaResult, estimate_snr_db, vca
 
 __all__ = [
     "Bands",

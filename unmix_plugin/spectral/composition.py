@@ -17,13 +17,13 @@ from torch import Tensor
 
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour import band_composite_matrix, linear_to_srgb, rgb_matrix
-from unmix_plugin.spectral.pca import PcaColours
-from unmix_plugin.spectral.reflectance_maps import (
+from unmix_plugin.spectral.colour.conversion import band_composite_matrix, linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.maps.reflectance_maps import (
     is_reflectance_map,
     parse_reflectance_map,
     seen_reflectance,
 )
+from unmix_plugin.spectral.pca import PcaColours
 from unmix_plugin.spectral.segmentation import material_ids, material_scores
 
 

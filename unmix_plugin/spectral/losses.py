@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from unmix_plugin.spectral.colour import linear_to_srgb
+from unmix_plugin.spectral.colour.conversion import linear_to_srgb
 
 
 def over_background(

@@ -20,7 +20,7 @@ from jaxtyping import Float64
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.integrals import integrals_up_to
-from unmix_plugin.spectral.spectra_csv import SpectraTable, read_spectra_csv
+from unmix_plugin.spectral.library.spectra_csv import SpectraTable, read_spectra_csv
 
 _MOST_UNSEEN = 0.01
 """Largest part of a channel's response that may lie where there are no bands."""

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.exports.run_views import RunView
+from unmix_plugin.trained.run_views import RunView
 from unmix_plugin.viewer.view_cameras import (
     ViewPose,
     checked_pose,

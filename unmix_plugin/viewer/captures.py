@@ -12,19 +12,19 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from unmix_plugin.engine.cameras import Cameras
+from unmix_plugin.engine.geometry.camera_paths import rows_of
+from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.exports.camera_paths import rows_of
-from unmix_plugin.exports.files import write_file
-from unmix_plugin.exports.formats.png import rgba_png_bytes
-from unmix_plugin.exports.formats.spectral_exr import write_spectral_exr
-from unmix_plugin.spectral.colour import rgb_matrix
+from unmix_plugin.formats.files import write_file
+from unmix_plugin.formats.png import rgba_png_bytes
+from unmix_plugin.formats.spectral_exr import write_spectral_exr
+from unmix_plugin.spectral.colour.conversion import rgb_matrix
 from unmix_plugin.spectral.composition import spectral
-from unmix_plugin.viewer.edits import Edit
-from unmix_plugin.viewer.frames import Frame, FrameRender
-from unmix_plugin.viewer.layers import linear_light
-from unmix_plugin.viewer.render_loop import RenderLoop
-from unmix_plugin.viewer.view import Capture
+from unmix_plugin.viewer.layers.layers import linear_light
+from unmix_plugin.viewer.rendering.edits import Edit
+from unmix_plugin.viewer.rendering.frames import Frame, FrameRender
+from unmix_plugin.viewer.rendering.render_loop import RenderLoop
+from unmix_plugin.viewer.rendering.view import Capture
 
 SIDE_BOUNDS = (16, 8192)
 """Least and greatest width and height of a picture."""

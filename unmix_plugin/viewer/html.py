@@ -7,7 +7,7 @@ from html import escape
 
 import numpy as np
 
-from unmix_plugin.viewer.painting import ColourMapLegend, Legend, SwatchLegend, colour_table
+from unmix_plugin.viewer.layers.painting import ColourMapLegend, Legend, SwatchLegend, colour_table
 
 _NUM_STOPS = 17
 _BLOCK = "padding:0.2em 0.8em;font-size:0.85em;line-height:1.35"

@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from unmix_plugin.engine.cameras import Cameras
-from unmix_plugin.engine.rays import RayBundle
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.spectral.bands import Bands

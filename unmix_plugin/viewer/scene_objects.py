@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from unmix_plugin.engine.scene_box import SceneBox
-from unmix_plugin.exports.run_views import RunView
+from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.trained.run_views import RunView
 from unmix_plugin.viewer.view_cameras import pose_of
 
 if TYPE_CHECKING:

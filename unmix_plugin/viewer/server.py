@@ -10,15 +10,15 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from unmix_plugin.editing import Recipe
-from unmix_plugin.engine.cameras import Cameras
+from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.viewer import html
 from unmix_plugin.viewer.address import free_port, notices
 from unmix_plugin.viewer.failures import failures_said
 from unmix_plugin.viewer.gate import MOST_CLIENTS, Gate, is_of_another_site
 from unmix_plugin.viewer.inputs import text
-from unmix_plugin.viewer.model_source import ModelSource
 from unmix_plugin.viewer.options import ViewerOptions
 from unmix_plugin.viewer.panels import PANELS
+from unmix_plugin.viewer.rendering.model_source import ModelSource
 from unmix_plugin.viewer.services import SceneReader, Services
 from unmix_plugin.viewer.session import Session
 from unmix_plugin.viewer.view_cameras import pose_of, up_direction

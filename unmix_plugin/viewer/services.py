@@ -10,25 +10,25 @@ import numpy as np
 import torch
 
 from unmix_plugin.editing import Recipe, sample_seen
-from unmix_plugin.exports.run_views import RunView, views_of
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour import linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.composition import Coefficients
-from unmix_plugin.viewer.edits import Edit
+from unmix_plugin.trained.run_views import RunView, views_of
 from unmix_plugin.viewer.failures import failures_said
-from unmix_plugin.viewer.frames import num_channels
-from unmix_plugin.viewer.layer_settings import LayerAids
-from unmix_plugin.viewer.measured import MeasuredViews
-from unmix_plugin.viewer.model_source import ModelSource
-from unmix_plugin.viewer.picture_maker import PictureMaker
+from unmix_plugin.viewer.layers.layer_settings import LayerAids
 from unmix_plugin.viewer.recipe_editor import numbered
-from unmix_plugin.viewer.reference import render_reference
-from unmix_plugin.viewer.render_loop import RenderLoop
+from unmix_plugin.viewer.rendering.edits import Edit
+from unmix_plugin.viewer.rendering.frames import num_channels
+from unmix_plugin.viewer.rendering.measured import MeasuredViews
+from unmix_plugin.viewer.rendering.model_source import ModelSource
+from unmix_plugin.viewer.rendering.picture_maker import PictureMaker
+from unmix_plugin.viewer.rendering.reference import render_reference
+from unmix_plugin.viewer.rendering.render_loop import RenderLoop
+from unmix_plugin.viewer.rendering.video_job import VideoJob
 from unmix_plugin.viewer.scene_objects import Thumbnail
 from unmix_plugin.viewer.training_curve import TrainingCurve
-from unmix_plugin.viewer.video_job import VideoJob
 
 _REFERENCE_STEPS = 200
 """Training steps after which the reference rays are rendered again."""

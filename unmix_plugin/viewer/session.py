@@ -10,19 +10,19 @@ import numpy as np
 from jaxtyping import Float
 
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.library import LibraryMatch, measured_library
+from unmix_plugin.spectral.library.material_library import LibraryMatch, measured_library
 from unmix_plugin.viewer import html
-from unmix_plugin.viewer.edits import Edit
 from unmix_plugin.viewer.failures import failures_said
-from unmix_plugin.viewer.layer_settings import LayerSettings
+from unmix_plugin.viewer.layers.layer_settings import LayerSettings
+from unmix_plugin.viewer.rendering.edits import Edit
+from unmix_plugin.viewer.rendering.view import Shown, View
 from unmix_plugin.viewer.services import Services
-from unmix_plugin.viewer.view import Shown, View
 from unmix_plugin.viewer.view_cameras import ViewPose, checked_pose, pose_of
 
 if TYPE_CHECKING:
     import viser
 
-    from unmix_plugin.engine.cameras import Cameras
+    from unmix_plugin.engine.geometry.cameras import Cameras
     from unmix_plugin.spectral.composition import Materials
     from unmix_plugin.viewer.panels import Panel
 

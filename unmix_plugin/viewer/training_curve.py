@@ -7,7 +7,7 @@ import threading
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.engine.progress import TrainingStatus
+from unmix_plugin.engine.training.progress import TrainingStatus
 
 _MOST_POINTS = 400
 

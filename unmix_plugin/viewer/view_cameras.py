@@ -16,8 +16,8 @@ import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
-from unmix_plugin.engine.cameras import Cameras
-from unmix_plugin.engine.rays import RayBundle
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.errors import ConfigError
 
 FOV_BOUNDS = (math.radians(1.0), math.radians(170.0))

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from unmix_plugin.commands.products.product import Job, Product
-from unmix_plugin.exports.product_formats import ShareFormat
-from unmix_plugin.exports.run_views import ViewChoice
+from unmix_plugin.products.product_formats import ShareFormat
+from unmix_plugin.trained.run_views import ViewChoice
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class Abundances(Product):
 
     def write(self, job: Job) -> list[Path]:
         """Render the views, one after the other, and write each."""
-        from unmix_plugin.exports.abundances import abundance_paths, write_abundances
-        from unmix_plugin.exports.view_rendering import render_view
+        from unmix_plugin.products.abundances import abundance_paths, write_abundances
+        from unmix_plugin.trained.view_rendering import render_view
 
         materials, views = job.materials, job.views(self.views)
         job.claim([path for view in views for path in abundance_paths(job.folder, view.name, self.formats)])

@@ -17,7 +17,7 @@ class Endmembers(Product):
 
     def write(self, job: Job) -> list[Path]:
         """Write table, library and plot."""
-        from unmix_plugin.exports.endmembers import endmember_paths, write_endmembers
+        from unmix_plugin.products.endmembers import endmember_paths, write_endmembers
 
         materials = job.materials
         job.claim(endmember_paths(job.folder))

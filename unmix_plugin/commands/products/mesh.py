@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from unmix_plugin.commands.products.product import Job, Product
-from unmix_plugin.exports.product_formats import MeshFormat
+from unmix_plugin.products.product_formats import MeshFormat
 
 _NUM_RAYS = 300_000
 """Rays that tell what of the surface is seen."""
@@ -36,8 +36,7 @@ class Mesh(Product):
         """Sample the density, march through it, trim and colour the surface."""
         import numpy as np
 
-        from unmix_plugin.exports.density_grid import GridPoints, sample_slice
-        from unmix_plugin.exports.mesh import (
+        from unmix_plugin.products.mesh import (
             extract_mesh,
             filled,
             mesh_paths,
@@ -47,6 +46,7 @@ class Mesh(Product):
             without_crumbs,
             write_mesh,
         )
+        from unmix_plugin.trained.density_grid import GridPoints, sample_slice
 
         require_sound(self.density, self.smoothing)
         model, frame = job.model, job.frame

@@ -31,13 +31,13 @@ class Metamerism(Product):
         """Compare all pairs in all lights."""
         import numpy as np
 
-        from unmix_plugin.exports.metamerism import (
+        from unmix_plugin.products.metamerism import (
             MetamerismOptions,
             find_metamers,
             metamerism_paths,
             write_metamerism,
         )
-        from unmix_plugin.spectral.library import library_with
+        from unmix_plugin.spectral.library.material_library import library_with
 
         job.claim(metamerism_paths(job.folder))
         light = job.loaded.scene.metadata.get("illuminant")

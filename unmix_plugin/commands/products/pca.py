@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from unmix_plugin.commands.products.product import Job, Product
-from unmix_plugin.exports.run_views import ViewChoice
+from unmix_plugin.trained.run_views import ViewChoice
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Pca(Product):
 
     def write(self, job: Job) -> list[Path]:
         """Find the components of all views, then paint each."""
-        from unmix_plugin.exports.pca import (
+        from unmix_plugin.products.pca import (
             components_path,
             find_components,
             pca_path,
@@ -32,7 +32,7 @@ class Pca(Product):
             write_components,
             write_pca,
         )
-        from unmix_plugin.exports.view_rendering import render_view
+        from unmix_plugin.trained.view_rendering import render_view
 
         materials, views, model = job.materials, job.views(self.views), job.loaded.model
         job.claim([*(pca_path(job.folder, view.name) for view in views), components_path(job.folder)])

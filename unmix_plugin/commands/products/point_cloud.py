@@ -22,13 +22,13 @@ class PointCloud(Product):
 
     def write(self, job: Job) -> list[Path]:
         """Look through all cameras of the run, clean and thin what they see."""
-        from unmix_plugin.exports.point_cloud import (
+        from unmix_plugin.products.point_cloud import (
             RAYS_PER_POINT,
             point_cloud_path,
             require_count,
             write_point_cloud,
         )
-        from unmix_plugin.exports.point_scores import require_point_scores
+        from unmix_plugin.products.point_scores import require_point_scores
 
         count = require_count(self.num_points)
         materials = job.materials

@@ -16,12 +16,12 @@ from unmix_plugin.engine.configs import DeviceName
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from unmix_plugin.engine.load_run import LoadedModel
-    from unmix_plugin.exports.run_views import RunView, ViewChoice
-    from unmix_plugin.exports.seen_surface import SeenSurface
+    from unmix_plugin.engine.runs.load_run import LoadedModel
     from unmix_plugin.model import UnmixModel
     from unmix_plugin.scenes.scene import Normalisation
     from unmix_plugin.spectral.composition import Materials
+    from unmix_plugin.trained.run_views import RunView, ViewChoice
+    from unmix_plugin.trained.surface import SeenSurface
 
 ItemT = TypeVar("ItemT")
 
@@ -78,7 +78,7 @@ class Job:
         Raises:
             ConfigError: its method does not unmix spectra.
         """
-        from unmix_plugin.exports.run_materials import materials_of
+        from unmix_plugin.trained.run_materials import materials_of
 
         return materials_of(self.loaded.model)
 
@@ -102,7 +102,7 @@ class Job:
     @property
     def frame(self) -> Normalisation:
         """How the scene's world became the run's model space."""
-        from unmix_plugin.exports.world_frame import world_frame
+        from unmix_plugin.trained.world_frame import world_frame
 
         return world_frame(self.loaded.scene)
 
@@ -112,19 +112,19 @@ class Job:
         Raises:
             ConfigError: one of them exists, and overwriting was not asked for.
         """
-        from unmix_plugin.exports.files import refuse_to_overwrite
+        from unmix_plugin.formats.files import refuse_to_overwrite
 
         refuse_to_overwrite(paths, self.overwrite)
 
     def views(self, choice: ViewChoice) -> list[RunView]:
         """Views of the run."""
-        from unmix_plugin.exports.run_views import views_of
+        from unmix_plugin.trained.run_views import views_of
 
         return views_of(self.loaded.scene, choice)
 
     def surface(self, num_rays: int) -> SeenSurface:
         """What all cameras of the run see, with about so many rays."""
-        from unmix_plugin.exports.seen_surface import SeenSurface
+        from unmix_plugin.trained.surface import SeenSurface
 
         cameras = [view.camera for view in self.views("all")]
         surface = SeenSurface(self.model, num_rays, cameras)

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 from unmix_plugin.commands.products.product import Job, Product
 
 if TYPE_CHECKING:
-    from unmix_plugin.exports.report_views import ReportViews
-    from unmix_plugin.exports.run_views import RunView
+    from unmix_plugin.products.report.views import ReportViews
     from unmix_plugin.scenes.scene import Scene
+    from unmix_plugin.trained.run_views import RunView
 
 _VIEWS_WITH_SHARES = 2
 
@@ -35,9 +35,9 @@ class Report(Product):
     def write(self, job: Job) -> list[Path]:
         """Render, compare and lay out."""
         from unmix_plugin.errors import ConfigError
-        from unmix_plugin.exports.report import report_path, write_report
-        from unmix_plugin.exports.report_views import evenly
-        from unmix_plugin.spectral.library import library_with
+        from unmix_plugin.products.report.report import report_path, write_report
+        from unmix_plugin.products.report.views import evenly
+        from unmix_plugin.spectral.library.material_library import library_with
 
         if self.max_views < 1:
             raise ConfigError(f"--max-views is {self.max_views}; choose at least 1")
@@ -61,9 +61,9 @@ class Report(Product):
 
     def _look(self, job: Job, chosen: list[RunView]) -> ReportViews:
         """Render the views, and compare each with what was measured, if that is at hand and still fits."""
-        from unmix_plugin.exports.evaluation import Evaluation, scene_truth, view_truth
-        from unmix_plugin.exports.report_views import ReportViews, evenly
-        from unmix_plugin.exports.view_rendering import render_view
+        from unmix_plugin.products.report.views import ReportViews, evenly
+        from unmix_plugin.trained.evaluation import Evaluation, scene_truth, view_truth
+        from unmix_plugin.trained.view_rendering import render_view
 
         materials, scene = job.materials, self._scene(job)
         evaluation = None
@@ -78,7 +78,7 @@ class Report(Product):
         return views
 
     def _scene(self, job: Job) -> Scene | None:
-        from unmix_plugin.exports.scene_at_hand import scene_at_hand
+        from unmix_plugin.trained.find_scene import scene_at_hand
 
         if self._is_edited:
             return None

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from unmix_plugin.commands.products.product import Job, Product
-from unmix_plugin.exports.run_views import ViewChoice
+from unmix_plugin.trained.run_views import ViewChoice
 
 
 @dataclass(frozen=True)
@@ -21,14 +21,14 @@ class Segmentation(Product):
 
     def write(self, job: Job) -> list[Path]:
         """Render the views, one after the other, and write each."""
-        from unmix_plugin.exports.segmentation import (
+        from unmix_plugin.products.segmentation import (
             is_legend_there,
             legend_path,
             segmentation_paths,
             write_legend,
             write_segmentation,
         )
-        from unmix_plugin.exports.view_rendering import render_view
+        from unmix_plugin.trained.view_rendering import render_view
 
         materials, views = job.materials, job.views(self.views)
         paths = [path for view in views for path in segmentation_paths(job.folder, view.name)]

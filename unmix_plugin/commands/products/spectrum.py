@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 
 from unmix_plugin.commands.products.product import Job, Product
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.spectral.library import Comparison
+from unmix_plugin.spectral.library.material_library import Comparison
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from unmix_plugin.exports.probe import Probe
-    from unmix_plugin.exports.run_views import RunView
-    from unmix_plugin.exports.spectrum import ProbedPlace
+    from unmix_plugin.products.spectrum import ProbedPlace
+    from unmix_plugin.trained.probe import Probe
+    from unmix_plugin.trained.run_views import RunView
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Spectrum(Product):
 
     def write(self, job: Job) -> list[Path]:
         """Probe the place and write what is there."""
-        from unmix_plugin.exports.spectrum import spectrum_paths, write_spectrum
+        from unmix_plugin.products.spectrum import spectrum_paths, write_spectrum
 
         if self.point is not None and self.view is None and self.pixel is None:
             point = _numbers(self.point, 3, "--point", "0.1,0.2,0.5")
@@ -59,7 +59,7 @@ class Spectrum(Product):
         return write_spectrum(job.folder, name, place, job.materials)
 
     def _pixel(self, job: Job, view: RunView, index: int | None, pixel: tuple[int, int]) -> ProbedPlace:
-        from unmix_plugin.exports.probe import probe_pixel
+        from unmix_plugin.trained.probe import probe_pixel
 
         probe = probe_pixel(job.model, view.camera, pixel, job.frame)
         facts = {"view": view.name, "pixel": list(pixel)}
@@ -67,7 +67,7 @@ class Spectrum(Product):
         return self._place(job, title, facts, probe, self._measured(job, index, pixel))
 
     def _point(self, job: Job, point: tuple[float, float, float]) -> ProbedPlace:
-        from unmix_plugin.exports.probe import probe_point
+        from unmix_plugin.trained.probe import probe_point
 
         probe = probe_point(job.model, point, job.frame)
         title = f"point {', '.join(f'{value:g}' for value in point)}"
@@ -76,10 +76,10 @@ class Spectrum(Product):
     def _place(
         self, job: Job, title: str, facts: dict[str, object], probe: Probe, measured: np.ndarray | None
     ) -> ProbedPlace:
-        from unmix_plugin.exports.library_matches import LIGHT_UNKNOWN, light_of, shown_matches
-        from unmix_plugin.exports.spectrum import ProbedPlace
+        from unmix_plugin.products.spectrum import ProbedPlace
         from unmix_plugin.spectral.composition import OCCUPIED_ACCUMULATION
-        from unmix_plugin.spectral.library import library_with
+        from unmix_plugin.spectral.library.material_library import library_with
+        from unmix_plugin.trained.library_matches import LIGHT_UNKNOWN, light_of, shown_matches
 
         light = light_of(job.model)
         if light is None:
@@ -94,8 +94,8 @@ class Spectrum(Product):
 
     def _measured(self, job: Job, index: int | None, pixel: tuple[int, int]) -> np.ndarray | None:
         """What the scene has in a pixel, in the light asked for."""
-        from unmix_plugin.exports.library_matches import light_of, relit
-        from unmix_plugin.exports.scene_at_hand import scene_at_hand
+        from unmix_plugin.trained.find_scene import scene_at_hand
+        from unmix_plugin.trained.library_matches import light_of, relit
 
         with job.working("looking for the scene"):
             scene = scene_at_hand(job.loaded.scene.summary, job.loaded.run.path, self.data)

@@ -20,8 +20,8 @@ class Volume(Product):
 
     def write(self, job: Job) -> list[Path]:
         """Sample the field, slice by slice."""
-        from unmix_plugin.exports.density_grid import GridPoints
-        from unmix_plugin.exports.volume import volume_path, write_volume
+        from unmix_plugin.products.volume import volume_path, write_volume
+        from unmix_plugin.trained.density_grid import GridPoints
 
         model = job.model
         grid = GridPoints.over(model.renderer.aabb, self.resolution)

@@ -8,11 +8,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from unmix_plugin.editing import recipe_to_yaml
-from unmix_plugin.engine.cameras import Cameras
+from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.exports.camera_files import camera_file_bytes
-from unmix_plugin.exports.files import write_file
-from unmix_plugin.exports.world_frame import world_frame
+from unmix_plugin.formats.files import write_file
+from unmix_plugin.trained.camera_files.camera_files import camera_file_bytes
+from unmix_plugin.trained.world_frame import world_frame
 from unmix_plugin.viewer.camera_path import (
     FPS_BOUNDS,
     MOST_KEY_FRAMES,
@@ -29,8 +29,8 @@ from unmix_plugin.viewer.captures import (
     check_size,
 )
 from unmix_plugin.viewer.inputs import new_file, number
+from unmix_plugin.viewer.rendering.video_job import output_of, render_words
 from unmix_plugin.viewer.session import Session
-from unmix_plugin.viewer.video_job import output_of, render_words
 from unmix_plugin.viewer.view_cameras import ViewPose, camera_of, sized_camera
 
 _PREVIEW_FPS = 12

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.indices import available_indices
+from unmix_plugin.spectral.maps.indices import available_indices
 from unmix_plugin.viewer.inputs import text
-from unmix_plugin.viewer.layer_settings import EXPOSURE_BOUNDS, GAMMA_BOUNDS, LayerSettings
-from unmix_plugin.viewer.layers import LAYERS, covered, layer_named
-from unmix_plugin.viewer.painting import BACKGROUNDS, COLOUR_MAPS
+from unmix_plugin.viewer.layers.layer_settings import EXPOSURE_BOUNDS, GAMMA_BOUNDS, LayerSettings
+from unmix_plugin.viewer.layers.layers import LAYERS, covered, layer_named
+from unmix_plugin.viewer.layers.painting import BACKGROUNDS, COLOUR_MAPS
+from unmix_plugin.viewer.layers.view_transforms import VIEW_TRANSFORMS
 from unmix_plugin.viewer.session import Session
-from unmix_plugin.viewer.view_transforms import VIEW_TRANSFORMS
 
 if TYPE_CHECKING:
     import viser

@@ -19,10 +19,10 @@ from unmix_plugin.editing import (
     assumption_of_light,
 )
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.spectral.colour import linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.colour.illuminants import illuminant_names
 from unmix_plugin.spectral.composition import Materials
-from unmix_plugin.spectral.illuminants import illuminant_names
-from unmix_plugin.spectral.library import measured_library
+from unmix_plugin.spectral.library.material_library import measured_library
 from unmix_plugin.viewer import html
 from unmix_plugin.viewer.charts import Chart, Line
 from unmix_plugin.viewer.inputs import number, text

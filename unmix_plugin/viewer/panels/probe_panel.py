@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.exports.files import write_file
+from unmix_plugin.formats.files import write_file
 from unmix_plugin.viewer import html
 from unmix_plugin.viewer.charts import Chart, Line
 from unmix_plugin.viewer.inputs import new_file, number

@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 from unmix_plugin.editing import Recipe, read_recipe, recipe_to_yaml
 from unmix_plugin.errors import ConfigError, UnmixError
-from unmix_plugin.exports.files import write_file
-from unmix_plugin.viewer.edits import Edit
+from unmix_plugin.formats.files import write_file
 from unmix_plugin.viewer.inputs import new_file
 from unmix_plugin.viewer.recipe_editor import RecipeHistory, numbered
+from unmix_plugin.viewer.rendering.edits import Edit
 from unmix_plugin.viewer.session import Session
 
 _NO_RECIPE = "none saved yet"

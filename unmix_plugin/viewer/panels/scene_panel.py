@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.spectral.colour import linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.viewer.inputs import number
+from unmix_plugin.viewer.rendering.view import DEFAULT_HEIGHT, HEIGHT_BOUNDS, SUBPIXEL_BOUNDS
 from unmix_plugin.viewer.scene_objects import add_box, add_cameras, add_points
 from unmix_plugin.viewer.services import thumbnail
 from unmix_plugin.viewer.session import Session
-from unmix_plugin.viewer.view import DEFAULT_HEIGHT, HEIGHT_BOUNDS, SUBPIXEL_BOUNDS
 
 if TYPE_CHECKING:
     import viser

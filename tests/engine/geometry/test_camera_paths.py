@@ -1,0 +1,144 @@
+"""Moving cameras: where they go, and that they are cameras."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.scenes.scene_factory import look_at
+from tests.trained.camera_files.camera_scenes import BOX, around, cameras_at, in_front
+from unmix_plugin.engine.geometry.camera_paths import interpolated, orbit, resized, rows_of
+from unmix_plugin.errors import ConfigError
+
+
+def assert_rigid(cameras):
+    rotations = cameras.camera_to_world[:, :, :3]
+    torch.testing.assert_close(
+        rotations.transpose(1, 2) @ rotations, torch.eye(3).expand(len(cameras), 3, 3), atol=1e-5, rtol=0
+    )
+    assert (torch.linalg.det(rotations) > 0).all()
+
+
+def seen_at(cameras, point):
+    """Where each camera sees a point, (N, 2) pixels, and whether all have it in front."""
+    seen = [cameras.project(torch.tensor([point]), index) for index in range(len(cameras))]
+    return torch.cat([coords for coords, _ in seen]), all(bool(depth > 0) for _, depth in seen)
+
+
+def test_an_orbit_goes_once_round_at_the_cameras_distance_and_looks_at_what_they_look_at():
+    path = orbit(around(), BOX, 36)
+    assert_rigid(path)
+    positions = path.camera_to_world[:, :, 3].numpy()
+    np.testing.assert_allclose(np.linalg.norm(positions, axis=1), 4.0, atol=1e-3)
+    np.testing.assert_allclose(positions[:, 2], positions[0, 2], atol=1e-3)
+    turned = np.diff(np.unwrap(np.arctan2(positions[:, 1], positions[:, 0])))
+    np.testing.assert_allclose(turned, 2 * np.pi / 36, atol=1e-4)
+    coords, in_view = seen_at(path, [0.0, 0.0, 0.0])
+    assert in_view
+    torch.testing.assert_close(coords, torch.tensor([[20.0, 15.0]]).expand(36, 2), atol=0.05, rtol=0)
+
+
+def test_the_horizon_of_an_orbit_is_level_even_where_cameras_look_down_unevenly():
+    poses = [
+        look_at(4 * np.array([np.cos(a), np.sin(a), 0.2 + 0.1 * a]), np.zeros(3)) for a in np.arange(6.0)
+    ]
+    path = orbit(cameras_at(poses), BOX, 8)
+    np.testing.assert_allclose(path.camera_to_world[:, 2, 0], 0.0, atol=1e-5)
+    assert (path.camera_to_world[:, 2, 1] > 0).all()
+
+
+def test_cameras_on_one_side_give_an_arc_over_that_side_to_and_fro():
+    cameras = in_front()
+    path = orbit(cameras, BOX, 40).camera_to_world[:, :, 3].numpy()
+    assert (path[:, 1] < -2.5).all()
+    given = cameras.camera_to_world[:, 0, 3]
+    assert path[:, 0].min() == pytest.approx(float(given.min()), abs=0.05)
+    assert path[:, 0].max() == pytest.approx(float(given.max()), abs=0.05)
+    steps = np.linalg.norm(np.diff(path, axis=0, append=path[:1]), axis=1)
+    assert steps.max() < 0.15, "the last frame leads back to the first"
+
+
+def test_one_camera_alone_still_has_an_orbit():
+    path = orbit(cameras_at([look_at(np.array([0.0, -3.0, 1.0]), np.zeros(3))]), BOX, 12)
+    assert_rigid(path)
+    assert 0.3 < np.ptp(path.camera_to_world[:, 0, 3].numpy()) < 2.0
+
+
+def test_cameras_that_look_straight_down_have_an_orbit_too():
+    poses = [look_at(np.array([x, 0.01, 4.0]), np.array([x, 0.0, 0.0])) for x in (-0.5, 0.0, 0.5)]
+    assert_rigid(orbit(cameras_at(poses), BOX, 12))
+
+
+def test_a_path_meets_its_cameras_and_goes_on_smoothly():
+    cameras = around(8)
+    path = interpolated(cameras, BOX, 701)
+    assert_rigid(path)
+    poses, along = cameras.camera_to_world, path.camera_to_world
+    torch.testing.assert_close(along[0], poses[0], atol=1e-5, rtol=0)
+    for pose in poses:
+        assert (along - pose).abs().amax(dim=(1, 2)).min() < 0.01
+    steps = np.linalg.norm(np.diff(along[:, :, 3].numpy(), axis=0), axis=1)
+    assert steps.max() < 4 * steps.mean()
+    assert np.abs(np.diff(along[:, :, :3].numpy(), axis=0)).max() < 0.05
+
+
+def test_a_path_bends_around_what_its_cameras_look_at():
+    places = ([4.0, 0.1, 1.0], [-4.0, 0.1, 1.0], [-4.0, -0.4, 1.0])
+    path = interpolated(cameras_at([look_at(np.array(place), np.zeros(3)) for place in places]), BOX, 60)
+    assert np.linalg.norm(path.camera_to_world[:, :, 3], axis=1).min() > 3.8
+    coords, in_view = seen_at(path, [0.0, 0.0, 0.0])
+    assert in_view
+    torch.testing.assert_close(coords, torch.tensor([[20.0, 15.0]]).expand(60, 2), atol=0.1, rtol=0)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_opposite_cameras_have_a_path_of_real_cameras(sign):
+    poses = [
+        look_at(
+            np.array([x, 0.0, 0.0]), sign * np.array([-x, 0.0, 0.0]) * 0.1 + (1 - sign) * np.array([x, 0, 0])
+        )
+        for x in (-3.0, 3.0)
+    ]
+    path = interpolated(cameras_at(poses), BOX, 31)
+    assert_rigid(path)
+    assert bool(torch.isfinite(path.camera_to_world).all())
+
+
+def test_the_nearest_camera_left_comes_next():
+    angles = [0.0, 2.0, 1.0, 3.0]
+    poses = [look_at(4 * np.array([np.cos(a), np.sin(a), 0.5]), np.zeros(3)) for a in angles]
+    path = interpolated(cameras_at(poses), BOX, 50).camera_to_world[:, :, 3].numpy()
+    turned = np.unwrap(np.arctan2(path[:, 1], path[:, 0]))
+    assert (np.diff(turned) > 0).all()
+    assert turned[-1] - turned[0] == pytest.approx(3.0, abs=1e-3)
+
+
+def test_a_path_needs_two_different_cameras():
+    pose = look_at(np.array([3.0, 0.0, 0.0]), np.zeros(3))
+    for poses in ([pose], [pose, pose]):
+        with pytest.raises(ConfigError, match="at least two different ones; choose --cameras orbit"):
+            interpolated(cameras_at(poses), BOX, 5)
+
+
+def test_another_size_keeps_the_vertical_view_and_square_pixels():
+    cameras = around(2)
+    larger = resized(cameras, 200, 60)
+    assert (larger.width, larger.height) == (200, 60)
+    point = torch.tensor([[0.1, 0.2, 0.3]])
+    before, after = cameras.project(point, 0)[0][0], larger.project(point, 0)[0][0]
+    torch.testing.assert_close(after - torch.tensor([100.0, 30.0]), 2 * (before - torch.tensor([20.0, 15.0])))
+
+
+def test_a_shifted_principal_point_stays_shifted_when_resized():
+    camera = around(1)
+    shifted = type(camera)(
+        camera.camera_to_world, camera.focal_px, torch.tensor([[23.0, 12.0]]), camera.distortion, 40, 30
+    )
+    torch.testing.assert_close(resized(shifted, 80, 60).center_px, torch.tensor([[46.0, 24.0]]))
+
+
+def test_rows_of_a_camera_have_the_rays_of_these_rows():
+    camera = around(1)
+    rows = rows_of(camera, 7, 19)
+    assert (rows.width, rows.height) == (40, 12)
+    whole, part = camera.image_rays(0), rows.image_rays(0)
+    torch.testing.assert_close(part.directions, whole.directions[7 * 40 : 19 * 40], atol=1e-6, rtol=0)

@@ -1,0 +1,151 @@
+"""Cameras: rays and projections undo each other, axes and pixels are where the conventions say."""
+
+import json
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.testing import assert_close
+
+from unmix_plugin.engine.geometry.camera_distortion import distort, undistort
+from unmix_plugin.engine.geometry.cameras import Cameras
+
+WIDTH, HEIGHT = 64, 48
+
+
+def make_cameras(
+    count: int = 3, distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+) -> Cameras:
+    generator = torch.Generator().manual_seed(count)
+    rotations = torch.linalg.qr(torch.randn(count, 3, 3, generator=generator))[0]
+    rotations = rotations * torch.linalg.det(rotations)[:, None, None]
+    positions = torch.randn(count, 3, 1, generator=generator)
+    return Cameras(
+        camera_to_world=torch.cat([rotations, positions], dim=-1),
+        focal_px=torch.tensor([[70.0, 66.0]]).repeat(count, 1) + torch.arange(count)[:, None],
+        center_px=torch.tensor([[31.0, 25.5]]).repeat(count, 1),
+        distortion=torch.tensor([distortion]).repeat(count, 1),
+        width=WIDTH,
+        height=HEIGHT,
+    )
+
+
+def identity_camera() -> Cameras:
+    return Cameras(
+        camera_to_world=torch.eye(3, 4)[None],
+        focal_px=torch.tensor([[50.0, 50.0]]),
+        center_px=torch.tensor([[32.0, 24.0]]),
+        distortion=torch.zeros(1, 4),
+        width=WIDTH,
+        height=HEIGHT,
+    )
+
+
+pixels = st.lists(
+    st.tuples(st.floats(0.0, WIDTH, width=32), st.floats(0.0, HEIGHT, width=32)), min_size=1, max_size=8
+)
+lenses = st.tuples(
+    st.floats(-0.2, 0.2), st.floats(-0.05, 0.05), st.floats(-0.01, 0.01), st.floats(-0.01, 0.01)
+)
+
+
+@given(pixels, lenses, st.integers(0, 2), st.floats(0.1, 50.0))
+def test_projecting_a_point_of_a_ray_gives_the_pixel_back(coords, lens, index, distance):
+    cameras = make_cameras(distortion=lens)
+    pixel_coords = torch.tensor(coords)
+    rays = cameras.generate_rays(torch.full((len(coords),), index), pixel_coords)
+    projected, depths = cameras.project(rays.origins + distance * rays.directions, index)
+    assert_close(projected, pixel_coords, atol=2e-3, rtol=0)
+    assert (depths > 0).all()
+
+
+@given(pixels, lenses)
+def test_directions_are_unit_and_origins_are_the_camera_positions(coords, lens):
+    cameras = make_cameras(distortion=lens)
+    indices = torch.arange(len(coords)) % 3
+    rays = cameras.generate_rays(indices, torch.tensor(coords))
+    assert_close(rays.directions.norm(dim=-1), torch.ones(len(coords)), atol=1e-5, rtol=0)
+    assert torch.equal(rays.origins, cameras.camera_to_world[indices, :, 3])
+    assert torch.equal(rays.camera_indices, indices)
+
+
+@given(lenses, st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
+def test_undistortion_inverts_distortion_to_rounding_in_double(lens, x, y):
+    coefficients = torch.tensor(lens, dtype=torch.float64)
+    coords = torch.tensor([[x, y]], dtype=torch.float64)
+    assert_close(undistort(distort(coords, coefficients), coefficients), coords, atol=1e-10, rtol=0)
+
+
+def test_distortion_agrees_with_the_opencv_formula_at_a_worked_point():
+    # by hand for x = 0.3, y = -0.2, r2 = 0.13
+    bent = distort(
+        torch.tensor([[0.3, -0.2]], dtype=torch.float64), torch.tensor([0.1, 0.02, 0.003, -0.004]).double()
+    )
+    radial = 1 + 0.1 * 0.13 + 0.02 * 0.13**2
+    expected_x = 0.3 * radial + 2 * 0.003 * 0.3 * -0.2 - 0.004 * (0.13 + 2 * 0.09)
+    expected_y = -0.2 * radial + 2 * -0.004 * 0.3 * -0.2 + 0.003 * (0.13 + 2 * 0.04)
+    assert_close(bent, torch.tensor([[expected_x, expected_y]], dtype=torch.float64), atol=1e-7, rtol=0)
+
+
+def test_axes_are_opengl():
+    camera = identity_camera()
+    middle = camera.generate_rays(
+        torch.zeros(3, dtype=torch.int64), torch.tensor([[32.0, 24], [52.0, 24], [32.0, 4]])
+    )
+    assert_close(middle.directions[0], torch.tensor([0.0, 0.0, -1.0]))
+    assert middle.directions[1, 0] > 0  # a pixel to the right lies at +x
+    assert middle.directions[2, 1] > 0  # a pixel further up lies at +y
+
+
+def test_depth_is_measured_along_the_axis_and_negative_behind():
+    _, depths = identity_camera().project(
+        torch.tensor([[1.0, 2.0, -3.0], [0.0, 0.0, 4.0], [1.0, 1.0, 0.0]]), 0
+    )
+    assert_close(depths, torch.tensor([3.0, -4.0, 0.0]))
+
+
+def test_points_on_the_camera_plane_project_to_finite_numbers():
+    projected, _ = identity_camera().project(torch.tensor([[1.0, 1.0, 0.0], [0.0, 0.0, 0.0]]), 0)
+    assert torch.isfinite(projected).all()
+
+
+def test_image_rays_run_row_after_row_through_pixel_centres():
+    cameras = make_cameras()
+    rays = cameras.image_rays(1)
+    assert len(rays) == WIDTH * HEIGHT
+    row, column = 5, 17
+    expected = cameras.generate_rays(torch.tensor([1]), torch.tensor([[column + 0.5, row + 0.5]]))
+    assert_close(rays.directions[row * WIDTH + column], expected.directions[0])
+    assert (rays.camera_indices == 1).all()
+
+
+def test_a_subpixel_offset_moves_the_rays_by_that_part_of_a_pixel():
+    cameras = make_cameras()
+    rays = cameras.image_rays(0, subpixel_offset=(0.25, 1.0))
+    projected, _ = cameras.project(rays.origins + rays.directions, 0)
+    assert_close(projected[WIDTH + 2], torch.tensor([2.25, 2.0]), atol=1e-3, rtol=0)
+
+
+def test_json_gives_back_the_same_bits():
+    cameras = make_cameras(distortion=(0.1, -0.02, 0.003, 0.1 / 3))
+    again = Cameras.from_json(json.loads(json.dumps(cameras.to_json())))
+    for name in ("camera_to_world", "focal_px", "center_px", "distortion"):
+        assert torch.equal(getattr(again, name), getattr(cameras, name)), name
+    assert (again.width, again.height) == (WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize(
+    ("index", "expected"), [(1, [1]), (slice(1, 3), [1, 2]), ([2, 0], [2, 0]), (-1, [2])]
+)
+def test_indexing_gives_cameras_in_the_order_asked_for(index, expected):
+    cameras = make_cameras()
+    chosen = cameras[index]
+    assert len(chosen) == len(expected)
+    assert torch.equal(chosen.focal_px, cameras.focal_px[expected])
+    assert torch.equal(chosen.camera_to_world, cameras.camera_to_world[expected])
+
+
+def test_a_distorted_lens_is_told_from_a_pinhole():
+    assert make_cameras(distortion=(0.0, 0.0, 0.0, 0.01)).is_distorted
+    assert not make_cameras().is_distorted

@@ -1,0 +1,252 @@
+"""Checkpoints survive a stop at any system call, a full disk, and damage to the newest."""
+
+import contextlib
+import errno
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from unmix_plugin import atomic_files
+from unmix_plugin.engine.runs import checkpoints
+from unmix_plugin.engine.runs.checkpoints import checkpoint_steps, newest_complete_checkpoint, save_checkpoint
+from unmix_plugin.errors import RunError
+
+CALLS = ("open", "write", "fsync", "replace", "unlink")
+
+
+def tensors_of(step: int) -> dict[str, Tensor]:
+    return {"a": torch.full((40, 3), float(step)), "n": torch.tensor(step)}
+
+
+class Faults:
+    """Counts the system calls of a save and raises in place of the `at`-th, and of all later ones if `dead`."""
+
+    def __init__(
+        self, monkeypatch: pytest.MonkeyPatch, at: int | None, error: type[BaseException], dead: bool
+    ):
+        self.count = 0
+        self.at = at
+        self.error = error
+        self.dead = dead
+        monkeypatch.setattr(atomic_files, "CHUNK_BYTES", 200)
+        for name in CALLS:
+            monkeypatch.setattr(os, name, self.wrap(name, getattr(os, name)))
+
+    def wrap(self, name: str, real: Any) -> Any:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            # A full disk refuses to grow files; removing them always works.
+            if not self.dead and name == "unlink":
+                return real(*args, **kwargs)
+            self.count += 1
+            if self.at is not None and (self.count == self.at or (self.dead and self.count > self.at)):
+                if name == "write" and self.count == self.at:
+                    real(args[0], args[1][: len(args[1]) // 2])
+                raise self.error(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            return real(*args, **kwargs)
+
+        return call
+
+
+class Killed(BaseException):
+    """Stands for SIGKILL: nothing that runs after it has any effect."""
+
+
+def calls_of_a_save(folder: Path, dead: bool = True) -> int:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        faults = Faults(monkeypatch, None, Killed, dead)
+        save_checkpoint(folder, 2, tensors_of(2), {}, keep=1)
+    return faults.count
+
+
+def test_a_checkpoint_comes_back_to_the_bit(tmp_path: Path):
+    tensors = {
+        "float": torch.randn(5, 7),
+        "double": torch.randn(3, dtype=torch.float64),
+        "flags": torch.tensor([True, False]),
+        "scalar": torch.tensor(3.5),
+        "empty": torch.zeros(0, 4),
+        "half": torch.randn(4).to(torch.bfloat16),
+    }
+    path = save_checkpoint(tmp_path / "new", 7, tensors, {"seconds": 1.25, "list": [1, "x", None]})
+    assert path.name == "step-000007.json"
+    loaded = newest_complete_checkpoint(tmp_path / "new")
+    assert loaded is not None
+    assert loaded.step == 7
+    assert loaded.record["seconds"] == 1.25
+    assert loaded.record["list"] == [1, "x", None]
+    assert set(loaded.tensors) == set(tensors)
+    for name, tensor in tensors.items():
+        assert loaded.tensors[name].dtype == tensor.dtype
+        assert torch.equal(loaded.tensors[name], tensor)
+
+
+def test_views_and_tied_tensors_are_saved_as_what_they_show(tmp_path: Path):
+    base = torch.arange(12.0).reshape(3, 4)
+    parameter = torch.nn.Parameter(base.clone())
+    tensors = {"base": base, "transposed": base.T, "row": base[1], "again": base, "parameter": parameter}
+    save_checkpoint(tmp_path, 1, tensors, {})
+    loaded = newest_complete_checkpoint(tmp_path)
+    assert loaded is not None
+    for name, tensor in tensors.items():
+        assert torch.equal(loaded.tensors[name], tensor.detach())
+
+
+def test_a_save_makes_enough_system_calls_for_the_fault_tests_to_mean_something(tmp_path: Path):
+    save_checkpoint(tmp_path, 1, tensors_of(1), {})
+    assert calls_of_a_save(tmp_path) >= 15
+
+
+@pytest.mark.parametrize("same_step", [False, True])
+def test_a_kill_at_any_system_call_leaves_a_complete_checkpoint(tmp_path: Path, same_step: bool):
+    reference = tmp_path / "reference"
+    save_checkpoint(reference, 1, tensors_of(1), {})
+    count = calls_of_a_save(reference)
+    seen: set[int] = set()
+    for at in range(1, count + 1):
+        folder = tmp_path / str(at)
+        save_checkpoint(folder, 1, tensors_of(1), {})
+        if same_step:
+            save_checkpoint(folder, 2, tensors_of(2), {"seconds": 1})
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            Faults(monkeypatch, at, Killed, dead=True)
+            with contextlib.suppress(Killed):
+                save_checkpoint(folder, 2, tensors_of(2), {}, keep=1 + same_step)
+        found = newest_complete_checkpoint(folder)
+        assert found is not None
+        assert found.damaged == ()
+        assert torch.equal(found.tensors["a"], tensors_of(found.step)["a"])
+        seen.add(found.step)
+        save_checkpoint(folder, 3, tensors_of(3), {}, keep=1)
+        assert sorted(path.name for path in folder.iterdir()) == [
+            "step-000003.json",
+            "step-000003.safetensors",
+        ]
+    assert seen == ({2} if same_step else {1, 2})
+
+
+def test_a_full_disk_at_any_system_call_is_said_and_changes_nothing(tmp_path: Path):
+    reference = tmp_path / "reference"
+    save_checkpoint(reference, 1, tensors_of(1), {})
+    count = calls_of_a_save(reference, dead=False)
+    assert count >= 12
+    for at in range(1, count + 1):
+        folder = tmp_path / str(at)
+        save_checkpoint(folder, 1, tensors_of(1), {})
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            Faults(monkeypatch, at, OSError, dead=False)
+            with pytest.raises(RunError, match="No space left on device"):
+                save_checkpoint(folder, 2, tensors_of(2), {})
+        names = {path.name for path in folder.iterdir()}
+        assert not [name for name in names if name.endswith(".tmp")]
+        assert {"step-000001.json", "step-000001.safetensors"} <= names
+        found = newest_complete_checkpoint(folder)
+        assert found is not None
+        assert found.damaged == ()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="forks")
+def test_twenty_real_kills_during_saving_leave_complete_checkpoints(tmp_path: Path):
+    done = subprocess.run(
+        [sys.executable, "-c", KILLING, str(tmp_path)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    steps = [int(word) for word in done.stdout.split()]
+    assert len(steps) == 20
+    assert steps == sorted(steps)
+    assert steps[-1] > steps[0]
+
+
+KILLING = """
+import os, random, signal, sys, time
+from pathlib import Path
+import torch
+from unmix_plugin.engine.runs.checkpoints import newest_complete_checkpoint, save_checkpoint
+
+folder, chance = Path(sys.argv[1]), random.Random(1)
+save_checkpoint(folder, 1, {"a": torch.full((300_000,), 1.0)}, {})
+for _ in range(20):
+    start = newest_complete_checkpoint(folder).step
+    child = os.fork()
+    if child == 0:
+        for step in range(start + 1, start + 10_000):
+            save_checkpoint(folder, step, {"a": torch.full((300_000,), float(step))}, {})
+        os._exit(0)
+    time.sleep(chance.uniform(0.01, 0.08))
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    found = newest_complete_checkpoint(folder)
+    assert found.damaged == (), found.damaged
+    assert found.tensors["a"].unique().tolist() == [float(found.step)]
+    print(found.step)
+"""
+
+
+def test_damage_to_the_newest_falls_back_to_the_one_before(tmp_path: Path):
+    for step in (1, 2):
+        save_checkpoint(tmp_path, step, tensors_of(step), {})
+    path = tmp_path / "step-000002.safetensors"
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.write_bytes(data)
+    found = newest_complete_checkpoint(tmp_path)
+    assert found is not None
+    assert found.step == 1
+    assert "step-000002" in found.damaged[0]
+    path.unlink()
+    assert newest_complete_checkpoint(tmp_path) is not None
+    (tmp_path / "step-000002.json").write_text('{"format_ver')
+    found = newest_complete_checkpoint(tmp_path)
+    assert found is not None
+    assert found.step == 1
+
+
+def test_a_save_after_damage_never_counts_the_damaged_one_among_those_kept(tmp_path: Path):
+    for step in (1, 2, 9):
+        save_checkpoint(tmp_path, step, tensors_of(step), {}, keep=3)
+    (tmp_path / "step-000009.safetensors").write_bytes(b"damaged")
+    save_checkpoint(tmp_path, 3, tensors_of(3), {}, keep=2)
+    assert checkpoint_steps(tmp_path) == [3, 2]
+
+
+def test_only_the_newest_two_stay(tmp_path: Path):
+    for step in (10, 999_999, 1_000_000, 1_000_001):
+        save_checkpoint(tmp_path, step, tensors_of(step), {})
+    assert checkpoint_steps(tmp_path) == [1_000_001, 1_000_000]
+    assert len(list(tmp_path.iterdir())) == 4
+
+
+def test_no_checkpoint_is_none(tmp_path: Path):
+    assert newest_complete_checkpoint(tmp_path) is None
+    assert newest_complete_checkpoint(tmp_path / "missing") is None
+
+
+def test_a_checkpoint_of_a_newer_version_is_refused_not_passed_over(tmp_path: Path):
+    save_checkpoint(tmp_path, 1, tensors_of(1), {})
+    save_checkpoint(tmp_path, 2, tensors_of(2), {})
+    path = tmp_path / "step-000002.json"
+    path.write_text(
+        json.dumps({**json.loads(path.read_text()), "format_version": checkpoints.FORMAT_VERSION + 1})
+    )
+    with pytest.raises(RunError, match="newer version"):
+        newest_complete_checkpoint(tmp_path)
+
+
+def test_saving_the_same_tensors_again_only_rewrites_the_record(tmp_path: Path):
+    save_checkpoint(tmp_path, 1, tensors_of(1), {"seconds": 1})
+    before = (tmp_path / "step-000001.safetensors").stat().st_mtime_ns
+    save_checkpoint(tmp_path, 1, tensors_of(1), {"seconds": 2})
+    found = newest_complete_checkpoint(tmp_path)
+    assert found is not None
+    assert found.record["seconds"] == 2
+    assert (tmp_path / "step-000001.safetensors").stat().st_mtime_ns == before

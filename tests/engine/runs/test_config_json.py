@@ -1,0 +1,156 @@
+"""Configs survive the way through JSON, and a file that does not fit says where."""
+
+import json
+import math
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.engine.rgb_nerf_plugin import rgb_nerf
+from unmix_plugin.engine.configs import OptimizerConfig, TrainerConfig
+from unmix_plugin.engine.instantiate import InstantiateConfig, Target
+from unmix_plugin.engine.runs.config_json import config_from_json, config_to_json
+from unmix_plugin.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Inner(InstantiateConfig):
+    _target: Target = field(default_factory=lambda: dict)
+    size: int = 3
+    name: str = "x"
+
+
+@dataclass(frozen=True)
+class Larger(Inner):
+    extra: float = 0.5
+
+
+@dataclass(frozen=True)
+class Everything(InstantiateConfig):
+    number: float = 1.0
+    count: int | None = None
+    flag: bool = False
+    path: Path | None = Path("a/b")
+    kind: Literal["none", "some", "full"] = "none"
+    pair: tuple[float, int] = (0.5, 2)
+    many: tuple[int, ...] = ()
+    names: list[str] = field(default_factory=list)
+    inner: Inner = field(default_factory=Larger)
+    perhaps: Inner | None = None
+    named: dict[str, Inner] = field(default_factory=lambda: {"a": Larger()})
+
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+larger = st.builds(Larger, _target=st.just(dict), size=st.integers(), name=st.text(), extra=finite)
+inner = st.builds(Inner, _target=st.just(dict), size=st.integers(), name=st.text())
+everything = st.builds(
+    Everything,
+    _target=st.just(object),
+    number=finite,
+    count=st.none() | st.integers(),
+    flag=st.booleans(),
+    path=st.none() | st.sampled_from([Path("x"), Path("/y z/ü")]),
+    kind=st.sampled_from(["none", "some", "full"]),
+    pair=st.tuples(finite, st.integers()),
+    many=st.lists(st.integers(), max_size=3).map(tuple),
+    names=st.lists(st.text(), max_size=3),
+    inner=larger,
+    perhaps=st.none() | inner,
+    named=st.fixed_dictionaries({"a": larger}, optional={"b": inner}),
+)
+
+
+def without_targets(config: Any) -> Any:
+    """Lambdas make the default targets unequal in identity, not in effect."""
+    return replace(config, _target=object)
+
+
+@settings(deadline=None, max_examples=150)
+@given(everything)
+def test_any_config_comes_back_equal(config: Everything):
+    text = json.dumps(config_to_json(config), allow_nan=False)
+    assert without_targets(config_from_json(json.loads(text), Everything())) == without_targets(config)
+
+
+def test_a_registered_method_comes_back_with_its_classes():
+    config = replace(rgb_nerf.config, data=Path("scene"), max_seconds=3.5, average_decay=0.99)
+    found = config_from_json(json.loads(json.dumps(config_to_json(config))), rgb_nerf.config)
+    assert found == config
+    assert type(found.pipeline.model) is type(config.pipeline.model)
+
+
+def test_what_the_file_lacks_is_the_default():
+    assert config_from_json({"seed": 7}, rgb_nerf.config) == replace(rgb_nerf.config, seed=7)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"count": "three"}, r"config\.count: expected an integer, found str 'three'"),
+        ({"count": True}, r"config\.count: expected an integer, found bool True"),
+        ({"flag": 1}, r"config\.flag: expected true or false, found int 1"),
+        ({"number": None}, r"config\.number: expected a number, found NoneType None"),
+        ({"kind": "most"}, r"config\.kind: expected one of 'none', 'some', 'full', found str 'most'"),
+        ({"pair": [1.0]}, r"config\.pair: expected 2 entries, found 1"),
+        ({"pair": 1.0}, r"config\.pair: expected a list"),
+        ({"many": [1, "x"]}, r"config\.many\[1\]: expected an integer"),
+        ({"inner": {"size": 1.5}}, r"config\.inner\.size: expected an integer, found float 1.5"),
+        ({"inner": {"sise": 1}}, r"config\.inner: Larger has no field sise"),
+        ({"inner": 3}, r"config\.inner: expected an object"),
+        ({"named": {"a": {"extra": "x"}}}, r"config\.named\.a\.extra: expected a number"),
+        ({"_target": "os.system"}, r"config: Everything has no field _target"),
+        ({"inner": {"_target": "os.system"}}, r"config\.inner: Larger has no field _target"),
+        ([], r"config: expected an object, found list"),
+    ],
+)
+def test_a_value_that_does_not_fit_is_named_by_its_path(values: Any, message: str):
+    with pytest.raises(ConfigError, match=message):
+        config_from_json(values, Everything())
+
+
+def test_a_value_out_of_range_is_named_by_its_path():
+    with pytest.raises(ConfigError, match=r"config\.optimizers\.fields: .*lr > 0"):
+        config_from_json({"optimizers": {"fields": {"lr": -1.0}}}, rgb_nerf.config)
+
+
+def test_numbers_that_are_not_finite_are_refused_before_they_are_written():
+    with pytest.raises(ConfigError, match="finite"):
+        config_to_json(Everything(number=math.inf))
+
+
+def test_a_config_that_holds_an_object_is_refused():
+    with pytest.raises(TypeError, match="holds a set"):
+        config_to_json(Everything(names={1}))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("settings_", "rule"),
+    [
+        ({"max_num_iterations": -1}, "max_num_iterations >= 0"),
+        ({"max_seconds": 0.0}, "max_seconds > 0"),
+        ({"max_seconds": math.inf}, "max_seconds > 0"),
+        ({"max_num_iterations": None}, "max_num_iterations or max_seconds"),
+        ({"steps_per_log": 0}, "steps_per_log >= 1"),
+        ({"average_decay": 1.0}, "average_decay in"),
+        ({"method_name": "../x"}, "a file name as method_name"),
+    ],
+)
+def test_impossible_training_settings_are_refused(settings_: dict[str, Any], rule: str):
+    with pytest.raises(ConfigError, match=rule):
+        replace(TrainerConfig(), **settings_)
+
+
+def test_impossible_optimizer_settings_are_refused():
+    for bad in (
+        {"lr": 0.0},
+        {"betas": (0.9, 1.0)},
+        {"eps": 0.0},
+        {"final_factor": 0.0},
+        {"warmup_fraction": 1.0},
+    ):
+        with pytest.raises(ConfigError, match=next(iter(bad))):
+            OptimizerConfig(**bad)  # type: ignore[arg-type]

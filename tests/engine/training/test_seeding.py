@@ -1,0 +1,46 @@
+"""Randomness is a function of seed, step and stream."""
+
+import random
+
+import numpy as np
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from unmix_plugin.engine.training.seeding import seed_everything, step_generator, step_seed
+
+integers = st.integers(0, 2**40)
+
+
+@given(integers, integers, integers)
+def test_a_seed_fits_a_generator_and_repeats(seed: int, step: int, stream: int):
+    found = step_seed(seed, step, stream)
+    assert 0 <= found < 2**63
+    assert found == step_seed(seed, step, stream)
+
+
+def test_neighbouring_seeds_steps_and_streams_are_all_different():
+    found = {step_seed(seed, step, stream) for seed in range(20) for step in range(50) for stream in range(5)}
+    assert len(found) == 20 * 50 * 5
+
+
+def test_a_steps_generator_draws_the_same_whatever_was_drawn_before():
+    first = torch.rand(5, generator=step_generator(1, 7))
+    step_generator(1, 6).seed()
+    assert torch.equal(torch.rand(5, generator=step_generator(1, 7)), first)
+    assert not torch.equal(torch.rand(5, generator=step_generator(1, 7, stream=1)), first)
+
+
+def test_draws_of_successive_steps_are_uniform_and_uncorrelated():
+    draws = torch.stack([torch.rand(2, generator=step_generator(3, step)) for step in range(2000)])
+    assert (draws.mean(dim=0) - 0.5).abs().max() < 0.03
+    centred = draws[:, 0] - 0.5
+    assert (12 * centred[1:] * centred[:-1]).mean().abs() < 0.08
+
+
+def test_seeding_everything_repeats_torch_numpy_and_python():
+    def draw() -> tuple[float, float, float]:
+        seed_everything(5)
+        return float(torch.rand(())), float(np.random.rand()), random.random()  # noqa: NPY002
+
+    assert draw() == draw()

@@ -1,0 +1,128 @@
+"""Watching and steering a training from another thread: it does as asked between steps, and nothing else changes."""
+
+import threading
+import time
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tests.engine.test_resume import call_after_step, newest, quiet_trainer
+from unmix_plugin.engine.runs.checkpoints import checkpoint_steps
+from unmix_plugin.engine.runs.load_run import load_config
+from unmix_plugin.engine.training.interrupts import Interrupted
+
+
+def in_background(work):
+    """A thread that does something, started."""
+    thread = threading.Thread(target=work)
+    thread.start()
+    return thread
+
+
+def wait_for(holds, timeout_s=20.0):
+    until = time.monotonic() + timeout_s
+    while not holds():
+        assert time.monotonic() < until
+        time.sleep(0.002)
+
+
+@pytest.mark.parametrize("average_decay", [None, 0.9])
+def test_a_guest_on_the_device_changes_nothing_of_a_training(short_config, average_decay):
+    config = replace(short_config, average_decay=average_decay, average_interval=2)
+    alone, watched = quiet_trainer(config), quiet_trainer(config)
+    alone.train()
+    model, camera = watched.pipeline.model, watched.pipeline.datamanager.eval_cameras[0]
+    is_over = threading.Event()
+
+    def watch():
+        while not is_over.is_set():
+            with watched.control.device.guest_turn():
+                training = model.training
+                model.eval()
+                model.get_outputs_for_camera(camera)
+                model.train(training)
+
+    guest = in_background(watch)
+    watched.train()
+    is_over.set()
+    guest.join()
+    expected, actual = newest(alone.run.path).tensors, newest(watched.run.path).tensors
+    assert set(expected) == set(actual)
+    for name, tensor in expected.items():
+        assert torch.equal(tensor, actual[name]), name
+
+
+def test_a_pause_stops_the_steps_and_the_clock_until_it_is_over(short_config):
+    trainer = quiet_trainer(short_config)
+    control = trainer.control
+    call_after_step(trainer, 5, control.pause)
+    thread = in_background(trainer.train)
+    wait_for(lambda: control.is_paused and trainer.step == 5)
+    assert control.is_running
+    assert not control.device.is_training
+    seconds = trainer.clock.seconds
+    time.sleep(0.3)
+    assert (trainer.step, trainer.clock.seconds) == (5, seconds)
+    control.resume()
+    thread.join(20)
+    assert trainer.step == 12
+    assert not control.is_running
+    assert not control.device.is_training
+
+
+def test_a_paused_training_saves_when_asked_and_not_otherwise(short_config):
+    trainer = quiet_trainer(replace(short_config, steps_per_save=0))
+    call_after_step(trainer, 3, trainer.control.pause)
+    thread = in_background(trainer.train)
+    wait_for(lambda: trainer.control.is_paused and trainer.step == 3)
+    time.sleep(0.2)
+    assert checkpoint_steps(trainer.run.checkpoints) == []
+    turns = trainer.control.device.training_turns
+    trainer.control.request_save()
+    wait_for(lambda: checkpoint_steps(trainer.run.checkpoints) == [3])
+    assert trainer.step == 3
+    assert trainer.control.device.training_turns <= turns + 1
+    trainer.control.resume()
+    thread.join(20)
+
+
+def test_a_checkpoint_that_is_asked_for_is_saved_after_the_step(short_config):
+    trainer = quiet_trainer(replace(short_config, steps_per_save=0, checkpoints_kept=5))
+    call_after_step(trainer, 7, trainer.control.request_save)
+    trainer.train()
+    assert sorted(checkpoint_steps(trainer.run.checkpoints)) == [7, 12]
+
+
+@pytest.mark.parametrize("is_paused", [False, True])
+def test_a_stop_ends_training_as_ctrl_c_does_and_it_can_go_on(short_config, is_paused):
+    trainer = quiet_trainer(short_config)
+    control = trainer.control
+
+    def stop():
+        if is_paused:
+            control.pause()
+        control.request_stop()
+
+    call_after_step(trainer, 6, stop)
+    with pytest.raises(Interrupted) as stopped:
+        trainer.train()
+    assert stopped.value.step == 6
+    assert not control.is_running
+    resumed = quiet_trainer(load_config(stopped.value.run))
+    resumed.train()
+    assert resumed.step == 12
+
+
+def test_the_status_follows_the_training(short_config, monkeypatch):
+    monkeypatch.setattr("unmix_plugin.engine.training.training_control._STATUS_INTERVAL_S", 0.0)
+    trainer = quiet_trainer(short_config)
+    seen = []
+    for step in range(1, 13):
+        call_after_step(trainer, step, lambda: seen.append(trainer.control.status))
+    trainer.train()
+    assert seen[0] is None
+    assert [status.step for status in seen[1:]] == list(range(1, 12))
+    assert trainer.control.status is not None
+    assert trainer.control.status.step == 12
+    assert trainer.control.status.progress == 1.0

@@ -1,0 +1,95 @@
+"""Spectral OpenEXR, read back with the OpenEXR library and checked against the layout."""
+
+import re
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from tests.formats.cubes import BANDS, WAVELENGTHS_NM, random_cube
+from unmix_plugin.errors import RunError
+from unmix_plugin.formats.exr import write_exr
+from unmix_plugin.formats.spectral_exr import write_spectral_exr
+
+
+def opened(path):
+    """Header, and pixels by channel."""
+    file = OpenEXR.File(str(path), separate_channels=True)
+    return file.header(), {name: channel.pixels for name, channel in file.channels().items()}
+
+
+def wavelength_of(name):
+    """What the layout's own expression reads in a channel's name."""
+    found = re.fullmatch(r"S0\.(\d+(?:,\d+)?)nm", name)
+    return float(found[1].replace(",", ".")) if found else 0.0
+
+
+def test_each_band_is_a_channel_named_by_its_wavelength(tmp_path):
+    cube = random_cube()
+    path = write_spectral_exr(tmp_path / "deep" / "view.exr", cube, BANDS, None)
+    _, channels = opened(path)
+    read = {wavelength_of(name): pixels for name, pixels in channels.items()}
+    assert tuple(sorted(read)) == WAVELENGTHS_NM
+    for index, wavelength in enumerate(WAVELENGTHS_NM):
+        assert read[wavelength].dtype == np.float32
+        np.testing.assert_array_equal(read[wavelength], cube[..., index])
+
+
+@pytest.mark.parametrize(
+    "laid_out",
+    [
+        np.asfortranarray,
+        lambda cube: cube[::-1][::-1],
+        lambda cube: np.moveaxis(np.moveaxis(cube, 2, 0).copy(), 0, 2),
+    ],
+)
+def test_numbers_are_right_however_they_lie_in_memory(tmp_path, laid_out):
+    cube = random_cube()
+    path = write_spectral_exr(tmp_path / "view.exr", laid_out(cube), BANDS, cube[..., :3], cube[..., 4])
+    _, channels = opened(path)
+    spectral = sorted((name for name in channels if wavelength_of(name)), key=wavelength_of)
+    np.testing.assert_array_equal(np.stack([channels[name] for name in spectral], axis=-1), cube)
+    np.testing.assert_array_equal(np.stack([channels[name] for name in "RGB"], axis=-1), cube[..., :3])
+    np.testing.assert_array_equal(channels["A"], cube[..., 4])
+
+
+def test_the_header_says_which_layout_it_is_and_loses_nothing_by_compression(tmp_path):
+    header, _ = opened(write_spectral_exr(tmp_path / "v.exr", random_cube(), BANDS, None, None, "of a test"))
+    assert header["spectralLayoutVersion"] == "1.0"
+    assert header["emissiveUnits"] == "W.m^-2.sr^-1"
+    assert header["comments"] == "of a test"
+    assert header["compression"] == OpenEXR.ZIP_COMPRESSION
+
+
+def test_channels_of_any_name_keep_their_type(tmp_path):
+    values = random_cube()[..., 0]
+    ids = np.arange(35, dtype=np.uint32).reshape(7, 5)
+    _, channels = opened(write_exr(tmp_path / "v.exr", {"Z": values, "layer.ids": ids}, {}))
+    np.testing.assert_array_equal(channels["Z"], values)
+    np.testing.assert_array_equal(channels["layer.ids"], ids)
+    assert channels["layer.ids"].dtype == np.uint32
+
+
+def test_a_file_that_cannot_be_written_is_named_and_leaves_nothing(tmp_path, monkeypatch):
+    path = write_spectral_exr(tmp_path / "v.exr", random_cube(), BANDS, None)
+    old = path.read_bytes()
+
+    class Full:
+        def __init__(self, *_args):
+            pass
+
+        def write(self, name):
+            with open(name, "wb") as file:  # noqa: PTH123 - as the library does
+                file.write(b"half")
+            raise RuntimeError(f'Failed to write pixel data to image file "{name}". No space left on device.')
+
+    monkeypatch.setattr(OpenEXR, "File", Full)
+    with pytest.raises(RunError, match=r"can't write \S*v\.exr: No space left on device; make room"):
+        write_spectral_exr(path, random_cube() + 1, BANDS, None)
+    assert path.read_bytes() == old
+    assert [file.name for file in tmp_path.iterdir()] == ["v.exr"]
+
+
+def test_wavelengths_must_be_as_many_as_bands(tmp_path):
+    with pytest.raises(ValueError, match="5 wavelengths for spectra of shape"):
+        write_spectral_exr(tmp_path / "v.exr", random_cube(bands=4), BANDS, None)

@@ -1,0 +1,82 @@
+"""A model whose field is known exactly: a hollow ball, its upper half of one material and its lower half of another."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tests.method_factory import make_model
+from tests.scenes.scene_factory import look_at
+from tests.trained.camera_files.camera_scenes import cameras_at
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.field import CoefficientField
+from unmix_plugin.model import UnmixModel
+from unmix_plugin.renderer import RendererConfig
+
+RADIUS, INNER_RADIUS = 0.6, 0.35
+DENSITY = 300.0
+SHADE = 0.8
+EDGE = 0.004
+
+
+class BallField(CoefficientField):
+    """Matter between two spheres around the origin; and, if asked for, a wall behind it."""
+
+    def __init__(self, has_wall: bool = False) -> None:
+        super().__init__()
+        self.has_wall = has_wall
+
+    def encode(self, positions: Tensor, known: Tensor | None = None) -> Tensor:
+        """Positions themselves."""
+        return positions if known is None else known
+
+    def get_density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """A density that rises steeply at the spheres."""
+        return self.density_of(positions)
+
+    def density_of(self, encoded: Tensor) -> tuple[Tensor, Tensor]:
+        """The same."""
+        radius = encoded.norm(dim=-1)
+        solid = torch.sigmoid((RADIUS - radius) / EDGE) * torch.sigmoid((radius - INNER_RADIUS) / EDGE)
+        if self.has_wall:
+            solid = torch.maximum(solid, torch.sigmoid((encoded[:, 0] - 0.8) / EDGE))
+        return DENSITY * solid, encoded
+
+    def abundances_of(self, features: Tensor) -> Tensor:
+        """Endmember 0 above the equator, 1 below it, never 2."""
+        above = (features[:, 2] > 0).float()
+        return torch.stack([above, 1 - above, torch.zeros_like(above)], dim=-1)
+
+    def get_outputs(self, positions: Tensor, directions: Tensor, features: Tensor) -> dict[str, Tensor]:
+        """The same shade everywhere, and no gloss."""
+        abundances = self.abundances_of(features)
+        return {
+            "abundances": abundances,
+            "scaled_abundances": SHADE * abundances,
+            "specular_coefficients": features.new_zeros(len(features), 0),
+        }
+
+
+def ball_model(has_wall: bool = False, **settings: Any) -> UnmixModel:
+    """A model that renders the ball in steps of a hundredth."""
+    renderer = RendererConfig(samples_per_pixel=8.7, smallest_weight=0.0, open_smallest_weight=0.0)
+    model = make_model(specular="none", renderer=renderer, **settings)
+    model.field = BallField(has_wall)  # type: ignore[assignment]
+    model.requires_grad_(False)
+    return model
+
+
+def cameras_around(directions: list[tuple[float, float, float]], side_px: int = 40) -> list[Cameras]:
+    """Cameras that look at the origin from a distance of 3 along each direction."""
+    poses = []
+    for direction in directions:
+        away = torch.nn.functional.normalize(torch.tensor(direction, dtype=torch.float64), dim=0)
+        poses.append(look_at(3 * away.numpy(), torch.zeros(3, dtype=torch.float64).numpy()))
+    cameras = cameras_at(poses, side_px, side_px, focal=1.6 * side_px)
+    return [cameras[index] for index in range(len(poses))]
+
+
+ALL_ROUND = [(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.5, 1.5)]
+FROM_ABOVE = [(x, y, 1.5) for x in (-1.0, 1.0) for y in (-1.0, 1.0)]

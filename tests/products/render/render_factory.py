@@ -1,0 +1,69 @@
+"""Renders of a tiny model, and their files read back with other people's readers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+import spectral.io.envi as envi
+
+from tests.method_factory import make_model
+from tests.scenes.scene_factory import ring_poses
+from tests.trained.camera_files.camera_scenes import cameras_at
+from unmix_plugin.products.render.cameras import RenderCameras
+from unmix_plugin.products.render.job import RenderJob
+from unmix_plugin.products.render.outputs import Product, choose_products
+from unmix_plugin.products.render.survey import Survey, take_survey
+from unmix_plugin.trained.run_views import RunView
+
+MODEL = make_model()
+MODEL.requires_grad_(False)
+
+
+def views(count: int = 2, is_path: bool = False, width: int = 14, height: int = 11) -> RenderCameras:
+    """Cameras around the model's box."""
+    cameras = cameras_at(ring_poses(count), width, height, focal=24.0)
+    named = tuple(RunView(f"view.{index}", cameras[index]) for index in range(count))
+    return RenderCameras(named, is_path, None)
+
+
+def render(
+    folder: Path,
+    outputs: Sequence[str],
+    formats: Sequence[str],
+    cameras: RenderCameras,
+    pixels: int | None = None,
+) -> tuple[tuple[Product, ...], Survey, RenderJob]:
+    """Render into a folder."""
+    products = choose_products(outputs, formats, MODEL.materials, cameras.is_path)
+    survey = take_survey(MODEL, cameras.views, {product.output.name for product in products})
+    with RenderJob(MODEL, cameras, products, survey, folder) as job:
+        for block in job.blocks(pixels):
+            job.render(block)
+    return products, survey, job
+
+
+def truth(cameras: RenderCameras, index: int, survey: Survey) -> dict[str, np.ndarray]:
+    """What the model itself renders of a view, all at once."""
+    names = [product.output.name for product in choose_products(["all"], [], MODEL.materials, False)]
+    asked = [*(name for name in names if name != "pca"), "band:550nm", "false-colour:650,550,450"]
+    rendered = MODEL.get_outputs_for_camera(cameras.views[index].camera, asked)
+    if survey.pca is not None:
+        seen = (rendered["accumulation"] > 0.5)[..., None]
+        rendered["pca"] = survey.pca(rendered["spectral"]) * seen
+    return {name: values.numpy() for name, values in rendered.items()}
+
+
+def read_envi(base: Path) -> tuple[np.ndarray, dict[str, Any]]:
+    """Numbers as they are on disk, and the header."""
+    image: Any = envi.open(f"{base}.hdr", f"{base}.img")
+    return np.array(image.open_memmap()), image.metadata
+
+
+def read_exr(path: Path) -> dict[str, np.ndarray]:
+    """Pixels by channel."""
+    file = OpenEXR.File(str(path), separate_channels=True)
+    return {name: channel.pixels for name, channel in file.channels().items()}

@@ -1,0 +1,111 @@
+"""Which cameras are chosen."""
+
+import json
+
+import pytest
+import torch
+
+from tests.scenes.scene_factory import ring_poses
+from tests.trained.camera_files.camera_scenes import around, cameras_at, record
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.products.render.cameras import CameraRequest, choose_cameras
+from unmix_plugin.trained.camera_files.camera_files import camera_file_bytes
+from unmix_plugin.trained.world_frame import world_frame
+
+SCENE = record(around(6), cameras_at(ring_poses(3)))
+
+
+def chosen(**request):
+    return choose_cameras(SCENE, CameraRequest(**request))
+
+
+def names(cameras):
+    return [view.name for view in cameras.views]
+
+
+def test_views_of_the_dataset_keep_their_names_and_are_no_path():
+    assert names(chosen()) == ["view_6", "view_7", "view_8"]
+    assert names(chosen(source="dataset-train")) == [f"view_{index}" for index in range(6)]
+    assert not chosen().is_path
+    torch.testing.assert_close(
+        chosen().views[1].camera.camera_to_world, SCENE.eval_cameras.camera_to_world[1:2]
+    )
+
+
+@pytest.mark.parametrize("source", ["orbit", "interpolate"])
+def test_paths_have_as_many_frames_as_asked_for(source):
+    cameras = chosen(source=source, num_frames=7)
+    assert names(cameras) == [f"{source}_{index:04d}" for index in range(7)]
+    assert cameras.is_path
+    assert len(chosen(source=source).views) == 120
+
+
+def test_views_are_picked_by_name_or_number_and_keep_their_order():
+    assert names(chosen(only=("view_8", "0"))) == ["view_6", "view_8"]
+    assert names(chosen(source="orbit", num_frames=5, only=("3",))) == ["orbit_0003"]
+
+
+def test_a_file_gives_the_cameras_written_in_it(tmp_path):
+    path = tmp_path / "mine.json"
+    path.write_bytes(camera_file_bytes(chosen(source="orbit", num_frames=4).views, 12.0, world_frame(SCENE)))
+    found = chosen(source=str(path))
+    assert names(found) == [f"orbit_{index:04d}" for index in range(4)]
+    assert (found.is_path, found.frames_per_second) == (True, 12.0)
+    assert chosen(source=str(path), frames_per_second=30).frames_per_second == 30.0
+
+
+def test_size_and_downscale_change_all_views():
+    for request, size in (
+        ({"size": (64, 48)}, (64, 48)),
+        ({"downscale": 2}, (20, 15)),
+        ({"downscale": 0.5}, (80, 60)),
+        ({}, (40, 30)),
+    ):
+        cameras = chosen(**request)
+        assert cameras.size == size
+        assert {(view.camera.width, view.camera.height) for view in cameras.views} == {size}
+
+
+BAD = {
+    "unknown": (
+        {"source": "orbti"},
+        r"unknown cameras 'orbti' \(did you mean orbit\?\); known are dataset-eval",
+    ),
+    "unlike anything": ({"source": "xyz"}, "unknown cameras 'xyz'; known are"),
+    "missing file": ({"source": "none.json"}, "can't read the camera file none.json"),
+    "frames of a dataset": (
+        {"num_frames": 5},
+        "--frames is for the paths that are made here, orbit and interpolate",
+    ),
+    "no frames": ({"source": "orbit", "num_frames": 0}, "--frames 0: expected 1 to 100000"),
+    "absurdly many frames": ({"source": "orbit", "num_frames": 10**9}, "--frames 1000000000"),
+    "unknown view": ({"only": ("view_9",)}, r"no view 'view_9' \(did you mean view_8 or"),
+    "number beyond": (
+        {"only": ("3",)},
+        "no view '3'; there are 3: numbers 0 to 2, or names from view_6 to view_8",
+    ),
+    "size twice": ({"size": (4, 4), "downscale": 2}, "--size and --downscale both say"),
+    "no size": ({"size": (0, 4)}, "--size: 0 x 4 pixels"),
+    "absurd size": (
+        {"size": (20_000, 4)},
+        "--size: 20000 x 4 pixels; expected whole numbers from 1 to 16384",
+    ),
+    "downscale 0": ({"downscale": 0.0}, "--downscale 0: expected 0.001 to 1000"),
+    "downscale nan": ({"downscale": float("nan")}, "--downscale nan"),
+    "downscaled away": ({"downscale": 100}, "--downscale 100: 0 x 0 pixels"),
+    "speed": ({"frames_per_second": -1}, "--fps: -1 frames a second"),
+    "speed nan": ({"frames_per_second": float("nan")}, "--fps: nan frames a second"),
+}
+
+
+@pytest.mark.parametrize("fault", BAD)
+def test_what_cannot_be_rendered_is_refused(fault):
+    request, said = BAD[fault]
+    with pytest.raises(ConfigError, match=said):
+        chosen(**request)
+
+
+def test_a_file_without_cameras_is_refused(tmp_path):
+    (tmp_path / "p.json").write_text(json.dumps({"frames": []}))
+    with pytest.raises(ConfigError, match="'frames' is empty"):
+        chosen(source=str(tmp_path / "p.json"))

@@ -1,0 +1,325 @@
+"""What is in the files of a render: exactly what the model renders, whatever the format."""
+
+import errno
+import os
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+from matplotlib import colormaps
+from PIL import Image
+
+from tests.formats.video_reading import read_video
+from tests.products.render.render_factory import MODEL, read_envi, read_exr, render, truth, views
+from unmix_plugin.errors import RunError
+from unmix_plugin.products.render.files import still_paths
+from unmix_plugin.products.render.job import RenderJob, product_paths
+from unmix_plugin.products.render.survey import Survey
+
+pytestmark = pytest.mark.usefixtures("no_wait_for_the_disk")
+
+NUMBERS = ["all", "band:550nm", "false-colour:650,550,450"]
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """All outputs of two views as numbers."""
+    folder, cameras = tmp_path_factory.mktemp("numbers"), views()
+    products, survey, _ = render(folder, NUMBERS, ["npy", "envi", "exr"], cameras)
+    return folder, cameras, products, [truth(cameras, index, survey) for index in range(2)]
+
+
+def test_arrays_are_what_the_model_renders_bit_for_bit(written):
+    folder, cameras, products, expected = written
+    read = 0
+    for product in products:
+        if product.format != "npy":
+            continue
+        for view, values in zip(cameras.views, expected, strict=True):
+            [path] = still_paths(folder, product, view.name)
+            array = np.load(path, allow_pickle=False)
+            assert array.dtype == (np.uint8 if product.output.name == "segmentation" else np.float32)
+            np.testing.assert_array_equal(array, values[product.output.name])
+            read += 1
+    assert read == 2 * 16
+
+
+def test_envi_cubes_are_what_the_model_renders_bit_for_bit(written):
+    folder, cameras, products, expected = written
+    read = 0
+    for product in products:
+        if product.format != "envi":
+            continue
+        for view, values in zip(cameras.views, expected, strict=True):
+            header, data = still_paths(folder, product, view.name)
+            assert header.name == f"{view.name}.hdr"
+            assert data.is_file()
+            numbers, metadata = read_envi(header.with_suffix(""))
+            wanted = values[product.output.name]
+            np.testing.assert_array_equal(numbers, wanted if wanted.ndim == 3 else wanted[..., None])
+            assert str(metadata["description"]).startswith(product.output.name)
+            read += 1
+    assert read == 2 * 15
+
+
+def test_envi_cubes_of_spectra_have_wavelengths_and_those_of_shares_have_names(written):
+    folder, _, _, _ = written
+    _, spectra = read_envi(folder / "spectral" / "view.0")
+    assert [float(str(nm)) for nm in spectra["wavelength"]] == [450, 500, 550, 600, 650]
+    assert spectra["band names"] == ["450 nm", "500 nm", "550 nm", "600 nm", "650 nm"]
+    _, shares = read_envi(folder / "abundances" / "view.0")
+    assert shares["band names"] == list(MODEL.materials.names)
+    assert "wavelength" not in shares
+
+
+@pytest.mark.parametrize("name", ["spectral", "diffuse", "specular"])
+def test_exr_of_spectra_has_a_channel_a_band_opacity_and_a_preview(written, name):
+    folder, _, _, expected = written
+    for index, values in enumerate(expected):
+        channels = read_exr(folder / name / f"view.{index}.exr")
+        bands = [channels[f"S0.{nm},000000nm"] for nm in (450, 500, 550, 600, 650)]
+        np.testing.assert_array_equal(np.stack(bands, axis=-1), values[name])
+        np.testing.assert_array_equal(channels["A"], values["accumulation"])
+        if name == "spectral":
+            preview = np.stack([channels[channel] for channel in "RGB"], axis=-1)
+            np.testing.assert_allclose(preview, values["linear_rgb"], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "channels"),
+    [
+        ("linear_rgb", ["R", "G", "B"]),
+        ("false-colour:650,550,450", ["R", "G", "B"]),
+        ("depth", ["Z"]),
+        ("accumulation", ["accumulation"]),
+        ("band:550nm", ["band-550nm"]),
+        ("normals", ["normals.X", "normals.Y", "normals.Z"]),
+        ("abundances", [f"abundances.endmember_{index}" for index in range(3)]),
+    ],
+)
+def test_exr_channels_have_the_names_that_other_tools_expect(written, name, channels):
+    folder, _, products, expected = written
+    product = next(one for one in products if one.output.name == name and one.format == "exr")
+    read = read_exr(still_paths(folder, product, "view.1")[0])
+    assert set(read) - {"A"} == set(channels)
+    values = expected[1][name]
+    np.testing.assert_array_equal(
+        np.stack([read[channel] for channel in channels], axis=-1), values.reshape(11, 14, -1)
+    )
+
+
+def test_a_view_rendered_in_blocks_of_rows_is_the_view(tmp_path):
+    cameras = views(1)
+    outputs = ["spectral", "depth", "normals", "segmentation"]
+    _, survey, job = render(tmp_path, outputs, ["npy", "envi", "exr", "png"], cameras, pixels=30)
+    assert [block.camera.height for block in job.blocks(30)] == [2, 2, 2, 2, 2, 1]
+    expected = truth(cameras, 0, survey)
+    for name in ("spectral", "depth"):
+        np.testing.assert_allclose(np.load(tmp_path / name / "view.0.npy"), expected[name], atol=1e-5)
+    numbers, _ = read_envi(tmp_path / "spectral" / "view.0")
+    np.testing.assert_allclose(numbers, expected["spectral"], atol=1e-5)
+    np.testing.assert_allclose(read_exr(tmp_path / "depth" / "view.0.exr")["Z"], expected["depth"], atol=1e-5)
+    with Image.open(tmp_path / "segmentation" / "view.0.png") as picture:
+        assert (np.asarray(picture) == expected["segmentation"]).mean() > 0.98
+
+
+def test_a_block_is_never_more_than_so_many_pixels_but_always_a_row(tmp_path):
+    job = RenderJob(MODEL, views(1, width=300, height=200), (), Survey(), tmp_path)
+    for pixels in (1, 299, 300, 1000, 10**6):
+        blocks = job.blocks(pixels)
+        assert sum(block.camera.height for block in blocks) == 200
+        assert all(300 * block.camera.height <= max(300, pixels) for block in blocks)
+        assert [block.is_last for block in blocks].count(True) == 1
+    assert all(block.camera.width * block.camera.height <= 1 << 16 for block in job.blocks())
+
+
+def over_black(rgba):
+    """Linear light that an RGBA picture adds to black."""
+    encoded = rgba[..., :3] / 255
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    return linear * (rgba[..., 3:] / 255)
+
+
+def test_pictures_have_straight_colours_and_the_models_opacity(tmp_path):
+    cameras = views()
+    _, survey, _ = render(tmp_path, ["rgb", "band:550nm"], ["png"], cameras)
+    for index in range(2):
+        expected = truth(cameras, index, survey)
+        rgba = iio.imread(tmp_path / "rgb" / f"view.{index}.png")
+        assert np.abs(rgba[..., 3] - 255 * expected["accumulation"]).max() <= 0.5001
+        assert (expected["accumulation"] < 0.9).any(), "the test needs transparent pixels"
+        np.testing.assert_allclose(over_black(rgba), expected["linear_rgb"], atol=0.006)
+        grey = over_black(iio.imread(tmp_path / "band-550nm" / f"view.{index}.png"))
+        np.testing.assert_allclose(grey[..., 1], expected["band:550nm"], atol=0.006)
+
+
+def test_maps_have_one_known_range_in_all_views(tmp_path):
+    cameras = views(3)
+    _, survey, _ = render(tmp_path, ["depth"], ["png"], cameras)
+    scale = survey.scales["depth"]
+    assert 0 < scale.low < scale.high
+    for index in range(3):
+        values = truth(cameras, index, survey)
+        path = tmp_path / "depth" / f"view.{index}.png"
+        rgba = iio.imread(path)
+        fraction = np.clip((values["depth"] - scale.low) / (scale.high - scale.low), 0, 1)
+        shown = rgba[..., 3] > 0
+        colours = np.round(255 * colormaps["viridis"](fraction)[..., :3])
+        np.testing.assert_array_equal(rgba[shown][:, :3], colours[shown])
+        with Image.open(path) as picture:
+            assert f"viridis from {scale.low:.6g} to {scale.high:.6g}" in picture.info["Description"]
+
+
+def test_ids_keep_their_colours_in_all_views(tmp_path):
+    cameras = views(3)
+    _, survey, job = render(tmp_path, ["segmentation"], ["png"], cameras)
+    for index in range(3):
+        ids = truth(cameras, index, survey)["segmentation"]
+        with Image.open(tmp_path / "segmentation" / f"view.{index}.png") as picture:
+            np.testing.assert_array_equal(np.asarray(picture), ids)
+            rgba = np.asarray(picture.convert("RGBA"))
+        seen = ids != 255
+        np.testing.assert_array_equal(rgba[seen][:, :3], np.round(255 * job.palette.colours[ids[seen]]))
+        assert not rgba[~seen][:, 3].any()
+
+
+def test_one_tile_for_each_endmember_stands_in_a_picture_of_abundances(tmp_path):
+    cameras = views(1)
+    _, survey, job = render(tmp_path, ["abundances"], ["png"], cameras)
+    rgba = iio.imread(tmp_path / "abundances" / "view.0.png")
+    assert rgba.shape[1] == 3 * 14 + 2 * 2
+    expected = truth(cameras, 0, survey)
+    shares = expected["abundances"] / np.maximum(expected["accumulation"], 1e-6)[..., None]
+    for index in range(3):
+        tile = rgba[-11:, 16 * index : 16 * index + 14]
+        colours = np.round(255 * colormaps["viridis"](np.clip(shares[..., index], 0, 1))[..., :3])
+        shown = tile[..., 3] > 0
+        np.testing.assert_array_equal(tile[shown][:, :3], colours[shown])
+        swatch = rgba[8, 16 * index + 6, :3]
+        np.testing.assert_array_equal(swatch, np.round(255 * job.palette.colours[index]))
+
+
+def test_a_moving_camera_makes_one_video_with_a_frame_a_view(tmp_path):
+    cameras = views(4, is_path=True)
+    outputs = ["rgb", "pca", "segmentation", "abundances"]
+    products, _, _ = render(tmp_path, outputs, ["mp4"], cameras)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(f"{name}.mp4" for name in outputs)
+    for product in products:
+        frames, facts = read_video(product_paths(tmp_path, product, cameras)[0])
+        assert len(frames) == 4
+        assert facts["fps"] == 24.0
+        assert np.abs(np.diff(frames.astype(float), axis=0)).mean() > 0.5, "the camera moves"
+
+
+def test_a_sweep_shows_band_after_band_from_one_camera(tmp_path):
+    cameras = views(2, width=36, height=28)
+    _, survey, _ = render(tmp_path, ["spectral"], ["mp4"], cameras)
+    frames, facts = read_video(tmp_path / "spectral" / "view.1.mp4")
+    assert frames.shape == (5, 28 + 18, 36, 3)
+    assert facts["fps"] == 4.0
+    expected = truth(cameras, 1, survey)
+    grey = ((0.92 + 0.055) / 1.055) ** 2.4
+    for band in range(5):
+        light = np.clip(expected["spectral"][..., band] + grey * (1 - expected["accumulation"]), 0, 1)
+        encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+        seen = frames[band, 18:].mean(axis=-1)
+        assert np.abs(seen - 255 * encoded).max() < 25
+        assert np.abs(seen - 255 * encoded).mean() < 3
+
+
+def test_spectra_from_a_moving_camera_go_through_the_bands_from_first_to_last(tmp_path):
+    cameras = views(3, is_path=True, width=52, height=10)
+    render(tmp_path, ["spectral"], ["mp4"], cameras)
+    assert [path.name for path in tmp_path.iterdir()] == ["spectral.mp4"]
+    frames, _ = read_video(tmp_path / "spectral.mp4")
+    assert frames.shape == (3, 10 + 18, 52, 3)
+    captions = frames[:, :18].astype(int)
+    same = [int(np.abs(captions[0] - caption).max()) < 80 for caption in captions]
+    assert same[0]
+    assert not same[-1]
+
+
+def limited(monkeypatch, after):
+    """A disk that is full after so many bytes."""
+    left, write = [after], os.write
+
+    def writing(descriptor, data):
+        if len(data) > left[0]:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        left[0] -= len(data)
+        return write(descriptor, data)
+
+    monkeypatch.setattr(os, "write", writing)
+
+
+@pytest.mark.parametrize("after", [0, 5000, 9000])
+def test_a_disk_that_fills_up_leaves_whole_files_only(tmp_path, monkeypatch, after):
+    cameras = views(2)
+    limited(monkeypatch, after)
+    with pytest.raises(RunError, match=r"can't write .*view\.\d.*: No space left on device; make room"):
+        render(tmp_path, ["spectral", "rgb"], ["npy", "envi", "png"], cameras, pixels=30)
+    whole = 128 + 11 * 14 * 5 * 4
+    for path in tmp_path.rglob("*"):
+        assert not path.name.endswith(".tmp")
+        if path.suffix == ".npy" and path.parent.name == "spectral":
+            assert path.stat().st_size == whole
+        if path.suffix == ".png":
+            iio.imread(path)
+
+
+def test_an_error_while_rendering_leaves_no_video(tmp_path, monkeypatch):
+    cameras = views(3, is_path=True)
+
+    def failing(camera, _names, rendered=MODEL.get_outputs_for_camera):
+        if camera is not first and camera.camera_to_world.equal(last):
+            raise KeyboardInterrupt
+        return rendered(camera, _names)
+
+    first, last = cameras.views[0].camera, cameras.views[2].camera.camera_to_world
+    monkeypatch.setattr(MODEL, "get_outputs_for_camera", failing, raising=False)
+    with pytest.raises(KeyboardInterrupt):
+        render(tmp_path, ["rgb", "accumulation"], ["mp4"], cameras)
+    assert list(tmp_path.iterdir()) == []
+
+
+INDEX = "index:(r650-r500)/(r650+r500)"
+
+
+@pytest.mark.parametrize("pixels", [None, 30])
+def test_indices_and_targets_are_those_of_the_rendered_spectra_in_every_block(tmp_path, pixels):
+    target = tmp_path / "paint.csv"
+    target.write_text("wavelength,paint\n450,0.1\n650,0.9\n")
+    cameras = views()
+    matched, angle = f"target:mf:{target}", f"target:{target}"
+    products, survey, _ = render(tmp_path, [INDEX, matched, angle, "spectral"], ["npy"], cameras, pixels)
+    read = {
+        product.output.name: np.load(still_paths(tmp_path, product, cameras.views[0].name)[0])
+        for product in products
+    }
+    opacity = MODEL.get_outputs_for_camera(cameras.views[0].camera, ["accumulation"])["accumulation"].numpy()
+    seen = opacity >= 0.5
+    spectra = read["spectral"]
+    expected = (spectra[..., 4] - spectra[..., 1]) / (spectra[..., 4] + spectra[..., 1])
+    np.testing.assert_allclose(read[INDEX][seen], expected[seen], rtol=1e-4, atol=1e-6)
+    assert np.isnan(read[INDEX][~seen]).all()
+    direction = np.interp([450, 500, 550, 600, 650], [450, 650], [0.1, 0.9])
+    cosine = spectra @ direction / (np.linalg.norm(spectra, axis=-1) * np.linalg.norm(direction) + 1e-12)
+    np.testing.assert_allclose(read[angle][seen], np.arccos(np.clip(cosine[seen], -1, 1)), atol=1e-3)
+    assert np.isfinite(read[matched][seen]).all()
+    assert set(survey.scores) == {INDEX, matched, angle}
+
+
+def test_pictures_of_an_index_are_transparent_where_it_is_undefined_and_have_a_legend(tmp_path):
+    from unmix_plugin.products.render.legend import draw_legend, needs_legend
+
+    cameras = views()
+    products, survey, job = render(tmp_path, [INDEX], ["png"], cameras)
+    [product] = products
+    [path] = still_paths(tmp_path, product, cameras.views[0].name)
+    pixels = np.asarray(Image.open(path))
+    opacity = MODEL.get_outputs_for_camera(cameras.views[0].camera, ["accumulation"])["accumulation"].numpy()
+    assert (pixels[opacity < 0.002][:, 3] == 0).all()
+    assert pixels[opacity > 0.55][:, :3].std() > 1
+    assert survey.scales[INDEX].low < survey.scales[INDEX].high
+    assert needs_legend(product)
+    assert draw_legend(product.output, job.palette).startswith(b"\x89PNG")

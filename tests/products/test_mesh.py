@@ -1,0 +1,218 @@
+import numpy as np
+import pytest
+import torch
+import trimesh
+from plyfile import PlyData
+
+from tests.products.ball_model import (
+    ALL_ROUND,
+    DENSITY,
+    EDGE,
+    FROM_ABOVE,
+    INNER_RADIUS,
+    RADIUS,
+    ball_model,
+    cameras_around,
+)
+from tests.products.mesh_reading import loaded_mesh
+from tests.trained.camera_files.camera_scenes import FRAME
+from unmix_plugin.errors import ConfigError, RunError
+from unmix_plugin.products.mesh import (
+    Mesh,
+    extract_mesh,
+    filled,
+    mesh_paths,
+    require_sound,
+    surface_density,
+    trim_unseen,
+    without_crumbs,
+    write_mesh,
+)
+from unmix_plugin.trained.density_grid import GridPoints, sample_slice
+from unmix_plugin.trained.surface import SeenSurface
+
+MODEL = ball_model()
+PIXEL = float(MODEL.metadata["pixel_size"])
+THRESHOLD = -float(np.log(0.5)) / PIXEL
+GRID = GridPoints.over(MODEL.renderer.aabb, 48)
+
+
+@pytest.fixture(scope="module")
+def densities():
+    return np.stack([sample_slice(MODEL, GRID.slice_points(index))[0] for index in range(GRID.shape[0])])
+
+
+@pytest.fixture(scope="module")
+def whole(densities):
+    """Both sides of the hollow ball."""
+    return extract_mesh(densities, GRID, THRESHOLD, 0.0, PIXEL)
+
+
+def seen(directions):
+    cameras = cameras_around(directions)
+    surface = SeenSurface(MODEL, 20_000, cameras)
+    for camera in cameras:
+        surface.look(camera)
+    return surface
+
+
+@pytest.fixture(scope="module")
+def outside(whole):
+    return without_crumbs(trim_unseen(whole, seen(ALL_ROUND)))
+
+
+def radii(mesh):
+    return np.linalg.norm(mesh.vertices, axis=1)
+
+
+def test_marching_finds_the_surfaces_where_they_are(whole):
+    depth = EDGE * np.log(
+        DENSITY / THRESHOLD - 1
+    )  # where the density passes the threshold, before the spheres
+    outer, inner = RADIUS + depth, INNER_RADIUS - depth
+    off = np.minimum(np.abs(radii(whole) - outer), np.abs(radii(whole) - inner))
+    assert off.max() < 0.6 * GRID.cell
+    volume = trimesh.Trimesh(whole.vertices, whole.faces, process=False).volume
+    assert volume == pytest.approx(4 / 3 * np.pi * (outer**3 - inner**3), rel=0.02)
+
+
+def test_triangles_and_normals_face_outwards(outside):
+    outwards = outside.vertices / radii(outside)[:, None]
+    np.testing.assert_allclose(np.linalg.norm(outside.normals, axis=1), 1, atol=1e-9)
+    assert (outside.normals * outwards).sum(axis=1).min() > 0.5
+
+
+def test_insides_that_no_camera_sees_are_trimmed_and_the_rest_stays_whole(outside):
+    assert radii(outside).min() > RADIUS - 0.05
+    shape = trimesh.Trimesh(outside.vertices, outside.faces, process=False)
+    assert shape.area == pytest.approx(4 * np.pi * RADIUS**2, rel=0.12)
+    assert shape.is_watertight
+
+
+def test_what_no_camera_sees_into_is_solid(densities):
+    """Where nothing is rendered inside the ball there is no second surface, and the outer one stays where it was; what
+    stands in the shadow of the ball for the cameras that might see it is cut away later."""
+    points = np.stack([GRID.slice_points(index).numpy() for index in range(GRID.shape[0])])
+    rendered = np.where(np.linalg.norm(points, axis=-1) < INNER_RADIUS + 0.1, 0, densities)
+    rendered[rendered < 1e-3 * THRESHOLD] = 0
+    shell = extract_mesh(rendered, GRID, THRESHOLD, 0.0, PIXEL)
+    surface = seen(ALL_ROUND)
+    solid = extract_mesh(filled(rendered, GRID, MODEL, surface), GRID, THRESHOLD, 0.0, PIXEL)
+    assert radii(shell).min() < INNER_RADIUS + 0.15
+    assert radii(solid).min() > RADIUS - 0.05
+    seen_from_outside = trim_unseen(solid, surface)
+    assert len(seen_from_outside.vertices) == int((radii(shell) > RADIUS - 0.05).sum())
+    assert radii(seen_from_outside).max() < RADIUS + 0.05
+
+
+def test_undersides_that_no_camera_sees_are_trimmed(whole):
+    trimmed = trim_unseen(whole, seen(FROM_ABOVE))
+    assert trimmed.vertices[:, 2].max() > 0.55
+    assert trimmed.vertices[:, 2].min() > -0.5
+    assert radii(trimmed).min() > RADIUS - 0.05
+
+
+def test_crumbs_go_and_large_parts_stay():
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    strip = np.concatenate([corners + np.array([index, 0, 0]) for index in range(120)])
+    faces = np.arange(len(strip)).reshape(-1, 3)
+    joined = np.concatenate([faces[:119], [[3 * i, 3 * i + 1, 3 * i + 3] for i in range(118)], faces[119:]])
+    kept = without_crumbs(Mesh(strip, joined))
+    assert len(kept.faces) == 119 + 118
+    assert kept.vertices[:, 0].max() < 119.5
+    empty = Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+    assert len(without_crumbs(empty).faces) == 0
+
+
+def test_a_blur_rounds_and_does_not_move_a_flat_wall():
+    grid = GridPoints(np.zeros(3, dtype=np.float32), 0.1, (12, 12, 12))
+    wall = np.zeros(grid.shape, dtype=np.float32)
+    wall[6:] = 1e4
+    mesh = extract_mesh(wall, grid, -np.log(0.5) / PIXEL, 1.5, PIXEL)
+    middle = mesh.vertices[(np.abs(mesh.vertices[:, 1:] - 0.55) < 0.15).all(axis=1)]
+    front = middle[middle[:, 0] < 0.9]
+    np.testing.assert_allclose(front[:, 0], 0.55, atol=0.01)
+
+
+def test_a_surface_that_reaches_the_box_is_closed_there():
+    grid = GridPoints(np.zeros(3, dtype=np.float32), 0.1, (5, 5, 5))
+    mesh = extract_mesh(np.full(grid.shape, 1e4, dtype=np.float32), grid, 1.0, 0.0, PIXEL)
+    assert trimesh.Trimesh(mesh.vertices, mesh.faces).is_watertight
+    np.testing.assert_allclose(mesh.vertices.max(axis=0), 0.4, atol=0.1)
+
+
+def test_the_surface_lies_at_the_density_where_rays_end():
+    points = seen(ALL_ROUND).points()
+    threshold = surface_density(MODEL, points)
+    found, _ = MODEL.field.get_density(points.positions)
+    assert (found < threshold).float().mean() == pytest.approx(0.07, abs=0.01)
+    nowhere = points.select(torch.zeros(len(points), dtype=torch.bool))
+    with pytest.raises(RunError, match="no ray of the run's cameras ends"):
+        surface_density(MODEL, nowhere)
+
+
+@pytest.fixture(scope="module")
+def files(outside, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("mesh")
+    written = write_mesh(folder, ("ply", "obj", "glb"), outside, MODEL, FRAME)
+    assert written == mesh_paths(folder, ("ply", "obj", "glb"))
+    return {path.suffix: path for path in written}
+
+
+@pytest.mark.parametrize("kind", [".ply", ".obj", ".glb"])
+def test_other_readers_get_the_mesh_in_the_world_of_the_scene(files, outside, kind):
+    mesh = loaded_mesh(files[kind])
+    assert len(mesh.faces) == len(outside.faces)
+    distances = np.linalg.norm(mesh.vertices - FRAME.to_world(np.zeros(3)), axis=1)
+    np.testing.assert_allclose(distances, RADIUS / FRAME.scale, atol=0.05 / FRAME.scale)
+    assert mesh.volume > 0
+
+
+def test_numbers_in_ply_and_glb_are_the_same_floats(files, outside):
+    vertices = PlyData.read(files[".ply"])["vertex"]
+    world = FRAME.to_world(outside.vertices).astype(np.float32)
+    np.testing.assert_array_equal(np.stack([vertices[axis] for axis in "xyz"], axis=1), world)
+    glb = loaded_mesh(files[".glb"])
+    np.testing.assert_array_equal(np.float32(glb.vertices), world)
+    assert set(glb.vertex_attributes) == {
+        "_MATERIAL",
+        *(f"_ABUNDANCE_ENDMEMBER_{index}" for index in range(3)),
+    }
+    np.testing.assert_array_equal(np.ravel(glb.vertex_attributes["_MATERIAL"]), vertices["material"])
+    for index in range(3):
+        found = np.ravel(glb.vertex_attributes[f"_ABUNDANCE_ENDMEMBER_{index}"])
+        np.testing.assert_array_equal(np.float32(found), vertices[f"abundance_endmember_{index}"])
+
+
+def test_vertices_have_the_material_of_their_half(files):
+    vertices = PlyData.read(files[".ply"])["vertex"]
+    world = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    height = FRAME.to_model(world)[:, 2]
+    assert (vertices["material"][height > 0.05] == 0).all()
+    assert (vertices["material"][height < -0.05] == 1).all()
+
+
+def test_a_density_that_nothing_reaches_is_refused(densities):
+    with pytest.raises(ConfigError, match=r"no surface at a density of 1e\+09 .* choose a lower --density"):
+        extract_mesh(densities, GRID, 1e9, 0.0, PIXEL)
+
+
+def test_a_mesh_without_faces_is_not_written(tmp_path):
+    empty = Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+    with pytest.raises(RunError, match="no camera of the run sees it; keep it with --unseen keep"):
+        write_mesh(tmp_path, ("ply",), empty, MODEL, FRAME)
+
+
+@pytest.mark.parametrize(
+    ("density", "smoothing", "said"),
+    [
+        (0.0, 1.0, "--density is 0"),
+        (-1.0, 1.0, "--density is -1"),
+        (None, -0.5, "--smoothing is -0.5"),
+        (float("nan"), 1.0, "--density is nan"),
+        (None, 9.0, "choose 0 to 8 cells"),
+    ],
+)
+def test_impossible_settings_are_refused(density, smoothing, said):
+    with pytest.raises(ConfigError, match=said):
+        require_sound(density, smoothing)

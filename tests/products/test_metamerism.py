@@ -1,0 +1,104 @@
+"""The product of metamers: whose pairs are in the table, and swatches in the colours that the table speaks of."""
+
+import csv
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from unmix_plugin.products.metamerism import (
+    MetamerismOptions,
+    find_metamers,
+    metamerism_paths,
+    write_metamerism,
+)
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.colour.conversion import xyz_matrix
+from unmix_plugin.spectral.colour.difference import lab_to_srgb, reflectance_to_lab
+from unmix_plugin.spectral.colour.illuminants import illuminant_power
+from unmix_plugin.spectral.composition import Materials
+from unmix_plugin.spectral.library.material_library import MaterialLibrary
+from unmix_plugin.spectral.library.spectra_csv import SpectraTable
+
+BANDS = Bands.of(np.linspace(400, 700, 31))
+SCENE_LIGHT = illuminant_power("D50", BANDS)
+GREY = np.full(31, 0.4)
+BOTH = MetamerismOptions(lights=("D65", "A"))
+
+
+def hidden(strength: float) -> np.ndarray:
+    """A reflectance that D65 can't tell from the grey, but A can."""
+    to_xyz = xyz_matrix(BANDS, torch.float64).numpy()
+    in_day, in_lamp = ((illuminant_power(name, BANDS)[:, None] * to_xyz).T for name in ("D65", "A"))
+    invisible = np.linalg.svd(in_day)[2][3:]
+    added = (invisible @ in_lamp[0]) @ invisible
+    return GREY + strength * added / np.abs(added).max()
+
+
+def run_materials(*reflectances: np.ndarray, names: tuple[str, ...]) -> Materials:
+    spectra = torch.tensor(np.stack(reflectances) * SCENE_LIGHT, dtype=torch.float32)
+    return Materials(BANDS, spectra, torch.zeros(0, 31), names=names)
+
+
+LIBRARY = MaterialLibrary(()).extended(
+    SpectraTable(BANDS, ("own/a", "own/b"), np.stack([hidden(0.35), GREY * 1.01])), "test"
+)
+SHORT = SpectraTable(Bands.of([500, 600]), ("own/short",), np.array([[0.4, 0.4]]))
+MATERIALS = run_materials(GREY, hidden(0.25), names=("slate", "paint"))
+
+
+def pairs_of(surfaces: str) -> list[set[str]]:
+    found = find_metamers(MATERIALS, SCENE_LIGHT, LIBRARY, replace(BOTH, surfaces=surfaces))
+    return [{found.names[pair.first], found.names[pair.second]} for pair in found.pairs]
+
+
+def test_pairs_are_of_the_run_or_of_the_library_or_of_both_with_the_runs_first():
+    assert pairs_of("run") == [{"slate", "paint"}]
+    assert pairs_of("library") == [{"own/a", "own/b"}]
+    every = pairs_of("all")
+    assert {"slate", "own/a"} in every
+    assert {"slate", "paint"} in every
+    assert every[-1] == {"own/a", "own/b"}
+
+
+def test_materials_that_do_not_reach_all_bands_are_passed_over():
+    longer = LIBRARY.extended(SHORT, "test")
+    found = find_metamers(MATERIALS, SCENE_LIGHT, longer, BOTH)
+    assert "own/short" not in found.names
+
+
+def test_the_table_names_materials_lights_and_differences(tmp_path):
+    found = find_metamers(MATERIALS, SCENE_LIGHT, LIBRARY, replace(BOTH, surfaces="run"))
+    assert write_metamerism(tmp_path / "new", found) == metamerism_paths(tmp_path / "new")
+    rows = list(csv.DictReader(io.StringIO((tmp_path / "new" / "metamerism.csv").read_text())))
+    [row] = rows
+    assert {row["first"], row["second"]} == {"slate", "paint"}
+    assert (row["alike in"], row["different in"]) == ("D65", "A")
+    assert float(row["CIEDE2000 in D65"]) < 0.05
+    assert float(row["CIEDE2000 in A"]) > 4
+
+
+def test_swatches_have_the_colours_that_an_adapted_eye_sees(tmp_path):
+    found = find_metamers(MATERIALS, SCENE_LIGHT, LIBRARY, replace(BOTH, surfaces="run"))
+    write_metamerism(tmp_path, found)
+    with Image.open(tmp_path / "metamerism.png") as picture:
+        pixels = np.asarray(picture.convert("RGB")).reshape(-1, 3) / 255
+    for name in ("D65", "A"):
+        lab = reflectance_to_lab(np.stack([GREY, hidden(0.25)]), illuminant_power(name, BANDS), BANDS)
+        for colour in lab_to_srgb(lab):
+            assert (np.abs(pixels - colour).max(axis=1) < 0.01).sum() > 500
+    assert pixels.reshape(-1, 3)[0].min() == 1
+
+
+@pytest.mark.parametrize("lights", [("D65", "A"), ("D65", "A", "FL2", "FL11", "E")])
+def test_a_figure_without_pairs_is_drawn_all_the_same(tmp_path, lights):
+    grey = run_materials(GREY, names=("slate",))
+    found = find_metamers(grey, None, MaterialLibrary(()), MetamerismOptions(lights=lights))
+    assert found.pairs == []
+    write_metamerism(tmp_path, found)
+    with Image.open(tmp_path / "metamerism.png") as picture:
+        assert np.asarray(picture.convert("L")).min() < 50
+    assert len((tmp_path / "metamerism.csv").read_text().splitlines()) == 1

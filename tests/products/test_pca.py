@@ -1,0 +1,88 @@
+import csv
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from tests.method_factory import make_model
+from tests.trained.camera_files.camera_scenes import around
+from unmix_plugin.products.pca import find_components, survey_view, write_components, write_pca
+from unmix_plugin.trained.view_rendering import render_view
+
+MODEL = make_model()
+MODEL.requires_grad_(False)
+CAMERA = around()[1]
+
+
+def spread(seed=0):
+    """Spectra along three directions, most along the first."""
+    generator = torch.Generator().manual_seed(seed)
+    axes = torch.linalg.qr(torch.randn(5, 5, generator=generator)).Q[:, :3]
+    amounts = torch.randn(4000, 3, generator=generator) * torch.tensor([0.5, 0.2, 0.05])
+    return 1 + amounts @ axes.T, axes
+
+
+def test_components_are_the_directions_of_largest_variance_of_all_views_together():
+    spectra, axes = spread()
+    components = find_components([spectra[:1000], spectra[1000:]], "spectra")
+    cosines = (components.colours.axes.T @ axes.double()).diagonal().numpy()
+    np.testing.assert_allclose(np.abs(cosines), 1, atol=0.01)
+    variances = np.array([0.25, 0.04, 0.0025])
+    np.testing.assert_allclose(components.explained, variances / variances.sum(), atol=0.01)
+
+
+def test_spectra_all_alike_explain_nothing():
+    assert find_components([torch.ones(10, 5)], "spectra").explained == (0.0, 0.0, 0.0)
+    assert find_components([torch.zeros(0, 5)], "abundances").explained == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("of", ["spectra", "abundances"])
+def test_a_picture_shows_the_components_of_its_pixels(tmp_path, of):
+    components = find_components([survey_view(MODEL, CAMERA, of)], of)
+    view = render_view(MODEL, CAMERA)
+    with Image.open(write_pca(tmp_path, "view", view, components)) as picture:
+        pixels = np.asarray(picture)
+    assert pixels.shape == (30, 40, 3)
+    values = view.spectra if of == "spectra" else view.shares
+    opacity = view.accumulation.numpy()[..., None]
+    assert (opacity > 0.5).sum() > 20
+    expected = opacity * components.colours(values.double()).numpy() + 0.92 * (1 - opacity)
+    np.testing.assert_allclose(pixels, 255 * expected, atol=0.6)
+    empty = view.accumulation.numpy() == 0
+    assert (pixels[empty] == 235).all()
+
+
+def test_a_component_that_tells_nothing_is_black_rather_than_noise():
+    shares = torch.softmax(torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    components = find_components([shares], "abundances")
+    assert components.explained[1] > 0.01
+    assert components.explained[2] < 1e-9
+    colours = components.colours(shares.double())
+    assert float(colours[:, 2].max()) == 0
+    assert float(colours[:, 1].max()) == 1
+
+
+def test_a_view_is_surveyed_where_something_is():
+    shares = survey_view(MODEL, CAMERA, "abundances")
+    torch.testing.assert_close(shares.sum(dim=-1), torch.ones(len(shares)), atol=1e-4, rtol=0)
+    assert survey_view(MODEL, CAMERA, "spectra").shape == (len(shares), 5)
+
+
+@pytest.mark.parametrize(("of", "first"), [("spectra", "450"), ("abundances", "endmember_0")])
+def test_the_table_gives_back_the_colours(tmp_path, of, first):
+    components = find_components([survey_view(MODEL, CAMERA, of)], of)
+    with write_components(tmp_path, components, MODEL.materials).open() as file:
+        rows = list(csv.reader(file))
+    body = {row[0]: row[1:] for row in rows[1:]}
+    names = list(body)[:-3]
+    assert names[0] == first
+    mean = np.array([float(body[name][0]) for name in names])
+    axes = np.array([[float(cell) for cell in body[name][1:]] for name in names])
+    low, high = (np.array([float(cell) for cell in body[f"value of {end}"][1:]]) for end in (0, 1))
+    view = render_view(MODEL, CAMERA)
+    values = (view.spectra if of == "spectra" else view.shares).double()
+    by_hand = np.clip(((values.numpy() - mean) @ axes - low) / (high - low), 0, 1)
+    np.testing.assert_allclose(components.colours(values), by_hand, atol=1e-6)
+    explained = [float(cell) for cell in body["explained variance"][1:]]
+    np.testing.assert_allclose(explained, components.explained, rtol=1e-8)

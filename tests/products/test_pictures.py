@@ -1,0 +1,170 @@
+"""Figures: nothing cut off, neutral where nothing is, and colours that keep their meaning."""
+
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from unmix_plugin.figures.picture_grid import (
+    NEUTRAL,
+    ColourScale,
+    Panel,
+    draw_panels,
+    in_rows,
+    over_neutral,
+    paint,
+    premultiplied_over_neutral,
+)
+from unmix_plugin.products.abundances import abundance_paths, draw_abundances, write_abundances
+from unmix_plugin.products.endmembers import draw_endmembers
+from unmix_plugin.products.evaluation_pictures import (
+    draw_colour,
+    draw_matched_abundances,
+    draw_matched_segmentation,
+    material_look,
+)
+from unmix_plugin.products.segmentation import draw_segmentation, paint_ids, scores_of
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.composition import Materials
+from unmix_plugin.trained.evaluation import Evaluation, SceneTruth, ViewTruth
+from unmix_plugin.trained.run_materials import endmember_colours
+from unmix_plugin.trained.view_rendering import RenderedView
+
+SCALE = ColourScale("viridis", 0.0, 1.0, "abundance")
+
+
+def decoded(data: bytes) -> np.ndarray:
+    """A PNG as (H, W, 3) in [0, 1]."""
+    with Image.open(io.BytesIO(data)) as picture:
+        return np.asarray(picture.convert("RGB")) / 255
+
+
+def assert_has_white_margins(data: bytes) -> None:
+    """The outermost pixels are white: what was drawn ends before them."""
+    picture = decoded(data)
+    for edge in (picture[:4], picture[-4:], picture[:, :4], picture[:, -4:]):
+        assert edge.min() == 1.0
+    assert picture.min() < 0.2
+
+
+def materials(count: int, num_bands: int = 8) -> Materials:
+    spectra = torch.rand(count, num_bands, generator=torch.Generator().manual_seed(0))
+    return Materials(Bands.of(np.linspace(400, 700, num_bands)), spectra, torch.zeros(0, num_bands))
+
+
+def rendered(given: Materials, height: int = 12, width: int = 16) -> RenderedView:
+    """Random abundances; nothing in the left quarter."""
+    generator = torch.Generator().manual_seed(1)
+    shares = torch.softmax(9 * torch.rand(height, width, len(given.endmembers), generator=generator), dim=-1)
+    shares[:, : width // 4] = 0
+    ids = shares.argmax(dim=-1).to(torch.uint8)
+    ids[:, : width // 4] = 255
+    return RenderedView(shares @ given.endmembers, shares.sum(dim=-1), shares, ids, shares)
+
+
+@pytest.mark.parametrize("count", [1, 3, 26])
+def test_no_figure_is_cut_off_however_many_materials(count):
+    given = materials(count, 32)
+    view = rendered(given)
+    assert_has_white_margins(draw_abundances("view", view, given))
+    assert_has_white_margins(draw_segmentation("view", view, given))
+    plot = decoded(draw_endmembers(given))
+    assert plot[:, -2:].min() == 1.0
+    assert plot.min() < 0.2
+
+
+@pytest.mark.parametrize(("height", "width"), [(4, 40), (40, 4), (1, 1), (700, 20)])
+def test_pictures_of_any_shape_fit_their_page(height, width):
+    panels = [Panel(np.zeros((height, width, 3)), "a title that is rather long", (0.5, 0.5, 0.5))] * 3
+    legend = [("a material with a long name indeed", (1.0, 0.0, 0.0))] * 7
+    assert_has_white_margins(draw_panels(in_rows(panels, 2), "heading", SCALE, legend))
+
+
+def test_where_nothing_is_pictures_are_neutral():
+    nothing, all_there = np.zeros((2, 2)), np.ones((2, 2))
+    black, white = np.zeros((2, 2, 3)), np.ones((2, 2, 3))
+    np.testing.assert_allclose(over_neutral(black, nothing), NEUTRAL)
+    np.testing.assert_allclose(over_neutral(black, all_there), 0.0)
+    np.testing.assert_allclose(premultiplied_over_neutral(black, nothing), NEUTRAL, atol=1e-6)
+    np.testing.assert_allclose(premultiplied_over_neutral(white, all_there), 1.0, atol=1e-6)
+    np.testing.assert_allclose(premultiplied_over_neutral(black, all_there), 0.0, atol=1e-6)
+    np.testing.assert_allclose(paint_ids(np.full((2, 2), 255, np.uint8), {0: (0.0, 0.0, 0.0)}), NEUTRAL)
+
+
+def test_a_scale_gives_its_ends_to_values_beyond_them():
+    values = np.array([[-1.0, 0.0, 1.0, 7.0]])
+    painted = paint(values, SCALE)
+    np.testing.assert_array_equal(painted[0, 0], painted[0, 1])
+    np.testing.assert_array_equal(painted[0, 2], painted[0, 3])
+    assert np.abs(painted[0, 1] - painted[0, 2]).max() > 0.5
+
+
+def test_ids_are_painted_in_their_own_colours():
+    ids = np.array([[0, 1, 255]], dtype=np.uint8)
+    painted = paint_ids(ids, {0: (1.0, 0.0, 0.0), 1: (0.0, 0.0, 1.0)})
+    np.testing.assert_array_equal(painted[0], [[1, 0, 0], [0, 0, 1], [NEUTRAL] * 3])
+
+
+def test_the_segmentation_figure_shows_the_colours_of_the_endmembers():
+    given = materials(4)
+    view = rendered(given)
+    picture = decoded(draw_segmentation("view", view, given)).reshape(-1, 3)
+    for index, colour in enumerate(endmember_colours(given)):
+        near = np.abs(picture - colour).max(axis=1) < 0.02
+        assert near.any() == bool((view.segmentation == index).any())
+
+
+def test_scores_are_what_the_ids_were_chosen_by():
+    given = materials(4)
+    view = rendered(given)
+    cosines = torch.rand(12, 16, 4)
+    view = replace(view, material_scores=cosines)
+    torch.testing.assert_close(scores_of(view, given), view.abundances)
+    probe = scores_of(view, replace(given, segmentation="probe"))
+    torch.testing.assert_close(probe[:, 4:], cosines[:, 4:])
+    assert float(probe[:, :4].abs().max()) == 0.0
+
+
+def test_an_exported_array_is_zero_where_nothing_is(tmp_path):
+    given = materials(3)
+    view = rendered(given)
+    assert write_abundances(tmp_path / "new", "view", view, given) == abundance_paths(
+        tmp_path / "new", "view"
+    )
+    exported = np.load(tmp_path / "new" / "view.npy")
+    assert (exported.dtype, exported.shape) == (np.float32, (12, 16, 3))
+    assert (exported[:, :4] == 0).all()
+    np.testing.assert_allclose(exported[:, 4:].sum(axis=-1), 1.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("num_true", [2, 3, 5])
+def test_evaluation_figures_are_whole_with_more_as_many_and_fewer_materials(num_true):
+    given = materials(3)
+    view = rendered(given)
+    truth = SceneTruth(given.bands, num_true, torch.rand(num_true, 8).double())
+    labels = (view.segmentation % num_true).masked_fill(view.segmentation == 255, 255)
+    abundances = torch.nn.functional.one_hot(labels.long() % num_true, num_true).float()
+    seen = ViewTruth(
+        "view", view.spectra, torch.ones(12, 16, dtype=torch.bool), view.accumulation, labels, abundances
+    )
+    evaluation = Evaluation(truth, given.endmembers)
+    evaluation.add(seen, view)
+    look, matching = material_look(evaluation), evaluation.segmentation().matching
+    assert_has_white_margins(draw_colour(seen, view, truth.bands, 30.0))
+    assert_has_white_margins(draw_matched_abundances(seen, view, evaluation, look))
+    ids = view.segmentation.numpy()
+    assert_has_white_margins(draw_matched_segmentation("view", labels.numpy(), ids, look, matching))
+    assert_has_white_margins(draw_matched_segmentation("view", None, ids, look, matching))
+
+
+def test_a_matched_endmember_has_the_colour_of_its_material_and_a_surplus_one_its_own():
+    given = materials(3)
+    evaluation = Evaluation(SceneTruth(given.bands, 2, torch.rand(2, 8).double()), given.endmembers)
+    look = material_look(evaluation)
+    colours = look.pred_colours({0: 1, 2: 0})
+    np.testing.assert_array_equal(colours[0], look.true_colours[1])
+    np.testing.assert_array_equal(colours[2], look.true_colours[0])
+    assert min(np.abs(colours[1] - colour).max() for colour in look.true_colours) > 0.05

@@ -1,0 +1,101 @@
+"""Cubes, abundances, segmentations and endmembers in other people's formats, read back with their readers."""
+
+import csv
+from typing import Any
+
+import numpy as np
+import OpenEXR
+import pytest
+import spectral.io.envi as envi
+import torch
+from PIL import Image
+
+from tests.method_factory import make_model
+from tests.trained.camera_files.camera_scenes import around
+from unmix_plugin.products.abundances import abundance_paths, write_abundances
+from unmix_plugin.products.cubes import cube_paths, write_cube
+from unmix_plugin.products.endmembers import endmember_paths, write_endmembers
+from unmix_plugin.products.segmentation import segmentation_paths, write_legend, write_segmentation
+from unmix_plugin.trained.run_materials import endmember_colours
+from unmix_plugin.trained.view_rendering import render_view
+
+MODEL = make_model()
+MODEL.requires_grad_(False)
+MATERIALS = MODEL.materials
+VIEW = render_view(MODEL, around()[0])
+NAME = "view.0"
+
+
+@pytest.fixture(scope="module")
+def cubes(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("cubes")
+    formats = ("envi", "exr", "npy")
+    written = write_cube(folder, NAME, VIEW, MATERIALS.bands, formats)
+    assert written == cube_paths(folder, NAME, formats)
+    return folder
+
+
+def test_every_format_of_a_cube_holds_the_same_float32_spectra(cubes):
+    expected = VIEW.spectra.numpy()
+    assert expected.max() > 0.05
+    from_envi: Any = envi.open(str(cubes / f"{NAME}.hdr"), str(cubes / f"{NAME}.img"))
+    np.testing.assert_array_equal(from_envi.open_memmap(), expected)
+    assert from_envi.bands.centers == [450.0, 500.0, 550.0, 600.0, 650.0]
+    np.testing.assert_array_equal(np.load(cubes / f"{NAME}.npy"), expected)
+    channels = OpenEXR.File(str(cubes / f"{NAME}.exr"), separate_channels=True).channels()
+    for index, wavelength in enumerate((450, 500, 550, 600, 650)):
+        np.testing.assert_array_equal(channels[f"S0.{wavelength},000000nm"].pixels, expected[..., index])
+    np.testing.assert_array_equal(channels["A"].pixels, VIEW.accumulation.numpy())
+
+
+def test_every_format_of_abundances_holds_the_same_float32_shares(tmp_path):
+    formats = ("npy", "png", "envi", "exr")
+    written = write_abundances(tmp_path, NAME, VIEW, MATERIALS, formats)
+    assert written == abundance_paths(tmp_path, NAME, formats)
+    expected = VIEW.abundances.numpy()
+    np.testing.assert_array_equal(np.load(tmp_path / f"{NAME}.npy"), expected)
+    from_envi: Any = envi.open(str(tmp_path / f"{NAME}.hdr"), str(tmp_path / f"{NAME}.img"))
+    np.testing.assert_array_equal(from_envi.open_memmap(), expected)
+    assert from_envi.metadata["band names"] == list(MATERIALS.names)
+    channels = OpenEXR.File(str(tmp_path / f"{NAME}.exr"), separate_channels=True).channels()
+    for index, name in enumerate(MATERIALS.names):
+        np.testing.assert_array_equal(channels[f"abundances.{name}"].pixels, expected[..., index])
+
+
+def test_spectral_python_opens_the_endmembers_as_a_library(tmp_path):
+    assert write_endmembers(tmp_path, MATERIALS) == endmember_paths(tmp_path)
+    library: Any = envi.open(str(tmp_path / "endmembers.hdr"), str(tmp_path / "endmembers.sli"))
+    assert library.names == list(MATERIALS.names)
+    np.testing.assert_array_equal(library.spectra, MODEL.endmembers.numpy())
+    np.testing.assert_array_equal(library.bands.centers, MATERIALS.bands.centers_nm)
+
+
+def test_labels_are_ids_whose_palette_and_legend_name_the_materials(tmp_path):
+    write_segmentation(tmp_path, NAME, VIEW, MATERIALS)
+    with Image.open(segmentation_paths(tmp_path, NAME)[2]) as labels:
+        ids, colours = np.asarray(labels), np.asarray(labels.convert("RGB"))
+        assert labels.mode == "P"
+    np.testing.assert_array_equal(ids, VIEW.segmentation.numpy())
+    assert len(np.unique(ids)) > 2
+    with write_legend(tmp_path, MATERIALS).open() as file:
+        rows = {int(row["id"]): row for row in csv.DictReader(file)}
+    assert [rows[index]["name"] for index in (0, 1, 2, 255)] == [*MATERIALS.names, "nothing"]
+    for index in np.unique(ids):
+        expected = [int(rows[int(index)][name]) for name in ("red", "green", "blue")]
+        assert (colours[ids == index] == expected).all()
+    np.testing.assert_allclose(
+        [int(rows[1][name]) for name in ("red", "green", "blue")],
+        255 * endmember_colours(MATERIALS)[1],
+        atol=0.5,
+    )
+
+
+def test_named_endmembers_keep_their_names(tmp_path):
+    model = make_model()
+    model.requires_grad_(False)
+    model.endmember_names = ("oak, old", "v1.2", "löss")
+    formats = ("exr",)
+    [path] = write_abundances(tmp_path, NAME, VIEW, model.materials, formats)
+    channels = OpenEXR.File(str(path), separate_channels=True).channels()
+    assert set(channels) == {"abundances.oak, old", "abundances.v1_2", "abundances.löss"}
+    assert torch.equal(torch.from_numpy(channels["abundances.v1_2"].pixels), VIEW.abundances[..., 1])

@@ -1,0 +1,102 @@
+import numpy as np
+import pytest
+import torch
+
+from tests.method_factory import make_model
+from tests.products.ball_model import INNER_RADIUS, RADIUS, ball_model
+from tests.trained.camera_files.camera_scenes import FRAME
+from unmix_plugin.errors import ConfigError, RunError
+from unmix_plugin.products.volume import volume_path, write_volume
+from unmix_plugin.trained.density_grid import GridPoints, is_rendered, sample_densities, sample_slice
+
+MODEL = ball_model()
+GRID = GridPoints.over(MODEL.renderer.aabb, 16)
+
+
+@pytest.fixture(scope="module")
+def volume(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("volume")
+    path = write_volume(folder, MODEL, GRID, FRAME, range(GRID.shape[0]))
+    assert path == volume_path(folder)
+    with np.load(path, allow_pickle=False) as arrays:
+        return {name: arrays[name] for name in arrays.files}
+
+
+def positions(volume):
+    """World points of the grid, by the file's own matrix."""
+    indices = np.stack(np.meshgrid(*map(np.arange, volume["density"].shape), indexing="ij"), axis=-1)
+    return (indices @ volume["index_to_world"][:3, :3].T) + volume["index_to_world"][:3, 3]
+
+
+def test_the_matrix_leads_from_indices_to_the_world_of_the_scene(volume):
+    radius = np.linalg.norm(FRAME.to_model(positions(volume)), axis=-1)
+    solid = volume["density"] > 1e-3
+    assert volume["density"].shape == (17, 17, 17)
+    np.testing.assert_array_equal(solid[radius < INNER_RADIUS - 0.06], False)
+    np.testing.assert_array_equal(solid[radius > RADIUS + 0.06], False)
+    between = (radius > INNER_RADIUS + 0.06) & (radius < RADIUS - 0.06)
+    assert between.sum() > 50
+    np.testing.assert_array_equal(solid[between], True)
+
+
+def test_densities_are_per_world_unit_and_abundances_those_of_the_field(volume):
+    places = torch.from_numpy(FRAME.to_model(positions(volume))).float().reshape(-1, 3)
+    density, features = MODEL.field.get_density(places)
+    np.testing.assert_allclose(volume["density"].ravel(), FRAME.scale * density.numpy(), rtol=1e-3, atol=1e-4)
+    expected = MODEL.field.abundances_of(features).numpy()
+    found = volume["abundances"].reshape(-1, 3)
+    clear = (places[:, 2].abs() > 1e-4).numpy()
+    np.testing.assert_array_equal(found[clear], expected[clear])
+    assert (volume["density"].dtype, volume["abundances"].dtype) == (np.float32, np.float32)
+
+
+def test_names_and_spectra_come_along(volume):
+    assert volume["endmember_names"].tolist() == ["endmember_0", "endmember_1", "endmember_2"]
+    np.testing.assert_array_equal(volume["endmembers"], MODEL.endmembers.numpy())
+    np.testing.assert_array_equal(volume["wavelengths_nm"], MODEL.bands.centers_nm)
+
+
+def test_what_is_never_rendered_is_empty():
+    model = make_model()
+    model.requires_grad_(False)
+    occupied = torch.zeros(8, 8, 8, dtype=torch.bool)
+    occupied[:4] = True
+    model.renderer.carve(occupied)
+    grid = GridPoints.over(model.renderer.aabb, 8)
+    for index in range(grid.shape[0]):
+        density, abundances = sample_slice(model, grid.slice_points(index))
+        if index < 4:
+            assert density.min() > 0
+            np.testing.assert_allclose(abundances.sum(axis=-1), 1, atol=1e-5)
+        else:
+            assert density.max() == 0
+            assert abundances.max() == 0
+    places = torch.tensor([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0], [-1.5, 0.0, 0.0], [-1.0, 1.0, -1.0]])
+    assert is_rendered(model, places).tolist() == [True, False, False, True]
+    assert (sample_densities(model, places) > 0).tolist() == [True, False, False, True]
+
+
+def test_a_grid_has_its_cells_along_the_longest_edge_and_stays_in_the_box():
+    aabb = torch.tensor([[-1.0, -0.5, 0.0], [1.0, 0.27, 0.05]])
+    grid = GridPoints.over(aabb, 20)
+    assert (grid.cell, grid.shape) == (pytest.approx(0.1), (21, 8, 1))
+    points = grid.slice_points(20)
+    assert points.shape == (8, 1, 3)
+    np.testing.assert_allclose(points[:, 0, 0], 1.0)
+    assert bool((points <= aabb[1] + 1e-6).all())
+
+
+@pytest.mark.parametrize("resolution", [0, 7, 1025])
+def test_an_unreasonable_resolution_is_refused(resolution):
+    with pytest.raises(ConfigError, match=f"--resolution is {resolution}; choose 8 to 1024"):
+        GridPoints.over(MODEL.renderer.aabb, resolution)
+
+
+def test_a_disk_that_is_full_half_way_leaves_nothing(tmp_path):
+    def slices():
+        yield 0
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(RunError, match=r"volume\.npz: No space left on device"):
+        write_volume(tmp_path, MODEL, GRID, FRAME, slices())
+    assert list(tmp_path.iterdir()) == []

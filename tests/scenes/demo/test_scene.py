@@ -1,0 +1,190 @@
+"""The built-in scene as a folder, and the folder that is kept."""
+
+import json
+from functools import partial
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from PIL import Image
+
+from unmix_plugin.errors import ConfigError, SceneError, SpectrumError
+from unmix_plugin.scenes.demo import scene as demo_scene
+from unmix_plugin.scenes.demo.materials import MATERIALS, band_centers_nm, lamp_power
+from unmix_plugin.scenes.demo.scene import demo_scene_path, is_complete, make_demo_scene
+from unmix_plugin.scenes.demo.shading import render_view
+from unmix_plugin.scenes.demo.views import CAMERA_DISTANCE, frame_name
+from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A small scene as it is written."""
+    directory = tmp_path_factory.mktemp("demo") / "scene"
+    make_demo_scene(directory, size=24, bands=7, views=7)
+    return directory
+
+
+@pytest.fixture
+def one_ray_a_pixel(monkeypatch):
+    """Coarser views, for tests of files rather than pixels."""
+    monkeypatch.setattr(demo_scene, "render_view", partial(render_view, subpixels=1))
+
+
+def test_a_scene_has_the_layout_that_transforms_json_names(folder):
+    transforms = json.loads((folder / "transforms.json").read_text())
+    assert (transforms["w"], transforms["h"], len(transforms["wavelengths"])) == (24, 24, 7)
+    assert transforms["materials"] == list(MATERIALS)
+    assert len(transforms["frames"]) == 7
+    assert is_complete(folder)
+    for frame in transforms["frames"]:
+        cube = np.load(folder / frame["hyperspectral_file_path"])
+        picture = np.asarray(Image.open(folder / frame["file_path"]))
+        labels = np.asarray(Image.open(folder / frame["seg_file_path"]))
+        assert (cube.shape, cube.dtype, picture.shape, labels.dtype) == ((24, 24, 7), "f2", (24, 24, 4), "u1")
+        assert cube.min() >= 0
+        assert cube.max() <= 1
+        assert (cube[picture[..., 3] == 0] == 0).all()
+        assert (labels[picture[..., 3] == 0] == 255).all()
+
+
+@pytest.mark.usefixtures("one_ray_a_pixel")
+def test_another_light_changes_each_band_of_the_scene_by_one_factor(tmp_path):
+    make_demo_scene(tmp_path / "day", size=16, bands=7, views=4)
+    make_demo_scene(tmp_path / "lamp", size=16, bands=7, views=4, illuminant="A")
+    lamps = [read_spectra_csv(tmp_path / name / "illuminant.csv").spectra[0] for name in ("day", "lamp")]
+    assert_allclose(lamps[1], lamp_power(band_centers_nm(7), "A"), rtol=1e-8)
+    assert lamps[1].argmax() == 6 != lamps[0].argmax()
+    cubes = [np.load(tmp_path / name / "cubes/eval_002.npy").astype(float) for name in ("day", "lamp")]
+    lit = (cubes[0].max(axis=-1) < 0.99) & (cubes[0].min(axis=-1) > 0.02)
+    assert lit.sum() > 20
+    assert_allclose(
+        cubes[1][lit] / cubes[0][lit], np.broadcast_to(lamps[1] / lamps[0], (lit.sum(), 7)), rtol=0.02
+    )
+
+
+def test_an_unknown_light_is_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(SpectrumError, match="there is no light 'D66'; nearest: D65"):
+        make_demo_scene(tmp_path / "scene", size=16, bands=3, views=4, illuminant="D66")
+    assert not (tmp_path / "scene").exists()
+
+
+def test_every_fourth_view_is_for_evaluation_and_has_abundances(folder):
+    transforms = json.loads((folder / "transforms.json").read_text())
+    evaluation = [f"images/{frame_name(i)}.png" for i in (2, 6)]
+    assert transforms["val_filenames"] == transforms["test_filenames"] == evaluation
+    frames = {frame["file_path"]: frame for frame in transforms["frames"]}
+    assert set(transforms["train_filenames"]) == set(frames) - set(evaluation)
+    assert [path for path, frame in frames.items() if "abundance_file_path" in frame] == evaluation
+    for path in evaluation:
+        abundances = np.load(folder / frames[path]["abundance_file_path"]).astype(np.float32)
+        assert abundances.shape == (24, 24, len(MATERIALS))
+        covered = np.asarray(Image.open(folder / path))[..., 3] > 0
+        assert_allclose(abundances.sum(axis=-1), covered, atol=2e-3)
+
+
+def test_cameras_look_at_the_table_from_all_sides_with_rigid_poses(folder):
+    transforms = json.loads((folder / "transforms.json").read_text())
+    poses = np.array([frame["transform_matrix"] for frame in transforms["frames"]])
+    rotations = poses[:, :3, :3]
+    assert_allclose(
+        rotations @ rotations.transpose(0, 2, 1), np.broadcast_to(np.eye(3), rotations.shape), atol=1e-6
+    )
+    assert_allclose(np.linalg.det(rotations), 1, atol=1e-6)
+    assert_allclose(poses[:, 3], np.broadcast_to([0, 0, 0, 1], (7, 4)))
+    looking_at = poses[:, :3, 3] - CAMERA_DISTANCE * rotations[:, :, 2]
+    assert_allclose(looking_at, np.broadcast_to([0, 0, 0.22], (7, 3)), atol=1e-5)
+    azimuths = np.sort(np.arctan2(poses[:, 1, 3], poses[:, 0, 3]))
+    assert np.diff(azimuths, append=azimuths[0] + 2 * np.pi).max() < np.pi / 2
+
+
+def test_a_scene_written_twice_has_the_same_bytes(folder, tmp_path):
+    make_demo_scene(tmp_path / "again", size=24, bands=7, views=7)
+    paths = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
+    assert paths == sorted(
+        p.relative_to(tmp_path / "again") for p in (tmp_path / "again").rglob("*") if p.is_file()
+    )
+    for path in paths:
+        assert (folder / path).read_bytes() == (tmp_path / "again" / path).read_bytes(), path
+
+
+@pytest.mark.parametrize(("name", "value"), [("size", 8), ("bands", 2), ("bands", 600), ("views", 3)])
+def test_a_number_out_of_bounds_is_refused_before_anything_is_written(tmp_path, name, value):
+    with pytest.raises(ConfigError, match=rf"--{name} of a demo scene must be \d+ to \d+; found {value}"):
+        make_demo_scene(tmp_path / "scene", **{name: value})
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_with_something_in_it_is_refused_and_left_alone(tmp_path):
+    (tmp_path / "thesis.tex").write_text("years")
+    with pytest.raises(ConfigError, match="is not empty"):
+        make_demo_scene(tmp_path, size=16, bands=3, views=4)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_a_file_in_the_folders_place_is_refused(tmp_path):
+    (tmp_path / "scene").write_text("no folder")
+    with pytest.raises(ConfigError, match="is a file"):
+        make_demo_scene(tmp_path / "scene", overwrite=True)
+
+
+@pytest.mark.usefixtures("one_ray_a_pixel")
+def test_overwriting_replaces_the_older_scene_and_spares_other_files(tmp_path):
+    directory = tmp_path / "scene"
+    make_demo_scene(directory, size=16, bands=3, views=9)
+    (directory / "notes.txt").write_text("mine")
+    (directory / "images" / "mine.png").write_bytes(b"mine")
+    make_demo_scene(directory, size=16, bands=4, views=4, overwrite=True)
+    assert sorted(path.name for path in (directory / "cubes").iterdir()) == [
+        "eval_002.npy",
+        "train_000.npy",
+        "train_001.npy",
+        "train_003.npy",
+    ]
+    assert np.load(directory / "cubes" / "train_000.npy").shape == (16, 16, 4)
+    assert (directory / "notes.txt").read_text() == "mine"
+    assert (directory / "images" / "mine.png").exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["scene"], "nothing temporary is left"
+
+
+@pytest.fixture
+def small_default(monkeypatch, one_ray_a_pixel):  # noqa: ARG001 - asked for its effect
+    """The cached scene, but small."""
+    for name, value in (("DEFAULT_SIZE", 16), ("DEFAULT_BANDS", 3), ("DEFAULT_VIEWS", 4)):
+        monkeypatch.setattr(demo_scene, name, value)
+
+
+@pytest.mark.usefixtures("small_default")
+def test_the_cached_scene_is_written_once(tmp_path):
+    path = demo_scene_path(tmp_path)
+    assert path.name == "demo", "a run is filed under the name of its scene"
+    assert is_complete(path)
+    assert [p.name for p in path.parent.iterdir()] == ["demo"], "nothing temporary is left"
+    stamp = (path / "transforms.json").stat().st_mtime_ns
+    assert demo_scene_path(tmp_path) == path
+    assert (path / "transforms.json").stat().st_mtime_ns == stamp
+
+
+@pytest.mark.usefixtures("small_default")
+@pytest.mark.parametrize("lost", ["transforms.json", "cubes/train_001.npy", "endmembers.csv"])
+def test_the_cached_scene_is_written_again_if_a_file_is_lost(tmp_path, lost):
+    path = demo_scene_path(tmp_path)
+    (path / lost).unlink()
+    assert not is_complete(path)
+    assert is_complete(demo_scene_path(tmp_path))
+
+
+@pytest.mark.usefixtures("small_default")
+def test_the_cache_is_xdg_cache_home_if_that_is_absolute_else_in_the_home_folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    assert demo_scene_path().is_relative_to(tmp_path / "cache" / "unmix-nerf")
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative")
+    assert demo_scene_path().is_relative_to(tmp_path / "home" / ".cache" / "unmix-nerf")
+
+
+@pytest.mark.usefixtures("small_default")
+def test_a_cache_that_cannot_be_written_is_a_scene_error_with_a_way_out(tmp_path):
+    (tmp_path / "cache").write_text("a file where the folder should be")
+    with pytest.raises(SceneError, match=r"XDG_CACHE_HOME .* unmix-demo-scene DIR"):
+        demo_scene_path(tmp_path / "cache")

@@ -1,0 +1,49 @@
+"""Light, shadow and gloss in the built-in scene."""
+
+import numpy as np
+from numpy.testing import assert_allclose
+
+from tests.scenes.demo.demo_parts import APPLE, LAMP, TABLE, row
+from unmix_plugin.scenes.demo.shading import (
+    COAT_REFLECTANCE,
+    LAMP_IRRADIANCE,
+    coat_highlight,
+    direct_light,
+    lamp_point,
+    sky_light,
+)
+
+
+def test_direct_light_follows_the_cosine_where_nothing_is_in_the_way():
+    point = row(1.1, -0.3, 0)
+    towards = LAMP - point[0]
+    expected = LAMP_IRRADIANCE * towards[2] / np.linalg.norm(towards)
+    assert_allclose(direct_light(point, row(0, 0, 1), LAMP), expected, rtol=1e-5)
+
+
+def test_a_point_behind_the_apple_lies_in_its_shadow():
+    center = np.array(APPLE.placement.center)
+    along = center - LAMP
+    shadow = (LAMP + along * (LAMP[2] / -along[2])).astype(np.float32)
+    assert np.hypot(shadow[0], shadow[1]) < 1.3, "the shadow's middle falls on the table"
+    assert direct_light(shadow[None], row(0, 0, 1), LAMP) == 0
+
+
+def test_the_sky_is_darker_beside_a_thing_than_in_the_open():
+    beside, away = row(-0.5, -0.3, 0), row(0.0, -1.2, 0)
+    up = row(0, 0, 1)
+    near, far = sky_light(beside, up, TABLE)[0], sky_light(away, up, TABLE)[0]
+    assert 0 <= near < 0.3 * far
+
+
+def test_a_highlight_seen_head_on_is_the_fresnel_reflectance_over_four_squared_roughness():
+    # Eye, lamp and normal coincide: D = 1 / (pi a^2), both Smith terms 1, cosines 1.
+    normal = LAMP[None] / np.linalg.norm(LAMP)
+    got = coat_highlight(np.zeros((1, 3), np.float32), normal, normal, roughness=0.2)
+    assert_allclose(got, COAT_REFLECTANCE / (4 * 0.2**2), rtol=1e-4)
+
+
+def test_the_lamps_points_fill_its_disc_evenly():
+    offsets = np.array([lamp_point(i, 9) for i in range(9)]) - LAMP
+    assert len(np.unique(offsets.round(4), axis=0)) == 9
+    assert_allclose(offsets.mean(axis=0), 0, atol=0.06)

@@ -1,0 +1,259 @@
+"""The hull never cuts into matter, and cuts away what views look through."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from tests.scenes.scene_factory import ball_alpha, look_at, make_scene, ring_poses
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.scenes import carve, load_scene
+from unmix_plugin.scenes.geometry.bounds import find_bounds, focus_point
+from unmix_plugin.scenes.geometry.carving import carve_box, matter_mask
+
+BOX = SceneBox(torch.tensor([[-1.0, -1.2, -0.9], [1.1, 1.0, 1.0]]))
+SIDE, FOCAL = 40, 60.0
+
+
+def make_cameras(poses: list[np.ndarray], distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)) -> Cameras:
+    count = len(poses)
+    return Cameras(
+        camera_to_world=torch.from_numpy(np.stack(poses)[:, :3]).float(),
+        focal_px=torch.full((count, 2), FOCAL),
+        center_px=torch.full((count, 2), SIDE / 2),
+        distortion=torch.tensor([distortion]).repeat(count, 1),
+        width=SIDE,
+        height=SIDE,
+    )
+
+
+def centres(box: SceneBox, cells: int) -> np.ndarray:
+    steps = (np.arange(cells) + 0.5) / cells
+    grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1)
+    return box.aabb[0].numpy() + grid * box.size.numpy()
+
+
+def ball_matter(poses: list[np.ndarray], radius: float) -> list[np.ndarray]:
+    return [ball_alpha(pose, radius, SIDE, SIDE, FOCAL) > 0 for pose in poses]
+
+
+@settings(max_examples=15)
+@given(st.integers(2, 7), st.floats(0.2, 0.7), st.integers(5, 36))
+def test_the_hull_holds_every_cell_that_a_ball_touches(views, radius, cells):
+    poses = ring_poses(views)
+    hull = carve_box(make_cameras(poses), ball_matter(poses, radius), BOX, cells)
+    touched = np.linalg.norm(centres(BOX, cells), axis=-1) < radius
+    assert hull[touched].all()
+
+
+def test_the_hull_of_a_ball_is_not_much_more_than_the_ball():
+    poses = ring_poses(12)
+    hull = carve_box(make_cameras(poses), ball_matter(poses, 0.5), BOX, 64)
+    distances = np.linalg.norm(centres(BOX, 64), axis=-1)
+    assert not hull[distances > 0.85].any()
+    assert hull.mean() < 3.0 * (distances < 0.5).mean()
+
+
+def test_cells_are_indexed_x_y_z_from_the_smallest_corner():
+    poses = ring_poses(8)
+    ball_at = np.array([0.5, 0.0, 0.0])
+    moved = [pose.copy() for pose in poses]
+    for pose in moved:
+        pose[:3, 3] -= ball_at  # the ball stays in the images of cameras that move with it
+    cameras = make_cameras(poses)
+    hull = carve_box(cameras, [ball_alpha(pose, 0.25, SIDE, SIDE, FOCAL) > 0 for pose in moved], BOX, 32)
+    middle = centres(BOX, 32)[hull].mean(axis=0)
+    np.testing.assert_allclose(middle, ball_at, atol=0.1)
+
+
+def test_a_grid_of_odd_size_agrees_with_one_that_is_refined_from_coarser_ones():
+    poses = ring_poses(6)
+    cameras, matter = make_cameras(poses), ball_matter(poses, 0.5)
+    fine = carve_box(cameras, matter, BOX, 64)
+    for cells in (63, 65):
+        other = carve_box(cameras, matter, BOX, cells)
+        assert abs(other.mean() - fine.mean()) < 0.02
+
+
+def test_refining_finds_exactly_what_testing_every_cell_finds(monkeypatch):
+    poses = ring_poses(6)
+    cameras, matter = make_cameras(poses), ball_matter(poses, 0.5)
+    refined = carve_box(cameras, matter, BOX, 64)
+    monkeypatch.setattr("unmix_plugin.scenes.geometry.carving.COARSEST_CELLS", 64)
+    direct = carve_box(cameras, matter, BOX, 64)
+    assert (refined != direct).mean() < 1e-4  # rectangles of children may stick out by rounding
+
+
+@pytest.mark.parametrize("lens", [(-0.3, 0.1, 0.0, 0.0), (0.2, 0.0, 0.01, -0.01)])
+def test_the_hull_holds_the_ball_through_a_bent_lens_too(lens):
+    poses = ring_poses(8)
+    cameras = make_cameras(poses, lens)
+    radius, cells = 0.5, 40
+    matter = []
+    for index in range(len(poses)):
+        rays = [cameras.image_rays(index, (x, y)) for x in (0.1, 0.5, 0.9) for y in (0.1, 0.5, 0.9)]
+        hits = []
+        for bundle in rays:
+            along = -(bundle.directions * bundle.origins).sum(-1)
+            hits.append((bundle.origins**2).sum(-1) - along**2 < radius**2)
+        matter.append(torch.stack(hits).any(dim=0).reshape(SIDE, SIDE).numpy())
+    hull = carve_box(cameras, matter, BOX, cells)
+    distances = np.linalg.norm(centres(BOX, cells), axis=-1)
+    assert hull[distances < radius].all()
+    assert hull.mean() < 4.0 * (distances < radius).mean()
+
+
+def test_nothing_is_carved_by_what_lies_outside_the_images():
+    poses = [look_at(np.array([0.0, -4.0, 0.0]), np.zeros(3))]
+    cameras = dataclasses.replace(make_cameras(poses), focal_px=torch.full((1, 2), 400.0))
+    hull = carve_box(cameras, [np.zeros((SIDE, SIDE), bool)], BOX, 32)
+    seen = carve_box(cameras, None, BOX, 32)
+    assert (hull & ~seen).sum() == 0  # nothing unseen is kept
+    assert hull.any()  # cells at the image's edge reach out of it and stay
+
+
+def test_without_alpha_exactly_the_cells_in_front_of_some_camera_stay():
+    poses = [look_at(np.array([0.0, -2.0, 0.2]), np.array([0.3, 0.0, 0.0]))]
+    cameras = make_cameras(poses)
+    kept = carve_box(cameras, None, BOX, 24)
+    points = torch.from_numpy(centres(BOX, 24).reshape(-1, 3)).float()
+    pixels, depths = cameras.project(points, 0)
+    seen = (((pixels >= 0) & (pixels <= SIDE)).all(-1) & (depths > 0.1)).reshape(24, 24, 24).numpy()
+    assert kept[seen].all()
+    far_out = (((pixels < -6) | (pixels > SIDE + 6)).any(-1) | (depths < -0.2)).reshape(24, 24, 24).numpy()
+    assert not kept[far_out].any()
+    assert seen.any()
+    assert far_out.any()
+
+
+def test_a_resolution_of_one_is_a_single_cell_and_less_is_refused():
+    poses = ring_poses(4)
+    assert carve_box(make_cameras(poses), ball_matter(poses, 0.5), BOX, 1).tolist() == [[[True]]]
+    with pytest.raises(ValueError, match="resolution must be at least 1"):
+        carve_box(make_cameras(poses), None, BOX, 0)
+
+
+def test_every_opaque_pixel_of_an_evaluation_view_has_hull_behind_it(tmp_path):
+    scene = load_scene(make_scene(tmp_path / "scene", frames=9).root)
+    cells = 32
+    hull = torch.from_numpy(carve(scene, cells))
+    for index in scene.eval_indices:
+        alpha = scene.alpha(index)
+        assert alpha is not None
+        rays = scene.cameras.image_rays(index)[torch.from_numpy(alpha.reshape(-1) > 0.99)]
+        t_near, t_far = scene.scene_box.intersect(rays.origins, rays.directions)
+        steps = torch.linspace(0, 1, 200)
+        t = t_near[:, None] + (t_far - t_near)[:, None] * steps
+        points = rays.origins[:, None] + t[..., None] * rays.directions[:, None]
+        x, y, z = (scene.scene_box.normalise(points) * cells).long().clamp(0, cells - 1).unbind(-1)
+        assert len(rays) > 20
+        assert hull[x, y, z].any(dim=1).all()
+
+
+def test_pixels_that_a_mask_ignores_count_as_matter(tmp_path):
+    folder = make_scene(tmp_path / "scene")
+    mask = np.zeros((16, 20), np.uint8)
+    mask[:, :10] = 255
+    Image.fromarray(mask).save(folder.root / "mask.png")
+    before = load_scene(folder.root)
+    folder.edit(lambda c: c["frames"][1].update(mask_path="mask.png"))
+    after = load_scene(folder.root)
+    assert matter_mask(after, 1)[:, 10:].all()
+    assert np.array_equal(matter_mask(after, 1)[:, :10], matter_mask(before, 1)[:, :10])
+    assert np.array_equal(matter_mask(after, 2), matter_mask(before, 2))
+
+
+def test_the_focus_is_where_all_axes_meet():
+    target = np.array([0.3, -0.2, 0.5])
+    poses = [look_at(np.array(p), target) for p in ((3.0, 0, 1), (0, 3.0, 2), (-2.0, -2.0, 0))]
+    focus = focus_point(make_cameras(poses))
+    assert focus is not None
+    np.testing.assert_allclose(focus, target, atol=1e-5)
+
+
+def test_parallel_and_outward_cameras_have_no_focus():
+    parallel = [look_at(np.array([x, -3.0, 0.0]), np.array([x, 0.0, 0.0])) for x in (-0.5, 0.0, 0.5)]
+    outward = [look_at(pose[:3, 3], 2.0 * pose[:3, 3]) for pose in ring_poses(6)]
+    assert focus_point(make_cameras(parallel)) is None
+    assert focus_point(make_cameras(outward)) is None
+
+
+def test_the_box_of_a_ball_is_tight_around_it(tmp_path):
+    poses = ring_poses(10)
+    box = find_bounds(tmp_path, make_cameras(poses), ball_matter(poses, 0.5))
+    low, high = box.aabb.numpy()
+    assert (low <= -0.5).all()
+    assert (high >= 0.5).all()
+    assert (low >= -0.85).all()
+    assert (high <= 0.85).all()
+
+
+def test_the_box_of_a_room_seen_from_one_side_holds_what_all_cameras_look_at(tmp_path):
+    positions = [np.array([x, -3.6, z]) for x in (-0.6, 0.0, 0.6) for z in (-0.5, 0.5)]
+    cameras = make_cameras([look_at(position, np.zeros(3)) for position in positions])
+    box = find_bounds(tmp_path, cameras, None)
+    corners = torch.tensor([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+    assert box.contains(corners).all()
+    assert (box.size < 3.2).all()
+    assert not box.contains(torch.tensor(np.stack(positions)).float()).any()
+
+
+def test_parallel_cameras_get_a_box_in_front_of_them_that_they_share(tmp_path):
+    positions = [np.array([x, -3.0, 0.0]) for x in (-0.5, 0.0, 0.5)]
+    cameras = make_cameras([look_at(p, p + np.array([0.0, 1.0, 0.0])) for p in positions])
+    box = find_bounds(tmp_path, cameras, None)
+    middle = box.aabb.mean(dim=0)
+    assert middle[1] > -2.0
+    pixels, depths = cameras.project(middle[None], 1)
+    assert (depths > 0).all()
+    assert ((pixels >= 0) & (pixels <= SIDE)).all()
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_single_camera_or_two_at_one_place_still_get_a_box(tmp_path, count):
+    poses = [look_at(np.array([0.0, -2.0, 0.0]), np.array([0.1 * i, 0.0, 0.0])) for i in range(count)]
+    box = find_bounds(tmp_path, make_cameras(poses), None)
+    assert torch.isfinite(box.aabb).all()
+    assert (box.size > 0.1).all()
+
+
+@pytest.mark.parametrize("has_alpha", [True, False])
+def test_the_model_box_is_centred_and_its_longest_edge_is_two(tmp_path, has_alpha):
+    poses = ring_poses(7)
+    for pose in poses:
+        pose[:3, 3] = pose[:3, 3] + np.array([500.0, -20.0, 3.0])  # far from the world's origin
+    plain = ring_poses(7)
+    folder = make_scene(tmp_path / "scene", frames=7, alpha=has_alpha, poses=plain)
+    folder.edit(
+        lambda c: [
+            f.update(transform_matrix=pose.tolist()) for f, pose in zip(c["frames"], poses, strict=True)
+        ]
+    )
+    scene = load_scene(folder.root)
+    low, high = scene.scene_box.aabb.numpy()
+    np.testing.assert_allclose(low, -high, atol=1e-6)
+    assert (high - low).max() == pytest.approx(2.0)
+    world = scene.normalisation.to_world(scene.scene_box.aabb.double().numpy())
+    assert ((world[0] < [500.0, -20.0, 3.0]) & (world[1] > [500.0, -20.0, 3.0])).all()
+
+
+def test_cells_that_too_few_views_see_are_carved_and_the_others_stay():
+    poses = [look_at(np.array([x, -2.0, 0.2]), np.array([x, 0.0, 0.0])) for x in (-0.6, 0.0, 0.6)]
+    cameras = make_cameras(poses)
+    matter = [np.ones((SIDE, SIDE), bool)] * 3
+    kept = [carve_box(cameras, matter, BOX, 24, fewest_views=n) for n in (1, 2, 3)]
+    points = torch.from_numpy(centres(BOX, 24).reshape(-1, 3)).float()
+    count = torch.zeros(len(points))
+    for index in range(3):
+        pixels, depths = cameras.project(points, index)
+        count += ((pixels >= 0) & (pixels <= SIDE)).all(-1) & (depths > 0.1)
+    for n, cells in enumerate(kept, start=1):
+        assert cells.reshape(-1)[(count >= n).numpy()].all()
+    assert kept[0].sum() > kept[1].sum() > kept[2].sum() > 0
+    assert (kept[0] >= kept[1]).all()
+    assert (kept[1] >= kept[2]).all()

@@ -1,0 +1,191 @@
+from pathlib import Path
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from unmix_plugin.errors import ConfigError, SpectrumError
+from unmix_plugin.spectral import Bands
+from unmix_plugin.spectral.maps.indices import NAMED_INDICES, available_indices, parse_index
+
+FULL = Bands.of(range(350, 2501, 10))
+VISIBLE = Bands.of(range(400, 701, 10))
+VNIR = Bands.of(range(400, 1001, 10))
+
+RATIOS = ["ndvi", "gndvi", "ndre", "pri", "sipi", "psri", "ndwi", "ndwi-gao", "nbr", "redness", "iron-oxide"]
+"""The named indices that have no unit: a common factor of all bands cancels."""
+
+LEAF = {
+    "ndvi": 0.45 / 0.55,
+    "gndvi": 0.4 / 0.6,
+    "evi": 2.5 * 0.45 / (0.5 + 6 * 0.05 - 7.5 * 0.04 + 1),
+    "savi": 1.5 * 0.45 / 1.05,
+    "osavi": 0.45 / 0.71,
+    "ndre": (0.49 - 0.2) / (0.49 + 0.2),
+    "pri": (0.07 - 0.09) / (0.07 + 0.09),
+    "mcari": ((0.12 - 0.05) - 0.2 * (0.12 - 0.1)) * 0.12 / 0.05,
+    "tvi": 0.5 * (120 * (0.4 - 0.1) - 200 * (0.05 - 0.1)),
+    "sipi": (0.5 - 0.03) / (0.5 - 0.06),
+    "psri": (0.055 - 0.045) / 0.4,
+    "cri1": 1 / 0.048 - 1 / 0.1,
+    "ari1": 1 / 0.1 - 1 / 0.12,
+    "ndwi": -0.4 / 0.6,
+    "ndwi-gao": (0.52 - 0.44) / (0.52 + 0.44),
+    "nbr": (0.51 - 0.15) / (0.51 + 0.15),
+    "redness": (0.051 - 0.11) / (0.051 + 0.11),
+    "iron-oxide": 0.051 / 0.042,
+}
+"""By hand, from the spectrum of `leaf`."""
+
+
+def leaf():
+    """A made-up leaf at just the wavelengths of the published definitions."""
+    blue = {445: 0.03, 470: 0.04, 485: 0.042, 500: 0.045, 510: 0.048}
+    green = {531: 0.07, 550: 0.1, 560: 0.11, 570: 0.09}
+    red = {660: 0.051, 670: 0.05, 678: 0.055, 680: 0.06, 700: 0.12, 720: 0.2, 750: 0.4}
+    infrared = {790: 0.49, 800: 0.5, 830: 0.51, 860: 0.52, 1240: 0.44, 2215: 0.15}
+    spectrum = blue | green | red | infrared
+    return Bands.of(list(spectrum)), torch.tensor(list(spectrum.values()), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("name", NAMED_INDICES)
+def test_a_named_index_has_the_value_computed_by_hand(name):
+    bands, spectrum = leaf()
+    assert float(parse_index(name, bands)(spectrum)) == pytest.approx(LEAF[name], rel=1e-12)
+
+
+@pytest.mark.parametrize("name", NAMED_INDICES)
+def test_the_formula_of_a_named_index_gives_the_same_when_typed(name):
+    reflectance = torch.rand(7, len(FULL), generator=torch.Generator().manual_seed(0)) + 0.01
+    typed = parse_index(NAMED_INDICES[name].formula, FULL)
+    assert_close(typed(reflectance), parse_index(name, FULL)(reflectance), rtol=0, atol=0, equal_nan=True)
+    assert typed.usual_range is None
+
+
+@pytest.mark.parametrize("name", RATIOS)
+def test_a_ratio_does_not_change_with_brightness(name):
+    bands, spectrum = leaf()
+    index = parse_index(name, bands)
+    assert_close(index(0.013 * spectrum), index(spectrum))
+
+
+@pytest.mark.parametrize("name", sorted(set(NAMED_INDICES) - set(RATIOS)))
+def test_other_indices_change_with_brightness_and_so_need_reflectance(name):
+    bands, spectrum = leaf()
+    index = parse_index(name, bands)
+    assert abs(float(index(0.5 * spectrum) - index(spectrum))) > 0.01
+
+
+def test_between_centres_reflectance_is_exact_for_a_linear_spectrum():
+    bands = Bands.of([400, 430, 500, 650])
+    wavelengths = torch.tensor(bands.centers_nm)
+    for nm in (400, 401, 415, 430, 477.25, 500, 649.5, 650):
+        assert float(parse_index(f"r{nm}", bands)(2e-3 * wavelengths - 0.5)) == pytest.approx(2e-3 * nm - 0.5)
+
+
+def test_half_a_spacing_beyond_the_outermost_centres_is_the_outermost_band():
+    spectrum = torch.arange(31.0)
+    assert parse_index("r395", VISIBLE)(spectrum) == 0
+    assert parse_index("r705", VISIBLE)(spectrum) == 30
+    with pytest.raises(SpectrumError, match=r"needs 705\.1 nm"):
+        parse_index("r705.1", VISIBLE)
+
+
+def test_a_lone_band_serves_its_interval():
+    assert parse_index("r552-r547", Bands.of([550]))(torch.tensor([[0.25]])).tolist() == [0]
+
+
+def test_a_wavelength_on_a_centre_does_not_read_the_neighbour():
+    spectrum = torch.tensor([0.2, torch.nan, torch.nan])
+    assert float(parse_index("r500", Bands.of([500, 600, 700]))(spectrum)) == pytest.approx(0.2)
+
+
+def test_a_wavelength_that_the_bands_do_not_reach_is_refused():
+    message = "index ndvi needs 800 nm but the bands cover 395-705 nm; nothing is extrapolated; named ones .*: pri, "
+    with pytest.raises(SpectrumError, match=message):
+        parse_index(" NDVI ", VISIBLE)
+    with pytest.raises(SpectrumError, match=r"index r300/r900 needs 300, 900 nm but"):
+        parse_index("r300/r900", VISIBLE)
+    with pytest.raises(SpectrumError, match="reach: none"):
+        parse_index("ndvi", Bands.of([600, 610]))
+
+
+def test_indices_of_a_sensor_are_those_whose_wavelengths_it_sees():
+    assert available_indices(FULL) == list(NAMED_INDICES)
+    assert [name for name in NAMED_INDICES if name not in available_indices(VNIR)] == ["ndwi-gao", "nbr"]
+    assert available_indices(VISIBLE) == ["pri", "mcari", "cri1", "ari1", "redness", "iron-oxide"]
+
+
+def test_every_named_index_is_finite_and_in_its_usual_range_on_vegetation():
+    nm = torch.tensor(FULL.centers_nm)
+    plateau = 0.45 * torch.sigmoid((nm - 718) / 12)
+    green = 0.07 * torch.exp(-(((nm - 552) / 30) ** 2))
+    water = sum(
+        depth * torch.exp(-(((nm - at) / 90) ** 2)) for at, depth in ((1200, 0.2), (1450, 0.7), (1940, 0.8))
+    )
+    spectrum = (0.04 + plateau + green) * (1 - water)  # a red edge, a green peak, water bands
+    for name, named in NAMED_INDICES.items():
+        low, high = named.usual_range
+        assert low <= float(parse_index(name, FULL)(spectrum)) <= high, name
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("rays", [(), (0,), (1,), (2, 3)])
+def test_the_result_has_the_rays_and_the_type_of_the_input(rays, dtype):
+    reflectance = torch.rand(*rays, len(FULL), dtype=dtype, generator=torch.Generator().manual_seed(1))
+    for name in ("evi", "max(0.3, r800**2) / 2"):
+        result = parse_index(name, FULL)(reflectance)
+        assert result.shape == rays
+        assert result.dtype == dtype
+        assert result.isfinite().all()
+
+
+def test_where_nothing_is_seen_a_normalised_difference_is_nan_and_its_neighbours_are_not():
+    index = parse_index("ndvi", Bands.of([670, 800]))
+    result = index(torch.tensor([[0.0, 0.0], [0.1, 0.3], [torch.inf, 0.1]]))
+    assert result.isnan().tolist() == [True, False, True]
+    assert float(result[1]) == pytest.approx(0.5)
+
+
+def test_what_names_the_formula_its_source_and_the_bands_used():
+    assert parse_index("NDVI", Bands.of([660, 680, 800])).what == (
+        "normalised difference vegetation index, (r800-r670)/(r800+r670) (Rouse et al. 1974); "
+        "from the bands at 660, 680, 800 nm"
+    )
+    index = parse_index(" r800 /\n r670", Bands.of([670, 800]))
+    assert index.name == "r800 /\n r670"
+    assert index.what == "formula r800 / r670; from the bands at 670, 800 nm"
+    assert parse_index("NDVI", VNIR).name == "ndvi"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("ndiv", "there is no index 'ndiv'; nearest: .*ndvi"),
+        ("iron_oxide", "nearest: iron-oxide"),
+        ("zzzz", "there is no index 'zzzz'; known: ndvi, gndvi"),
+        ("__import__", "there is no index '__import__'"),
+        ("  ", r"index: is followed by nothing; give a name \(ndvi, gndvi"),
+        ("ndvi/2", "column 1: expected a number, a wavelength, a function or"),
+        ("r800-ndvi", "column 6: .* found 'ndvi'"),
+        ("1+2", "takes no wavelength"),
+    ],
+)
+def test_a_text_that_is_no_index_is_refused(text, message):
+    with pytest.raises(ConfigError, match=message):
+        parse_index(text, VNIR)
+
+
+def test_spectra_of_another_sampling_are_refused():
+    with pytest.raises(
+        SpectrumError, match=r"index pri is made for 31 bands, 400-700 nm; found spectra of 61"
+    ):
+        parse_index("pri", VISIBLE)(torch.zeros(2, 61))
+
+
+def test_the_page_of_docs_lists_every_named_index_as_it_is_computed():
+    page = (Path(__file__).parents[3] / "docs" / "indices.md").read_text(encoding="utf-8")
+    for name, named in NAMED_INDICES.items():
+        low, high = named.usual_range
+        assert f"| {named.title} | `{named.formula}` | {named.source} | {low:g} to {high:g} |" in page
+        assert f"| `{name}` " in page

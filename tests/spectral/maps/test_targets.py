@@ -1,0 +1,221 @@
+"""Targets by name: what is read, what is refused, and that they are found."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from unmix_plugin.errors import ConfigError, SpectrumError
+from unmix_plugin.spectral import Bands, SpectraTable, write_spectra_csv
+from unmix_plugin.spectral.maps.targets import parse_target
+
+BANDS = Bands.of([450, 500, 550, 600, 650])
+GOLD = [0.1, 0.2, 0.5, 0.7, 0.8]
+PAINTS = SpectraTable(
+    Bands.of([400, *BANDS.centers_nm, 700]),
+    ("gold", "cobalt <45um", "black"),
+    np.array([[0.1, *GOLD, 0.8], [0.3, 0.4, 0.3, 0.1, 0.1, 0.2, 0.3], [0.0] * 7]),
+)
+
+
+@pytest.fixture
+def paints(tmp_path):
+    path = tmp_path / "paints.csv"
+    write_spectra_csv(path, PAINTS)
+    return path
+
+
+@pytest.fixture
+def gold(tmp_path):
+    path = tmp_path / "gold.csv"
+    write_spectra_csv(path, SpectraTable(PAINTS.bands, ("gold",), PAINTS.spectra[:1]))
+    return path
+
+
+def image(seed=0):
+    """20 x 30 pixels of two materials in all mixtures and shading, with a planted patch of gold; and where it is."""
+    g = np.random.default_rng(seed)
+    shares, shade = g.uniform(size=(20, 30, 1)), g.uniform(0.7, 1, (20, 30, 1))
+    planted = np.zeros((20, 30), dtype=bool)
+    planted[5:9, 10:16] = True
+    leaf, stone = np.array([0.05, 0.1, 0.4, 0.2, 0.1]), np.array([0.5, 0.5, 0.55, 0.6, 0.6])
+    spectra = np.where(planted[..., None], GOLD, shares * leaf + (1 - shares) * stone) * shade
+    return torch.tensor(spectra + g.normal(0, 0.005, spectra.shape)).float(), torch.tensor(planted)
+
+
+def test_a_target_is_resampled_to_the_bands_and_needs_no_name_where_there_is_one_spectrum(gold):
+    target = parse_target(str(gold), Bands.of([475, 525]))
+    assert (target.method, target.name, target.file, target.threshold) == ("angle", "gold", "gold.csv", None)
+    assert_close(target.reflectance, torch.tensor([0.15, 0.35]).double())
+
+
+def test_each_part_of_the_text_is_read(paints):
+    target = parse_target(f"ace:{paints}#gold>0.5", BANDS)
+    assert (target.method, target.name, target.threshold) == ("ace", "gold", 0.5)
+    assert parse_target(f"mf:{paints}#gold > -1e-1", BANDS).threshold == -0.1
+
+
+def test_names_may_hold_signs_of_comparison(paints):
+    assert parse_target(f"{paints}#cobalt <45um", BANDS).name == "cobalt <45um"
+    target = parse_target(f"{paints}#cobalt <45um<.1", BANDS)
+    assert (target.name, target.threshold) == ("cobalt <45um", 0.1)
+
+
+def test_odd_paths_are_paths(gold, monkeypatch):
+    monkeypatch.chdir(gold.parent)
+    for path in ("C:gold.csv", "a#b <1.csv", "x.csv.CSV", "MF:gold.csv"):
+        (gold.parent / path).write_bytes(gold.read_bytes())
+        assert parse_target(path, BANDS).file == path
+        assert parse_target(f"mf:{path}#gold>1", BANDS).method == "mf"
+
+
+def test_the_angle_is_zero_at_the_target_and_ignores_brightness_and_background(gold):
+    score = parse_target(str(gold), BANDS).fit(torch.zeros(0, 5))
+    spectra, _ = image()
+    assert_close(score(torch.tensor([GOLD]) * 0.3), torch.zeros(1), atol=1e-6, rtol=0)
+    assert_close(score(spectra), score(0.2 * spectra), atol=1e-6, rtol=1e-5)
+    assert_close(
+        score(torch.tensor([[0.0, 1, 0, 0, 0]]).double())[0].cos(),
+        torch.tensor(0.2 / math.sqrt(1.43)).double(),
+    )
+
+
+@pytest.mark.parametrize("method", ["mf", "ace"])
+def test_the_target_scores_one(gold, method):
+    spectra, _ = image()
+    score = parse_target(f"{method}:{gold}", BANDS).fit(spectra.reshape(-1, 5))
+    assert_close(score(torch.tensor(GOLD)), torch.tensor(1.0))
+
+
+@pytest.mark.parametrize("method", ["angle", "mf", "ace"])
+def test_a_planted_target_is_found(gold, method):
+    spectra, planted = image()
+    target = parse_target(f"{method}:{gold}", BANDS)
+    scores = target.fit(spectra.reshape(-1, 5))(spectra) * (-1 if method == "angle" else 1)
+    assert scores.shape == planted.shape
+    assert (scores[planted] > scores[~planted].quantile(0.99)).float().mean() > 0.95
+
+
+@pytest.mark.parametrize(("method", "limit"), [("angle", "<0.12"), ("mf", ">0.5"), ("ace", ">0.5")])
+def test_a_threshold_gives_one_where_the_score_passes_and_zero_where_not(gold, method, limit):
+    spectra, planted = image()
+    spectra[0, 0] = 0
+    background = spectra.reshape(-1, 5)
+    scores = parse_target(f"{method}:{gold}", BANDS).fit(background)(spectra)
+    passes = parse_target(f"{method}:{gold}{limit}", BANDS).fit(background)(spectra)
+    assert passes[0, 0].isnan()
+    seen = ~passes.isnan()
+    assert seen.sum() == 599
+    expected = scores < 0.12 if method == "angle" else scores > 0.5
+    assert_close(passes[seen], expected[seen].float())
+    assert (passes[seen] == planted[seen]).float().mean() > 0.95
+
+
+@pytest.mark.parametrize("method", ["angle", "mf", "ace"])
+def test_pixels_in_which_nothing_is_known_have_no_score(gold, method):
+    spectra, _ = image()
+    score = parse_target(f"{method}:{gold}", BANDS).fit(spectra.reshape(-1, 5))
+    odd = torch.tensor(
+        [[0.0] * 5, [torch.nan, 1, 1, 1, 1], [1, 1, torch.inf, 1, 1], [0.3, 0.2, 0.1, 0.3, 0.3]]
+    )
+    assert score(odd).isnan().tolist() == [True, True, True, False]
+
+
+@pytest.mark.parametrize("method", ["angle", "mf", "ace"])
+@pytest.mark.parametrize("shape", [(), (1,), (0,), (3, 2)])
+def test_scores_have_the_shape_and_type_of_the_rays(gold, method, shape):
+    spectra, _ = image()
+    score = parse_target(f"{method}:{gold}", BANDS).fit(spectra.reshape(-1, 5))
+    found = score(torch.full((*shape, 5), 0.4))
+    assert (found.shape, found.dtype) == (shape, torch.float32)
+
+
+def test_a_target_says_what_its_numbers_are(gold):
+    angle, mf, ace = (parse_target(f"{method}:{gold}", BANDS) for method in ("angle", "mf", "ace"))
+    assert angle.what == "spectral angle in radians to 'gold' (gold.csv): 0 = the same but for brightness"
+    assert mf.what == (
+        "matched filter score of 'gold' (gold.csv): 1 = like the target, 0 = like the background's mean"
+    )
+    assert ace.what.startswith("adaptive coherence with 'gold' (gold.csv): 1 = ")
+    assert [one.usual_range for one in (angle, mf, ace)] == [(0, 0.5), (0, 1), (0, 1)]
+    assert [one.needs_background for one in (angle, mf, ace)] == [False, True, True]
+    below = parse_target(f"{gold}<0.1", BANDS)
+    assert below.what == "spectral angle in radians to 'gold' (gold.csv) below 0.1: 1 = yes, 0 = no"
+    assert below.usual_range == (0, 1)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", r"target: must be target:\[METHOD:\]FILE.csv"),
+        ("{0}/gold.txt", "must be .* as in paint.csv, ace:paint.csv"),
+        ("{0}/gold.csv<low", "must be .*<VALUE"),
+        ("{0}/gold.csv<nan", "must be .*<VALUE"),
+        ("{0}/gold.csv>0.1", "small scores of angle are alike, so its threshold is <0.1; found >0.1"),
+        ("mf:{0}/gold.csv<0.1", "large scores of mf are alike, so its threshold is >0.1; found <0.1"),
+        ("ace:{0}/gold.csv<0.1", "large scores of ace are alike"),
+        ("ace:{0}/gold.csv>1", "scores of ace lie between 0 and 1, so >1 says the same of every pixel"),
+        ("angle:{0}/gold.csv<0", "scores of angle lie between 0 and 3.142, so <0 says the same"),
+        ("{0}/none.csv", "there is no file .*none.csv with the spectrum of a target$"),
+        ("ACE:{0}/gold.csv", "no file ACE:.*did you mean the method ace: .they are angle, mf, ace"),
+        (
+            "{0}/paints.csv",
+            "paints.csv has 3 spectra; say which, as in .*paints.csv#NAME: gold, cobalt <45um, black",
+        ),
+        ("{0}/paints.csv#golt", "no spectrum 'golt'; did you mean gold. it has gold, cobalt"),
+        ("{0}/paints.csv#", "no spectrum ''; it has gold"),
+    ],
+)
+@pytest.mark.usefixtures("paints")
+def test_text_that_names_no_target_is_refused(gold, text, message):
+    with pytest.raises(ConfigError, match=message):
+        parse_target(text.format(gold.parent), BANDS)
+
+
+def test_a_target_that_does_not_reach_the_bands_is_refused_with_its_file_and_the_gap(gold):
+    with pytest.raises(
+        SpectrumError, match=r"gold.csv: spectra at .* 50 nm above their range; .*nothing is extra"
+    ):
+        parse_target(str(gold), Bands.of([450, 750]))
+
+
+def test_a_file_that_is_no_table_of_spectra_is_refused(tmp_path):
+    (tmp_path / "bad.csv").write_text("nm,gold\n400,1\n")
+    with pytest.raises(SpectrumError, match=r"bad\.csv: the first column must be headed 'wavelength'"):
+        parse_target(f"{tmp_path}/bad.csv", BANDS)
+
+
+def test_percent_are_refused_but_by_the_angle(tmp_path):
+    write_spectra_csv(tmp_path / "p.csv", SpectraTable(PAINTS.bands, ("gold",), 100 * PAINTS.spectra[:1]))
+    with pytest.raises(
+        SpectrumError, match=r"'gold' .* must be in reflectances, 1 for white; found 80 .divide percent"
+    ):
+        parse_target(f"mf:{tmp_path}/p.csv", BANDS)
+    score = parse_target(f"{tmp_path}/p.csv", BANDS).fit(torch.zeros(0, 5))
+    assert_close(score(torch.tensor(GOLD).double()), torch.tensor(0.0).double(), atol=1e-7, rtol=0)
+
+
+def test_no_angle_is_measured_to_a_black_target_but_mf_takes_it(paints):
+    with pytest.raises(SpectrumError, match=r"'black' .* is zero in all bands: no angle to it is defined"):
+        parse_target(f"{paints}#black", BANDS)
+    spectra, _ = image()
+    score = parse_target(f"mf:{paints}#black", BANDS).fit(spectra.reshape(-1, 5))
+    assert score(spectra).isfinite().all()
+
+
+def test_one_band_has_no_direction(gold):
+    with pytest.raises(SpectrumError, match="angle compares spectra of two bands or more; found 1 band"):
+        parse_target(str(gold), Bands.of([550]))
+
+
+def test_a_background_whose_mean_is_the_target_is_refused(gold):
+    around = torch.tensor(GOLD).double() + torch.tensor([[0.1], [-0.1]]).double()
+    with pytest.raises(SpectrumError, match=r"'gold' \(gold.csv\) is the mean of the background"):
+        parse_target(f"mf:{gold}", BANDS).fit(around)
+
+
+def test_a_background_of_other_bands_is_refused(gold):
+    with pytest.raises(SpectrumError, match="target 'gold' has 5 bands, the background 4"):
+        parse_target(f"ace:{gold}", BANDS).fit(torch.rand(10, 4))

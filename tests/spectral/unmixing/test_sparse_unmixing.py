@@ -1,0 +1,68 @@
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch.testing import assert_close
+
+from tests.spectral.mixtures import seeded, smooth_endmembers
+from unmix_plugin.spectral.unmixing.abundance_estimation import nnls
+from unmix_plugin.spectral.unmixing.sparse_unmixing import sparse_abundances
+
+
+def endmembers_of(num_endmembers):
+    return smooth_endmembers(num_endmembers).float()
+
+
+@pytest.mark.parametrize("num_endmembers", [1, 2, 3, 5, 25])
+def test_pure_spectra_are_pure_under_any_shading(num_endmembers):
+    endmembers = endmembers_of(num_endmembers) if num_endmembers < 10 else torch.eye(num_endmembers)
+    shading = torch.linspace(0.1, 1.5, num_endmembers)[:, None]
+    found = sparse_abundances(shading * endmembers, endmembers, 0.02)
+    assert_close(found, torch.eye(num_endmembers), atol=1e-3, rtol=0)
+
+
+@given(st.integers(0, 50), st.floats(0.2, 0.8))
+@settings(max_examples=20)
+def test_abundances_of_mixtures_of_two_are_found_whatever_the_brightness_of_endmembers(seed, share):
+    endmembers = endmembers_of(5) * torch.rand(5, 1, generator=seeded(seed)).clamp(min=0.2)
+    mixture = 0.4 * (share * endmembers[1] + (1 - share) * endmembers[3])
+    found = sparse_abundances(mixture[None], endmembers, 1e-4)
+    assert_close(found, torch.tensor([[0.0, share, 0.0, 1 - share, 0.0]]), atol=5e-3, rtol=0)
+
+
+def test_without_a_penalty_mixtures_of_three_are_those_of_non_negative_least_squares():
+    endmembers = endmembers_of(3)
+    shares = torch.rand(40, 3, generator=seeded(3)) + 0.05
+    mixtures = shares @ endmembers
+    expected = nnls(mixtures.double(), endmembers.double())
+    expected = expected / expected.sum(dim=1, keepdim=True)
+    assert_close(sparse_abundances(mixtures, endmembers, 0.0).double(), expected, atol=5e-3, rtol=0)
+
+
+def test_a_material_that_explains_less_than_the_penalty_is_left_out():
+    endmembers = endmembers_of(4)
+    nearly_pure = endmembers[:1] + 0.02 * endmembers[2:3]
+    assert int((sparse_abundances(nearly_pure, endmembers, 0.3) > 0).sum()) == 1
+    assert int((sparse_abundances(nearly_pure, endmembers, 0.0) > 0).sum()) > 1
+
+
+def test_no_spectrum_shows_more_than_three_materials_and_shares_sum_to_one():
+    endmembers = endmembers_of(7)
+    mixtures = torch.rand(200, 7, generator=seeded(1)) @ endmembers
+    found = sparse_abundances(mixtures, endmembers, 0.001)
+    assert_close(found.sum(dim=1), torch.ones(200))
+    assert bool((found >= 0).all())
+    assert int((found > 0).sum(dim=1).max()) <= 3
+
+
+def test_black_spectra_show_nothing():
+    found = sparse_abundances(torch.zeros(2, 12), torch.rand(3, 12, generator=seeded(0)), 0.02)
+    assert_close(found, torch.zeros(2, 3))
+
+
+def test_endmembers_of_one_shape_are_no_error():
+    endmembers = endmembers_of(3)
+    twins = torch.cat([endmembers, endmembers[:1]])
+    found = sparse_abundances(endmembers, twins, 0.02)
+    assert bool(torch.isfinite(found).all())
+    assert_close(found.sum(dim=1), torch.ones(3))

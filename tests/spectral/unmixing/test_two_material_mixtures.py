@@ -1,0 +1,122 @@
+import math
+from itertools import combinations, pairwise
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch.nn.functional import normalize
+from torch.testing import assert_close
+
+from tests.spectral.mixtures import seeded, smooth_endmembers
+from unmix_plugin.errors import SpectrumError
+from unmix_plugin.spectral import nnls, spectral_angle, two_material_endmembers, two_material_fits
+from unmix_plugin.spectral.unmixing.two_material_mixtures import distances_to_pairs
+
+
+def surface_pixels(materials, seed=0, per_material=60, per_pair=30, noise=0.0):
+    """Pure pixels of each material and mixtures of every two, under random shading."""
+    generator = seeded(seed)
+    parts = [materials.repeat(per_material, 1)]
+    for first, second in combinations(range(len(materials)), 2):
+        share = torch.rand(per_pair, 1, dtype=torch.float64, generator=generator)
+        parts.append(share * materials[first] + (1 - share) * materials[second])
+    pixels = torch.cat(parts)
+    shading = 0.1 + 0.9 * torch.rand(len(pixels), 1, dtype=torch.float64, generator=generator)
+    spread = noise * torch.randn(pixels.shape, dtype=torch.float64, generator=generator)
+    return (shading * pixels + spread).clamp(min=1e-4)
+
+
+def worst_angle(found, materials):
+    return float(spectral_angle(materials[:, None], found[None]).amin(1).max())
+
+
+@settings(max_examples=15)
+@given(st.integers(1, 6), st.integers(0, 100))
+def test_materials_are_found_among_more_mixtures_under_any_shading(num_endmembers, seed):
+    materials = smooth_endmembers(num_endmembers)
+    found = two_material_endmembers(surface_pixels(materials, seed), num_endmembers, seeded(seed))
+    assert found.shape == materials.shape
+    assert worst_angle(found, materials) < 0.03
+
+
+def test_a_material_inside_the_cone_of_the_others_is_found():
+    corners = smooth_endmembers(3)
+    materials = torch.cat([corners, corners.mean(0, keepdim=True)])
+    # Nothing but the three corners is needed to explain every pixel, if three may be mixed.
+    pixels = surface_pixels(materials, noise=0.001)
+    assert worst_angle(two_material_endmembers(pixels, 4, seeded()), materials) < 0.03
+
+
+def test_a_mixture_that_fills_more_pixels_than_a_material_is_no_endmember():
+    materials = smooth_endmembers(3)
+    blend = (0.5 * materials[0] + 0.5 * materials[1]).repeat(600, 1)
+    pixels = torch.cat([surface_pixels(materials, noise=0.002), blend])
+    assert worst_angle(two_material_endmembers(pixels, 3, seeded()), materials) < 0.03
+
+
+@given(st.integers(0, 100))
+def test_distances_are_those_of_least_squares_on_each_pair(seed):
+    spectra = normalize(torch.rand(12, 6, dtype=torch.float64, generator=seeded(seed)), dim=1)
+    candidates, shapes = spectra[:4], spectra[4:]
+    distances = distances_to_pairs(shapes, candidates)
+    for first in range(4):
+        for second in range(4):
+            pair = candidates[sorted({first, second})]
+            expected = (shapes - nnls(shapes, pair) @ pair).norm(dim=1)
+            assert_close(distances[first, second].double(), expected, atol=1e-6, rtol=0)
+
+
+def test_the_search_finds_the_best_set_that_brute_force_finds():
+    generator = seeded(3)
+    pixels = torch.rand(9, 5, dtype=torch.float64, generator=generator)
+    shapes = normalize(pixels, dim=1)
+    distances = distances_to_pairs(shapes, shapes)
+    best = min(
+        float(distances[list(ids)][:, list(ids)].flatten(0, 1).amin(0).mean())
+        for ids in combinations(range(9), 3)
+    )
+    # Nine distinct pixels: every one is a candidate and a judge.
+    assert two_material_fits(pixels, 3, seeded())[-1].mean_distance == pytest.approx(best, abs=1e-6)
+
+
+def test_more_endmembers_never_explain_less():
+    pixels = torch.rand(300, 8, dtype=torch.float64, generator=seeded(1))
+    distances = [fit.mean_distance for fit in two_material_fits(pixels, 8, seeded())]
+    assert len(distances) == 8
+    assert all(after <= before + 1e-6 for before, after in pairwise(distances))
+    assert 0 < distances[-1] < distances[0] < math.pi / 2
+
+
+def test_endmembers_have_length_one_and_the_type_of_the_pixels():
+    found = two_material_endmembers(surface_pixels(smooth_endmembers(3)).float(), 3, seeded())
+    assert found.dtype == torch.float32
+    assert_close(found.norm(dim=1), torch.ones(3))
+
+
+def test_the_same_generator_gives_the_same_endmembers():
+    pixels = torch.rand(4000, 8, generator=seeded(1))
+    first, again = (two_material_endmembers(pixels, 4, seeded(5)) for _ in range(2))
+    assert torch.equal(first, again)
+
+
+def test_fewer_shapes_than_endmembers_are_refused():
+    pixels = smooth_endmembers(3).repeat(50, 1) * torch.linspace(0.1, 1, 150, dtype=torch.float64)[:, None]
+    assert len(two_material_fits(pixels, 5, seeded())) == 3
+    with pytest.raises(SpectrumError, match="only 3 distinct spectral shapes among 150 pixels: 4 endmembers"):
+        two_material_endmembers(pixels, 4, seeded())
+
+
+def test_numbers_out_of_range_are_refused():
+    pixels = torch.rand(100, 80, generator=seeded())
+    with pytest.raises(SpectrumError, match="1 to 64 endmembers; 65 were asked for"):
+        two_material_endmembers(pixels, 65, seeded())
+    with pytest.raises(SpectrumError, match="0 were asked for"):
+        two_material_endmembers(pixels, 0, seeded())
+
+
+def test_no_pixels_and_black_ones_are_refused():
+    with pytest.raises(SpectrumError, match="non-zero length"):
+        two_material_endmembers(torch.zeros(0, 4), 2, seeded())
+    with pytest.raises(SpectrumError, match="non-zero length; found 1 zero ones"):
+        two_material_endmembers(torch.tensor([[0.0, 0.0], [0.1, 0.2], [0.2, 0.1]]), 2, seeded())

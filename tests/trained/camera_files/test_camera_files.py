@@ -1,0 +1,186 @@
+"""Camera files: what is read, that what is written comes back, and what is refused."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from tests.scenes.scene_factory import look_at
+from tests.trained.camera_files.camera_scenes import FRAME, around
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.trained.camera_files.camera_files import camera_file_bytes, read_camera_file
+from unmix_plugin.trained.run_views import RunView
+
+POSE = look_at(np.array([1.0, -3.0, 2.0]), np.zeros(3))
+
+
+def nerfstudio(**changes):
+    """A camera_path.json as nerfstudio's viewer saves it."""
+    entry = {"camera_to_world": POSE.reshape(-1).tolist(), "fov": 50.0, "aspect": 1.6}
+    return {
+        "camera_type": "perspective",
+        "render_height": 60,
+        "render_width": 96,
+        "fps": 30,
+        "seconds": 4,
+        "is_cycle": False,
+        "keyframes": [],
+        "camera_path": [entry, {**entry, "fov": 25.0}],
+        "crop": None,
+        **changes,
+    }
+
+
+def frames(**changes):
+    """A transforms.json with two views."""
+    entries = [
+        {"file_path": f"images/{name}.png", "transform_matrix": POSE.tolist()} for name in ("a", "b c")
+    ]
+    return {"w": 96, "h": 60, "fl_x": 70.0, "frames": entries, **changes}
+
+
+def written(tmp_path, content):
+    path = tmp_path / "path.json"
+    path.write_text(content if isinstance(content, str) else json.dumps(content), encoding="utf-8")
+    return path
+
+
+def test_nerfstudios_camera_path_is_read_in_model_space(tmp_path):
+    found = read_camera_file(written(tmp_path, nerfstudio()), FRAME)
+    assert [view.name for view in found.views] == ["frame_0000", "frame_0001"]
+    assert found.frames_per_second == 30
+    camera = found.views[0].camera
+    assert (camera.width, camera.height) == (96, 60)
+    np.testing.assert_allclose(camera.camera_to_world[0], POSE[:3], atol=1e-6)
+    # The field of view is the vertical one: half a picture above the middle is seen at half its angle.
+    ray = camera.image_rays(0, (0.5, 0.0)).directions[48]
+    up, forward = torch.tensor(POSE[:3, 1]).float(), -torch.tensor(POSE[:3, 2]).float()
+    assert math.degrees(math.atan2(float(ray @ up), float(ray @ forward))) == pytest.approx(25.0, abs=1e-2)
+    assert found.views[1].camera.focal_px[0, 0] > 2 * camera.focal_px[0, 0]
+
+
+def test_frames_are_read_in_the_scenes_own_world(tmp_path):
+    found = read_camera_file(written(tmp_path, frames()), FRAME)
+    assert [view.name for view in found.views] == ["a", "b_c"]
+    assert found.frames_per_second is None
+    camera = found.views[0].camera
+    np.testing.assert_allclose(camera.camera_to_world[0, :, 3], FRAME.to_model(POSE[:3, 3]), atol=1e-6)
+    np.testing.assert_allclose(camera.camera_to_world[0, :, :3], FRAME.rotation @ POSE[:3, :3], atol=1e-6)
+    torch.testing.assert_close(camera.center_px, torch.tensor([[48.0, 30.0]]))
+
+
+def test_frames_may_be_in_model_space_and_are_a_path_if_they_have_a_speed(tmp_path):
+    found = read_camera_file(written(tmp_path, frames(space="model", fps=12.5)), FRAME)
+    np.testing.assert_allclose(found.views[0].camera.camera_to_world[0], POSE[:3], atol=1e-6)
+    assert found.frames_per_second == 12.5
+
+
+@pytest.mark.parametrize("frames_per_second", [None, 24.0])
+def test_what_is_written_is_read_back_as_the_same_cameras(tmp_path, frames_per_second):
+    cameras = around(3)
+    odd = type(cameras)(
+        cameras.camera_to_world,
+        torch.tensor([[50.0, 51.5]] * 3),
+        torch.tensor([[19.0, 15.25]] * 3),
+        torch.tensor([[0.1, -0.02, 0.003, -0.004]] * 3),
+        40,
+        30,
+    )
+    views = [RunView(f"v.{index}", odd[index]) for index in range(3)]
+    path = tmp_path / "cameras.json"
+    path.write_bytes(camera_file_bytes(views, frames_per_second, FRAME))
+    found = read_camera_file(path, FRAME)
+    assert found.frames_per_second == frames_per_second
+    for view, again in zip(views, found.views, strict=True):
+        assert again.name == view.name
+        for part in ("camera_to_world", "focal_px", "center_px", "distortion"):
+            torch.testing.assert_close(
+                getattr(again.camera, part), getattr(view.camera, part), atol=1e-6, rtol=0
+            )
+
+
+def scaled(matrix):
+    return (np.array(matrix) * 1.1).tolist()
+
+
+BAD = {
+    "empty": ("", "is empty"),
+    "blank": (" \n", "is empty"),
+    "cut short": ('{"frames": [', "is not valid JSON .* at line 1"),
+    "no object": ("[1, 2]", "holds a list of 2; expected an object with cameras"),
+    "something else": ({"wavelengths": [1]}, "is no camera file: .* found the keys wavelengths"),
+    "newer": (frames(format_version=2), "has format_version 2; this version reads 1"),
+    "version of no kind": (frames(format_version="x"), 'has format_version "x"'),
+    "no cameras": (nerfstudio(camera_path=[]), "'camera_path' is empty; expected at least one camera"),
+    "no frames": (frames(frames=[]), "'frames' is empty"),
+    "cameras no list": (nerfstudio(camera_path=3), "'camera_path' is 3; expected a list"),
+    "camera no object": (nerfstudio(camera_path=[3]), r"camera_path\[0\] is 3; expected an object"),
+    "fisheye": (nerfstudio(camera_type="fisheye"), 'camera_type "fisheye" is not supported'),
+    "crop": (nerfstudio(crop={"crop_scale": [1, 1, 1]}), "'crop' is not supported; take it out"),
+    "no size": (nerfstudio(render_width=None), "'render_width' is null; expected a number"),
+    "size 0": (nerfstudio(render_width=0), "0 x 60 pixels; expected whole numbers from 1 to 16384"),
+    "half pixels": (nerfstudio(render_height=60.5), "96 x 60.5 pixels"),
+    "absurd size": (nerfstudio(render_height=1e9), "96 x 1e[+]09 pixels"),
+    "absurd size of a frame": (frames(w=100_000), r"frames\[0\]: 100000 x 60 pixels"),
+    "sizes that differ": (
+        frames(frames=[{"transform_matrix": POSE.tolist()}, {"transform_matrix": POSE.tolist(), "w": 50}]),
+        r"sizes \[\(50, 60\), \(96, 60\)\]; expected one size",
+    ),
+    "no size of frames": (frames(w=None), r"frames\[0\]: 'w' and 'h' are absent"),
+    "no lens": (frames(fl_x=None), "'fl_x' is absent"),
+    "lens of no kind": (frames(camera_model="EQUIRECTANGULAR"), '"EQUIRECTANGULAR" is not supported'),
+    "fov": (
+        nerfstudio(camera_path=[{"camera_to_world": POSE.reshape(-1).tolist(), "fov": 180}]),
+        r"camera_path\[0\]: 'fov' is 180; expected degrees between 0 and 180",
+    ),
+    "speed": (nerfstudio(fps=0), "'fps': 0.0 frames a second; expected a number above 0"),
+    "speed of no kind": (frames(fps="fast"), "'fps': None frames a second"),
+    "space": (frames(space="outer"), "'space' is \"outer\"; expected world or model"),
+    "names": (
+        frames(frames=[{"name": "a", "transform_matrix": POSE.tolist()}] * 2),
+        "two frames have one name",
+    ),
+    "scaled": (
+        nerfstudio(
+            camera_path=[{"camera_to_world": [*scaled(POSE.reshape(-1)[:12]), 0, 0, 0, 1], "fov": 50}]
+        ),
+        r"camera_path\[0\]: 'camera_to_world' is not rigid: its axes have lengths \(1.1, 1.1, 1.1\)",
+    ),
+    "15 numbers": (
+        nerfstudio(camera_path=[{"camera_to_world": [1.0] * 15, "fov": 50}]),
+        "'camera_to_world' is a list of 15; expected 4",
+    ),
+    "mirrored": (
+        frames(frames=[{"transform_matrix": (POSE @ np.diag([1, 1, -1, 1.0])).tolist()}]),
+        r"frames\[0\]: 'transform_matrix' is a reflection",
+    ),
+    "projective": (
+        frames(frames=[{"transform_matrix": [*POSE[:3].tolist(), [0, 0, 1, 1]]}]),
+        r"its last row is \(0, 0, 1, 1\)",
+    ),
+    "no pose": (frames(frames=[{}]), "'transform_matrix' is absent"),
+}
+
+
+@pytest.mark.parametrize("fault", BAD)
+def test_a_file_that_cannot_be_used_is_refused_in_one_sentence_that_names_it(tmp_path, fault):
+    content, said = BAD[fault]
+    path = written(tmp_path, content)
+    with pytest.raises(ConfigError, match=said) as caught:
+        read_camera_file(path, FRAME)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(ConfigError, match=r"can't read the camera file .*none\.json: No such file"):
+        read_camera_file(tmp_path / "none.json", FRAME)
+
+
+def test_a_file_that_is_no_text_is_refused(tmp_path):
+    path = tmp_path / "path.json"
+    path.write_bytes(b"\xff\xfe\x00 not text \x80")
+    with pytest.raises(ConfigError, match="is not readable as JSON"):
+        read_camera_file(path, FRAME)

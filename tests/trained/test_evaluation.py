@@ -1,0 +1,218 @@
+"""The evaluation of a scene: perfect predictions, what counts, what has no truth."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from unmix_plugin.scenes.demo.scene import make_demo_scene
+from unmix_plugin.scenes.reading.loader import load_scene
+from unmix_plugin.scenes.scene import SceneOptions
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.metrics import abundance_rmse, psnr, sam
+from unmix_plugin.trained.evaluation import (
+    VIEW_FIGURES,
+    Evaluation,
+    SceneTruth,
+    ViewTruth,
+    finite_or_none,
+    scene_truth,
+    view_truth,
+)
+from unmix_plugin.trained.view_rendering import RenderedView
+
+SHUFFLED = [2, 0, 1]
+
+
+@pytest.fixture
+def scene() -> SceneTruth:
+    """Three materials in five bands."""
+    endmembers = torch.tensor(
+        [[0.9, 0.1, 0.1, 0.2, 0.3], [0.1, 0.8, 0.3, 0.1, 0.1], [0.2, 0.2, 0.2, 0.9, 0.6]]
+    )
+    return SceneTruth(Bands.of([450, 500, 550, 600, 650]), 3, endmembers.double(), ("a", "b", "c"))
+
+
+@pytest.fixture
+def view(scene: SceneTruth) -> ViewTruth:
+    """Stripes of the materials, mixed a little, half covered along one edge, nothing beyond it."""
+    assert scene.endmembers is not None
+    labels = (torch.arange(12) // 4).to(torch.uint8).repeat(10, 1)
+    abundances = 0.8 * torch.nn.functional.one_hot(labels.long(), 3).float() + 0.2 / 3
+    alpha = torch.ones(10, 12)
+    alpha[0], alpha[1] = 0.0, 0.5
+    abundances[0] = 0
+    labels[:2] = 255
+    spectra = (alpha[..., None] * abundances).double() @ scene.endmembers
+    return ViewTruth("view", spectra.float(), torch.ones(10, 12, dtype=torch.bool), alpha, labels, abundances)
+
+
+def perfect(view: ViewTruth, order: list[int]) -> RenderedView:
+    """What a model renders that knows the truth, its endmembers numbered in another order."""
+    assert view.labels is not None
+    assert view.abundances is not None
+    position = torch.zeros(256, dtype=torch.uint8)
+    position[order] = torch.arange(len(order), dtype=torch.uint8)
+    position[255] = 255
+    composited = (view.abundances * view.opacity[..., None])[..., order]
+    return RenderedView(view.spectra, view.opacity, composited, position[view.labels.long()], composited)
+
+
+def evaluated(scene: SceneTruth, view: ViewTruth, predicted: RenderedView, order: list[int]) -> Evaluation:
+    """An evaluation of one view."""
+    assert scene.endmembers is not None
+    evaluation = Evaluation(scene, scene.endmembers[order])
+    evaluation.add(view, predicted)
+    return evaluation
+
+
+def test_a_perfect_prediction_has_no_error_whatever_the_order_of_its_endmembers(scene, view):
+    figures = evaluated(scene, view, perfect(view, SHUFFLED), SHUFFLED).figures()
+    assert figures["psnr"] == figures["rgb_psnr"] == math.inf
+    for name in ("rmse", "sam", "abundance_rmse", "endmember_angle"):
+        assert figures[name] == pytest.approx(0.0, abs=1e-7), name
+    for name in ("ssim", "miou", "macro_f1", "accuracy"):
+        assert figures[name] == pytest.approx(1.0), name
+    assert (figures["views"], figures["bands"]) == (1, 5)
+    assert finite_or_none(figures)["psnr"] is None
+
+
+def test_a_real_scene_predicted_by_its_own_truth_has_angle_0_and_miou_1(tmp_path):
+    make_demo_scene(tmp_path, 16, 8, 4)
+    scene = load_scene(tmp_path, SceneOptions())
+    truth = scene_truth(scene)
+    assert truth.endmembers is not None
+    evaluation = Evaluation(truth, truth.endmembers)
+    for index in scene.eval_indices:
+        view = view_truth(scene, index)
+        evaluation.add(view, perfect(view, list(range(len(truth.endmembers)))))
+    figures = evaluation.figures()
+    assert figures["sam"] == pytest.approx(0.0, abs=1e-7)
+    assert (figures["miou"], figures["accuracy"]) == (1.0, 1.0)
+    assert figures["abundance_rmse"] < 2e-3  # true abundances are stored as float16
+    assert figures["views"] == len(scene.eval_indices)
+
+
+def test_figures_without_truth_are_unknown_and_the_others_stay(scene, view):
+    untold_scene = SceneTruth(scene.bands, 0)
+    untold_view = ViewTruth("view", view.spectra, view.valid)
+    evaluation = Evaluation(untold_scene, scene.endmembers)
+    evaluation.add(untold_view, replace(perfect(view, [0, 1, 2]), spectra=view.spectra * 0.9))
+    figures = finite_or_none(evaluation.figures())
+    unknown = {"miou", "macro_f1", "accuracy", "abundance_rmse", "endmember_angle"}
+    assert {name for name, value in figures.items() if value is None} == unknown
+
+
+def test_a_shift_of_brightness_costs_psnr_but_no_angle(scene, view):
+    predicted = replace(perfect(view, [0, 1, 2]), spectra=view.spectra * 0.5)
+    figures = evaluated(scene, view, predicted, [0, 1, 2]).figures()
+    assert figures["psnr"] == pytest.approx(psnr(view.spectra * 0.5, view.spectra))
+    assert figures["psnr"] < 20
+    assert figures["sam"] == pytest.approx(0.0, abs=1e-7)
+
+
+def test_the_angle_counts_labelled_or_opaque_pixels_only(scene, view):
+    spectra = view.spectra.clone()
+    spectra[:2] = spectra[:2].flip(-1)  # half covered and empty pixels
+    evaluation = evaluated(scene, view, replace(perfect(view, [0, 1, 2]), spectra=spectra), [0, 1, 2])
+    assert evaluation.figures()["sam"] == pytest.approx(0.0, abs=1e-7)
+    labels = torch.zeros_like(view.labels)
+    labelled = evaluated(
+        scene,
+        replace(view, labels=labels),
+        replace(perfect(view, [0, 1, 2]), spectra=spectra),
+        [0, 1, 2],
+    )
+    assert labelled.figures()["sam"] == pytest.approx(sam(spectra, view.spectra))
+    assert labelled.figures()["sam"] > 0.01
+
+
+def test_invalid_pixels_count_for_nothing(scene, view):
+    valid = view.valid.clone()
+    valid[4:6] = False
+    predicted = perfect(view, SHUFFLED)
+    spoilt = replace(
+        predicted,
+        spectra=torch.where(valid[..., None], predicted.spectra, 1 - predicted.spectra),
+        accumulation=torch.where(valid, predicted.accumulation, 1 - predicted.accumulation),
+        abundances=torch.where(valid[..., None], predicted.abundances, 1 - predicted.abundances),
+        segmentation=torch.where(valid, predicted.segmentation, (predicted.segmentation + 1) % 3),
+    )
+    figures = evaluated(scene, replace(view, valid=valid), spoilt, SHUFFLED).figures()
+    for name in ("rmse", "sam", "abundance_rmse"):
+        assert figures[name] == pytest.approx(0.0, abs=1e-7), name
+    assert figures["miou"] == 1.0
+    assert evaluated(scene, view, spoilt, SHUFFLED).figures()["miou"] < 1
+
+
+def test_abundances_of_partly_covered_pixels_are_compared_as_shares(scene, view):
+    """Row 1 is half covered: composited abundances sum to 0.5 there, true ones to 1, and that is no error."""
+    predicted = perfect(view, [0, 1, 2])
+    assert float(predicted.abundances[1].sum(-1).max()) == pytest.approx(0.5)
+    assert evaluated(scene, view, predicted, [0, 1, 2]).figures()["abundance_rmse"] == pytest.approx(
+        0, abs=1e-7
+    )
+
+
+def test_missing_matter_is_an_error_of_its_abundances(scene, view):
+    predicted = perfect(view, [0, 1, 2])
+    thin = replace(
+        predicted, accumulation=predicted.accumulation * 0.25, abundances=predicted.abundances * 0.25
+    )
+    evaluation = evaluated(scene, view, thin, [0, 1, 2])
+    assert evaluation.matching is not None
+    counted = view.opacity >= 0.5
+    expected = abundance_rmse(view.abundances * 0.25, view.abundances, evaluation.matching, counted)
+    assert evaluation.figures()["abundance_rmse"] == pytest.approx(expected, rel=1e-6)
+    assert expected > 0.3
+
+
+def test_segmentation_is_matched_once_over_all_views(scene, view):
+    """Ids swapped in one of two views cannot both be right: a matching a view would call both perfect."""
+    order, swapped = [0, 1, 2], [1, 0, 2]
+    evaluation = Evaluation(scene, scene.endmembers)
+    evaluation.add(view, perfect(view, order))
+    evaluation.add(
+        replace(view, name="other"),
+        replace(perfect(view, order), segmentation=perfect(view, swapped).segmentation),
+    )
+    figures = evaluation.figures()
+    assert figures["accuracy"] == pytest.approx(4 / 6)
+    assert figures["miou"] == pytest.approx((1 / 3 + 1 / 3 + 1) / 3)
+
+
+def test_means_are_over_views_that_have_the_figure(scene, view):
+    evaluation = Evaluation(scene, scene.endmembers)
+    dim = replace(perfect(view, [0, 1, 2]), abundances=perfect(view, [0, 1, 2]).abundances * 0.5)
+    first = evaluation.add(view, dim)["abundance_rmse"]
+    assert first > 0.1
+    second = evaluation.add(replace(view, name="other", abundances=None), dim)["abundance_rmse"]
+    assert math.isnan(second)
+    assert evaluation.figures()["abundance_rmse"] == pytest.approx(first)
+    assert set(evaluation.per_view) == {"view", "other"}
+    assert tuple(evaluation.per_view["view"]) == VIEW_FIGURES
+
+
+def test_images_too_small_for_its_window_have_no_ssim(scene):
+    spectra = torch.rand(6, 9, 5)
+    view = ViewTruth("small", spectra, torch.ones(6, 9, dtype=torch.bool))
+    blank = torch.zeros(6, 9)
+    predicted = RenderedView(
+        spectra, blank, torch.zeros(6, 9, 3), blank.to(torch.uint8), torch.zeros(6, 9, 3)
+    )
+    evaluation = Evaluation(scene, scene.endmembers)
+    assert math.isnan(evaluation.add(view, predicted)["ssim"])
+    assert finite_or_none(evaluation.figures())["ssim"] is None
+
+
+def test_true_endmembers_are_reflectances_in_the_light_of_the_scene(tmp_path):
+    make_demo_scene(tmp_path, 16, 8, 4)
+    scene = load_scene(tmp_path, SceneOptions())
+    lit = scene_truth(scene).endmembers
+    flat = scene_truth(replace(scene, illuminant=None)).endmembers
+    assert scene.illuminant is not None
+    assert lit is not None
+    assert flat is not None
+    torch.testing.assert_close(lit, flat * torch.from_numpy(scene.illuminant), rtol=1e-6, atol=0)
+    assert not torch.allclose(lit, flat, rtol=1e-2)

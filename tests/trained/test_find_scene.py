@@ -1,0 +1,78 @@
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.scenes.scene_factory import make_scene
+from unmix_plugin.errors import RunError, SceneError
+from unmix_plugin.scenes import SceneOptions, load_scene
+from unmix_plugin.trained.find_scene import scene_at_hand
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return make_scene(tmp_path_factory.mktemp("scene") / "ball").root
+
+
+@pytest.fixture
+def copy(folder, tmp_path):
+    return shutil.copytree(folder, tmp_path / "copy")
+
+
+def run_on(root):
+    """What a run remembers of a scene."""
+    return json.loads(json.dumps(load_scene(root, SceneOptions()).summary()))
+
+
+def find(summary, data=None):
+    return scene_at_hand(summary, Path("/runs/this"), data)
+
+
+def test_a_scene_that_is_where_it_was_is_found(folder):
+    scene = find(run_on(folder))
+    assert scene is not None
+    assert scene.root == folder
+    assert scene.cube(0).max() > 0
+
+
+def test_a_scene_that_is_gone_is_not_at_hand(copy):
+    run = run_on(copy)
+    shutil.rmtree(copy)
+    assert find(run) is None
+
+
+def test_a_scene_that_has_moved_is_found_where_it_is_said_to_be(copy, tmp_path):
+    run = run_on(copy)
+    moved = copy.rename(tmp_path / "moved")
+    scene = find(run, moved)
+    assert scene is not None
+    assert scene.root == moved
+    assert find(run) is None
+
+
+def changed(root):
+    path = root / "cubes" / "view_0.npy"
+    np.save(path, np.load(path) * np.float16(0.5))
+
+
+def test_a_scene_that_was_changed_is_not_the_runs(copy):
+    run = run_on(copy)
+    changed(copy)
+    assert find(run) is None
+    with pytest.raises(RunError, match=r"is not the one that /runs/this was trained on: input_hashes differ"):
+        find(run, copy)
+
+
+def test_a_scene_that_is_damaged_is_passed_over_unless_it_was_named(copy):
+    run = run_on(copy)
+    (copy / "transforms.json").write_text("{")
+    assert find(run) is None
+    with pytest.raises(SceneError):
+        find(run, copy)
+
+
+def test_a_run_that_kept_no_root_has_no_scene_at_hand(folder):
+    for root in (None, "relative/place"):
+        assert find({**run_on(folder), "root": root}) is None

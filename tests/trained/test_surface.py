@@ -1,0 +1,116 @@
+import numpy as np
+import pytest
+import torch
+
+from tests.products.ball_model import (
+    ALL_ROUND,
+    FROM_ABOVE,
+    RADIUS,
+    SHADE,
+    ball_model,
+    cameras_around,
+)
+from unmix_plugin.trained.surface import SeenSurface, look_from_above
+
+MODEL = ball_model()
+
+
+def seen(directions, model=MODEL, num_rays=12_000):
+    cameras = cameras_around(directions)
+    surface = SeenSurface(model, num_rays, cameras)
+    for camera in cameras:
+        surface.look(camera)
+    return surface
+
+
+@pytest.fixture(scope="module")
+def ball():
+    return seen(ALL_ROUND)
+
+
+def test_points_lie_on_the_surface_and_cover_all_that_is_seen(ball):
+    points = ball.points()
+    radii = points.positions.norm(dim=-1)
+    assert len(points) > 1000
+    assert float((radii - RADIUS).abs().max()) < 0.04
+    assert float(radii.mean()) == pytest.approx(RADIUS, abs=0.01)
+    octants = {tuple(row) for row in (points.positions > 0).tolist()}
+    assert len(octants) == 8
+
+
+def test_points_carry_the_mixture_and_the_light_of_their_surface(ball):
+    points = ball.points()
+    clear = points.positions[:, 2].abs() > 0.05
+    above = (points.positions[:, 2] > 0)[clear]
+    torch.testing.assert_close(points.abundances[clear, 0], above.float(), atol=5e-3, rtol=0)
+    torch.testing.assert_close(points.abundances.sum(dim=-1), torch.ones(len(points)), atol=1e-4, rtol=0)
+    expected = SHADE * points.abundances @ MODEL.materials.endmembers
+    torch.testing.assert_close(points.diffuse, expected, atol=1e-4, rtol=0)
+
+
+def test_directions_lead_from_a_camera_to_the_point(ball):
+    points = ball.points()
+    origins = torch.tensor(ALL_ROUND, dtype=torch.float32)
+    origins = 3 * origins / origins.norm(dim=-1, keepdim=True)
+    towards = torch.nn.functional.normalize(points.positions[:, None] - origins, dim=-1)
+    cosines = (towards * points.directions[:, None]).sum(dim=-1).max(dim=1).values
+    torch.testing.assert_close(cosines, torch.ones(len(points)), atol=1e-4, rtol=0)
+
+
+def test_rays_that_end_in_the_air_between_two_surfaces_give_no_points():
+    model = ball_model(has_wall=True)
+    cameras = [(-1.0, y, z) for y in (-0.6, 0.0, 0.6) for z in (-0.5, 0.5)]
+    surface = seen(cameras, model, num_rays=20_000)
+    everything = torch.cat([part.positions for part in surface._points])
+    points = surface.points().positions
+
+    def off(positions):
+        """Distance to the nearer of ball and wall."""
+        to_ball, to_wall = (positions.norm(dim=-1) - RADIUS).abs(), (positions[:, 0] - 0.8).abs()
+        return torch.minimum(to_ball, to_wall)
+
+    assert float(off(everything).max()) > 0.1, "without points in the air this test shows nothing"
+    assert (off(points) < 0.08).float().mean() > 0.995
+    assert len(points) > 0.9 * len(everything)
+
+
+def test_only_what_a_camera_sees_counts_as_seen(ball):
+    places = torch.tensor(
+        [[0.0, 0.0, 0.6], [0.0, 0.0, -0.6], [0.0, 0.0, 0.35], [0.0, 0.0, 0.0], [0.5, 0.5, 0.5]]
+    )
+    assert ball.shows(places).tolist() == [True, True, False, False, False]
+    assert seen(FROM_ABOVE).shows(places).tolist() == [True, False, False, False, False]
+
+
+def test_hidden_is_what_lies_behind_a_surface_for_every_camera(ball):
+    """The middle and a place just inside are; places on the surface and in the air aren't, nor what no image shows."""
+    places = torch.tensor(
+        [[0.0, 0.0, 0.0], [0.0, 0.0, 0.35], [0.0, 0.0, 0.6], [0.5, 0.5, 0.5], [0.0, 0.0, -50.0]]
+    )
+    assert ball.hides(places).tolist() == [True, True, False, False, False]
+    below = torch.tensor([[0.0, 0.0, -0.6]])
+    assert seen(FROM_ABOVE).hides(below).tolist() == [True]
+    assert ball.hides(below).tolist() == [False]
+
+
+def test_the_number_of_rays_is_what_was_asked_for_whatever_the_image_size():
+    for num_rays in (4_000, 30_000):
+        surface = seen(FROM_ABOVE, num_rays=num_rays)
+        cast = sum(distances.numel() for _, distances in surface._views)
+        assert cast == pytest.approx(num_rays, rel=0.25)
+
+
+def test_a_single_camera_gives_points_without_a_second_witness():
+    points = seen([(1.0, 0.0, 0.2)], num_rays=1600).points()
+    assert len(points) > 100
+    assert float((points.positions.norm(dim=-1) - RADIUS).abs().max()) < 0.04
+
+
+def test_from_straight_above_a_point_looks_as_its_surface():
+    normals = torch.nn.functional.normalize(torch.tensor([[0.1, 0.2, 0.9], [0.3, 0.1, -0.8]]), dim=-1)
+    abundances, diffuse = look_from_above(MODEL, RADIUS * normals, normals)
+    torch.testing.assert_close(abundances, torch.tensor([[1.0, 0, 0], [0, 1, 0]]), atol=1e-4, rtol=0)
+    torch.testing.assert_close(diffuse, SHADE * MODEL.materials.endmembers[:2].detach(), atol=1e-3, rtol=0)
+    nothing, light = look_from_above(MODEL, torch.zeros(0, 3), torch.zeros(0, 3))
+    assert (nothing.shape, light.shape) == ((0, 3), (0, 5))
+    assert np.isfinite(diffuse.numpy()).all()

@@ -1,0 +1,68 @@
+"""What a user has chosen stays within bounds, whatever a browser sends."""
+
+import math
+from dataclasses import fields
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from unmix_plugin.spectral.maps.index_formula import MAX_LENGTH
+from unmix_plugin.viewer.layers.layer_settings import EXPOSURE_BOUNDS, GAMMA_BOUNDS, LayerSettings
+from unmix_plugin.viewer.layers.painting import BACKGROUNDS, COLOUR_MAPS
+from unmix_plugin.viewer.layers.view_transforms import VIEW_TRANSFORMS
+
+names = st.sampled_from([entry.name for entry in fields(LayerSettings)])
+anything = st.recursive(
+    st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text()),
+    lambda inner: st.lists(inner, max_size=4),
+    max_leaves=6,
+)
+
+
+@given(names, anything)
+def test_settings_are_always_valid(name, value):
+    settings = LayerSettings().changed(name, value)
+    assert isinstance(settings.layer, str)
+    assert EXPOSURE_BOUNDS[0] <= settings.exposure_ev <= EXPOSURE_BOUNDS[1]
+    assert GAMMA_BOUNDS[0] <= settings.gamma <= GAMMA_BOUNDS[1]
+    assert settings.background in BACKGROUNDS
+    assert settings.colour_map in COLOUR_MAPS
+    assert settings.view_transform in VIEW_TRANSFORMS
+    assert all(math.isfinite(value) for value in (settings.wavelength_nm, *settings.false_colour_nm))
+    assert 0 <= settings.endmember < 255
+    assert len(settings.index) <= 1000
+    assert settings.value_range is None or settings.value_range[0] < settings.value_range[1]
+
+
+def test_sound_values_are_taken_as_they_are():
+    settings = LayerSettings()
+    for name, value in {
+        "layer": "pca",
+        "wavelength_nm": 610.0,
+        "false_colour_nm": (700.0, 600.0, 500.0),
+        "endmember": 4,
+        "index": "(r800-r670)/(r800+r670)",
+        "colour_map": "magma",
+        "value_range": (-1.0, 2.0),
+        "exposure_ev": -2.5,
+        "gamma": 2.2,
+        "view_transform": "agx",
+        "background": "black",
+    }.items():
+        settings = settings.changed(name, value)
+        assert getattr(settings, name) == value
+    assert settings.changed("value_range", None).value_range is None
+
+
+def test_a_range_that_is_none_leaves_the_one_before():
+    settings = LayerSettings().changed("value_range", (0.0, 2.0))
+    for nonsense in ((2.0, 1.0), (math.nan, 1.0), "ab", 3, (1.0,)):
+        assert settings.changed("value_range", nonsense).value_range == (0.0, 2.0)
+
+
+def test_a_formula_that_is_too_long_stays_too_long_rather_than_becoming_another_one():
+    cut = LayerSettings().changed("index", "r600" + " " * 900 + "+r650" * 400)
+    assert len(cut.index) == 1000 > MAX_LENGTH
+    kept = LayerSettings().changed("index", "r600" + " " * 2000 + "/ r650")
+    assert kept.index == "r600 / r650"
+    assert kept.changed("index", 3.0).index == "r600 / r650"

@@ -1,0 +1,243 @@
+"""Layers are pictures of the coefficients and nothing else; where outputs of renders exist, they agree with those."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from tests.viewer.view_factory import make_aids, make_frame, make_source
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.spectral.colour.conversion import band_composite_matrix, linear_to_srgb
+from unmix_plugin.spectral.composition import Coefficients, compose
+from unmix_plugin.trained.run_materials import endmember_colours
+from unmix_plugin.viewer.layers.layer_settings import LayerSettings
+from unmix_plugin.viewer.layers.layers import (
+    LAYERS,
+    band_values,
+    layer_named,
+    linear_light,
+    linear_spectra,
+    paint_layer,
+)
+from unmix_plugin.viewer.layers.painting import (
+    BACKGROUNDS,
+    ColourMapLegend,
+    SwatchLegend,
+    TextLegend,
+    colour_table,
+)
+
+PAINTED = [name for name in LAYERS if name != "error"]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A frame of which every pixel is somewhere between empty and solid, and what layers need."""
+    source = make_source(tmp_path_factory.mktemp("run"))
+    return make_frame(source), make_aids(source)
+
+
+@pytest.fixture(scope="module")
+def frame(scene):
+    return scene[0]
+
+
+@pytest.fixture(scope="module")
+def aids(scene):
+    return scene[1]
+
+
+def painted(frame, aids, layer, **settings) -> tuple[Any, Any]:
+    """The picture of a layer, and its legend."""
+    return paint_layer(frame, replace(LayerSettings(layer=layer, index="r600/r500"), **settings), aids)
+
+
+def solid(frame):
+    """The same view as if every ray ended fully on what it meets."""
+    part = frame.coefficients.accumulation.clamp(min=1e-6)
+    values = {
+        name: value / (part if value.ndim == 2 else part[..., None])
+        for name, value in vars(frame.coefficients).items()
+    }
+    values["accumulation"] = torch.ones_like(part)
+    return replace(frame, coefficients=Coefficients(**values))
+
+
+@pytest.mark.parametrize("layer", PAINTED)
+def test_every_layer_is_a_picture_that_shows_something(frame, aids, layer):
+    picture, legend = painted(frame, aids, layer)
+    height, width = frame.coefficients.accumulation.shape
+    assert picture.shape == (height, width, 3)
+    assert picture.isfinite().all()
+    assert float(picture.min()) >= 0
+    assert float(picture.max()) <= 1
+    assert picture.flatten(0, 1).std(dim=0).max() > 0.01
+    assert isinstance(legend, ColourMapLegend | SwatchLegend | TextLegend)
+
+
+def test_colour_is_the_output_of_renders(frame, aids):
+    opaque = solid(frame)
+    expected = compose("rgb", opaque.coefficients, opaque.materials)
+    picture, legend = painted(opaque, aids, "rgb")
+    assert_close(picture, expected, atol=1e-5, rtol=0)
+    assert legend.text.startswith("true colour")
+
+
+def test_light_through_a_matrix_is_light_of_the_spectra(frame):
+    materials = frame.materials
+    matrix = band_composite_matrix(materials.bands, (650, 550, 450))
+    spectra = compose("spectral", frame.coefficients, materials)
+    assert_close(linear_light(frame, matrix), spectra @ matrix, atol=1e-6, rtol=1e-5)
+    for part in ("diffuse", "specular"):
+        light = linear_light(frame, matrix, part == "diffuse", part == "specular")
+        assert_close(light, compose(part, frame.coefficients, materials) @ matrix, atol=1e-6, rtol=1e-5)
+    pixels = torch.tensor([3, 50, 200])
+    assert_close(linear_spectra(frame, pixels), spectra.flatten(0, 1)[pixels], atol=1e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("wavelength", [450.0, 520.0, 650.0])
+def test_a_band_is_the_output_of_renders(frame, wavelength):
+    materials = frame.materials
+    values = band_values(frame, materials.bands.nearest(wavelength))
+    expected = compose(f"band:{wavelength:g}", frame.coefficients, materials)
+    assert_close(values, expected, atol=1e-6, rtol=1e-5)
+
+
+def test_a_band_is_painted_by_its_value_between_the_ends_of_the_scale(frame, aids):
+    opaque = solid(frame)
+    picture, legend = painted(
+        opaque, aids, "band", wavelength_nm=550.0, value_range=(0.0, 2.0), colour_map="gray"
+    )
+    values = band_values(opaque, opaque.materials.bands.nearest(550.0))
+    assert_close(picture[..., 0], (values / 2).clamp(0, 1), atol=4e-3, rtol=0)
+    assert (legend.low, legend.high, legend.colour_map) == (0.0, 2.0, "gray")
+    assert "550 nm" in legend.label
+
+
+def test_wavelengths_beyond_the_bands_show_the_outermost_band(frame, aids):
+    for wavelength, band in ((1.0, 0), (99_999.0, len(frame.materials.bands) - 1)):
+        picture, legend = painted(frame, aids, "band", wavelength_nm=wavelength)
+        expected, _ = painted(
+            frame, aids, "band", wavelength_nm=float(frame.materials.bands.centers_nm[band])
+        )
+        assert_close(picture, expected)
+        assert f"{frame.materials.bands.centers_nm[band]:.0f} nm" in legend.label
+
+
+def test_false_colour_names_the_bands_that_it_shows(frame, aids):
+    _, legend = painted(frame, aids, "false-colour", false_colour_nm=(649.0, 551.0, 449.0))
+    assert legend.text == "red 650 nm, green 550 nm, blue 450 nm"
+
+
+def test_an_abundance_is_the_share_of_what_is_seen(frame, aids):
+    opaque = solid(frame)
+    picture, legend = painted(opaque, aids, "abundance", endmember=1, colour_map="gray")
+    assert_close(picture[..., 1], opaque.coefficients.abundances[..., 1], atol=4e-3, rtol=0)
+    assert legend.label == "abundance of endmember_1"
+
+
+def test_an_endmember_that_is_not_there_is_the_last(frame, aids):
+    last, _ = painted(frame, aids, "abundance", endmember=len(frame.materials.names) - 1)
+    beyond, _ = painted(frame, aids, "abundance", endmember=200)
+    assert_close(beyond, last)
+
+
+def test_pure_pixels_have_the_colours_of_all_figures(frame, aids):
+    count = len(frame.materials.names)
+    colours = torch.as_tensor(endmember_colours(frame.materials), dtype=torch.float32)
+    pure = torch.eye(count)[None]
+    ones = torch.ones(1, count)
+    coefficients = Coefficients(ones, ones, pure, pure, torch.zeros(1, count, 1))
+    row = replace(frame, coefficients=coefficients)
+    for layer in ("abundances", "segmentation"):
+        picture, legend = painted(row, aids, layer)
+        assert_close(picture[0], colours, atol=1e-6, rtol=0)
+        assert [name for name, _ in legend.entries] == list(frame.materials.names)
+
+
+@pytest.mark.parametrize("layer", [name for name in PAINTED if name not in ("accumulation", "specular")])
+@pytest.mark.parametrize("background", list(BACKGROUNDS))
+def test_where_nothing_is_the_background_shows(frame, aids, layer, background):
+    nothing = Coefficients(
+        **{name: torch.zeros_like(value) for name, value in vars(frame.coefficients).items()}
+    )
+    picture, _ = painted(replace(frame, coefficients=nothing), aids, layer, background=background)
+    assert_close(picture, torch.full_like(picture, BACKGROUNDS[background]), atol=1e-5, rtol=0)
+
+
+def test_half_transparent_light_is_mixed_with_the_background_in_linear_light(frame, aids):
+    opaque = solid(frame)
+    halved = {name: value / 2 for name, value in vars(opaque.coefficients).items()}
+    half = replace(opaque, coefficients=Coefficients(**halved))
+    light = compose("linear_rgb", opaque.coefficients, opaque.materials)
+    picture, _ = painted(half, aids, "rgb", background="white")
+    assert_close(picture, linear_to_srgb((light + 1) / 2), atol=1e-4, rtol=0)
+
+
+def test_principal_components_keep_their_colours_when_the_camera_moves(tmp_path):
+    source = make_source(tmp_path)
+    aids = make_aids(source)
+    first = make_frame(source, source.scene.train_cameras[0])
+    part = replace(
+        first,
+        coefficients=Coefficients(
+            **{name: value[4:12, 6:18] for name, value in vars(first.coefficients).items()}
+        ),
+    )
+    whole, _ = painted(first, aids, "pca")
+    cropped, _ = painted(part, aids, "pca")
+    assert_close(cropped, whole[4:12, 6:18], atol=1e-5, rtol=0)
+
+
+def test_scales_stay_the_same_when_the_camera_moves(tmp_path):
+    source = make_source(tmp_path)
+    aids = make_aids(source)
+    legends = [
+        painted(make_frame(source, source.scene.train_cameras[index]), aids, "band")[1] for index in range(3)
+    ]
+    assert len({(legend.low, legend.high) for legend in legends}) == 1
+    assert legends[0].high > legends[0].low
+
+
+def test_depth_lies_between_the_ends_of_its_own_scale(frame, aids):
+    _, legend = painted(frame, aids, "depth")
+    distance = compose("ray_distance", frame.coefficients, frame.materials)
+    seen = distance[frame.coefficients.accumulation > 0.5]
+    assert legend.low < float(seen.min())
+    assert float(seen.max()) < legend.high
+
+
+def test_an_error_without_a_scene_says_why_there_is_none(frame, aids):
+    with pytest.raises(ConfigError, match="no error to show: the scene is not at hand"):
+        painted(frame, aids, "error")
+
+
+def test_an_error_is_painted_where_it_is_known(frame, aids):
+    values = torch.full_like(frame.coefficients.accumulation, 0.05)
+    is_known = torch.zeros_like(values, dtype=torch.bool)
+    is_known[3, 4] = True
+    known = replace(aids, error_of=lambda _: (values, is_known, "train_007"))
+    picture, legend = painted(frame, known, "error", value_range=(0.0, 0.1), background="white")
+    assert_close(picture[3, 4], colour_table("viridis")[512], atol=0.01, rtol=0)
+    assert_close(picture[0, 0], torch.ones(3))
+    assert "train_007" in legend.label
+
+
+def test_an_unknown_layer_is_named_with_the_known_ones():
+    with pytest.raises(ConfigError, match="there is no layer named 'x-ray'; known: rgb, false-colour"):
+        layer_named("x-ray")
+
+
+def test_a_single_material_has_every_layer(tmp_path):
+    source = make_source(tmp_path, num_endmembers=1, specular="none")
+    frame, aids = make_frame(source), make_aids(source)
+    for layer in PAINTED:
+        picture, _ = painted(frame, aids, layer)
+        assert picture.isfinite().all(), layer
+
+
+def test_the_error_layer_exists_even_though_it_needs_the_scene():
+    assert np.array_equal(sorted(set(LAYERS) - set(PAINTED)), ["error"])

@@ -1,0 +1,95 @@
+"""What training views measured: of a point that they see, and of every pixel of a rendered view."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from unmix_plugin.scenes import load_scene
+from unmix_plugin.scenes.demo.scene import make_demo_scene
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.composition import Coefficients, Materials
+from unmix_plugin.viewer.rendering import measured as measured_module
+from unmix_plugin.viewer.rendering.frames import Frame
+from unmix_plugin.viewer.rendering.measured import MeasuredViews
+
+BALL = 0.5
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene") / "demo"
+    make_demo_scene(folder, 24, 6, 8)
+    return load_scene(folder)
+
+
+@pytest.fixture
+def views(scene, source, monkeypatch):
+    """The scene's views around a ball that stands for what the model renders."""
+    monkeypatch.setattr(measured_module, "render_frame", lambda _, camera: ball_frame(camera))
+    return MeasuredViews(scene, source)
+
+
+def ball_frame(camera):
+    """A view of a ball at the middle of model space: solid, and endmember 0 only."""
+    bundle = camera.image_rays(0)
+    along = -(bundle.directions * bundle.origins).sum(dim=-1)
+    nearest = (bundle.origins.square().sum(dim=-1) - along.square()).clamp(min=0)
+    hits = ((nearest < BALL**2) & (along > 0)).float()
+    distance = along - (BALL**2 - nearest).clamp(min=0).sqrt()
+    shares = hits[:, None] * torch.tensor([1.0, 0.0, 0.0])
+    coefficients = Coefficients(hits, hits * distance, shares, shares, torch.zeros(len(hits), 1))
+    bands = Bands.of([450.0, 490.0, 530.0, 570.0, 610.0, 650.0])
+    materials = Materials(bands, torch.full((3, 6), 0.25), torch.zeros(1, 6))
+    return Frame(camera, coefficients.unflatten(camera.height, camera.width), materials)
+
+
+def test_the_error_at_a_training_view_is_the_difference_to_its_picture(views, scene):
+    index = 2
+    camera = scene.cameras[scene.train_indices[index]]
+    frame = ball_frame(camera)
+    errors, is_known, name = views.error(frame)
+    assert name == scene.frames[scene.train_indices[index]].name
+    hits = frame.coefficients.accumulation > 0.5
+    assert bool(hits.any())
+    assert torch.equal(is_known, hits)
+    expected = (torch.from_numpy(scene.cube(scene.train_indices[index])) - 0.25).abs().mean(dim=-1)
+    assert_close(errors[hits], expected[hits], atol=1e-6, rtol=0)
+    assert float(errors[~hits].abs().max()) == 0
+
+
+def test_from_between_two_views_only_what_the_nearest_sees_has_an_error(views, scene):
+    camera = scene.cameras[scene.train_indices[0]]
+    turned = camera.camera_to_world.clone()
+    angle = torch.tensor(0.9)
+    turn = torch.tensor([[angle.cos(), -angle.sin(), 0.0], [angle.sin(), angle.cos(), 0.0], [0.0, 0.0, 1.0]])
+    turned[0] = turn @ turned[0]
+    frame = ball_frame(replace(camera, camera_to_world=turned))
+    _, is_known, _ = views.error(frame)
+    hits = frame.coefficients.accumulation > 0.5
+    assert 0 < int(is_known.sum()) < int(hits.sum())
+    assert not bool((is_known & ~hits).any())
+
+
+def test_a_point_is_measured_by_the_view_nearest_to_the_camera(views, scene):
+    index = 1
+    camera = scene.cameras[scene.train_indices[index]]
+    towards = camera.camera_to_world[0, :, 3] / camera.camera_to_world[0, :, 3].norm()
+    found = views.measurement(BALL * towards, camera)
+    assert found is not None
+    assert found.view == scene.frames[scene.train_indices[index]].name
+    coords, _ = camera.project((BALL * towards)[None], 0)
+    column, row = (int(value) for value in coords[0])
+    np.testing.assert_allclose(found.spectrum, scene.cube(scene.train_indices[index])[row, column])
+
+
+def test_a_point_inside_is_seen_by_nobody(views, scene):
+    assert views.measurement(torch.zeros(3), scene.cameras[scene.train_indices[0]]) is None
+
+
+def test_depths_of_few_views_are_kept(views, scene):
+    for index in range(len(scene.train_indices)):
+        views.error(ball_frame(scene.cameras[scene.train_indices[index]]))
+    assert len(views._distances) == min(len(scene.train_indices), 4)

@@ -1,0 +1,240 @@
+"""Moving cameras: a circle around the scene, and a smooth path through some of its cameras.
+
+Notation: `N` cameras, `F` frames. Axes are OpenGL: the columns of a pose are right, up and back; a camera looks along
+minus back.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.errors import ConfigError
+
+_WIDEST_GAP_DEG = 120.0
+"""Directions that no camera looks from, beyond which a circle becomes an arc: behind them there may be walls."""
+
+_SMALLEST_SWING_DEG = 10.0
+"""Half of the shortest arc, so that there is something to see."""
+
+_NEAR = 0.05
+"""Part of a length below which a direction is no longer reliable."""
+
+_STEEPEST_DEG = 80.0
+"""Greatest elevation of a circle, near which its cameras would only spin."""
+
+
+def orbit(cameras: Cameras, box: SceneBox, num_frames: int) -> Cameras:
+    """A circle around what the cameras look at, at their middle distance and elevation; it ends where it starts.
+
+    Where the cameras stand on one side only, it is an arc over that side, to and fro.
+
+    Args:
+        cameras: Those of the scene.
+        box: What is modelled; the circle's centre lies in it.
+        num_frames: F.
+    Returns:
+        F pinhole cameras with the middle lens of the given ones.
+    """
+    poses = cameras.camera_to_world.double().cpu().numpy()
+    centre, up = _looked_at(poses, box.aabb.double().cpu().numpy()), _upwards(poses)
+    away = poses[:, :, 3] - centre
+    height = away @ up
+    elevation = np.median(np.arctan2(height, np.linalg.norm(away - height[:, None] * up, axis=1)))
+    elevation = np.clip(elevation, -np.deg2rad(_STEEPEST_DEG), np.deg2rad(_STEEPEST_DEG))
+    first, second = _ground_axes(up)
+    angles = _swing(np.arctan2(away @ second, away @ first), num_frames)
+    outward = np.cos(elevation) * (np.cos(angles)[:, None] * first + np.sin(angles)[:, None] * second)
+    distance = np.median(np.linalg.norm(away, axis=1))
+    positions = centre + distance * (outward + np.sin(elevation) * up)
+    return _with_lens(cameras, np.stack([_look_at(position, centre, up) for position in positions]))
+
+
+def interpolated(cameras: Cameras, box: SceneBox, num_frames: int) -> Cameras:
+    """A smooth path through the cameras, each the nearest of those left; from the first to the last at even speed.
+
+    Between two cameras the path bends around what all look at, and does not cut through it.
+
+    Args:
+        cameras: N of them, at least two in different places or directions.
+        box: What is modelled.
+        num_frames: F.
+    Returns:
+        F pinhole cameras with the middle lens of the given ones.
+    Raises:
+        ConfigError: there are no two different cameras.
+    """
+    poses, lengths = _tour(cameras.camera_to_world.double().cpu().numpy())
+    if len(poses) < 2:
+        raise ConfigError(
+            "a path through cameras needs at least two different ones; choose --cameras orbit instead"
+        )
+    along = np.concatenate([[0.0], np.cumsum(lengths)])
+    at = np.linspace(0.0, along[-1], num_frames)
+    centre = _looked_at(poses, box.aabb.double().cpu().numpy())
+    path = _path_around(centre, poses, along, at)
+    return _with_lens(cameras, _straight_path(poses, along, at) if path is None else path)
+
+
+def resized(cameras: Cameras, width: int, height: int) -> Cameras:
+    """The same cameras with another number of pixels: the vertical field of view stays, the horizontal follows."""
+    scale = height / cameras.height
+    old, new = (torch.tensor(size) / 2 for size in ((cameras.width, cameras.height), (width, height)))
+    old, new = old.to(cameras.center_px), new.to(cameras.center_px)
+    return Cameras(
+        cameras.camera_to_world,
+        cameras.focal_px * scale,
+        (cameras.center_px - old) * scale + new,
+        cameras.distortion,
+        width,
+        height,
+    )
+
+
+def rows_of(camera: Cameras, start: int, stop: int) -> Cameras:
+    """The camera of rows `start` to `stop` of the image, the last excluded."""
+    above = torch.tensor([0.0, float(start)]).to(camera.center_px)
+    return Cameras(
+        camera.camera_to_world,
+        camera.focal_px,
+        camera.center_px - above,
+        camera.distortion,
+        camera.width,
+        stop - start,
+    )
+
+
+def _looked_at(
+    poses: Float64[np.ndarray, "N 3 4"], aabb: Float64[np.ndarray, "2 3"]
+) -> Float64[np.ndarray, "3"]:
+    """The point of the box nearest to all optical axes, in the sense of least squares."""
+    backs = poses[:, :, 2]
+    across = np.eye(3) - backs[:, :, None] * backs[:, None, :]
+    # Parallel axes leave the depth open: a little pull towards the middle of the box decides it.
+    pull = 1e-3 * len(poses)
+    wanted = (across @ poses[:, :, 3:]).sum(axis=0)[:, 0] + pull * aabb.mean(axis=0)
+    return np.clip(np.linalg.solve(across.sum(axis=0) + pull * np.eye(3), wanted), aabb[0], aabb[1])
+
+
+def _upwards(poses: Float64[np.ndarray, "N 3 4"]) -> Float64[np.ndarray, "3"]:
+    """The direction to which all cameras' right is perpendicular, as it is where nobody tilts the horizon."""
+    rights, mean_up = poses[:, :, 0], poses[:, :, 1].mean(axis=0)
+    mean_up = mean_up / max(float(np.linalg.norm(mean_up)), 1e-9)
+    # Cameras side by side leave a plane of such directions: a little pull towards their own up decides.
+    pull = 1e-5 * len(poses) * (np.eye(3) - np.outer(mean_up, mean_up))
+    up = np.linalg.eigh(rights.T @ rights + pull)[1][:, 0]
+    return up if up @ mean_up >= 0 else -up
+
+
+def _ground_axes(
+    up: Float64[np.ndarray, "3"],
+) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
+    """Two unit vectors perpendicular to up and to each other; seen from above the second is left of the first."""
+    first = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    first /= np.linalg.norm(first)
+    return first, np.cross(up, first)
+
+
+def _swing(angles: Float64[np.ndarray, "N"], num_frames: int) -> Float64[np.ndarray, "F"]:
+    """Angles in radians of a full circle, or to and fro over the arc on which the cameras are."""
+    turn = np.arange(num_frames) / num_frames * 2 * np.pi
+    ordered = np.sort(angles)
+    gaps = np.diff(np.append(ordered, ordered[0] + 2 * np.pi))
+    widest = int(gaps.argmax())
+    if gaps[widest] <= np.deg2rad(_WIDEST_GAP_DEG):
+        return ordered[0] + turn
+    start = ordered[(widest + 1) % len(ordered)]
+    half = max((2 * np.pi - gaps[widest]) / 2, np.deg2rad(_SMALLEST_SWING_DEG))
+    return start + (2 * np.pi - gaps[widest]) / 2 + half * np.sin(turn)
+
+
+def _look_at(
+    position: Float64[np.ndarray, "3"], target: Float64[np.ndarray, "3"], up: Float64[np.ndarray, "3"]
+) -> Float64[np.ndarray, "3 4"]:
+    back = (position - target) / np.linalg.norm(position - target)
+    right = np.cross(up, back)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(back, right), back, position], axis=1)
+
+
+def _path_around(
+    centre: Float64[np.ndarray, "3"],
+    poses: Float64[np.ndarray, "N 3 4"],
+    along: Float64[np.ndarray, "N"],
+    at: Float64[np.ndarray, "F"],
+) -> Float64[np.ndarray, "F 3 4"] | None:
+    """Poses between poses: direction and distance from a centre, what is looked at and what is up each change smoothly.
+
+    None where that fails, since the path meets the centre or what it looks at.
+    """
+    from scipy.interpolate import CubicSpline
+
+    away, backs = poses[:, :, 3] - centre, poses[:, :, 2]
+    distances = np.linalg.norm(away, axis=1)
+    # On each axis the point nearest to the centre, or one in front of a camera that looks elsewhere.
+    ahead = np.maximum((away * backs).sum(axis=1), 0.2 * distances.mean())
+    gazes = CubicSpline(along, away - ahead[:, None] * backs)(at)
+    outward, ups = CubicSpline(along, away)(at), CubicSpline(along, poses[:, :, 1])(at)
+    if np.linalg.norm(outward, axis=1).min() < _NEAR * distances.min():
+        return None
+    positions = CubicSpline(along, distances)(at)[:, None] * _unit(outward)
+    backs = positions - gazes
+    rights = np.cross(_unit(ups), _unit(backs))
+    if (
+        np.linalg.norm(backs, axis=1).min() < _NEAR * ahead.min()
+        or np.linalg.norm(rights, axis=1).min() < _NEAR
+    ):
+        return None
+    backs, rights = _unit(backs), _unit(rights)
+    return np.stack([rights, np.cross(backs, rights), backs, positions + centre], axis=2)
+
+
+def _straight_path(
+    poses: Float64[np.ndarray, "N 3 4"], along: Float64[np.ndarray, "N"], at: Float64[np.ndarray, "F"]
+) -> Float64[np.ndarray, "F 3 4"]:
+    """Poses between poses: positions by a spline, rotations by the shortest turns."""
+    from scipy.interpolate import CubicSpline
+    from scipy.spatial.transform import Rotation, Slerp
+
+    rotations = Slerp(along, Rotation.from_matrix(poses[:, :, :3]))(at).as_matrix()
+    return np.concatenate([rotations, CubicSpline(along, poses[:, :, 3])(at)[:, :, None]], axis=2)
+
+
+def _unit(vectors: Float64[np.ndarray, "F 3"]) -> Float64[np.ndarray, "F 3"]:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+
+
+def _tour(
+    poses: Float64[np.ndarray, "N 3 4"],
+) -> tuple[Float64[np.ndarray, "M 3 4"], Float64[np.ndarray, " steps"]]:
+    """The poses from the first on, each followed by the nearest of those left, and the lengths of the steps."""
+    reach = float(np.ptp(poses[:, :, 3], axis=0).max()) or 1.0
+    order, lengths, left = [0], [], list(range(1, len(poses)))
+    while left:
+        # A step has the length of its way and, if it only turns, of its turn.
+        differences = poses[left] - poses[order[-1]]
+        steps = np.linalg.norm(differences[:, :, 3], axis=1)
+        steps = steps + 0.1 * reach * np.linalg.norm(differences[:, :, :3], axis=(1, 2))
+        nearest = int(steps.argmin())
+        following = left.pop(nearest)
+        if steps[nearest] > 1e-6 * reach:
+            order.append(following)
+            lengths.append(steps[nearest])
+    return poses[order], np.array(lengths)
+
+
+def _with_lens(cameras: Cameras, poses: Float[np.ndarray, "F 3 4"]) -> Cameras:
+    """Pinhole cameras at these poses, with the middle lens of `cameras`."""
+    count = len(poses)
+    middle = torch.tensor([[cameras.width / 2, cameras.height / 2]])
+    return Cameras(
+        torch.tensor(poses, dtype=torch.float32),
+        cameras.focal_px.cpu().median(dim=0).values.expand(count, 2).contiguous(),
+        middle.expand(count, 2).contiguous(),
+        torch.zeros(count, 4),
+        cameras.width,
+        cameras.height,
+    )

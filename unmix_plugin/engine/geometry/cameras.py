@@ -1,0 +1,149 @@
+"""Posed cameras, all of one image size: from pixels to rays and from points to pixels.
+
+Notation: `N` cameras, `R` rays, `P` points. Axes are OpenGL: +x right, +y up, a camera looks along -z. Pixel
+coordinates are x to the right and y down in pixels from the image's top left corner, so pixel centres lie at +0.5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from unmix_plugin.engine.geometry.camera_distortion import distort, undistort
+from unmix_plugin.engine.geometry.rays import RayBundle
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """Pinhole cameras, optionally with OPENCV distortion."""
+
+    camera_to_world: Float[Tensor, "N 3 4"]
+    """Rotation (orthonormal, determinant 1) and position in scene units, OpenGL axes."""
+    focal_px: Float[Tensor, "N 2"]
+    """Focal lengths along x and y in pixels, > 0."""
+    center_px: Float[Tensor, "N 2"]
+    """Principal point x, y in pixels."""
+    distortion: Float[Tensor, "N 4"]
+    """k1, k2, p1, p2 of the OPENCV model; zeros are a pinhole."""
+    width: int
+    """Columns of every image, pixels."""
+    height: int
+    """Rows of every image, pixels."""
+
+    def __len__(self) -> int:
+        return self.camera_to_world.shape[0]
+
+    def __getitem__(self, index: int | slice | list[int]) -> Cameras:
+        """Some of the cameras, in the order asked for; an int gives a `Cameras` of one."""
+        rows = [index] if isinstance(index, int) else index
+        return Cameras(
+            self.camera_to_world[rows],
+            self.focal_px[rows],
+            self.center_px[rows],
+            self.distortion[rows],
+            self.width,
+            self.height,
+        )
+
+    def to(self, device: torch.device | str) -> Cameras:
+        """The same cameras on another device."""
+        return Cameras(
+            self.camera_to_world.to(device),
+            self.focal_px.to(device),
+            self.center_px.to(device),
+            self.distortion.to(device),
+            self.width,
+            self.height,
+        )
+
+    @cached_property
+    def is_distorted(self) -> bool:
+        """Whether any lens bends; found once, since the answer costs a device synchronisation."""
+        return bool(self.distortion.ne(0.0).any())
+
+    def generate_rays(
+        self, camera_indices: Int[Tensor, " R"], pixel_coords: Float[Tensor, "R 2"]
+    ) -> RayBundle:
+        """Rays through points of the images, lens distortion undone.
+
+        Args:
+            camera_indices: Which camera, in [0, N), int64.
+            pixel_coords: x, y in pixels; the centre of column c, row r is (c + 0.5, r + 0.5).
+        """
+        coords = (pixel_coords - self.center_px[camera_indices]) / self.focal_px[camera_indices]
+        if self.is_distorted:
+            coords = undistort(coords, self.distortion[camera_indices])
+        local = torch.stack([coords[:, 0], -coords[:, 1], -torch.ones_like(coords[:, 0])], dim=-1)
+        poses = self.camera_to_world[camera_indices]
+        directions = (poses[:, :, :3] * local[:, None, :]).sum(dim=-1)
+        directions = directions / directions.norm(dim=-1, keepdim=True)
+        return RayBundle(poses[:, :, 3].contiguous(), directions, camera_indices)
+
+    def image_rays(self, index: int, subpixel_offset: tuple[float, float] = (0.5, 0.5)) -> RayBundle:
+        """One ray a pixel of a whole image, H * W of them, row after row.
+
+        Args:
+            index: Which camera.
+            subpixel_offset: Where in a pixel the ray passes, x, y in [0, 1].
+        """
+        device = self.camera_to_world.device
+        rows, columns = torch.meshgrid(
+            torch.arange(self.height, device=device, dtype=torch.float32),
+            torch.arange(self.width, device=device, dtype=torch.float32),
+            indexing="ij",
+        )
+        pixel_coords = torch.stack([columns + subpixel_offset[0], rows + subpixel_offset[1]], dim=-1)
+        indices = torch.full((self.height * self.width,), index, dtype=torch.int64, device=device)
+        return self.generate_rays(indices, pixel_coords.reshape(-1, 2))
+
+    def project(
+        self, points: Float[Tensor, "P 3"], index: int
+    ) -> tuple[Float[Tensor, "P 2"], Float[Tensor, " P"]]:
+        """Where a camera sees points, the inverse of `generate_rays`.
+
+        Returns:
+            Pixel coordinates x, y (meaningless where the depth is not positive) and depths along the optical axis in
+            scene units, positive in front of the camera.
+        """
+        pose = self.camera_to_world[index]
+        local = (points - pose[:, 3]) @ pose[:, :3]
+        depths = -local[:, 2]
+        # Points on the camera plane have no image; any finite number does, since the caller looks at the depth.
+        divisor = torch.where(depths.abs() < 1e-12, torch.full_like(depths, 1e-12), depths)
+        coords = torch.stack([local[:, 0], -local[:, 1]], dim=-1) / divisor[:, None]
+        if self.is_distorted:
+            coords = distort(coords, self.distortion[index])
+        return coords * self.focal_px[index] + self.center_px[index], depths
+
+    def to_json(self) -> dict[str, Any]:
+        """The cameras as numbers and lists; `from_json` gives back the same bits."""
+        return {
+            "width": self.width,
+            "height": self.height,
+            "camera_to_world": self.camera_to_world.tolist(),
+            "focal_px": self.focal_px.tolist(),
+            "center_px": self.center_px.tolist(),
+            "distortion": self.distortion.tolist(),
+        }
+
+    @staticmethod
+    def from_json(values: dict[str, Any]) -> Cameras:
+        """The cameras that `to_json` wrote.
+
+        Raises:
+            KeyError: a part is missing.
+        """
+        count = len(values["camera_to_world"])
+        return Cameras(
+            torch.tensor(values["camera_to_world"], dtype=torch.float32).reshape(count, 3, 4),
+            torch.tensor(values["focal_px"], dtype=torch.float32).reshape(count, 2),
+            torch.tensor(values["center_px"], dtype=torch.float32).reshape(count, 2),
+            torch.tensor(values["distortion"], dtype=torch.float32).reshape(count, 4),
+            int(values["width"]),
+            int(values["height"]),
+        )

@@ -1,0 +1,123 @@
+"""The folder of one run: what lies where in it, making one, finding one."""
+
+import re
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+
+from unmix_plugin.engine.runs.checkpoints import checkpoint_steps
+from unmix_plugin.errors import RunError
+
+_STAMP = re.compile(r"(\d{4}-\d{2}-\d{2}_\d{6})(?:-(\d+))?")
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Where a run keeps its files."""
+
+    path: Path
+    """`<output_dir>/<scene>/<method>/<YYYY-MM-DD_HHMMSS>`, absolute."""
+
+    @property
+    def config_path(self) -> Path:
+        """Every setting of the run."""
+        return self.path / "config.json"
+
+    @property
+    def scene_path(self) -> Path:
+        """What rendering needs of the scene: box, cameras, metadata; and the data manager's summary."""
+        return self.path / "scene.json"
+
+    @property
+    def training_path(self) -> Path:
+        """Steps, seconds and rays of the finished training."""
+        return self.path / "training.json"
+
+    @property
+    def checkpoints(self) -> Path:
+        """Folder of the checkpoints."""
+        return self.path / "checkpoints"
+
+    @property
+    def metrics_path(self) -> Path:
+        """Losses and metrics, one JSON object a line."""
+        return self.path / "metrics.jsonl"
+
+    @property
+    def log_path(self) -> Path:
+        """What happened, one line an event."""
+        return self.path / "run.log"
+
+    @property
+    def eval(self) -> Path:
+        """Folder of evaluations."""
+        return self.path / "eval"
+
+    @property
+    def exports(self) -> Path:
+        """Folder of exports."""
+        return self.path / "exports"
+
+
+def create_run_folder(
+    output_dir: Path, scene_name: str, method_name: str, started: datetime | None = None
+) -> RunFolder:
+    """Make a new run folder, named for the local time; a second one in the same second gets `-2` appended.
+
+    Raises:
+        RunError: it can't be made.
+    """
+    stamp = (started or datetime.now(timezone.utc).astimezone()).strftime("%Y-%m-%d_%H%M%S")
+    parent = output_dir.resolve() / (_file_name(scene_name) or "scene") / _file_name(method_name)
+    try:
+        parent.mkdir(parents=True, exist_ok=True)
+        for number in range(1, 10_000):
+            path = parent / (stamp if number == 1 else f"{stamp}-{number}")
+            try:
+                path.mkdir()
+            except FileExistsError:
+                continue
+            return RunFolder(path)
+    except OSError as error:
+        raise RunError(
+            f"can't make a run folder in {parent}: {error.strerror or error}; choose another --output-dir"
+        ) from error
+    raise RunError(f"can't make a run folder in {parent}: too many runs called {stamp}")
+
+
+def open_run_folder(path: Path) -> RunFolder:
+    """An existing run folder.
+
+    Raises:
+        RunError: it is missing, is no run folder, or is half-written.
+    """
+    if not path.is_dir():
+        raise RunError(f"no run folder at {path}; give the path that training printed as its last line")
+    run = RunFolder(path.resolve())
+    missing = [file.name for file in (run.config_path, run.scene_path) if not file.is_file()]
+    if missing:
+        raise RunError(f"{path} is no run folder, or a half-written one: {' and '.join(missing)} missing")
+    return run
+
+
+def newest_run(output_dir: Path) -> RunFolder:
+    """The run under `output_dir` that started last, of those that have a checkpoint.
+
+    Raises:
+        RunError: there is none.
+    """
+    found: list[tuple[str, int, Path]] = []
+    for path in output_dir.glob("*/*/*"):
+        match = _STAMP.fullmatch(path.name)
+        if match and (path / "config.json").is_file() and checkpoint_steps(path / "checkpoints"):
+            found.append((match[1], int(match[2] or 1), path))
+    if not found:
+        raise RunError(
+            f"no run with a checkpoint under {output_dir.resolve()}; train one first or name it with --run"
+        )
+    return open_run_folder(max(found)[2])
+
+
+def _file_name(name: str) -> str:
+    """`name` with whatever a folder name had better not have replaced by `_`."""
+    return re.sub(r"[^\w.+-]", "_", name).strip(".")

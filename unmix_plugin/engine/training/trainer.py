@@ -1,0 +1,301 @@
+"""The training loop."""
+
+from collections.abc import Mapping
+from contextlib import nullcontext, suppress
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from torch import Tensor
+
+from unmix_plugin.atomic_files import write_json_atomically
+from unmix_plugin.engine.configs import TrainerConfig
+from unmix_plugin.engine.devices import resolve_device
+from unmix_plugin.engine.pipeline import Pipeline
+from unmix_plugin.engine.runs.checkpoints import checkpoint_steps, save_checkpoint
+from unmix_plugin.engine.runs.config_json import config_to_json
+from unmix_plugin.engine.runs.load_run import (
+    check_same_scene,
+    read_scene_record,
+    require_checkpoint,
+    require_data,
+    scene_record_to_json,
+    write_config,
+)
+from unmix_plugin.engine.runs.run_folder import RunFolder, create_run_folder, open_run_folder
+from unmix_plugin.engine.training.averages import ParameterAverage
+from unmix_plugin.engine.training.callbacks import TrainingCallbackLocation, run_callbacks
+from unmix_plugin.engine.training.guards import GradientGuard
+from unmix_plugin.engine.training.interrupts import Interrupted, StopSignals
+from unmix_plugin.engine.training.limits import Limits, TrainingClock
+from unmix_plugin.engine.training.memory import keep_freed_memory
+from unmix_plugin.engine.training.optimizers import build_optimizer, set_learning_rates
+from unmix_plugin.engine.training.progress import ProgressDisplay, TrainingStatus
+from unmix_plugin.engine.training.seeding import seed_everything, step_seed
+from unmix_plugin.engine.training.training_control import TrainingControl
+from unmix_plugin.engine.training.training_state import (
+    AVERAGE,
+    TrainingRecord,
+    collect_tensors,
+    part,
+    restore_training,
+)
+from unmix_plugin.engine.training.writers import MetricsWriter, RunLog
+from unmix_plugin.errors import RunError
+
+MODEL_STREAM = 1
+"""Stream of randomness of the model's own draws in a step; data managers draw from stream 0."""
+
+TRAINING_FORMAT_VERSION = 1
+
+
+class Trainer:
+    """Trains one pipeline into one run folder.
+
+    A step is a function of the parameters and of (seed, step) alone: the global generator is seeded anew before each,
+    so a run stopped and resumed takes the very steps of a straight one (while limits are given in steps).
+    """
+
+    def __init__(
+        self, config: TrainerConfig, *, console: Console | None = None, control: TrainingControl | None = None
+    ) -> None:
+        """Read the scene, make the model, then make the run folder or reopen the one in `config.load_run`.
+
+        Args:
+            config: All settings; to resume, `load_config(path)`, in which limits may be changed.
+            console: Where progress is shown; standard output if None.
+            control: Through which other threads watch and steer this training.
+        Raises:
+            SceneError, ConfigError: scene or settings are wrong; nothing has been written.
+            RunError: the run to resume is unusable, or the folder can't be made.
+        """
+        config_to_json(config)  # settings that can't be written down are refused before anything is
+        self.config = _with_absolute_data(config)
+        self.console = console or Console()
+        self.control = control or TrainingControl()
+        keep_freed_memory()
+        device = resolve_device(config.device)
+        seed_everything(config.seed)
+        resumed = None if config.load_run is None else open_run_folder(config.load_run)
+        self.pipeline: Pipeline = config.pipeline.setup(
+            data=require_data(self.config), device=device, seed=config.seed
+        )
+        self.config = replace(self.config, pipeline=self.pipeline.config)
+        if resumed is None:
+            self.pipeline.initialise()
+        self.optimizer = build_optimizer(self.pipeline.get_param_groups(), config.optimizers)
+        self.guard = GradientGuard(self.optimizer, config.optimizers, config.max_skipped_steps)
+        self.callbacks = self.pipeline.get_training_callbacks()
+        self.limits = Limits(config.max_num_iterations, config.max_seconds)
+        self.clock = TrainingClock()
+        self.step = 0
+        """Training steps done."""
+        self.total_rays = 0
+        self.learning_rates: dict[str, float] = {}
+        self.average = self._new_average()
+        self._saved_step: int | None = None
+        self.run = self._new_run() if resumed is None else resumed
+        self.log = RunLog(self.run)
+        if resumed is not None:
+            self._resume()
+        self.writer = MetricsWriter(self.run, self.step)
+        self.log.write(f"{'resumed' if resumed else 'started'} on {device}, torch {torch.__version__}")
+        for line in self.pipeline.reasons.splitlines():
+            self.log.write(line)
+
+    @property
+    def progress(self) -> float:
+        """Fraction of the training done, [0, 1]."""
+        return self.limits.progress(self.step, self.clock.seconds)
+
+    @property
+    def record(self) -> TrainingRecord:
+        """How far training has come."""
+        return TrainingRecord(
+            steps=self.step,
+            train_seconds=self.clock.seconds,
+            total_rays=self.total_rays,
+            skipped_steps=self.guard.skipped,
+            num_rays=self.pipeline.datamanager.get_train_rays_per_batch(),
+            average_updates=0 if self.average is None else self.average.updates,
+            progress=self.progress,
+            learning_rates=self.learning_rates,
+        )
+
+    def train(self) -> TrainingRecord:
+        """Train to the limit, save, and write `training.json`.
+
+        Raises:
+            Interrupted: Ctrl-C, SIGTERM or a stop through `control`; the step under way was ended and saved. A second
+                signal stops at once, and then the newest checkpoint is an older one.
+            RunError: the disk is full, or loss and gradients stay non-finite.
+        """
+        self.pipeline.train()
+        try:
+            self.pipeline.model.warm_up()
+            with StopSignals() as stop, ProgressDisplay(self.console) as display, self.control.running():
+                self._loop(stop, display)
+        except KeyboardInterrupt as error:
+            steps = checkpoint_steps(self.run.checkpoints)
+            raise Interrupted(self.run.path, steps[0] if steps else None) from error
+        except Exception as error:
+            with suppress(RunError):  # the disk may be full, which `error` says already
+                self.log.write(f"failed at step {self.step}: {type(error).__name__}: {error}")
+            raise
+        finally:
+            self.writer.close()
+        write_json_atomically(
+            self.run.training_path, {"format_version": TRAINING_FORMAT_VERSION, **self.record.to_json()}
+        )
+        self.log.write(f"finished: {self.step} steps, {self.clock.seconds:.1f} s, {self.total_rays} rays")
+        return self.record
+
+    def save(self) -> None:
+        """Save a checkpoint of the present step.
+
+        Raises:
+            RunError: the disk is full or refuses; the previous checkpoint is as it was.
+        """
+        if self._saved_step == self.step:
+            return
+        tensors = collect_tensors(
+            self.pipeline.model, self.optimizer, self.average, self.pipeline.datamanager
+        )
+        save_checkpoint(
+            self.run.checkpoints, self.step, tensors, self.record.to_json(), self.config.checkpoints_kept
+        )
+        self._saved_step = self.step
+        self.log.write(f"saved step {self.step}")
+
+    def _loop(self, stop: StopSignals, display: ProgressDisplay) -> None:
+        while not (self._is_at_limit or stop.requested or self.control.is_stop_requested):
+            if not self.control.is_paused:
+                with self.control.device.training_turn():
+                    self._iterate(display)
+            elif self.control.wait_while_paused():
+                with self.control.device.training_turn():
+                    self.save()
+        with self.control.device.training_turn():
+            self.save()
+        if not self._is_at_limit:
+            self.log.write(f"stopped on request at step {self.step}")
+            raise Interrupted(self.run.path, self.step)
+
+    def _iterate(self, display: ProgressDisplay) -> None:
+        """A step, and whatever is shown, written or measured after it."""
+        loss, metrics = self._train_step()
+        if self.control.is_status_due:
+            self.control.show(self._status(loss, metrics))
+        if display.is_due or self.progress >= 1.0:
+            display.show(self._status(loss, metrics))
+        if self._is_time_for(self.config.steps_per_log):
+            self._write_metrics(loss, metrics)
+        if self._is_time_for(self.config.steps_per_save) or self.control.take_save_request():
+            self.save()
+        self._evaluate(display)
+
+    @property
+    def _is_at_limit(self) -> bool:
+        return self.limits.reached(self.step, self.clock.seconds)
+
+    def _train_step(self) -> tuple[float, dict[str, Tensor]]:
+        """One step; its loss, and all losses and metrics without their graphs."""
+        with self.clock.running():
+            progress, step, datamanager = self.progress, self.step, self.pipeline.datamanager
+            num_rays = datamanager.get_train_rays_per_batch()
+            torch.manual_seed(step_seed(self.config.seed, step, MODEL_STREAM))
+            self.learning_rates = set_learning_rates(self.optimizer, self.config.optimizers, progress)
+            run_callbacks(self.callbacks, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, step, progress)
+            outputs, losses, metrics = self.pipeline.get_train_loss_dict(step)
+            total = torch.stack(list(losses.values())).sum()
+            self.optimizer.zero_grad(set_to_none=True)
+            total.backward()
+            is_finite, loss = self.guard.check(total)
+            if is_finite:
+                self.optimizer.step()
+            else:
+                self.log.write(f"step {step} skipped: non-finite loss ({loss:g}) or gradient")
+            self.step += 1
+            self.total_rays += num_rays
+            run_callbacks(self.callbacks, TrainingCallbackLocation.AFTER_TRAIN_ITERATION, step, progress)
+            if self.average is not None:
+                self.average.update(self.step)  # after the callbacks, which keep parameters in their bounds
+            next_num_rays = self.pipeline.model.next_num_rays(outputs, num_rays)
+            if next_num_rays is not None:
+                datamanager.set_train_rays_per_batch(next_num_rays)
+        counts = {"num_rays": num_rays, "num_samples": self.pipeline.model.num_samples(outputs)}
+        detached = {name: value.detach() for name, value in {**losses, **metrics}.items()}
+        return loss, {**detached, **{name: torch.tensor(float(count)) for name, count in counts.items()}}
+
+    def _evaluate(self, display: ProgressDisplay) -> None:
+        one = self._is_time_for(self.config.steps_per_eval_image)
+        every = self._is_time_for(self.config.steps_per_eval_all_images)
+        if not one and not every:
+            return
+        with nullcontext() if self.average is None else self.average.swapped_in():
+            if one:
+                metrics, images = self.pipeline.get_eval_image_metrics_and_images(self.step)
+                self.writer.write(self.step, self.clock.seconds, "eval", metrics)
+                self.writer.write_images(self.step, images)
+            if every:
+                metrics = self.pipeline.get_average_eval_image_metrics(self.step)
+                self.writer.write(self.step, self.clock.seconds, "eval_all", metrics)
+                found = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items())
+                display.message(f"step {self.step}: evaluation views: {found}")
+
+    def _write_metrics(self, loss: float, values: Mapping[str, Tensor]) -> None:
+        rates = {f"lr/{name}": rate for name, rate in self.learning_rates.items()}
+        numbers = {name: float(value) for name, value in values.items()}
+        speed = {
+            "rays_per_second": self.record.train_rays_per_second,
+            "skipped_steps": float(self.guard.skipped),
+        }
+        self.writer.write(self.step, self.clock.seconds, "train", {**numbers, "loss": loss, **rates, **speed})
+
+    def _status(self, loss: float, metrics: Mapping[str, Tensor]) -> TrainingStatus:
+        psnr = float(metrics["psnr"]) if "psnr" in metrics else None
+        speed = self.record.train_rays_per_second
+        return TrainingStatus(self.step, self.clock.seconds, self.progress, loss, psnr, speed)
+
+    def _is_time_for(self, interval: int) -> bool:
+        return interval > 0 and self.step % interval == 0
+
+    def _new_average(self) -> ParameterAverage | None:
+        if self.config.average_decay is None:
+            return None
+        return ParameterAverage(self.pipeline.model, self.config.average_decay, self.config.average_interval)
+
+    def _new_run(self) -> RunFolder:
+        scene = scene_record_to_json(self.pipeline.datamanager)
+        data = require_data(self.config)
+        run = create_run_folder(self.config.output_dir, data.resolve().name, self.config.method_name)
+        write_json_atomically(run.scene_path, scene)
+        write_config(run, self.config)
+        return run
+
+    def _resume(self) -> None:
+        """Take back all that the newest complete checkpoint holds."""
+        datamanager = self.pipeline.datamanager
+        check_same_scene(read_scene_record(self.run), datamanager, self.run)
+        checkpoint = require_checkpoint(self.run)
+        restore_training(checkpoint.tensors, self.pipeline.model, self.optimizer, datamanager)
+        record = TrainingRecord.from_json(checkpoint.record)
+        datamanager.set_train_rays_per_batch(record.num_rays)
+        self.step = self._saved_step = record.steps
+        self.total_rays, self.learning_rates = record.total_rays, record.learning_rates
+        self.guard.skipped = record.skipped_steps
+        self.clock = TrainingClock(record.train_seconds)
+        self.average = self._new_average()
+        averaged = part(checkpoint.tensors, AVERAGE)
+        if self.average is not None and averaged:
+            self.average.load_state_dict(averaged, record.average_updates)
+        write_config(self.run, self.config)
+        for reason in checkpoint.damaged:
+            self.log.write(f"passed over a damaged checkpoint: {reason}")
+
+
+def _with_absolute_data(config: TrainerConfig) -> TrainerConfig:
+    """A run must find its scene from any working directory; a word that names no folder stays as it is."""
+    data: Path | None = config.data
+    return replace(config, data=data.resolve()) if data is not None and data.exists() else config

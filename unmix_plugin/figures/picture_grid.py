@@ -1,0 +1,208 @@
+"""Figures as PNG: grids of pictures with titles, a colour bar, a legend.
+
+Everything is placed in inches, so that nothing is cut off, however many panels or names there are. Where a picture
+shows nothing it fades into a neutral light grey.
+
+Notation: pictures are (H, W, 3) sRGB in [0, 1].
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from unmix_plugin.formats.files import figure_bytes
+from unmix_plugin.spectral.colour.conversion import linear_to_srgb, srgb_to_linear
+
+NEUTRAL = 0.92
+"""sRGB grey of what shows nothing."""
+
+_DPI = 130
+_FONT_PT = 10
+_MARGIN, _GAP, _TITLE, _HEADING, _LEGEND_ROW = 0.15, 0.14, 0.30, 0.34, 0.25
+_BAR_WIDTH, _BAR_SPACE = 0.16, 0.80
+_LETTER, _HEADING_LETTER = 0.075, 0.115
+"""Widths of a letter, generous."""
+_PANEL_BOUNDS = (2.1, 5.0)
+"""Least and greatest longer side of a panel."""
+
+Picture = Float[np.ndarray, "H W 3"]
+Colour = Sequence[float] | np.ndarray
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One picture of a figure."""
+
+    image: Picture
+    title: str
+    swatch: Colour | None = None
+    """sRGB colour of a small square before the title."""
+
+
+@dataclass(frozen=True)
+class ColourScale:
+    """How values become colours."""
+
+    colour_map: str
+    """A name that matplotlib knows."""
+    low: float
+    high: float
+    """Values at the two ends; those outside get the colours of the ends."""
+    label: str
+    """What the values are, with their unit."""
+
+
+def paint(values: Float[np.ndarray, "H W"], scale: ColourScale) -> Picture:
+    """Values as colours of a scale; undefined ones are the neutral grey."""
+    from matplotlib import colormaps
+
+    fraction = (values - scale.low) / (scale.high - scale.low)
+    colours = colormaps[scale.colour_map](np.clip(fraction, 0, 1))[..., :3]
+    return np.where(np.isnan(values)[..., None], NEUTRAL, colours)
+
+
+def over_neutral(picture: Picture, opacity: Float[np.ndarray, "H W"]) -> Picture:
+    """A picture that is not multiplied by its opacity, laid over the neutral grey."""
+    part = np.clip(opacity, 0, 1)[..., None]
+    return picture * part + NEUTRAL * (1 - part)
+
+
+def premultiplied_over_neutral(linear_rgb: Picture, opacity: Float[np.ndarray, "H W"]) -> Picture:
+    """Linear light seen on black, laid over the neutral grey and encoded as sRGB."""
+    behind = float(srgb_to_linear(torch.tensor(NEUTRAL, dtype=torch.float64)))
+    light = linear_rgb + behind * (1 - np.clip(opacity, 0, 1)[..., None])
+    return linear_to_srgb(torch.from_numpy(np.asarray(light, dtype=np.float64)).clamp(0, 1)).numpy()
+
+
+def columns_for(count: int) -> int:
+    """Columns of a grid of `count` panels that is wider than high."""
+    return count if count <= 4 else max(4, int(np.ceil(np.sqrt(1.6 * count))))
+
+
+def in_rows(panels: Sequence[Panel], columns: int | None = None) -> list[Sequence[Panel]]:
+    """Panels in rows of equal length, the last one perhaps shorter."""
+    width = columns or columns_for(len(panels))
+    return [panels[i : i + width] for i in range(0, len(panels), width)]
+
+
+def draw_panels(
+    rows: Sequence[Sequence[Panel]],
+    heading: str,
+    scale: ColourScale | None = None,
+    legend: Sequence[tuple[str, Colour]] = (),
+) -> bytes:
+    """A grid of panels as a PNG.
+
+    Args:
+        rows: Panels, all of one picture size.
+        heading: Line above all.
+        scale: Drawn as a colour bar on the right.
+        legend: Names and their colours, listed below.
+    """
+    from matplotlib.figure import Figure
+
+    height_px, width_px, _ = rows[0][0].image.shape
+    longer = float(np.clip(max(height_px, width_px) / _DPI, *_PANEL_BOUNDS))
+    width, height = (longer * side / max(height_px, width_px) for side in (width_px, height_px))
+    width = max(width, 1.3)  # room for a title
+    num_columns = max(len(row) for row in rows)
+    bar = 0.0 if scale is None else _BAR_SPACE
+    grid_width = num_columns * (width + _GAP) - _GAP
+    page_width = max(grid_width + bar, _HEADING_LETTER * len(heading), _legend_width(legend)) + 2 * _MARGIN
+    legend_columns = max(1, int((page_width - 2 * _MARGIN) / _legend_width(legend)))
+    below = _LEGEND_ROW * -(-len(legend) // legend_columns) + (_GAP if legend else 0.0)
+    grid_height = len(rows) * (height + _TITLE + _GAP) - _GAP
+    page = (page_width, _MARGIN + below + grid_height + _HEADING + _MARGIN)
+    figure = Figure(figsize=page, facecolor="white")
+    top = page[1] - _MARGIN
+    figure.text(_MARGIN / page[0], top / page[1], heading, fontsize=_FONT_PT + 2, fontweight="bold", va="top")
+    for row, panels in enumerate(rows):
+        bottom = top - _HEADING - (row + 1) * (height + _TITLE) - row * _GAP
+        for column, panel in enumerate(panels):
+            left = _MARGIN + column * (width + _GAP)
+            _draw_panel(figure, panel, (left, bottom, width, height), page)
+    if scale is not None:
+        box = (_MARGIN + grid_width + 0.18, _MARGIN + below, _BAR_WIDTH, grid_height - _TITLE)
+        _draw_bar(figure, scale, box, page)
+    _draw_legend(figure, legend, legend_columns, below, page)
+    return figure_bytes(figure, _DPI)
+
+
+def _axes(figure: Any, box: tuple[float, float, float, float], page: tuple[float, float]) -> Any:
+    left, bottom, width, height = box
+    return figure.add_axes((left / page[0], bottom / page[1], width / page[0], height / page[1]))
+
+
+def _draw_panel(
+    figure: Any, panel: Panel, box: tuple[float, float, float, float], page: tuple[float, float]
+) -> None:
+    axes = _axes(figure, box, page)
+    axes.imshow(np.clip(panel.image, 0, 1))
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set(color="0.75", linewidth=0.8)
+    left, bottom, width, height = box
+    base = bottom + height + 0.07
+    if panel.swatch is not None:
+        _draw_swatch(figure, panel.swatch, (left, base), page)
+        left, width = left + 0.22, width - 0.22
+    title = textwrap.shorten(panel.title, max(8, int(width / _LETTER)), placeholder="...")
+    figure.text(left / page[0], (base + 0.02) / page[1], title, fontsize=_FONT_PT, va="bottom")
+
+
+def _draw_swatch(figure: Any, colour: Colour, corner: tuple[float, float], page: tuple[float, float]) -> None:
+    from matplotlib.patches import Rectangle
+
+    side = 0.15
+    square = Rectangle(
+        (corner[0] / page[0], (corner[1] + 0.02) / page[1]),
+        side / page[0],
+        side / page[1],
+        transform=figure.transFigure,
+        facecolor=tuple(np.clip(colour, 0, 1)),
+        edgecolor="0.3",
+        linewidth=0.6,
+    )
+    figure.add_artist(square)
+
+
+def _draw_bar(
+    figure: Any, scale: ColourScale, box: tuple[float, float, float, float], page: tuple[float, float]
+) -> None:
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+    from matplotlib.ticker import MaxNLocator
+
+    mappable = ScalarMappable(Normalize(scale.low, scale.high), scale.colour_map)
+    bar = figure.colorbar(mappable, cax=_axes(figure, box, page))
+    bar.set_label(scale.label, fontsize=_FONT_PT)
+    bar.ax.tick_params(labelsize=_FONT_PT - 1)
+    bar.locator = MaxNLocator(5)
+
+
+def _legend_width(legend: Sequence[tuple[str, Colour]]) -> float:
+    """Inches that one entry takes."""
+    return 0.52 + _LETTER * max((len(name) for name, _ in legend), default=8)
+
+
+def _draw_legend(
+    figure: Any,
+    legend: Sequence[tuple[str, Colour]],
+    columns: int,
+    below: float,
+    page: tuple[float, float],
+) -> None:
+    for index, (name, colour) in enumerate(legend):
+        row, column = divmod(index, columns)
+        left = _MARGIN + column * _legend_width(legend)
+        base = _MARGIN + below - _GAP - (row + 1) * _LEGEND_ROW
+        _draw_swatch(figure, colour, (left, base), page)
+        figure.text((left + 0.24) / page[0], (base + 0.03) / page[1], name, fontsize=_FONT_PT, va="bottom")

@@ -1,0 +1,72 @@
+"""Writing results: formats as bytes, files that are whole or not there, and nothing overwritten by accident."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unmix_plugin.atomic_files import write_atomically
+from unmix_plugin.errors import ConfigError, RunError
+
+
+def make_folder(path: Path) -> Path:
+    """The folder, made if it is not there.
+
+    Raises:
+        RunError: it can't be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunError(
+            f"can't make the folder {path}: {error.strerror or error}; choose another one"
+        ) from error
+    return path
+
+
+def write_file(path: Path, data: bytes) -> Path:
+    """Write a file under a temporary name, then give it its own; its folder is made.
+
+    Raises:
+        RunError: the disk is full or refuses; what was there before is untouched.
+    """
+    make_folder(path.parent)
+    try:
+        write_atomically(path, data)
+    except RunError as error:
+        cause = error.__cause__
+        reason = getattr(cause, "strerror", None) or cause or error
+        raise RunError(f"can't write {path}: {reason}; make room or choose another folder") from error
+    return path
+
+
+def refuse_to_overwrite(paths: Collection[Path], overwrite: bool) -> None:
+    """Look before anything is computed whether files would be lost.
+
+    Raises:
+        ConfigError: one of `paths` exists, and overwriting was not asked for.
+    """
+    existing = [path for path in paths if path.exists()]
+    if existing and not overwrite:
+        others = f" and {len(existing) - 1} more of its files" if len(existing) > 1 else ""
+        raise ConfigError(
+            f"{existing[0]}{others} exist already; give --overwrite to replace them or another --output"
+        )
+
+
+def array_bytes(array: np.ndarray) -> bytes:
+    """An array as the bytes of an .npy file."""
+    buffer = io.BytesIO()
+    np.save(buffer, array, allow_pickle=False)
+    return buffer.getvalue()
+
+
+def figure_bytes(figure: Any, dpi: int) -> bytes:
+    """A matplotlib figure as the bytes of a PNG."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi)
+    return buffer.getvalue()

@@ -1,0 +1,113 @@
+"""Binary glTF 2.0 (.glb): one mesh with a colour and any other numbers a vertex.
+
+Source: Khronos Group, glTF 2.0 specification, sections 3.7 (meshes) and 4 (GLB).
+
+Notation: `P` vertices, `F` faces.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Int
+
+from unmix_plugin import __version__
+from unmix_plugin.formats.files import write_file
+
+_FLOAT, _UNSIGNED_INT = 5126, 5125
+_VERTEX_BUFFER, _INDEX_BUFFER = 34962, 34963
+_JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
+
+
+def write_glb(
+    path: Path,
+    positions: Float32[np.ndarray, "P 3"],
+    normals: Float32[np.ndarray, "P 3"],
+    linear_rgb: Float32[np.ndarray, "P 3"],
+    faces: Int[np.ndarray, "F 3"],
+    numbers: Mapping[str, np.ndarray],
+    extras: Mapping[str, Any],
+) -> Path:
+    """Write a mesh.
+
+    Args:
+        path: File; its folder is made.
+        positions: Of the vertices.
+        normals: Unit vectors.
+        linear_rgb: Colours, linear light in sRGB primaries, [0, 1], as glTF wants them.
+        faces: Indices of vertices.
+        numbers: More of each vertex, (P,) float32, by a name that starts with `_`.
+        extras: What else the file says of the mesh, as JSON has it.
+    Returns:
+        The file.
+    Raises:
+        RunError: the disk is full or refuses.
+    """
+    builder = _Builder()
+    attributes = {
+        "POSITION": builder.add(positions, "VEC3", _FLOAT, _VERTEX_BUFFER, has_bounds=True),
+        "NORMAL": builder.add(normals, "VEC3", _FLOAT, _VERTEX_BUFFER),
+        "COLOR_0": builder.add(linear_rgb, "VEC3", _FLOAT, _VERTEX_BUFFER),
+    }
+    for name, values in numbers.items():
+        attributes[name] = builder.add(values, "SCALAR", _FLOAT, _VERTEX_BUFFER)
+    indices = builder.add(faces.astype("<u4").ravel(), "SCALAR", _UNSIGNED_INT, _INDEX_BUFFER)
+    content = {
+        "asset": {"version": "2.0", "generator": f"unmix-nerf {__version__}"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "name": "surface"}],
+        "meshes": [
+            {
+                "primitives": [{"attributes": attributes, "indices": indices, "material": 0}],
+                "extras": dict(extras),
+            }
+        ],
+        "materials": [{"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0}}],
+        "accessors": builder.accessors,
+        "bufferViews": builder.views,
+        "buffers": [{"byteLength": len(builder.data)}],
+    }
+    return write_file(path, _container(json.dumps(content).encode(), bytes(builder.data)))
+
+
+class _Builder:
+    """The binary part and what describes it."""
+
+    def __init__(self) -> None:
+        self.data = bytearray()
+        self.views: list[dict[str, Any]] = []
+        self.accessors: list[dict[str, Any]] = []
+
+    def add(
+        self, values: np.ndarray, kind: str, component: int, target: int, has_bounds: bool = False
+    ) -> int:
+        """Append an array of 4-byte numbers; the index of its accessor."""
+        raw = np.ascontiguousarray(values, dtype="<u4" if component == _UNSIGNED_INT else "<f4").tobytes()
+        view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": len(raw), "target": target}
+        accessor = {
+            "bufferView": len(self.views),
+            "componentType": component,
+            "count": len(values),
+            "type": kind,
+        }
+        if has_bounds and len(values):
+            accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
+        self.data += raw
+        self.views.append(view)
+        self.accessors.append(accessor)
+        return len(self.accessors) - 1
+
+
+def _container(text: bytes, data: bytes) -> bytes:
+    """Header and two chunks, padded to multiples of four bytes."""
+    text += b" " * (-len(text) % 4)
+    data += b"\0" * (-len(data) % 4)
+    chunks = struct.pack("<II", len(text), _JSON_CHUNK) + text
+    chunks += struct.pack("<II", len(data), _BINARY_CHUNK) + data
+    return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks

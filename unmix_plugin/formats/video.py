@@ -1,0 +1,107 @@
+"""MP4 video, H.264: frames go to an encoder as they come, and none is kept.
+
+Source of the tags: ITU-T H.273; colours are those of BT.709, whose primaries sRGB has, with sRGB's own transfer curve.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, TypeAlias
+
+import numpy as np
+
+from unmix_plugin.errors import RunError
+from unmix_plugin.formats.whole_file import cannot_write, whole_file
+
+FrameSink: TypeAlias = Callable[[np.ndarray], None]
+"""Takes the next frame, (H, W, 3) uint8 sRGB."""
+
+_QUALITY = 16
+"""Constant rate factor of x264: 0 is lossless, 18 is hard to tell from it."""
+
+_TAGS = "colorspace=bt709:color_primaries=bt709:color_trc=iec61966-2-1:range=tv"
+
+
+@contextmanager
+def video_frames(path: Path, width: int, height: int, frames_per_second: float) -> Iterator[FrameSink]:
+    """Context that gives a sink for frames; at its end the video is complete and has its name.
+
+    Players want even sizes: where a side is odd, the last row or column is shown twice.
+
+    Raises:
+        RunError: the disk is full or refuses, or the encoder fails; nothing is left of the video.
+        ValueError: a frame of another size.
+    """
+
+    def add(frame: np.ndarray) -> None:
+        if frame.shape != (height, width, 3) or frame.dtype != np.uint8:
+            raise ValueError(f"frames are ({height}, {width}, 3) uint8; got {frame.shape} {frame.dtype}")
+        even = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+        assert encoder.stdin is not None
+        try:
+            encoder.stdin.write(even.tobytes())
+        except OSError as error:
+            encoder.wait()
+            raise _failure(path, log) from error
+
+    with whole_file(path) as temporary, tempfile.TemporaryFile() as log:
+        size = (width + width % 2, height + height % 2)
+        encoder = _start(_words(temporary, size, frames_per_second), log)
+        try:
+            yield add
+            _finish(encoder, path, log)
+        finally:
+            _stop(encoder)
+
+
+def _words(path: Path, size: tuple[int, int], frames_per_second: float) -> list[str]:
+    """The encoder's command."""
+    import imageio_ffmpeg
+
+    frames = f"-f rawvideo -pix_fmt rgb24 -s {size[0]}x{size[1]} -r {frames_per_second:g} -i -"
+    colours = f"-vf scale=out_color_matrix=bt709:out_range=tv,setparams={_TAGS} -pix_fmt yuv420p"
+    codec = f"-an -c:v libx264 -crf {_QUALITY} -movflags +faststart -f mp4"
+    words = f"-hide_banner -loglevel error -nostdin -y {frames} {colours} {codec}"
+    return [imageio_ffmpeg.get_ffmpeg_exe(), *words.split(), str(path)]
+
+
+def _start(words: list[str], log: IO[bytes]) -> subprocess.Popen[bytes]:
+    # A session of its own: Ctrl-C is for us, and we end the encoder.
+    return subprocess.Popen(
+        words, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=log, start_new_session=True
+    )
+
+
+def _finish(encoder: subprocess.Popen[bytes], path: Path, log: IO[bytes]) -> None:
+    assert encoder.stdin is not None
+    try:
+        encoder.stdin.close()
+    except OSError as error:
+        encoder.wait()
+        raise _failure(path, log) from error
+    if encoder.wait() != 0:
+        raise _failure(path, log)
+
+
+def _stop(encoder: subprocess.Popen[bytes]) -> None:
+    """End an encoder that is still at work, and close what leads to it."""
+    if encoder.poll() is None:
+        encoder.kill()
+        encoder.wait()
+    if encoder.stdin is not None and not encoder.stdin.closed:
+        with contextlib.suppress(OSError):  # what was not yet written has no reader any more
+            encoder.stdin.close()
+
+
+def _failure(path: Path, log: IO[bytes]) -> RunError:
+    log.seek(0)
+    lines = log.read().decode(errors="replace").strip().splitlines()
+    # What stands in brackets is the part of the encoder that complains.
+    reason = re.sub(r"^\[.*?\]\s*", "", lines[-1]) if lines else "the video encoder ended early"
+    return cannot_write(path, reason)

@@ -1,0 +1,1 @@
+"""What `unmix-export` and `unmix-render` write."""

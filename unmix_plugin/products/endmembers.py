@@ -1,0 +1,77 @@
+"""Endmember spectra: a table, a spectral library and a plot over wavelength."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from unmix_plugin.formats.envi_library import envi_library_paths, write_envi_library
+from unmix_plugin.formats.files import figure_bytes, make_folder, write_file
+from unmix_plugin.spectral.composition import Materials
+from unmix_plugin.trained.run_materials import endmember_colours, write_endmembers_csv
+
+_LINE_STYLES = ("-", "--", "-.", ":")
+_LEGEND_ROWS = 16
+_DPI = 130
+
+
+def endmember_paths(folder: Path) -> list[Path]:
+    """Files that `write_endmembers` makes."""
+    return [
+        folder / "endmembers.csv",
+        *envi_library_paths(folder / "endmembers"),
+        folder / "endmembers.png",
+    ]
+
+
+def write_endmembers(folder: Path, materials: Materials) -> list[Path]:
+    """Write the endmembers as CSV (wavelength in nm, one column a spectrum), as an ENVI spectral library and as a plot.
+
+    Raises:
+        RunError: the disk is full or refuses.
+    """
+    table_path, *_, plot_path = endmember_paths(make_folder(folder))
+    spectra = materials.endmembers.detach().cpu().numpy().astype(np.float32)
+    library = write_envi_library(
+        folder / "endmembers",
+        spectra,
+        materials.bands,
+        materials.names,
+        "endmembers: radiance, 1 = full scale",
+    )
+    plot = draw_endmembers(materials)
+    return [write_endmembers_csv(table_path, materials), *library, write_file(plot_path, plot)]
+
+
+def draw_endmembers(materials: Materials) -> bytes:
+    """The spectra as lines in the endmembers' colours; from the ninth on, dashes tell near colours apart too."""
+    from matplotlib.figure import Figure
+
+    colours = endmember_colours(materials)
+    legend_columns = -(-len(colours) // _LEGEND_ROWS)
+    figure = Figure(figsize=(7.2 + 1.5 * legend_columns, 4.6), layout="constrained", facecolor="white")
+    axes = figure.add_subplot()
+    wavelengths = materials.bands.centers_nm
+    for index, (spectrum, colour) in enumerate(
+        zip(materials.endmembers.detach().cpu(), colours, strict=True)
+    ):
+        axes.plot(
+            wavelengths,
+            spectrum.numpy(),
+            color=tuple(colour),
+            linestyle=_LINE_STYLES[index // 8 % len(_LINE_STYLES)],
+            linewidth=2.0,
+            marker="o" if len(wavelengths) <= 40 else None,
+            markersize=3.5,
+            label=materials.names[index],
+        )
+    axes.set(xlabel="wavelength (nm)", ylabel="radiance under the scene's light (1 = full scale)")
+    axes.set_ylim(bottom=0.0)
+    axes.set_title("Endmembers", loc="left", fontweight="bold")
+    axes.grid(color="0.9")
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    figure.legend(loc="outside right upper", ncols=legend_columns, frameon=False)
+    return figure_bytes(figure, _DPI)

@@ -1,0 +1,206 @@
+"""Materials that look alike in one light and differ in another: a table and a figure of swatches.
+
+Surfaces are the endmembers of a run, as reflectances (radiance over the scene's light), and measured materials of the
+library that reach all of the run's bands.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from unmix_plugin.errors import SpectrumError
+from unmix_plugin.formats.files import figure_bytes, write_file
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.colour.difference import lab_to_srgb, reflectance_to_lab
+from unmix_plugin.spectral.colour.illuminants import illuminant_power, parse_light
+from unmix_plugin.spectral.colour.metamerism import MetamericPair, metameric_pairs
+from unmix_plugin.spectral.composition import Materials
+from unmix_plugin.spectral.library.material_library import MaterialLibrary
+
+Surfaces = Literal["run", "library", "all"]
+"""Which materials are paired: the run's endmembers, those of the library, or both together."""
+
+DEFAULT_LIGHTS = ("D65", "A", "FL2", "FL11")
+
+_MOST_DRAWN = 12
+_DPI = 130
+_NAME_WIDTH, _CELL, _ROW, _HEADING, _MARGIN = 3.4, 1.5, 0.62, 0.75, 0.2
+
+
+@dataclass(frozen=True)
+class MetamerismOptions:
+    """What counts as alike and as different, and where."""
+
+    lights: tuple[str, ...] = DEFAULT_LIGHTS
+    """Names of lights, or CSV files."""
+    surfaces: Surfaces = "all"
+    alike: float = 2.0
+    """CIEDE2000 up to which two surfaces look alike."""
+    different: float = 4.0
+    """CIEDE2000 from which they look different."""
+
+
+@dataclass(frozen=True)
+class Metamers:
+    """What was found."""
+
+    names: tuple[str, ...]
+    """Of all surfaces looked at."""
+    reflectance: Float64[np.ndarray, "N B"]
+    bands: Bands
+    lights: tuple[str, ...]
+    powers: Float64[np.ndarray, "L B"]
+    pairs: list[MetamericPair]
+
+
+def metamerism_paths(folder: Path) -> list[Path]:
+    """Files that `write_metamerism` makes."""
+    return [folder / "metamerism.csv", folder / "metamerism.png"]
+
+
+def find_metamers(
+    materials: Materials,
+    scene_light: Float64[np.ndarray, " B"] | None,
+    library: MaterialLibrary,
+    options: MetamerismOptions,
+) -> Metamers:
+    """Look at all pairs of surfaces in all lights.
+
+    Args:
+        materials: Of the run.
+        scene_light: What it was recorded in; None for flat light.
+        library: Measured materials.
+        options: What is looked for.
+    Raises:
+        SpectrumError: a light that is unknown or does not cover the run's bands, bands that can't tell colours, or
+            thresholds the wrong way round.
+    """
+    bands = materials.bands
+    lights = [parse_light(word) for word in options.lights]
+    powers = (
+        np.stack([illuminant_power(light, bands) for light in lights])
+        if lights
+        else np.zeros((0, len(bands)))
+    )
+    names, rows = _surfaces(materials, scene_light, library, options.surfaces)
+    reflectance = np.array(rows).reshape(len(names), len(bands))
+    pairs = metameric_pairs(reflectance, powers, bands, options.alike, options.different)
+    num_own = 0 if options.surfaces == "library" else len(materials.names)
+    pairs.sort(key=lambda pair: pair.first >= num_own)  # stable: the run's own first, then by difference
+    labels = tuple(light.stem if isinstance(light, Path) else light for light in lights)
+    return Metamers(tuple(names), reflectance, bands, labels, powers, pairs)
+
+
+def write_metamerism(folder: Path, found: Metamers) -> list[Path]:
+    """Write the pairs as CSV and swatches of the first dozen in every light.
+
+    Pairs with an endmember of the run come first, each kind sorted by their greatest difference.
+
+    Raises:
+        RunError: the disk is full or refuses.
+    """
+    table_path, figure_path = metamerism_paths(folder)
+    return [write_file(table_path, _table(found)), write_file(figure_path, draw_metamers(found))]
+
+
+def draw_metamers(found: Metamers) -> bytes:
+    """A row a pair, a column a light: both surfaces side by side as an eye adapted to the light sees them."""
+    from matplotlib.figure import Figure
+
+    drawn = found.pairs[:_MOST_DRAWN]
+    rows, columns = max(1, len(drawn)), len(found.lights)
+    page = (_NAME_WIDTH + max(3, columns) * _CELL + 2 * _MARGIN, _HEADING + rows * _ROW + 2 * _MARGIN)
+    figure = Figure(figsize=page, facecolor="white")
+    heading = f"{len(found.pairs)} pairs of {len(found.names)} materials look alike in one light, different in another"
+    figure.text(_MARGIN / page[0], 1 - _MARGIN / page[1], heading, fontsize=11, fontweight="bold", va="top")
+    labels = ["CIEDE2000 beside the swatches", *found.lights]
+    for label, left in zip(labels, [_MARGIN, *(_column(index) for index in range(columns))], strict=True):
+        figure.text(left / page[0], 1 - (_MARGIN + 0.68) / page[1], label, fontsize=10, va="bottom")
+    labs = [reflectance_to_lab(found.reflectance, power, found.bands) for power in found.powers]
+    for column, light in enumerate(found.lights):
+        left = (_MARGIN + _NAME_WIDTH + column * _CELL) / page[0]
+        figure.text(left, 1 - (_MARGIN + 0.68) / page[1], Path(light).stem, fontsize=10, va="bottom")
+    for row, pair in enumerate(drawn):
+        base = page[1] - _MARGIN - _HEADING - (row + 1) * _ROW
+        for index, surface in enumerate((pair.first, pair.second)):
+            height = (base + 0.36 - 0.2 * index) / page[1]
+            figure.text(_MARGIN / page[0], height, found.names[surface][:42], fontsize=9, va="center")
+        for column, lab in enumerate(labs):
+            corner = (_column(column), base)
+            _draw_cell(
+                figure, lab_to_srgb(lab[[pair.first, pair.second]]), pair.differences[column], corner, page
+            )
+    return figure_bytes(figure, _DPI)
+
+
+def _column(index: int) -> float:
+    """Where the column of a light begins."""
+    return _MARGIN + _NAME_WIDTH + index * _CELL
+
+
+def _surfaces(
+    materials: Materials,
+    scene_light: Float64[np.ndarray, " B"] | None,
+    library: MaterialLibrary,
+    chosen: Surfaces,
+) -> tuple[list[str], list[Float64[np.ndarray, " B"]]]:
+    """Names and reflectances of what is paired."""
+    names: list[str] = []
+    rows: list[Float64[np.ndarray, " B"]] = []
+    if chosen != "library":
+        light = np.ones(len(materials.bands)) if scene_light is None else scene_light
+        spectra = materials.endmembers.detach().to("cpu", torch.float64).numpy()
+        names += list(materials.names)
+        rows += list(np.divide(spectra, light, out=np.zeros_like(spectra), where=light > 0))
+    for material in library.materials if chosen != "run" else ():
+        try:
+            rows.append(library.reflectance(material.name, materials.bands))
+        except SpectrumError:
+            continue  # it does not reach all bands
+        names.append(material.name)
+    return names, rows
+
+
+def _table(found: Metamers) -> bytes:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    shown = [f"CIEDE2000 in {light}" for light in found.lights]
+    writer.writerow(["first", "second", "alike in", "different in", *shown])
+    for pair in found.pairs:
+        lights = [found.lights[index] for index in (pair.alike_in, pair.different_in)]
+        differences = [f"{value:.3f}" for value in pair.differences]
+        writer.writerow([found.names[pair.first], found.names[pair.second], *lights, *differences])
+    return text.getvalue().encode()
+
+
+def _draw_cell(
+    figure: Any,
+    colours: Float64[np.ndarray, "2 3"],
+    difference: float,
+    corner: tuple[float, float],
+    page: tuple[float, float],
+) -> None:
+    """Two touching swatches and their difference."""
+    from matplotlib.patches import Rectangle
+
+    side = 0.46
+    for index, colour in enumerate(colours):
+        swatch = Rectangle(
+            ((corner[0] + index * side) / page[0], (corner[1] + 0.06) / page[1]),
+            side / page[0],
+            side / page[1],
+            transform=figure.transFigure,
+            facecolor=tuple(colour),
+            edgecolor="none",
+        )
+        figure.add_artist(swatch)
+    text = ((corner[0] + 2 * side + 0.08) / page[0], (corner[1] + 0.29) / page[1])
+    figure.text(*text, f"{difference:.1f}", fontsize=10, va="center")

@@ -1,0 +1,130 @@
+"""Principal components of spectra or abundances as colours, with one basis and one stretch for all views.
+
+Notation: `H x W` pixels, `C` bands or endmembers, `N` pixels.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from unmix_plugin.engine.geometry.camera_paths import resized
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.model import Model
+from unmix_plugin.figures.picture_grid import over_neutral
+from unmix_plugin.formats.files import write_file
+from unmix_plugin.formats.png import rgba_png_bytes
+from unmix_plugin.spectral.composition import OCCUPIED_ACCUMULATION, Materials
+from unmix_plugin.spectral.pca import PcaColours
+from unmix_plugin.trained.view_rendering import RenderedView, as_numpy
+
+PcaOf = Literal["spectra", "abundances"]
+"""What has its components taken."""
+
+_PIXELS = 48 * 48
+"""Of each view that the components are found from."""
+
+
+_LEAST_EXPLAINED = 1e-6
+"""Part of the variance that a component has to explain to be shown."""
+
+
+@dataclass(frozen=True)
+class Components:
+    """Three components, and how much they tell."""
+
+    of: PcaOf
+    colours: PcaColours
+    explained: tuple[float, float, float]
+    """Part of the variance that lies along each."""
+
+
+def component_values(outputs: dict[str, Tensor], of: PcaOf) -> Float[Tensor, "N C"]:
+    """What is seen of a view in pixels where something is: spectra, or abundances that sum to 1."""
+    accumulation = outputs["accumulation"]
+    seen = accumulation > OCCUPIED_ACCUMULATION
+    values = outputs["spectral" if of == "spectra" else "abundances"][seen]
+    return (values if of == "spectra" else values / accumulation[seen][:, None]).cpu()
+
+
+def survey_view(model: Model, camera: Cameras, of: PcaOf) -> Float[Tensor, "N C"]:
+    """What a small render of a view shows, to find components from."""
+    scale = min(1.0, math.sqrt(_PIXELS / (camera.width * camera.height)))
+    width, height = (max(1, round(scale * side)) for side in (camera.width, camera.height))
+    names = ("spectral", "abundances", "accumulation")
+    return component_values(model.get_outputs_for_camera(resized(camera, width, height), names), of)
+
+
+def find_components(values: Sequence[Float[Tensor, "_ C"]], of: PcaOf) -> Components:
+    """The components of what all views show."""
+    together = torch.cat(list(values)).double()
+    colours = PcaColours.fit(together)
+    centred = together - colours.mean
+    total = float(centred.square().sum())
+    along = (centred @ colours.axes).square().sum(dim=0).tolist()
+    first, second, third = (part / total if total > 0 else 0.0 for part in along)
+    # What is left of abundances that sum to 1, or of mixtures of few spectra, is rounding: it would be drawn as noise.
+    tells = (torch.tensor([first, second, third]) > _LEAST_EXPLAINED).double()
+    high = colours.high * tells + (1 - tells)
+    colours = PcaColours(colours.mean, colours.axes * tells, colours.low * tells, high)
+    return Components(of, colours, (first, second, third))
+
+
+def pca_path(folder: Path, name: str) -> Path:
+    """The file that `write_pca` makes for a view."""
+    return folder / f"{name}.png"
+
+
+def components_path(folder: Path) -> Path:
+    """The file that `write_components` makes."""
+    return folder / "components.csv"
+
+
+def write_pca(folder: Path, name: str, view: RenderedView, components: Components) -> Path:
+    """Write a view's components as red, green and blue, fading into grey where nothing is; a pixel a pixel.
+
+    Raises:
+        RunError: the disk is full or refuses.
+    """
+    values = view.spectra if components.of == "spectra" else view.shares
+    colours = as_numpy(components.colours(values.double()))
+    painted = over_neutral(colours, as_numpy(view.accumulation))
+    what = (
+        f"{name}: three principal components of the {components.of}, each from its 1st to its 99th percentile"
+    )
+    pixels = np.round(255 * np.clip(painted, 0, 1)).astype(np.uint8)
+    return write_file(pca_path(folder, name), rgba_png_bytes(pixels, what))
+
+
+def write_components(folder: Path, components: Components, materials: Materials) -> Path:
+    """Write what red, green and blue stand for: a row for each band or endmember, with its mean and its weight in each
+    component; then the values that become 0 and 1, and the part of the variance that each component explains.
+
+    Raises:
+        RunError: the disk is full or refuses.
+    """
+    colours = components.colours
+    of_spectra = components.of == "spectra"
+    names = [f"{nm:g}" for nm in materials.bands.centers_nm] if of_spectra else list(materials.names)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["wavelength" if of_spectra else "endmember", "mean", "red", "green", "blue"])
+    for name, mean, axes in zip(names, colours.mean.tolist(), colours.axes.tolist(), strict=True):
+        writer.writerow([name, f"{mean:.9g}", *(f"{value:.9g}" for value in axes)])
+    for name, row in (
+        ("value of 0", colours.low.tolist()),
+        ("value of 1", colours.high.tolist()),
+        ("explained variance", components.explained),
+    ):
+        writer.writerow([name, "", *(f"{value:.9g}" for value in row)])
+    return write_file(components_path(folder), text.getvalue().encode())

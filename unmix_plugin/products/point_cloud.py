@@ -1,0 +1,94 @@
+"""The scene's surface as a cloud of points with their spectra's mixture: PLY.
+
+Points are the ends of rays of the run's own cameras where nearly all of a ray ends, and where the cameras agree on it;
+lone points are left out, and the rest is thinned evenly. Normals are those of planes through the neighbours.
+
+Notation: `P` points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from unmix_plugin.errors import ConfigError, RunError
+from unmix_plugin.formats.ply import write_ply
+from unmix_plugin.products.cloud import plane_normals, stands_alone, thinned
+from unmix_plugin.products.point_scores import PointScore
+from unmix_plugin.scenes.scene import Normalisation
+from unmix_plugin.spectral.composition import Materials
+from unmix_plugin.trained.surface import SurfacePoints
+from unmix_plugin.trained.surface_appearance import SurfaceLooks
+from unmix_plugin.trained.world_frame import directions_to_world
+
+RAYS_PER_POINT = 5
+"""Rays cast for each point asked for: many miss, and an even cover needs a choice."""
+
+_COUNT_BOUNDS = (1, 10_000_000)
+
+
+def point_cloud_path(folder: Path) -> Path:
+    """The file that `write_point_cloud` makes."""
+    return folder / "points.ply"
+
+
+def require_count(num_points: int) -> int:
+    """The number of points asked for.
+
+    Raises:
+        ConfigError: none, or more than ten million.
+    """
+    low, high = _COUNT_BOUNDS
+    if not low <= num_points <= high:
+        raise ConfigError(f"--num-points is {num_points}; choose {low} to {high}")
+    return num_points
+
+
+def write_point_cloud(
+    folder: Path,
+    points: SurfacePoints,
+    num_points: int,
+    materials: Materials,
+    frame: Normalisation,
+    scores: Sequence[PointScore] = (),
+) -> tuple[Path, int]:
+    """Write `points.ply`, binary: x y z nx ny nz (float32, world), red green blue (uint8, sRGB of the diffuse
+    spectrum), material (uint8), every abundance and every score (float32).
+
+    Args:
+        folder: Where to write; it is made.
+        points: Candidates, model space.
+        num_points: The most to write.
+        materials: Of the model.
+        frame: Of the run.
+        scores: More numbers for every point, of its diffuse spectrum, judged against the points of the cloud.
+    Returns:
+        The file, and how many points are in it.
+    Raises:
+        RunError: there is no point, or the disk is full or refuses.
+        SpectrumError: too few points to judge a target against, or all are alike.
+    """
+    points = points.select(torch.from_numpy(~stands_alone(points.positions.numpy())))
+    if len(points) == 0:
+        raise RunError(
+            "no ray of the run's cameras ends on a surface: train longer, or there is nothing to export"
+        )
+    positions = points.positions.double().numpy()
+    chosen = thinned(positions, num_points)
+    normals = plane_normals(positions, -points.directions.double().numpy(), chosen)
+    kept = points.select(torch.from_numpy(chosen))
+    looks = SurfaceLooks(materials, kept.abundances, kept.diffuse)
+    world = frame.to_world(positions[chosen]).astype(np.float32)
+    turned = directions_to_world(frame, normals).astype(np.float32)
+    vertices = {
+        **{name: world[:, axis] for axis, name in enumerate("xyz")},
+        **{f"n{name}": turned[:, axis] for axis, name in enumerate("xyz")},
+        **looks.properties(),
+        **{score.property: score.values(kept.diffuse, materials.light) for score in scores},
+    }
+    comments = looks.comments("surface points of an unmix-nerf run")
+    comments += [score.comment(materials) for score in scores]
+    return write_ply(point_cloud_path(folder), vertices, comments=comments), len(chosen)

@@ -1,0 +1,1 @@
+"""`unmix-render`: views as files."""

@@ -1,0 +1,152 @@
+"""Which cameras a render uses: views of the dataset, a path around or through them, or those of a file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from unmix_plugin.engine.geometry.camera_paths import interpolated, orbit, resized
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.runs.load_run import SceneRecord
+from unmix_plugin.errors import ConfigError, did_you_mean
+from unmix_plugin.trained.camera_files.camera_files import read_camera_file
+from unmix_plugin.trained.camera_files.camera_json import check_frames_per_second, check_size
+from unmix_plugin.trained.run_views import RunView, views_of
+from unmix_plugin.trained.world_frame import world_frame
+
+DATASET_CAMERAS = ("dataset-eval", "dataset-train")
+PATH_CAMERAS = ("orbit", "interpolate")
+CAMERA_CHOICES = (*DATASET_CAMERAS, *PATH_CAMERAS)
+"""Cameras that have a name; any other choice is a file."""
+
+USUAL_FRAMES = 120
+_MOST_FRAMES = 100_000
+_GREATEST_DOWNSCALE = 1000
+
+
+@dataclass(frozen=True)
+class CameraRequest:
+    """What cameras are asked for."""
+
+    source: str = "dataset-eval"
+    """One of `CAMERA_CHOICES`, or the path of a camera file."""
+    only: tuple[str, ...] = ()
+    """Names of views, or numbers from 0; none: all."""
+    size: tuple[int, int] | None = None
+    """Width and height in pixels; None: that of the dataset or of the file."""
+    downscale: float | int | None = None
+    """Division of width and height."""
+    num_frames: int | None = None
+    """Of a path that is made here."""
+    frames_per_second: float | int | None = None
+    """Of videos; None: as in the file, or whatever suits each."""
+
+
+@dataclass(frozen=True)
+class RenderCameras:
+    """Cameras to render from."""
+
+    views: tuple[RunView, ...]
+    """At least one; all of one size, in model space, with different names fit for file names."""
+    is_path: bool
+    """Whether one view follows the other, as the frames of a video do."""
+    frames_per_second: float | None
+    """Of videos, where it is given."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        return self.views[0].camera.width, self.views[0].camera.height
+
+
+def choose_cameras(scene: SceneRecord, request: CameraRequest) -> RenderCameras:
+    """The cameras asked for.
+
+    Raises:
+        ConfigError: an unknown choice, a bad file, an impossible size, or options that contradict each other.
+    """
+    chosen = _from_source(scene, request)
+    chosen = replace(chosen, views=_only(chosen.views, request.only))
+    if request.frames_per_second is not None:
+        frames_per_second = check_frames_per_second(request.frames_per_second, "--fps")
+        chosen = replace(chosen, frames_per_second=frames_per_second)
+    width, height = _size(chosen.size, request)
+    if (width, height) == chosen.size:
+        return chosen
+    views = tuple(RunView(view.name, resized(view.camera, width, height)) for view in chosen.views)
+    return replace(chosen, views=views)
+
+
+def _from_source(scene: SceneRecord, request: CameraRequest) -> RenderCameras:
+    source = request.source
+    if request.num_frames is not None:
+        _check_frames(source, request.num_frames)
+    if source in DATASET_CAMERAS:
+        views = views_of(scene, "eval" if source == "dataset-eval" else "train")
+        return RenderCameras(tuple(views), False, None)
+    count = USUAL_FRAMES if request.num_frames is None else request.num_frames
+    if source == "orbit":
+        return _path("orbit", orbit(scene.train_cameras, scene.scene_box, count))
+    if source == "interpolate":
+        return _path("interpolate", interpolated(scene.eval_cameras, scene.scene_box, count))
+    if not source.endswith(".json") and not Path(source).is_file():
+        raise ConfigError(
+            f"unknown cameras {source!r}{_near(source, CAMERA_CHOICES)}; known are {', '.join(CAMERA_CHOICES)}, and "
+            "the path of a camera file (.json)"
+        )
+    found = read_camera_file(Path(source), world_frame(scene))
+    is_path = found.frames_per_second is not None
+    return RenderCameras(found.views, is_path, found.frames_per_second)
+
+
+def _path(name: str, cameras: Cameras) -> RenderCameras:
+    views = tuple(RunView(f"{name}_{index:04d}", cameras[index]) for index in range(len(cameras)))
+    return RenderCameras(views, True, None)
+
+
+def _check_frames(source: str, num_frames: int) -> None:
+    if source not in PATH_CAMERAS:
+        raise ConfigError(
+            f"--frames is for the paths that are made here, {' and '.join(PATH_CAMERAS)}; "
+            f"--cameras {source} has cameras of its own"
+        )
+    if not 1 <= num_frames <= _MOST_FRAMES:
+        raise ConfigError(f"--frames {num_frames}: expected 1 to {_MOST_FRAMES}")
+
+
+def _only(views: Sequence[RunView], wanted: Sequence[str]) -> tuple[RunView, ...]:
+    """The views with these names or numbers, in their own order."""
+    names = [view.name for view in views]
+    chosen: set[int] = set()
+    for word in wanted:
+        if word in names:
+            chosen.add(names.index(word))
+        elif word.isdecimal() and int(word) < len(names):
+            chosen.add(int(word))
+        else:
+            raise ConfigError(
+                f"no view {word!r}{_near(word, names)}; there are {len(names)}: numbers 0 to {len(names) - 1}, or "
+                f"names from {names[0]} to {names[-1]}"
+            )
+    return tuple(view for index, view in enumerate(views) if index in chosen or not wanted)
+
+
+def _near(word: str, known: Sequence[str]) -> str:
+    """The nearest names, as part of a sentence."""
+    return did_you_mean(word, known, likeness=0.5, form=" ({})")
+
+
+def _size(size: tuple[int, int], request: CameraRequest) -> tuple[int, int]:
+    if request.size is not None and request.downscale is not None:
+        raise ConfigError("--size and --downscale both say how large pictures are; give one of them")
+    if request.size is not None:
+        return check_size(*request.size, "--size")
+    if request.downscale is None:
+        return size
+    if not 1 / _GREATEST_DOWNSCALE <= request.downscale <= _GREATEST_DOWNSCALE:
+        raise ConfigError(
+            f"--downscale {request.downscale:g}: expected {1 / _GREATEST_DOWNSCALE:g} to {_GREATEST_DOWNSCALE}"
+        )
+    width, height = (round(side / request.downscale) for side in size)
+    return check_size(width, height, f"--downscale {request.downscale:g}")

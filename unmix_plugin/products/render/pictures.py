@@ -1,0 +1,147 @@
+"""Outputs of a render as colours: what a PNG or a video shows.
+
+A picture has tiles side by side, one for most outputs and one for each endmember for abundances. For a PNG, colours
+come with opacity, by which they are not multiplied; for a video, they are laid over the neutral grey.
+
+Notation: `h x W` pixels, some rows of an image; `T` tiles, `K` endmembers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64, UInt8
+
+from unmix_plugin.figures.picture_grid import (
+    NEUTRAL,
+    ColourScale,
+    over_neutral,
+    paint,
+    premultiplied_over_neutral,
+)
+from unmix_plugin.products.abundances import SHARE_SCALE
+from unmix_plugin.products.render.outputs import RenderOutput
+from unmix_plugin.spectral.colour.conversion import linear_to_srgb, srgb_to_linear
+from unmix_plugin.spectral.composition import Materials
+from unmix_plugin.trained.run_materials import endmember_colours
+
+_FIXED_SCALES = {
+    "accumulation": ColourScale("gray", 0.0, 1.0, "opacity"),
+    "confidence": ColourScale("viridis", 0.0, 1.0, "probability of the material"),
+    "abundances": SHARE_SCALE,
+    "material_scores": ColourScale("viridis", 0.0, 1.0, "cosine to the endmember"),
+}
+
+_LIGHT_KINDS = frozenset({"srgb", "light", "radiance"})
+"""Outputs seen on black, hence multiplied by opacity already."""
+
+
+@dataclass(frozen=True)
+class Palette:
+    """The colours of a render, the same in all its pictures."""
+
+    names: tuple[str, ...]
+    """Of the endmembers."""
+    colours: Float64[np.ndarray, "K 3"]
+    """sRGB colours that stand for the endmembers."""
+    scales: dict[str, ColourScale]
+    """Colours of the outputs that have a scale."""
+
+    @staticmethod
+    def of(materials: Materials, surveyed: dict[str, ColourScale]) -> Palette:
+        """That of a model, with the scales that depend on the views."""
+        return Palette(materials.names, endmember_colours(materials), {**_FIXED_SCALES, **surveyed})
+
+    @property
+    def by_id(self) -> Float64[np.ndarray, "256 3"]:
+        """Colour of each id, neutral grey for those that no endmember has."""
+        colours = np.full((256, 3), NEUTRAL)
+        colours[: len(self.colours)] = self.colours
+        return colours
+
+    def describe(self, output: RenderOutput) -> str:
+        """What an output's colours mean."""
+        scale = self.scales.get(output.name)
+        if scale is None:
+            return output.what
+        return f"{output.what}; colours: {scale.colour_map} from {scale.low:.6g} to {scale.high:.6g}"
+
+
+def opaque_tiles(
+    output: RenderOutput, values: np.ndarray, opacity: Float[np.ndarray, "h W"], palette: Palette
+) -> UInt8[np.ndarray, "h W T 3"]:
+    """Colours over the neutral grey."""
+    if output.kind.name in _LIGHT_KINDS:
+        return _over_grey(_linear(output, values), opacity)
+    tiles = _symbols(output, values, opacity, palette)
+    if output.name == "accumulation":
+        return _eight_bits(tiles)
+    flat = [over_neutral(tiles[:, :, index], opacity) for index in range(tiles.shape[2])]
+    return _eight_bits(np.stack(flat, axis=2))
+
+
+def opaque_band(
+    radiance: Float[np.ndarray, "h W"], opacity: Float[np.ndarray, "h W"]
+) -> UInt8[np.ndarray, "h W 1 3"]:
+    """One band of a spectrum on black as grey, over the neutral grey."""
+    return _over_grey(_grey(np.clip(np.asarray(radiance, dtype=np.float64), 0, 1)), opacity)
+
+
+def transparent_tiles(
+    output: RenderOutput, values: np.ndarray, opacity: Float[np.ndarray, "h W"], palette: Palette
+) -> UInt8[np.ndarray, "h W T 4"]:
+    """Colours with opacity as the fourth channel; black where nothing is."""
+    if output.kind.name in _LIGHT_KINDS:
+        straight = _linear(output, values) / np.maximum(opacity, 1e-6)[..., None]
+        tiles = _encoded(straight)[:, :, None]
+    else:
+        tiles = _symbols(output, values, opacity, palette)
+    alpha = np.ones_like(opacity) if output.name == "accumulation" else opacity
+    alpha = np.broadcast_to(_eight_bits(alpha)[:, :, None, None], (*tiles.shape[:3], 1))
+    return np.concatenate([np.where(alpha > 0, _eight_bits(tiles), np.uint8(0)), alpha], axis=-1)
+
+
+def _symbols(
+    output: RenderOutput, values: np.ndarray, opacity: Float[np.ndarray, "h W"], palette: Palette
+) -> Float[np.ndarray, "h W T 3"]:
+    """sRGB colours that are not multiplied by opacity."""
+    kind = output.kind.name
+    if kind == "picture":
+        return np.asarray(values, dtype=np.float64)[:, :, None]
+    if kind == "vectors":
+        return (0.5 + 0.5 * np.asarray(values, dtype=np.float64))[:, :, None]
+    if kind == "labels":
+        return palette.by_id[values][:, :, None]
+    scale = palette.scales[output.name]
+    if output.name == "abundances":  # of what is seen: that a pixel is half covered is told by its opacity
+        values = values / np.maximum(opacity, 1e-6)[..., None]
+    maps = values[..., None] if kind == "map" else values
+    return np.stack([paint(np.asarray(one, np.float64), scale) for one in np.moveaxis(maps, -1, 0)], axis=2)
+
+
+def _linear(output: RenderOutput, values: np.ndarray) -> Float64[np.ndarray, "h W 3"]:
+    """Linear light on black, in [0, 1]."""
+    light = np.clip(np.asarray(values, dtype=np.float64), 0, 1)
+    if output.kind.name == "srgb":
+        return srgb_to_linear(torch.from_numpy(light)).numpy()
+    return _grey(light) if output.kind.name == "radiance" else light
+
+
+def _grey(light: Float64[np.ndarray, "h W"]) -> Float64[np.ndarray, "h W 3"]:
+    return np.repeat(light[..., None], 3, axis=-1)
+
+
+def _over_grey(
+    linear: Float64[np.ndarray, "h W 3"], opacity: Float[np.ndarray, "h W"]
+) -> UInt8[np.ndarray, "h W 1 3"]:
+    return _eight_bits(premultiplied_over_neutral(linear, opacity))[:, :, None]
+
+
+def _encoded(linear: Float64[np.ndarray, "h W 3"]) -> Float64[np.ndarray, "h W 3"]:
+    return linear_to_srgb(torch.from_numpy(linear).clamp(0, 1)).numpy()
+
+
+def _eight_bits(values: np.ndarray) -> np.ndarray:
+    return np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)

@@ -1,0 +1,72 @@
+"""Density and abundances on a regular grid, as an .npz.
+
+Notation: `X x Y x Z` grid points, `K` endmembers, `B` bands.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from unmix_plugin.formats.whole_file import blaming, whole_file
+from unmix_plugin.model import UnmixModel
+from unmix_plugin.scenes.scene import Normalisation
+from unmix_plugin.trained.density_grid import GridPoints, sample_slice
+from unmix_plugin.trained.world_frame import affine_to_world
+
+_FASTEST = 1
+"""Compression that the disk doesn't wait for; most of a volume is empty and shrinks to nothing anyway."""
+
+
+def volume_path(folder: Path) -> Path:
+    """The file that `write_volume` makes."""
+    return folder / "volume.npz"
+
+
+def write_volume(
+    folder: Path, model: UnmixModel, grid: GridPoints, frame: Normalisation, slices: Iterable[int]
+) -> Path:
+    """Write `volume.npz`, of which one slice is in memory at a time, and all densities.
+
+    Arrays: `density` (X, Y, Z) float32 per world unit; `abundances` (X, Y, Z, K) float32, summing to 1; both are 0 in
+    cells that are never rendered. `index_to_world` (4, 4) float64 leads from (i, j, k, 1) to world points.
+    `endmember_names`, `endmembers` (K, B) float32 and `wavelengths_nm` (B,) say what the abundances are of.
+
+    Args:
+        folder: Where to write; it is made.
+        model: Trained.
+        grid: Where to sample.
+        frame: Of the run.
+        slices: 0 to X - 1, in order.
+    Raises:
+        RunError: the disk is full or refuses.
+    """
+    path, materials = volume_path(folder), model.materials
+    density = np.zeros(grid.shape, dtype=np.float32)
+    others = {
+        "index_to_world": affine_to_world(frame, grid.origin.astype(np.float64), grid.cell),
+        "endmember_names": np.array(materials.names),
+        "endmembers": materials.endmembers.detach().cpu().numpy().astype(np.float32),
+        "wavelengths_nm": np.asarray(materials.bands.centers_nm),
+    }
+    with (
+        whole_file(path) as temporary,
+        blaming(path),
+        zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=_FASTEST) as archive,
+    ):
+        with archive.open("abundances.npy", "w", force_zip64=True) as stream:
+            shape = (*grid.shape, len(materials.names))
+            np.lib.format.write_array_header_1_0(
+                stream, {"descr": "<f4", "fortran_order": False, "shape": shape}
+            )
+            for index in slices:
+                found, abundances = sample_slice(model, grid.slice_points(index))
+                density[index] = found * np.float32(frame.scale)
+                stream.write(np.ascontiguousarray(abundances, dtype="<f4").tobytes())
+        for name, values in {"density": density, **others}.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
+                np.lib.format.write_array(stream, values, allow_pickle=False)
+    return path

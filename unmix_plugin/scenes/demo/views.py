@@ -1,0 +1,64 @@
+"""The demo scene's views: where its cameras stand, and pixels from the coefficients that rays gathered.
+
+Notation: `B` bands, `K` materials, `H`, `W` rows and columns.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.scenes.demo.shading import ViewCoefficients
+
+UNLABELLED = 255
+"""Label of pixels that are covered to less than half."""
+
+VIEW_ANGLE_DEG = 38.0
+CAMERA_DISTANCE = 4.1
+LOOK_AT = (0.0, 0.0, 0.22)
+ELEVATIONS_DEG = (16.0, 68.0)
+
+
+def demo_cameras(size: int, views: int) -> Cameras:
+    """Cameras on a dome around the table, azimuths spread by the golden angle."""
+    i = np.arange(views)
+    azimuths = i * np.pi * (3 - np.sqrt(5))
+    # A second irrational stride decouples elevation from order, so that every 4th view samples the whole dome.
+    shares = (i * np.sqrt(2) + 0.5 / views) % 1
+    low, high = np.sin(np.deg2rad(ELEVATIONS_DEG))
+    heights = low + (high - low) * shares
+    flat = np.sqrt(1 - heights**2)
+    backward = np.stack([flat * np.cos(azimuths), flat * np.sin(azimuths), heights], axis=1)
+    right = np.stack([-np.sin(azimuths), np.cos(azimuths), np.zeros(views)], axis=1)
+    up = np.cross(backward, right)
+    positions = np.asarray(LOOK_AT) + CAMERA_DISTANCE * backward
+    poses = np.stack([right, up, backward, positions], axis=2)
+    focal_px = size / 2 / np.tan(np.deg2rad(VIEW_ANGLE_DEG / 2))
+    return Cameras(
+        torch.tensor(poses, dtype=torch.float32),
+        torch.full((views, 2), focal_px),
+        torch.full((views, 2), size / 2),
+        torch.zeros(views, 4),
+        size,
+        size,
+    )
+
+
+def frame_name(index: int) -> str:
+    """`train_000`, `train_001`, `eval_002`, ...: every 4th view is for evaluation."""
+    return f"{'eval' if index % 4 == 2 else 'train'}_{index:03d}"
+
+
+def radiance_cube(
+    view: ViewCoefficients, spectra: Float[np.ndarray, "K B"], lamp: Float[np.ndarray, " B"]
+) -> Float[np.ndarray, "H W B"]:
+    """Spectral radiance of every pixel in [0, 1]: what exceeds 1 saturates, as in a sensor."""
+    reflected = view.diffuse @ spectra.astype(np.float32) + view.specular[..., None]
+    return (reflected * lamp.astype(np.float32)).clip(0, 1)
+
+
+def label_image(view: ViewCoefficients) -> UInt8[np.ndarray, "H W"]:
+    """The material with the largest abundance where at least half a pixel is covered, else 255."""
+    return np.where(view.alpha >= 0.5, view.abundances.argmax(axis=-1), UNLABELLED).astype(np.uint8)

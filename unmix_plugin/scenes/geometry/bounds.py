@@ -1,0 +1,173 @@
+"""The box of space to model, found from the training views.
+
+With alpha: the hull of what is not transparent decides. Without, nothing but the cameras is known, and the box rests
+on how people frame pictures: the subject is where the optical axes meet, and is about as deep as the images are wide
+there. So the box starts as a cube around the point nearest to all axes (least squares), its half edge a little more
+than half the width of the images at that distance. If all cameras look from one side, nothing can stand between them
+and their subject but things are seen behind it, and the cube moves away from them. It is then cut to what a third of
+the cameras see. Cameras that share no such point (parallel or outward-looking) get a cube in front of their middle,
+at a depth where most of their views overlap.
+
+Notation: poses are camera to world, OpenGL axes, float64; `N` training cameras.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, Int64
+from torch import Tensor
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.rays import RayBundle
+from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.errors import SceneError
+from unmix_plugin.scenes.geometry.carving import carve_box
+from unmix_plugin.scenes.geometry.matter_rays import MIN_EXPLAINED, rays_to_matter, share_through
+
+MIN_CONVERGENCE = 1e-3
+"""Least mean squared sine between optical axes and their spread direction that still fixes a focus, (1.8 deg)^2."""
+FRAME_MARGIN = 1.2
+"""The cube of views over the width of the images at the focus."""
+SHIFT_BEHIND = 0.2
+"""How far the cube moves away from cameras that all look one way, over half that width; a ring of cameras moves it
+little, since its directions cancel."""
+HULL_CELLS = 64
+"""Cells along an edge when the hull's extent is sought."""
+HULL_SHARES = (2.0 / 3.0, 1.0 / 3.0)
+"""Tried in turn: the hull's cells count for its extent if this share of the cameras that see its best seen cell see
+them, as long as the box still explains the images."""
+MIN_CONSISTENT = 0.5
+"""Least share of the pixels with matter that must have hull behind them: only gross contradictions fall below, since
+masks that are a little off keep far more."""
+HULL_START = 1.25
+"""The first box of the hull over the cameras' cube: room for things that reach out of the images."""
+SEEN_SHARE = 1.0 / 3.0
+"""Share of the training cameras that must see a place for it to belong to the box."""
+SEEN_CELLS = 32
+"""Cells along an edge when the region that cameras share is sought."""
+
+
+def find_bounds(root: Path, cameras: Cameras, matter: list[Bool[np.ndarray, "H W"]] | None) -> SceneBox:
+    """The box that the training views show.
+
+    Args:
+        root: Scene folder, for messages.
+        cameras: Training cameras, in coordinates of order 1.
+        matter: For each view True where it may show matter; None where there is no alpha.
+    Returns:
+        The box in the cameras' space.
+    Raises:
+        SceneError: with alpha, no place is opaque in all views that see it: poses and pictures contradict.
+    """
+    centre, half = _cube_of_views(cameras)
+    if matter is None:
+        return _cut_to_shared_view(cameras, _box(centre - half, centre + half))
+    rays = rays_to_matter(cameras, matter)
+    box = _box(centre - HULL_START * half, centre + HULL_START * half)
+    hull = carve_box(cameras, matter, box, HULL_CELLS)
+    # Near a camera that looks out of the others' images everything is consistent, so only shared places count.
+    count = _count_views(cameras, box, HULL_CELLS)
+    explained = share_through(rays, box, hull & (count >= HULL_SHARES[0] * count.max()))
+    if explained < MIN_CONSISTENT:
+        raise SceneError(
+            f"{root}: alpha and poses contradict: only {explained:.0%} of the pixels that are not transparent have "
+            "a place behind them that no other training view looks through; check that 'transform_matrix' is camera "
+            "to world with OpenGL axes (+y up, looking along -z), and that each picture stands with its own pose"
+        )
+    box = _tighten(cameras, rays, box, hull)
+    # The second look has finer cells and so a thinner margin.
+    return _tighten(cameras, rays, box, carve_box(cameras, matter, box, HULL_CELLS))
+
+
+def focus_point(cameras: Cameras) -> Float64[np.ndarray, "3"] | None:
+    """The point nearest to all optical axes; None if they are (nearly) parallel or most point away from it."""
+    poses = cameras.camera_to_world.double().numpy()
+    positions, forward = poses[:, :, 3], -poses[:, :, 2]
+    projectors = np.eye(3) - forward[:, :, None] * forward[:, None, :]
+    mean = projectors.mean(axis=0)
+    if np.linalg.eigvalsh(mean)[0] < MIN_CONVERGENCE:
+        return None
+    point = np.linalg.solve(mean, (projectors @ positions[:, :, None]).mean(axis=0)[:, 0])
+    is_ahead = ((point - positions) * forward).sum(axis=-1) > 0.0
+    return point if is_ahead.mean() > 0.5 else None
+
+
+def _cube_of_views(cameras: Cameras) -> tuple[Float64[np.ndarray, "3"], float]:
+    poses = cameras.camera_to_world.double().numpy()
+    positions, forward = poses[:, :, 3], -poses[:, :, 2]
+    sides = np.array([cameras.width, cameras.height], dtype=np.float64)
+    half_angles = (0.5 * sides / cameras.focal_px.double().numpy()).max(axis=-1)
+    focus = focus_point(cameras)
+    if focus is not None:
+        depths = ((focus - positions) * forward).sum(axis=-1)
+        ahead = depths > 0.0
+        half = float(np.median((depths * half_angles)[ahead]))
+        return focus + SHIFT_BEHIND * half * forward.mean(axis=0), FRAME_MARGIN * half
+    middle = positions.mean(axis=0)
+    spread = float(np.linalg.norm(positions - middle, axis=-1).max())
+    direction = forward.mean(axis=0)
+    length = float(np.linalg.norm(direction))
+    if length < 0.1:  # views in all directions: the box holds the cameras and as much again around them
+        return middle, 2.0 * spread if spread > 0.0 else 1.0
+    half = 2.0 * spread if spread > 0.0 else 1.0
+    depth = half / float(np.median(half_angles))
+    return middle + direction / length * depth, half
+
+
+def _cut_to_shared_view(cameras: Cameras, box: SceneBox) -> SceneBox:
+    """The part of a box that a third of the cameras see; the box itself if they share nothing."""
+    is_shared = _count_views(cameras, box, SEEN_CELLS) >= SEEN_SHARE * len(cameras)
+    return _extent(box, is_shared, margin_cells=0) if is_shared.any() else box
+
+
+def _tighten(cameras: Cameras, rays: RayBundle, box: SceneBox, hull: Bool[np.ndarray, "R R R"]) -> SceneBox:
+    """The extent of the hull in a box, without its far ends that few cameras see, if the images allow.
+
+    Where views are cropped the hull has long arms that reach from the subject to the edge of what is seen.
+    """
+    if not hull.any():  # finer cells may find that nothing fits after all
+        return box
+    count = _count_views(cameras, box, HULL_CELLS)
+    for share in HULL_SHARES:
+        tight = _extent(box, hull & (count >= share * count.max(where=hull, initial=0)), margin_cells=1)
+        t_near, t_far = tight.intersect(rays.origins, rays.directions)
+        if float((t_far > t_near).double().mean()) >= MIN_EXPLAINED:
+            return tight
+    return _extent(box, hull, margin_cells=1)
+
+
+def _cell_centres(box: SceneBox, cells: int) -> Float[Tensor, "P 3"]:
+    steps = (torch.arange(cells, dtype=torch.float32) + 0.5) / cells
+    grid = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), dim=-1).reshape(-1, 3)
+    return box.aabb[0] + grid * box.size
+
+
+def _count_views(cameras: Cameras, box: SceneBox, cells: int) -> Int64[np.ndarray, "R R R"]:
+    """How many cameras see the centre of each cell."""
+    points = _cell_centres(box, cells)
+    limits = torch.tensor([cameras.width, cameras.height], dtype=torch.float32)
+    count = torch.zeros(len(points), dtype=torch.int64)
+    for index in range(len(cameras)):
+        pixels, depths = cameras.project(points, index)
+        count += ((pixels >= 0.0) & (pixels <= limits)).all(dim=-1) & (depths > 0.0)
+    return count.reshape(cells, cells, cells).numpy()
+
+
+def _extent(box: SceneBox, kept: Bool[np.ndarray, "R R R"], margin_cells: int) -> SceneBox:
+    """The smallest box around the kept cells, wider by a margin but never beyond the old box."""
+    low, size = box.aabb[0].double().numpy(), box.size.double().numpy()
+    new_low, new_high = np.zeros(3), np.zeros(3)
+    for axis in range(3):
+        others = tuple(other for other in range(3) if other != axis)
+        cells = np.flatnonzero(kept.any(axis=others))
+        first, last = max(cells[0] - margin_cells, 0), min(cells[-1] + 1 + margin_cells, kept.shape[axis])
+        new_low[axis] = low[axis] + size[axis] * first / kept.shape[axis]
+        new_high[axis] = low[axis] + size[axis] * last / kept.shape[axis]
+    return _box(new_low, new_high)
+
+
+def _box(low: Float64[np.ndarray, "3"], high: Float64[np.ndarray, "3"]) -> SceneBox:
+    return SceneBox(torch.from_numpy(np.stack([low, high])).float())

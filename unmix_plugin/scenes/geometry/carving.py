@@ -1,0 +1,230 @@
+"""Which cells of space may hold matter, judged by the training views alone and before any training.
+
+A cell stays if enough training cameras see it and, where pictures have alpha, no training view looks through it: a view
+looks through a cell if the cell's whole footprint, widened by a margin, lies in the image on pixels of alpha 0. The
+footprint is the bounding rectangle of the cell's projection, rounded outwards, so the hull errs only towards matter.
+
+What one or two views see is not held by the others, and what grows there fits single images only: with alpha half of
+the views must see a cell, unless that leaves pixels unexplained, without alpha a tenth.
+
+Notation: `M` cells, `R` cells along an edge; cells are indexed [x, y, z] from the box's smallest corner.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Int64
+from torch import Tensor
+
+from unmix_plugin.engine.geometry.camera_distortion import distort, undistort
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.scenes.geometry.matter_rays import MIN_EXPLAINED, rays_to_matter, share_through
+from unmix_plugin.scenes.scene import Scene
+
+PIXEL_MARGIN = 1.0
+"""Pixels around a footprint that must be empty too: alpha is quantised and poses are not exact."""
+NEAR_DEPTH = 0.05
+"""Depth in front of a camera, as a share of the box's longest half edge, below which it sees nothing."""
+COARSEST_CELLS = 16
+"""Cells along an edge of the coarsest grid; finer ones look only inside what the coarser left."""
+BORDER_POINTS = 65
+"""Points along each image edge when its undistorted bounds are sought."""
+FAIR_SHARE = 0.5
+"""Share of the training views that must see a cell of a scene with alpha, unless that leaves matter unexplained."""
+FAIR_SHARE_OPEN = 0.1
+"""The same without alpha, where nothing tells what it leaves unexplained: only what hardly any view sees is carved,
+since walls would be continued there into the void beside a room."""
+BLOCK_CELLS = 1 << 15
+"""Cells projected together; keeps temporaries within the processor's cache."""
+
+
+def carve(scene: Scene, resolution: int) -> Bool[np.ndarray, "R R R"]:
+    """Cells of the scene box that may hold matter.
+
+    Args:
+        scene: With alpha its hull is carved; without, what hardly any training camera sees.
+        resolution: Cells along each edge of the box.
+    Returns:
+        True where matter may be.
+    """
+    indices = list(scene.train_indices)
+    cameras, box = scene.cameras[indices], scene.scene_box
+    if not scene.has_alpha:
+        fewest_views = max(1, math.ceil(FAIR_SHARE_OPEN * len(indices)))
+        return carve_box(cameras, None, box, resolution, fewest_views)
+    matter = [matter_mask(scene, index) for index in indices]
+    fair = carve_box(
+        cameras, matter, box, resolution, fewest_views=max(1, math.ceil(FAIR_SHARE * len(indices)))
+    )
+    if share_through(rays_to_matter(cameras, matter), box, fair) >= MIN_EXPLAINED:
+        return fair
+    return carve_box(cameras, matter, box, resolution)
+
+
+def matter_mask(scene: Scene, index: int) -> Bool[np.ndarray, "H W"]:
+    """Pixels of a view behind which matter may be: not fully transparent, or not to be trusted."""
+    alpha = scene.alpha(index)
+    valid = scene.valid_mask(index)
+    return ~valid if alpha is None else (alpha > 0.0) | ~valid
+
+
+def carve_box(
+    cameras: Cameras,
+    matter: list[Bool[np.ndarray, "H W"]] | None,
+    box: SceneBox,
+    resolution: int,
+    fewest_views: int = 1,
+) -> Bool[np.ndarray, "R R R"]:
+    """Cells of a box that may hold matter, by the given views.
+
+    Args:
+        cameras: One a view, in the space of the box.
+        matter: For each view True on pixels that may show matter; None where there is no alpha.
+        box: What is divided into cells.
+        resolution: Cells along each edge, >= 1.
+        fewest_views: Views that must see a cell for it to stay.
+    """
+    if resolution < 1:
+        raise ValueError(f"resolution must be at least 1; got {resolution}")
+    views = [_View(cameras, i, None if matter is None else matter[i]) for i in range(len(cameras))]
+    near = NEAR_DEPTH * 0.5 * float(box.size.max())
+    sizes = [resolution]
+    while sizes[-1] % 2 == 0 and sizes[-1] > COARSEST_CELLS:
+        sizes.append(sizes[-1] // 2)
+    kept = np.ones((sizes[-1],) * 3, dtype=bool)
+    for cells in reversed(sizes):
+        if kept.shape[0] != cells:
+            kept = kept.repeat(2, axis=0).repeat(2, axis=1).repeat(2, axis=2)
+        candidates = np.flatnonzero(kept)
+        for first in range(0, len(candidates), BLOCK_CELLS):
+            block = candidates[first : first + BLOCK_CELLS]
+            kept.reshape(-1)[block] = _may_hold_matter(block, cells, views, box, near, fewest_views)
+    return kept
+
+
+def _may_hold_matter(
+    flat_cells: Int64[np.ndarray, " M"],
+    cells: int,
+    views: list[_View],
+    box: SceneBox,
+    near: float,
+    fewest_views: int,
+) -> Bool[np.ndarray, " M"]:
+    low, size = box.aabb[0].numpy(), box.size.numpy()
+    index = np.stack(np.unravel_index(flat_cells, (cells, cells, cells))).astype(np.float32)
+    centres = low[:, None] + (index + np.float32(0.5)) * (size / np.float32(cells))[:, None]
+    half = size * np.float32(0.5 / cells)
+    seen_by = np.zeros(len(flat_cells), dtype=np.int64)
+    alive = np.arange(len(flat_cells))
+    for view in views:
+        # With alpha every cell left is looked at by every view; without, only those too few have seen yet.
+        looked_at = alive if view.covered is not None else alive[seen_by[alive] < fewest_views]
+        footprint = view.footprint(centres.take(looked_at, axis=1), half)
+        seen_by[looked_at] += view.sees(footprint, near)
+        if view.covered is not None:
+            alive = alive[~view.looks_through(footprint)]
+    result = np.zeros(len(flat_cells), dtype=bool)
+    result[alive] = seen_by[alive] >= fewest_views
+    return result
+
+
+@dataclass(frozen=True)
+class _Footprint:
+    """Bounding rectangles of projected cells in ideal coordinates (over depth, undistorted), and their depths."""
+
+    low: Float32[np.ndarray, "2 M"]
+    high: Float32[np.ndarray, "2 M"]
+    nearest: Float32[np.ndarray, " M"]
+    farthest: Float32[np.ndarray, " M"]
+
+
+class _View:
+    """One camera with the running sum of its matter pixels, so that any rectangle is counted with four look-ups."""
+
+    def __init__(self, cameras: Cameras, index: int, matter: Bool[np.ndarray, "H W"] | None) -> None:
+        pose = cameras.camera_to_world[index].numpy()
+        # OpenCV axes here (x right, y down, z forward), so that image and depth have the signs of pixels
+        self._axes = (pose[:, :3] * np.array([1.0, -1.0, -1.0], dtype=np.float32)).T
+        self._position = pose[:, 3]
+        self._focal = cameras.focal_px[index].numpy()[:, None]
+        self._center = cameras.center_px[index].numpy()[:, None]
+        self._distortion = cameras.distortion[index] if cameras.is_distorted else None
+        self._columns, self._rows = cameras.width, cameras.height
+        self._low, self._high = self._ideal_bounds()
+        self.covered = None
+        if matter is not None:
+            sums = np.zeros((cameras.height + 1, cameras.width + 1), dtype=np.int32)
+            np.cumsum(np.cumsum(matter, axis=0, dtype=np.int32), axis=1, out=sums[1:, 1:])
+            self.covered = sums.reshape(-1)
+
+    def footprint(self, centres: Float32[np.ndarray, "3 M"], half: Float32[np.ndarray, "3"]) -> _Footprint:
+        local = self._axes @ (centres - self._position[:, None])
+        reach = np.abs(self._axes) @ half
+        nearest, farthest = local[2] - reach[2], local[2] + reach[2]
+        # Cells that reach behind the camera get a huge rectangle; `looks_through` asks for the depth too.
+        front, back = np.maximum(nearest, 1e-6), np.maximum(farthest, 1e-6)
+        low, high = local[:2] - reach[:2, None], local[:2] + reach[:2, None]
+        low = np.where(low < 0.0, low / front, low / back)
+        high = np.where(high > 0.0, high / front, high / back)
+        return _Footprint(low, high, nearest, farthest)
+
+    def sees(self, footprint: _Footprint, near: float) -> Bool[np.ndarray, " M"]:
+        """Cells of which at least a part may be in the image and beyond the near plane."""
+        overlaps = (footprint.high > self._low) & (footprint.low < self._high)
+        return overlaps[0] & overlaps[1] & (footprint.farthest > near)
+
+    def looks_through(self, footprint: _Footprint) -> Bool[np.ndarray, " M"]:
+        """Cells whose whole footprint lies in the image, on pixels without matter."""
+        assert self.covered is not None
+        inside = (footprint.low >= self._low) & (footprint.high <= self._high)
+        chosen = np.flatnonzero(inside[0] & inside[1] & (footprint.nearest > 1e-6))
+        low, high = footprint.low.take(chosen, axis=1), footprint.high.take(chosen, axis=1)
+        if self._distortion is not None:
+            low, high = _bend(low, high, self._distortion)
+        # One array of row-major corner numbers and `take` cost a third of two-dimensional indexing.
+        low = low * self._focal + (self._center - PIXEL_MARGIN)
+        high = high * self._focal + (self._center + PIXEL_MARGIN)
+        fits = np.flatnonzero(
+            (low[0] >= 0.0) & (low[1] >= 0.0) & (high[0] < self._columns) & (high[1] < self._rows)
+        )
+        x0, y0 = low.take(fits, axis=1).astype(np.int32)
+        x1, y1 = high.take(fits, axis=1).astype(np.int32) + 1
+        y0, y1 = y0 * (self._columns + 1), y1 * (self._columns + 1)
+        sums = self.covered
+        count = sums.take(y1 + x1) - sums.take(y0 + x1) - sums.take(y1 + x0) + sums.take(y0 + x0)
+        empty = np.zeros(len(footprint.nearest), dtype=bool)
+        empty[chosen[fits]] = count == 0
+        return empty
+
+    def _sides(self) -> Float32[np.ndarray, "2 1"]:
+        return np.array([[self._columns], [self._rows]], dtype=np.float32)
+
+    def _ideal_bounds(self) -> tuple[Float32[np.ndarray, "2 1"], Float32[np.ndarray, "2 1"]]:
+        """Bounds of the image in ideal coordinates, from its border; far outside them a lens model folds over."""
+        if self._distortion is None:
+            return -self._center / self._focal, (self._sides() - self._center) / self._focal
+        along = np.linspace(0.0, 1.0, BORDER_POINTS, dtype=np.float32)
+        ends = np.repeat(np.array([0.0, 1.0], dtype=np.float32), BORDER_POINTS)
+        both = np.tile(along, 2)
+        border = np.concatenate([np.stack([both, ends]), np.stack([ends, both])], axis=1) * self._sides()
+        bent = torch.from_numpy(((border - self._center) / self._focal).T.copy())
+        ideal = undistort(bent, self._distortion).numpy()
+        return ideal.min(axis=0)[:, None], ideal.max(axis=0)[:, None]
+
+
+def _bend(
+    low: Float32[np.ndarray, "2 M"], high: Float32[np.ndarray, "2 M"], distortion: Float[Tensor, "4"]
+) -> tuple[Float32[np.ndarray, "2 M"], Float32[np.ndarray, "2 M"]]:
+    """Bounds of distorted rectangles, from their corners, the middles of their edges and their centres.
+
+    A bulge between these points is of second order in a cell's size and stays within `PIXEL_MARGIN`.
+    """
+    columns, rows = (np.stack([low[axis], 0.5 * (low[axis] + high[axis]), high[axis]]) for axis in (0, 1))
+    points = np.stack(np.broadcast_arrays(columns[:, None], rows[None, :]), axis=-1)
+    bent = distort(torch.from_numpy(points), distortion).numpy().reshape(9, -1, 2)
+    return bent.min(axis=0).T, bent.max(axis=0).T

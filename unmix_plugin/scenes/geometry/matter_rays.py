@@ -1,0 +1,40 @@
+"""Rays through the pixels that show matter, and whether a hull explains them."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.rays import RayBundle
+from unmix_plugin.engine.geometry.scene_box import SceneBox
+
+MAX_RAYS = 20_000
+"""Pixels that are asked for whether a hull explains them."""
+MIN_EXPLAINED = 0.999
+"""Share of the pixels with matter whose rays must cross what is kept."""
+
+
+def rays_to_matter(cameras: Cameras, matter: list[Bool[np.ndarray, "H W"]]) -> RayBundle:
+    """Rays through pixels that may show matter, evenly thinned out to at most `MAX_RAYS`."""
+    flat = np.flatnonzero(np.stack(matter))
+    chosen = torch.from_numpy(flat[:: max(1, -(-len(flat) // MAX_RAYS))])
+    pixel = chosen % (cameras.height * cameras.width)
+    coords = torch.stack([pixel % cameras.width, pixel // cameras.width], dim=-1).float() + 0.5
+    return cameras.generate_rays(chosen // (cameras.height * cameras.width), coords)
+
+
+def share_through(rays: RayBundle, box: SceneBox, hull: Bool[np.ndarray, "R R R"]) -> float:
+    """Share of the rays that meet a cell of the hull; 0 without rays."""
+    if len(rays) == 0:
+        return 0.0
+    cells = hull.shape[0]
+    t_near, t_far = box.intersect(rays.origins, rays.directions)
+    kept = torch.from_numpy(hull)
+    meets = torch.zeros(len(rays), dtype=torch.bool)
+    for step in torch.linspace(0.0, 1.0, 2 * cells):
+        points = rays.origins + (t_near + step * (t_far - t_near))[:, None] * rays.directions
+        x, y, z = (box.normalise(points) * cells).long().clamp(0, cells - 1).unbind(-1)
+        meets |= kept[x, y, z] & (t_far > t_near)
+    return float(meets.double().mean())

@@ -1,0 +1,1 @@
+"""From a scene folder to a validated scene."""

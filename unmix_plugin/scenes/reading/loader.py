@@ -1,0 +1,207 @@
+"""From a scene folder to a validated `Scene`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.scenes.geometry.bounds import find_bounds
+from unmix_plugin.scenes.geometry.carving import matter_mask
+from unmix_plugin.scenes.reading.faults import Faults
+from unmix_plugin.scenes.reading.frame_files import (
+    ImageSize,
+    check_colours,
+    check_cubes,
+    check_truth,
+    locate_files,
+)
+from unmix_plugin.scenes.reading.scene_paths import resolve_path, sha256_of
+from unmix_plugin.scenes.reading.spectra_files import read_endmembers, read_illuminant
+from unmix_plugin.scenes.reading.splits import Split, split_frames
+from unmix_plugin.scenes.reading.transforms_json import FILE_NAME, SceneEntry, read_transforms
+from unmix_plugin.scenes.scene import Frame, Normalisation, Scene, SceneOptions
+
+
+def load_scene(root: Path, options: SceneOptions | None = None) -> Scene:
+    """Read and check a scene folder.
+
+    Every value of every cube and every picture is looked at once, a frame at a time; the `Scene` reads them again
+    from the files when asked.
+
+    Args:
+        root: Folder that holds transforms.json.
+        options: How to read it; None for the defaults.
+    Raises:
+        SceneError: the folder is no sound scene; the message lists all that is wrong with it.
+    """
+    options = SceneOptions() if options is None else options
+    faults = Faults(root)
+    _check_options(options, faults)
+    entry = read_transforms(root, faults)
+    located = locate_files(root, entry, options, faults)
+    size = check_cubes(entry, located, options, faults)
+    has_alpha = check_colours(entry, located, size, faults)
+    truth = _read_truth(root, entry, options, faults)
+    names = truth.material_names
+    check_truth(entry, located, size, None if names is None else len(names), faults)
+    split = split_frames(entry, options.eval_split, options.eval_interval, faults)
+    faults.raise_if_any()
+    assert size is not None
+    return _with_bounds(_assemble(root, entry, located, size, has_alpha, truth, split, options), entry)
+
+
+@dataclass(frozen=True)
+class _Truth:
+    """What a scene says of its materials and light; None where it is silent."""
+
+    material_names: tuple[str, ...] | None
+    illuminant: Float64[np.ndarray, " B"] | None
+    endmembers: Float64[np.ndarray, "K B"] | None
+    paths: tuple[Path, ...]
+
+
+def _check_options(options: SceneOptions, faults: Faults) -> None:
+    scale = options.value_scale
+    if scale is not None and not (math.isfinite(scale) and scale > 0.0):
+        faults.add(
+            "value_scale", f"is {scale:g}; expected a positive number, the stored value that stands for 1"
+        )
+        faults.raise_if_any()
+
+
+def _read_truth(root: Path, entry: SceneEntry, options: SceneOptions, faults: Faults) -> _Truth:
+    names, illuminant, endmembers = entry.materials, None, None
+    paths: list[Path] = []
+    for key, text in (("illuminant_path", entry.illuminant_path), ("endmembers_path", entry.endmembers_path)):
+        if text is None:
+            continue
+        path = resolve_path(root, text, options.allow_outside_paths, f"'{key}'", faults)
+        if path is None or entry.wavelengths_nm is None:
+            continue
+        paths.append(path)
+        if key == "illuminant_path":
+            illuminant = read_illuminant(path, entry.wavelengths_nm, f"'{key}'", faults)
+        else:
+            table = read_endmembers(path, entry.wavelengths_nm, names, f"'{key}'", faults)
+            names, endmembers = (names, None) if table is None else (table.names, table.spectra)
+    return _Truth(names, illuminant, endmembers, tuple(paths))
+
+
+def _assemble(
+    root: Path,
+    entry: SceneEntry,
+    located: tuple[dict[str, Path], ...],
+    size: ImageSize,
+    has_alpha: bool,
+    truth: _Truth,
+    split: Split,
+    options: SceneOptions,
+) -> Scene:
+    """The scene in a first model space, centred on the training cameras; `_with_bounds` gives it its own."""
+    assert entry.wavelengths_nm is not None
+    positions = _world_poses(entry)[list(split.train), :, 3]
+    radius = float(np.linalg.norm(positions - positions.mean(axis=0), axis=-1).max())
+    first = Normalisation(np.eye(3), -positions.mean(axis=0), 1.0 / radius if radius > 0.0 else 1.0)
+    inputs = [root / FILE_NAME, *truth.paths, *(path for paths in located for path in paths.values())]
+    evaluated = [located[index] for index in split.evaluation]
+    return Scene(
+        root=root,
+        wavelengths_nm=entry.wavelengths_nm,
+        frames=_name_frames(entry, located),
+        cameras=_make_cameras(entry, size, first),
+        train_indices=split.train,
+        eval_indices=split.evaluation,
+        scene_box=SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])),
+        normalisation=first,
+        material_names=truth.material_names,
+        illuminant=truth.illuminant,
+        endmembers=truth.endmembers,
+        has_alpha=has_alpha,
+        has_labels=all("seg_file_path" in paths for paths in evaluated),
+        has_abundances=all("abundance_file_path" in paths for paths in evaluated),
+        input_hashes={_relative(path, root): sha256_of(path) for path in inputs},
+        options=options,
+    )
+
+
+def _with_bounds(scene: Scene, entry: SceneEntry) -> Scene:
+    """The scene with the box that its training views show, brought to [-1, 1]."""
+    train = list(scene.train_indices)
+    matter = [matter_mask(scene, index) for index in train] if scene.has_alpha else None
+    low, high = find_bounds(scene.root, scene.cameras[train], matter).aabb.double().numpy()
+    scale = float(2.0 / (high - low).max())
+    half = 0.5 * scale * (high - low)
+    first = scene.normalisation
+    normalisation = Normalisation(
+        rotation=first.rotation,
+        translation=first.translation - 0.5 * (low + high) / first.scale,
+        scale=first.scale * scale,
+    )
+    size = ImageSize(scene.cameras.height, scene.cameras.width)
+    return replace(
+        scene,
+        cameras=_make_cameras(entry, size, normalisation),
+        normalisation=normalisation,
+        scene_box=SceneBox(torch.from_numpy(np.stack([-half, half])).float()),
+    )
+
+
+def _world_poses(entry: SceneEntry) -> Float64[np.ndarray, "N 3 4"]:
+    poses = [frame.pose for frame in entry.frames if frame.pose is not None]
+    assert len(poses) == len(entry.frames)
+    return np.stack(poses)
+
+
+def _make_cameras(entry: SceneEntry, size: ImageSize, normalisation: Normalisation) -> Cameras:
+    lenses = [frame.intrinsics for frame in entry.frames if frame.intrinsics is not None]
+    assert len(lenses) == len(entry.frames)
+    poses = _world_poses(entry)
+    rotations = normalisation.rotation @ poses[:, :, :3]
+    positions = normalisation.to_model(poses[:, :, 3])
+    middle = (0.5 * size.width, 0.5 * size.height)
+    centers = [
+        [middle[axis] if value is None else value for axis, value in enumerate(lens.center_px)]
+        for lens in lenses
+    ]
+    return Cameras(
+        camera_to_world=torch.from_numpy(np.concatenate([rotations, positions[:, :, None]], axis=-1)).float(),
+        focal_px=torch.tensor([lens.focal_at(size.width) for lens in lenses], dtype=torch.float32),
+        center_px=torch.tensor(centers, dtype=torch.float32),
+        distortion=torch.tensor([lens.distortion for lens in lenses], dtype=torch.float32),
+        width=size.width,
+        height=size.height,
+    )
+
+
+def _name_frames(entry: SceneEntry, located: tuple[dict[str, Path], ...]) -> tuple[Frame, ...]:
+    """Frames with the shortest names that differ: the stem of the cube, its folder before it, or its whole path."""
+    paths = [PurePosixPath(frame.paths["hyperspectral_file_path"]).with_suffix("") for frame in entry.frames]
+    candidates = (
+        [path.name for path in paths],
+        [f"{path.parent.name}_{path.name}" for path in paths],
+        ["_".join(part for part in path.parts if part not in ("..", "/")) for path in paths],
+        [f"{path.name}_{index}" for index, path in enumerate(paths)],
+    )
+    names = next((names for names in candidates if len(set(names)) == len(names)), candidates[-1])
+    return tuple(
+        Frame(
+            name=name,
+            cube_path=files["hyperspectral_file_path"],
+            image_path=files.get("file_path"),
+            label_path=files.get("seg_file_path"),
+            mask_path=files.get("mask_path"),
+            abundance_path=files.get("abundance_file_path"),
+        )
+        for name, files in zip(names, located, strict=True)
+    )
+
+
+def _relative(path: Path, root: Path) -> str:
+    return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)

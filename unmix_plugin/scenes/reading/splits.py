@@ -1,0 +1,132 @@
+"""Which frames train and which evaluate: by lists, by folder or file name, or every n-th.
+
+Evaluation frames are those of the test split if there are any, else those of the validation split.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+from typing import Literal
+
+from unmix_plugin.scenes.reading.faults import Faults
+from unmix_plugin.scenes.reading.transforms_json import FILE_NAME, SceneEntry
+
+SPLIT_NAMES = ("train", "eval", "val", "test")
+SPLIT_NAME = re.compile(
+    r"(train(?:ing)?|eval(?:uation)?|val(?:idation)?|test(?:ing)?)(?![a-z])", re.IGNORECASE
+)
+"""A folder or file name that starts with a split's name as a word of its own: train_000, test, val-3, eval7."""
+
+
+@dataclass(frozen=True)
+class Split:
+    """Indices of frames, increasing."""
+
+    train: tuple[int, ...]
+    evaluation: tuple[int, ...]
+
+
+def split_frames(
+    entry: SceneEntry,
+    method: Literal["auto", "lists", "filename", "interval"],
+    interval: int,
+    faults: Faults,
+) -> Split:
+    """Split the frames; notes a fault where training or evaluation is left without a frame."""
+    if method == "lists" and not entry.split_lists:
+        faults.add(
+            FILE_NAME,
+            "has no train_filenames, val_filenames or test_filenames; eval_split 'lists' needs them",
+        )
+        return Split((), ())
+    if method == "lists" or (method == "auto" and entry.split_lists):
+        split = _by_lists(entry, faults)
+    elif method == "filename" or (method == "auto" and _names_tell(entry)):
+        split = _by_name(entry, faults)
+    else:
+        split = _by_interval(len(entry.frames), interval, faults)
+    if entry.frames and not split.train:
+        faults.add(
+            FILE_NAME, f"no frame is left to train on ({_how(method)}); name some in 'train_filenames'"
+        )
+    if entry.frames and not split.evaluation:
+        advice = "name some in 'test_filenames' or use eval_split 'interval'"
+        faults.add(FILE_NAME, f"no frame is left to evaluate ({_how(method)}); {advice}")
+    return split
+
+
+def _how(method: str) -> str:
+    return "split chosen by itself" if method == "auto" else f"split by {method}"
+
+
+def _by_lists(entry: SceneEntry, faults: Faults) -> Split:
+    index_of: dict[str, int] = {}
+    for index, frame in enumerate(entry.frames):
+        for key in ("hyperspectral_file_path", "file_path"):
+            if key in frame.paths:
+                index_of[_plain(frame.paths[key])] = index
+    chosen: dict[str, set[int]] = {}
+    for name, paths in entry.split_lists.items():
+        chosen[name] = set()
+        for path in paths:
+            index = index_of.get(_plain(path))
+            if index is None:
+                faults.add(f"'{name}_filenames'", f"lists {path!r}, which is the file_path of no frame")
+            else:
+                chosen[name].add(index)
+    everything = set(range(len(entry.frames)))
+    evaluation = chosen.get("test") or chosen.get("val")
+    if evaluation is None:
+        evaluation = everything - chosen["train"] if "train" in chosen else set()
+    held_out = chosen.get("val", set()) | chosen.get("test", set())
+    train = chosen.get("train", everything - held_out)
+    _refuse_overlap(entry, train & evaluation, faults)
+    return Split(tuple(sorted(train)), tuple(sorted(evaluation)))
+
+
+def _refuse_overlap(entry: SceneEntry, both: set[int], faults: Faults) -> None:
+    for index in sorted(both):
+        message = "is listed for training and for evaluation; a frame trained on cannot judge the result"
+        faults.add(entry.frames[index].where, message)
+
+
+def _plain(path: str) -> str:
+    return str(PurePosixPath(path))
+
+
+def _name_split(paths: dict[str, str]) -> str | None:
+    """The split that the parent folder or the name of a frame's picture or cube starts with."""
+    for key in ("file_path", "hyperspectral_file_path"):
+        path = PurePosixPath(paths.get(key, ""))
+        for word in (path.name, path.parent.name):
+            match = SPLIT_NAME.match(word)
+            if match:
+                return next(name for name in SPLIT_NAMES if match.group(1).lower().startswith(name))
+    return None
+
+
+def _names_tell(entry: SceneEntry) -> bool:
+    names = [_name_split(frame.paths) for frame in entry.frames]
+    return None not in names and "train" in names and len(set(names)) > 1
+
+
+def _by_name(entry: SceneEntry, faults: Faults) -> Split:
+    members: dict[str, list[int]] = {}
+    for index, frame in enumerate(entry.frames):
+        name = _name_split(frame.paths)
+        if name is None:
+            message = "neither its folder nor its name starts with train, eval, val or test"
+            faults.add(frame.where, f"{message}, which eval_split 'filename' needs")
+        else:
+            members.setdefault(name, []).append(index)
+    evaluation = members.get("test") or sorted(members.get("eval", []) + members.get("val", []))
+    return Split(tuple(members.get("train", [])), tuple(evaluation))
+
+
+def _by_interval(count: int, interval: int, faults: Faults) -> Split:
+    if interval < 2:
+        faults.add("eval_interval", f"is {interval}; expected 2 or more, so that frames are left to train on")
+        return Split((), ())
+    return Split(tuple(i for i in range(count) if i % interval != 0), tuple(range(0, count, interval)))

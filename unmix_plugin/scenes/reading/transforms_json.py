@@ -1,0 +1,182 @@
+"""transforms.json in nerfstudio's form with the keys of UnMix-NeRF: from text of unknown make to typed entries.
+
+Nothing here opens a file other than transforms.json; a value of the wrong type becomes a noted fault and None.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from unmix_plugin.scenes.reading.faults import Faults
+from unmix_plugin.scenes.reading.intrinsics import Intrinsics, read_intrinsics
+from unmix_plugin.scenes.reading.json_values import describe, read_number
+from unmix_plugin.scenes.reading.poses import read_pose
+
+FILE_NAME = "transforms.json"
+SPLIT_KEYS = ("train_filenames", "val_filenames", "test_filenames")
+FILE_KEYS = ("file_path", "hyperspectral_file_path", "seg_file_path", "mask_path", "abundance_file_path")
+
+
+@dataclass(frozen=True)
+class FrameEntry:
+    """One element of `frames`; None where a value is absent or faulty."""
+
+    where: str
+    """How messages call it."""
+    paths: dict[str, str]
+    """The values of `FILE_KEYS` that are there."""
+    pose: Float64[np.ndarray, "3 4"] | None
+    """Camera to world, rotation orthonormal."""
+    intrinsics: Intrinsics | None
+    """Lens of this frame."""
+
+
+@dataclass(frozen=True)
+class SceneEntry:
+    """The content of transforms.json; None where a value is absent or faulty."""
+
+    wavelengths_nm: Float64[np.ndarray, " B"] | None
+    materials: tuple[str, ...] | None
+    illuminant_path: str | None
+    endmembers_path: str | None
+    split_lists: dict[str, tuple[str, ...]]
+    frames: tuple[FrameEntry, ...]
+
+
+def read_transforms(root: Path, faults: Faults) -> SceneEntry:
+    """Read transforms.json, noting every fault in it.
+
+    Raises:
+        SceneError: the file is absent, is no JSON object, or has no list of frames: there is nothing to go on with.
+    """
+    content = _read_object(root / FILE_NAME, faults)
+    frames = content.get("frames")
+    if not isinstance(frames, list):
+        found = "is absent" if frames is None else f"is {describe(frames)}"
+        faults.add(FILE_NAME, f"'frames' {found}; expected a list with one object a view")
+        faults.raise_if_any()
+    frames = frames if isinstance(frames, list) else []
+    if not frames:
+        faults.add(FILE_NAME, "'frames' is empty; a scene needs frames to train on and to evaluate")
+    return SceneEntry(
+        wavelengths_nm=_read_wavelengths(content, faults),
+        materials=_read_materials(content, faults),
+        illuminant_path=_read_text(content, "illuminant_path", FILE_NAME, faults),
+        endmembers_path=_read_text(content, "endmembers_path", FILE_NAME, faults),
+        split_lists=_read_split_lists(content, faults),
+        frames=tuple(_read_frame(content, frame, i, faults) for i, frame in enumerate(frames)),
+    )
+
+
+def _read_object(path: Path, faults: Faults) -> dict[str, Any]:
+    if not path.parent.is_dir():
+        faults.add(
+            str(path.parent), "the scene folder is not there; give the folder that holds transforms.json"
+        )
+    elif not path.is_file():
+        faults.add(
+            FILE_NAME, "is not in the scene folder; expected nerfstudio's form (see the README, 'own data')"
+        )
+    faults.raise_if_any()
+    content: Any = None
+    try:
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        faults.add(FILE_NAME, f"cannot be read ({error.strerror})")
+    except json.JSONDecodeError as error:
+        at = f"line {error.lineno}, column {error.colno}"
+        faults.add(FILE_NAME, f"is not valid JSON ({error.msg} at {at}); was it cut short?")
+    except (
+        ValueError,
+        RecursionError,
+    ) as error:  # not UTF-8, numbers of thousands of digits, endless nesting
+        faults.add(FILE_NAME, f"is not readable as JSON ({type(error).__name__})")
+    faults.raise_if_any()
+    if not isinstance(content, dict):
+        faults.add(
+            FILE_NAME, f"holds {describe(content)}; expected an object with 'frames' and 'wavelengths'"
+        )
+        faults.raise_if_any()
+    return content
+
+
+def _read_frame(content: dict[str, Any], frame: Any, index: int, faults: Faults) -> FrameEntry:
+    where = f"frames[{index}]"
+    if not isinstance(frame, dict):
+        faults.add(where, f"is {describe(frame)}; expected an object")
+        return FrameEntry(where, {}, None, None)
+    paths = {key: _read_text(frame, key, where, faults) for key in FILE_KEYS}
+    if "hyperspectral_file_path" not in frame:
+        faults.add(where, "has no 'hyperspectral_file_path'; expected the path of its (H, W, B) .npy cube")
+    return FrameEntry(
+        where=where,
+        paths={key: path for key, path in paths.items() if path is not None},
+        pose=read_pose(frame.get("transform_matrix"), where, faults),
+        intrinsics=read_intrinsics(content, frame, where, faults),
+    )
+
+
+def _read_text(content: dict[str, Any], key: str, where: str, faults: Faults) -> str | None:
+    value = content.get(key)
+    if value is None:
+        return None
+    if not isinstance(value, str) or not value or "\0" in value:
+        faults.add(where, f"'{key}' is {describe(value)}; expected a path")
+        return None
+    return value
+
+
+def _read_wavelengths(content: dict[str, Any], faults: Faults) -> Float64[np.ndarray, " B"] | None:
+    values = content.get("wavelengths")
+    if values is None:
+        faults.add(FILE_NAME, "'wavelengths' is absent; expected a list with the centre of each band in nm")
+        return None
+    if not isinstance(values, list) or not values:
+        faults.add(FILE_NAME, f"'wavelengths' is {describe(values)}; expected a list of numbers in nm")
+        return None
+    numbers = [read_number(value) for value in values]
+    for band, number in enumerate(numbers):
+        if number is None or number <= 0.0:
+            found = describe(values[band])
+            faults.add(
+                FILE_NAME, f"'wavelengths' has {found} at band {band}; expected a positive number in nm"
+            )
+            return None
+    wavelengths = np.array(numbers, dtype=np.float64)
+    drops = np.flatnonzero(np.diff(wavelengths) <= 0.0)
+    if drops.size:
+        a, b = wavelengths[drops[0]], wavelengths[drops[0] + 1]
+        message = f"'wavelengths' must increase; got {a:g} nm then {b:g} nm at band {drops[0] + 1}"
+        faults.add(FILE_NAME, message + "; sort the bands of wavelengths and cubes alike")
+        return None
+    return wavelengths
+
+
+def _read_materials(content: dict[str, Any], faults: Faults) -> tuple[str, ...] | None:
+    values = content.get("materials")
+    if values is None:
+        return None
+    is_list = isinstance(values, list) and values and all(isinstance(v, str) and v for v in values)
+    if not is_list or len(set(values)) != len(values):
+        faults.add(FILE_NAME, f"'materials' is {describe(values)}; expected a list of different names")
+        return None
+    return tuple(values)
+
+
+def _read_split_lists(content: dict[str, Any], faults: Faults) -> dict[str, tuple[str, ...]]:
+    lists: dict[str, tuple[str, ...]] = {}
+    for key in SPLIT_KEYS:
+        values = content.get(key)
+        if values is None:
+            continue
+        if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
+            faults.add(FILE_NAME, f"'{key}' is {describe(values)}; expected a list of file paths")
+            continue
+        lists[key.removesuffix("_filenames")] = tuple(values)
+    return lists

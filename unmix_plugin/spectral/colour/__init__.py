@@ -1,0 +1,1 @@
+"""Colour: spectra to sRGB, illuminants, colour differences."""

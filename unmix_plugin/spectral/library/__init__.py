@@ -1,0 +1,1 @@
+"""Tables and libraries of measured spectra."""

@@ -1,0 +1,131 @@
+"""ENVI spectral libraries: a header `x.hdr` of `key = value` lines, and a file of numbers, one spectrum a line.
+
+Of the header these keys count: `samples` (bands), `lines` (spectra), `data type`, `byte order`, `header offset`,
+`wavelength` and `wavelength units`, `spectra names`, `reflectance scale factor` (values are divided by it) and
+`data ignore value`. Spectra are stored one after the other.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from unmix_plugin.errors import SpectrumError
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.library.spectra_csv import SpectraTable
+
+_TYPES = {1: "u1", 2: "i2", 3: "i4", 4: "f4", 5: "f8", 12: "u2", 13: "u4", 14: "i8", 15: "u8"}
+_NM_PER_UNIT = {
+    "": 1.0,
+    "nm": 1.0,
+    "nanometers": 1.0,
+    "nanometer": 1.0,
+    "um": 1e3,
+    "micrometers": 1e3,
+    "micrometer": 1e3,
+    "microns": 1e3,
+}
+_DATA_SUFFIXES = (".sli", ".SLI", "", ".dat", ".img", ".lib", ".raw")
+
+
+def read_spectra_envi(path: Path) -> SpectraTable:
+    """Read and validate an ENVI spectral library.
+
+    Args:
+        path: Its header, or the file of numbers beside which the header lies.
+    Raises:
+        SpectrumError: a part is missing, is no such library, has a unit of wavelength that is not known, or holds
+            values that are ignored, not finite or negative.
+    """
+    header_path = path if path.suffix.lower() == ".hdr" else path.with_suffix(".hdr")
+    try:
+        header = _read_header(header_path)
+        values = _read_values(header, header_path)
+        centers = _numbers(header, "wavelength", values.shape[1]) * _nm_per_unit(header)
+        names = _names(header, len(values))
+        return SpectraTable(Bands(centers), names, values / _number(header, "reflectance scale factor", 1.0))
+    except SpectrumError as error:
+        raise SpectrumError(f"{header_path}: {error}") from error
+    except OSError as error:
+        raise SpectrumError(f"{header_path}: can't read: {error.strerror or error}") from error
+
+
+def _read_header(path: Path) -> dict[str, str]:
+    """Keys in lower case, and their values; lists with their braces cut off."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise SpectrumError(f"no ENVI header: not text in UTF-8 ({error.reason})") from error
+    lines = text.splitlines()
+    if not lines or lines[0].strip() != "ENVI":
+        raise SpectrumError("no ENVI header: its first line is not 'ENVI'")
+    body = "\n".join(line for line in lines[1:] if not line.lstrip().startswith(";"))
+    pairs = re.findall(r"^\s*([^=\n]+?)\s*=\s*(\{[^}]*\}|[^\n]*)", body, flags=re.MULTILINE)
+    return {key.lower(): value.strip().strip("{}").strip() for key, value in pairs}
+
+
+def _read_values(header: dict[str, str], header_path: Path) -> Float64[np.ndarray, "K B"]:
+    code = int(_number(header, "data type"))
+    if code not in _TYPES:
+        raise SpectrumError(f"'data type' is {code}; known: {', '.join(map(str, _TYPES))}")
+    shape = int(_number(header, "lines")), int(_number(header, "samples"))
+    order = ">" if int(_number(header, "byte order", 0.0)) else "<"
+    data_path = _data_path(header_path)
+    raw = data_path.read_bytes()[int(_number(header, "header offset", 0.0)) :]
+    kind = np.dtype(order + _TYPES[code])
+    if len(raw) < shape[0] * shape[1] * kind.itemsize:
+        raise SpectrumError(
+            f"{data_path.name} has {len(raw)} bytes; {shape[0]} spectra of {shape[1]} values need "
+            f"{shape[0] * shape[1] * kind.itemsize}"
+        )
+    values = np.frombuffer(raw, kind, shape[0] * shape[1]).reshape(shape).astype(np.float64)
+    if "data ignore value" in header:
+        values[values == np.array(_number(header, "data ignore value")).astype(kind)] = np.nan
+    return values
+
+
+def _data_path(header_path: Path) -> Path:
+    for suffix in _DATA_SUFFIXES:
+        found = header_path.with_suffix(suffix)
+        if found.is_file():
+            return found
+    raise SpectrumError(f"no file of numbers beside it; expected {header_path.with_suffix('.sli').name}")
+
+
+def _nm_per_unit(header: dict[str, str]) -> float:
+    unit = header.get("wavelength units", "").strip().lower()
+    if unit not in _NM_PER_UNIT:
+        raise SpectrumError(f"'wavelength units' is {unit!r}; expected Nanometers or Micrometers")
+    return _NM_PER_UNIT[unit]
+
+
+def _names(header: dict[str, str], count: int) -> tuple[str, ...]:
+    names = tuple(re.sub(r"\s+", " ", name.strip()) for name in header.get("spectra names", "").split(","))
+    if names == ("",):
+        return tuple(f"spectrum {index}" for index in range(count))
+    if len(names) != count:
+        raise SpectrumError(f"{len(names)} 'spectra names' for {count} spectra")
+    return names
+
+
+def _numbers(header: dict[str, str], key: str, count: int) -> Float64[np.ndarray, " B"]:
+    words = header.get(key, "").split(",")
+    try:
+        values = np.array([float(word) for word in words])
+    except ValueError:
+        raise SpectrumError(f"'{key}' is missing or no list of numbers") from None
+    if len(values) != count:
+        raise SpectrumError(f"'{key}' has {len(values)} values for {count} bands")
+    return values
+
+
+def _number(header: dict[str, str], key: str, default: float | None = None) -> float:
+    if key not in header and default is not None:
+        return default
+    try:
+        return float(header[key])
+    except (KeyError, ValueError):
+        raise SpectrumError(f"'{key}' is {header.get(key, 'missing')}; expected a number") from None

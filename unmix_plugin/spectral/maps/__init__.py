@@ -1,0 +1,1 @@
+"""Maps from reflectance: spectral indices and target detection."""

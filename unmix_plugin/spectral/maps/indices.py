@@ -1,0 +1,228 @@
+"""Spectral indices: one number a pixel from its reflectance at a few wavelengths, by name or by formula.
+
+Notation: `B` bands, `*rays` any leading axes. Reflectance is what an index is defined on; ratios alone take radiance in
+a light of equal power just as well. Between two band centres reflectance is interpolated linearly, in the outer half of
+an outermost band it is that band's; beyond, an index is refused: nothing is extrapolated.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from unmix_plugin.errors import ConfigError, SpectrumError
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.maps.index_formula import ALLOWED, Formula, parse_formula
+
+
+@dataclass(frozen=True)
+class NamedIndex:
+    """A published index, at the centre wavelengths that we take for its bands."""
+
+    title: str
+    """Full name."""
+    formula: str
+    """In the grammar of `index_formula`."""
+    source: str
+    """Who published it."""
+    usual_range: tuple[float, float]
+    """Values that pictures spread their colours over."""
+
+
+NAMED_INDICES: dict[str, NamedIndex] = {
+    "ndvi": NamedIndex(
+        "normalised difference vegetation index", "(r800-r670)/(r800+r670)", "Rouse et al. 1974", (-1.0, 1.0)
+    ),
+    "gndvi": NamedIndex(
+        "green normalised difference vegetation index",
+        "(r800-r550)/(r800+r550)",
+        "Gitelson, Kaufman & Merzlyak 1996",
+        (-1.0, 1.0),
+    ),
+    "evi": NamedIndex(
+        "enhanced vegetation index",
+        "2.5*(r800-r670)/(r800+6*r670-7.5*r470+1)",
+        "Huete et al. 2002",
+        (-1.0, 1.0),
+    ),
+    "savi": NamedIndex(
+        "soil-adjusted vegetation index", "1.5*(r800-r670)/(r800+r670+0.5)", "Huete 1988", (-1.0, 1.0)
+    ),
+    "osavi": NamedIndex(
+        "optimised soil-adjusted vegetation index",
+        "(r800-r670)/(r800+r670+0.16)",
+        "Rondeaux, Steven & Baret 1996",
+        (-1.0, 1.0),
+    ),
+    "ndre": NamedIndex(
+        "normalised difference red edge", "(r790-r720)/(r790+r720)", "Barnes et al. 2000", (-1.0, 1.0)
+    ),
+    "pri": NamedIndex(
+        "photochemical reflectance index",
+        "(r531-r570)/(r531+r570)",
+        "Gamon, Peñuelas & Field 1992, in the form of Gamon, Serrano & Surfus 1997",
+        (-0.2, 0.2),
+    ),
+    "mcari": NamedIndex(
+        "modified chlorophyll absorption ratio index",
+        "((r700-r670)-0.2*(r700-r550))*(r700/r670)",
+        "Daughtry et al. 2000",
+        (0.0, 1.0),
+    ),
+    "tvi": NamedIndex(
+        "triangular vegetation index",
+        "0.5*(120*(r750-r550)-200*(r670-r550))",
+        "Broge & Leblanc 2001",
+        (0.0, 50.0),
+    ),
+    "sipi": NamedIndex(
+        "structure-insensitive pigment index (carotenoids to chlorophyll a)",
+        "(r800-r445)/(r800-r680)",
+        "Peñuelas, Baret & Filella 1995",
+        (0.0, 2.0),
+    ),
+    "psri": NamedIndex(
+        "plant senescence reflectance index", "(r678-r500)/r750", "Merzlyak et al. 1999", (-0.5, 0.5)
+    ),
+    "cri1": NamedIndex(
+        "carotenoid reflectance index 1", "1/r510-1/r550", "Gitelson et al. 2002", (0.0, 15.0)
+    ),
+    "ari1": NamedIndex(
+        "anthocyanin reflectance index 1",
+        "1/r550-1/r700",
+        "Gitelson, Merzlyak & Chivkunova 2001",
+        (0.0, 10.0),
+    ),
+    "ndwi": NamedIndex(
+        "normalised difference water index (open water)",
+        "(r550-r800)/(r550+r800)",
+        "McFeeters 1996",
+        (-1.0, 1.0),
+    ),
+    "ndwi-gao": NamedIndex(
+        "normalised difference water index (water in leaves)",
+        "(r860-r1240)/(r860+r1240)",
+        "Gao 1996",
+        (-1.0, 1.0),
+    ),
+    "nbr": NamedIndex("normalised burn ratio", "(r830-r2215)/(r830+r2215)", "Key & Benson 2006", (-1.0, 1.0)),
+    "redness": NamedIndex(
+        "redness index of soils (iron oxides)",
+        "(r660-r560)/(r660+r560)",
+        "Escadafal & Huete 1991",
+        (-1.0, 1.0),
+    ),
+    "iron-oxide": NamedIndex("iron oxide ratio, red over blue", "r660/r485", "Segal 1982", (0.0, 5.0)),
+}
+"""By the name that stands after `index:`, in the order in which they are listed."""
+
+
+@dataclass(frozen=True)
+class SpectralIndex:
+    """An index on spectra of one sampling: call it on reflectance."""
+
+    name: str
+    """Of a named index, else the formula as it was written."""
+    what: str
+    """One line: full name, formula and source, and the bands it is computed from."""
+    usual_range: tuple[float, float] | None
+    """Values that pictures spread their colours over; None for a formula, of which nothing is known."""
+    bands: Bands
+    formula: Formula
+
+    def __call__(self, reflectance: Float[Tensor, "*rays B"]) -> Float[Tensor, "*rays"]:
+        """The index of each spectrum, of the same type and on the same device; NaN where it is undefined.
+
+        Undefined is where any part of the formula is: 0/0 and other divisions by zero, the logarithm or root of a
+        negative number, overflow.
+
+        Raises:
+            SpectrumError: another number of bands than those the index was made for.
+        """
+        if reflectance.shape[-1] != len(self.bands):
+            raise SpectrumError(
+                f"index {self.name} is made for {self.bands}; found spectra of {reflectance.shape[-1]}"
+            )
+        return self.formula.evaluate(lambda nm: _reflectance_at(nm, reflectance, self.bands), reflectance)
+
+
+def parse_index(text: str, bands: Bands) -> SpectralIndex:
+    """The index that a name (`ndvi`) or a formula (`(r800-r670)/(r800+r670)`) means on these bands.
+
+    Raises:
+        ConfigError: an unknown name (the message has the nearest), or no formula (it shows the place).
+        SpectrumError: the bands do not reach a wavelength that the index needs.
+
+    >>> index = parse_index("NDVI", Bands.of([660, 680, 800]))
+    >>> index(torch.tensor([0.1, 0.1, 0.4]))
+    tensor(0.6000)
+    """
+    text = text.strip()
+    named = NAMED_INDICES.get(text.lower())
+    name = text.lower() if named else text
+    formula = parse_formula(named.formula if named else _require_formula(text))
+    missing = _missing(formula, bands)
+    if missing:
+        edges = bands.edges_nm
+        raise SpectrumError(
+            f"index {name} needs {_listed(missing)} nm but the bands cover {edges[0]:g}-{edges[-1]:g} nm; "
+            f"nothing is extrapolated; named ones that these bands reach: "
+            f"{', '.join(available_indices(bands)) or 'none'}"
+        )
+    used = {index for nm in formula.wavelengths_nm for index in _neighbours(nm, bands)[:2]}
+    centres = _listed(float(bands.centers_nm[index]) for index in sorted(used))
+    title = f"{named.title}, {named.formula} ({named.source})" if named else f"formula {formula.text}"
+    what = f"{' '.join(title.split())}; from the bands at {centres} nm"
+    return SpectralIndex(name, what, named.usual_range if named else None, bands, formula)
+
+
+def available_indices(bands: Bands) -> list[str]:
+    """Names of the indices whose wavelengths the bands reach, in the order of `NAMED_INDICES`."""
+    return [
+        name for name, named in NAMED_INDICES.items() if not _missing(parse_formula(named.formula), bands)
+    ]
+
+
+def _require_formula(text: str) -> str:
+    """The text, unless it is empty or no more than a word, which can only be a name."""
+    if not text:
+        raise ConfigError(
+            f"index: is followed by nothing; give a name ({', '.join(NAMED_INDICES)}) or a formula of {ALLOWED}"
+        )
+    if not re.fullmatch(r"[a-z_][\w-]*", text, re.IGNORECASE) or re.search(r"\br[0-9]", text, re.IGNORECASE):
+        return text
+    near = difflib.get_close_matches(text.lower(), NAMED_INDICES, n=3, cutoff=0.5)
+    hint = f"nearest: {', '.join(near)}" if near else f"known: {', '.join(NAMED_INDICES)}"
+    raise ConfigError(f"there is no index {text!r}; {hint}; or give a formula of {ALLOWED}")
+
+
+def _missing(formula: Formula, bands: Bands) -> list[float]:
+    return [nm for nm in formula.wavelengths_nm if not bands.contains(nm)]
+
+
+def _listed(wavelengths_nm: Iterable[float]) -> str:
+    return ", ".join(f"{nm:g}" for nm in wavelengths_nm)
+
+
+def _neighbours(nm: float, bands: Bands) -> tuple[int, int, float]:
+    """The bands to the left and right of a covered wavelength and the weight of the right one; twice one band where
+    the wavelength is its centre or lies beyond the outermost."""
+    centers = bands.centers_nm
+    right = min(int(centers.searchsorted(nm)), len(centers) - 1)
+    if right == 0 or centers[right] <= nm:
+        return right, right, 0.0
+    left = right - 1
+    return left, right, float((nm - centers[left]) / (centers[right] - centers[left]))
+
+
+def _reflectance_at(nm: float, reflectance: Float[Tensor, "*rays B"], bands: Bands) -> Float[Tensor, "*rays"]:
+    left, right, weight = _neighbours(nm, bands)
+    if left == right:
+        return reflectance[..., left]
+    return torch.lerp(reflectance[..., left], reflectance[..., right], weight)

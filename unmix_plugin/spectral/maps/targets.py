@@ -1,0 +1,222 @@
+"""Targets by name, `ace:paint.csv#gold>0.5`: how much each pixel looks like a given spectrum.
+
+Notation: `B` bands, `N` pixels of the background, `*rays` any leading axes; all spectra are reflectances. A score is
+NaN where a pixel has a value that is not finite, where it is zero in all bands, and where the score is undefined.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from unmix_plugin.errors import ConfigError, SpectrumError, did_you_mean
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.library.spectra_csv import SpectraTable, read_spectra_csv
+from unmix_plugin.spectral.maps.detectors import Background, adaptive_coherence, is_defined, matched_filter
+from unmix_plugin.spectral.metrics import spectral_angle
+
+DetectionMethod = Literal["angle", "mf", "ace"]
+"""Spectral angle, matched filter, adaptive coherence estimator."""
+
+GREATEST_REFLECTANCE = 2.0
+"""A target of mf or ace with a value above it is not in reflectances; glossy and fluorescent surfaces exceed 1."""
+
+_LEAST_DISTANCE = 1e-4
+"""From the background's mean to a target, in standard deviations: the rounding of float32 reaches a tenth of it."""
+
+_GRAMMAR = re.compile(
+    rf"((?P<method>{'|'.join(get_args(DetectionMethod))}):)?(?P<file>.+?\.csv)(#(?P<name>.*?))?"
+    r"(\s*(?P<side>[<>])\s*(?P<limit>[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?)\s*)?",
+    re.IGNORECASE | re.DOTALL,
+)
+_EXAMPLES = "paint.csv, ace:paint.csv, mf:paint.csv#gold or 'paint.csv#gold<0.1'"
+
+_SIDES: dict[DetectionMethod, str] = {"angle": "<", "mf": ">", "ace": ">"}
+"""On which side of a threshold a pixel is like the target."""
+
+_POSSIBLE: dict[DetectionMethod, tuple[float, float]] = {
+    "angle": (0.0, math.pi),
+    "mf": (-math.inf, math.inf),
+    "ace": (0.0, 1.0),
+}
+_USUAL: dict[DetectionMethod, tuple[float, float]] = {
+    "angle": (0.0, 0.5),
+    "mf": (0.0, 1.0),
+    "ace": (0.0, 1.0),
+}
+_LABELS: dict[DetectionMethod, tuple[str, str]] = {
+    "angle": ("spectral angle in radians to", "0 = the same but for brightness"),
+    "mf": ("matched filter score of", "1 = like the target, 0 = like the background's mean"),
+    "ace": ("adaptive coherence with", "1 = differs from the background as the target does, 0 = does not"),
+}
+
+
+@dataclass(frozen=True)
+class Target:
+    """A spectrum to look for, and how."""
+
+    method: DetectionMethod
+    name: str
+    file: str
+    """Where the spectrum is from, for messages and legends."""
+    reflectance: Float[Tensor, "B"]
+    """Float64, at the bands of the run."""
+    threshold: float | None = None
+    """Scores below it (angle) or above it (mf, ace) become 1, others 0; None: the scores themselves."""
+
+    @property
+    def what(self) -> str:
+        """One line: what the numbers are."""
+        score, meaning = _LABELS[self.method]
+        if self.threshold is None:
+            return f"{score} '{self.name}' ({self.file}): {meaning}"
+        side = "below" if self.method == "angle" else "above"
+        return f"{score} '{self.name}' ({self.file}) {side} {self.threshold:g}: 1 = yes, 0 = no"
+
+    @property
+    def usual_range(self) -> tuple[float, float]:
+        """What pictures show."""
+        return _USUAL[self.method] if self.threshold is None else (0.0, 1.0)
+
+    @property
+    def needs_background(self) -> bool:
+        """Whether scores depend on what else there is."""
+        return self.method != "angle"
+
+    def fit(self, background: Float[Tensor, "N B"]) -> TargetScore:
+        """The score, judged against a sample of the scene's reflectances; the angle ignores it.
+
+        Raises:
+            SpectrumError: another number of bands than the target's; fewer than two pixels in which something is; all
+                are equal; their mean is the target.
+        """
+        if background.shape[1] != len(self.reflectance):
+            raise SpectrumError(
+                f"the target '{self.name}' has {len(self.reflectance)} bands, the background {background.shape[1]}"
+            )
+        if not self.needs_background:
+            return TargetScore(self, None)
+        found = Background.fit(background)
+        target = self.reflectance.to(found.mean)
+        if not found.whiten(target).norm() > _LEAST_DISTANCE:
+            raise SpectrumError(
+                f"the target '{self.name}' ({self.file}) is the mean of the background, so nothing tells them apart; "
+                "choose views that show more than the target, or the spectral angle"
+            )
+        return TargetScore(self, found)
+
+
+@dataclass(frozen=True)
+class TargetScore:
+    """From reflectances to scores, or to 1 and 0 with a threshold."""
+
+    target: Target
+    background: Background | None
+    """None for the spectral angle."""
+
+    def __call__(self, reflectance: Float[Tensor, "*rays B"]) -> Float[Tensor, "*rays"]:
+        """Scores, of the spectra's type and on their device; computed in float64."""
+        spectra, target = reflectance.double(), self.target.reflectance.to(reflectance.device)
+        if self.background is None:
+            scores = spectral_angle(spectra, target)
+        else:
+            detect = matched_filter if self.target.method == "mf" else adaptive_coherence
+            here = Background(self.background.mean.to(target), self.background.whitening.to(target))
+            scores = detect(spectra, target, here)
+        if (limit := self.target.threshold) is not None:
+            passes = scores < limit if self.target.method == "angle" else scores > limit
+            scores = torch.where(scores.isnan(), scores, passes.double())
+        return torch.where(is_defined(reflectance), scores, torch.nan).to(reflectance.dtype)
+
+
+def parse_target(text: str, bands: Bands) -> Target:
+    """What stands after `target:` in the name of an output, `[METHOD:]FILE.csv[#NAME][<VALUE | >VALUE]`.
+
+    Raises:
+        ConfigError: text of another form, no such file, no or several spectra that could be meant, a threshold on the
+            wrong side or one that says the same of every pixel.
+        SpectrumError: the file is no table of spectra, does not cover the bands, is not in reflectances (the angle
+            takes any unit), or has no angle to anything.
+    """
+    match = _GRAMMAR.fullmatch(text)
+    if match is None:
+        raise ConfigError(f"target:{text} must be target:[METHOD:]FILE.csv[#NAME][<VALUE], as in {_EXAMPLES}")
+    prefix = match["method"] or ""
+    method = _method_of(prefix)
+    file = match["file"] if method or not prefix else f"{prefix}:{match['file']}"
+    method = method or "angle"
+    threshold = None if match["limit"] is None else _threshold(method, match["side"], float(match["limit"]))
+    table = _table(file, bands)
+    name = _chosen(match["name"], table, file)
+    reflectance = table.spectra[table.names.index(name)]
+    _validate(reflectance, method, f"'{name}' ({file})")
+    return Target(method, name, Path(file).name, torch.from_numpy(reflectance.copy()), threshold)
+
+
+def _method_of(prefix: str) -> DetectionMethod | None:
+    return next((method for method in _SIDES if method == prefix), None)
+
+
+def _threshold(method: DetectionMethod, side: str, limit: float) -> float:
+    if side != _SIDES[method]:
+        alike = "small" if method == "angle" else "large"
+        raise ConfigError(
+            f"{alike} scores of {method} are alike, so its threshold is {_SIDES[method]}{limit:g}; "
+            f"found {side}{limit:g}"
+        )
+    low, high = _POSSIBLE[method]
+    if not (low < limit <= high if method == "angle" else low <= limit < high):
+        raise ConfigError(
+            f"scores of {method} lie between {low:g} and {high:.4g}, so {side}{limit:g} says the same of every pixel"
+        )
+    return limit
+
+
+def _table(file: str, bands: Bands) -> SpectraTable:
+    """The file's spectra at the bands."""
+    if not Path(file).exists():
+        prefix, colon, _ = file.partition(":")
+        near = difflib.get_close_matches(prefix.lower(), _SIDES, n=1, cutoff=0.6) if colon else []
+        hint = f"; did you mean the method {near[0]}: (they are {', '.join(_SIDES)})?" if near else ""
+        raise ConfigError(f"there is no file {file} with the spectrum of a target{hint}")
+    table = read_spectra_csv(Path(file))
+    try:
+        return table.resampled(bands)
+    except SpectrumError as error:
+        raise SpectrumError(f"{file}: {error}") from error
+
+
+def _chosen(name: str | None, table: SpectraTable, file: str) -> str:
+    """The spectrum that is meant."""
+    listed = ", ".join(table.names[:8]) + (", ..." if len(table.names) > 8 else "")
+    if name is None:
+        if len(table.names) == 1:
+            return table.names[0]
+        raise ConfigError(f"{file} has {len(table.names)} spectra; say which, as in {file}#NAME: {listed}")
+    if name in table.names:
+        return name
+    hint = did_you_mean(name, table.names, form="{} ")
+    raise ConfigError(f"{file} has no spectrum {name!r}; {hint}it has {listed}")
+
+
+def _validate(reflectance: np.ndarray, method: DetectionMethod, what: str) -> None:
+    if method != "angle" and reflectance.max() > GREATEST_REFLECTANCE:
+        raise SpectrumError(
+            f"the target {what} must be in reflectances, 1 for white; found {reflectance.max():g} "
+            "(divide percent by 100)"
+        )
+    if method == "angle" and not reflectance.any():
+        raise SpectrumError(
+            f"the target {what} is zero in all bands: no angle to it is defined; choose mf or ace"
+        )
+    if method != "mf" and len(reflectance) < 2:
+        raise SpectrumError(f"{method} compares spectra of two bands or more; found 1 band")

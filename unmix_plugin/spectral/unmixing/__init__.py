@@ -1,0 +1,1 @@
+"""Linear unmixing: endmembers, abundances and their number."""

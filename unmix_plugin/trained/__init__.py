@@ -1,0 +1,1 @@
+"""A trained scene: what renders, probes and evaluates it."""

@@ -1,0 +1,253 @@
+"""How well a model predicts views that it has not seen: every figure of merit of a scene, view by view.
+
+Each figure has one definition, in `DEFINITIONS` and in `spectral.metrics`. Figures are means over the evaluation
+views, but for segmentation, which is scored once over all of them.
+
+Notation: `H x W` pixels, `B` bands, `K` true materials, `P` predicted endmembers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from unmix_plugin.scenes.scene import Scene
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.composition import default_names
+from unmix_plugin.spectral.metrics import (
+    SSIM_WINDOW_PX,
+    abundance_rmse,
+    endmember_angle,
+    match_endmembers,
+    psnr,
+    rgb_psnr,
+    rmse,
+    sam,
+    ssim,
+)
+from unmix_plugin.spectral.segmentation import NOTHING_ID, SegmentationScores, SegmentationTally
+from unmix_plugin.trained.view_rendering import RenderedView
+
+OPAQUE_ALPHA = 0.99
+"""Opacity from which an unlabelled pixel counts for the spectral angle."""
+
+HALF_COVERED = 0.5
+"""Opacity from which a pixel's abundances count."""
+
+VIEW_FIGURES = ("psnr", "rmse", "ssim", "sam", "rgb_psnr", "abundance_rmse")
+"""Figures that every view has, as far as there is truth for them."""
+
+DEFINITIONS = {
+    "psnr": "dB, all valid pixels and bands of spectra on black, peak 1",
+    "rmse": "root mean squared error of the same",
+    "ssim": "mean over bands, 7 x 7 uniform window, data range 1",
+    "sam": "mean spectral angle in radians over labelled or opaque pixels whose true spectrum is not dark "
+    "(root mean square over bands above 0.005)",
+    "rgb_psnr": "dB, the same cubes as sRGB (false colour where the bands are not those of the eye)",
+    "miou": "mean intersection over union of the true materials; predicted ids matched to labels once a scene "
+    "(Hungarian), unlabelled pixels ignored",
+    "macro_f1": "mean F1 of the true materials, same matching",
+    "accuracy": "share of labelled pixels with the right material, same matching",
+    "abundance_rmse": "endmembers matched by spectral angle; pixels at least half covered; composited abundances "
+    "divided by the larger of predicted and true opacity, since true ones sum to 1 on partly covered pixels too",
+    "endmember_angle": "mean spectral angle in radians between reflectance x illuminant and the matched endmember",
+    "views": "evaluation views",
+    "bands": "spectral bands",
+    "train_seconds": "seconds of training alone",
+    "train_rays_per_second": "training rays a second of training",
+}
+"""What each figure is, in the order in which they are shown."""
+
+
+@dataclass(frozen=True)
+class ViewTruth:
+    """What was measured of one view."""
+
+    name: str
+    spectra: Float[Tensor, "H W B"]
+    valid: Bool[Tensor, "H W"]
+    """Pixels that count."""
+    alpha: Float[Tensor, "H W"] | None = None
+    labels: UInt8[Tensor, "H W"] | None = None
+    """True material, 255 where unlabelled."""
+    abundances: Float[Tensor, "H W K"] | None = None
+
+    @property
+    def opacity(self) -> Float[Tensor, "H W"]:
+        """Alpha, 1 without it."""
+        return torch.ones(self.spectra.shape[:2]) if self.alpha is None else self.alpha
+
+    @property
+    def shows_matter(self) -> Bool[Tensor, "H W"]:
+        """Valid pixels that are labelled or opaque."""
+        matter = self.opacity > OPAQUE_ALPHA
+        return self.valid & (matter if self.labels is None else matter | (self.labels != NOTHING_ID))
+
+    def in_light(self, factors: Float[np.ndarray, " B"] | None) -> ViewTruth:
+        """The view as the same sensor would have measured it in another light; itself where `factors` are None."""
+        if factors is None:
+            return self
+        return replace(self, spectra=(self.spectra * torch.from_numpy(factors).to(self.spectra)).clamp(0, 1))
+
+
+@dataclass(frozen=True)
+class SceneTruth:
+    """What is known of a scene's materials."""
+
+    bands: Bands
+    num_materials: int
+    """Of labels; 0 where nothing is known of materials."""
+    endmembers: Float[Tensor, "K B"] | None = None
+    """True radiance of each material: reflectance x illuminant, under flat light where the illuminant is unknown."""
+    names: tuple[str, ...] | None = None
+
+    def in_light(self, factors: Float[np.ndarray, " B"] | None) -> SceneTruth:
+        """The scene in another light; itself where `factors` are None."""
+        if factors is None or self.endmembers is None:
+            return self
+        return replace(self, endmembers=self.endmembers * torch.from_numpy(factors))
+
+
+class Evaluation:
+    """Figures of merit of one scene, fed view by view; keeps no image."""
+
+    def __init__(
+        self, truth: SceneTruth, endmembers: Float[Tensor, "P B"], names: tuple[str, ...] | None = None
+    ) -> None:
+        """
+        Args:
+            truth: Of the scene.
+            endmembers: Of the model.
+            names: Of the endmembers; None: `default_names`.
+        """
+        self.truth = truth
+        self.names = default_names(len(endmembers)) if names is None else names
+        self.endmembers = endmembers.detach().cpu().double()
+        self.matching = (
+            None if truth.endmembers is None else match_endmembers(self.endmembers, truth.endmembers)
+        )
+        """Predicted and true endmembers, paired by spectral angle; None without true ones."""
+        self.per_view: dict[str, dict[str, float]] = {}
+        """`VIEW_FIGURES` of each view; NaN where it has no truth."""
+        self._tally = SegmentationTally(len(endmembers), truth.num_materials) if truth.num_materials else None
+
+    def add(self, view: ViewTruth, predicted: RenderedView) -> dict[str, float]:
+        """Count one view; its figures."""
+        valid = None if bool(view.valid.all()) else view.valid
+        spectra = predicted.spectra
+        figures = {
+            "psnr": psnr(spectra, view.spectra, valid),
+            "rmse": rmse(spectra, view.spectra, valid),
+            "ssim": ssim(spectra, view.spectra, valid) if _fits_window(spectra) else math.nan,
+            "sam": sam(spectra, view.spectra, view.shows_matter),
+            "rgb_psnr": rgb_psnr(self._srgb(spectra), self._srgb(view.spectra), valid),
+            "abundance_rmse": self._abundance_rmse(view, predicted),
+        }
+        if self._tally is not None and view.labels is not None:
+            counted = torch.where(view.valid, view.labels, torch.full_like(view.labels, NOTHING_ID))
+            self._tally.add(predicted.segmentation, counted)
+        self.per_view[view.name] = figures
+        return figures
+
+    def segmentation(self) -> SegmentationScores:
+        """Scores over all views counted so far, and which id stands for which material."""
+        if self._tally is None:
+            return SegmentationScores(math.nan, math.nan, math.nan, {}, {})
+        return self._tally.scores()
+
+    def figures(self) -> dict[str, float]:
+        """The scene's figures; NaN where there is no truth."""
+        means = {name: _mean(view[name] for view in self.per_view.values()) for name in VIEW_FIGURES}
+        scores, truth = self.segmentation(), self.truth
+        angle = math.nan
+        if truth.endmembers is not None:
+            flat = torch.ones(
+                len(truth.bands), dtype=torch.float64
+            )  # the light is in the true spectra already
+            angle = endmember_angle(self.endmembers, truth.endmembers, flat)
+        return {
+            **means,
+            "miou": scores.miou,
+            "macro_f1": scores.macro_f1,
+            "accuracy": scores.accuracy,
+            "endmember_angle": angle,
+            "views": len(self.per_view),
+            "bands": len(truth.bands),
+        }
+
+    def _abundance_rmse(self, view: ViewTruth, predicted: RenderedView) -> float:
+        if self.matching is None or view.abundances is None:
+            return math.nan
+        counts = view.valid & (view.opacity >= HALF_COVERED) & (view.abundances.sum(dim=-1) > 0)
+        # Dividing by what is there, or by what should be there if less is seen, neither blames a partly covered pixel
+        # for its background nor forgives matter that is missing.
+        opacity = torch.maximum(predicted.accumulation, view.opacity).clamp(min=1e-6)
+        return abundance_rmse(
+            predicted.abundances / opacity[..., None], view.abundances, self.matching, counts
+        )
+
+    def _srgb(self, spectra: Float[Tensor, "H W B"]) -> Float[Tensor, "H W 3"]:
+        linear = spectra.double().clamp(0, 1) @ rgb_matrix(self.truth.bands, torch.float64)
+        return linear_to_srgb(linear.clamp(0, 1))
+
+
+def scene_truth(scene: Scene) -> SceneTruth:
+    """What a scene says of its materials."""
+    endmembers = None
+    if scene.endmembers is not None:
+        light = np.ones(len(scene.wavelengths_nm)) if scene.illuminant is None else scene.illuminant
+        endmembers = torch.from_numpy(scene.endmembers * light)
+    return SceneTruth(Bands.of(scene.wavelengths_nm), _num_materials(scene), endmembers, scene.material_names)
+
+
+def view_truth(scene: Scene, index: int) -> ViewTruth:
+    """What was measured of one view of a scene."""
+    return ViewTruth(
+        name=scene.frames[index].name,
+        spectra=torch.from_numpy(scene.cube(index)),
+        valid=torch.tensor(scene.valid_mask(index)),
+        alpha=_tensor(scene.alpha(index)),
+        labels=_tensor(scene.labels(index)),
+        abundances=_tensor(scene.abundances(index)),
+    )
+
+
+def finite_or_none(figures: dict[str, float]) -> dict[str, float | None]:
+    """Figures as JSON has them: null where there is no truth, or for the infinite PSNR of equal images."""
+    return {name: value if math.isfinite(value) else None for name, value in figures.items()}
+
+
+def _num_materials(scene: Scene) -> int:
+    """Materials that labels of evaluation views may name."""
+    if scene.material_names is not None:
+        return len(scene.material_names)
+    if scene.endmembers is not None:
+        return len(scene.endmembers)
+    greatest = -1
+    for index in scene.eval_indices:
+        labels = scene.labels(index)
+        if labels is not None:
+            greatest = max(greatest, int(labels.max(where=labels != NOTHING_ID, initial=0)))
+    return greatest + 1
+
+
+def _tensor(array: np.ndarray | None) -> Tensor | None:
+    """A copy: arrays of pictures may be read-only."""
+    return None if array is None else torch.tensor(array)
+
+
+def _fits_window(image: Float[Tensor, "H W B"]) -> bool:
+    return min(image.shape[:2]) >= SSIM_WINDOW_PX
+
+
+def _mean(values: Iterable[float]) -> float:
+    """Mean over the views that have the figure; NaN if none does."""
+    known = [value for value in values if not math.isnan(value)]
+    return sum(known) / len(known) if known else math.nan

@@ -1,0 +1,104 @@
+"""Which known materials a run's spectra resemble: radiance is divided by the light it was seen in, if that is known.
+
+Notation: `N` spectra, `B` bands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+from unmix_plugin.engine.model import Model
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.library.material_library import (
+    DARK_LIGHT,
+    Comparison,
+    LibraryMatch,
+    MaterialLibrary,
+)
+
+LIGHT_UNKNOWN = (
+    "the light of the scene is unknown and taken as flat: matches are of radiance rather than of reflectance"
+)
+"""What has to be said of matches where `light_of` gives nothing."""
+
+
+def relit(
+    measured: Float[np.ndarray, "*pixels B"],
+    recorded: Sequence[float] | None,
+    light: Float64[np.ndarray, " B"] | None,
+) -> Float64[np.ndarray, "*pixels B"]:
+    """Radiance measured in one light as it is in another; 0 in bands that the first left dark.
+
+    Args:
+        measured: Radiance.
+        recorded: Light that it was measured in, relative power; None for flat light.
+        light: The other one; None for the same.
+    """
+    if light is None:
+        return measured.astype(np.float64)
+    before = np.ones(len(light)) if recorded is None else np.asarray(recorded, dtype=np.float64)
+    lit = before > DARK_LIGHT * before.max()
+    return measured * np.divide(light, before, out=np.zeros_like(light), where=lit)
+
+
+@dataclass(frozen=True)
+class ShownMatch:
+    """A known material beside the spectrum that it resembles."""
+
+    match: LibraryMatch
+    spectrum: Float64[np.ndarray, " B"]
+    """The material in the light of the scene, as bright as the spectrum (least squares); NaN where it is unknown."""
+
+
+def light_of(model: Model) -> Float64[np.ndarray, " B"] | None:
+    """Relative power of the light in which a model's spectra are seen; None where it is unknown."""
+    light = model.metadata.get("illuminant")
+    return None if light is None else np.asarray(light, dtype=np.float64)
+
+
+def shown_matches(
+    spectra: Float[np.ndarray, "N B"],
+    bands: Bands,
+    light: Float64[np.ndarray, " B"] | None,
+    library: MaterialLibrary,
+    count: int = 3,
+    comparison: Comparison = "scale",
+) -> list[list[ShownMatch]]:
+    """The nearest materials of each spectrum, nearest first, in the light and brightness of the spectrum."""
+    found = library.nearest(spectra, bands, light, count, comparison)
+    return [
+        [ShownMatch(match, _as_seen(match, library, spectrum, bands, light)) for match in matches]
+        for spectrum, matches in zip(spectra, found, strict=True)
+    ]
+
+
+def match_json(match: LibraryMatch) -> dict[str, Any]:
+    """A match as JSON has it."""
+    return {
+        "name": match.name,
+        "angle_rad": match.angle_rad,
+        "bands_compared": match.num_bands,
+        "source": match.source,
+    }
+
+
+def _as_seen(
+    match: LibraryMatch,
+    library: MaterialLibrary,
+    spectrum: Float[np.ndarray, " B"],
+    bands: Bands,
+    light: Float64[np.ndarray, " B"] | None,
+) -> Float64[np.ndarray, " B"]:
+    material = library.find(match.name)
+    known = np.interp(
+        bands.centers_nm, material.bands.centers_nm, material.reflectance, left=np.nan, right=np.nan
+    )
+    lit = known if light is None else known * light
+    shared = np.isfinite(lit)
+    power = float(lit[shared] @ lit[shared])
+    return lit * (float(lit[shared] @ spectrum[shared]) / power if power > 0 else 0.0)

@@ -1,0 +1,181 @@
+"""The surface of a trained scene as its own cameras see it: where their rays end, and whether they agree.
+
+A ray that grazes an edge ends, on average, between what is before and what is behind it: in the air. And what no camera
+sees was never learnt. Both are told by asking the other cameras: a point lies on the surface where cameras see
+something at its distance, and few see through it.
+
+Notation: `P` points, `K` endmembers. Model space.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from unmix_plugin.engine.geometry.camera_paths import resized
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.rays import RayBundle
+from unmix_plugin.model import UnmixModel
+from unmix_plugin.spectral.composition import OCCUPIED_ACCUMULATION, Coefficients
+
+SOLID_ACCUMULATION = 0.9
+"""Rays of which at least this much ends on something give points."""
+
+_TOLERANCE_PX = 2.0
+"""Difference of distances, in pixels as large as they are at the point, that still counts as the same surface."""
+
+_SCALE_BOUNDS = (1 / 16, 4.0)
+_SIDE_PX = 24
+"""Least side of an image that surfaces are looked for in."""
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Ends of rays, on the CPU."""
+
+    positions: Float[Tensor, "P 3"]
+    directions: Float[Tensor, "P 3"]
+    """Unit vectors away from the camera."""
+    abundances: Float[Tensor, "P K"]
+    """Of what the ray ends on, summing to 1."""
+    diffuse: Float[Tensor, "P B"]
+    """Spectra without the view-dependent part."""
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def select(self, chosen: Bool[Tensor, " P"] | Int64[Tensor, " chosen"]) -> SurfacePoints:
+        """Some of the points."""
+        return SurfacePoints(
+            self.positions[chosen], self.directions[chosen], self.abundances[chosen], self.diffuse[chosen]
+        )
+
+    @staticmethod
+    def concatenate(parts: Sequence[SurfacePoints]) -> SurfacePoints:
+        """The points of all parts, in order."""
+        names = ("positions", "directions", "abundances", "diffuse")
+        return SurfacePoints(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
+
+
+class SeenSurface:
+    """What the cameras of a run see, fed camera by camera."""
+
+    def __init__(self, model: UnmixModel, num_rays: int, cameras: Sequence[Cameras]) -> None:
+        """
+        Args:
+            model: Trained.
+            num_rays: Rays to cast in all, about: images get more or fewer pixels for it.
+            cameras: One camera each; what `look` is then called with, one after the other.
+        """
+        self._model = model
+        pixels = sum(camera.width * camera.height for camera in cameras)
+        factor = min(max((num_rays / max(pixels, 1)) ** 0.5, _SCALE_BOUNDS[0]), _SCALE_BOUNDS[1])
+        smallest = min((min(camera.width, camera.height) for camera in cameras), default=1)
+        self._factor = max(factor, min(_SIDE_PX / smallest, 1.0))
+        self._views: list[tuple[Cameras, Float[Tensor, "H W"]]] = []
+        self._points: list[SurfacePoints] = []
+
+    @torch.no_grad()
+    def look(self, camera: Cameras) -> None:
+        """Render what one camera sees."""
+        width, height = (max(1, round(self._factor * side)) for side in (camera.width, camera.height))
+        view = resized(camera, width, height).to("cpu")
+        found = self._model.get_image_coefficients(view, subpixels=1)
+        accumulation = found.accumulation.flatten().cpu()
+        distances = found.distance.flatten().cpu() / accumulation.clamp(min=1e-6)
+        distances[accumulation < OCCUPIED_ACCUMULATION] = torch.inf
+        self._views.append((view, distances.unflatten(0, (view.height, view.width))))
+        rays = view.image_rays(0)
+        solid = accumulation >= SOLID_ACCUMULATION
+        self._points.append(
+            SurfacePoints(
+                (rays.origins + distances[:, None] * rays.directions)[solid],
+                rays.directions[solid],
+                *_looks(self._model, found, solid),
+            )
+        )
+
+    def points(self) -> SurfacePoints:
+        """Ends of all rays on whose place the cameras agree."""
+        points = SurfacePoints.concatenate(self._points)
+        confirmed, seen_through = self._votes(points.positions)
+        # The camera that a point is from confirms it, so another one has to, unless there is none.
+        needed = min(2, len(self._views))
+        return points.select((confirmed >= needed) & (2 * seen_through <= confirmed))
+
+    def shows(self, positions: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:
+        """Which points lie on what the cameras see."""
+        confirmed, seen_through = self._votes(positions)
+        return (confirmed >= 1) & (seen_through <= confirmed)
+
+    def hides(self, positions: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:
+        """Which points lie behind what the cameras see, for every camera that has them in its image."""
+        hidden = torch.zeros(len(positions), dtype=torch.bool)
+        left = torch.arange(len(positions))
+        for camera, distances in self._views:
+            inside, excess = _excess_px(camera, distances, positions[left])
+            hidden[left[inside]] |= excess < -_TOLERANCE_PX
+            # What one camera sees, or sees through, isn't asked for again: most points are in the air.
+            in_sight = torch.zeros(len(left), dtype=torch.bool)
+            in_sight[inside] = excess >= -_TOLERANCE_PX
+            hidden[left[in_sight]] = False
+            left = left[~in_sight]
+        return hidden
+
+    def _votes(self, positions: Float[Tensor, "P 3"]) -> tuple[Int64[Tensor, " P"], Int64[Tensor, " P"]]:
+        """How many cameras see something at each point, and how many see something only behind it."""
+        confirmed = torch.zeros(len(positions), dtype=torch.int64)
+        seen_through = torch.zeros_like(confirmed)
+        for camera, distances in self._views:
+            inside, excess = _excess_px(camera, distances, positions)
+            confirmed[inside] += excess.abs() <= _TOLERANCE_PX
+            seen_through[inside] += excess > _TOLERANCE_PX
+        return confirmed, seen_through
+
+
+def _excess_px(
+    camera: Cameras, distances: Float[Tensor, "H W"], positions: Float[Tensor, "P 3"]
+) -> tuple[Bool[Tensor, " P"], Float[Tensor, " inside"]]:
+    """Which points are in the image, and by how many pixels, as large as they are there, it sees farther than each."""
+    coords, depths = camera.project(positions, 0)
+    size = torch.tensor([camera.width, camera.height])
+    inside = (depths > 0) & (coords >= 0).all(dim=-1) & (coords < size).all(dim=-1)
+    columns, rows = coords[inside].long().unbind(-1)
+    own = (positions[inside] - camera.camera_to_world[0, :, 3]).norm(dim=-1)
+    return inside, (distances[rows, columns] - own) * camera.focal_px[0].min() / depths[inside]
+
+
+@torch.no_grad()
+def look_from_above(
+    model: UnmixModel, positions: Float[Tensor, "P 3"], normals: Float[Tensor, "P 3"]
+) -> tuple[Float[Tensor, "P K"], Float[Tensor, "P B"]]:
+    """Abundances, summing to 1, and diffuse spectra of points as a camera straight above the surface sees them.
+
+    Args:
+        model: Trained.
+        positions: On a surface.
+        normals: Unit vectors out of it.
+    """
+    above = positions + float(model.metadata["pixel_size"]) * normals
+    indices = torch.zeros(len(above), dtype=torch.int64)
+    rays = RayBundle(above, -normals, indices).to(model.device)
+    if len(rays) == 0:
+        return torch.zeros(0, len(model.materials.names)), torch.zeros(0, len(model.bands))
+    found = model.renderer.in_chunks(model.field, rays, model.config.eval_num_rays_per_chunk)
+    return _looks(model, found, torch.ones(len(above), dtype=torch.bool))
+
+
+def _looks(
+    model: UnmixModel, found: Coefficients, chosen: Bool[Tensor, " R"]
+) -> tuple[Float[Tensor, "P K"], Float[Tensor, "P B"]]:
+    """Abundances and diffuse spectra of what the chosen rays end on."""
+    rows = chosen.to(found.accumulation.device)
+    opacity = found.accumulation.flatten()[rows].clamp(min=1e-6)[:, None]
+    abundances, scaled_abundances = (
+        values.flatten(0, -2)[rows] / opacity for values in (found.abundances, found.scaled_abundances)
+    )
+    return abundances.cpu(), (scaled_abundances @ model.materials.endmembers).detach().cpu()

@@ -1,0 +1,53 @@
+"""One view of a trained model, as every product and the evaluation want it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.model import Model
+from unmix_plugin.figures.picture_grid import Picture, premultiplied_over_neutral
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.colour.conversion import rgb_matrix
+
+
+@dataclass(frozen=True)
+class RenderedView:
+    """What a model sees from one camera, on black; on the CPU."""
+
+    spectra: Float[Tensor, "H W B"]
+    accumulation: Float[Tensor, "H W"]
+    """Opacity, [0, 1]."""
+    abundances: Float[Tensor, "H W K"]
+    """Composited, so that they sum to the accumulation."""
+    segmentation: UInt8[Tensor, "H W"]
+    """Material ids, 255 where nothing is."""
+    material_scores: Float[Tensor, "H W K"]
+    """Cosine of the spectrum to each endmember."""
+
+    @property
+    def shares(self) -> Float[Tensor, "H W K"]:
+        """Abundances of what is seen, summing to 1 wherever anything is."""
+        return self.abundances / self.accumulation.clamp(min=1e-6)[..., None]
+
+
+def render_view(model: Model, camera: Cameras) -> RenderedView:
+    """Render all that is written about a view."""
+    names = ("spectral", "accumulation", "abundances", "segmentation", "material_scores")
+    outputs = model.get_outputs_for_camera(camera, names)
+    return RenderedView(*(outputs[name].detach().cpu() for name in names))
+
+
+def picture(spectra: Float[Tensor, "H W B"], opacity: Float[Tensor, "H W"], bands: Bands) -> Picture:
+    """Spectra seen on black as an sRGB picture over neutral grey."""
+    linear = spectra.double().clamp(min=0) @ rgb_matrix(bands).double()
+    return premultiplied_over_neutral(linear.clamp(0, 1).numpy(), as_numpy(opacity))
+
+
+def as_numpy(values: Tensor) -> np.ndarray:
+    """float64 for drawing."""
+    return values.double().numpy()

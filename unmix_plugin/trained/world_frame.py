@@ -1,0 +1,50 @@
+"""Where things are in the scene's own world: the space of its transforms.json, before the run moved and scaled it."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+from unmix_plugin.engine.runs.load_run import SceneRecord
+from unmix_plugin.errors import RunError
+from unmix_plugin.scenes.scene import Normalisation
+
+
+def world_frame(scene: SceneRecord) -> Normalisation:
+    """How a run's world became its model space; one that changes nothing where the run has recorded none.
+
+    Raises:
+        RunError: the record is damaged.
+    """
+    recorded = scene.summary.get("normalisation")
+    if recorded is None:
+        return Normalisation(np.eye(3), np.zeros(3), 1.0)
+    try:
+        return Normalisation.from_json(recorded)
+    except (KeyError, TypeError, ValueError) as error:
+        raise RunError(
+            f"the run's scene.json is damaged: its normalisation is {recorded!r} ({error}); train again"
+        ) from error
+
+
+def directions_to_world(
+    frame: Normalisation, directions: Float[np.ndarray, "*points 3"]
+) -> Float64[np.ndarray, "*points 3"]:
+    """Directions of model space in the world: turned back, lengths kept."""
+    return directions @ frame.rotation
+
+
+def affine_to_world(
+    frame: Normalisation, origin: Float[np.ndarray, "3"], cell: float
+) -> Float64[np.ndarray, "4 4"]:
+    """Matrix from the indices of a grid in model space, as (i, j, k, 1), to world points.
+
+    Args:
+        frame: Of the run.
+        origin: Point of index (0, 0, 0), model space.
+        cell: Edge of a cell, model units.
+    """
+    matrix = np.eye(4)
+    matrix[:3, :3] = frame.rotation.T * (cell / frame.scale)
+    matrix[:3, 3] = frame.to_world(np.asarray(origin, dtype=np.float64))
+    return matrix

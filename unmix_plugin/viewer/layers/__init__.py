@@ -1,0 +1,1 @@
+"""What the viewer can show of a rendered view."""

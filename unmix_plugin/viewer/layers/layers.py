@@ -1,0 +1,244 @@
+"""What can be shown: pure functions from a rendered view to a picture and its legend.
+
+A layer is one entry of `LAYERS`: its name, what users read, which controls it has, and the function that paints it.
+
+Notation: pictures are (H, W, 3) sRGB in [0, 1]; what is transparent shows the background. `light` is linear RGB seen on
+black.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.colour.conversion import band_composite_matrix, describe_colour, rgb_matrix
+from unmix_plugin.spectral.composition import compose
+from unmix_plugin.spectral.segmentation import NOTHING_ID
+from unmix_plugin.viewer.layers.index_layer import paint_index
+from unmix_plugin.viewer.layers.layer_settings import LayerAids, LayerSettings
+from unmix_plugin.viewer.layers.painting import (
+    ColourMapLegend,
+    Legend,
+    Picture,
+    SwatchLegend,
+    TextLegend,
+    over_background,
+    paint_values,
+    tone_mapped,
+)
+from unmix_plugin.viewer.rendering.frames import Frame
+from unmix_plugin.viewer.view_cameras import depth_along_axis
+
+Painter = Callable[[Frame, LayerSettings, LayerAids], tuple[Picture, Legend]]
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One thing that can be shown."""
+
+    name: str
+    """As in outputs of renders, where there is such an output."""
+    title: str
+    """What users read."""
+    paint: Painter
+    controls: frozenset[str]
+    """Which of `wavelength`, `false-colour`, `endmember`, `index`, `tone`, `scale` apply."""
+
+
+def paint_layer(frame: Frame, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
+    """The picture of the layer that `settings` name, and what its colours mean.
+
+    Raises:
+        ConfigError: there is no such layer, or it can't be shown here; the message says why.
+    """
+    with torch.no_grad():
+        return layer_named(settings.layer).paint(frame, settings, aids)
+
+
+def layer_named(name: str) -> Layer:
+    """A layer by its name.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    if name not in LAYERS:
+        raise ConfigError(f"there is no layer named {name[:40]!r}; known: {', '.join(LAYERS)}")
+    return LAYERS[name]
+
+
+def linear_light(
+    frame: Frame, matrix: Float[Tensor, "B 3"], diffuse: bool = True, specular: bool = True
+) -> Float[Tensor, "H W 3"]:
+    """Linear RGB through a matrix on spectra, without ever making the spectra: colour commutes with mixing."""
+    coefficients, materials = frame.coefficients, frame.materials
+    on_device = matrix.to(materials.endmembers)
+    light = coefficients.scaled_abundances.new_zeros(*coefficients.accumulation.shape, 3)
+    if diffuse:
+        light = light + coefficients.scaled_abundances @ (materials.endmembers @ on_device)
+    if specular and coefficients.specular.shape[-1]:
+        light = light + coefficients.specular @ (materials.specular_spectra @ on_device)
+    return light
+
+
+def band_values(frame: Frame, band: int) -> Float[Tensor, "*rays"]:
+    """Radiance in one band, on black."""
+    coefficients, materials = frame.coefficients, frame.materials
+    diffuse = coefficients.scaled_abundances @ materials.endmembers[:, band]
+    return diffuse + coefficients.specular @ materials.specular_spectra[:, band]
+
+
+def linear_spectra(frame: Frame, pixels: Int[Tensor, " P"]) -> Float[Tensor, "P B"]:
+    """Spectra of some pixels, seen on black, given as row * width + column."""
+    coefficients, materials = frame.coefficients, frame.materials
+    diffuse = coefficients.scaled_abundances.flatten(0, 1)[pixels] @ materials.endmembers
+    return diffuse + coefficients.specular.flatten(0, 1)[pixels] @ materials.specular_spectra
+
+
+def _paint_colour(diffuse: bool, specular: bool) -> Painter:
+    def paint(frame: Frame, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
+        bands = frame.materials.bands
+        light = linear_light(frame, rgb_matrix(bands), diffuse, specular)
+        # The view-dependent part is light added to what is there: it has no opacity of its own.
+        opacity = frame.coefficients.accumulation if diffuse else torch.ones_like(light[..., 0])
+        return tone_mapped(light, opacity, settings), TextLegend(describe_colour(bands))
+
+    return paint
+
+
+def _paint_false_colour(frame: Frame, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
+    bands = frame.materials.bands
+    wavelengths = tuple(covered(bands, value) for value in settings.false_colour_nm)
+    light = linear_light(frame, band_composite_matrix(bands, wavelengths))
+    shown = [f"{bands.centers_nm[bands.nearest(value)]:.0f} nm" for value in wavelengths]
+    legend = TextLegend(f"red {shown[0]}, green {shown[1]}, blue {shown[2]}")
+    return tone_mapped(light, frame.coefficients.accumulation, settings), legend
+
+
+def _paint_band(frame: Frame, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
+    bands = frame.materials.bands
+    band = bands.nearest(covered(bands, settings.wavelength_nm))
+    reference = aids.reference_frame(frame.materials)
+    scale = aids.reference.range_of(_unpremultiplied(band_values(reference, band), reference)[:, 0])
+    label = f"radiance at {bands.centers_nm[band]:.0f} nm"
+    return _paint_seen(
+        _unpremultiplied(band_values(frame, band), frame)[..., 0], frame, settings, scale, label
+    )
+
+
+def _paint_abundance(frame: Frame, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
+    index = min(max(settings.endmember, 0), len(frame.materials.names) - 1)
+    values = _unpremultiplied(frame.coefficients.abundances[..., index], frame)[..., 0]
+    label = f"abundance of {frame.materials.names[index]}"
+    return _paint_seen(values, frame, settings, (0.0, 1.0), label)
+
+
+def _paint_confidence(frame: Frame, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
+    values = compose("confidence", frame.coefficients, frame.materials)
+    return _paint_seen(values, frame, settings, (0.0, 1.0), "estimated probability of the material")
+
+
+def _paint_abundances(frame: Frame, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
+    colours = aids.colours_of(frame.materials)
+    picture = _unpremultiplied(frame.coefficients.abundances, frame) @ colours
+    return over_background(picture, frame.coefficients.accumulation, settings), _swatches(frame, colours)
+
+
+def _paint_segmentation(frame: Frame, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
+    ids = compose("segmentation", frame.coefficients, frame.materials)
+    colours = aids.colours_of(frame.materials)
+    palette = torch.cat([colours, colours.new_zeros(256 - len(colours), 3)])
+    is_something = (ids != NOTHING_ID).to(colours.dtype)
+    return over_background(palette[ids.long()], is_something, settings), _swatches(frame, colours)
+
+
+def _paint_pca(frame: Frame, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
+    colours = aids.pca_of(frame.materials)
+    components = _unpremultiplied(linear_light(frame, colours.axes), frame) - colours.mean @ colours.axes
+    stretched = (components - colours.low) / (colours.high - colours.low).clamp(min=1e-9)
+    legend = TextLegend("red, green, blue: first, second, third principal component of the spectra")
+    return over_background(stretched.clamp(0, 1), frame.coefficients.accumulation, settings), legend
+
+
+def _paint_depth(frame: Frame, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
+    depth = depth_along_axis(frame.camera, compose("ray_distance", frame.coefficients, frame.materials))
+    scale = settings.value_range or aids.depth_range(frame.camera)
+    picture = paint_values(depth, scale, settings.colour_map)
+    legend = ColourMapLegend(settings.colour_map, *scale, "distance along the viewing axis, scene units")
+    return over_background(picture, frame.coefficients.accumulation, settings), legend
+
+
+def _paint_accumulation(frame: Frame, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
+    scale = settings.value_range or (0.0, 1.0)
+    picture = paint_values(frame.coefficients.accumulation, scale, settings.colour_map)
+    return picture, ColourMapLegend(settings.colour_map, *scale, "opacity")
+
+
+def _paint_error(frame: Frame, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
+    if aids.error_of is None:
+        raise ConfigError(f"no error to show: {aids.why_no_error}")
+    values, is_known, view = aids.error_of(frame)
+    scale = settings.value_range or (0.0, 0.1)
+    picture = paint_values(values, scale, settings.colour_map)
+    label = f"mean absolute error of the bands against training view {view}, where it sees the same"
+    legend = ColourMapLegend(settings.colour_map, *scale, label)
+    return over_background(picture, is_known.to(picture.dtype), settings), legend
+
+
+def _paint_seen(
+    values: Float[Tensor, "H W"],
+    frame: Frame,
+    settings: LayerSettings,
+    scale: tuple[float, float],
+    label: str,
+) -> tuple[Picture, Legend]:
+    """Values of what is seen in the colours of a scale, over the background."""
+    shown = settings.value_range or scale
+    picture = paint_values(values, shown, settings.colour_map)
+    legend = ColourMapLegend(settings.colour_map, *shown, label)
+    return over_background(picture, frame.coefficients.accumulation, settings), legend
+
+
+def _unpremultiplied(values: Tensor, frame: Frame) -> Tensor:
+    """Values of what is seen, channels last, rather than of what is seen on black."""
+    channels = values if values.ndim > frame.coefficients.accumulation.ndim else values[..., None]
+    return channels / frame.coefficients.accumulation.clamp(min=1e-3)[..., None]
+
+
+def _swatches(frame: Frame, colours: Float[Tensor, "K 3"]) -> SwatchLegend:
+    return SwatchLegend(tuple(zip(frame.materials.names, map(tuple, colours.tolist()), strict=True)))
+
+
+def covered(bands: Bands, wavelength_nm: float) -> float:
+    """The wavelength, or the nearest that some band covers."""
+    low, high = float(bands.edges_nm[0]), float(bands.edges_nm[-1])
+    return min(max(low, wavelength_nm), high)
+
+
+_SCALE, _TONE = "scale", "tone"
+
+LAYERS: dict[str, Layer] = {
+    layer.name: layer
+    for layer in (
+        Layer("rgb", "colour", _paint_colour(True, True), frozenset({_TONE})),
+        Layer("false-colour", "false colour", _paint_false_colour, frozenset({_TONE, "false-colour"})),
+        Layer("band", "one band", _paint_band, frozenset({_SCALE, "wavelength"})),
+        Layer("index", "spectral index", paint_index, frozenset({_SCALE, "index"})),
+        Layer("abundance", "abundance of one endmember", _paint_abundance, frozenset({_SCALE, "endmember"})),
+        Layer("abundances", "all abundances", _paint_abundances, frozenset()),
+        Layer("segmentation", "segmentation", _paint_segmentation, frozenset()),
+        Layer("confidence", "segmentation confidence", _paint_confidence, frozenset({_SCALE})),
+        Layer("diffuse", "diffuse part", _paint_colour(True, False), frozenset({_TONE})),
+        Layer("specular", "specular part", _paint_colour(False, True), frozenset({_TONE})),
+        Layer("pca", "principal components", _paint_pca, frozenset()),
+        Layer("depth", "depth", _paint_depth, frozenset({_SCALE})),
+        Layer("accumulation", "opacity", _paint_accumulation, frozenset({_SCALE})),
+        Layer("error", "error against a training view", _paint_error, frozenset({_SCALE})),
+    )
+}
+"""All that can be shown, in the order in which it is offered."""

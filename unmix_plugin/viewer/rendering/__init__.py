@@ -1,0 +1,1 @@
+"""From cameras of browsers to pictures."""

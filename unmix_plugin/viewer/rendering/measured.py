@@ -1,0 +1,134 @@
+"""What the training views measured: spectra of points that they see, and errors of a rendered view.
+
+Notation: `P` points, `B` bands. A training view sees a point if nothing that the model renders stands before it.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Float32
+from torch import Tensor
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.scenes.scene import Scene
+from unmix_plugin.spectral.composition import OCCUPIED_ACCUMULATION
+from unmix_plugin.viewer.layers.layers import linear_spectra
+from unmix_plugin.viewer.rendering.frames import Frame, render_frame
+from unmix_plugin.viewer.rendering.model_source import ModelSource
+
+_TOLERANCE = 0.03
+"""Depths of a point and of what a view renders there may differ by so much of the depth."""
+
+_VIEWS_KEPT = 4
+_STEPS_KEPT = 200
+"""Depths rendered so many training steps ago are rendered again."""
+
+_VIEWS_TRIED = 6
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What a training view measured of a point."""
+
+    view: str
+    """Name of the view."""
+    spectrum: Float32[Tensor, "B"]
+    """Radiance, [0, 1]."""
+
+
+class MeasuredViews:
+    """The training views of a scene that is at hand."""
+
+    def __init__(self, scene: Scene, source: ModelSource) -> None:
+        self._scene = scene
+        self._source = source
+        self._indices = scene.train_indices
+        self._cameras = scene.cameras[list(scene.train_indices)]
+        self._distances: OrderedDict[int, tuple[int, Tensor]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def error(self, frame: Frame) -> tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"], str]:
+        """Mean absolute error of the bands against the nearest training view, where that sees the same point.
+
+        Returns:
+            Errors; where they are known; the name of the view.
+        """
+        index = int(self._by_nearness(frame.camera)[0])
+        height, width = frame.camera.height, frame.camera.width
+        errors = torch.zeros(height * width)
+        is_known = torch.zeros(height * width, dtype=torch.bool)
+        seen = (frame.coefficients.accumulation.flatten() > OCCUPIED_ACCUMULATION).nonzero()[:, 0]
+        if len(seen):
+            points = _end_points(frame)[seen]
+            rows, columns, sees = self._pixels_of(points, index)
+            cube = torch.from_numpy(self._scene.cube(self._indices[index]))
+            spectra = linear_spectra(frame, seen[sees]).cpu()
+            measured = cube[rows[sees], columns[sees]]
+            places = seen[sees].cpu()
+            errors[places] = (spectra - measured).abs().mean(dim=-1)
+            is_known[places] = True
+        device = frame.coefficients.accumulation.device
+        name = self._scene.frames[self._indices[index]].name
+        return errors.view(height, width).to(device), is_known.view(height, width).to(device), name
+
+    def measurement(self, point: Float[Tensor, "3"], camera: Cameras) -> Measurement | None:
+        """What the training view nearest to a camera measured of a point; None where no view tried sees it."""
+        for index in self._by_nearness(camera)[:_VIEWS_TRIED].tolist():
+            rows, columns, sees = self._pixels_of(point[None], index)
+            if bool(sees[0]):
+                cube = self._scene.cube(self._indices[index])
+                spectrum = torch.from_numpy(cube[int(rows[0]), int(columns[0])].copy())
+                return Measurement(self._scene.frames[self._indices[index]].name, spectrum)
+        return None
+
+    def _by_nearness(self, camera: Cameras) -> Tensor:
+        """Training views by the angle between their axis and the camera's, and by their distance to it."""
+        middle = self._scene.scene_box.aabb.mean(dim=0)
+        pose, poses = camera.camera_to_world[0].cpu(), self._cameras.camera_to_world
+        reach = (pose[:, 3] - middle).norm().clamp(min=1e-3)
+        offsets = (poses[:, :, 3] - pose[:, 3]).norm(dim=-1) / reach
+        angles = (poses[:, :, 2] * pose[:, 2]).sum(dim=-1).clamp(-1, 1).arccos()
+        return (offsets + angles).argsort()
+
+    def _pixels_of(
+        self, points: Float[Tensor, "P 3"], index: int
+    ) -> tuple[Tensor, Tensor, Bool[Tensor, "P"]]:
+        """Row and column of each point in a training view, and whether that view sees it."""
+        camera = self._cameras[index]
+        coords, depths = camera.project(points.cpu(), 0)
+        columns, rows = coords.nan_to_num(-1.0).clamp(-1, 1e6).floor().long().unbind(-1)
+        inside = (depths > 0) & (columns >= 0) & (rows >= 0)
+        inside &= (columns < camera.width) & (rows < camera.height)
+        rows, columns = rows.clamp(0, camera.height - 1), columns.clamp(0, camera.width - 1)
+        distance = (points.cpu() - camera.camera_to_world[0, :, 3]).norm(dim=-1)
+        rendered = self._distance_of(index)[rows, columns]
+        return rows, columns, inside & ((distance - rendered).abs() < _TOLERANCE * distance)
+
+    def _distance_of(self, index: int) -> Float[Tensor, "H W"]:
+        """Distances along the rays of a training view as rendered lately, infinite where nothing is."""
+        step = self._source.version
+        with self._lock:
+            kept = self._distances.get(index)
+        if kept is not None and step - kept[0] < _STEPS_KEPT:
+            return kept[1]
+        with self._source.borrowed() as model:
+            coefficients = render_frame(model, self._cameras[index]).coefficients
+        distance = coefficients.distance / coefficients.accumulation.clamp(min=1e-6)
+        distance = distance.where(coefficients.accumulation > OCCUPIED_ACCUMULATION, torch.inf).cpu()
+        with self._lock:
+            self._distances[index] = (step, distance)
+            while len(self._distances) > _VIEWS_KEPT:
+                self._distances.popitem(last=False)
+        return distance
+
+
+def _end_points(frame: Frame) -> Float[Tensor, "P 3"]:
+    """Where the rays of all pixels end."""
+    coefficients = frame.coefficients
+    bundle = frame.camera.to(coefficients.accumulation.device).image_rays(0)
+    distance = (coefficients.distance / coefficients.accumulation.clamp(min=1e-6)).flatten()
+    return bundle.origins + distance[:, None] * bundle.directions

@@ -1,0 +1,138 @@
+"""The work of the render loop: what size a picture gets, rendering its blocks, painting it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.spectral.composition import Materials
+from unmix_plugin.viewer.layers.layer_settings import LayerAids, LayerSettings
+from unmix_plugin.viewer.layers.layers import paint_layer
+from unmix_plugin.viewer.layers.painting import as_bytes
+from unmix_plugin.viewer.probing import Probe, probe
+from unmix_plugin.viewer.rendering.edits import Edit, See
+from unmix_plugin.viewer.rendering.frames import Frame, FrameRender, detached
+from unmix_plugin.viewer.rendering.model_source import ModelSource
+from unmix_plugin.viewer.rendering.pacing import Speedometer, affordable_height, finer_height, moving_height
+from unmix_plugin.viewer.rendering.picture_depth import picture_depth
+from unmix_plugin.viewer.rendering.view import Shown
+from unmix_plugin.viewer.view_cameras import ViewPose, camera_of
+
+RESTING_COST = 6.0
+"""Credit that rendering for clients at rest takes while training, so that it may wait when someone moves."""
+
+REFRESH_S = 2.0
+"""How long one picture of a client at rest should take while training."""
+
+LARGEST_FRAME_BYTES = 1 << 26
+"""Coefficients that are kept for one client."""
+
+
+class PictureMaker:
+    """Renders and paints with one model; used by one thread at a time."""
+
+    def __init__(
+        self, source: ModelSource, aids: Callable[[], LayerAids], see: See, num_channels: int
+    ) -> None:
+        """
+        Args:
+            source: The model.
+            aids: What layers need, asked anew for each picture.
+            see: What cameras see of the model, asked while it is lent.
+            num_channels: Numbers a pixel that a frame keeps.
+        """
+        self.speed = Speedometer()
+        self.source = source
+        self._aids = aids
+        self._see = see
+        self._largest_pixels = max(256, LARGEST_FRAME_BYTES // (4 * num_channels))
+
+    def first_render(self, pose: ViewPose, largest_height: int) -> FrameRender:
+        """A small picture, for a camera that moved."""
+        largest = self.target_height(pose, largest_height)
+        height = moving_height(self.speed.rays_per_second, pose.aspect, largest)
+        return FrameRender(camera_of(pose, height, self._largest_pixels))
+
+    def finer_render(self, pose: ViewPose, frame: Frame, largest_height: int, subpixels: int) -> FrameRender:
+        """The picture after `frame`: a finer one, or at the end the same anew."""
+        target = self.target_height(pose, largest_height)
+        height = finer_height(frame.camera.height, target) or target
+        is_last = height == target and not self.source.is_changing
+        return FrameRender(camera_of(pose, height, self._largest_pixels), subpixels if is_last else 1)
+
+    def target_height(self, pose: ViewPose, largest_height: int) -> int:
+        """Rows of the finest picture: as asked for, but while training no more than keep up with it."""
+        largest = camera_of(pose, largest_height, self._largest_pixels).height
+        if not self.source.is_changing:
+            return largest
+        share = self.source.device.guest_share
+        speed = self.speed.rays_per_second * share / (share + RESTING_COST * (1 - share))
+        return affordable_height(speed, REFRESH_S, pose.aspect, largest)
+
+    def advance(self, render: FrameRender, edit: Edit, num_rays: int, cost: float) -> Frame | None:
+        """Render a block; the frame if that was the last.
+
+        Raises:
+            UnmixError: the edit does not fit the run.
+        """
+        with self.source.borrowed(cost) as model, torch.no_grad():
+            shown = edit.apply(model, self.source.version, self._see)
+            started = time.perf_counter()
+            rays = render.render_block(shown, num_rays)
+            if shown.device.type == "cuda":
+                torch.cuda.synchronize(shown.device)
+            self.speed.add(rays, time.perf_counter() - started)
+            return render.frame(shown.materials) if render.rays_left == 0 else None
+
+    def probe(self, edit: Edit, camera: Cameras, column: float, row: float, number: int) -> Probe:
+        """What is seen through a point of a camera's picture.
+
+        Raises:
+            UnmixError: nothing is there, or the edit does not fit the run.
+        """
+        with self.source.borrowed() as model:
+            shown = edit.apply(model, self.source.version, self._see)
+            return probe(shown, camera, column, row, number)
+
+    def edited(self, edit: Edit) -> Materials:
+        """Materials after an edit.
+
+        Raises:
+            UnmixError: the edit does not fit the run.
+        """
+        with self.source.borrowed() as model:
+            return detached(edit.apply(model, self.source.version, self._see).materials)
+
+    def light_of(self, edit: Edit) -> Float64[np.ndarray, " B"] | None:
+        """Relative power of the light after an edit; None where the scene's is unknown.
+
+        Raises:
+            UnmixError: the edit does not fit the run.
+        """
+        with self.source.borrowed() as model:
+            light = edit.apply(model, self.source.version, self._see).metadata["illuminant"]
+        return None if light is None else np.array(light, dtype=np.float64)
+
+    def with_materials_of(self, edit: Edit, frame: Frame) -> Frame:
+        """What a frame would be with other materials on the same shapes.
+
+        Raises:
+            UnmixError: the edit does not fit the run.
+        """
+        return replace(frame, materials=self.edited(edit))
+
+    def paint(self, frame: Frame, settings: LayerSettings, with_depth: bool, is_moving: bool) -> Shown:
+        """A frame as a picture.
+
+        Raises:
+            UnmixError: the layer can't be shown.
+        """
+        picture, legend = paint_layer(frame, settings, self._aids())
+        depth = picture_depth(frame) if with_depth else None
+        return Shown(as_bytes(picture), depth, legend, is_moving)

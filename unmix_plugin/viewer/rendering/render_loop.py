@@ -1,0 +1,238 @@
+"""When to render: one thread that serves all clients, block by block, the most urgent first.
+
+A camera that moved is answered with a small picture, never interrupted; a client at rest gets finer ones, in blocks so
+short that anything more urgent comes between; a change of layer is painted from the coefficients of the last picture.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+from unmix_plugin.viewer.failures import failures_said
+from unmix_plugin.viewer.layers.layer_settings import LayerSettings
+from unmix_plugin.viewer.rendering.edits import Edit
+from unmix_plugin.viewer.rendering.frames import Frame
+from unmix_plugin.viewer.rendering.picture_maker import RESTING_COST, PictureMaker
+from unmix_plugin.viewer.rendering.view import Capture, View
+from unmix_plugin.viewer.view_cameras import ViewPose
+
+_POLL_S = 0.05
+_JOIN_S = 20.0
+
+
+class RenderLoop:
+    """Renders for all views until stopped; nothing that goes wrong in a picture ends it."""
+
+    def __init__(self, maker: PictureMaker) -> None:
+        self._maker = maker
+        self._changed = threading.Condition()
+        self._views: list[View] = []
+        self._captures: list[Capture] = []
+        self._is_stopping = False
+        self._thread = threading.Thread(target=self._run, name="unmix-viewer-render", daemon=True)
+
+    def start(self) -> None:
+        """Begin to serve."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End after the block under way; captures that are not finished are told so."""
+        with self._changed:
+            self._is_stopping = True
+            self._changed.notify_all()
+        if self._thread.is_alive():
+            self._thread.join(_JOIN_S)
+        for capture in self._captures:
+            capture.done(None, "the viewer was stopped")
+        self._captures.clear()
+
+    @property
+    def num_views(self) -> int:
+        """How many are served."""
+        return len(self._views)
+
+    def add(self, view: View) -> None:
+        """Serve a view."""
+        with self._changed:
+            self._views.append(view)
+
+    def remove(self, view: View) -> None:
+        """Forget a view, also one whose picture is under way."""
+        with self._changed:
+            if view in self._views:
+                self._views.remove(view)
+            view.render = view.frame = None
+
+    def move(self, view: View, pose: ViewPose) -> None:
+        """Show the scene from elsewhere."""
+        with self._changed:
+            view.pose = pose
+            self._ask_anew(view)
+
+    def restyle(self, view: View, settings: LayerSettings) -> None:
+        """Show something else of the same picture."""
+        with self._changed:
+            view.settings = settings
+            self._repaint(view)
+
+    def want_depth(self, view: View, wanted: bool) -> None:
+        """Send depth with pictures, or no longer."""
+        with self._changed:
+            if view.wants_depth != wanted:
+                view.wants_depth = wanted
+                self._repaint(view)
+
+    def change_edit(self, view: View, edit: Edit) -> None:
+        """Show the scene with other materials or light; rendered anew only where shape or gloss changes."""
+        with self._changed:
+            view.edit = edit
+            if edit.reuses(view.frame_edit):
+                self._repaint(view)
+            else:
+                self._ask_anew(view)
+
+    def change_quality(self, view: View, largest_height: int, subpixels: int) -> None:
+        """Render the finest picture otherwise."""
+        with self._changed:
+            view.largest_height, view.subpixels = largest_height, subpixels
+            self._ask_anew(view)
+
+    def capture(self, capture: Capture) -> None:
+        """Render a picture of its own."""
+        with self._changed:
+            self._captures.append(capture)
+            self._changed.notify_all()
+
+    def _ask_anew(self, view: View) -> None:
+        view.render, view.is_stuck = None, False
+        view.moved_at = view.moved_at or time.monotonic()
+        self._changed.notify_all()
+
+    def _repaint(self, view: View) -> None:
+        view.is_stuck = False
+        view.restyled_at = view.restyled_at or time.monotonic()
+        self._changed.notify_all()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                unit = None
+                while unit is None:
+                    if self._is_stopping:
+                        return
+                    unit = self._next_unit()
+                    if unit is None:
+                        self._changed.wait(_POLL_S if self._views or self._captures else None)
+            unit()
+
+    def _next_unit(self) -> Callable[[], None] | None:
+        """What is most urgent: answers in the order in which they were asked for, then blocks in turn."""
+        active = [view for view in self._views if view.pose is not None and not view.is_stuck]
+        waiting = [view for view in active if view.asked_at is not None]
+        if waiting:
+            first = min(waiting, key=lambda view: view.asked_at or 0.0)
+            return lambda: self._guarded(first, self._answer if first.moved_at is not None else self._redraw)
+        if not self._maker.source.device.guest_may_go:
+            return None
+        unfinished: list[View | Capture] = [view for view in active if self._has_more(view)]
+        served = min([*unfinished, *self._captures], key=lambda one: one.served_at, default=None)
+        if isinstance(served, View):
+            return lambda: self._guarded(served, self._refine)
+        if served is not None:
+            return lambda: self._advance_capture(served)
+        return None
+
+    def _has_more(self, view: View) -> bool:
+        if view.render is not None or view.frame is None or view.pose is None:
+            return view.render is not None
+        if view.frame.camera.height < self._maker.target_height(view.pose, view.largest_height):
+            return True
+        is_stale = view.frame_version != self._maker.source.version
+        return is_stale and time.monotonic() - view.shown_at > _POLL_S
+
+    def _guarded(self, view: View, work: Callable[[View], None]) -> None:
+        """Do a piece of work for a view; what goes wrong is said to its client, and the loop goes on."""
+        with failures_said("this picture failed", lambda reason: self._fail(view, reason)):
+            work(view)
+
+    def _fail(self, view: View, reason: str) -> None:
+        with self._changed:
+            view.is_stuck = view.has_reported = True
+            view.render = view.moved_at = view.restyled_at = None
+        view.report(reason)
+
+    def _answer(self, view: View) -> None:
+        """A small picture at once."""
+        with self._changed:
+            pose, edit, height = view.pose, view.edit, view.largest_height
+            view.moved_at = view.restyled_at = None
+            version = self._maker.source.version
+        assert pose is not None
+        render = self._maker.first_render(pose, height)
+        frame = self._maker.advance(render, edit, render.num_rays, cost=1.0)
+        assert frame is not None
+        self._present(view, frame, edit, version)
+
+    def _refine(self, view: View) -> None:
+        """A block of the next finer picture; the picture itself after its last block."""
+        with self._changed:
+            if view.pose is None or view.frame is None:
+                return
+            if view.render is None:
+                view.render = self._maker.finer_render(
+                    view.pose, view.frame, view.largest_height, view.subpixels
+                )
+                view.render_version = self._maker.source.version
+            render, edit, version = view.render, view.edit, view.render_version
+            view.served_at = time.monotonic()
+        frame = self._maker.advance(render, edit, self._maker.speed.block_rays, cost=RESTING_COST)
+        with self._changed:
+            if frame is None or view.render is not render:
+                return  # more is to come, or the camera moved while the last block was rendered
+            view.render = None
+        self._present(view, frame, edit, version)
+
+    def _redraw(self, view: View) -> None:
+        """The last picture in another layer, or with other materials on the same shapes."""
+        with self._changed:
+            frame, edit, version, view.restyled_at = view.frame, view.edit, view.frame_version, None
+        if frame is None:
+            return
+        if edit is not view.frame_edit:
+            frame = self._maker.with_materials_of(edit, frame)
+        self._present(view, frame, edit, version)
+
+    def _present(self, view: View, frame: Frame, edit: Edit, version: int) -> None:
+        """Paint a frame and send it."""
+        with self._changed:
+            if view not in self._views or view.pose is None:
+                return
+            view.frame, view.frame_edit, view.frame_version = frame, edit, version
+            settings, wants_depth = view.settings, view.wants_depth
+            is_moving = frame.camera.height < self._maker.target_height(view.pose, view.largest_height)
+        started = time.perf_counter()
+        view.show(self._maker.paint(frame, settings, wants_depth, is_moving))
+        self._maker.source.device.charge(time.perf_counter() - started)
+        view.shown_at = time.monotonic()
+        if view.has_reported:
+            view.has_reported = False
+            view.report("")
+
+    def _advance_capture(self, capture: Capture) -> None:
+        """A block of a capture; after its last it is handed over."""
+        capture.served_at = time.monotonic()
+        frame: Frame | None = None
+        reasons = ["cancelled"] if capture.is_cancelled else []
+        with failures_said("the picture failed", reasons.append):
+            if not reasons:
+                block = self._maker.speed.block_rays
+                frame = self._maker.advance(capture.render, capture.edit, block, RESTING_COST)
+                capture.progress(1 - capture.render.rays_left / capture.render.num_rays)
+        if frame is None and not reasons:
+            return
+        with self._changed:
+            self._captures.remove(capture)
+        with failures_said("the picture could not be handed over", reasons.append):
+            capture.done(frame, "".join(reasons))
