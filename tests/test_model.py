@@ -215,7 +215,7 @@ def test_more_endmembers_than_bands_or_distinct_pixels_are_refused():
     model = make_model()
     data = {**initial_data(), "pixels": np.full((40, NUM_BANDS), 0.5, np.float32)}
     with pytest.raises(SpectrumError, match="distinct"), torch.no_grad():
-        model.initialise(data)
+        model.initialise(data, torch.Generator())
 
 
 @pytest.mark.parametrize(
@@ -360,7 +360,7 @@ def test_the_guide_of_abundances_lets_go_of_them_as_training_goes_on():
 
 
 def test_an_automatic_number_of_endmembers_is_that_of_the_pixels_said_with_evidence():
-    config, reasons = UnmixModelConfig(num_endmembers="auto").settled(initial_data)
+    config, reasons = UnmixModelConfig(num_endmembers="auto").resolve_auto(initial_data, torch.Generator())
     assert config.num_endmembers == 3
     assert "proposed" in reasons
 
@@ -370,9 +370,9 @@ def test_a_given_number_of_endmembers_reads_no_data():
         raise AssertionError
 
     config = UnmixModelConfig(num_endmembers=4)
-    assert config.settled(unread) == (config, "")
+    assert config.resolve_auto(unread, torch.Generator()) == (config, "")
 
 
-def test_no_model_is_made_before_its_number_of_endmembers_is_settled():
+def test_no_model_is_made_before_its_number_of_endmembers_is_resolved():
     with pytest.raises(ConfigError, match="num-endmembers is auto"):
         make_model(num_endmembers="auto")

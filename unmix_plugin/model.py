@@ -112,7 +112,9 @@ class UnmixModelConfig(ModelConfig, LossSettings):
         if broken:
             raise ConfigError(f"the model needs {' and '.join(broken)}")
 
-    def settled(self, initial_data: Callable[[], Mapping[str, np.ndarray]]) -> tuple[UnmixModelConfig, str]:
+    def resolve_auto(
+        self, initial_data: Callable[[], Mapping[str, np.ndarray]], generator: torch.Generator
+    ) -> tuple[UnmixModelConfig, str]:
         """With `num_endmembers` auto, the number that the training pixels propose, and the evidence for it.
 
         Raises:
@@ -120,7 +122,6 @@ class UnmixModelConfig(ModelConfig, LossSettings):
         """
         if self.num_endmembers != "auto":
             return self, ""
-        generator = torch.Generator().manual_seed(torch.initial_seed() % 2**63)
         pixels = drop_uninformative_pixels(torch.from_numpy(initial_data()["pixels"]))
         kept = torch.randperm(len(pixels), generator=generator)[:_PIXELS_TO_COUNT_BY]
         count = propose_num_materials(pixels[kept], generator)
@@ -144,9 +145,7 @@ class UnmixModel(Model):
         self.bands = Bands.of(metadata["wavelengths_nm"])
         num_bands = len(self.bands)
         if config.num_endmembers == "auto":
-            raise ConfigError(
-                "num-endmembers is auto: a model is made from settled settings, see ModelConfig.settled"
-            )
+            raise ConfigError("num-endmembers is auto: call resolve_auto first")
         self.num_endmembers = config.num_endmembers
         if self.num_endmembers > num_bands:
             raise ConfigError(
@@ -181,7 +180,7 @@ class UnmixModel(Model):
         self.register_buffer("every_band", torch.eye(num_bands), persistent=False)
         self._progress = 0.0
 
-    def initialise(self, initial_data: Mapping[str, np.ndarray]) -> None:
+    def initialise(self, initial_data: Mapping[str, np.ndarray], generator: torch.Generator) -> None:
         """Endmembers from the training pixels or a file, the light in the dictionary, and the carved grid.
 
         Raises:
@@ -191,7 +190,7 @@ class UnmixModel(Model):
         light = self.metadata["illuminant"]
         lamp = torch.ones(len(self.bands)) if light is None else torch.tensor(light, dtype=torch.float32)
         pixels = torch.from_numpy(initial_data["pixels"])
-        self.endmembers.copy_(self._guess_endmembers(pixels, lamp))
+        self.endmembers.copy_(self._guess_endmembers(pixels, lamp, generator))
         self.mixture_guide.start(pixels, self.endmembers.detach(), self.config.mixing_penalty)
         for row in range(len(self.specular_spectra)):
             self.specular_spectra[row] = (
@@ -348,12 +347,11 @@ class UnmixModel(Model):
         return self.config.num_specular_spectra
 
     def _guess_endmembers(
-        self, pixels: Float[Tensor, "N B"], lamp: Float[Tensor, "B"]
+        self, pixels: Float[Tensor, "N B"], lamp: Float[Tensor, "B"], generator: torch.Generator
     ) -> Float[Tensor, "K B"]:
         config = self.config
         if config.endmember_file is None:
             assert config.endmember_init != "file"
-            generator = torch.Generator().manual_seed(torch.initial_seed() % 2**63)
             return initialise_endmembers(pixels, self.num_endmembers, config.endmember_init, generator)
         table = read_spectra_csv(config.endmember_file).resampled(self.bands)
         if len(table.names) != self.num_endmembers:

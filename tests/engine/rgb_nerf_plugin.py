@@ -109,7 +109,7 @@ class RgbNerf(Model):
     def populate_modules(self) -> None:
         self.field = GridField(self.metadata["grid_size"])
 
-    def initialise(self, initial_data: Mapping[str, np.ndarray]) -> None:
+    def initialise(self, initial_data: Mapping[str, np.ndarray], generator: torch.Generator) -> None:
         self.field.grid[:, 0] += float(initial_data["raw_density"][0])
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
@@ -119,7 +119,9 @@ class RgbNerf(Model):
         count = self.config.num_samples_per_ray
         t_near, t_far = self.scene_box.to(self.device).intersect(ray_bundle.origins, ray_bundle.directions)
         edges = torch.linspace(0.0, 1.0, count + 1, device=self.device)[:-1].expand(len(ray_bundle), count)
-        jitter = torch.rand_like(edges) if self.training else torch.full_like(edges, 0.5)
+        jitter = torch.full_like(edges, 0.5)
+        if self.training:
+            jitter = torch.rand(edges.shape, generator=self.generator, device=self.device)
         ts = t_near[:, None] + (t_far - t_near)[:, None] * (edges + jitter / count)
         positions = ray_bundle.origins[:, None] + ts[..., None] * ray_bundle.directions[:, None]
         densities, found = self.field(positions, ray_bundle.directions[:, None].expand_as(positions))

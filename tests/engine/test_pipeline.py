@@ -57,6 +57,15 @@ def test_average_metrics_are_the_mean_over_the_evaluation_views_that_have_them(
     assert pipeline.model.training
 
 
+def test_what_a_step_draws_follows_from_the_seed_and_the_step_alone(pipeline: Pipeline):
+    def loss(step: int) -> float:
+        pipeline.seed_step(step)
+        torch.rand(3)  # somebody else draws from the global generator
+        return pipeline.get_train_loss_dict(5)[1]["rgb_loss"].item()
+
+    assert loss(5) == loss(5) != loss(6)
+
+
 def test_a_training_step_has_gradients_and_an_evaluation_step_has_none(pipeline: Pipeline):
     assert pipeline.get_train_loss_dict(0)[1]["rgb_loss"].requires_grad
     outputs, losses, metrics = pipeline.get_eval_loss_dict(0)
@@ -105,7 +114,7 @@ def test_a_model_takes_its_first_values_from_the_scene_only_when_a_run_starts(
 
     def counted(self: RgbNerf, initial_data) -> None:
         calls.append(set(initial_data))
-        original(self, initial_data)
+        original(self, initial_data, generator)
 
     monkeypatch.setattr(RgbNerf, "initialise", counted)
     trainer = Trainer(short_config, console=Console(file=io.StringIO()))

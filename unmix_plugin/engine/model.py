@@ -27,11 +27,15 @@ class ModelConfig(InstantiateConfig):
     eval_num_rays_per_chunk: int = 8192
     """Rays rendered at once for a whole image; fewer take less memory."""
 
-    def settled(self, initial_data: Callable[[], Mapping[str, np.ndarray]]) -> tuple[ModelConfig, str]:
-        """These settings with all that was left to the data decided, and for people what speaks for the decision.
+    def resolve_auto(
+        self,
+        initial_data: Callable[[], Mapping[str, np.ndarray]],
+        generator: torch.Generator,
+    ) -> tuple[ModelConfig, str]:
+        """These settings with every `auto` replaced by a value, and the reasons in words.
 
-        Called for every new run and every loaded one, whose settings are settled already: read `initial_data`, which
-        takes seconds, only to decide something.
+        Called for new runs and for loaded ones, which have no `auto` left: call `initial_data`, which takes seconds,
+        only to decide something. `generator` is on the CPU.
         """
         return self, ""
 
@@ -49,6 +53,9 @@ class Model(nn.Module, ABC):
         self.config = config
         self.scene_box = scene_box
         self.metadata = metadata
+        self.generator: torch.Generator | None = None
+        """Source of every random draw of a training step, on the model's device, seeded by the trainer from (seed,
+        step); None is torch's global one."""
         self.populate_modules()
 
     @property
@@ -60,9 +67,9 @@ class Model(nn.Module, ABC):
     def populate_modules(self) -> None:
         """Make the modules, parameters and buffers, their shapes from `config`, `scene_box` and `metadata` only."""
 
-    def initialise(self, initial_data: Mapping[str, np.ndarray]) -> None:
+    def initialise(self, initial_data: Mapping[str, np.ndarray], generator: torch.Generator) -> None:
         """Fill parameters and buffers from the data manager's `initial_data`; called once when a run starts, after
-        the move to the device, and never when one is loaded."""
+        the move to the device, and never when one is loaded. `generator` is on the CPU."""
 
     @abstractmethod
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:

@@ -14,6 +14,10 @@ from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.instantiate import InstantiateConfig, Target
 from unmix_plugin.engine.model import Model, ModelConfig
 from unmix_plugin.engine.training.callbacks import TrainingCallback
+from unmix_plugin.engine.training.seeding import step_generator, step_seed
+
+MODEL_STREAM = 1
+"""Stream of randomness of the model's own draws in a step; data managers draw from stream 0."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +41,7 @@ class Pipeline(nn.Module):
     def __init__(self, config: PipelineConfig, *, data: Path, device: torch.device, seed: int = 0) -> None:
         """Read the scene, then make the model for it, with parameters not yet initialised from the scene.
 
-        Afterwards `config` holds what the scene decided where that was left to it, and `reasons` why.
+        Afterwards `config` has no `auto` left, and `reasons` says why.
 
         Raises:
             SceneError: the scene is missing or malformed.
@@ -45,7 +49,10 @@ class Pipeline(nn.Module):
         """
         super().__init__()
         self.datamanager: DataManager = config.datamanager.setup(data=data, device=device, seed=seed)
-        model_config, self.reasons = config.model.settled(self.datamanager.initial_data)
+        self.seed = seed
+        model_config, self.reasons = config.model.resolve_auto(
+            self.datamanager.initial_data, torch.Generator().manual_seed(seed)
+        )
         self.config = replace(config, model=model_config)
         self.model: Model = model_config.setup(
             scene_box=self.datamanager.scene_box, metadata=self.datamanager.metadata()
@@ -54,7 +61,13 @@ class Pipeline(nn.Module):
     def initialise(self) -> None:
         """Let the model of a new run take its first values from the scene."""
         with torch.no_grad():
-            self.model.initialise(self.datamanager.initial_data())
+            self.model.initialise(self.datamanager.initial_data(), torch.Generator().manual_seed(self.seed))
+
+    def seed_step(self, step: int) -> None:
+        """Make everything that the model draws in training step `step` a function of (seed, step)."""
+        self.model.generator = step_generator(self.seed, step, self.model.device, MODEL_STREAM)
+        # For what takes no generator, such as dropout.
+        torch.manual_seed(step_seed(self.seed, step, MODEL_STREAM))
 
     def get_train_loss_dict(self, step: int) -> TrainOutputs:
         """Outputs, losses and metrics of training step `step`."""

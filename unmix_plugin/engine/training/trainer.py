@@ -32,7 +32,7 @@ from unmix_plugin.engine.training.limits import Limits, TrainingClock
 from unmix_plugin.engine.training.memory import keep_freed_memory
 from unmix_plugin.engine.training.optimizers import build_optimizer, set_learning_rates
 from unmix_plugin.engine.training.progress import ProgressDisplay, TrainingStatus
-from unmix_plugin.engine.training.seeding import seed_everything, step_seed
+from unmix_plugin.engine.training.seeding import seed_everything
 from unmix_plugin.engine.training.training_control import TrainingControl
 from unmix_plugin.engine.training.training_state import (
     AVERAGE,
@@ -44,17 +44,14 @@ from unmix_plugin.engine.training.training_state import (
 from unmix_plugin.engine.training.writers import MetricsWriter, RunLog
 from unmix_plugin.errors import RunError
 
-MODEL_STREAM = 1
-"""Stream of randomness of the model's own draws in a step; data managers draw from stream 0."""
-
 TRAINING_FORMAT_VERSION = 1
 
 
 class Trainer:
     """Trains one pipeline into one run folder.
 
-    A step is a function of the parameters and of (seed, step) alone: the global generator is seeded anew before each,
-    so a run stopped and resumed takes the very steps of a straight one (while limits are given in steps).
+    A step is a function of the parameters and of (seed, step) alone: every generator is seeded anew before each, so a
+    run stopped and resumed takes the very steps of a straight one (while limits are given in steps).
     """
 
     def __init__(
@@ -204,7 +201,7 @@ class Trainer:
         with self.clock.running():
             progress, step, datamanager = self.progress, self.step, self.pipeline.datamanager
             num_rays = datamanager.get_train_rays_per_batch()
-            torch.manual_seed(step_seed(self.config.seed, step, MODEL_STREAM))
+            self.pipeline.seed_step(step)
             self.learning_rates = set_learning_rates(self.optimizer, self.config.optimizers, progress)
             run_callbacks(self.callbacks, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, step, progress)
             outputs, losses, metrics = self.pipeline.get_train_loss_dict(step)
