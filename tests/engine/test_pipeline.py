@@ -112,7 +112,7 @@ def test_a_model_takes_its_first_values_from_the_scene_only_when_a_run_starts(
     calls: list[set[str]] = []
     original = RgbNerf.initialise
 
-    def counted(self: RgbNerf, initial_data) -> None:
+    def counted(self: RgbNerf, initial_data, generator) -> None:
         calls.append(set(initial_data))
         original(self, initial_data, generator)
 
