@@ -2,9 +2,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from tests.spectral.mixtures import seeded, smooth_endmembers
+from unmix_plugin.spectral.unmixing import sparse_unmixing
 from unmix_plugin.spectral.unmixing.abundance_estimation import nnls
 from unmix_plugin.spectral.unmixing.sparse_unmixing import sparse_abundances
 
@@ -66,3 +68,60 @@ def test_endmembers_of_one_shape_are_no_error():
     found = sparse_abundances(endmembers, twins, 0.02)
     assert bool(torch.isfinite(found).all())
     assert_close(found.sum(dim=1), torch.ones(3))
+
+
+def test_nearly_collinear_greys_are_told_apart_as_far_as_float32_spectra_allow():
+    generator = seeded(0)
+    first = 0.2 + 0.6 * torch.rand(31, generator=generator, dtype=torch.float64)
+    second = first * (1 + 1e-4 * torch.randn(31, generator=generator, dtype=torch.float64))
+    shares = torch.rand(400, 1, generator=generator, dtype=torch.float64)
+    mixtures = (shares * first + (1 - shares) * second).float()
+    greys = torch.stack([first, second]).float()
+    expected = nnls(mixtures.double(), greys.double())
+    expected = expected / expected.sum(dim=1, keepdim=True)
+    assert float((sparse_abundances(mixtures, greys, 0.0).double() - expected).abs().max()) < 0.01
+
+
+def _cost(found, mixtures, endmembers, penalty):
+    """What the search minimises, of each spectrum."""
+    fitted = normalize(found.double() @ endmembers.double(), dim=1)
+    cosines = (fitted * normalize(mixtures.double(), dim=1)).sum(dim=1)
+    return (1 - cosines.square()).clamp(min=0).sqrt() + penalty * ((found > 0).sum(dim=1) - 1)
+
+
+def _noisy_mixtures(endmembers, count=300):
+    """Of one to three endmembers."""
+    generator = seeded(4)
+    places = torch.rand(count, len(endmembers), generator=generator).argsort(dim=1)[:, :3]
+    amounts = torch.rand(count, 3, generator=generator) * (torch.arange(count)[:, None] % 3 >= torch.arange(3))
+    clean = torch.zeros(count, len(endmembers)).scatter(1, places, amounts + 0.0) @ endmembers
+    return clean + 0.002 * torch.randn(clean.shape, generator=generator)
+
+
+def test_few_endmembers_are_searched_wholly_and_extending_sets_finds_the_same(monkeypatch):
+    endmembers = endmembers_of(5)
+    mixtures = _noisy_mixtures(endmembers)
+    whole = sparse_abundances(mixtures, endmembers, 0.01)
+    monkeypatch.setattr(sparse_unmixing, "_MOST_SEARCHED", 0)
+    monkeypatch.setattr(sparse_unmixing, "_SETS_KEPT", 5)
+    assert_close(sparse_abundances(mixtures, endmembers, 0.01), whole, atol=1e-5, rtol=0)
+
+
+def test_of_many_endmembers_nearly_every_spectrum_gets_the_mixture_of_the_whole_search(monkeypatch):
+    endmembers = endmembers_of(16)
+    mixtures = _noisy_mixtures(endmembers)
+    screened = _cost(sparse_abundances(mixtures, endmembers, 0.01), mixtures, endmembers, 0.01)
+    monkeypatch.setattr(sparse_unmixing, "_MOST_SEARCHED", 16)
+    whole = _cost(sparse_abundances(mixtures, endmembers, 0.01), mixtures, endmembers, 0.01)
+    assert bool((screened >= whole - 1e-6).all())
+    assert float((screened < whole + 1e-6).double().mean()) > 0.95
+    assert float(screened.mean()) < 1.02 * float(whole.mean())
+
+
+def test_hundreds_of_endmembers_are_searched_in_bounded_parts(monkeypatch):
+    endmembers = torch.rand(255, 40, generator=seeded(2)).square()
+    mixtures = 0.7 * endmembers[:20] + 0.3 * endmembers[100:120]
+    found = sparse_abundances(mixtures, endmembers, 0.001)
+    assert_close(found.gather(1, torch.arange(20)[:, None])[:, 0], torch.full((20,), 0.7), atol=1e-3, rtol=0)
+    monkeypatch.setattr(sparse_unmixing, "_NUMBERS_AT_A_TIME", 255 * 8 * 3)
+    assert_close(sparse_abundances(mixtures, endmembers, 0.001), found)

@@ -2,29 +2,34 @@
 
 With all endmembers free to take part, a spectrum that is a little off is explained by a mixture of many: white by a
 bit of every colour. A spectrum here shows at most three materials, and each beyond the first must bring it nearer by
-a fixed angle. All choices of materials that could cost less than what was found are tried, which is exact; brightness
-takes no part.
+a fixed angle. Brightness takes no part. Up to twelve endmembers every choice of three is tried, which is exact; of more,
+the best sets found are extended one endmember at a time.
 
 Source: least squares with an l0 penalty, as in sparse unmixing (Iordache, Bioucas-Dias and Plaza 2011), whose l1
-relaxation is needed only for libraries of hundreds.
+relaxation is needed only for libraries of hundreds. The extension is that of optimised orthogonal matching pursuit
+(L. Rebollo-Neira and D. Lowe, IEEE Signal Processing Letters 9(4), 2002), with several sets kept.
 
-Notation: `N` spectra, `B` bands, `K` endmembers, `C` choices of `m` endmembers.
+Notation: `N` spectra, `B` bands, `K` endmembers, `C` choices of `m` endmembers, `S` sets kept a spectrum. Computed in
+float64: between endmembers of nearly one shape, the shares are small differences.
 """
 
 from __future__ import annotations
 
 from functools import cache
-from math import comb
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import normalize
 
 _MOST_MATERIALS = 3
-_MOST_CHOICES = 2000
-"""Choices of endmembers that are tried: with more than 23 endmembers only pairs are."""
+_MOST_SEARCHED = 12
+"""Endmembers up to which all choices are tried."""
+_SETS_KEPT = 8
+_NUMBERS_AT_A_TIME = 2_000_000
+"""Bounds memory: spectra are taken in parts of so many candidate fits."""
 
-_RIDGE = 1e-6
+_RIDGE = 1e-13
 """Added to the diagonal of normal equations, so that endmembers of one shape can be solved for."""
 
 
@@ -37,12 +42,25 @@ def sparse_abundances(
         endmembers: Their brightness matters: a dark one must cover more than a bright one to send the same light.
         mixing_penalty: Sine of the angle by which each material beyond the first must improve the fit.
     """
+    corners = normalize(endmembers.double(), dim=1)
+    gram = corners @ corners.T + _RIDGE * torch.eye(len(corners), dtype=torch.float64, device=corners.device)
+    cosines = corners @ normalize(spectra.double(), dim=1).T
+    search = _search_all if len(corners) <= _MOST_SEARCHED else _extend_best
+    part = max(1, _NUMBERS_AT_A_TIME // (_SETS_KEPT * len(corners)))
+    # `split` of no spectra gives one empty part.
+    shares = torch.cat([search(some, gram, mixing_penalty) for some in cosines.split(part, dim=1)], dim=1)
+    covered = shares.T / endmembers.double().norm(dim=1).clamp(min=1e-6)
+    return (covered / covered.sum(dim=1, keepdim=True).clamp(min=1e-9)).to(spectra.dtype)
+
+
+def _search_all(
+    cosines: Float[Tensor, "K N"], gram: Float[Tensor, "K K"], mixing_penalty: float | Tensor
+) -> Float[Tensor, "K N"]:
+    """Shares of unit endmembers in the cheapest mixture of at most three."""
     # Spectra are columns here: what is done to every choice then runs along memory.
-    corners = torch.nn.functional.normalize(endmembers, dim=1)
-    cosines, gram = corners @ torch.nn.functional.normalize(spectra, dim=1).T, corners @ corners.T
     smallest = torch.full_like(cosines[0], torch.inf)
     shares = torch.zeros_like(cosines)
-    for choices in _choices(len(endmembers), cosines.device):
+    for choices in _choices(len(gram), cosines.device):
         price = mixing_penalty * (choices.shape[1] - 1)
         # The others are explained so well that even a perfect fit would cost more.
         open_to = (smallest > price).nonzero()[:, 0]
@@ -52,17 +70,15 @@ def sparse_abundances(
         better = cost < before
         smallest[open_to] = torch.where(better, cost, before)
         shares[:, open_to] = torch.where(better, found, shares.index_select(1, open_to))
-    covered = shares.T / endmembers.norm(dim=1).clamp(min=1e-6)
-    return covered / covered.sum(dim=1, keepdim=True).clamp(min=1e-9)
+    return shares
 
 
 @cache
 def _choices(num_endmembers: int, device: torch.device) -> list[Int[Tensor, "C m"]]:
-    """All choices of one, two and three of the endmembers; of three only while they stay few."""
+    """All choices of one, two and three of the endmembers."""
     return [
         torch.combinations(torch.arange(num_endmembers, device=device), size)
         for size in range(1, min(num_endmembers, _MOST_MATERIALS) + 1)
-        if size <= 2 or comb(num_endmembers, size) <= _MOST_CHOICES
     ]
 
 
@@ -74,11 +90,62 @@ def _best_choice(
     Infinite where no choice has only positive shares.
     """
     num_choices, size = choices.shape
-    among = gram[choices[:, :, None], choices[:, None, :]].double()
-    inverse = torch.linalg.inv(among + _RIDGE * torch.eye(size, device=gram.device)).to(gram)
-    own = cosines.index_select(0, choices.flatten()).view(num_choices, size, -1)
-    shares = inverse @ own
-    misfits = 1 - (shares * own).sum(dim=1)
+    # By Cholesky factors: what a nearly collinear endmember adds is then one small square, not a difference of large ones.
+    factors = torch.linalg.cholesky(gram[choices[:, :, None], choices[:, None, :]])
+    whitening = torch.linalg.solve_triangular(factors, torch.eye(size).to(factors), upper=False)
+    whitened = whitening @ cosines.index_select(0, choices.flatten()).view(num_choices, size, -1)
+    shares = whitening.mT @ whitened
+    misfits = 1 - whitened.square().sum(dim=1)
     misfit, best = misfits.masked_fill_(shares.amin(dim=1) <= 0, torch.inf).min(dim=0)
     chosen = shares.gather(0, best.expand(1, size, -1))[0].clamp(min=0)
     return misfit.clamp(min=0).sqrt(), torch.zeros_like(cosines).scatter(0, choices[best].T, chosen)
+
+
+def _extend_best(
+    cosines: Float[Tensor, "K N"], gram: Float[Tensor, "K K"], mixing_penalty: float | Tensor
+) -> Float[Tensor, "K N"]:
+    """As `_search_all`, but only among extensions of the best sets of one endmember fewer."""
+    loads = cosines.T.contiguous()
+    sets = loads.topk(_SETS_KEPT, dim=1).indices[..., None]
+    own = loads.gather(1, sets[:, 0]).clamp(min=0)
+    smallest = (1 - own[:, 0].square()).clamp(min=0).sqrt()
+    shares = torch.zeros_like(loads).scatter(1, sets[:, 0], own)
+    rows = torch.arange(len(loads), device=loads.device)
+    for size in range(2, _MOST_MATERIALS + 1):
+        price = mixing_penalty * (size - 1)
+        is_open = smallest[rows] > price
+        rows = rows[is_open]
+        misfit, found, sets = _extended(loads[rows], gram, sets[is_open])
+        better = misfit + price < smallest[rows]
+        smallest[rows[better]] = (misfit + price)[better]
+        shares[rows[better]] = torch.zeros_like(loads[rows]).scatter(1, sets[:, 0], found)[better]
+    return shares.T
+
+
+def _extended(
+    loads: Float[Tensor, "N K"], gram: Float[Tensor, "K K"], sets: Int[Tensor, "N S m"]
+) -> tuple[Float[Tensor, " N"], Float[Tensor, "N m+1"], Int[Tensor, "N S m+1"]]:
+    """Best sets of one endmember more: sine of the angle to the first, its shares, and all, best first.
+
+    By block elimination: what of a spectrum and of a new endmember the set leaves unexplained gives the new share.
+    """
+    num_kept, size = sets.shape[1:]
+    # Where fewer sets fit than are kept, the rest repeat members, and their fits are no numbers.
+    inverse = torch.linalg.inv_ex(gram[sets[..., :, None], sets[..., None, :]]).inverse
+    own, across = loads.gather(1, sets.flatten(1)).view(sets.shape), gram[sets]
+    alone, slopes = (inverse @ own[..., None])[..., 0], inverse @ across
+    rest = loads[:, None] - (own[..., None] * slopes).sum(dim=2)
+    new = rest / (1 + _RIDGE - (across * slopes).sum(dim=2)).clamp(min=_RIDGE)
+    old = alone[..., None] - slopes * new[:, :, None]
+    misfits = 1 - (own * alone).sum(dim=2)[..., None] - rest * new
+    misfits.masked_fill_((new <= 0) | (old.amin(dim=2) <= 0), torch.inf).scatter_(2, sets, torch.inf)
+    if size == 1:  # a pair is found from either end: only from the better one
+        ends = torch.arange(num_kept, device=loads.device)
+        ranks = torch.full_like(loads, torch.inf).scatter(1, sets[..., 0], ends.expand(len(sets), -1).to(loads))
+        misfits.masked_fill_(ranks[:, None] < ends[:, None], torch.inf)
+    best = misfits.nan_to_num_(nan=torch.inf, posinf=torch.inf).flatten(1).topk(num_kept, largest=False, sorted=True)
+    parents, added = best.indices // len(gram), best.indices % len(gram)
+    grown = torch.cat([sets.gather(1, parents[..., None].expand(-1, -1, size)), added[..., None]], dim=2)
+    rows = torch.arange(len(loads), device=loads.device)
+    shares = torch.cat([old[rows, parents[:, 0], :, added[:, 0]], new[rows, parents[:, 0], added[:, 0]][:, None]], dim=1)
+    return best.values[:, 0].clamp(min=0).sqrt(), shares.clamp(min=0), grown
