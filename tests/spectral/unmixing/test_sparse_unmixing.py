@@ -93,7 +93,9 @@ def _noisy_mixtures(endmembers, count=300):
     """Of one to three endmembers."""
     generator = seeded(4)
     places = torch.rand(count, len(endmembers), generator=generator).argsort(dim=1)[:, :3]
-    amounts = torch.rand(count, 3, generator=generator) * (torch.arange(count)[:, None] % 3 >= torch.arange(3))
+    amounts = torch.rand(count, 3, generator=generator) * (
+        torch.arange(count)[:, None] % 3 >= torch.arange(3)
+    )
     clean = torch.zeros(count, len(endmembers)).scatter(1, places, amounts + 0.0) @ endmembers
     return clean + 0.002 * torch.randn(clean.shape, generator=generator)
 

@@ -2,8 +2,8 @@
 
 With all endmembers free to take part, a spectrum that is a little off is explained by a mixture of many: white by a
 bit of every colour. A spectrum here shows at most three materials, and each beyond the first must bring it nearer by
-a fixed angle. Brightness takes no part. Up to twelve endmembers every choice of three is tried, which is exact; of more,
-the best sets found are extended one endmember at a time.
+a fixed angle. Brightness takes no part. Up to twelve endmembers every choice of three is tried, which is exact; of
+more, the best sets found are extended one endmember at a time.
 
 Source: least squares with an l0 penalty, as in sparse unmixing (Iordache, Bioucas-Dias and Plaza 2011), whose l1
 relaxation is needed only for libraries of hundreds. The extension is that of optimised orthogonal matching pursuit
@@ -25,7 +25,7 @@ from torch.nn.functional import normalize
 _MOST_MATERIALS = 3
 _MOST_SEARCHED = 12
 """Endmembers up to which all choices are tried."""
-_SETS_KEPT = 8
+_SETS_KEPT = 6
 _NUMBERS_AT_A_TIME = 2_000_000
 """Bounds memory: spectra are taken in parts of so many candidate fits."""
 
@@ -90,7 +90,7 @@ def _best_choice(
     Infinite where no choice has only positive shares.
     """
     num_choices, size = choices.shape
-    # By Cholesky factors: what a nearly collinear endmember adds is then one small square, not a difference of large ones.
+    # By Cholesky factors what a nearly collinear endmember adds is one small square, not a difference of large numbers.
     factors = torch.linalg.cholesky(gram[choices[:, :, None], choices[:, None, :]])
     whitening = torch.linalg.solve_triangular(factors, torch.eye(size).to(factors), upper=False)
     whitened = whitening @ cosines.index_select(0, choices.flatten()).view(num_choices, size, -1)
@@ -141,11 +141,19 @@ def _extended(
     misfits.masked_fill_((new <= 0) | (old.amin(dim=2) <= 0), torch.inf).scatter_(2, sets, torch.inf)
     if size == 1:  # a pair is found from either end: only from the better one
         ends = torch.arange(num_kept, device=loads.device)
-        ranks = torch.full_like(loads, torch.inf).scatter(1, sets[..., 0], ends.expand(len(sets), -1).to(loads))
+        ranks = torch.full_like(loads, torch.inf).scatter(
+            1, sets[..., 0], ends.expand(len(sets), -1).to(loads)
+        )
         misfits.masked_fill_(ranks[:, None] < ends[:, None], torch.inf)
-    best = misfits.nan_to_num_(nan=torch.inf, posinf=torch.inf).flatten(1).topk(num_kept, largest=False, sorted=True)
+    best = (
+        misfits.nan_to_num_(nan=torch.inf, posinf=torch.inf)
+        .flatten(1)
+        .topk(num_kept, largest=False, sorted=True)
+    )
     parents, added = best.indices // len(gram), best.indices % len(gram)
     grown = torch.cat([sets.gather(1, parents[..., None].expand(-1, -1, size)), added[..., None]], dim=2)
     rows = torch.arange(len(loads), device=loads.device)
-    shares = torch.cat([old[rows, parents[:, 0], :, added[:, 0]], new[rows, parents[:, 0], added[:, 0]][:, None]], dim=1)
+    shares = torch.cat(
+        [old[rows, parents[:, 0], :, added[:, 0]], new[rows, parents[:, 0], added[:, 0]][:, None]], dim=1
+    )
     return best.values[:, 0].clamp(min=0).sqrt(), shares.clamp(min=0), grown
