@@ -1,81 +1,107 @@
 """Files that a kill, a crash or a full disk at any moment leaves whole: the old one or the new one, never a part."""
 
 import contextlib
-import json
+import errno
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from unmix_plugin.errors import RunError
 
 CHUNK_BYTES = 1 << 26
 """Bytes handed to one write."""
 
+_MAKE_ROOM, _ELSEWHERE = "; make room or choose another folder", "; choose a folder that you may write to"
+_ADVICE = {
+    os.strerror(number): advice
+    for advice, numbers in (
+        (_MAKE_ROOM, (errno.ENOSPC, errno.EDQUOT)),
+        (_ELSEWHERE, (errno.EACCES, errno.EPERM, errno.EROFS)),
+    )
+    for number in numbers
+}
 
-class NewerFormatError(RunError):
-    """A file of a run was written by a version newer than this one."""
 
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Context that gives a temporary name in the folder of `path`, which is made; nothing has that name yet.
 
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write `data` to a temporary file in the same folder, force it to disk, then give it its name.
+    At the end of the block the file under that name is forced to disk and becomes `path`. If the block fails, nothing
+    is left of it and `path` is as it was.
 
     Raises:
-        RunError: the disk is full or refuses; `path` is as it was and no temporary file is left.
+        RunError: the folder can't be made, or the file can't get its name.
     """
-    temporary = temporary_path(path)
+    make_folder(path.parent)
+    temporary = path.with_name(f".{path.name}.tmp")
     try:
-        _write_synced(temporary, data)
-        temporary.replace(path)
-        sync_folder(path.parent)
-    except OSError as error:
-        raise RunError(
-            f"can't write {path}: {error.strerror or error}; what was there before is untouched. "
-            "Make room or choose another --output-dir, then go on with --load-run"
-        ) from error
+        with write_errors_as(path):
+            temporary.unlink(missing_ok=True)  # a link that lies there would lead the writer elsewhere
+        yield temporary
+        with write_errors_as(path):
+            _sync(temporary, os.O_RDWR)
+            temporary.replace(path)
+            if os.name != "nt":  # Windows can't sync a folder, and needn't
+                _sync(path.parent, os.O_RDONLY)
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
 
 
-def write_json_atomically(path: Path, values: dict[str, Any]) -> None:
-    """`write_atomically` of `values` as readable JSON.
+def write_file(path: Path, data: bytes) -> Path:
+    """Write `data` under a temporary name, force it to disk, then give it its own; the folder is made.
 
     Raises:
-        RunError: as `write_atomically`.
-        TypeError: a value that JSON has no form for.
-        ValueError: a number that is not finite.
+        RunError: the disk is full or refuses; what was there before is untouched.
     """
-    write_atomically(path, (json.dumps(values, indent=1, allow_nan=False) + "\n").encode())
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+    with whole_file(path) as temporary, write_errors_as(path):
+        descriptor = os.open(temporary, flags, 0o666)
+        try:
+            write_all(descriptor, memoryview(data))
+        finally:
+            os.close(descriptor)
+    return path
 
 
-def read_json(path: Path, newest_format: int) -> dict[str, Any]:
-    """The object in a JSON file of a run.
+def write_all(descriptor: int, data: memoryview) -> None:
+    """Write all bytes of `data`."""
+    while len(data) > 0:
+        data = data[os.write(descriptor, data[:CHUNK_BYTES]) :]
+
+
+def make_folder(path: Path) -> Path:
+    """The folder, made if it is not there.
 
     Raises:
-        RunError: it is missing, cut off or no object.
-        NewerFormatError: its format is newer than `newest_format`.
+        RunError: it can't be made.
     """
     try:
-        values = json.loads(path.read_bytes())
-    except FileNotFoundError as error:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
         raise RunError(
-            f"{path} is missing: the run is half-written or was moved in part; train again"
+            f"can't make the folder {path}: {error.strerror or error}; choose another one"
         ) from error
-    except (OSError, ValueError) as error:
-        raise RunError(f"can't read {path}: {error}; the run is damaged") from error
-    if not isinstance(values, dict) or not isinstance(values.get("format_version"), int):
-        raise RunError(f"{path} is no file of a run: it has no format_version")
-    if values["format_version"] > newest_format:
-        raise NewerFormatError(
-            f"{path} has format {values['format_version']}, written by a newer version; "
-            f"this one reads up to {newest_format}: update this package"
-        )
-    return values
+    return path
 
 
-def temporary_path(path: Path) -> Path:
-    """Where `write_atomically` puts the bytes of `path` until they are complete."""
-    return path.with_name(f".{path.name}.tmp")
+@contextmanager
+def write_errors_as(path: Path) -> Iterator[None]:
+    """Context in which an error of the system becomes one of writing `path`.
+
+    Raises:
+        RunError: the disk is full or refuses.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise cannot_write(path, error.strerror or str(error)) from error
+
+
+def cannot_write(path: Path, reason: str) -> RunError:
+    """The error of a file that can't be written, with advice where the reason calls for some."""
+    return RunError(f"can't write {path}: {reason}{_ADVICE.get(reason, '')}")
 
 
 def remove_stale_temporaries(folder: Path) -> None:
@@ -84,24 +110,9 @@ def remove_stale_temporaries(folder: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def sync_folder(folder: Path) -> None:
-    """Force the names in `folder` to disk; Windows has no such call and needs none."""
-    if os.name == "nt":
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
+def _sync(path: Path, flags: int) -> None:
+    descriptor = os.open(path, flags)
     try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _write_synced(path: Path, data: bytes) -> None:
-    flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | getattr(os, "O_BINARY", 0)
-    descriptor = os.open(path, flags, 0o666)
-    try:
-        rest = memoryview(data)
-        while len(rest) > 0:
-            rest = rest[os.write(descriptor, rest[:CHUNK_BYTES]) :]
         os.fsync(descriptor)
     finally:
         os.close(descriptor)

@@ -26,6 +26,7 @@ from unmix_plugin.engine.training.seeding import step_generator
 from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.scenes.geometry.carving import carve
 from unmix_plugin.scenes.reading.loader import load_scene
+from unmix_plugin.scenes.recorded_scene import check_recorded_scene
 from unmix_plugin.scenes.scene import Scene, SceneOptions
 
 DEMO = Path("demo")
@@ -62,9 +63,8 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
         Raises:
             ConfigError: a number out of its range.
         """
+        super().__post_init__()
         rules = {
-            "train-num-rays-per-batch of at least 1": self.train_num_rays_per_batch >= 1,
-            "eval-num-rays-per-batch of at least 1": self.eval_num_rays_per_batch >= 1,
             "subpixels of 1 to 8": 1 <= self.subpixels <= 8,
             "single-ray-until and open-single-ray-until in [0, 1]": 0 <= self.single_ray_until <= 1
             and 0 <= self.open_single_ray_until <= 1,
@@ -182,6 +182,12 @@ class HyperspectralDataManager(DataManager):
     def summary(self) -> dict[str, Any]:
         """The scene's own record: files, splits, normalisation, truth, hashes."""
         return self.scene.summary()
+
+    @classmethod
+    def check_record(cls, metadata: Mapping[str, Any], summary: Mapping[str, Any]) -> None:
+        """Refuse what no scene has: see `check_recorded_scene`."""
+        check_recorded_scene(metadata)
+        check_recorded_scene(summary)
 
     @cached_property
     def _pixels(self) -> _PixelTable:

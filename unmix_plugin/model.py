@@ -96,6 +96,7 @@ class UnmixModelConfig(ModelConfig, LossSettings):
         Raises:
             ConfigError: a number out of its range or settings that contradict each other.
         """
+        super().__post_init__()
         rules = {
             "num-endmembers of 1 to 255 or auto": self.num_endmembers == "auto"
             or 1 <= self.num_endmembers <= 255,

@@ -37,6 +37,15 @@ def newer(name):
     return change
 
 
+def in_scene(part, **changes):
+    def change(path):
+        values = json.loads((path / "scene.json").read_text())
+        values[part].update(changes)
+        (path / "scene.json").write_text(json.dumps(values))
+
+    return change
+
+
 def without_checkpoints(path):
     for file in (path / "checkpoints").iterdir():
         file.unlink()
@@ -47,6 +56,13 @@ SPOILT = {
     "missing scene.json": (removed("scene.json"), "scene.json missing"),
     "config.json cut off": (cut_off("config.json"), "can't read"),
     "scene.json cut off": (cut_off("scene.json"), "can't read"),
+    "views outside": (
+        in_scene("summary", frames=[f"../{i}" for i in range(8)]),
+        "can't be the name of a frame",
+    ),
+    "grid of gigabytes": (in_scene("metadata", grid_resolution=1290), "a grid_resolution of 8 to 512"),
+    "bands of text": (in_scene("metadata", wavelengths_nm=["red"]), "expected a number"),
+    "root of no kind": (in_scene("summary", root=7), "expected text"),
     "newer config.json": (newer("config.json"), "written by a newer version"),
     "newer scene.json": (newer("scene.json"), "written by a newer version"),
     "newer checkpoint": (newer("checkpoints/step-000020.json"), "written by a newer version"),

@@ -13,7 +13,7 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
-from unmix_plugin.engine.instantiate import InstantiateConfig, Target
+from unmix_plugin.engine.instantiate import InstantiateConfig, Target, require_in_range
 from unmix_plugin.engine.training.callbacks import TrainingCallback
 
 
@@ -26,6 +26,15 @@ class DataManagerConfig(InstantiateConfig):
     """Rays of the first training step; a model may adapt the number later."""
     eval_num_rays_per_batch: int = 4096
     """Rays of one evaluation batch."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible settings; a subclass with rules of its own calls this too.
+
+        Raises:
+            ConfigError: a number out of its range.
+        """
+        for name in ("train_num_rays_per_batch", "eval_num_rays_per_batch"):
+            require_in_range(name, getattr(self, name), 1, 2**22)
 
 
 class DataManager(ABC):
@@ -103,12 +112,20 @@ class DataManager(ABC):
         `metadata`, kept in the run folder."""
         return {}
 
+    @classmethod  # noqa: B027
+    def check_record(cls, metadata: Mapping[str, Any], summary: Mapping[str, Any]) -> None:
+        """Refuse a `metadata` or `summary` read from a run folder that this class can't have written.
+
+        Raises:
+            KeyError, TypeError, ValueError, ConfigError: what is missing or wrong.
+        """
+
     def state_dict(self) -> dict[str, Tensor]:
         """What a resumed run needs beyond (seed, step) and the rays per batch; usually nothing."""
         return {}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:  # noqa: B027
-        """Take back what `state_dict` gave."""
+        """Restore what `state_dict` gave."""
 
     def get_training_callbacks(self) -> list[TrainingCallback]:
         """Functions to call around each step."""

@@ -9,6 +9,8 @@ from typing import Any
 
 import tyro
 
+from unmix_plugin.errors import ConfigError
+
 Target = tyro.conf.Suppress[type]
 """Annotation of `_target`: the class that a config sets up; neither shown on the command line nor written to a file."""
 
@@ -23,3 +25,13 @@ class InstantiateConfig:
     def setup(self, **kwargs: Any) -> Any:
         """The configured object: `_target(self, **kwargs)`."""
         return self._target(self, **kwargs)
+
+
+def require_in_range(name: str, value: int | float, low: int | float, high: int | float) -> None:
+    """Refuse a setting outside [low, high].
+
+    Raises:
+        ConfigError: it is outside, or not a number.
+    """
+    if not low <= value <= high:
+        raise ConfigError(f"{name} must be from {low} to {high}; got {value}")

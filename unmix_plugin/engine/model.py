@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
-from unmix_plugin.engine.instantiate import InstantiateConfig, Target
+from unmix_plugin.engine.instantiate import InstantiateConfig, Target, require_in_range
 from unmix_plugin.engine.training.callbacks import TrainingCallback
 from unmix_plugin.errors import ConfigError
 
@@ -26,6 +26,14 @@ class ModelConfig(InstantiateConfig):
     _target: Target = field(default_factory=lambda: Model)
     eval_num_rays_per_chunk: int = 8192
     """Rays rendered at once for a whole image; fewer take less memory."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible settings; a subclass with rules of its own calls this too.
+
+        Raises:
+            ConfigError: a number out of its range.
+        """
+        require_in_range("eval_num_rays_per_chunk", self.eval_num_rays_per_chunk, 1, 2**22)
 
     def resolve_auto(
         self,

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
+from unmix_plugin.atomic_files import write_errors_as
 from unmix_plugin.formats.envi_header import (
     HeaderValue,
     beside,
@@ -21,7 +22,6 @@ from unmix_plugin.formats.envi_header import (
 )
 from unmix_plugin.formats.files import write_file
 from unmix_plugin.formats.raw_rows import RowSink, raw_rows
-from unmix_plugin.formats.whole_file import blaming
 from unmix_plugin.spectral.bands import Bands
 
 _SHOWN_NM = (640.0, 550.0, 460.0)
@@ -88,7 +88,7 @@ def envi_cube_rows(
     }
     with raw_rows(data_path, b"", shape, kind) as add:
         yield add
-        with blaming(header_path):
+        with write_errors_as(header_path):
             header_path.unlink(missing_ok=True)
     write_file(header_path, header_bytes(entries))
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from unmix_plugin.atomic_files import write_errors_as
 from unmix_plugin.formats.envi_header import beside, header_bytes, layout_entries, wavelength_entries
 from unmix_plugin.formats.files import write_file
 from unmix_plugin.formats.raw_rows import raw_rows
-from unmix_plugin.formats.whole_file import blaming
 from unmix_plugin.spectral.bands import Bands
 
 
@@ -59,7 +59,7 @@ def write_envi_library(
     }
     with raw_rows(data_path, b"", spectra.shape, kind) as add:
         add(spectra)
-        with blaming(header_path):
+        with write_errors_as(header_path):
             header_path.unlink(missing_ok=True)
     write_file(header_path, header_bytes(entries))
     return [header_path, data_path]

@@ -9,39 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from unmix_plugin.atomic_files import write_atomically
-from unmix_plugin.errors import ConfigError, RunError
+from unmix_plugin.atomic_files import make_folder, write_file
+from unmix_plugin.errors import ConfigError
 
-
-def make_folder(path: Path) -> Path:
-    """The folder, made if it is not there.
-
-    Raises:
-        RunError: it can't be made.
-    """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RunError(
-            f"can't make the folder {path}: {error.strerror or error}; choose another one"
-        ) from error
-    return path
-
-
-def write_file(path: Path, data: bytes) -> Path:
-    """Write a file under a temporary name, then give it its own; its folder is made.
-
-    Raises:
-        RunError: the disk is full or refuses; what was there before is untouched.
-    """
-    make_folder(path.parent)
-    try:
-        write_atomically(path, data)
-    except RunError as error:
-        cause = error.__cause__
-        reason = getattr(cause, "strerror", None) or cause or error
-        raise RunError(f"can't write {path}: {reason}; make room or choose another folder") from error
-    return path
+__all__ = ["array_bytes", "figure_bytes", "make_folder", "refuse_to_overwrite", "write_file"]
 
 
 def refuse_to_overwrite(paths: Collection[Path], overwrite: bool) -> None:

@@ -10,8 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from unmix_plugin.atomic_files import CHUNK_BYTES
-from unmix_plugin.formats.whole_file import blaming, whole_file
+from unmix_plugin.atomic_files import whole_file, write_all, write_errors_as
 
 RowSink: TypeAlias = Callable[[np.ndarray], None]
 """Takes the next rows of an image, (rows, W, ...), from the top down."""
@@ -37,15 +36,15 @@ def raw_rows(path: Path, header: bytes, shape: tuple[int, ...], dtype: np.dtype)
         if rows.shape[1:] != shape[1:]:
             raise ValueError(f"rows of {path.name} have shape {shape[1:]}; got {rows.shape[1:]}")
         given += len(rows)
-        with blaming(path):
+        with write_errors_as(path):
             _write(descriptor, np.ascontiguousarray(rows, dtype=dtype))
 
     with whole_file(path) as temporary:
-        with blaming(path):
-            flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | getattr(os, "O_BINARY", 0)
+        with write_errors_as(path):
+            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
             descriptor = os.open(temporary, flags, 0o666)
         try:
-            with blaming(path):
+            with write_errors_as(path):
                 _write(descriptor, np.frombuffer(header, dtype=np.uint8))
             yield add
         finally:
@@ -55,6 +54,4 @@ def raw_rows(path: Path, header: bytes, shape: tuple[int, ...], dtype: np.dtype)
 
 
 def _write(descriptor: int, values: np.ndarray) -> None:
-    rest = values.reshape(-1).view(np.uint8).data
-    while len(rest) > 0:
-        rest = rest[os.write(descriptor, rest[:CHUNK_BYTES]) :]
+    write_all(descriptor, values.reshape(-1).view(np.uint8).data)

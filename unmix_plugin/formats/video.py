@@ -16,8 +16,8 @@ from typing import IO, TypeAlias
 
 import numpy as np
 
+from unmix_plugin.atomic_files import cannot_write, whole_file
 from unmix_plugin.errors import RunError
-from unmix_plugin.formats.whole_file import cannot_write, whole_file
 
 FrameSink: TypeAlias = Callable[[np.ndarray], None]
 """Takes the next frame, (H, W, 3) uint8 sRGB."""

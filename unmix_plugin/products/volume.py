@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from unmix_plugin.formats.whole_file import blaming, whole_file
+from unmix_plugin.atomic_files import whole_file, write_errors_as
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.trained.density_grid import GridPoints, sample_slice
@@ -54,7 +54,7 @@ def write_volume(
     }
     with (
         whole_file(path) as temporary,
-        blaming(path),
+        write_errors_as(path),
         zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=_FASTEST) as archive,
     ):
         with archive.open("abundances.npy", "w", force_zip64=True) as stream:

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from unmix_plugin import atomic_files
-from unmix_plugin.engine.runs import checkpoints
 from unmix_plugin.engine.runs.checkpoints import checkpoint_steps, newest_complete_checkpoint, save_checkpoint
+from unmix_plugin.engine.runs.run_files import RUN_FORMAT
 from unmix_plugin.errors import RunError
 
 CALLS = ("open", "write", "fsync", "replace", "unlink")
@@ -235,9 +235,7 @@ def test_a_checkpoint_of_a_newer_version_is_refused_not_passed_over(tmp_path: Pa
     save_checkpoint(tmp_path, 1, tensors_of(1), {})
     save_checkpoint(tmp_path, 2, tensors_of(2), {})
     path = tmp_path / "step-000002.json"
-    path.write_text(
-        json.dumps({**json.loads(path.read_text()), "format_version": checkpoints.FORMAT_VERSION + 1})
-    )
+    path.write_text(json.dumps({**json.loads(path.read_text()), "format_version": RUN_FORMAT + 1}))
     with pytest.raises(RunError, match="newer version"):
         newest_complete_checkpoint(tmp_path)
 

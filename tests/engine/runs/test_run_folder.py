@@ -1,6 +1,7 @@
 """Run folders: made once each, found again, refused when unusable."""
 
 import json
+import os
 from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -8,11 +9,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from unmix_plugin.atomic_files import write_json_atomically
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.runs.checkpoints import save_checkpoint
-from unmix_plugin.engine.runs.load_run import load_config, load_model, load_pipeline, read_scene_record
+from unmix_plugin.engine.runs.load_run import load_config, load_model, load_pipeline
+from unmix_plugin.engine.runs.run_files import RUN_FORMAT, write_run_json
 from unmix_plugin.engine.runs.run_folder import RunFolder, create_run_folder, newest_run, open_run_folder
+from unmix_plugin.engine.runs.scene_record import read_scene_record
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.errors import ConfigError, RunError, SceneError
 
@@ -22,7 +24,7 @@ NOON = datetime(2024, 5, 6, 12, 0, 7, tzinfo=timezone.utc)
 def complete_run(output_dir: Path, started: datetime, scene: str = "s", checkpoint: bool = True) -> RunFolder:
     run = create_run_folder(output_dir, scene, "m", started)
     for path in (run.config_path, run.scene_path):
-        write_json_atomically(path, {"format_version": 1})
+        write_run_json(path, {})
     if checkpoint:
         save_checkpoint(run.checkpoints, 1, {"a": torch.zeros(1)}, {})
     return run
@@ -52,13 +54,22 @@ def test_a_scene_name_that_is_no_file_name_stays_inside_the_output_folder(tmp_pa
         assert run.path.parents[2] == tmp_path
 
 
-def test_the_newest_run_is_the_one_that_started_last_in_any_scene(tmp_path: Path):
-    complete_run(tmp_path, NOON.replace(year=2025), "a")
-    last = [complete_run(tmp_path, NOON.replace(year=2026), "b") for _ in range(11)][-1]
-    complete_run(tmp_path, NOON.replace(year=2024), "c")
-    complete_run(tmp_path, NOON.replace(year=2027), "d", checkpoint=False)
+def test_the_newest_run_is_the_one_started_or_resumed_last_whatever_its_name(tmp_path: Path):
+    runs = [
+        complete_run(tmp_path, NOON.replace(year=year), scene, checkpoint)
+        for year, scene, checkpoint in (
+            (2099, "a", True),
+            (2026, "b", True),
+            (2024, "c", True),
+            (2027, "d", False),
+        )
+    ]
+    for second, run in enumerate(runs):
+        os.utime(run.config_path, (second, second))
     (tmp_path / "a" / "m" / "notes").mkdir()
-    assert newest_run(tmp_path) == last
+    assert newest_run(tmp_path) == runs[2]
+    os.utime(runs[1].config_path, (9, 9))
+    assert newest_run(tmp_path) == runs[1]
 
 
 def test_no_run_at_all_is_said(tmp_path: Path):
@@ -98,6 +109,14 @@ def test_a_newer_version_is_refused_with_what_to_do(trained: RunFolder, name: st
     path = trained.path / name
     path.write_text(json.dumps({**json.loads(path.read_text()), "format_version": 99}))
     with pytest.raises(RunError, match=r"format 99, written by a newer version.*update this package"):
+        load_model(trained.path)
+
+
+@pytest.mark.parametrize("name", ["config.json", "scene.json", "checkpoints/step-000012.json"])
+def test_an_older_version_is_refused_with_what_to_do(trained: RunFolder, name: str):
+    path = trained.path / name
+    path.write_text(json.dumps({**json.loads(path.read_text()), "format_version": RUN_FORMAT - 1}))
+    with pytest.raises(RunError, match=rf"format {RUN_FORMAT - 1}, written by an older version.*train again"):
         load_model(trained.path)
 
 

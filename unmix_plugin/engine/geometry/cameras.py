@@ -17,6 +17,8 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.camera_distortion import distort, undistort
 from unmix_plugin.engine.geometry.rays import RayBundle
 
+_LONGEST_EDGE_PX = 1 << 16
+
 
 @dataclass(frozen=True)
 class Cameras:
@@ -136,14 +138,24 @@ class Cameras:
         """The cameras that `to_json` wrote.
 
         Raises:
-            KeyError: a part is missing.
+            KeyError, TypeError, ValueError, RuntimeError: a part is missing, of another shape or out of its range.
         """
-        count = len(values["camera_to_world"])
-        return Cameras(
+        count, width, height = len(values["camera_to_world"]), values["width"], values["height"]
+        if not all(type(edge) is int and 1 <= edge <= _LONGEST_EDGE_PX for edge in (width, height)):
+            raise ValueError(f"images of {width} x {height} pixels; edges have 1 to {_LONGEST_EDGE_PX}")
+        cameras = Cameras(
             torch.tensor(values["camera_to_world"], dtype=torch.float32).reshape(count, 3, 4),
             torch.tensor(values["focal_px"], dtype=torch.float32).reshape(count, 2),
             torch.tensor(values["center_px"], dtype=torch.float32).reshape(count, 2),
             torch.tensor(values["distortion"], dtype=torch.float32).reshape(count, 4),
-            int(values["width"]),
-            int(values["height"]),
+            width,
+            height,
         )
+        numbers = torch.cat(
+            [part.flatten() for part in (cameras.camera_to_world, cameras.center_px, cameras.distortion)]
+        )
+        if not (
+            numbers.isfinite().all() and (cameras.focal_px > 0).all() and cameras.focal_px.isfinite().all()
+        ):
+            raise ValueError("poses, centres and distortion must be finite, focal lengths above 0")
+        return cameras

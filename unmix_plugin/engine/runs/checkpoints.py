@@ -11,18 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import safetensors.torch
+from safetensors import SafetensorError
 from torch import Tensor
 
-from unmix_plugin.atomic_files import (
-    NewerFormatError,
-    read_json,
-    remove_stale_temporaries,
-    write_atomically,
-    write_json_atomically,
-)
+from unmix_plugin.atomic_files import remove_stale_temporaries, write_file
+from unmix_plugin.engine.runs.run_files import OtherFormatError, read_run_json, write_run_json
 from unmix_plugin.errors import RunError
-
-FORMAT_VERSION = 1
 
 
 @dataclass(frozen=True)
@@ -64,10 +58,8 @@ def save_checkpoint(
         _remove_orphans(folder)
         if not _has_tensors(record_path, sha256):
             record_path.unlink(missing_ok=True)
-            write_atomically(tensors_path, data)
-        write_json_atomically(
-            record_path, {**record, "format_version": FORMAT_VERSION, "step": step, "sha256": sha256}
-        )
+            write_file(tensors_path, data)
+        write_run_json(record_path, {**record, "step": step, "sha256": sha256})
         _remove_others(folder, step, keep)
     except OSError as error:
         raise RunError(f"can't write to {folder}: {error.strerror or error}") from error
@@ -81,22 +73,29 @@ def newest_complete_checkpoint(folder: Path) -> Checkpoint | None:
     """The newest checkpoint whose tensors have the hash that its record says; None if there is none.
 
     Raises:
-        NewerFormatError: a record is of a newer format.
+        OtherFormatError: another version of this package wrote a record.
     """
     damaged: list[str] = []
     for step in checkpoint_steps(folder):
-        try:
-            record = read_json(folder / f"{_stem(step)}.json", FORMAT_VERSION)
-            data = (folder / f"{_stem(step)}.safetensors").read_bytes()
-        except NewerFormatError:
-            raise
-        except (OSError, RunError) as error:
-            damaged.append(f"{_stem(step)}: {error}")
-            continue
-        if hashlib.sha256(data).hexdigest() == record.get("sha256"):
-            return Checkpoint(step, safetensors.torch.load(data), record, tuple(damaged))
-        damaged.append(f"{_stem(step)}: the tensors do not have the hash of the record")
+        found = _read(folder / f"{_stem(step)}.json")
+        if not isinstance(found, str):
+            return Checkpoint(step, *found, tuple(damaged))
+        damaged.append(f"{_stem(step)}: {found}")
     return None
+
+
+def _read(record_path: Path) -> tuple[dict[str, Tensor], dict[str, Any]] | str:
+    """Tensors and record of a checkpoint, or what is wrong with it."""
+    try:
+        record = read_run_json(record_path)
+        data = record_path.with_suffix(".safetensors").read_bytes()
+        if hashlib.sha256(data).hexdigest() != record.get("sha256"):
+            return "the tensors do not have the hash of the record"
+        return safetensors.torch.load(data), record
+    except OtherFormatError:
+        raise
+    except (OSError, RunError, SafetensorError, ValueError, KeyError) as error:
+        return str(error)
 
 
 def checkpoint_steps(folder: Path) -> list[int]:

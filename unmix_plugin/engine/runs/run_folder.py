@@ -1,5 +1,6 @@
 """The folder of one run: what lies where in it, making one, finding one."""
 
+import os
 import re
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -7,8 +8,6 @@ from pathlib import Path
 
 from unmix_plugin.engine.runs.checkpoints import checkpoint_steps
 from unmix_plugin.errors import RunError
-
-_STAMP = re.compile(r"(\d{4}-\d{2}-\d{2}_\d{6})(?:-(\d+))?")
 
 
 @dataclass(frozen=True)
@@ -47,6 +46,11 @@ class RunFolder:
     def log_path(self) -> Path:
         """What happened, one line an event."""
         return self.path / "run.log"
+
+    @property
+    def lock_path(self) -> Path:
+        """Held by the training that writes to the run."""
+        return self.path / "run.lock"
 
     @property
     def eval(self) -> Path:
@@ -89,11 +93,12 @@ def open_run_folder(path: Path) -> RunFolder:
     """An existing run folder.
 
     Raises:
-        RunError: it is missing, is no run folder, or is half-written.
+        RunError: it is missing, is no run folder, is half-written, or has a link that leads out of it.
     """
     if not path.is_dir():
         raise RunError(f"no run folder at {path}; give the path that training printed as its last line")
     run = RunFolder(path.resolve())
+    _refuse_links_out(run.path)
     missing = [file.name for file in (run.config_path, run.scene_path) if not file.is_file()]
     if missing:
         raise RunError(f"{path} is no run folder, or a half-written one: {' and '.join(missing)} missing")
@@ -101,21 +106,36 @@ def open_run_folder(path: Path) -> RunFolder:
 
 
 def newest_run(output_dir: Path) -> RunFolder:
-    """The run under `output_dir` that started last, of those that have a checkpoint.
+    """The run under `output_dir` that was started or resumed last, of those that have a checkpoint.
 
     Raises:
         RunError: there is none.
     """
-    found: list[tuple[str, int, Path]] = []
-    for path in output_dir.glob("*/*/*"):
-        match = _STAMP.fullmatch(path.name)
-        if match and (path / "config.json").is_file() and checkpoint_steps(path / "checkpoints"):
-            found.append((match[1], int(match[2] or 1), path))
+    found = [
+        (
+            (path / "config.json").stat().st_mtime_ns,
+            path,
+        )  # not the name, which only says what a clock once said
+        for path in output_dir.glob("*/*/*")
+        if (path / "config.json").is_file() and checkpoint_steps(path / "checkpoints")
+    ]
     if not found:
         raise RunError(
             f"no run with a checkpoint under {output_dir.resolve()}; train one first or name it with --run"
         )
-    return open_run_folder(max(found)[2])
+    return open_run_folder(max(found)[1])
+
+
+def _refuse_links_out(root: Path) -> None:
+    """Whoever made the folder must not choose which other files get written."""
+    for folder, folders, files in os.walk(root):
+        for name in (*folders, *files):
+            path = Path(folder, name)
+            if path.is_symlink() and not path.resolve().is_relative_to(root):
+                raise RunError(
+                    f"{path} is a link that leads out of the run folder, to {path.resolve()}; "
+                    "put what it leads to in its place, or remove it"
+                )
 
 
 def _file_name(name: str) -> str:

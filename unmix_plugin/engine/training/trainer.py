@@ -9,21 +9,15 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from unmix_plugin.atomic_files import write_json_atomically
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.devices import resolve_device
 from unmix_plugin.engine.pipeline import Pipeline
 from unmix_plugin.engine.runs.checkpoints import checkpoint_steps, save_checkpoint
 from unmix_plugin.engine.runs.config_json import config_to_json
-from unmix_plugin.engine.runs.load_run import (
-    check_same_scene,
-    read_scene_record,
-    require_checkpoint,
-    require_data,
-    scene_record_to_json,
-    write_config,
-)
+from unmix_plugin.engine.runs.load_run import require_checkpoint, require_data, write_config
+from unmix_plugin.engine.runs.run_files import write_run_json
 from unmix_plugin.engine.runs.run_folder import RunFolder, create_run_folder, open_run_folder
+from unmix_plugin.engine.runs.scene_record import check_same_scene, read_scene_record, scene_record_to_json
 from unmix_plugin.engine.training.averages import ParameterAverage
 from unmix_plugin.engine.training.callbacks import TrainingCallbackLocation, run_callbacks
 from unmix_plugin.engine.training.guards import GradientGuard
@@ -43,8 +37,6 @@ from unmix_plugin.engine.training.training_state import (
 )
 from unmix_plugin.engine.training.writers import MetricsWriter, RunLog
 from unmix_plugin.errors import RunError
-
-TRAINING_FORMAT_VERSION = 1
 
 
 class Trainer:
@@ -142,9 +134,7 @@ class Trainer:
             raise
         finally:
             self.writer.close()
-        write_json_atomically(
-            self.run.training_path, {"format_version": TRAINING_FORMAT_VERSION, **self.record.to_json()}
-        )
+        write_run_json(self.run.training_path, self.record.to_json())
         self.log.write(f"finished: {self.step} steps, {self.clock.seconds:.1f} s, {self.total_rays} rays")
         return self.record
 
@@ -159,9 +149,11 @@ class Trainer:
         tensors = collect_tensors(
             self.pipeline.model, self.optimizer, self.average, self.pipeline.datamanager
         )
-        save_checkpoint(
-            self.run.checkpoints, self.step, tensors, self.record.to_json(), self.config.checkpoints_kept
-        )
+        record, kept = self.record.to_json(), self.config.checkpoints_kept
+        try:
+            save_checkpoint(self.run.checkpoints, self.step, tensors, record, kept)
+        except RunError as error:
+            raise RunError(f"{error}. What was saved before is whole: go on with --load-run") from error
         self._saved_step = self.step
         self.log.write(f"saved step {self.step}")
 
@@ -267,14 +259,14 @@ class Trainer:
         scene = scene_record_to_json(self.pipeline.datamanager)
         data = require_data(self.config)
         run = create_run_folder(self.config.output_dir, data.resolve().name, self.config.method_name)
-        write_json_atomically(run.scene_path, scene)
+        write_run_json(run.scene_path, scene)
         write_config(run, self.config)
         return run
 
     def _resume(self) -> None:
-        """Take back all that the newest complete checkpoint holds."""
+        """Restore all that the newest complete checkpoint holds."""
         datamanager = self.pipeline.datamanager
-        check_same_scene(read_scene_record(self.run), datamanager, self.run)
+        check_same_scene(read_scene_record(self.run, type(datamanager)), datamanager, self.run)
         checkpoint = require_checkpoint(self.run)
         restore_training(checkpoint.tensors, self.pipeline.model, self.optimizer, datamanager)
         record = TrainingRecord.from_json(checkpoint.record)

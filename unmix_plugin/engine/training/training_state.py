@@ -8,8 +8,9 @@ import torch
 from torch import Tensor, nn
 
 from unmix_plugin.engine.data_manager import DataManager
+from unmix_plugin.engine.runs.config_json import config_from_json
 from unmix_plugin.engine.training.averages import ParameterAverage
-from unmix_plugin.errors import RunError
+from unmix_plugin.errors import ConfigError, RunError
 
 MODEL, OPTIMIZER, AVERAGE, DATAMANAGER = "model/", "optimizer/", "average/", "datamanager/"
 
@@ -49,12 +50,16 @@ class TrainingRecord:
         """What `to_json` wrote, further entries ignored.
 
         Raises:
-            RunError: an entry is missing.
+            RunError: an entry is missing, of another type, or negative.
         """
+        known = {name: values.get(name) for name in TrainingRecord.__dataclass_fields__}
         try:
-            return TrainingRecord(**{name: values[name] for name in TrainingRecord.__dataclass_fields__})
-        except KeyError as error:
-            raise RunError(f"the checkpoint's record lacks {error}; it is damaged") from error
+            record = config_from_json(known, TrainingRecord(0, 0.0, 0, 0, 1, 0, 0.0, {}), "the record")
+        except ConfigError as error:
+            raise RunError(f"the checkpoint is damaged: {error}") from error
+        if min(*(value for value in known.values() if not isinstance(value, dict)), record.num_rays - 1) < 0:
+            raise RunError(f"the checkpoint is damaged: its record has a negative number: {known}")
+        return record
 
 
 def collect_tensors(
@@ -81,7 +86,7 @@ def restore_training(
     optimizer: torch.optim.Optimizer,
     datamanager: DataManager,
 ) -> None:
-    """Take back what `collect_tensors` gave, but for the average.
+    """Restore what `collect_tensors` gave, but for the average.
 
     Raises:
         RunError: the tensors do not fit the model.
@@ -90,7 +95,9 @@ def restore_training(
     params = dict(model.named_parameters())
     optimizer.state.clear()
     for name, value in part(tensors, OPTIMIZER).items():
-        owner, key = name.rsplit("/", 1)
+        owner, _, key = name.rpartition("/")
+        if owner not in params or (value.ndim > 0 and value.shape != params[owner].shape):
+            raise RunError(f"the checkpoint is damaged: its optimiser state {name} fits no parameter")
         # Cloned: on the CPU `to` returns its argument, and the optimiser writes into its state.
         optimizer.state[params[owner]][key] = value.to(params[owner].device).clone()
     datamanager.load_state_dict(part(tensors, DATAMANAGER))

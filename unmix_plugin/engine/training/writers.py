@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 from torch import Tensor
 
+from unmix_plugin.atomic_files import write_file
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.errors import RunError
 
@@ -72,7 +73,7 @@ class RunLog:
 
 def _append(path: Path, line: str) -> None:
     try:
-        with path.open("a", encoding="utf-8") as file:
+        with path.open("a", encoding="utf-8", errors="backslashreplace") as file:
             file.write(line + "\n")
     except OSError as error:
         raise RunError(
@@ -84,17 +85,15 @@ def _keep_until(path: Path, step: int) -> None:
     """Rewrite a JSON-lines file without the lines of later steps and without a last line cut off by a kill."""
     if not path.exists():
         return
-    kept: list[str] = []
-    for line in path.read_text(encoding="utf-8").splitlines():
-        try:
-            if json.loads(line)["step"] <= step:
-                kept.append(line + "\n")
-        except (ValueError, KeyError, TypeError):  # noqa: PERF203
-            continue
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    write_file(path, "".join(line + "\n" for line in lines if _is_of_step(line, step)).encode())
+
+
+def _is_of_step(line: str, step: int) -> bool:
     try:
-        path.write_text("".join(kept), encoding="utf-8")
-    except OSError as error:
-        raise RunError(f"can't write {path}: {error.strerror or error}") from error
+        return bool(json.loads(line)["step"] <= step)
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return False
 
 
 def _tensorboard(folder: Path, resumed_step: int) -> Any | None:
