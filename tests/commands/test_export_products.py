@@ -190,7 +190,7 @@ def test_a_pixel_has_what_was_measured_there_beside_what_is_predicted(trained, e
 
 def test_a_view_goes_by_its_number_too_and_a_point_by_its_coordinates(trained, tmp_path):
     common = ["--run", trained.run, "--output", tmp_path, "--device", "cpu"]
-    assert run(export, "spectrum", "--view", 2, "--pixel", "8,8", *common).status == 0
+    assert run(export, "spectrum", "--view", 0, "--pixel", "8,8", *common).status == 0
     assert (tmp_path / "eval_002_x8_y8.csv").is_file()
     assert run(export, "spectrum", "--point", "-0.0,0.05,0.2", *common).status == 0
     with (tmp_path / "point_0_0.05_0.2.csv").open() as file:
@@ -212,11 +212,11 @@ def test_own_reflectances_are_compared_with_too(trained, tmp_path):
         tmp_path / "mine.csv",
     ]
     assert (
-        run(export, "spectrum", "--view", 2, "--pixel", "8,8", "--compare", "continuum", *common).status == 0
+        run(export, "spectrum", "--view", 0, "--pixel", "8,8", "--compare", "continuum", *common).status == 0
     )
     assert run(export, "report", "--max-views", 1, *common).status == 0
     assert "184 known" in (tmp_path / "out" / "report.html").read_text()
-    ended = run(export, "spectrum", "--view", 2, "--pixel", "9,9", *common[:-1], tmp_path / "none.csv")
+    ended = run(export, "spectrum", "--view", 0, "--pixel", "9,9", *common[:-1], tmp_path / "none.csv")
     assert ended.status == 2
     assert "none.csv: can't read" in ended.err
 
@@ -285,11 +285,11 @@ def test_removed_matter_leaves_the_surface(trained, tmp_path):
     ("given", "said"),
     [
         (["spectrum"], "give a pixel with --view and --pixel, or else a point with --point"),
-        (["spectrum", "--view", "2", "--point", "1,2,3"], "give a pixel with --view and --pixel"),
-        (["spectrum", "--view", "eval_003", "--pixel", "1,1"], "no view 'eval_003'; nearest:"),
-        (["spectrum", "--view", "8", "--pixel", "1,1"], "a number from 0 to 7"),
-        (["spectrum", "--view", "2", "--pixel", "16,1"], "columns are 0 to 15, rows 0 to 15"),
-        (["spectrum", "--view", "2", "--pixel", "1"], "--pixel 1 is not a column and a row"),
+        (["spectrum", "--view", "1", "--point", "1,2,3"], "give a pixel with --view and --pixel"),
+        (["spectrum", "--view", "eval_003", "--pixel", "1,1"], "no view 'eval_003' (did you mean"),
+        (["spectrum", "--view", "2", "--pixel", "1,1"], "a number from 0 to 1"),
+        (["spectrum", "--view", "1", "--pixel", "16,1"], "columns are 0 to 15, rows 0 to 15"),
+        (["spectrum", "--view", "1", "--pixel", "1"], "--pixel 1 is not a column and a row"),
         (["spectrum", "--point", "1,2"], "--point 1,2 is not 3 numbers"),
         (["spectrum", "--point", "1,2,nan"], "--point 1,2,nan is not 3 numbers"),
         (["spectrum", "--point", "99,0,0"], "outside the scene box"),

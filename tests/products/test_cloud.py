@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
-from unmix_plugin.products.cloud import plane_normals, stands_alone, thinned
+from unmix_plugin.products.cloud import is_outlier, plane_normals, thinned
 
 
 def sphere(count: int, seed: int = 0) -> np.ndarray:
@@ -14,14 +14,14 @@ def sphere(count: int, seed: int = 0) -> np.ndarray:
 
 def test_lone_points_are_told_from_a_surface():
     lone = np.array([[3.0, 0.0, 0.0], [0.0, -2.0, 0.0]])
-    alone = stands_alone(np.concatenate([sphere(2000), lone]))
+    alone = is_outlier(np.concatenate([sphere(2000), lone]))
     assert alone[-2:].all()
     assert alone[:-2].mean() < 0.01
 
 
 @pytest.mark.parametrize("count", [0, 1, 8])
 def test_few_points_are_company_enough(count):
-    assert not stands_alone(sphere(count)).any()
+    assert not is_outlier(sphere(count)).any()
 
 
 @given(st.integers(1, 400), st.integers(1, 500))

@@ -17,16 +17,14 @@ from tests.products.ball_model import (
 from tests.products.mesh_reading import loaded_mesh
 from tests.trained.camera_files.camera_scenes import FRAME
 from unmix_plugin.errors import ConfigError, RunError
-from unmix_plugin.products.mesh import (
-    Mesh,
+from unmix_plugin.products.mesh import mesh_paths, require_sound, write_mesh
+from unmix_plugin.products.mesh_extraction import (
+    TriangleMesh,
     extract_mesh,
     filled,
-    mesh_paths,
-    require_sound,
     surface_density,
     trim_unseen,
-    without_crumbs,
-    write_mesh,
+    without_stray_pieces,
 )
 from unmix_plugin.trained.density_grid import GridPoints, sample_slice
 from unmix_plugin.trained.surface import SeenSurface
@@ -58,7 +56,7 @@ def seen(directions):
 
 @pytest.fixture(scope="module")
 def outside(whole):
-    return without_crumbs(trim_unseen(whole, seen(ALL_ROUND)))
+    return without_stray_pieces(trim_unseen(whole, seen(ALL_ROUND)))
 
 
 def radii(mesh):
@@ -112,16 +110,30 @@ def test_undersides_that_no_camera_sees_are_trimmed(whole):
     assert radii(trimmed).min() > RADIUS - 0.05
 
 
-def test_crumbs_go_and_large_parts_stay():
-    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    strip = np.concatenate([corners + np.array([index, 0, 0]) for index in range(120)])
-    faces = np.arange(len(strip)).reshape(-1, 3)
-    joined = np.concatenate([faces[:119], [[3 * i, 3 * i + 1, 3 * i + 3] for i in range(118)], faces[119:]])
-    kept = without_crumbs(Mesh(strip, joined))
-    assert len(kept.faces) == 119 + 118
-    assert kept.vertices[:, 0].max() < 119.5
-    empty = Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
-    assert len(without_crumbs(empty).faces) == 0
+def ribbon(count, left):
+    """Vertices and faces of `count` triangles in a row, each sharing an edge with the next."""
+    index = np.arange(count)
+    places = np.arange(count + 2)
+    vertices = np.stack([left + 0.5 * places, places % 2, np.zeros(count + 2)], axis=1)
+    return vertices, np.stack([index, index + 1, index + 2], axis=1)
+
+
+def test_stray_pieces_go_though_they_touch_the_rest_in_a_point_and_large_ones_stay():
+    (large, large_faces), (middle, middle_faces), (two, two_faces) = (
+        ribbon(120, 0.0),
+        ribbon(20, 200.0),
+        ribbon(2, 61.0),
+    )
+    vertices = np.concatenate([large, middle, two])
+    two_faces = two_faces + len(large) + len(middle)
+    two_faces[0, 0] = len(large) - 1  # the last vertex of the large piece
+    faces = np.concatenate([large_faces, middle_faces + len(large), two_faces])
+    kept = without_stray_pieces(TriangleMesh(vertices, faces))
+    assert len(kept.faces) == 120 + 20
+    assert len(kept.vertices) == len(large) + len(middle)
+    assert len(without_stray_pieces(TriangleMesh(*ribbon(2, 0.0))).faces) == 2
+    empty = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+    assert len(without_stray_pieces(empty).faces) == 0
 
 
 def test_a_blur_rounds_and_does_not_move_a_flat_wall():
@@ -193,12 +205,12 @@ def test_vertices_have_the_material_of_their_half(files):
 
 
 def test_a_density_that_nothing_reaches_is_refused(densities):
-    with pytest.raises(ConfigError, match=r"no surface at a density of 1e\+09 .* choose a lower --density"):
+    with pytest.raises(ConfigError, match=r"the density asked for; choose a lower --density"):
         extract_mesh(densities, GRID, 1e9, 0.0, PIXEL)
 
 
 def test_a_mesh_without_faces_is_not_written(tmp_path):
-    empty = Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+    empty = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
     with pytest.raises(RunError, match="no camera of the run sees it; keep it with --unseen keep"):
         write_mesh(tmp_path, ("ply",), empty, MODEL, FRAME)
 

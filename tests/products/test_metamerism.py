@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from unmix_plugin.products.metamerism import (
-    MetamerismOptions,
+    Metamerism,
     find_metamers,
     metamerism_paths,
     write_metamerism,
@@ -26,7 +26,7 @@ from unmix_plugin.spectral.library.spectra_csv import SpectraTable
 BANDS = Bands.of(np.linspace(400, 700, 31))
 SCENE_LIGHT = illuminant_power("D50", BANDS)
 GREY = np.full(31, 0.4)
-BOTH = MetamerismOptions(lights=("D65", "A"))
+BOTH = Metamerism(lights=("D65", "A"))
 
 
 def hidden(strength: float) -> np.ndarray:
@@ -96,7 +96,7 @@ def test_swatches_have_the_colours_that_an_adapted_eye_sees(tmp_path):
 @pytest.mark.parametrize("lights", [("D65", "A"), ("D65", "A", "FL2", "FL11", "E")])
 def test_a_figure_without_pairs_is_drawn_all_the_same(tmp_path, lights):
     grey = run_materials(GREY, names=("slate",))
-    found = find_metamers(grey, None, MaterialLibrary(()), MetamerismOptions(lights=lights))
+    found = find_metamers(grey, None, MaterialLibrary(()), Metamerism(lights=lights))
     assert found.pairs == []
     write_metamerism(tmp_path, found)
     with Image.open(tmp_path / "metamerism.png") as picture:

@@ -18,7 +18,7 @@ from unmix_plugin.figures.picture_grid import (
     paint,
     premultiplied_over_neutral,
 )
-from unmix_plugin.products.abundances import abundance_paths, draw_abundances, write_abundances
+from unmix_plugin.products.abundances import Abundances, draw_abundances
 from unmix_plugin.products.endmembers import draw_endmembers
 from unmix_plugin.products.evaluation_pictures import (
     draw_colour,
@@ -131,9 +131,8 @@ def test_scores_are_what_the_ids_were_chosen_by():
 def test_an_exported_array_is_zero_where_nothing_is(tmp_path):
     given = materials(3)
     view = rendered(given)
-    assert write_abundances(tmp_path / "new", "view", view, given) == abundance_paths(
-        tmp_path / "new", "view"
-    )
+    folder = tmp_path / "new"
+    assert Abundances().write_view(folder, "view", view, given) == Abundances().paths(folder, "view")
     exported = np.load(tmp_path / "new" / "view.npy")
     assert (exported.dtype, exported.shape) == (np.float32, (12, 16, 3))
     assert (exported[:, :4] == 0).all()

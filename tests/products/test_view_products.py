@@ -12,10 +12,10 @@ from PIL import Image
 
 from tests.method_factory import make_model
 from tests.trained.camera_files.camera_scenes import around
-from unmix_plugin.products.abundances import abundance_paths, write_abundances
-from unmix_plugin.products.cubes import cube_paths, write_cube
+from unmix_plugin.products.abundances import Abundances
+from unmix_plugin.products.cubes import Cubes
 from unmix_plugin.products.endmembers import endmember_paths, write_endmembers
-from unmix_plugin.products.segmentation import segmentation_paths, write_legend, write_segmentation
+from unmix_plugin.products.segmentation import Segmentation, legend_bytes
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.view_rendering import render_view
 
@@ -29,9 +29,8 @@ NAME = "view.0"
 @pytest.fixture(scope="module")
 def cubes(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cubes")
-    formats = ("envi", "exr", "npy")
-    written = write_cube(folder, NAME, VIEW, MATERIALS.bands, formats)
-    assert written == cube_paths(folder, NAME, formats)
+    product = Cubes(formats=("envi", "exr", "npy"))
+    assert product.write_view(folder, NAME, VIEW, MATERIALS) == product.paths(folder, NAME)
     return folder
 
 
@@ -49,9 +48,9 @@ def test_every_format_of_a_cube_holds_the_same_float32_spectra(cubes):
 
 
 def test_every_format_of_abundances_holds_the_same_float32_shares(tmp_path):
-    formats = ("npy", "png", "envi", "exr")
-    written = write_abundances(tmp_path, NAME, VIEW, MATERIALS, formats)
-    assert written == abundance_paths(tmp_path, NAME, formats)
+    product = Abundances(formats=("npy", "png", "envi", "exr"))
+    assert product.write_view(tmp_path, NAME, VIEW, MATERIALS) == product.paths(tmp_path, NAME)
+    assert all(path.is_file() for path in product.paths(tmp_path, NAME))
     expected = VIEW.abundances.numpy()
     np.testing.assert_array_equal(np.load(tmp_path / f"{NAME}.npy"), expected)
     from_envi: Any = envi.open(str(tmp_path / f"{NAME}.hdr"), str(tmp_path / f"{NAME}.img"))
@@ -71,14 +70,14 @@ def test_spectral_python_opens_the_endmembers_as_a_library(tmp_path):
 
 
 def test_labels_are_ids_whose_palette_and_legend_name_the_materials(tmp_path):
-    write_segmentation(tmp_path, NAME, VIEW, MATERIALS)
-    with Image.open(segmentation_paths(tmp_path, NAME)[2]) as labels:
+    paths = Segmentation().write_view(tmp_path, NAME, VIEW, MATERIALS)
+    with Image.open(paths[2]) as labels:
         ids, colours = np.asarray(labels), np.asarray(labels.convert("RGB"))
         assert labels.mode == "P"
     np.testing.assert_array_equal(ids, VIEW.segmentation.numpy())
     assert len(np.unique(ids)) > 2
-    with write_legend(tmp_path, MATERIALS).open() as file:
-        rows = {int(row["id"]): row for row in csv.DictReader(file)}
+    legend = legend_bytes(MATERIALS).decode().splitlines()
+    rows = {int(row["id"]): row for row in csv.DictReader(legend)}
     assert [rows[index]["name"] for index in (0, 1, 2, 255)] == [*MATERIALS.names, "nothing"]
     for index in np.unique(ids):
         expected = [int(rows[int(index)][name]) for name in ("red", "green", "blue")]
@@ -94,8 +93,7 @@ def test_named_endmembers_keep_their_names(tmp_path):
     model = make_model()
     model.requires_grad_(False)
     model.endmember_names = ("oak, old", "v1.2", "löss")
-    formats = ("exr",)
-    [path] = write_abundances(tmp_path, NAME, VIEW, model.materials, formats)
+    [path] = Abundances(formats=("exr",)).write_view(tmp_path, NAME, VIEW, model.materials)
     channels = OpenEXR.File(str(path), separate_channels=True).channels()
     assert set(channels) == {"abundances.oak, old", "abundances.v1_2", "abundances.löss"}
     assert torch.equal(torch.from_numpy(channels["abundances.v1_2"].pixels), VIEW.abundances[..., 1])

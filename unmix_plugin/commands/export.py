@@ -1,6 +1,6 @@
 """`unmix-export PRODUCT --run PATH`: files for others, from the run folder alone.
 
-A product is one module in `commands/products` and one entry in `PRODUCTS`.
+A product is one module in `products` and one entry in `PRODUCTS`.
 """
 
 from __future__ import annotations
@@ -10,18 +10,18 @@ import inspect
 import tyro
 
 from unmix_plugin.commands.entry import run_command
-from unmix_plugin.commands.products.abundances import Abundances
-from unmix_plugin.commands.products.cubes import Cubes
-from unmix_plugin.commands.products.endmembers import Endmembers
-from unmix_plugin.commands.products.mesh import Mesh
-from unmix_plugin.commands.products.metamerism import Metamerism
-from unmix_plugin.commands.products.pca import Pca
-from unmix_plugin.commands.products.point_cloud import PointCloud
-from unmix_plugin.commands.products.product import Job, Product
-from unmix_plugin.commands.products.report import Report
-from unmix_plugin.commands.products.segmentation import Segmentation
-from unmix_plugin.commands.products.spectrum import Spectrum
-from unmix_plugin.commands.products.volume import Volume
+from unmix_plugin.products.abundances import Abundances
+from unmix_plugin.products.cubes import Cubes
+from unmix_plugin.products.endmembers import Endmembers
+from unmix_plugin.products.mesh import Mesh
+from unmix_plugin.products.metamerism import Metamerism
+from unmix_plugin.products.pca import Pca
+from unmix_plugin.products.point_cloud import PointCloud
+from unmix_plugin.products.product import Job, Product
+from unmix_plugin.products.report.report import Report
+from unmix_plugin.products.segmentation import Segmentation
+from unmix_plugin.products.spectrum import Spectrum
+from unmix_plugin.products.volume import Volume
 
 PRODUCTS: tuple[Product, ...] = (
     Abundances(),
@@ -68,9 +68,11 @@ def export(words: list[str]) -> None:
 
 def _open(product: Product) -> Job:
     """Load the run that a product is of."""
+    from functools import partial
+
     from rich.console import Console
 
-    from unmix_plugin.commands.reporting import say, working
+    from unmix_plugin.commands.reporting import follow, say, working
     from unmix_plugin.commands.run_choice import chosen_run
     from unmix_plugin.editing.edited_run import edit_notes, load_edited_model
 
@@ -82,7 +84,14 @@ def _open(product: Product) -> Job:
     folder = (product.output or loaded.run.exports / product.name).resolve()
     for line in edit_notes(loaded, product.edits, product.illuminant, product.sensor):
         say(console, line)
-    return Job(loaded, folder, product.overwrite, console)
+    return Job(
+        loaded,
+        folder,
+        product.overwrite,
+        partial(say, console),
+        partial(working, console),
+        partial(follow, console),
+    )
 
 
 def _refuse_sensor(product: Product) -> None:

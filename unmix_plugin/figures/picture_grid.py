@@ -17,13 +17,12 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from unmix_plugin.formats.files import figure_bytes
+from unmix_plugin.figures.plotting import FIGURE_DPI, Colour, draw_colour_bar, draw_swatch, figure_bytes
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, srgb_to_linear
 
 NEUTRAL = 0.92
 """sRGB grey of what shows nothing."""
 
-_DPI = 130
 _FONT_PT = 10
 _MARGIN, _GAP, _TITLE, _HEADING, _LEGEND_ROW = 0.15, 0.14, 0.30, 0.34, 0.25
 _BAR_WIDTH, _BAR_SPACE = 0.16, 0.80
@@ -33,7 +32,6 @@ _PANEL_BOUNDS = (2.1, 5.0)
 """Least and greatest longer side of a panel."""
 
 Picture = Float[np.ndarray, "H W 3"]
-Colour = Sequence[float] | np.ndarray
 
 
 @dataclass(frozen=True)
@@ -109,7 +107,7 @@ def draw_panels(
     from matplotlib.figure import Figure
 
     height_px, width_px, _ = rows[0][0].image.shape
-    longer = float(np.clip(max(height_px, width_px) / _DPI, *_PANEL_BOUNDS))
+    longer = float(np.clip(max(height_px, width_px) / FIGURE_DPI, *_PANEL_BOUNDS))
     width, height = (longer * side / max(height_px, width_px) for side in (width_px, height_px))
     width = max(width, 1.3)  # room for a title
     num_columns = max(len(row) for row in rows)
@@ -132,7 +130,7 @@ def draw_panels(
         box = (_MARGIN + grid_width + 0.18, _MARGIN + below, _BAR_WIDTH, grid_height - _TITLE)
         _draw_bar(figure, scale, box, page)
     _draw_legend(figure, legend, legend_columns, below, page)
-    return figure_bytes(figure, _DPI)
+    return figure_bytes(figure)
 
 
 def _axes(figure: Any, box: tuple[float, float, float, float], page: tuple[float, float]) -> Any:
@@ -152,37 +150,18 @@ def _draw_panel(
     left, bottom, width, height = box
     base = bottom + height + 0.07
     if panel.swatch is not None:
-        _draw_swatch(figure, panel.swatch, (left, base), page)
+        draw_swatch(figure, panel.swatch, (left, base + 0.02))
         left, width = left + 0.22, width - 0.22
     title = textwrap.shorten(panel.title, max(8, int(width / _LETTER)), placeholder="...")
     figure.text(left / page[0], (base + 0.02) / page[1], title, fontsize=_FONT_PT, va="bottom")
 
 
-def _draw_swatch(figure: Any, colour: Colour, corner: tuple[float, float], page: tuple[float, float]) -> None:
-    from matplotlib.patches import Rectangle
-
-    side = 0.15
-    square = Rectangle(
-        (corner[0] / page[0], (corner[1] + 0.02) / page[1]),
-        side / page[0],
-        side / page[1],
-        transform=figure.transFigure,
-        facecolor=tuple(np.clip(colour, 0, 1)),
-        edgecolor="0.3",
-        linewidth=0.6,
-    )
-    figure.add_artist(square)
-
-
 def _draw_bar(
     figure: Any, scale: ColourScale, box: tuple[float, float, float, float], page: tuple[float, float]
 ) -> None:
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
     from matplotlib.ticker import MaxNLocator
 
-    mappable = ScalarMappable(Normalize(scale.low, scale.high), scale.colour_map)
-    bar = figure.colorbar(mappable, cax=_axes(figure, box, page))
+    bar = draw_colour_bar(figure, _axes(figure, box, page), scale.colour_map, (scale.low, scale.high))
     bar.set_label(scale.label, fontsize=_FONT_PT)
     bar.ax.tick_params(labelsize=_FONT_PT - 1)
     bar.locator = MaxNLocator(5)
@@ -204,5 +183,5 @@ def _draw_legend(
         row, column = divmod(index, columns)
         left = _MARGIN + column * _legend_width(legend)
         base = _MARGIN + below - _GAP - (row + 1) * _LEGEND_ROW
-        _draw_swatch(figure, colour, (left, base), page)
+        draw_swatch(figure, colour, (left, base + 0.02))
         figure.text((left + 0.24) / page[0], (base + 0.03) / page[1], name, fontsize=_FONT_PT, va="bottom")

@@ -5,7 +5,7 @@ Notation: `H x W` pixels.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +32,11 @@ def write_exr(path: Path, channels: Mapping[str, np.ndarray], attributes: Mappin
         except (OSError, RuntimeError) as error:
             raise cannot_write(path, _reason(error)) from error
     return path
+
+
+def layer_names(layer: str, channels: Sequence[str]) -> list[str]:
+    """Names of the channels of a layer; dots in them become `_`, since a dot parts layers."""
+    return [f"{layer}.{channel.replace('.', '_')}" for channel in channels]
 
 
 def _reason(error: Exception) -> str:

@@ -1,9 +1,11 @@
-"""Abundance maps: an array and a figure a view."""
+"""Abundance maps: arrays, images for other programs, and a figure of every view."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -11,9 +13,10 @@ from torch import Tensor
 
 from unmix_plugin.figures.picture_grid import ColourScale, Panel, draw_panels, in_rows, over_neutral, paint
 from unmix_plugin.formats.envi_cube import envi_cube_paths, write_envi_cube
-from unmix_plugin.formats.exr import write_exr
+from unmix_plugin.formats.exr import layer_names, write_exr
 from unmix_plugin.formats.files import array_bytes, write_file
-from unmix_plugin.products.product_formats import ShareFormat
+from unmix_plugin.products.product import ViewProduct
+from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import colour_mode
 from unmix_plugin.spectral.composition import Materials
 from unmix_plugin.trained.run_materials import endmember_colours
@@ -25,58 +28,54 @@ SHARE_SCALE = ColourScale("viridis", 0.0, 1.0, "abundance")
 _WHAT = "abundances, summing to the opacity"
 
 
-_DEFAULT_FORMATS: tuple[ShareFormat, ...] = ("npy", "png")
+@dataclass(frozen=True)
+class Abundances(ViewProduct):
+    """Abundance of each endmember, summing to the opacity, 0 where nothing is: of each view VIEW.npy, (H, W, K)
+    float32, and VIEW.png, a figure; on request ENVI and EXR images."""
+
+    name = "abundances"
+
+    formats: tuple[Literal["npy", "png", "envi", "exr"], ...] = ("npy", "png")
+    """npy, envi (.hdr and .img), exr (a channel for each endmember), png."""
+
+    def paths(self, folder: Path, view: str) -> list[Path]:
+        """Files of a view."""
+        return [path for kind in self.formats for path in view_paths(folder, view, kind)]
+
+    def write_view(self, folder: Path, view: str, rendered: RenderedView, materials: Materials) -> list[Path]:
+        """Write the abundances of a view: npy, envi and exr hold the same float32 numbers, png is the figure."""
+        shares = rendered.abundances.numpy().astype(np.float32)
+        about = f"{view}: {_WHAT}"
+        for kind in self.formats:
+            path = folder / f"{view}.{kind}"
+            if kind == "npy":
+                write_file(path, array_bytes(shares))
+            elif kind == "png":
+                write_file(path, draw_abundances(view, rendered, materials))
+            elif kind == "envi":
+                write_envi_cube(folder / view, shares, None, materials.names, about)
+            else:
+                names = layer_names("abundances", materials.names)
+                planes = dict(zip(names, np.moveaxis(shares, -1, 0), strict=True))
+                write_exr(path, planes, {"comments": about})
+        return self.paths(folder, view)
 
 
-def abundance_paths(folder: Path, name: str, formats: Sequence[ShareFormat] = _DEFAULT_FORMATS) -> list[Path]:
-    """Files that `write_abundances` makes for a view."""
-    return [path for kind in formats for path in _paths(folder / name, kind)]
+def view_paths(folder: Path, view: str, kind: str) -> list[Path]:
+    """Files of a view in one format: ENVI has two, the others one."""
+    return envi_cube_paths(folder / view) if kind == "envi" else [folder / f"{view}.{kind}"]
 
 
-def write_abundances(
-    folder: Path,
-    name: str,
-    view: RenderedView,
-    materials: Materials,
-    formats: Sequence[ShareFormat] = _DEFAULT_FORMATS,
-) -> list[Path]:
-    """Write the abundances of a view: (H, W, K) float32, summing to the opacity, 0 where nothing is; and a figure.
-
-    Args:
-        folder: Where to write; it is made.
-        name: Of the view.
-        view: Rendered.
-        materials: Of the model.
-        formats: `npy`, `envi` and `exr` have the numbers, `png` is the figure.
-    Raises:
-        RunError: the disk is full or refuses.
-    """
-    written: list[Path] = []
-    shares = view.abundances.numpy().astype(np.float32)
-    for kind in formats:
-        path = _paths(folder / name, kind)[0]
-        if kind == "npy":
-            written.append(write_file(path, array_bytes(shares)))
-        elif kind == "png":
-            written.append(write_file(path, draw_abundances(name, view, materials)))
-        elif kind == "envi":
-            written += write_envi_cube(
-                path.with_suffix(""), shares, None, materials.names, f"{name}: {_WHAT}"
-            )
-        else:
-            # A dot in a channel's name would part layers.
-            channels = [f"abundances.{channel.replace('.', '_')}" for channel in materials.names]
-            planes = dict(zip(channels, np.moveaxis(shares, -1, 0), strict=True))
-            written.append(write_exr(path, planes, {"comments": f"{name}: {_WHAT}"}))
-    return written
+def colour_panel(view: RenderedView, bands: Bands) -> Panel:
+    """A view as an eye, or a camera with these bands, sees it."""
+    title = "colour" if colour_mode(bands) == "true-colour" else "false colour"
+    return Panel(picture(view.spectra, view.accumulation, bands), title)
 
 
 def draw_abundances(name: str, view: RenderedView, materials: Materials) -> bytes:
     """A figure of a view in colour and of the abundances of what is seen, fading where nothing is."""
-    swatches = endmember_colours(materials)
-    kind = "colour" if colour_mode(materials.bands) == "true-colour" else "false colour"
-    panels = [Panel(picture(view.spectra, view.accumulation, materials.bands), kind)]
-    panels += share_panels(view.shares, view.accumulation, materials.names, swatches)
+    panels = [colour_panel(view, materials.bands)]
+    panels += share_panels(view.shares, view.accumulation, materials.names, endmember_colours(materials))
     return draw_panels(in_rows(panels), f"{name}: abundances", SHARE_SCALE)
 
 
@@ -92,7 +91,3 @@ def share_panels(
         Panel(over_neutral(image, as_numpy(opacity)), title, swatch)
         for image, title, swatch in zip(images, titles, swatches, strict=True)
     ]
-
-
-def _paths(base: Path, kind: ShareFormat) -> list[Path]:
-    return envi_cube_paths(base) if kind == "envi" else [base.with_name(f"{base.name}.{kind}")]

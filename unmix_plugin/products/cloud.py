@@ -10,15 +10,15 @@ from jaxtyping import Bool, Float, Int64
 
 _OUTLIER_NEIGHBOURS = 8
 _OUTLIER_FACTOR = 4.0
-"""Points whose neighbours are, on average, farther by this factor than those of the median point, stand alone."""
+"""Points whose neighbours are, on average, farther by this factor than those of the median point, are outliers."""
 
 _PLANE_NEIGHBOURS = 24
 _CHUNK = 50_000
 _BISECTIONS = 20
 
 
-def stands_alone(positions: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
-    """Which points have no company, by the mean distance to their nearest eight."""
+def is_outlier(positions: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
+    """Which points lie far from all others, by the mean distance to their nearest eight."""
     if len(positions) <= _OUTLIER_NEIGHBOURS:
         return np.zeros(len(positions), dtype=bool)
     from scipy.spatial import KDTree

@@ -1,54 +1,51 @@
-"""Spectral images of views, in formats of remote sensing and of rendering.
-
-Notation: `H x W` pixels, `B` bands.
-"""
+"""Spectral images of views, in formats of remote sensing and of rendering."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
-from unmix_plugin.formats.envi_cube import envi_cube_paths, write_envi_cube
+from unmix_plugin.formats.envi_cube import write_envi_cube
 from unmix_plugin.formats.files import array_bytes, write_file
 from unmix_plugin.formats.spectral_exr import write_spectral_exr
-from unmix_plugin.products.product_formats import CubeFormat
-from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.products.abundances import view_paths
+from unmix_plugin.products.product import ViewProduct
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
+from unmix_plugin.spectral.composition import Materials
 from unmix_plugin.trained.view_rendering import RenderedView
 
-_WHAT = "radiance on black, 1 = full scale"
 
+@dataclass(frozen=True)
+class Cubes(ViewProduct):
+    """Spectral images: of each view radiance on black, (H, W, bands) float32, 1 = full scale, as ENVI (VIEW.hdr and
+    VIEW.img), spectral OpenEXR (VIEW.exr) or VIEW.npy."""
 
-def cube_paths(folder: Path, name: str, formats: Sequence[CubeFormat]) -> list[Path]:
-    """Files that `write_cube` makes for a view."""
-    return [path for kind in formats for path in _paths(folder / name, kind)]
+    name = "cubes"
 
+    formats: tuple[Literal["envi", "exr", "npy"], ...] = ("envi",)
+    """envi, exr, npy (without wavelengths)."""
 
-def write_cube(
-    folder: Path, name: str, view: RenderedView, bands: Bands, formats: Sequence[CubeFormat]
-) -> list[Path]:
-    """Write the spectra of a view, (H, W, B) float32, with their wavelengths; `npy` has none.
+    def paths(self, folder: Path, view: str) -> list[Path]:
+        """Files of a view."""
+        return [path for kind in self.formats for path in view_paths(folder, view, kind)]
 
-    Raises:
-        RunError: the disk is full or refuses.
-    """
-    written: list[Path] = []
-    spectra = view.spectra.numpy().astype(np.float32)
-    for kind in formats:
-        path = _paths(folder / name, kind)[0]
-        if kind == "npy":
-            written.append(write_file(path, array_bytes(spectra)))
-        elif kind == "envi":
-            names = [f"{wavelength:g} nm" for wavelength in bands.centers_nm]
-            written += write_envi_cube(path.with_suffix(""), spectra, bands, names, f"{name}: {_WHAT}")
-        else:
-            preview = (view.spectra.float().clamp(0, 1) @ rgb_matrix(bands)).clamp(0, 1).numpy()
-            opacity = view.accumulation.float().numpy()
-            written.append(write_spectral_exr(path, spectra, bands, preview, opacity, f"{name}: {_WHAT}"))
-    return written
-
-
-def _paths(base: Path, kind: CubeFormat) -> list[Path]:
-    return envi_cube_paths(base) if kind == "envi" else [base.with_name(f"{base.name}.{kind}")]
+    def write_view(self, folder: Path, view: str, rendered: RenderedView, materials: Materials) -> list[Path]:
+        """Write the spectra of a view."""
+        spectra, bands = rendered.spectra.numpy().astype(np.float32), materials.bands
+        about = f"{view}: radiance on black, 1 = full scale"
+        for kind in self.formats:
+            path = folder / f"{view}.{kind}"
+            if kind == "npy":
+                write_file(path, array_bytes(spectra))
+            elif kind == "envi":
+                names = [f"{wavelength:g} nm" for wavelength in bands.centers_nm]
+                write_envi_cube(folder / view, spectra, bands, names, about)
+            else:
+                preview = (rendered.spectra.float().clamp(0, 1) @ rgb_matrix(bands)).clamp(0, 1).numpy()
+                write_spectral_exr(
+                    path, spectra, bands, preview, rendered.accumulation.float().numpy(), about
+                )
+        return self.paths(folder, view)

@@ -2,18 +2,33 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from unmix_plugin.figures.plotting import figure_bytes, plain_axes
 from unmix_plugin.formats.envi_library import envi_library_paths, write_envi_library
-from unmix_plugin.formats.files import figure_bytes, make_folder, write_file
+from unmix_plugin.formats.files import make_folder, write_file
+from unmix_plugin.products.product import Job, Product
 from unmix_plugin.spectral.composition import Materials
 from unmix_plugin.trained.run_materials import endmember_colours, write_endmembers_csv
 
 _LINE_STYLES = ("-", "--", "-.", ":")
 _LEGEND_ROWS = 16
-_DPI = 130
+
+
+@dataclass(frozen=True)
+class Endmembers(Product):
+    """Spectra of the endmembers: endmembers.csv, the ENVI spectral library endmembers.hdr and .sli, and a plot over
+    wavelength, endmembers.png."""
+
+    name = "endmembers"
+
+    def write(self, job: Job) -> list[Path]:
+        """Write table, library and plot."""
+        job.claim(endmember_paths(job.folder))
+        return write_endmembers(job.folder, job.materials)
 
 
 def endmember_paths(folder: Path) -> list[Path]:
@@ -33,15 +48,11 @@ def write_endmembers(folder: Path, materials: Materials) -> list[Path]:
     """
     table_path, *_, plot_path = endmember_paths(make_folder(folder))
     spectra = materials.endmembers.detach().cpu().numpy().astype(np.float32)
-    library = write_envi_library(
-        folder / "endmembers",
-        spectra,
-        materials.bands,
-        materials.names,
-        "endmembers: radiance, 1 = full scale",
-    )
-    plot = draw_endmembers(materials)
-    return [write_endmembers_csv(table_path, materials), *library, write_file(plot_path, plot)]
+    about = "endmembers: radiance, 1 = full scale"
+    write_envi_library(folder / "endmembers", spectra, materials.bands, materials.names, about)
+    write_endmembers_csv(table_path, materials)
+    write_file(plot_path, draw_endmembers(materials))
+    return endmember_paths(folder)
 
 
 def draw_endmembers(materials: Materials) -> bytes:
@@ -69,9 +80,6 @@ def draw_endmembers(materials: Materials) -> bytes:
     axes.set(xlabel="wavelength (nm)", ylabel="radiance under the scene's light (1 = full scale)")
     axes.set_ylim(bottom=0.0)
     axes.set_title("Endmembers", loc="left", fontweight="bold")
-    axes.grid(color="0.9")
-    axes.set_axisbelow(True)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    plain_axes(axes)
     figure.legend(loc="outside right upper", ncols=legend_columns, frameon=False)
-    return figure_bytes(figure, _DPI)
+    return figure_bytes(figure)

@@ -17,7 +17,6 @@ from torch import Tensor
 from unmix_plugin.figures.material_colours import distinct_colours, own_colours
 from unmix_plugin.figures.picture_grid import (
     NEUTRAL,
-    Colour,
     ColourScale,
     Panel,
     draw_panels,
@@ -25,6 +24,7 @@ from unmix_plugin.figures.picture_grid import (
     over_neutral,
     paint,
 )
+from unmix_plugin.figures.plotting import RIGHT, WRONG, Colour
 from unmix_plugin.products.abundances import SHARE_SCALE, share_panels
 from unmix_plugin.products.segmentation import paint_ids
 from unmix_plugin.spectral.bands import Bands
@@ -35,7 +35,6 @@ from unmix_plugin.trained.view_rendering import RenderedView, as_numpy, picture
 
 _ERROR_SCALE = ColourScale("magma", 0.0, 0.2, "error of sRGB")
 _COLUMNS = 7
-_RIGHT, _WRONG = (0.80, 0.84, 0.80), (0.80, 0.15, 0.15)
 
 
 @dataclass(frozen=True)
@@ -109,12 +108,12 @@ def draw_matched_segmentation(
     seen = set(np.unique(as_true[ids]).tolist())
     extra: list[tuple[str, Colour]] = []
     if labels is not None:
-        agreement = np.where((as_true[ids] != labels)[..., None], _WRONG, _RIGHT)
+        agreement = np.where((as_true[ids] != labels)[..., None], WRONG, RIGHT)
         agreement[labels == NOTHING_ID] = NEUTRAL
         true = Panel(paint_ids(labels, dict(enumerate(look.true_colours))), "true")
         panels = [true, *panels, Panel(agreement, "disagreement")]
         seen |= set(np.unique(labels).tolist())
-        extra = [("right", _RIGHT), ("wrong", _WRONG), ("unlabelled", (NEUTRAL,) * 3)]
+        extra = [("right", RIGHT), ("wrong", WRONG), ("unlabelled", (NEUTRAL,) * 3)]
     true_entries = [entry for index, entry in enumerate(look.true_entries) if index in seen]
     surplus = [
         (name, colours[index])

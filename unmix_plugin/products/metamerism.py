@@ -10,14 +10,16 @@ import csv
 import io
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float64
 
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.formats.files import figure_bytes, write_file
+from unmix_plugin.figures.plotting import draw_swatch, figure_bytes
+from unmix_plugin.formats.files import write_file
+from unmix_plugin.products.product import Job, Product
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.difference import lab_to_srgb, reflectance_to_lab
 from unmix_plugin.spectral.colour.illuminants import illuminant_power, parse_light
@@ -25,27 +27,43 @@ from unmix_plugin.spectral.colour.metamerism import MetamericPair, metameric_pai
 from unmix_plugin.spectral.composition import Materials
 from unmix_plugin.spectral.library.material_library import MaterialLibrary
 
-Surfaces = Literal["run", "library", "all"]
-"""Which materials are paired: the run's endmembers, those of the library, or both together."""
-
-DEFAULT_LIGHTS = ("D65", "A", "FL2", "FL11")
-
 _MOST_DRAWN = 12
-_DPI = 130
 _NAME_WIDTH, _CELL, _ROW, _HEADING, _MARGIN = 3.4, 1.5, 0.62, 0.75, 0.2
+_SWATCH = 0.46
 
 
 @dataclass(frozen=True)
-class MetamerismOptions:
-    """What counts as alike and as different, and where."""
+class Metamerism(Product):
+    """Pairs of materials that look alike in one light and differ in another, as an eye adapted to each light sees them:
+    metamerism.csv, the pairs with their differences, and metamerism.png, swatches."""
 
-    lights: tuple[str, ...] = DEFAULT_LIGHTS
-    """Names of lights, or CSV files."""
-    surfaces: Surfaces = "all"
+    name = "metamerism"
+
+    surfaces: Literal["run", "library", "all"] = "all"
+    """Pair the run's endmembers, materials of the library, or both together."""
+    lights: tuple[str, ...] = ("D65", "A", "FL2", "FL11")
+    """Lights to compare: CIE illuminants, lamps or .csv files (wavelength,power)."""
     alike: float = 2.0
-    """CIEDE2000 up to which two surfaces look alike."""
+    """Colour difference (CIEDE2000) up to which two materials look alike."""
     different: float = 4.0
-    """CIEDE2000 from which they look different."""
+    """Colour difference from which they look different."""
+    library: tuple[Path, ...] = ()
+    """CSV files or ENVI spectral libraries with reflectances of your own, beside the measured ones."""
+
+    def write(self, job: Job) -> list[Path]:
+        """Compare all pairs in all lights."""
+        from unmix_plugin.spectral.library.material_library import library_with
+
+        job.claim(metamerism_paths(job.folder))
+        light = job.loaded.scene.metadata.get("illuminant")
+        scene_light = None if light is None else np.array(light)
+        with job.working("comparing colours"):
+            found = find_metamers(job.materials, scene_light, library_with(self.library), self)
+            written = write_metamerism(job.folder, found)
+        job.say(
+            f"{len(found.pairs)} pairs of {len(found.names)} materials, seen in {', '.join(found.lights)}"
+        )
+        return written
 
 
 @dataclass(frozen=True)
@@ -70,7 +88,7 @@ def find_metamers(
     materials: Materials,
     scene_light: Float64[np.ndarray, " B"] | None,
     library: MaterialLibrary,
-    options: MetamerismOptions,
+    options: Metamerism,
 ) -> Metamers:
     """Look at all pairs of surfaces in all lights.
 
@@ -78,7 +96,7 @@ def find_metamers(
         materials: Of the run.
         scene_light: What it was recorded in; None for flat light.
         library: Measured materials.
-        options: What is looked for.
+        options: Which materials and lights, and what counts as alike and as different.
     Raises:
         SpectrumError: a light that is unknown or does not cover the run's bands, bands that can't tell colours, or
             thresholds the wrong way round.
@@ -125,20 +143,18 @@ def draw_metamers(found: Metamers) -> bytes:
     for label, left in zip(labels, [_MARGIN, *(_column(index) for index in range(columns))], strict=True):
         figure.text(left / page[0], 1 - (_MARGIN + 0.68) / page[1], label, fontsize=10, va="bottom")
     labs = [reflectance_to_lab(found.reflectance, power, found.bands) for power in found.powers]
-    for column, light in enumerate(found.lights):
-        left = (_MARGIN + _NAME_WIDTH + column * _CELL) / page[0]
-        figure.text(left, 1 - (_MARGIN + 0.68) / page[1], Path(light).stem, fontsize=10, va="bottom")
     for row, pair in enumerate(drawn):
         base = page[1] - _MARGIN - _HEADING - (row + 1) * _ROW
         for index, surface in enumerate((pair.first, pair.second)):
             height = (base + 0.36 - 0.2 * index) / page[1]
             figure.text(_MARGIN / page[0], height, found.names[surface][:42], fontsize=9, va="center")
         for column, lab in enumerate(labs):
-            corner = (_column(column), base)
-            _draw_cell(
-                figure, lab_to_srgb(lab[[pair.first, pair.second]]), pair.differences[column], corner, page
-            )
-    return figure_bytes(figure, _DPI)
+            left = _column(column)
+            for index, colour in enumerate(lab_to_srgb(lab[[pair.first, pair.second]])):
+                draw_swatch(figure, colour, (left + index * _SWATCH, base + 0.06), _SWATCH, "none")
+            place = ((left + 2 * _SWATCH + 0.08) / page[0], (base + 0.29) / page[1])
+            figure.text(*place, f"{pair.differences[column]:.1f}", fontsize=10, va="center")
+    return figure_bytes(figure)
 
 
 def _column(index: int) -> float:
@@ -150,7 +166,7 @@ def _surfaces(
     materials: Materials,
     scene_light: Float64[np.ndarray, " B"] | None,
     library: MaterialLibrary,
-    chosen: Surfaces,
+    chosen: Literal["run", "library", "all"],
 ) -> tuple[list[str], list[Float64[np.ndarray, " B"]]]:
     """Names and reflectances of what is paired."""
     names: list[str] = []
@@ -179,28 +195,3 @@ def _table(found: Metamers) -> bytes:
         differences = [f"{value:.3f}" for value in pair.differences]
         writer.writerow([found.names[pair.first], found.names[pair.second], *lights, *differences])
     return text.getvalue().encode()
-
-
-def _draw_cell(
-    figure: Any,
-    colours: Float64[np.ndarray, "2 3"],
-    difference: float,
-    corner: tuple[float, float],
-    page: tuple[float, float],
-) -> None:
-    """Two touching swatches and their difference."""
-    from matplotlib.patches import Rectangle
-
-    side = 0.46
-    for index, colour in enumerate(colours):
-        swatch = Rectangle(
-            ((corner[0] + index * side) / page[0], (corner[1] + 0.06) / page[1]),
-            side / page[0],
-            side / page[1],
-            transform=figure.transFigure,
-            facecolor=tuple(colour),
-            edgecolor="none",
-        )
-        figure.add_artist(swatch)
-    text = ((corner[0] + 2 * side + 0.08) / page[0], (corner[1] + 0.29) / page[1])
-    figure.text(*text, f"{difference:.1f}", fontsize=10, va="center")

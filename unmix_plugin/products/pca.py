@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
@@ -20,23 +20,50 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.camera_paths import resized
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.model import Model
 from unmix_plugin.figures.picture_grid import over_neutral
 from unmix_plugin.formats.files import write_file
 from unmix_plugin.formats.png import rgba_png_bytes
+from unmix_plugin.products.product import Job, Product
 from unmix_plugin.spectral.composition import OCCUPIED_ACCUMULATION, Materials
 from unmix_plugin.spectral.pca import PcaColours
+from unmix_plugin.trained.run_views import ViewChoice
 from unmix_plugin.trained.view_rendering import RenderedView, as_numpy
 
+if TYPE_CHECKING:
+    from unmix_plugin.engine.model import Model
+
 PcaOf = Literal["spectra", "abundances"]
-"""What has its components taken."""
 
 _PIXELS = 48 * 48
 """Of each view that the components are found from."""
 
-
 _LEAST_EXPLAINED = 1e-6
 """Part of the variance that a component has to explain to be shown."""
+
+
+@dataclass(frozen=True)
+class Pca(Product):
+    """Principal components as colours, the same in all views: VIEW.png, pixel by pixel, and components.csv, which says
+    what red, green and blue stand for."""
+
+    name = "pca"
+
+    of: PcaOf = "spectra"
+    """What has its components taken."""
+    views: ViewChoice = "eval"
+    """Which of the scene's views to render."""
+
+    def write(self, job: Job) -> list[Path]:
+        """Find the components of all views, then paint each."""
+        views, model = job.views(self.views), job.loaded.model
+        job.claim([*(pca_path(job.folder, view.name) for view in views), components_path(job.folder)])
+        seen = [survey_view(model, view.camera, self.of) for view in job.follow("finding components", views)]
+        components = find_components(seen, self.of)
+        written = [
+            write_pca(job.folder, view.name, job.render(view), components)
+            for view in job.follow("rendering views", views)
+        ]
+        return [*written, write_components(job.folder, components, job.materials)]
 
 
 @dataclass(frozen=True)

@@ -9,25 +9,56 @@ Notation: `P` points.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.formats.ply import write_ply
-from unmix_plugin.products.cloud import plane_normals, stands_alone, thinned
-from unmix_plugin.products.point_scores import PointScore
-from unmix_plugin.scenes.scene import Normalisation
-from unmix_plugin.spectral.composition import Materials
-from unmix_plugin.trained.surface import SurfacePoints
-from unmix_plugin.trained.surface_appearance import SurfaceLooks
-from unmix_plugin.trained.world_frame import directions_to_world
+from unmix_plugin.products.cloud import is_outlier, plane_normals, thinned
+from unmix_plugin.products.product import Job, Product
 
-RAYS_PER_POINT = 5
+if TYPE_CHECKING:
+    from unmix_plugin.products.point_scores import PointScore
+    from unmix_plugin.scenes.scene import Normalisation
+    from unmix_plugin.spectral.composition import Materials
+    from unmix_plugin.trained.surface import SurfacePoints
+
+_RAYS_PER_POINT = 5
 """Rays cast for each point asked for: many miss, and an even cover needs a choice."""
 
 _COUNT_BOUNDS = (1, 10_000_000)
+
+
+@dataclass(frozen=True)
+class PointCloud(Product):
+    """The surface as points: points.ply with position and normal in the scene's world coordinates, colour, material and
+    every abundance of each point, and with --outputs more numbers."""
+
+    name = "point-cloud"
+
+    num_points: int = 100_000
+    """Most points to write; they cover what the run's cameras see evenly."""
+    outputs: tuple[str, ...] = ()
+    """Numbers to add to each point: spectral indices and targets, as in index:ndvi target:ace:paint.csv."""
+
+    def write(self, job: Job) -> list[Path]:
+        """Look through all cameras of the run, clean and thin what they see."""
+        from unmix_plugin.products.point_scores import require_point_scores
+
+        count, materials = require_count(self.num_points), job.materials
+        scores = require_point_scores(self.outputs, materials.bands)
+        job.claim([point_cloud_path(job.folder)])
+        surface = job.surface(_RAYS_PER_POINT * count)
+        with job.working("cleaning and thinning the points"):
+            path, written = write_point_cloud(
+                job.folder, surface.points(), count, materials, job.frame, scores
+            )
+        job.say(f"{written} points")
+        return [path]
 
 
 def point_cloud_path(folder: Path) -> Path:
@@ -71,7 +102,10 @@ def write_point_cloud(
         RunError: there is no point, or the disk is full or refuses.
         SpectrumError: too few points to judge a target against, or all are alike.
     """
-    points = points.select(torch.from_numpy(~stands_alone(points.positions.numpy())))
+    from unmix_plugin.trained.surface_appearance import SurfaceLooks
+    from unmix_plugin.trained.world_frame import directions_to_world
+
+    points = points.select(torch.from_numpy(~is_outlier(points.positions.numpy())))
     if len(points) == 0:
         raise RunError(
             "no ray of the run's cameras ends on a surface: train longer, or there is nothing to export"

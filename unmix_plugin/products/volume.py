@@ -7,18 +7,43 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from unmix_plugin.atomic_files import whole_file, write_errors_as
-from unmix_plugin.model import UnmixModel
-from unmix_plugin.scenes.scene import Normalisation
-from unmix_plugin.trained.density_grid import GridPoints, sample_slice
-from unmix_plugin.trained.world_frame import affine_to_world
+from unmix_plugin.products.product import Job, Product
+
+if TYPE_CHECKING:
+    from unmix_plugin.model import UnmixModel
+    from unmix_plugin.scenes.scene import Normalisation
+    from unmix_plugin.trained.density_grid import GridPoints
 
 _FASTEST = 1
 """Compression that the disk doesn't wait for; most of a volume is empty and shrinks to nothing anyway."""
+
+
+@dataclass(frozen=True)
+class Volume(Product):
+    """Density and abundances on a regular grid: volume.npz with `density` (X, Y, Z), per world unit, `abundances`
+    (X, Y, Z, K), the matrix `index_to_world`, and names and spectra of the endmembers."""
+
+    name = "volume"
+
+    resolution: int = 128
+    """Cells along the longest edge of the scene box."""
+
+    def write(self, job: Job) -> list[Path]:
+        """Sample the field, slice by slice."""
+        from unmix_plugin.trained.density_grid import GridPoints
+
+        model = job.model
+        grid = GridPoints.over(model.renderer.aabb, self.resolution)
+        job.claim([volume_path(job.folder)])
+        slices = job.follow("sampling the field", range(grid.shape[0]))
+        return [write_volume(job.folder, model, grid, job.frame, slices)]
 
 
 def volume_path(folder: Path) -> Path:
@@ -44,6 +69,9 @@ def write_volume(
     Raises:
         RunError: the disk is full or refuses.
     """
+    from unmix_plugin.trained.density_grid import sample_slice
+    from unmix_plugin.trained.world_frame import affine_to_world
+
     path, materials = volume_path(folder), model.materials
     density = np.zeros(grid.shape, dtype=np.float32)
     others = {

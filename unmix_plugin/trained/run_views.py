@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.runs.load_run import SceneRecord
+from unmix_plugin.errors import ConfigError, did_you_mean
+
+if TYPE_CHECKING:
+    from unmix_plugin.engine.runs.load_run import SceneRecord
 
 ViewChoice = Literal["eval", "train", "all"]
 """Evaluation views, training views, or the ones and then the others."""
@@ -31,6 +35,27 @@ def views_of(scene: SceneRecord, choice: ViewChoice) -> list[RunView]:
         for split, cameras in chosen.items()
         for index, name in enumerate(_names(scene, split, len(cameras)))
     ]
+
+
+def find_view(numbered: Sequence[RunView], wanted: str, others: Sequence[RunView] = ()) -> RunView:
+    """A view by its name, or by its number from 0.
+
+    Args:
+        numbered: The views that numbers count.
+        wanted: Name or number; a name goes first.
+        others: Views that can be had by name only.
+    Raises:
+        ConfigError: there is none.
+    """
+    by_name = {view.name: view for view in (*others, *numbered)}
+    if wanted in by_name:
+        return by_name[wanted]
+    if wanted.isdecimal() and int(wanted) < len(numbered):
+        return numbered[int(wanted)]
+    hint = did_you_mean(wanted, list(by_name), likeness=0.4, form=" ({})")
+    raise ConfigError(
+        f"no view {wanted!r}{hint}; give a number from 0 to {len(numbered) - 1}, or a name such as {numbered[0].name}"
+    )
 
 
 def _names(scene: SceneRecord, split: str, count: int) -> list[str]:

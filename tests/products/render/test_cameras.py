@@ -82,7 +82,7 @@ BAD = {
     "unknown view": ({"only": ("view_9",)}, r"no view 'view_9' \(did you mean view_8 or"),
     "number beyond": (
         {"only": ("3",)},
-        "no view '3'; there are 3: numbers 0 to 2, or names from view_6 to view_8",
+        "no view '3'; give a number from 0 to 2, or a name such as view_6",
     ),
     "size twice": ({"size": (4, 4), "downscale": 2}, "--size and --downscale both say"),
     "no size": ({"size": (0, 4)}, "--size: 0 x 4 pixels"),

@@ -12,7 +12,7 @@ from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.errors import ConfigError, did_you_mean
 from unmix_plugin.trained.camera_files.camera_files import read_camera_file
 from unmix_plugin.trained.camera_files.camera_json import check_frames_per_second, check_size
-from unmix_plugin.trained.run_views import RunView, views_of
+from unmix_plugin.trained.run_views import RunView, find_view, views_of
 from unmix_plugin.trained.world_frame import world_frame
 
 DATASET_CAMERAS = ("dataset-eval", "dataset-train")
@@ -117,19 +117,8 @@ def _check_frames(source: str, num_frames: int) -> None:
 
 def _only(views: Sequence[RunView], wanted: Sequence[str]) -> tuple[RunView, ...]:
     """The views with these names or numbers, in their own order."""
-    names = [view.name for view in views]
-    chosen: set[int] = set()
-    for word in wanted:
-        if word in names:
-            chosen.add(names.index(word))
-        elif word.isdecimal() and int(word) < len(names):
-            chosen.add(int(word))
-        else:
-            raise ConfigError(
-                f"no view {word!r}{_near(word, names)}; there are {len(names)}: numbers 0 to {len(names) - 1}, or "
-                f"names from {names[0]} to {names[-1]}"
-            )
-    return tuple(view for index, view in enumerate(views) if index in chosen or not wanted)
+    chosen = {find_view(views, one).name for one in wanted}
+    return tuple(view for view in views if not wanted or view.name in chosen)
 
 
 def _near(word: str, known: Sequence[str]) -> str:

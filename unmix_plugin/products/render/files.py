@@ -15,7 +15,7 @@ import numpy as np
 
 from unmix_plugin.figures.picture_canvas import Canvas, canvas_size
 from unmix_plugin.formats.envi_cube import envi_cube_paths, envi_cube_rows
-from unmix_plugin.formats.exr import write_exr
+from unmix_plugin.formats.exr import layer_names, write_exr
 from unmix_plugin.formats.files import write_file
 from unmix_plugin.formats.npy import npy_rows
 from unmix_plugin.formats.png import indexed_png_bytes, rgba_png_bytes
@@ -268,6 +268,5 @@ def _exr_names(output: RenderOutput, setting: Setting) -> list[str]:
     if kind == "vectors":
         return [f"{output.file_name}.{axis}" for axis in "XYZ"]
     if kind == "shares":
-        # A dot would part layers.
-        return [f"{output.file_name}.{name.replace('.', '_')}" for name in setting.materials.names]
+        return layer_names(output.file_name, setting.materials.names)
     return ["Z" if output.name == "depth" else output.file_name.replace(".", "_")]

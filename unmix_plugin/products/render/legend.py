@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from unmix_plugin.figures.picture_grid import ColourScale
-from unmix_plugin.formats.files import figure_bytes
+from unmix_plugin.figures.plotting import draw_colour_bar, draw_swatch, figure_bytes
 from unmix_plugin.products.render.outputs import Product, RenderOutput
 from unmix_plugin.products.render.pictures import Palette
 
@@ -15,7 +13,6 @@ _WIDTH, _BAR_ROW, _NAME_ROW, _MARGIN = 5.2, 0.66, 0.26, 0.16
 """Inches."""
 _NAMES_A_ROW = 3
 _LONGEST_NAME = 24
-_DPI = 130
 _FONT_PT = 9
 
 
@@ -40,36 +37,16 @@ def draw_legend(output: RenderOutput, palette: Palette) -> bytes:
     for index, (name, colour) in enumerate(names):
         row, column = divmod(index, _NAMES_A_ROW)
         left = _MARGIN + column * (_WIDTH - 2 * _MARGIN) / _NAMES_A_ROW
-        _draw_name(figure, name, colour, (left, top - (row + 1) * _NAME_ROW), height)
-    return figure_bytes(figure, _DPI)
+        bottom = top - (row + 1) * _NAME_ROW
+        draw_swatch(figure, colour, (left, bottom + 0.05))
+        place = ((left + 0.22) / _WIDTH, (bottom + 0.06) / height)
+        figure.text(*place, name[:_LONGEST_NAME], fontsize=_FONT_PT, va="bottom")
+    return figure_bytes(figure)
 
 
 def _draw_bar(figure: Any, title: str, scale: ColourScale, bottom: float, height: float) -> None:
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-
     box = (_MARGIN / _WIDTH, (bottom + 0.3) / height, 1 - 2 * _MARGIN / _WIDTH, 0.14 / height)
-    mappable = ScalarMappable(Normalize(scale.low, scale.high), scale.colour_map)
-    bar = figure.colorbar(mappable, cax=figure.add_axes(box), orientation="horizontal")
+    bounds = (scale.low, scale.high)
+    bar = draw_colour_bar(figure, figure.add_axes(box), scale.colour_map, bounds, "horizontal")
     bar.ax.tick_params(labelsize=_FONT_PT - 1, length=2, pad=2)
     bar.ax.set_title(title, fontsize=_FONT_PT, loc="left", pad=3)
-
-
-def _draw_name(
-    figure: Any, name: str, colour: np.ndarray, corner: tuple[float, float], height: float
-) -> None:
-    from matplotlib.patches import Rectangle
-
-    left, bottom = corner
-    square = Rectangle(
-        (left / _WIDTH, (bottom + 0.05) / height),
-        0.15 / _WIDTH,
-        0.15 / height,
-        transform=figure.transFigure,
-        facecolor=tuple(colour),
-        edgecolor="0.3",
-        linewidth=0.6,
-    )
-    figure.add_artist(square)
-    place = ((left + 0.22) / _WIDTH, (bottom + 0.06) / height)
-    figure.text(*place, name[:_LONGEST_NAME], fontsize=_FONT_PT, va="bottom")

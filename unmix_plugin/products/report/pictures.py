@@ -17,7 +17,8 @@ from unmix_plugin.figures.html_page import (
     swatch,
     table,
 )
-from unmix_plugin.figures.picture_grid import NEUTRAL, Colour, ColourScale, paint
+from unmix_plugin.figures.picture_grid import NEUTRAL, ColourScale, paint
+from unmix_plugin.figures.plotting import RIGHT, WRONG, Colour
 from unmix_plugin.figures.svg_chart import Chart, Line, draw_chart, draw_legend
 from unmix_plugin.products.abundances import SHARE_SCALE
 from unmix_plugin.products.evaluation_pictures import MaterialLook, material_look
@@ -29,7 +30,6 @@ from unmix_plugin.trained.run_materials import endmember_colours
 
 _SHOWN_VIEWS, _WORST_VIEWS = 3, 3
 _MAP_COLUMNS = (7, 6, 5)
-_RIGHT, _WRONG = (0.80, 0.84, 0.80), (0.80, 0.15, 0.15)
 
 
 def views_section(views: ReportViews) -> Section:
@@ -117,7 +117,7 @@ def segmentation_section(views: ReportViews) -> Section:
         for index, name in enumerate(look.pred_names)
         if index not in scores.matching
     ]
-    extra: list[tuple[str, Colour]] = [("right", _RIGHT), ("wrong", _WRONG)]
+    extra: list[tuple[str, Colour]] = [("right", RIGHT), ("wrong", WRONG)]
     html += figures(panels, 3) + _colour_legend([*look.true_entries, *surplus, *extra])
     return Section("segmentation", "Segmentation", html + _iou_table(look, scores.matching, scores.iou))
 
@@ -146,7 +146,7 @@ def _against_labels(view: ShownView, look: MaterialLook, matching: Mapping[int, 
     labels = view.labels if view.labels is not None else np.full_like(view.ids, NOTHING_ID)
     as_true = np.full(256, NOTHING_ID, dtype=np.uint8)
     as_true[list(matching)] = list(matching.values())
-    agreement = np.where((as_true[view.ids] != labels)[..., None], _WRONG, _RIGHT)
+    agreement = np.where((as_true[view.ids] != labels)[..., None], WRONG, RIGHT)
     agreement[labels == NOTHING_ID] = NEUTRAL
     true = paint_ids(labels, dict(enumerate(look.true_colours)))
     return [

@@ -2,35 +2,90 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.products.product import Job, Product
 
-from unmix_plugin.engine.runs.load_run import LoadedModel
-from unmix_plugin.figures.html_page import Section, paragraph, render_page
-from unmix_plugin.formats.files import write_file
-from unmix_plugin.products.report.materials import materials_section
-from unmix_plugin.products.report.pictures import (
-    abundances_section,
-    error_section,
-    segmentation_section,
-    views_section,
-    worst_section,
-)
-from unmix_plugin.products.report.run import (
-    figures_section,
-    scene_name,
-    scene_section,
-    settings_section,
-    training_section,
-    versions_section,
-)
-from unmix_plugin.products.report.views import ReportViews
-from unmix_plugin.spectral.library.material_library import MaterialLibrary
-from unmix_plugin.trained.evaluation import finite_or_none
-from unmix_plugin.trained.library_matches import light_of
+if TYPE_CHECKING:
+    from unmix_plugin.products.report.views import ReportViews
+    from unmix_plugin.scenes.scene import Scene
+    from unmix_plugin.trained.run_views import RunView
+
+_VIEWS_WITH_SHARES = 2
+
+
+@dataclass(frozen=True)
+class Report(Product):
+    """One HTML file about the run, report.html, which needs nothing else: scene, views, materials with their nearest
+    known ones, abundances, segmentation, figures of merit, errors, training, settings. Measured images and labels are
+    shown where the scene is at hand."""
+
+    name = "report"
+
+    max_views: int = 24
+    """Most evaluation views to render; of more, an even choice."""
+    data: Path | None = None
+    """Scene folder, where it is no longer where the run was trained on it."""
+    library: tuple[Path, ...] = ()
+    """Own reflectances to compare with too: .csv files or ENVI spectral libraries."""
+
+    def write(self, job: Job) -> list[Path]:
+        """Render, compare and lay out."""
+        from unmix_plugin.products.report.layout import write_report
+        from unmix_plugin.products.report.views import evenly
+        from unmix_plugin.spectral.library.material_library import library_with
+
+        if self.max_views < 1:
+            raise ConfigError(f"--max-views is {self.max_views}; choose at least 1")
+        job.claim([report_path(job.folder)])
+        library = library_with(self.library)
+        chosen = evenly(job.views("eval"), self.max_views)
+        views, notes = self._look(job, chosen), []
+        if self._is_edited:
+            notes.append(
+                "Edited: what is rendered here is the run with the edits or the light asked for; figures and training "
+                "are those of the run itself."
+            )
+        if len(chosen) < len(job.loaded.scene.eval_cameras):
+            notes.append(f"Rendered: {len(chosen)} of {len(job.loaded.scene.eval_cameras)} evaluation views.")
+        with job.working("laying out the report"):
+            return [write_report(job.folder, job.loaded, views, library, _stored_figures(job), notes)]
+
+    @property
+    def _is_edited(self) -> bool:
+        return self.edits is not None or self.illuminant is not None
+
+    def _look(self, job: Job, chosen: list[RunView]) -> ReportViews:
+        """Render the views, and compare each with what was measured, if that is at hand and still fits."""
+        from unmix_plugin.products.report.views import ReportViews, evenly
+        from unmix_plugin.trained.evaluation import Evaluation, scene_truth, view_truth
+
+        materials, scene = job.materials, self._scene(job)
+        evaluation = None
+        if scene is not None:
+            evaluation = Evaluation(scene_truth(scene), materials.endmembers, materials.names)
+        with_shares = {view.name for view in evenly(chosen, _VIEWS_WITH_SHARES)}
+        views = ReportViews(materials, evaluation, with_shares)
+        indices = {} if scene is None else {frame.name: index for index, frame in enumerate(scene.frames)}
+        for view in job.follow("rendering views", chosen):
+            truth = None if scene is None else view_truth(scene, indices[view.name])
+            views.add(view.name, job.render(view), truth)
+        return views
+
+    def _scene(self, job: Job) -> Scene | None:
+        from unmix_plugin.trained.find_scene import scene_at_hand
+
+        if self._is_edited:
+            return None
+        with job.working("looking for the scene"):
+            scene = scene_at_hand(job.loaded.scene.summary, job.loaded.run.path, self.data)
+        if scene is None:
+            job.say("the scene is not at hand: nothing measured in the report (--data says where it is)")
+        return scene
 
 
 def report_path(folder: Path) -> Path:
@@ -38,60 +93,11 @@ def report_path(folder: Path) -> Path:
     return folder / "report.html"
 
 
-def write_report(
-    folder: Path,
-    loaded: LoadedModel,
-    views: ReportViews,
-    library: MaterialLibrary,
-    stored_figures: dict[str, Any] | None,
-    notes: Sequence[str],
-) -> Path:
-    """Write `report.html`.
-
-    Args:
-        folder: Where to write; it is made.
-        loaded: The run.
-        views: All views that are to be shown have been added.
-        library: Known materials.
-        stored_figures: What `eval/metrics.json` has; None without it: then those of `views`, if the truth was at hand.
-        notes: What a reader has to know first.
-    Raises:
-        RunError: the disk is full or refuses.
-    """
-    materials = views.materials
-    values, source = stored_figures, "From the run's eval/metrics.json."
-    if values is None and views.evaluation is not None:
-        values = finite_or_none(views.evaluation.figures())
-        source = f"Of the {len(views.shown)} views rendered for this report."
-    light = light_of(loaded.model)
-    sections = [
-        scene_section(loaded, materials, values),
-        views_section(views),
-        materials_section(materials, views.proportions, light, library, _true_materials(loaded)),
-        abundances_section(views),
-        segmentation_section(views),
-        figures_section(values, source),
-        error_section(views),
-        worst_section(views),
-        training_section(loaded),
-        settings_section(loaded),
-        versions_section(loaded, ()),
-    ]
-    shown = [section for section in sections if section is not None]
-    if notes:
-        warnings = "".join(paragraph(note, "warning") for note in notes)
-        shown[0] = Section(shown[0].key, shown[0].title, warnings + shown[0].html)
-    title = f"{scene_name(loaded)}: spectral unmixing report"
-    subtitle = f"{loaded.config.method_name}, run {loaded.run.path.name}"
-    return write_file(report_path(folder), render_page(title, subtitle, shown).encode())
-
-
-def _true_materials(loaded: LoadedModel) -> tuple[list[str], np.ndarray] | None:
-    """Names and radiance of the true materials in the light of the model, as far as the run knows them."""
-    summary = loaded.scene.summary
-    if not summary.get("endmembers"):
+def _stored_figures(job: Job) -> dict[str, Any] | None:
+    """What `unmix-eval` found, if it was run."""
+    path = job.loaded.run.eval / "metrics.json"
+    try:
+        found = json.loads(path.read_bytes())
+    except (OSError, ValueError):
         return None
-    reflectance = np.array(summary["endmembers"], dtype=np.float64)
-    light = light_of(loaded.model)
-    names = summary.get("material_names") or [f"material {index}" for index in range(len(reflectance))]
-    return [str(name) for name in names], reflectance if light is None else reflectance * light
+    return found if isinstance(found, dict) else None

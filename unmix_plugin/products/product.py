@@ -3,32 +3,31 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import tyro
 
 from unmix_plugin.engine.configs import DeviceName
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.formats.files import refuse_to_overwrite
+from unmix_plugin.trained.run_views import RunView, ViewChoice, views_of
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from unmix_plugin.engine.runs.load_run import LoadedModel
     from unmix_plugin.model import UnmixModel
     from unmix_plugin.scenes.scene import Normalisation
     from unmix_plugin.spectral.composition import Materials
-    from unmix_plugin.trained.run_views import RunView, ViewChoice
     from unmix_plugin.trained.surface import SeenSurface
-
-ItemT = TypeVar("ItemT")
+    from unmix_plugin.trained.view_rendering import RenderedView
 
 
 @dataclass(frozen=True)
 class Product(ABC):
-    """What every product is told."""
+    """Options that every product has."""
 
     name: ClassVar[str]
     """Of the product, and of its folder."""
@@ -62,18 +61,53 @@ class Product(ABC):
 
 
 @dataclass(frozen=True)
+class ViewProduct(Product):
+    """A product of which every view has files of its own."""
+
+    views: ViewChoice = "eval"
+    """Which of the scene's views to render."""
+
+    @abstractmethod
+    def paths(self, folder: Path, view: str) -> list[Path]:
+        """Files of a view."""
+
+    @abstractmethod
+    def write_view(self, folder: Path, view: str, rendered: RenderedView, materials: Materials) -> list[Path]:
+        """Write the files of a view, in a folder that is made.
+
+        Raises:
+            RunError: the disk is full or refuses.
+        """
+
+    def write(self, job: Job) -> list[Path]:
+        """Render the views, one after the other, and write each."""
+        views = job.views(self.views)
+        job.claim([path for view in views for path in self.paths(job.folder, view.name)])
+        return [
+            path
+            for view in job.follow("rendering views", views)
+            for path in self.write_view(job.folder, view.name, job.render(view), job.materials)
+        ]
+
+
+@dataclass(frozen=True)
 class Job:
-    """A loaded run, a folder to write to, and a place to show how far things are."""
+    """A loaded run, a folder to write to, and ways to show how far the work is."""
 
     loaded: LoadedModel
     folder: Path
     """Absolute."""
     overwrite: bool
-    console: Console
+    say: Callable[[str], None]
+    """Show a line."""
+    working: Callable[[str], AbstractContextManager[None]]
+    """Context that shows that something of unknown length is under way."""
+    follow: Callable[[str, Sequence[Any]], Iterator[Any]]
+    """The items given, while it is shown how many are done."""
 
     @property
     def materials(self) -> Materials:
-        """Of the model.
+        """The model's materials.
 
         Raises:
             ConfigError: its method does not unmix spectra.
@@ -84,12 +118,11 @@ class Job:
 
     @property
     def model(self) -> UnmixModel:
-        """The model, where more is asked of it than every method that unmixes spectra has.
+        """The model, for products that need more than every method that unmixes spectra has.
 
         Raises:
             ConfigError: it is not of this method.
         """
-        from unmix_plugin.errors import ConfigError
         from unmix_plugin.model import UnmixModel
 
         model = self.loaded.model
@@ -112,15 +145,17 @@ class Job:
         Raises:
             ConfigError: one of them exists, and overwriting was not asked for.
         """
-        from unmix_plugin.formats.files import refuse_to_overwrite
-
         refuse_to_overwrite(paths, self.overwrite)
 
     def views(self, choice: ViewChoice) -> list[RunView]:
         """Views of the run."""
-        from unmix_plugin.trained.run_views import views_of
-
         return views_of(self.loaded.scene, choice)
+
+    def render(self, view: RunView) -> RenderedView:
+        """A view of the run."""
+        from unmix_plugin.trained.view_rendering import render_view
+
+        return render_view(self.loaded.model, view.camera)
 
     def surface(self, num_rays: int) -> SeenSurface:
         """What all cameras of the run see, with about so many rays."""
@@ -131,21 +166,3 @@ class Job:
         for camera in self.follow("looking at the surface", cameras):
             surface.look(camera)
         return surface
-
-    def follow(self, doing: str, items: Sequence[ItemT]) -> Iterator[ItemT]:
-        """The items, while it is shown how many are done."""
-        from unmix_plugin.commands.reporting import follow
-
-        return follow(self.console, doing, items)
-
-    def working(self, doing: str) -> AbstractContextManager[None]:
-        """Context that shows that something of unknown length is under way."""
-        from unmix_plugin.commands.reporting import working
-
-        return working(self.console, doing)
-
-    def say(self, text: str) -> None:
-        """A line for the user."""
-        from unmix_plugin.commands.reporting import say
-
-        say(self.console, text)
