@@ -11,7 +11,7 @@ import numpy as np
 from unmix_plugin.atomic_files import make_folder, write_file
 from unmix_plugin.errors import ConfigError
 
-__all__ = ["array_bytes", "figure_bytes", "make_folder", "refuse_to_overwrite", "write_file"]
+__all__ = ["array_bytes", "make_folder", "refuse_to_overwrite", "write_file"]
 
 
 def refuse_to_overwrite(paths: Collection[Path], overwrite: bool) -> None:
