@@ -1,5 +1,6 @@
 """Recipes as text: what is read, what is refused and where, and that writing is the inverse of reading."""
 
+import time
 from functools import partial
 from pathlib import Path
 
@@ -122,7 +123,7 @@ def test_a_recipe_that_cannot_be_read_is_named(tmp_path):
     with pytest.raises(ConfigError, match=r"can't read the recipe .*gone\.yml: No such file"):
         read_recipe(tmp_path / "gone.yml")
     (tmp_path / "latin.yml").write_bytes("edits: [rename: {endmember: 0, name: blé}]".encode("latin-1"))
-    with pytest.raises(ConfigError, match=r"latin\.yml: it is no text in UTF-8"):
+    with pytest.raises(ConfigError, match=r"latin\.yml: it is not text in UTF-8"):
         read_recipe(tmp_path / "latin.yml")
 
 
@@ -137,10 +138,10 @@ def test_a_recipe_that_cannot_be_read_is_named(tmp_path):
         ("edits: {swap: [0, 1]}", "line 1: edits must be a list; found a mapping"),
         ("edits:\n\n- swp: [0, 1]", "line 3: there is no edit 'swp'; did you mean swap?"),
         ("edits: [swap]", "an edit is one of swap, replace, retint, scale"),
-        ("edits:\n- swap: [0, 1, 2]", "line 2: swap takes two endmembers; found 3"),
-        ("edits:\n- swap: [0, true]", "line 2: an endmember is meant by its name or number; found 'true'"),
+        ("edits:\n- swap: [0, 1, 2]", "line 2: swap takes a list of 2; found 3"),
+        ("edits:\n- swap: [0, true]", "line 2: an endmember is given by its name or number; found 'true'"),
         ("edits:\n- swap: [0, 1.5]", "found '1.5'"),
-        ("edits:\n- remove: []", "line 2: remove: no endmember is named"),
+        ("edits:\n- remove: []", "line 2: remove: no endmember is given"),
         ("edits:\n- scale: {endmember: 1}", "line 2: scale needs factor"),
         ("edits:\n- scale: {endmember: 1, factor: 2,\n    factor: 3}", "line 3: scale has 'factor' twice"),
         ("edits:\n- scale: {endmember: 1, factr: 2}", "scale has no 'factr'; did you mean factor?"),
@@ -168,12 +169,12 @@ def test_a_recipe_that_cannot_be_read_is_named(tmp_path):
         ("edits:\n- rename: {endmember: 1, name: 'a,b'}", "a name has at most 40 letters, digits"),
         ("edits:\n- rename: {endmember: 1, name: 7}", "name must be text; found '7'; put it in quotes"),
         ("edits:\n- rename: {endmember: 1, name: '7'}", "starts with a letter; found '7'"),
-        ("edits:\n- gloss: {endmember: 1}", "gloss needs a scale or a colour"),
+        ("edits:\n- gloss: {endmember: 1}", "gloss needs scale or colour"),
         ("edits:\n- replace: {endmember: 1}", "replace takes either library"),
         ("edits:\n- replace: {endmember: 1, library: a, file: b}", "replace takes either library"),
         (
             "edits:\n- replace: {endmember: 1, library: a, spectrum: b}",
-            "spectrum says which of a file's spectra",
+            "line 2: replace: spectrum goes with file, not with library",
         ),
         (
             "edits:\n- replace: {endmember: 1, file: a, extrapolate: 3}",
@@ -185,11 +186,25 @@ def test_a_recipe_that_cannot_be_read_is_named(tmp_path):
         ("edits: [swap: [0, !!python/name:os.system x]]", "only plain data is read"),
         (
             "edits: [swap: [0, !!python/object/apply:os.getcwd []]]",
-            "an endmember is meant by its name or number",
+            "an endmember is given by its name or number",
         ),
         ("edits: " + 3000 * "[", "not YAML"),
         ("edits: [\x00]", "not YAML"),
-        ("#" * 1_000_001, "1000001 characters are too many"),
+        ("#" * 100_001, "100001 characters are too many"),
+        ("edits:" + 1001 * "\n- remove: 0", "line 2: edits has 1001 items; at most 1000"),
+        ("edits: [remove: [" + 256 * "0," + "]]", "remove has 256 items; at most 255"),
+        ("edits:\n- scale: {endmember: 0, factor: !!bool maybe}", "line 2: can't read 'maybe' as bool"),
+        ("edits:\n- scale: {endmember: 0, factor: !!float ''}", "line 2: can't read nothing as float"),
+        ("edits:\n- scale: {endmember: 0, factor: " + 400 * "9" + "}", "line 2: can't read '9999"),
+        ("edits:\n- remove: 1:30", "line 2: can't read '1:30' as a number"),
+        (
+            "edits:\n- replace: {endmember: 0, library: 2026-99-99}",
+            "line 2: can't read '2026-99-99' as timestamp",
+        ),
+        ('edits:\n- replace: {endmember: 0, file: "a\\0b"}', "line 2: file has a character that no name"),
+        ('edits:\n- replace: {endmember: 0, file: "\\ud800"}', "line 2: file has a character that no name"),
+        ("%YAML " + 5000 * "1" + ".1\n---\nedits: []", "not YAML"),
+        ('edits: ["\\UFFFFFFFF"]', "not YAML"),
     ],
 )
 def test_what_is_wrong_is_said_with_its_line(text, message):
@@ -212,3 +227,14 @@ def test_aliases_are_plain_data_too():
     recipe = recipe_from_yaml("edits:\n- remove: &some [0, 1]\n- isolate: *some\n")
     assert recipe.operations == (Remove((0, 1)), Isolate((0, 1)))
     assert "not YAML" in fault_of("edits: &a [*a]") or "an edit is one of" in fault_of("edits: &a [*a]")
+
+
+def test_a_recipe_of_the_greatest_size_is_read_in_time_and_aliases_do_not_multiply_it():
+    """An alias costs as much as what it repeats: the limits on both bound the product."""
+    many = ", ".join(["7"] * 255)
+    text = f"edits:\n- remove: &all [{many}]\n" + 999 * "- remove: *all\n"
+    started = time.perf_counter()
+    recipe = recipe_from_yaml(text)
+    assert time.perf_counter() - started < 20  # as measured: 2
+    assert len(recipe.operations) == 1000
+    assert recipe.operations[-1] == Remove((7,) * 255)

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float64
 from torch import nn
 
-from unmix_plugin.editing.carrying_out import carry_out
+from unmix_plugin.editing.handlers import carry_out
 from unmix_plugin.editing.edited_field import EditedField
 from unmix_plugin.editing.light import relighting_factors
 from unmix_plugin.editing.material_state import MaterialState

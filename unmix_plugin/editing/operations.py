@@ -1,6 +1,7 @@
-"""What can be done to the materials of a run: one value a change, validated where it is made.
+"""What can be done to the materials of a run: one dataclass for each kind of edit, validated where it is made.
 
-Endmembers are meant by their name at that point of the recipe, or by their number from 0. Colours are sRGB in [0, 1].
+An endmember is given by its name at that point of the recipe, or by its number from 0. Colours are sRGB in [0, 1].
+Fields are also the keys of a recipe's YAML, see `yaml_fields`.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ Colour: TypeAlias = tuple[float, float, float]
 """sRGB, [0, 1]."""
 
 Match: TypeAlias = Literal["picture", "spectrum"]
-"""What shall have a colour: the material as cameras see it, shaded, or its spectrum in full light."""
+"""What is given a colour: the material as cameras see it, shaded, or its spectrum in full light."""
 
 LONGEST_NAME = 40
 GREATEST_FACTOR = 1000.0
@@ -27,20 +28,25 @@ GREATEST_FACTOR = 1000.0
 
 @dataclass(frozen=True)
 class Operation:
-    """What every change has; each kind is a class of its own."""
+    """One edit; each kind is a class of its own."""
 
     kind: ClassVar[str]
-    """The word for it in a recipe."""
+    """Its name in a recipe."""
+    is_list: ClassVar[bool] = False
+    """Whether a recipe has its fields as a list, rather than by name."""
+    needs_one_of: ClassVar[tuple[str, ...]] = ()
+    """Fields of which a recipe must give at least one."""
 
     line: int | None = field(default=None, compare=False, kw_only=True)
-    """Where it stands in the recipe's file, from 1; None where there is none."""
+    """In the recipe's file, from 1; None if it comes from no file."""
 
 
 @dataclass(frozen=True)
 class Swap(Operation):
-    """Two endmembers exchange their spectra: each is where it was and looks like the other."""
+    """Two endmembers exchange their spectra: each stays where it is and looks like the other."""
 
     kind = "swap"
+    is_list = True
 
     first: Endmember
     second: Endmember
@@ -50,18 +56,18 @@ class Swap(Operation):
 class LibrarySpectrum:
     """A measured reflectance that comes with the program."""
 
-    name: str
-    """As `spectral.library` knows it: in full, or the last part where only one has it."""
+    library: str
+    """Name in `spectral.library`: in full, or its last part if that is unique."""
 
 
 @dataclass(frozen=True)
 class FileSpectrum:
-    """A reflectance in a file of one's own."""
+    """A reflectance in a file of the user's."""
 
-    path: Path
+    file: Path
     """CSV (wavelength,name,...), or an ENVI spectral library."""
-    name: str | None = None
-    """Which spectrum of the file; None where it has one only."""
+    spectrum: str | None = None
+    """Which spectrum of the file; None if it has only one."""
 
 
 @dataclass(frozen=True)
@@ -73,12 +79,12 @@ class Replace(Operation):
     endmember: Endmember
     spectrum: LibrarySpectrum | FileSpectrum
     extrapolate: bool = False
-    """Hold the outermost values where the reflectance is not known at the run's bands."""
+    """Hold the outermost values in bands that the measured reflectance does not reach."""
 
 
 @dataclass(frozen=True)
 class Retint(Operation):
-    """An endmember's spectrum turns smoothly until it has a colour in the scene's light."""
+    """An endmember's spectrum changes smoothly until it has a colour in the scene's light."""
 
     kind = "retint"
 
@@ -110,6 +116,7 @@ class Remove(Operation):
     """Endmembers become transparent."""
 
     kind = "remove"
+    is_list = True
 
     endmembers: tuple[Endmember, ...]
 
@@ -122,6 +129,7 @@ class Isolate(Operation):
     """All endmembers but these become transparent."""
 
     kind = "isolate"
+    is_list = True
 
     endmembers: tuple[Endmember, ...]
 
@@ -154,13 +162,14 @@ class Gloss(Operation):
     """The view-dependent part becomes stronger or weaker, and takes a colour."""
 
     kind = "gloss"
+    needs_one_of = ("scale", "colour")
 
     endmember: Endmember | None = None
-    """Whose gloss, by the share that it has of a point; None for that of all."""
+    """Whose gloss, by its share of each point; None for all."""
     scale: float = 1.0
     """0 makes matt."""
     colour: Colour | None = None
-    """What highlights are mirrored in: white leaves them as they are, gold makes them golden."""
+    """Highlights take it: white leaves them as they are, gold makes them golden."""
 
     def __post_init__(self) -> None:
         _require_factor("scale", self.scale)
@@ -169,7 +178,7 @@ class Gloss(Operation):
 
 
 OPERATIONS: tuple[type[Operation], ...] = (Swap, Replace, Retint, Scale, Remove, Isolate, Rename, Gloss)
-"""Every kind of change."""
+"""Every kind of edit."""
 
 
 def _require_colour(colour: Colour) -> None:
@@ -184,4 +193,4 @@ def _require_factor(name: str, factor: float) -> None:
 
 def _require_some(endmembers: tuple[Endmember, ...]) -> None:
     if not endmembers:
-        raise ConfigError("no endmember is named; name at least one")
+        raise ConfigError("no endmember is given; give at least one")

@@ -1,4 +1,4 @@
-"""YAML as plain data whose every value knows its line: nothing of it is ever constructed but numbers and words."""
+"""YAML as plain data whose every value knows its line. Only numbers, words, true, false and null are ever constructed."""
 
 from __future__ import annotations
 
@@ -10,11 +10,15 @@ import yaml
 
 from unmix_plugin.errors import did_you_mean
 
-_MAX_CHARACTERS = 1_000_000
+_MAX_CHARACTERS = 100_000
+"""PyYAML reads about 60,000 characters a second."""
+_LONGEST_NUMBER = 40
+_LONGEST_QUOTE = 60
 
 _PLAIN_TAGS = frozenset(
     f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "timestamp")
 )
+_NUMBER_TAGS = frozenset(f"tag:yaml.org,2002:{kind}" for kind in ("int", "float"))
 
 _HEXADECIMAL = re.compile(r"#?([0-9a-fA-F]{6})")
 
@@ -25,14 +29,14 @@ class NodeError(Exception):
     def __init__(self, line: int | None, message: str) -> None:
         super().__init__(message)
         self.line = line
-        """From 1; None where the text as a whole is meant."""
+        """From 1; None if the text as a whole is meant."""
 
 
 def compose(text: str) -> yaml.Node | None:
     """The text's only document as nodes; None if it is empty.
 
     Raises:
-        NodeError: it is no YAML, more than one document, too long or too deep.
+        NodeError: it is not YAML, has more than one document, or is too long or too deep.
     """
     if len(text) > _MAX_CHARACTERS:
         raise NodeError(None, f"{len(text)} characters are too many; at most {_MAX_CHARACTERS}")
@@ -43,8 +47,9 @@ def compose(text: str) -> yaml.Node | None:
         raise NodeError(
             mark.line + 1 if mark else None, f"not YAML: {error.problem or error.context}"
         ) from error
-    except (yaml.YAMLError, RecursionError) as error:
-        raise NodeError(None, f"not YAML: {str(error).splitlines()[0]}") from error
+    except (yaml.YAMLError, RecursionError, ValueError, OverflowError) as error:
+        # The last two are PyYAML's own, of version numbers and escapes that no program can hold.
+        raise NodeError(None, f"not YAML: {str(error).partition(chr(10))[0]}") from error
 
 
 def line_of(node: yaml.Node) -> int:
@@ -63,7 +68,7 @@ def mapping(
     """The values of a mapping by key.
 
     Raises:
-        NodeError: it is no mapping; a key is unknown, repeated or missing.
+        NodeError: it is not a mapping, or a key is unknown, repeated or missing.
     """
     known = [*required, *optional]
     if not isinstance(node, yaml.MappingNode):
@@ -72,7 +77,7 @@ def mapping(
     for key_node, value in node.value:
         key = text(key_node, "a key")
         if key not in known:
-            raise fault(key_node, f"{what} has no {key!r}; {nearest(key, known)}")
+            raise fault(key_node, f"{what} has no {describe(key_node)}; {nearest(key, known)}")
         if key in found:
             raise fault(key_node, f"{what} has {key!r} twice")
         found[key] = value
@@ -82,19 +87,21 @@ def mapping(
     return found
 
 
-def sequence(node: yaml.Node, what: str) -> list[yaml.Node]:
+def sequence(node: yaml.Node, what: str, longest: int) -> list[yaml.Node]:
     """The items of a list.
 
     Raises:
-        NodeError: it is no list.
+        NodeError: it is not a list, or longer than allowed.
     """
     if not isinstance(node, yaml.SequenceNode):
         raise fault(node, f"{what} must be a list; found {describe(node)}")
+    if len(node.value) > longest:
+        raise fault(node, f"{what} has {len(node.value)} items; at most {longest}")
     return list(node.value)
 
 
 def text(node: yaml.Node, what: str) -> str:
-    """A word.
+    """A string.
 
     Raises:
         NodeError: it is something else, such as a number without quotes.
@@ -102,6 +109,8 @@ def text(node: yaml.Node, what: str) -> str:
     value = scalar(node)
     if not isinstance(value, str):
         raise fault(node, f"{what} must be text; found {describe(node)}; put it in quotes if it is text")
+    if any(letter == "\0" or "\ud800" <= letter <= "\udfff" for letter in value):
+        raise fault(node, f"{what} has a character that no name or path can have; found {describe(node)}")
     return value
 
 
@@ -137,10 +146,10 @@ def colour(node: yaml.Node, what: str) -> tuple[float, float, float]:
     """
     expected = f"{what} must be '#rrggbb' in quotes, or three numbers in [0, 1]"
     if isinstance(node, yaml.SequenceNode):
-        values = [number(item, what) for item in node.value]
-        if len(values) != 3:
-            raise fault(node, f"{expected}; found {len(values)} numbers")
-        return values[0], values[1], values[2]
+        if len(node.value) != 3:
+            raise fault(node, f"{expected}; found {len(node.value)} numbers")
+        red, green, blue = (number(item, what) for item in node.value)
+        return red, green, blue
     value = scalar(node)
     if value is None:
         raise fault(node, f"{expected}; found nothing (without quotes, # begins a comment)")
@@ -152,19 +161,22 @@ def colour(node: yaml.Node, what: str) -> tuple[float, float, float]:
 
 
 def scalar(node: yaml.Node) -> Any:
-    """A word, number, true, false, date or None; None, too, for anything that is no single value of these.
+    """A word, number, true, false, date or None; None, too, for lists and mappings.
 
     Raises:
-        NodeError: its tag asks for something else to be constructed.
+        NodeError: its tag asks for something else to be constructed, or its text does not fit its tag.
     """
     if not isinstance(node, yaml.ScalarNode):
         return None
     if node.tag not in _PLAIN_TAGS:
-        raise fault(node, f"only plain data is read; found a value with the tag {node.tag}")
+        raise fault(node, f"only plain data is read; found a value with the tag {node.tag[:_LONGEST_QUOTE]}")
+    # YAML 1.1 takes 1:30 for a number in base 60, which nobody means.
+    if node.tag in _NUMBER_TAGS and (len(node.value) > _LONGEST_NUMBER or ":" in node.value):
+        raise fault(node, f"can't read {describe(node)} as a number; put it in quotes if it is text")
     try:
         return yaml.constructor.SafeConstructor().construct_object(node)
-    except (yaml.YAMLError, ValueError) as error:
-        raise fault(node, f"can't read {node.value!r} as a value: {error}") from error
+    except (yaml.YAMLError, ValueError, KeyError, IndexError, OverflowError) as error:
+        raise fault(node, f"can't read {describe(node)} as {node.tag.rpartition(':')[2]}") from error
 
 
 def describe(node: yaml.Node) -> str:
@@ -173,9 +185,10 @@ def describe(node: yaml.Node) -> str:
         return "a mapping"
     if isinstance(node, yaml.SequenceNode):
         return f"a list of {len(node.value)}"
-    return repr(node.value) if node.value else "nothing"
+    shortened = node.value[:_LONGEST_QUOTE] + "..." if len(node.value) > _LONGEST_QUOTE else node.value
+    return repr(shortened) if shortened else "nothing"
 
 
 def nearest(word: str, known: Collection[str]) -> str:
     """Words that a reader may have meant, for the end of a message."""
-    return did_you_mean(word, known) or f"known: {', '.join(known)}"
+    return did_you_mean(word[:_LONGEST_QUOTE], known) or f"known: {', '.join(known)}"

@@ -84,16 +84,15 @@ def _replace(state: MaterialState, edit: Replace, where: str) -> None:
 def _library_of(spectrum: LibrarySpectrum | FileSpectrum) -> tuple[MaterialLibrary, str]:
     """Where a reflectance is looked up, and its name there."""
     if isinstance(spectrum, LibrarySpectrum):
-        return measured_library(), spectrum.name
-    table = read_library_table(spectrum.path)
+        return measured_library(), spectrum.library
+    table = read_library_table(spectrum.file)
     names = list(table.names)
-    if spectrum.name is None and len(names) > 1:
+    if spectrum.spectrum is None and len(names) > 1:
         raise SpectrumError(
-            f"{spectrum.path} has {len(names)} spectra ({', '.join(names[:5])}, ...); "
-            "name the one that is meant with spectrum"
+            f"{spectrum.file} has {len(names)} spectra ({', '.join(names[:5])}, ...); choose one with spectrum"
         )
-    library = MaterialLibrary(()).extended(table, spectrum.path.name)
-    return library, spectrum.name or names[0]
+    library = MaterialLibrary(()).extended(table, spectrum.file.name)
+    return library, spectrum.spectrum or names[0]
 
 
 def _retint(state: MaterialState, edit: Retint, where: str) -> None:
