@@ -1,5 +1,7 @@
 """Edits of a real model: laws of each edit, in every view, and the model itself untouched."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -292,8 +294,6 @@ def test_an_unknown_light_is_taken_as_flat_and_this_is_said():
             ["replace: {endmember: 0, library: checker/rde}"],
             "the library has no 'checker/rde'; nearest: checker/red",
         ),
-        (["retint: {endmember: 0, colour: '#0000ff'}"], "no surface has the colour #0000ff in this light"),
-        (["gloss: {colour: '#00ff00'}"], "no surface has the colour #00ff00"),
     ],
 )
 def test_what_does_not_fit_the_run_or_contradicts_is_refused_with_its_line(edits, message):
@@ -303,6 +303,24 @@ def test_what_does_not_fit_the_run_or_contradicts_is_refused_with_its_line(edits
         edited(model, *edits)
     assert str(caught.value).startswith("edits.yml, line ")
     assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("edit", "note"),
+    [
+        (
+            "retint: {endmember: 0, colour: '#0000ff'}",
+            r"retint\): red can't be #0000ff .* nearest colour, #[0-5]",
+        ),
+        ("gloss: {colour: '#00ff00'}", r"gloss\): highlights can't be #00ff00 in this light; took"),
+    ],
+)
+def test_a_colour_that_no_surface_has_becomes_the_nearest_and_the_user_is_told(edit, note):
+    model = lit_model()
+    model.endmember_names = ("red", "green", "blue")
+    [found] = edited(model, edit).metadata["edit_notes"]
+    assert re.search(note, found)
+    assert edited(model, "retint: {endmember: 0, colour: '#807060'}").metadata["edit_notes"] == []
 
 
 def test_a_swapped_look_may_be_replaced_where_it_is_now():
@@ -325,7 +343,7 @@ def test_gloss_of_a_run_without_a_view_dependent_part_is_refused():
 
 def test_files_with_several_spectra_or_per_cent_are_refused(tmp_path):
     path = write_paints(tmp_path / "paints.csv")
-    with pytest.raises(ConfigError, match=r"paints.csv has 2 spectra \(dark, ochre, ...\); name the one"):
+    with pytest.raises(ConfigError, match=r"paints.csv has 2 spectra \(dark, ochre, ...\); choose one"):
         edited(lit_model(), f"replace: {{endmember: 0, file: {path}}}")
     path.write_text("wavelength,ochre\n440,60\n660,50\n")
     with pytest.raises(ConfigError, match=r"ochre has reflectances of up to 59\.5"):

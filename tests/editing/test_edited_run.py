@@ -87,7 +87,7 @@ def test_measured_radiance_is_comparable_after_the_lights_factors():
     assert_close(edited.model.materials.endmembers.double(), expected, rtol=1e-5, atol=1e-7)
     same = apply_recipe(model, Recipe((Rename(0, "clay"),)), CAMERAS)
     assert (same.light_factors == 1).all()
-    assert (edited.note, same.note) == (None, None)
+    assert (edited.notes, same.notes) == ([], [])
 
 
 def test_a_model_without_materials_is_refused():

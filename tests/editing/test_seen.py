@@ -5,12 +5,11 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.editing.scenes import CAMERAS, edited, lit_model
+from tests.editing.scenes import CAMERAS, LIGHT, edited, lit_model
 from unmix_plugin.editing import sample_seen
 from unmix_plugin.editing.material_state import MaterialState
 from unmix_plugin.editing.seen import Look, look_at
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.composition import Coefficients, compose
 
@@ -86,15 +85,16 @@ def test_where_the_rest_of_the_pixels_is_too_bright_the_nearest_colour_is_taken(
     np.testing.assert_allclose(look.full_colour((0.2, 0.0, 0.5)), [0.0, 0.0, 2 * 0.21404], atol=1e-4)
 
 
-def test_a_colour_that_pictures_cannot_have_is_refused_with_what_is_asked():
-    with pytest.raises(
-        ConfigError, match=r"can't be #ffffff in the mean: in full light, no surface has the colour"
-    ):
-        edited(
-            lit_model(),
-            "retint: {endmember: 0, colour: '#ffffff'}",
-            seen=seen_pixels([0.1] * 50 + [0.6] * 10),
-        )
+def test_a_colour_that_pictures_cannot_have_becomes_the_nearest_that_they_can():
+    result = edited(
+        lit_model(), "retint: {endmember: 0, colour: '#ffffff'}", seen=seen_pixels([0.1] * 50 + [0.6] * 10)
+    )
+    [note] = result.metadata["edit_notes"]
+    assert "(retint): pictures of endmember_0 can't be #ffffff in this light; took the nearest colour" in note
+    brightest = result.materials.endmembers[0].detach().double() / torch.tensor(LIGHT).double()
+    assert_close(
+        brightest, torch.full_like(brightest, 1 / 0.6), rtol=1e-3, atol=0
+    )  # all that the bound allows
 
 
 def test_endmembers_that_are_hardly_seen_have_no_look():

@@ -9,6 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
+from unmix_plugin.errors import SpectrumError
 from unmix_plugin.products.metamerism import (
     Metamerism,
     find_metamers,
@@ -68,6 +69,26 @@ def test_materials_that_do_not_reach_all_bands_are_passed_over():
     longer = LIBRARY.extended(SHORT, "test")
     found = find_metamers(MATERIALS, SCENE_LIGHT, longer, BOTH)
     assert "own/short" not in found.names
+
+
+def test_bands_that_no_eye_sees_play_no_part():
+    """Neither the lights nor the library reach 1000 nm."""
+    wide = Bands.of(np.linspace(400, 1000, 61))
+    spectra = torch.full((2, 61), 0.4)
+    spectra[:, :31] = MATERIALS.endmembers
+    light = np.concatenate([SCENE_LIGHT, np.ones(30)])
+    library = LIBRARY.extended(
+        SpectraTable(Bands.of([390, 790]), ("own/wide",), np.full((1, 2), 0.4)), "test"
+    )
+    found = find_metamers(
+        Materials(wide, spectra, torch.zeros(0, 61), names=MATERIALS.names), light, library, BOTH
+    )
+    assert found.bands == Bands.of(np.linspace(400, 780, 39))
+    assert {"slate", "own/wide"} <= set(found.names)
+    assert {"slate", "paint"} in [{found.names[pair.first], found.names[pair.second]} for pair in found.pairs]
+    infrared = Bands.of(np.linspace(800, 1000, 61))
+    with pytest.raises(SpectrumError, match="no visible light"):
+        find_metamers(Materials(infrared, spectra, torch.zeros(0, 61)), None, library, BOTH)
 
 
 def test_the_table_names_materials_lights_and_differences(tmp_path):

@@ -104,8 +104,8 @@ def _subject(loaded: LoadedPipeline, recipe: Recipe | None, options: EvalOptions
     if recipe is None:
         return _Subject(loaded, model, None, loaded.run.eval, None)
     edited = apply_recipe(model, recipe, loaded.scene.train_cameras)
-    if edited.note:
-        print(edited.note)
+    for note in edited.notes:
+        print(note)
     words = ["eval", *([options.edits.stem] if options.edits else [])]
     words += [Path(options.illuminant).stem] if options.illuminant else []
     folder = loaded.run.exports / re.sub(r"[^\w.-]+", "_", "-".join(words))

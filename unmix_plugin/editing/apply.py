@@ -14,15 +14,14 @@ import torch
 from jaxtyping import Float64
 from torch import nn
 
-from unmix_plugin.editing.handlers import carry_out
 from unmix_plugin.editing.edited_field import EditedField
+from unmix_plugin.editing.handlers import carry_out
 from unmix_plugin.editing.light import relighting_factors
 from unmix_plugin.editing.material_state import MaterialState
 from unmix_plugin.editing.operations import Gloss, Replace, Retint
 from unmix_plugin.editing.recipe import Light, Recipe
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.model import UnmixModel
-from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.composition import Coefficients
 
 
@@ -43,7 +42,7 @@ def edit_model(model: UnmixModel, recipe: Recipe, seen: Coefficients | None = No
     light = _recorded_light(model.metadata)
     state = MaterialState.of(model.materials, light, seen)
     carry_out(recipe, state)
-    factors = _light_factors(state.bands, light, recipe)
+    factors = _light_factors(state, light, recipe)
     edited = _light_copy(model)
     edited.endmember_names = tuple(state.names)
     edited.endmembers = _spectra(state.spectra * factors, model)
@@ -58,9 +57,10 @@ def edit_model(model: UnmixModel, recipe: Recipe, seen: Coefficients | None = No
             model.field, torch.from_numpy(state.is_kept), torch.from_numpy(shine).float()
         )
         edited.add_module("field", edited_field.to(model.device))
+    edited.metadata = {**model.metadata, "edit_notes": [*state.notes]}
     if recipe.illuminant is not None:
         lit = factors if light is None else light * factors
-        edited.metadata = {**model.metadata, "illuminant": lit.tolist()}
+        edited.metadata["illuminant"] = lit.tolist()
     return edited
 
 
@@ -94,12 +94,14 @@ def _recorded_light(metadata: Mapping[str, Any]) -> Float64[np.ndarray, " B"] | 
 
 
 def _light_factors(
-    bands: Bands, light: Float64[np.ndarray, " B"] | None, recipe: Recipe
+    state: MaterialState, light: Float64[np.ndarray, " B"] | None, recipe: Recipe
 ) -> Float64[np.ndarray, " B"]:
     if recipe.illuminant is None:
-        return np.ones(len(bands))
+        return np.ones(len(state.bands))
     try:
-        return relighting_factors(bands, light, recipe.illuminant)
+        factors, notes = relighting_factors(state.bands, light, recipe.illuminant)
+        state.notes += notes
+        return factors
     except SpectrumError as error:
         raise ConfigError(f"{recipe.source}: {error}") from error
 

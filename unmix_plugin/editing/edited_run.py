@@ -34,7 +34,7 @@ class EditedModel:
     model: UnmixModel
     light_factors: Float64[np.ndarray, " B"]
     """What radiance measured in the scene's light is multiplied with, to compare it with what this model renders."""
-    note: str | None
+    notes: list[str]
     """What a user has to be told about the result."""
 
 
@@ -114,8 +114,11 @@ def apply_recipe(model: Model, recipe: Recipe, cameras: Cameras) -> EditedModel:
     factors = np.ones(len(model.bands))
     if recipe.illuminant is not None:
         recorded = model.metadata["illuminant"]
-        factors = np.array(edited.metadata["illuminant"]) / (1.0 if recorded is None else np.array(recorded))
-    return EditedModel(edited, factors, assumption_of_light(model.metadata, recipe))
+        before = np.ones(len(factors)) if recorded is None else np.array(recorded)
+        factors = np.array(edited.metadata["illuminant"])
+        factors = np.divide(factors, before, out=np.zeros(len(before)), where=before > 0)
+    note = assumption_of_light(model.metadata, recipe)
+    return EditedModel(edited, factors, [*([] if note is None else [note]), *edited.metadata["edit_notes"]])
 
 
 def light_note(loaded: LoadedModel, edits: Path | None, illuminant: str | None) -> str | None:
@@ -136,7 +139,8 @@ def edit_notes(
 ) -> list[str]:
     """All that a command should say of a run that was loaded with these."""
     note = light_note(loaded, edits, illuminant)
-    return [*([] if note is None else [note]), *sensor_notes(loaded, sensor)]
+    found = loaded.model.metadata.get("edit_notes", []) if isinstance(loaded.model, UnmixModel) else []
+    return [*([] if note is None else [note]), *found, *sensor_notes(loaded, sensor)]
 
 
 def sensor_notes(loaded: LoadedModel, sensor: Path | None) -> list[str]:

@@ -1,4 +1,4 @@
-"""What each kind of edit does to the materials: pure functions of the state, one for each kind."""
+"""What each kind of edit does to the materials: one function of the state for each kind."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import torch
 
 from unmix_plugin.editing.material_state import MaterialState
 from unmix_plugin.editing.operations import (
+    Colour,
     FileSpectrum,
     Gloss,
     Isolate,
@@ -26,7 +27,7 @@ from unmix_plugin.editing.recipe import Recipe
 from unmix_plugin.editing.retint import Surface, hexadecimal, retinted
 from unmix_plugin.editing.seen import look_at
 from unmix_plugin.errors import ConfigError, SpectrumError, UnmixError
-from unmix_plugin.spectral.colour.conversion import srgb_to_linear
+from unmix_plugin.spectral.colour.conversion import linear_to_srgb, srgb_to_linear
 from unmix_plugin.spectral.library.material_library import (
     DARK_LIGHT,
     MaterialLibrary,
@@ -35,7 +36,10 @@ from unmix_plugin.spectral.library.material_library import (
 )
 
 _GREATEST_REFLECTANCE = 2.0
-"""What a table of reflectances may hold; more is a sign of per cent. Fluorescent ones exceed 1."""
+"""Of a table of reflectances; more is a sign of per cent. Fluorescent ones exceed 1."""
+
+_VISIBLE_DIFFERENCE = 2.5 / 255
+"""Of sRGB channels, from which a user is told."""
 
 _REPLACED, _RETINTED, _NAMED, _COLOURED = "replaced", "retinted", "renamed", "given a colour of gloss"
 _REMOVED, _ISOLATED = "removed", "isolated"
@@ -98,24 +102,29 @@ def _library_of(spectrum: LibrarySpectrum | FileSpectrum) -> tuple[MaterialLibra
 def _retint(state: MaterialState, edit: Retint, where: str) -> None:
     index = state.index_of(edit.endmember)
     state.note(_RETINTED, index, where)
-    look = look_at(state, index) if edit.match == "picture" else None
-    if look is None:
-        linear_rgb, greatest = _linear(edit.colour), 1.0
-    else:
-        linear_rgb, greatest = look.full_colour(edit.colour), look.greatest_reflectance
+    seen = look_at(state, index) if edit.match == "picture" else None
     is_lit = state.light > DARK_LIGHT * state.light.max()
     light = np.where(is_lit, state.light, 0.0)
     reflectance = np.where(is_lit, state.spectra[index] / np.where(is_lit, light, 1.0), 0.0)
     surface = Surface(state.bands, reflectance, light)
-    try:
-        state.spectra[index] = retinted(surface, linear_rgb, greatest) * light
-    except SpectrumError as error:
-        if look is None:
-            raise
-        asked = hexadecimal(_linear(edit.colour))
-        raise SpectrumError(
-            f"pictures of it can't be {asked} in the mean: in full light, {error}; ask for a duller or darker colour"
-        ) from error
+    if seen is None:
+        changed = retinted(surface, _linear(edit.colour))
+        reached = _srgb(changed @ surface.to_linear_rgb)
+    else:
+        changed = retinted(surface, seen.full_colour(edit.colour), seen.greatest_reflectance)
+        reached = seen.mean_srgb(changed @ surface.to_linear_rgb)
+    state.spectra[index] = changed * light
+    what = state.names[index] if seen is None else f"pictures of {state.names[index]}"
+    _tell_nearest(state, f"{where}: {what}", edit.colour, reached)
+
+
+def _tell_nearest(state: MaterialState, what: str, asked: Colour, reached: np.ndarray) -> None:
+    """Note if a colour visibly differs from the one asked for."""
+    if np.abs(reached - asked).max() > _VISIBLE_DIFFERENCE:
+        state.notes.append(
+            f"{what} can't be {hexadecimal(np.array(asked))} in this light; took the nearest colour, "
+            f"{hexadecimal(reached)}"
+        )
 
 
 def _scale(state: MaterialState, edit: Scale, _: str) -> None:
@@ -133,7 +142,7 @@ def _remove(state: MaterialState, edit: Remove, where: str) -> None:
 def _isolate(state: MaterialState, edit: Isolate, where: str) -> None:
     earlier = [before for (what, _), before in state.done.items() if what == _ISOLATED]
     if earlier:
-        raise ConfigError(f"{earlier[0]} isolates already; isolate all that shall stay in one edit")
+        raise ConfigError(f"{earlier[0]} isolates already; name all that are to stay in one edit")
     kept = [state.index_of(endmember) for endmember in edit.endmembers]
     for index in kept:
         _refuse_both(state, index, _REMOVED, _ISOLATED)
@@ -158,8 +167,10 @@ def _gloss(state: MaterialState, edit: Gloss, where: str) -> None:
     chosen = range(len(state.names)) if edit.endmember is None else [state.index_of(edit.endmember)]
     if edit.colour is not None and edit.colour not in state.mirror_reflectances:
         flat = np.ones(len(state.bands))
-        mirror = retinted(Surface(state.bands, flat, flat), _linear(edit.colour))
+        white = Surface(state.bands, flat, flat)
+        mirror = retinted(white, _linear(edit.colour))
         state.mirror_reflectances[edit.colour] = mirror
+        _tell_nearest(state, f"{where}: highlights", edit.colour, _srgb(mirror @ white.to_linear_rgb))
     for index in chosen:
         state.gloss[index] *= edit.scale
         if edit.colour is not None:
@@ -181,6 +192,10 @@ _HANDLERS: dict[type[Operation], Callable[[MaterialState, Any, str], None]] = {
 
 def _linear(srgb: tuple[float, float, float]) -> np.ndarray:
     return srgb_to_linear(torch.tensor(srgb, dtype=torch.float64)).numpy()
+
+
+def _srgb(linear_rgb: np.ndarray) -> np.ndarray:
+    return linear_to_srgb(torch.from_numpy(np.clip(linear_rgb, 0, 1))).numpy()
 
 
 def _refuse_both(state: MaterialState, index: int, before: str, now: str) -> None:

@@ -40,6 +40,8 @@ class MaterialState:
     """What cameras see, rows of pixels (N, ...); None where that is not known."""
     done: dict[tuple[str, int], str] = field(default_factory=dict)
     """Which edit did what to which endmember."""
+    notes: list[str] = field(default_factory=list)
+    """What the user has to be told about the result."""
 
     @classmethod
     def of(

@@ -1,4 +1,4 @@
-"""The smoothest change of a spectrum that gives it a wanted colour.
+"""The smoothest change of a spectrum that gives it a wanted colour, or the nearest colour that a surface can have.
 
 Notation: `B` bands; `r` a reflectance, `L` the light, M (B, 3) the matrix from radiance to linear RGB. The changed
 reflectance is r + (r + f) d with a floor f, so that d is a relative change that still reaches where r is 0. Of all d
@@ -6,8 +6,10 @@ with M^T L (r + (r + f) d) = colour and bounds on the result, the one is taken w
 
     integral of d'^2 + (d / reach)^2 over wavelength
 
-is least: it turns with wavelength as little as the colour allows, and fades to no change far from where colour is seen.
-Leaving the colour as it is leaves the spectrum as it is.
+is least: it changes with wavelength as little as the colour allows, and fades far from where colour is seen. Asking
+for the colour that a surface has leaves its spectrum as it is. The equation is solved in least squares, with a large
+weight: exactly if the bounds allow it, else as nearly as they do. Channels count by the slope of the sRGB curve at the
+wanted colour, so that "near" is near on a display.
 """
 
 from __future__ import annotations
@@ -18,7 +20,6 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float64
 
-from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 
@@ -31,9 +32,6 @@ _REACH_NM = 300.0
 _EXACTNESS = 1e5
 """Weight of the colour against smoothness: what it misses by vanishes as the inverse square."""
 
-_TOLERANCE = 1e-3
-"""Greatest error of linear RGB with which a colour still counts as reached."""
-
 
 @dataclass(frozen=True)
 class Surface:
@@ -44,53 +42,53 @@ class Surface:
     light: Float64[np.ndarray, " B"]
     """Relative power."""
 
+    @property
+    def to_linear_rgb(self) -> Float64[np.ndarray, "B 3"]:
+        """Matrix from reflectance to linear RGB of the light that the surface sends."""
+        return self.light[:, None] * rgb_matrix(self.bands, torch.float64).numpy()
+
 
 def retinted(
     surface: Surface, linear_rgb: Float64[np.ndarray, "3"], greatest: float = 1.0
 ) -> Float64[np.ndarray, " B"]:
-    """The reflectance nearest in kind to a surface's that has a colour under its light.
+    """The reflectance most like a surface's own that has a colour in its light, or comes nearest to it.
 
     Args:
         surface: What is changed.
-        linear_rgb: The wanted colour as `spectral.colour.rgb_matrix` makes it, of the light that the surface sends.
+        linear_rgb: The wanted colour, as `spectral.colour.rgb_matrix` makes it of the light that the surface sends.
         greatest: Upper bound of the reflectance; the lower one is 0.
-    Raises:
-        SpectrumError: no reflectance within the bounds has that colour in this light; the message has the nearest that
-            can be had.
     """
     from scipy.optimize import lsq_linear
 
-    reflectance = surface.reflectance
+    reflectance, to_rgb = surface.reflectance, surface.to_linear_rgb
     base = reflectance + _FLOOR
-    to_rgb = surface.light[:, None] * rgb_matrix(surface.bands, torch.float64).numpy()
-    colour_rows = _EXACTNESS * (to_rgb * base[:, None]).T
-    wanted = _EXACTNESS * (linear_rgb - reflectance @ to_rgb)
+    weights = (_EXACTNESS * _srgb_slope(linear_rgb))[:, None]
     smoothness = _smoothness(surface.bands)
     lower, upper = -reflectance / base, np.maximum(greatest - reflectance, 0.0) / base
     solution = lsq_linear(
-        np.concatenate([smoothness, colour_rows]),
-        np.concatenate([np.zeros(len(smoothness)), wanted]),
+        np.concatenate([smoothness, weights * (to_rgb * base[:, None]).T]),
+        np.concatenate([np.zeros(len(smoothness)), weights[:, 0] * (linear_rgb - reflectance @ to_rgb)]),
         (lower, np.maximum(upper, lower + 1e-12)),
         method="bvls",
     )
-    changed = np.clip(reflectance + base * solution.x, 0.0, max(greatest, float(reflectance.max())))
-    reached = changed @ to_rgb
-    if np.abs(reached - linear_rgb).max() > _TOLERANCE:
-        raise SpectrumError(
-            f"no surface has the colour {hexadecimal(linear_rgb)} in this light; "
-            f"the nearest that one can have is about {hexadecimal(reached)}"
-        )
-    return changed
+    return np.clip(reflectance + base * solution.x, 0.0, max(greatest, float(reflectance.max())))
 
 
-def hexadecimal(linear_rgb: Float[np.ndarray, "3"]) -> str:
-    """A linear colour as it is written, sRGB in hexadecimal digits.
+def hexadecimal(srgb: Float[np.ndarray, "3"]) -> str:
+    """An sRGB colour as it is written; clipped to [0, 1].
 
-    >>> hexadecimal(np.array([1.0, 0.0, 0.2159]))
+    >>> hexadecimal(np.array([1.2, 0.0, 0.5]))
     '#ff0080'
     """
-    srgb = linear_to_srgb(torch.from_numpy(np.clip(linear_rgb, 0, 1).astype(np.float64))).numpy()
-    return "#" + "".join(f"{round(255 * float(value)):02x}" for value in srgb)
+    return "#" + "".join(f"{round(255 * float(value)):02x}" for value in np.clip(srgb, 0, 1))
+
+
+def _srgb_slope(linear_rgb: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
+    """Slope of the sRGB curve at each channel, from 12.92 at black to 0.44 at white."""
+    linear = torch.from_numpy(np.clip(linear_rgb, 0, 1)).requires_grad_()
+    linear_to_srgb(linear).sum().backward()
+    assert linear.grad is not None
+    return linear.grad.numpy()
 
 
 def _smoothness(bands: Bands) -> Float64[np.ndarray, "rows B"]:

@@ -67,11 +67,12 @@ class Look:
         low, high = np.zeros(3), np.full(3, 1.0 / self.strengths.min())
         for _ in range(60):
             middle = (low + high) / 2
-            is_dark = self._mean_srgb(middle) < wanted
+            is_dark = self.mean_srgb(middle) < wanted
             low, high = np.where(is_dark, middle, low), np.where(is_dark, high, middle)
         return (low + high) / 2
 
-    def _mean_srgb(self, linear_rgb: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
+    def mean_srgb(self, linear_rgb: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
+        """What pixels show in the mean if the spectrum has this colour."""
         shown = np.clip(self.behind + self.strengths[:, None] * linear_rgb, 0, 1)
         return np.average(linear_to_srgb(torch.from_numpy(shown)).numpy(), axis=0, weights=self.weights)
 

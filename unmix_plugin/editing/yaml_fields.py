@@ -149,7 +149,7 @@ def _options(kind: type, name: str) -> list[type]:
     return [option for option in get_args(_types(kind)[name]) if is_dataclass(option)]
 
 
-def _endmember(node: yaml.Node, what: str, _: Path) -> Endmember:
+def _endmember(node: yaml.Node, _: str, __: Path) -> Endmember:
     value = nodes.scalar(node)
     if isinstance(value, bool) or not isinstance(value, str | int):
         raise fault(node, f"an endmember is given by its name or number; found {nodes.describe(node)}")

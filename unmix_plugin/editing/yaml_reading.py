@@ -73,13 +73,17 @@ def _read_document(text: str, folder: Path, faults: list[NodeError]) -> tuple[li
     if not parts:
         raise fault(document, "a recipe needs edits or an illuminant")
     light = _read_light(parts["illuminant"], folder) if "illuminant" in parts else None
-    operations: list[Operation] = []
-    for item in nodes.sequence(parts["edits"], "edits", MOST_EDITS) if "edits" in parts else []:
-        try:
-            operations.append(_read_operation(item, folder))
-        except NodeError as error:
-            faults.append(error)
-    return operations, light
+    items = nodes.sequence(parts["edits"], "edits", MOST_EDITS) if "edits" in parts else []
+    read = [_read_or_note(item, folder, faults) for item in items]
+    return [operation for operation in read if operation is not None], light
+
+
+def _read_or_note(node: yaml.Node, folder: Path, faults: list[NodeError]) -> Operation | None:
+    try:
+        return _read_operation(node, folder)
+    except NodeError as error:
+        faults.append(error)
+        return None
 
 
 def _read_operation(node: yaml.Node, folder: Path) -> Operation:

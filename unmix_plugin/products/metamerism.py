@@ -1,7 +1,7 @@
 """Materials that look alike in one light and differ in another: a table and a figure of swatches.
 
 Surfaces are the endmembers of a run, as reflectances (radiance over the scene's light), and measured materials of the
-library that reach all of the run's bands.
+library that reach all of the run's visible bands; the other bands play no part.
 """
 
 from __future__ import annotations
@@ -101,14 +101,17 @@ def find_metamers(
         SpectrumError: a light that is unknown or does not cover the run's bands, bands that can't tell colours, or
             thresholds the wrong way round.
     """
-    bands = materials.bands
+    is_visible = materials.bands.visible_mask
+    if not is_visible.any():
+        raise SpectrumError(f"{materials.bands} hold no visible light, so nothing is known of metamerism")
+    bands = Bands.of(materials.bands.centers_nm[is_visible])
     lights = [parse_light(word) for word in options.lights]
     powers = (
         np.stack([illuminant_power(light, bands) for light in lights])
         if lights
         else np.zeros((0, len(bands)))
     )
-    names, rows = _surfaces(materials, scene_light, library, options.surfaces)
+    names, rows = _surfaces(materials, scene_light, library, options.surfaces, bands)
     reflectance = np.array(rows).reshape(len(names), len(bands))
     pairs = metameric_pairs(reflectance, powers, bands, options.alike, options.different)
     num_own = 0 if options.surfaces == "library" else len(materials.names)
@@ -167,20 +170,22 @@ def _surfaces(
     scene_light: Float64[np.ndarray, " B"] | None,
     library: MaterialLibrary,
     chosen: Literal["run", "library", "all"],
-) -> tuple[list[str], list[Float64[np.ndarray, " B"]]]:
-    """Names and reflectances of what is paired."""
+    bands: Bands,
+) -> tuple[list[str], list[Float64[np.ndarray, " V"]]]:
+    """Names of what is paired, and reflectances at `bands`, the visible ones of the run."""
     names: list[str] = []
-    rows: list[Float64[np.ndarray, " B"]] = []
+    rows: list[Float64[np.ndarray, " V"]] = []
     if chosen != "library":
         light = np.ones(len(materials.bands)) if scene_light is None else scene_light
         spectra = materials.endmembers.detach().to("cpu", torch.float64).numpy()
         names += list(materials.names)
-        rows += list(np.divide(spectra, light, out=np.zeros_like(spectra), where=light > 0))
+        reflectance = np.divide(spectra, light, out=np.zeros_like(spectra), where=light > 0)
+        rows += list(reflectance[:, materials.bands.visible_mask])
     for material in library.materials if chosen != "run" else ():
         try:
-            rows.append(library.reflectance(material.name, materials.bands))
+            rows.append(library.reflectance(material.name, bands))
         except SpectrumError:
-            continue  # it does not reach all bands
+            continue  # it does not reach all of them
         names.append(material.name)
     return names, rows
 

@@ -2,7 +2,7 @@
 
 Notation: `B` bands. Power is relative, greatest band 1. A band sees the mean of the light over its interval, so that
 narrow lines of a lamp count wherever they lie between band centres; in the outer halves of the outermost bands a light
-that is known up to the band centre only is taken to go on as it ends.
+that is known only up to the band centre is taken to continue at its last value.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import colour_mode, xyz_matrix
 from unmix_plugin.spectral.integrals import integrals_up_to
-from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv, resample_spectra
+from unmix_plugin.spectral.library.spectra_csv import TOLERANCE_NM, read_spectra_csv, resample_spectra
 
 _FORMULA_RANGE_NM = (250.0, 3000.0)
 """Where the lights that are defined by a formula are given."""
 
 
 def parse_light(text: str) -> str | Path:
-    """What a word for a light stands for: the name of a known one, or else the path of a CSV file.
+    """A light as a user writes it: the name of a known one, or else the path of a CSV file.
 
     Raises:
         SpectrumError: neither; the message has the nearest names.
@@ -58,12 +58,12 @@ def illuminant_power(
     Args:
         light: A name as `parse_light` gives it, or a CSV file, `wavelength,power`.
         bands: Of the sensor.
-        beyond: Where the light is not known at a band's centre refuse, or hold its outermost value.
+        beyond: What to do in bands at whose centres the light is not known: refuse, or hold its outermost value.
     Raises:
         SpectrumError: an unknown name; a file that is missing, malformed or not one light; a light that is not known at
             all bands (the message says by how much) or that is zero there.
     """
-    source, power = _read(light) if isinstance(light, Path) else _tables()[str(parse_light(light))]
+    source, power = _table(light)
     if beyond == "refuse":
         try:
             resample_spectra(power, source, bands)
@@ -75,11 +75,25 @@ def illuminant_power(
     return means / means.max()
 
 
+def covered_bands(light: str | Path, bands: Bands) -> Bool[np.ndarray, " B"]:
+    """Bands at whose centres a light is known.
+
+    Raises:
+        SpectrumError: as `illuminant_power`, for the name and the file.
+    """
+    source = _table(light)[0].centers_nm
+    return (bands.centers_nm >= source[0] - TOLERANCE_NM) & (bands.centers_nm <= source[-1] + TOLERANCE_NM)
+
+
 def brightness(power: Float64[np.ndarray, " B"], bands: Bands) -> float:
     """How bright a perfect white is in a light: its luminance where the bands see colours, else its mean radiance."""
     if colour_mode(bands) == "true-colour":
         return float(power @ xyz_matrix(bands).double().numpy()[:, 1])
     return float(power @ bands.widths_nm / bands.widths_nm.sum())
+
+
+def _table(light: str | Path) -> tuple[Bands, Float64[np.ndarray, " N"]]:
+    return _read(light) if isinstance(light, Path) else _tables()[str(parse_light(light))]
 
 
 def _read(path: Path) -> tuple[Bands, Float64[np.ndarray, " N"]]:

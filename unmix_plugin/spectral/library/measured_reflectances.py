@@ -52,7 +52,10 @@ def measured_reflectances() -> Iterator[Measured]:
 
     yield from _each("pmc", SDS_COLOURCHECKERS["PMC"], "Preferred Memory Color chart")
     yield from _each("checker", SDS_COLOURCHECKERS["ColorChecker N Ohta"], "ColorChecker, Ohta 1997")
-    samples: dict[str, Any] = dict(zip(_CRI_NAMES, SDS_TCS["CIE 2024"].values(), strict=True))
+    known = SDS_TCS.get(
+        "CIE 2024", SDS_TCS["CIE 1995"]
+    )  # the older one has no Asian skin; colour-science below 0.4.7
+    samples: dict[str, Any] = dict(zip(_CRI_NAMES, known.values(), strict=False))
     yield from _each("cri", samples, "test colour samples, CIE 13.3:1995 and CIE 2024")
     extended = dict(SDS_VS["NIST CQS 9.0"].items())
     for name, bands, values, source in _each("cqs", extended, "colour quality scale 9.0, NIST"):

@@ -18,7 +18,7 @@ from jaxtyping import Float64
 from unmix_plugin.errors import RunError, SpectrumError
 from unmix_plugin.spectral.bands import Bands
 
-_TOLERANCE_NM = 1e-6
+TOLERANCE_NM = 1e-6
 """Reach beyond the data that counts as rounding, not as extrapolation."""
 
 
@@ -68,8 +68,8 @@ def resample_spectra(
         raise SpectrumError(f"spectra of {spectra.shape[-1]} values do not fit {source}")
     below = source.centers_nm[0] - target.centers_nm[0]
     above = target.centers_nm[-1] - source.centers_nm[-1]
-    if max(below, above) > _TOLERANCE_NM:
-        sides = [f"{d:g} nm {side}" for d, side in ((below, "below"), (above, "above")) if d > _TOLERANCE_NM]
+    if max(below, above) > TOLERANCE_NM:
+        sides = [f"{d:g} nm {side}" for d, side in ((below, "below"), (above, "above")) if d > TOLERANCE_NM]
         raise SpectrumError(
             f"spectra at {source} do not reach {target}: {' and '.join(sides)} their range; "
             "measure them there or leave those bands out (nothing is extrapolated)"
