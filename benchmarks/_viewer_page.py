@@ -45,6 +45,8 @@ class Page:
     downloads: list[str] = field(default_factory=list)
     """Names of files that were sent."""
     is_closed: bool = False
+    storage: dict[str, str] = field(default_factory=dict)
+    """What the browser keeps from page to page."""
 
     def __enter__(self) -> Page:
         self._socket = connect(
@@ -55,6 +57,7 @@ class Page:
             compression=None,
         )
         self._changed = threading.Condition()
+        self._seen_texts: list[str] = []
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
         return self
@@ -133,6 +136,11 @@ class Page:
                 )
 
     @property
+    def seen_texts(self) -> str:
+        """All HTML that controls were changed to so far."""
+        return "\n".join(self._seen_texts)
+
+    @property
     def texts(self) -> str:
         """All HTML that the page shows."""
         return "\n".join(str(props.get("content", "")) for props in list(self.controls.values()))
@@ -162,6 +170,7 @@ class Page:
             self.pictures.append((time.monotonic(), len(message["rgb_data"])))
         elif kind == "GuiUpdateMessage":
             self.controls.setdefault(message["uuid"], {}).update(message["updates"])
+            self._seen_texts.append(str(message["updates"].get("content", "")))
         elif kind == "GuiRemoveMessage":
             self.controls.pop(message["uuid"], None)
         elif kind.startswith("Gui") and "uuid" in message and "props" in message:
@@ -171,6 +180,15 @@ class Page:
             self.notices.append((message["props"]["title"], message["props"]["body"]))
         elif kind == "FileTransferStartDownload":
             self.downloads.append(message["filename"])
+        elif kind == "LocalStorageSetItemMessage":
+            self.storage[message["key"]] = message["value"]
+        elif kind == "LocalStorageGetItemRequestMessage":
+            self.send(
+                "LocalStorageGetItemResponseMessage",
+                value=self.storage.get(message["key"]),
+                error=None,
+                request_uuid=message["request_uuid"],
+            )
 
 
 def _looking_at_origin(place: tuple[float, float, float]) -> tuple[float, float, float, float]:

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from contextlib import contextmanager
 
 import numpy as np
@@ -30,7 +29,11 @@ class Started:
     """A command in a process of its own, its output read line by line."""
 
     def __init__(self, command, *words):
-        launch = f"from unmix_plugin.commands.{command} import main; main()"
+        # A test run in the background of a script inherits an ignored SIGINT, which Python would leave ignored.
+        launch = (
+            "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+            f"from unmix_plugin.commands.{command} import main; main()"
+        )
         self.process = subprocess.Popen(
             [sys.executable, "-c", launch, *map(str, words)],
             stdin=subprocess.DEVNULL,
@@ -39,24 +42,30 @@ class Started:
             text=True,
         )
         self.lines = []
+        self._changed = threading.Condition()
+        self._has_ended = False
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
     def _read(self):
         assert self.process.stdout is not None
         for line in self.process.stdout:
-            self.lines.append(line.rstrip())
+            with self._changed:
+                self.lines.append(line.rstrip())
+                self._changed.notify_all()
+        with self._changed:
+            self._has_ended = True
+            self._changed.notify_all()
 
     def wait_for_line(self, pattern):
-        until = time.monotonic() + START_S
-        while time.monotonic() < until:
-            for line in list(self.lines):
-                found = re.search(pattern, line)
-                if found:
-                    return found
-            assert self.process.poll() is None or self._reader.is_alive(), self.lines
-            time.sleep(0.02)
-        raise AssertionError(self.lines)
+        def found():
+            return next((match for line in self.lines if (match := re.search(pattern, line))), None)
+
+        with self._changed:
+            self._changed.wait_for(lambda: found() or self._has_ended, START_S)
+            match = found()
+        assert match is not None, self.lines
+        return match
 
     @property
     def address(self):
@@ -122,11 +131,12 @@ def test_an_address_that_is_none_is_refused(trained, words, message):
     assert message in ended.err
 
 
-def test_a_run_is_served_until_ctrl_c(trained):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_run_is_served_until_it_is_asked_to_end(trained, number):
     with started("view", "--run", trained.run, "--device", "cpu", "--viewer.port", "0") as command:
         with looking(command.address) as page:
             page.wait_until(lambda: any(one.get("label") == "layer" for one in page.controls.values()))
-            command.process.send_signal(signal.SIGINT)
+            command.process.send_signal(number)
             page.wait_until(lambda: page.is_closed)
         assert command.end() == 0
         assert command.lines[-2:] == ["stop with Ctrl-C", "stopped"]
@@ -144,10 +154,8 @@ def served(trained):
 
 def test_what_was_measured_is_shown_where_the_scene_is_at_hand(served):
     with looking(f"ws://127.0.0.1:{served.port}") as page:
-        until = time.monotonic() + START_S
-        while served.services.measured is None:
-            assert time.monotonic() < until, served.services.why_not_measured
-            time.sleep(0.05)
+        served.services._reader.join(START_S)
+        assert served.services.measured is not None, served.services.why_not_measured
         page.set("layer", "error against a training view")
         page.wait_until(lambda: "mean absolute error of the bands against training view" in page.texts)
         page.set("cameras", True)

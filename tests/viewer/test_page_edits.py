@@ -1,9 +1,13 @@
 """Edits of materials and light, made in a page."""
 
+import threading
+
 import numpy as np
 import pytest
 
 from tests.viewer.pages import decoded, opened, show_layer
+from unmix_plugin.editing import Retint
+from unmix_plugin.errors import ConfigError
 
 
 def test_materials_are_edited_undone_saved_and_loaded(viewer):
@@ -48,6 +52,42 @@ def test_every_change_is_an_edit_of_the_recipe_and_can_be_undone(viewer, label, 
         assert not any(title == "not done" for title, _ in page.notices)
         page.set("changes", "redo")
         page.wait_until(lambda: written in recipe["value"])
+
+
+def test_a_name_with_spaces_can_be_typed_letter_by_letter_and_is_one_edit(viewer):
+    with opened(viewer) as page:
+        name, recipe = (page.controls[page.control(label)] for label in ("name", "recipe"))
+        for length in range(len("blue ") + 1):
+            page.set("name", "blue "[:length])
+        page.wait_until(lambda: "name: blue" in recipe["value"])
+        # What the page was sent has the letters as typed, with the space: nothing was written back.
+        assert name["value"] == "endmember_0"
+        for length in range(len("blue "), len("blue cloth") + 1):
+            page.set("name", "blue cloth"[:length])
+        page.wait_until(lambda: "name: blue cloth" in recipe["value"])
+        page.set("changes", "undo")
+        page.wait_until(lambda: recipe["value"] == "edits: []\n")
+        page.wait_until(lambda: name["value"] == "endmember_0")
+        assert page.notices == []
+
+
+def test_a_colour_that_is_refused_again_and_again_is_one_notice(viewer, monkeypatch):
+    accept, refused = viewer.services.maker.edited, threading.Semaphore(0)
+
+    def refuse_colours(edit):
+        if any(isinstance(one, Retint) for one in edit.recipe.operations):
+            refused.release()
+            raise ConfigError("that can't be")
+        return accept(edit)
+
+    monkeypatch.setattr(viewer.services.maker, "edited", refuse_colours)
+    with opened(viewer) as page:
+        for green in range(10):
+            page.set("colour", (10, green, 10))
+            assert refused.acquire(timeout=30)
+        page.wait_until(lambda: bool(page.notices))
+        show_layer(page, "depth")
+        assert [text for _, text in page.notices].count("that can't be") == 1
 
 
 def test_a_name_that_is_taken_is_refused_and_the_field_goes_back(viewer):

@@ -69,6 +69,32 @@ def test_an_index_is_chosen_by_name_or_typed_as_a_formula_and_a_wrong_one_says_w
         page.wait_until(lambda: np.abs(decoded(page.last_picture) - first).mean() < 3)
 
 
+def test_a_formula_is_shown_when_it_is_typed_not_letter_by_letter(viewer):
+    with opened(viewer) as page:
+        show_layer(page, "spectral index")
+        formula = "r650/r450"
+        for length in range(1, len(formula) + 1):
+            page.set("formula", formula[:length])
+        page.wait_until(lambda: "formula r650/r450" in page.texts)
+        assert "formula r650/r4;" not in page.seen_texts  # a prefix that can be read, too
+        assert "expected" not in page.seen_texts
+
+
+def test_the_ends_of_a_range_are_shown_when_they_are_ones_own_and_begin_as_they_were(viewer):
+    with opened(viewer) as page:
+        show_layer(page, "depth")
+        low, high = (page.controls[page.control(label)] for label in ("low", "high"))
+        assert (low["visible"], high["visible"]) == (False, False)
+        before = decoded(page.last_picture)
+        page.set("own range", True)
+        page.wait_until(lambda: low["visible"] and high["visible"] and high["value"] > 2)
+        page.set("high", high["value"] + 5)
+        page.wait_until(lambda: np.abs(decoded(page.last_picture) - before).mean() > 3)
+        page.set("own range", False)
+        page.wait_until(lambda: np.abs(decoded(page.last_picture) - before).mean() < 1)
+        assert not low["visible"]
+
+
 def test_bands_that_no_named_index_takes_say_so_and_a_formula_is_shown(tmp_path):
     source = make_source(tmp_path)
     narrow = Bands.of([1000.0, 1010.0, 1020.0, 1030.0, 1040.0])

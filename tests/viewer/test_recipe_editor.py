@@ -112,3 +112,27 @@ def test_what_a_panel_builds_is_what_is_read_from_its_file(isolated):
     recipe = with_change(recipe, Rename(1, "clay"))
     recipe = with_visible(with_swap(recipe, Swap(0, 2)), {0}, isolated)
     assert recipe_from_yaml(recipe_to_yaml(recipe)) == recipe
+
+
+def test_changes_of_the_same_thing_in_quick_succession_are_undone_together():
+    now = [0.0]
+    history = RecipeHistory(clock=lambda: now[0])
+    for factor in (1.1, 1.2, 1.3):
+        history.take(with_change(history.present, Scale(0, factor)), (Scale, 0))
+        now[0] += 0.1
+    history.take(with_change(history.present, Scale(1, 2.0)), (Scale, 1))
+    now[0] += 10.0
+    history.take(with_change(history.present, Scale(1, 3.0)), (Scale, 1))
+    assert history.undone() == Recipe((Scale(0, 1.3), Scale(1, 2.0)))
+    assert history.undone() == Recipe((Scale(0, 1.3),))
+    assert history.undone() == Recipe()
+    assert history.undone() is None
+
+
+def test_a_change_after_an_undo_is_undone_by_itself():
+    history = RecipeHistory(clock=lambda: 0.0)
+    for factor in (1.1, 1.2):
+        history.take(with_change(history.present, Scale(0, factor)), (Scale, 0))
+    history.undone()
+    history.take(with_change(history.present, Scale(0, 5.0)), (Scale, 0))
+    assert history.undone() == Recipe()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -39,15 +40,16 @@ class ViewOptions:
     """How the viewer is served."""
 
 
-def view(words: list[str]) -> None:
-    """Parse the words, serve until Ctrl-C.
+def view(argv: list[str]) -> None:
+    """Parse the arguments, serve until Ctrl-C or until the process is asked to end.
 
     Raises:
         RunError: the run is unusable.
         ConfigError: the method does not unmix spectra, the device is not there, or nothing can listen at the address.
     """
-    options = tyro.cli(ViewOptions, prog="unmix-view", args=words)
+    options = tyro.cli(ViewOptions, prog="unmix-view", args=argv)
     viewer = prepared(options)
+    _let_signals_interrupt()
     viewer.start()
     print("stop with Ctrl-C", flush=True)
     try:
@@ -94,6 +96,14 @@ def prepared(options: ViewOptions) -> Viewer:
             lambda line: print(line, flush=True),
             recipe,
         )
+
+
+def _let_signals_interrupt() -> None:
+    """Let SIGTERM and SIGHUP end the viewer as Ctrl-C does, with its children; what is ignored (nohup) stays so."""
+    for name in ("SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)  # Windows has no SIGHUP
+        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, signal.default_int_handler)
 
 
 def _scene_of(source: ModelSource, data: Path | None) -> Scene:

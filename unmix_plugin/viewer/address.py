@@ -12,7 +12,8 @@ from unmix_plugin.errors import ConfigError
 from unmix_plugin.viewer.options import ViewerOptions
 
 _PORTS_TRIED = 100
-_ANYWHERE = ("0.0.0.0", "::", "")
+ANYWHERE = ("0.0.0.0", "::", "")
+"""Hosts that mean every address of this machine."""
 
 
 def free_port(host: str, port: int) -> int:
@@ -46,7 +47,7 @@ def url_of(host: str, port: int) -> str:
     >>> url_of("127.0.0.1", 7007), url_of("::1", 7007)
     ('http://127.0.0.1:7007', 'http://[::1]:7007')
     """
-    shown = "localhost" if host in _ANYWHERE else host
+    shown = "localhost" if host in ANYWHERE else host
     return f"http://[{shown}]:{port}" if ":" in shown else f"http://{shown}:{port}"
 
 

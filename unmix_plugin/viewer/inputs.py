@@ -35,6 +35,18 @@ def choice(value: Any, known: Collection[_ChoiceT], fallback: _ChoiceT) -> _Choi
     return next((one for one in known if type(one) is type(value) and one == value), fallback)
 
 
+def index_in(menu: Any) -> int:
+    """Which of a menu's options is chosen.
+
+    Raises:
+        ConfigError: none of them.
+    """
+    options = tuple(menu.options)
+    if menu.value not in options:
+        raise ConfigError(f"there is no {menu.label} {str(menu.value)[:40]!r}")
+    return options.index(menu.value)
+
+
 def text(value: Any) -> str:
     """What was typed, cut to `LONGEST_TEXT`; empty for what is no text."""
     return value[:LONGEST_TEXT] if isinstance(value, str) else ""

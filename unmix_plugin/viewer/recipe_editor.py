@@ -6,7 +6,8 @@ takes the place of the first.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import time
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import replace
 
 from unmix_plugin.editing import (
@@ -25,21 +26,33 @@ from unmix_plugin.editing import (
 
 _MOST_UNDONE = 200
 _MOST_OPERATIONS = 500
+_ONE_EDIT_S = 2.0
+"""Changes of the same thing that follow each other so quickly, as while a slider is dragged, are undone together."""
 
 
 class RecipeHistory:
     """The recipe in force, those before it, and those that were undone."""
 
-    def __init__(self, present: Recipe | None = None) -> None:
+    def __init__(self, present: Recipe | None = None, clock: Callable[[], float] = time.monotonic) -> None:
         self._past: list[Recipe] = []
         self._future: list[Recipe] = []
+        self._clock = clock
+        self._last_change: tuple[Hashable, float] = (None, 0.0)
         self.present = present or Recipe()
 
-    def take(self, recipe: Recipe) -> None:
-        """Put another recipe in force."""
+    def take(self, recipe: Recipe, subject: Hashable = None) -> None:
+        """Put another recipe in force.
+
+        Args:
+            recipe: The new one.
+            subject: What the change is of; None for one that is always undone by itself.
+        """
         if recipe == self.present:
             return
-        self._past = [*self._past, self.present][-_MOST_UNDONE:]
+        now, (last_subject, changed_at) = self._clock(), self._last_change
+        if subject is None or subject != last_subject or now - changed_at > _ONE_EDIT_S:
+            self._past = [*self._past, self.present][-_MOST_UNDONE:]
+        self._last_change = (subject, now)
         self._future.clear()
         self.present = recipe
 
@@ -47,6 +60,7 @@ class RecipeHistory:
         """Go back by one; None at the beginning."""
         if not self._past:
             return None
+        self._last_change = (None, 0.0)
         self._future.append(self.present)
         self.present = self._past.pop()
         return self.present
@@ -55,6 +69,7 @@ class RecipeHistory:
         """Go forward again by one; None at the end."""
         if not self._future:
             return None
+        self._last_change = (None, 0.0)
         self._past.append(self.present)
         self.present = self._future.pop()
         return self.present
@@ -67,7 +82,7 @@ def with_change(recipe: Recipe, change: Replace | Retint | Scale | Rename | Glos
 
 
 def with_swap(recipe: Recipe, swap: Swap) -> Recipe:
-    """The recipe with two endmembers swapped; swapping the same two again at once takes it back."""
+    """The recipe with two endmembers swapped; swapping the same two again at once undoes it."""
     last = recipe.operations[-1] if recipe.operations else None
     if isinstance(last, Swap) and {last.first, last.second} == {swap.first, swap.second}:
         return _with_operations(recipe, recipe.operations[:-1])

@@ -2,32 +2,31 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from unmix_plugin.editing import Recipe
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.viewer import html
 from unmix_plugin.viewer.address import free_port, notices
 from unmix_plugin.viewer.failures import failures_said
-from unmix_plugin.viewer.gate import MOST_CLIENTS, Gate, is_of_another_site
-from unmix_plugin.viewer.inputs import text
+from unmix_plugin.viewer.gate import MOST_CLIENTS, Gate, is_own_page
+from unmix_plugin.viewer.kept_pages import KeptPages, browser_of
 from unmix_plugin.viewer.options import ViewerOptions
 from unmix_plugin.viewer.panels import PANELS
 from unmix_plugin.viewer.rendering.model_source import ModelSource
 from unmix_plugin.viewer.services import SceneReader, Services
 from unmix_plugin.viewer.session import Session
+from unmix_plugin.viewer.token_prompt import TokenPrompts
 from unmix_plugin.viewer.view_cameras import pose_of, up_direction
+from unmix_plugin.viewer.web_server import LABEL, address_of, close_soon, headers_of, open_server, quiet
 
 if TYPE_CHECKING:
     import viser
 
 _TICK_S = 0.5
-_LABEL = "unmix-nerf"
 
 
 class Viewer:
@@ -44,7 +43,7 @@ class Viewer:
         """
         Args:
             source: The model.
-            options: Where to listen, and the word to ask for.
+            options: Where to listen, and the token to ask for.
             read_scene: Reads the scene that the run was trained on.
             say: Takes lines for the user's terminal.
             recipe: Edits that every page starts with.
@@ -54,6 +53,9 @@ class Viewer:
         self._options = options
         self._say = say
         self._gate = Gate(options.token)
+        self._prompts = TokenPrompts(self._gate, self._open)
+        self._sites_warned_of: set[str] = set()
+        self._kept_pages = KeptPages()
         self._services = Services(source, read_scene, recipe)
         self._sessions: dict[int, Session] = {}
         self._lock = threading.Lock()
@@ -72,8 +74,7 @@ class Viewer:
         # A page that is closed while it is being sent something is no reason to print anything.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         port = free_port(self._options.host, self._options.port)
-        with _quiet():
-            self._server = _server_at(self._options.host, port)
+        self._server = open_server(self._options.host, port)
         self.port = self._server.get_port()
         self._dress(self._server)
         self._services.start()
@@ -95,7 +96,7 @@ class Viewer:
             session.close()
         self._services.stop()
         if self._server is not None:
-            with _quiet():
+            with quiet():
                 self._server.stop()
         if self._ticker.is_alive():
             self._ticker.join()
@@ -118,7 +119,7 @@ class Viewer:
     def _dress(self, server: viser.ViserServer) -> None:
         """Looks, and where pages start to look from."""
         server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
-        server.gui.set_panel_label(_LABEL)
+        server.gui.set_panel_label(LABEL)
         scene = self._services.source.scene
         up = up_direction(scene.train_cameras)
         server.scene.set_up_direction(up)
@@ -138,49 +139,36 @@ class Viewer:
         start.position, start.look_at, start.up, start.fov = pose.position, (x, y, z), up, pose.fov
 
     def _connected(self, client: viser.ClientHandle) -> None:
-        """Let a page in, or ask it for the word."""
+        """Let a page in, ask it for the token, or turn it away."""
         with failures_said("this page could not be served", lambda text: _warn(client, text)):
             reason = self._refusal(client)
+            if not reason and self._gate.is_open:
+                self._open(client)
+            elif not reason and not self._prompts.ask(client, address_of(client)):
+                reason = "too many pages are asked for the token already: close one and load this page again"
             if reason:
                 _warn(client, reason)
-            elif self._gate.is_open:
-                self._open(client)
-            else:
-                self._ask(client)
+                close_soon(client)
 
     def _refusal(self, client: viser.ClientHandle) -> str:
         """Why a page is not served; empty if it is."""
         if self.num_clients >= MOST_CLIENTS:
             return f"{MOST_CLIENTS} pages are open already: close one and load this page again"
-        if self._gate.is_open and is_of_another_site(_headers_of(client)):
+        headers = headers_of(client)
+        if not self._gate.is_open or is_own_page(headers, self._options.host):
+            return ""
+        site = (headers or {}).get("Origin", "unknown")[:100]
+        if site not in self._sites_warned_of and len(self._sites_warned_of) < MOST_CLIENTS:
+            self._sites_warned_of.add(site)
             self._say(
-                "warning: a page of another site tried to use the viewer and was refused; if it is yours, use a token"
+                f"warning: a page of another site ({site}) tried to use the viewer and was refused; if it is yours, "
+                "start the viewer with --viewer.token"
             )
-            return (
-                "this page is from another site; the viewer must be started with --viewer.token to serve it"
-            )
-        return ""
-
-    def _ask(self, client: viser.ClientHandle) -> None:
-        gui = client.gui
-        note = gui.add_html(html.paragraph("This viewer asks for the token that it was started with."))
-        word = gui.add_text("token", "")
-        button = gui.add_button("enter")
-
-        def enter(_: Any) -> None:
-            if not self._gate.admits(text(word.value)):
-                note.content = html.paragraph(
-                    "That is not the token; wait a moment and try again.", is_warning=True
-                )
-                return
-            for handle in (note, word, button):
-                handle.remove()
-            self._open(client)
-
-        button.on_click(enter)
+        return "this page is from another site; the viewer must be started with --viewer.token to serve it"
 
     def _open(self, client: viser.ClientHandle) -> None:
-        session = Session(client, self._services)
+        browser = browser_of(client)
+        session = Session(client, self._services, self._kept_pages.take(browser), browser)
         with self._lock:
             if self._stopped.is_set() or client.client_id in self._sessions:
                 return
@@ -190,15 +178,18 @@ class Viewer:
             self._disconnected(client)  # it left before it was noted
 
     def _disconnected(self, client: viser.ClientHandle) -> None:
+        self._prompts.leave(client)
         with self._lock:
             session = self._sessions.pop(client.client_id, None)
         if session is not None:
             session.close()
+            self._kept_pages.leave(session.browser, session.state)
 
     def _tick(self) -> None:
-        """Let panels follow a run that goes on."""
+        """Let panels follow a run that goes on, and check tokens."""
         while not self._stopped.wait(_TICK_S):
             with failures_said("panels could not be renewed", self._say):
+                self._prompts.tick()
                 self._services.tick()
                 for session in list(self._sessions.values()):
                     session.tick()
@@ -206,29 +197,3 @@ class Viewer:
 
 def _warn(client: viser.ClientHandle, reason: str) -> None:
     client.gui.add_html(html.paragraph(reason, is_warning=True))
-
-
-def _server_at(host: str, port: int) -> viser.ViserServer:
-    """viser's server without its public tunnel, which any page could else ask for."""
-    import viser
-
-    class LocalServer(viser.ViserServer):
-        def request_share_url(self, verbose: bool = True) -> str | None:
-            return None
-
-    return LocalServer(host=host, port=port, label=_LABEL, verbose=False)
-
-
-def _headers_of(client: viser.ClientHandle) -> Mapping[str, str]:
-    """Headers of the request that opened a client's connection; none where this viser does not give them."""
-    server = getattr(getattr(client, "_viser_server", None), "_websock_server", None)
-    connection = getattr(server, "_live_connections", {}).get(client.client_id)
-    request = getattr(connection, "request", None)
-    return {} if request is None else dict(request.headers.raw_items())
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """viser prints a banner and a farewell of its own; ours say what is true of host and port."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        yield

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import threading
+import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -13,11 +15,14 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.material_library import LibraryMatch, measured_library
 from unmix_plugin.viewer import html
 from unmix_plugin.viewer.failures import failures_said
-from unmix_plugin.viewer.layers.layer_settings import LayerSettings
+from unmix_plugin.viewer.kept_pages import PageState
+from unmix_plugin.viewer.layers.layer_settings import LayerSettings, first_settings
+from unmix_plugin.viewer.layers.painting import ColourMapLegend
+from unmix_plugin.viewer.recipe_editor import RecipeHistory
 from unmix_plugin.viewer.rendering.edits import Edit
 from unmix_plugin.viewer.rendering.view import Shown, View
 from unmix_plugin.viewer.services import Services
-from unmix_plugin.viewer.view_cameras import ViewPose, checked_pose, pose_of
+from unmix_plugin.viewer.view_cameras import ViewPose, camera_of, checked_pose, pose_of
 
 if TYPE_CHECKING:
     import viser
@@ -35,10 +40,31 @@ _NOTICE_S = 8.0
 class Session:
     """What the server keeps for a client, from its unlocking to its disconnection."""
 
-    def __init__(self, client: viser.ClientHandle, services: Services) -> None:
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        services: Services,
+        state: PageState | None = None,
+        browser: str = "",
+    ) -> None:
+        """
+        Args:
+            client: The page.
+            services: What all pages share.
+            state: What the page showed before it was loaded again, if it was.
+            browser: The name that the page's browser keeps.
+        """
         self.client = client
         self.services = services
-        self.view = View(show=self._show, report=self._report, edit=Edit(services.first_recipe))
+        self.browser = browser
+        self.history = RecipeHistory(services.first_recipe) if state is None else state.history
+        self.view = View(show=self._show, report=self._report, edit=Edit(self.history.present))
+        if state is None:
+            self.view.settings = first_settings(self.materials().bands)
+        else:
+            self.view.settings, self.view.pose = state.settings, state.pose
+            self.view.largest_height, self.view.subpixels = state.largest_height, state.subpixels
+        self._returns = state is not None
         self.is_closed = False
         self._lock = threading.RLock()
         self.on_tick: list[Callable[[], None]] = []
@@ -50,7 +76,11 @@ class Session:
         self._legend: viser.GuiHtmlHandle | None = None
         self._status: viser.GuiHtmlHandle | None = None
         self._legend_shown = ""
+        self.value_range_shown: tuple[float, float] | None = None
+        """Ends of the colour map of the picture shown; None where it has none."""
         self._object_owners: set[str] = set()
+        self._warning: viser.NotificationHandle | None = None
+        self._warning_said = (-math.inf, "")
 
     def open(self, panels: Sequence[Panel]) -> None:
         """Build the panels, in the order of their tabs, and begin to render."""
@@ -67,7 +97,11 @@ class Session:
             self.services.loop.remove(self.view)
             return
         self.client.camera.on_update(self._moved)
-        self._moved(self.client.camera)
+        if self._returns and self.view.pose is not None:
+            self.services.loop.move(self.view, self.view.pose)
+            self.look_from(camera_of(self.view.pose, 64))
+        else:
+            self._moved(self.client.camera)
 
     def close(self) -> None:
         """Stop rendering for the client."""
@@ -75,6 +109,12 @@ class Session:
         self.services.loop.remove(self.view)
         for tell in self.on_close:
             tell()
+
+    @property
+    def state(self) -> PageState:
+        """What the page shows, to be gone on with when it is loaded again."""
+        view = self.view
+        return PageState(view.pose, view.settings, self.history, view.largest_height, view.subpixels)
 
     def tick(self) -> None:
         """Renew what panels show of a run that goes on."""
@@ -92,11 +132,20 @@ class Session:
         return callback
 
     def say(self, title: str, text: str, is_warning: bool = False) -> None:
-        """Show a notice."""
-        if not self.is_closed:
-            self.client.add_notification(
-                title, text[:2000], auto_close_seconds=_NOTICE_S, color="red" if is_warning else "teal"
-            )
+        """Show a notice. Of warnings there is one at a time, however many a control that is dragged brings about."""
+        if self.is_closed:
+            return
+        if is_warning:
+            before, self._warning_said = self._warning_said, (time.monotonic(), text)
+            if before[1] == text and self._warning_said[0] - before[0] < _NOTICE_S:
+                return
+            if self._warning is not None:
+                self._warning.remove()
+        notice = self.client.add_notification(
+            title, text[:2000], auto_close_seconds=_NOTICE_S, color="red" if is_warning else "teal"
+        )
+        if is_warning:
+            self._warning = notice
 
     def _warn(self, text: str) -> None:
         self.say("not done", text, is_warning=True)
@@ -177,6 +226,9 @@ class Session:
             text = html.legend(shown.legend)
             if text != self._legend_shown:
                 self._legend_shown = self._legend.content = text
+            self.value_range_shown = (
+                (shown.legend.low, shown.legend.high) if isinstance(shown.legend, ColourMapLegend) else None
+            )
         if self._status is not None and not self.view.has_reported:
             height, width = shown.picture.shape[:2]
             speed = self.services.maker.speed.rays_per_second

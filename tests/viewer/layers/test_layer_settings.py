@@ -1,15 +1,17 @@
 """What a user has chosen stays within bounds, whatever a browser sends."""
 
 import math
-from dataclasses import fields
+from dataclasses import fields, replace
 
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.viewer.view_factory import make_aids
 from unmix_plugin.spectral.maps.index_formula import MAX_LENGTH
 from unmix_plugin.viewer.layers.layer_settings import EXPOSURE_BOUNDS, GAMMA_BOUNDS, LayerSettings
 from unmix_plugin.viewer.layers.painting import BACKGROUNDS, COLOUR_MAPS
 from unmix_plugin.viewer.layers.view_transforms import VIEW_TRANSFORMS
+from unmix_plugin.viewer.rendering.frames import detached
 
 names = st.sampled_from([entry.name for entry in fields(LayerSettings)])
 anything = st.recursive(
@@ -66,3 +68,15 @@ def test_a_formula_that_is_too_long_stays_too_long_rather_than_becoming_another_
     kept = LayerSettings().changed("index", "r600" + " " * 2000 + "/ r650")
     assert kept.index == "r600 / r650"
     assert kept.changed("index", 3.0).index == "r600 / r650"
+
+
+def test_what_is_remembered_survives_another_thread_that_forgets_it(source):
+    class Forgetful(dict):
+        def __setitem__(self, key, value):
+            super().__setitem__(key, value)
+            self.clear()  # as another thread may, at just this moment
+
+    aids = replace(make_aids(source), _kept=Forgetful())
+    with source.borrowed() as model:
+        materials = detached(model.materials)
+    assert aids.colours_of(materials).shape == (len(materials.names), 3)

@@ -2,6 +2,7 @@
 
 import sys
 import threading
+import time
 from dataclasses import replace
 
 import pytest
@@ -94,3 +95,18 @@ def test_the_command_is_run_by_this_python(tmp_path, run_instead):
     done, said = ended(VideoJob(), tmp_path)
     assert done.wait(30)
     assert said[0].startswith("the video is in")
+
+
+def test_stopping_ends_the_encoder_that_the_render_started(tmp_path, run_instead):
+    run_instead(
+        "import subprocess, sys; child = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)']);"
+        f"open({str(tmp_path / 'child')!r}, 'w').write(str(child.pid)); child.wait()"
+    )
+    job = VideoJob()
+    done, _ = ended(job, tmp_path)
+    until = time.monotonic() + 30
+    while not (tmp_path / "child").exists() or not (tmp_path / "child").read_text():
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    job.stop()
+    assert done.wait(30)  # its output is closed only once the encoder, which has it too, has ended

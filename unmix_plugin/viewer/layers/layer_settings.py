@@ -13,7 +13,9 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.composition import Materials
+from unmix_plugin.spectral.maps.indices import available_indices
 from unmix_plugin.spectral.pca import PcaColours
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.viewer.inputs import choice, number, text
@@ -57,6 +59,13 @@ class LayerSettings:
     def changed(self, name: str, value: Any) -> LayerSettings:
         """With one setting as a browser sent it, brought within its bounds; what makes no sense changes nothing."""
         return replace(self, **{name: _CHECKS[name](value, getattr(self, name))})
+
+
+def first_settings(bands: Bands) -> LayerSettings:
+    """What a page shows at first; false colour from the middles of the long, middle and short third of the bands."""
+    centers_nm, count = bands.centers_nm.tolist(), len(bands)
+    starts = (centers_nm[5 * count // 6], centers_nm[count // 2], centers_nm[count // 6])
+    return LayerSettings(false_colour_nm=starts, index=next(iter(available_indices(bands)), ""))
 
 
 def _checked_range(value: Any, before: tuple[float, float] | None) -> tuple[float, float] | None:
@@ -139,8 +148,9 @@ class LayerAids:
         """What `make` gives, remembered for the materials that clients look at."""
         spectra = torch.cat([materials.endmembers, materials.specular_spectra])
         key = (what, spectra.cpu().numpy().tobytes())
-        if key not in self._kept:
+        found = self._kept.get(key)  # looked up once: another thread may clear what is kept at any moment
+        if found is None:
             if len(self._kept) >= _MOST_REMEMBERED:
                 self._kept.clear()
-            self._kept[key] = make()
-        return self._kept[key]
+            found = self._kept[key] = make()
+        return found

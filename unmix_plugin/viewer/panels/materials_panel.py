@@ -25,7 +25,7 @@ from unmix_plugin.spectral.composition import Materials
 from unmix_plugin.spectral.library.material_library import measured_library
 from unmix_plugin.viewer import html
 from unmix_plugin.viewer.charts import Chart, Line
-from unmix_plugin.viewer.inputs import number, text
+from unmix_plugin.viewer.inputs import index_in, number, text
 from unmix_plugin.viewer.panels.recipe_controls import RecipeControls
 from unmix_plugin.viewer.recipe_editor import (
     change_of,
@@ -36,6 +36,7 @@ from unmix_plugin.viewer.recipe_editor import (
     with_visible,
 )
 from unmix_plugin.viewer.session import Session
+from unmix_plugin.viewer.settling import Settling
 
 _OWN_LIGHT = "as recorded"
 _COMMON_LIGHTS = ("D65", "D50", "A", "E", "C", "FL2", "FL7", "FL11")
@@ -51,6 +52,7 @@ class MaterialsPanel:
     def __init__(self, session: Session) -> None:
         self._session = session
         self._is_showing = False
+        self._named = 0
         self._gui = session.client.gui
         self._recipe = RecipeControls(session, refused=self._show_chosen)
         self._listing = self._gui.add_html("")
@@ -59,7 +61,7 @@ class MaterialsPanel:
         self._recipe.add_history()
         names = session.materials().names
         self._chosen = self._gui.add_dropdown("endmember", names)
-        self._on(self._chosen, self._show_chosen)
+        self._on(self._chosen, self._choose)
         self._add_changes(names)
         self._chart = Chart(self._gui, "spectra under the light")
         self._recipe.add_files()
@@ -86,11 +88,13 @@ class MaterialsPanel:
             (self._colour, lambda index: Retint(index, _srgb(self._colour.value))),
             (self._gloss, self._glossed),
             (self._gloss_colour, self._glossed),
-            (self._name, lambda index: Rename(index, text(self._name.value).strip())),
         ):
             self._on(control, lambda make=make: self._change_endmember(make(self._index)))
         for control in (self._is_visible, self._is_alone):
             self._on(control, lambda control=control: self._change_visibility(control))
+        self._typed_name = Settling(self._rename)
+        self._on(self._name, self._type_name)
+        self._session.on_tick.append(self._typed_name.tick)
         replace_button.on_click(
             self._session.guarded(lambda: self._change_endmember(self._replacement(self._index)))
         )
@@ -99,7 +103,7 @@ class MaterialsPanel:
     @property
     def _index(self) -> int:
         """Number of the endmember chosen."""
-        return _index_in(self._chosen)
+        return index_in(self._chosen)
 
     def _on(self, control: Any, work: Callable[[], None]) -> None:
         """Do something when a user changes a control, not when the panel itself does."""
@@ -111,7 +115,21 @@ class MaterialsPanel:
         control.on_update(self._session.guarded(change))
 
     def _change_endmember(self, change: Replace | Retint | Scale | Rename | Gloss) -> None:
-        self._recipe.change(with_change(self._recipe.recipe, change))
+        self._recipe.change(with_change(self._recipe.recipe, change), (type(change), change.endmember))
+
+    def _type_name(self) -> None:
+        self._named = self._index
+        self._typed_name.note()
+
+    def _rename(self) -> None:
+        """Take the name that was typed, once nothing more is; an empty field waits for more."""
+        name = text(self._name.value).strip()
+        if name:
+            self._change_endmember(Rename(self._named, name))
+
+    def _choose(self) -> None:
+        self._typed_name.finish()
+        self._show_chosen()
 
     def _change_light(self) -> None:
         name = str(self._light.value)
@@ -143,7 +161,7 @@ class MaterialsPanel:
         return Replace(index, LibrarySpectrum(text(self._library.value)), extrapolate=True)
 
     def _swap(self) -> None:
-        self._recipe.change(with_swap(self._recipe.recipe, Swap(self._index, _index_in(self._other))))
+        self._recipe.change(with_swap(self._recipe.recipe, Swap(self._index, index_in(self._other))))
 
     def _show_materials(self) -> None:
         """Show the materials as they are now."""
@@ -160,7 +178,7 @@ class MaterialsPanel:
         self._is_showing = True
         try:
             for menu in (self._chosen, self._other):
-                index = _index_in(menu)
+                index = index_in(menu)
                 if tuple(menu.options) != names:
                     menu.options = names
                     menu.value = names[index]
@@ -181,7 +199,9 @@ class MaterialsPanel:
             tint = gloss.colour if isinstance(gloss, Gloss) else None
             self._gloss_colour.value = _WHITE if tint is None else _bytes(torch.tensor(tint))
             self._colour.value = self._colour_of(materials, index)
-            self._name.value = materials.names[index]
+            # While a name is typed the field is the user's: "blue " may become "blue cloth".
+            if not self._typed_name.is_waiting and text(self._name.value).strip() != materials.names[index]:
+                self._name.value = materials.names[index]
             self._light.options = _lights(recipe.illuminant)
             self._light.value = _OWN_LIGHT if recipe.illuminant is None else str(recipe.illuminant.light)
             spectrum = materials.endmembers[index : index + 1].double().cpu().numpy()
@@ -220,13 +240,6 @@ def _lights(present: Light | None = None) -> tuple[str, ...]:
     names = (_OWN_LIGHT, *_COMMON_LIGHTS, *others)
     shown = _OWN_LIGHT if present is None else str(present.light)
     return names if shown in names else (*names, shown)
-
-
-def _index_in(menu: Any) -> int:
-    names = tuple(menu.options)
-    if menu.value not in names:
-        raise ConfigError(f"there is no endmember {str(menu.value)[:40]!r}")
-    return names.index(menu.value)
 
 
 def _factor(value: Any) -> float:

@@ -56,19 +56,10 @@ class ProbePanel:
         self._comparison = Chart(gui, "all probes")
         gui.add_button("save as CSV").on_click(session.guarded(self._save))
         gui.add_button("forget all").on_click(session.guarded(self._forget))
-        self._listen()
+        session.client.scene.on_click()(self._clicked)
 
-    def _listen(self) -> None:
-        scene = self._session.client.scene
-        # viser 1.1 has on_click, whose event has one position; 1.0 has on_pointer_event, with a tuple of positions.
-        if hasattr(scene, "on_click"):
-            scene.on_click()(self._clicked)
-        else:
-            scene.on_pointer_event("click")(self._clicked)
-
-    def _clicked(self, event: Any) -> None:
-        position = event.screen_pos
-        x, y = position[0] if isinstance(position[0], tuple | list) else position
+    def _clicked(self, event: viser.ScenePointerEvent) -> None:
+        x, y = event.screen_pos
         self._session.guarded(lambda: self._take(x, y))()
 
     def _take(self, x: Any, y: Any) -> None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 
 from unmix_plugin.editing import Recipe, read_recipe, recipe_to_yaml
 from unmix_plugin.errors import ConfigError, UnmixError
 from unmix_plugin.formats.files import write_file
 from unmix_plugin.viewer.inputs import new_file
-from unmix_plugin.viewer.recipe_editor import RecipeHistory, numbered
+from unmix_plugin.viewer.recipe_editor import numbered
 from unmix_plugin.viewer.rendering.edits import Edit
 from unmix_plugin.viewer.session import Session
 
@@ -26,16 +26,19 @@ class RecipeControls:
         """
         self._session, self._refused = session, refused
         self._gui = session.client.gui
-        self._history = RecipeHistory(session.view.edit.recipe)
+        self._history = session.history
 
     @property
     def recipe(self) -> Recipe:
         """The one in force; endmembers are meant by their numbers."""
         return self._history.present
 
-    def change(self, recipe: Recipe) -> None:
+    def change(self, recipe: Recipe, subject: Hashable = None) -> None:
         """Put a recipe in force if it fits the run.
 
+        Args:
+            recipe: The new one.
+            subject: As `RecipeHistory.take` has it.
         Raises:
             UnmixError: it does not; nothing has changed.
         """
@@ -45,7 +48,7 @@ class RecipeControls:
         except UnmixError:
             self._refused()
             raise
-        self._history.take(recipe)
+        self._history.take(recipe, subject)
         self._session.change_edit(edit)
 
     def add_history(self) -> None:

@@ -33,13 +33,13 @@ class ScenePanel:
             gui.add_button("look from there").on_click(session.guarded(self._look_from_view))
         with gui.add_folder("quality"):
             self._height = gui.add_slider(
-                "finest picture (rows)", *HEIGHT_BOUNDS, _HEIGHT_STEP, DEFAULT_HEIGHT
+                "finest picture (rows)", *HEIGHT_BOUNDS, _HEIGHT_STEP, session.view.largest_height
             )
             self._subpixels = gui.add_slider(
                 "rays along a pixel's edge",
                 *SUBPIXEL_BOUNDS,
                 1,
-                1,
+                session.view.subpixels,
                 hint="More smooth edges, for as much more time.",
             )
         for control in (self._height, self._subpixels):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
 import threading
@@ -77,6 +79,7 @@ class VideoJob:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
                 text=True,
+                start_new_session=True,
             )
         threading.Thread(target=_wait, args=(process, folder, done), daemon=True).start()
 
@@ -84,11 +87,21 @@ class VideoJob:
         """End a render under way."""
         with self._lock:
             if self._process is not None and self._process.poll() is None:
-                self._process.terminate()
-                try:
-                    self._process.wait(_WAIT_S)
-                except subprocess.TimeoutExpired:
-                    self._process.kill()
+                _end(self._process)
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    """End a render, and the encoder that it started."""
+    if not hasattr(os, "killpg"):  # Windows
+        process.kill()
+        return
+    for number in (signal.SIGTERM, signal.SIGKILL):
+        os.killpg(process.pid, number)
+        try:
+            process.wait(_WAIT_S)
+            return
+        except subprocess.TimeoutExpired:
+            continue
 
 
 def render_words(run: Path, cameras: Path, output: str, folder: Path, recipe: Path | None) -> list[str]:

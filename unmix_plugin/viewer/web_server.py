@@ -1,0 +1,90 @@
+"""viser's server as the viewer needs it: no public tunnel, no uploads, connections that can be closed."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import io
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import viser
+
+LABEL = "unmix-nerf"
+
+_MOST_CONNECTIONS = 64
+"""Connections that may be open at once, served or not."""
+
+_READING_S = 2.0
+"""How long a page that is turned away shows why before its connection is closed."""
+
+
+def open_server(host: str, port: int) -> viser.ViserServer:
+    """A server that listens."""
+    import viser
+
+    class LocalServer(viser.ViserServer):
+        def request_share_url(self, verbose: bool = True) -> str | None:
+            return None
+
+    with quiet():
+        server = LocalServer(host=host, port=port, label=LABEL, verbose=False)
+    websocket_server = server._websock_server
+    _refuse_uploads(websocket_server)
+
+    async def accept(connection: Any) -> None:
+        _refuse_uploads(connection)
+        if len(websocket_server._live_connections) > _MOST_CONNECTIONS:
+            await websocket_server._live_connections[connection.client_id].close(1013)
+
+    websocket_server.on_client_connect(accept)
+    return server
+
+
+def headers_of(client: viser.ClientHandle) -> dict[str, str] | None:
+    """Headers of the request that opened a client's connection; None where they can't be read."""
+    request = getattr(_connection_of(client), "request", None)
+    return None if request is None else dict(request.headers.raw_items())
+
+
+def address_of(client: viser.ClientHandle) -> str:
+    """Where a client connects from; empty if unknown."""
+    remote = getattr(_connection_of(client), "remote_address", None)
+    return str(remote[0]) if remote else ""
+
+
+def close_soon(client: viser.ClientHandle) -> None:
+    """Close a client's connection, once it has shown what it was told."""
+    connection = _connection_of(client)
+    if connection is None:
+        return
+
+    async def close() -> None:
+        await asyncio.sleep(_READING_S)
+        await connection.close(1008)
+
+    client.flush()
+    asyncio.run_coroutine_threadsafe(close(), client._viser_server._event_loop)
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """viser prints a banner and a farewell of its own; ours say what is true of host and port."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        yield
+
+
+def _connection_of(client: viser.ClientHandle) -> Any:
+    """The websocket of a client; None if it has gone, or this viser keeps it elsewhere."""
+    server = getattr(getattr(client, "_viser_server", None), "_websock_server", None)
+    return getattr(server, "_live_connections", {}).get(client.client_id)
+
+
+def _refuse_uploads(handler: Any) -> None:
+    """No control takes files, and viser would keep what a page sends, whether or not the page is served."""
+    from viser._messages import FileTransferPart, FileTransferStartUpload
+
+    for kind in (FileTransferStartUpload, FileTransferPart):
+        if kind in handler._incoming_handlers:
+            handler.unregister_handler(kind)
