@@ -18,8 +18,8 @@ from unmix_plugin.spectral.metrics import psnr
 from unmix_plugin.trained.evaluation import DEFINITIONS
 
 KEYS = [
-    *("psnr", "rmse", "ssim", "sam", "rgb_psnr", "miou", "macro_f1", "accuracy", "abundance_rmse"),
-    *("endmember_angle", "views", "bands", "train_seconds", "train_rays_per_second"),
+    *("psnr", "psnr_matter", "rmse", "ssim", "sam", "rgb_psnr", "miou", "macro_f1", "accuracy"),
+    *("abundance_rmse", "endmember_angle", "views", "bands", "train_seconds", "train_rays_per_second"),
 ]
 
 

@@ -5,7 +5,9 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from torch import Tensor
 from torch.testing import assert_close
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.spectral.mixtures import seeded, smooth_endmembers
 from unmix_plugin.errors import SpectrumError
@@ -13,6 +15,7 @@ from unmix_plugin.spectral import (
     abundance_rmse,
     endmember_angle,
     match_endmembers,
+    metrics,
     psnr,
     rgb_psnr,
     rmse,
@@ -218,3 +221,27 @@ def test_unmatched_materials_count_as_absent_and_surplus_ones_have_no_column():
     pred = torch.cat([torch.full((1, 1, 1), 0.9, dtype=torch.float64), true], dim=-1)
     assert more.pred_ids == (1, 2, 3)
     assert abundance_rmse(pred, true, more) == 0
+
+
+class Largest(TorchDispatchMode):
+    """Remembers the most values that any new tensor in float64 had."""
+
+    values = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        result = func(*args, **(kwargs or {}))
+        if isinstance(result, Tensor) and result.dtype == torch.float64 and not result._is_view():
+            self.values = max(self.values, result.numel())
+        return result
+
+
+def test_cubes_are_scored_a_few_rows_at_a_time_with_the_same_result(monkeypatch):
+    pred, target = (image(seed, 40, 30, 16).float() for seed in (1, 2))
+    valid = torch.rand(40, 30, generator=seeded(5)) > 0.3
+    figures = (psnr, rmse, sam, ssim)
+    expected = [figure(pred, target, valid) for figure in figures]
+    monkeypatch.setattr(metrics, "_VALUES_AT_ONCE", 1500)
+    with Largest() as largest:
+        found = [figure(pred, target, valid) for figure in figures]
+    assert found == pytest.approx(expected, rel=1e-12)
+    assert 0 < largest.values <= 1500  # of 19,200

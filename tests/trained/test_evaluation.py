@@ -216,3 +216,25 @@ def test_true_endmembers_are_reflectances_in_the_light_of_the_scene(tmp_path):
     assert flat is not None
     torch.testing.assert_close(lit, flat * torch.from_numpy(scene.illuminant), rtol=1e-6, atol=0)
     assert not torch.allclose(lit, flat, rtol=1e-2)
+
+
+def test_psnr_of_matter_leaves_the_background_and_invalid_pixels_out(scene, view):
+    """A background that is rendered as black as it is raises PSNR, by however much there is of it."""
+    matter = view.shows_matter[..., None]
+    flat = replace(view, spectra=torch.where(matter, 0.5, view.spectra))
+    predicted = replace(perfect(view, SHUFFLED), spectra=torch.where(matter, 0.4, view.spectra))
+    found = evaluated(scene, flat, predicted, SHUFFLED).per_view["view"]
+    assert found["psnr_matter"] == pytest.approx(20.0, abs=1e-4)
+    assert found["psnr"] == pytest.approx(20.0 + 10 * math.log10(120 / 96), abs=1e-4)
+    spoiled = replace(flat, spectra=flat.spectra.clone(), valid=flat.valid.clone())
+    spoiled.spectra[5], spoiled.valid[5] = 1.0, False
+    assert evaluated(scene, spoiled, predicted, SHUFFLED).per_view["view"]["psnr_matter"] == pytest.approx(
+        20.0, abs=1e-4
+    )
+
+
+def test_psnr_of_matter_is_unknown_where_nothing_is(scene, view):
+    empty = ViewTruth("void", torch.zeros(10, 12, 5), view.valid, torch.zeros(10, 12))
+    assert math.isnan(
+        evaluated(scene, empty, perfect(view, SHUFFLED), SHUFFLED).per_view["void"]["psnr_matter"]
+    )

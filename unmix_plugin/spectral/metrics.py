@@ -2,12 +2,14 @@
 
 Notation: images are (H, W, B), values in [0, 1], bands last; `pred_*` against `target_*`. Figures are Python floats,
 computed in float64 with the prediction clamped to [0, 1]; the mean over views is the caller's. Angles are in radians.
-A spectrum of zero length has no direction: its angle to anything is pi/2.
+A spectrum of zero length has no direction: its angle to anything is pi/2. Images are converted to float64 a few rows at
+a time, so that scoring a cube takes little more memory than the cube.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +21,8 @@ from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.unmixing.endmembers import DARK_RMS
 
 SSIM_WINDOW_PX = 7
+
+_VALUES_AT_ONCE = 1 << 20
 
 
 def psnr(
@@ -43,11 +47,8 @@ def rmse(
     target_image: Float[Tensor, "H W B"],
     valid_mask: Bool[Tensor, "H W"] | None = None,
 ) -> float:
-    """Root of the mean squared error over all pixels and bands; NaN where no pixel counts."""
-    difference = _clamped(pred_image) - target_image.double()
-    if valid_mask is not None:
-        difference = difference[valid_mask]
-    return math.sqrt(float(difference.detach().square().mean())) if difference.numel() else math.nan
+    """Root of the mean squared error over all pixels and bands; NaN if no pixel counts."""
+    return _root_mean_square(_rows(pred_image, target_image, valid_mask))
 
 
 def rgb_psnr(
@@ -65,7 +66,7 @@ def ssim(
     valid_mask: Bool[Tensor, "H W"] | None = None,
 ) -> float:
     """Structural similarity in [-1, 1], mean over bands: 7 x 7 uniform window, data range 1, sample covariance, windows
-    that stick out of the image left out.
+    that reach beyond the image left out.
 
     Args:
         valid_mask: Pixels whose windows count. Pixels that do not are made equal in both images first.
@@ -81,23 +82,20 @@ def ssim(
         raise SpectrumError(
             f"SSIM needs images of at least {SSIM_WINDOW_PX} x {SSIM_WINDOW_PX} pixels; found {height} x {width}"
         )
-    pred, target = _clamped(pred_image), target_image.double()
-    if valid_mask is not None:
-        pred, target = (torch.where(valid_mask[..., None], image, 0.0) for image in (pred, target))
-    result: Any = structural_similarity(
-        target.cpu().numpy(),
-        pred.cpu().numpy(),
-        win_size=SSIM_WINDOW_PX,
-        data_range=1.0,
-        channel_axis=-1,
-        full=True,
-    )
-    margin = SSIM_WINDOW_PX // 2
-    inner = slice(margin, -margin)
-    counted = result[1][inner, inner]  # [0] is the mean over all pixels
-    if valid_mask is not None:
-        counted = counted[valid_mask[inner, inner].cpu().numpy()]
-    return float(counted.mean()) if counted.size else math.nan
+    valid = torch.ones(height, width, dtype=torch.bool) if valid_mask is None else valid_mask.cpu()
+    inner = slice(SSIM_WINDOW_PX // 2, -(SSIM_WINDOW_PX // 2))
+    if not bool(valid[inner, inner].any()):
+        return math.nan
+    means = []
+    for pred_band, target_band in zip(pred_image.unbind(-1), target_image.unbind(-1), strict=True):
+        pred, target = (
+            torch.where(valid, band.detach().cpu().double(), 0.0).numpy()
+            for band in (pred_band.clamp(0, 1), target_band)
+        )
+        result: Any = structural_similarity(target, pred, win_size=SSIM_WINDOW_PX, data_range=1.0, full=True)
+        similarity = result[1]  # [0] is the mean over all pixels
+        means.append(float(similarity[inner, inner][valid[inner, inner].numpy()].mean()))
+    return math.fsum(means) / len(means)
 
 
 def sam(
@@ -105,19 +103,18 @@ def sam(
     target_image: Float[Tensor, "H W B"],
     mask: Bool[Tensor, "H W"] | None = None,
 ) -> float:
-    """Spectral angle mapper: mean angle in radians over the pixels that count; NaN where none does.
+    """Spectral angle mapper: mean angle in radians over the pixels that count; NaN if none does.
 
     Args:
         mask: Labelled or opaque pixels; None takes all. Pixels whose true spectrum is dark (root mean square over
             bands at most 0.005) never count.
     """
-    target = target_image.double()
-    counts = target.norm(dim=-1) > DARK_RMS * math.sqrt(target.shape[-1])
-    if mask is not None:
-        counts = counts & mask
-    if not bool(counts.any()):
-        return math.nan
-    return float(spectral_angle(_clamped(pred_image)[counts], target[counts]).mean())
+    total, count = 0.0, 0
+    for pred, target, counts in _rows(pred_image, target_image, mask):
+        counts = counts & (target.norm(dim=-1) > DARK_RMS * math.sqrt(target.shape[-1]))
+        total += float(spectral_angle(pred[counts], target[counts]).sum())
+        count += int(counts.sum())
+    return total / count if count else math.nan
 
 
 def spectral_angle(a: Float[Tensor, "*#rays B"], b: Float[Tensor, "*#rays B"]) -> Float[Tensor, "*#rays"]:
@@ -193,17 +190,38 @@ def abundance_rmse(
         matching: From `match_endmembers`, once a scene.
         mask: Pixels that count; None takes those whose true abundances are not all zero.
     """
-    target = true_abundances.double()
-    pred = torch.zeros_like(target)
-    pred[..., list(matching.true_ids)] = _clamped(pred_abundances)[..., list(matching.pred_ids)]
     if mask is None:
-        mask = target.sum(dim=-1) > 0
-    difference = (pred - target)[mask]
-    return math.sqrt(float(difference.detach().square().mean())) if difference.numel() else math.nan
+        mask = true_abundances.sum(dim=-1) > 0
+    matched = torch.zeros_like(true_abundances)
+    matched[..., list(matching.true_ids)] = pred_abundances.to(matched)[..., list(matching.pred_ids)]
+    return _root_mean_square(_rows(matched, true_abundances, mask))
 
 
-def _clamped(prediction: Tensor) -> Tensor:
-    return prediction.double().clamp(0, 1)
+def _rows(
+    pred_image: Float[Tensor, "H W C"],
+    target_image: Float[Tensor, "H W C"],
+    mask: Bool[Tensor, "H W"] | None,
+) -> Iterator[tuple[Float[Tensor, "h W C"], Float[Tensor, "h W C"], Bool[Tensor, "h W"]]]:
+    """A few rows at a time: prediction clamped and truth, both in float64, and the pixels that count."""
+    height, width, channels = pred_image.shape
+    if mask is None:
+        mask = torch.ones(height, width, dtype=torch.bool, device=target_image.device)
+    step = max(1, _VALUES_AT_ONCE // max(1, width * channels))
+    for start in range(0, height, step):
+        pred, target, counts = (image[start : start + step] for image in (pred_image, target_image, mask))
+        yield pred.detach().double().clamp(0, 1), target.double(), counts
+
+
+def _root_mean_square(
+    rows: Iterator[tuple[Float[Tensor, "h W C"], Float[Tensor, "h W C"], Bool[Tensor, "h W"]]],
+) -> float:
+    """Of the differences over all rows; NaN where nothing counts."""
+    total, count = 0.0, 0
+    for pred, target, counts in rows:
+        difference = (pred - target)[counts]
+        total += float(difference.square().sum())
+        count += difference.numel()
+    return math.sqrt(total / count) if count else math.nan
 
 
 def _unit(spectra: Tensor) -> Tensor:

@@ -41,12 +41,13 @@ OPAQUE_ALPHA = 0.99
 HALF_COVERED = 0.5
 """Opacity from which a pixel's abundances count."""
 
-VIEW_FIGURES = ("psnr", "rmse", "ssim", "sam", "rgb_psnr", "abundance_rmse")
-"""Figures that every view has, as far as there is truth for them."""
+VIEW_FIGURES = ("psnr", "psnr_matter", "rmse", "ssim", "sam", "rgb_psnr", "abundance_rmse")
+"""Figures of every view, as far as there is truth for them."""
 
 DEFINITIONS = {
     "psnr": "dB, all valid pixels and bands of spectra on black, peak 1",
-    "rmse": "root mean squared error of the same",
+    "psnr_matter": "dB, the same over valid pixels that are labelled or opaque only, background left out",
+    "rmse": "root mean squared error, all valid pixels and bands",
     "ssim": "mean over bands, 7 x 7 uniform window, data range 1",
     "sam": "mean spectral angle in radians over labelled or opaque pixels whose true spectrum is not dark "
     "(root mean square over bands above 0.005)",
@@ -144,6 +145,7 @@ class Evaluation:
         spectra = predicted.spectra
         figures = {
             "psnr": psnr(spectra, view.spectra, valid),
+            "psnr_matter": psnr(spectra, view.spectra, view.shows_matter),
             "rmse": rmse(spectra, view.spectra, valid),
             "ssim": ssim(spectra, view.spectra, valid) if _fits_window(spectra) else math.nan,
             "sam": sam(spectra, view.spectra, view.shows_matter),
@@ -194,7 +196,9 @@ class Evaluation:
         )
 
     def _srgb(self, spectra: Float[Tensor, "H W B"]) -> Float[Tensor, "H W 3"]:
-        linear = spectra.double().clamp(0, 1) @ rgb_matrix(self.truth.bands, torch.float64)
+        matrix = rgb_matrix(self.truth.bands, torch.float64)
+        # Row by row, since float64 doubles the cube.
+        linear = torch.stack([row.double().clamp(0, 1) @ matrix for row in spectra])
         return linear_to_srgb(linear.clamp(0, 1))
 
 
