@@ -25,6 +25,7 @@ from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCal
 from unmix_plugin.engine.training.seeding import step_generator
 from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.scenes.geometry.carving import carve
+from unmix_plugin.scenes.identity import scene_identity
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.recorded_scene import check_recorded_scene
 from unmix_plugin.scenes.scene import Scene, SceneOptions
@@ -188,6 +189,10 @@ class HyperspectralDataManager(DataManager):
         """Refuse what no scene has: see `check_recorded_scene`."""
         check_recorded_scene(metadata)
         check_recorded_scene(summary)
+
+    def identity(self, summary: Mapping[str, Any]) -> dict[str, Any]:
+        """Views, cameras, bands and the hashes of what was measured."""
+        return scene_identity(summary)
 
     @cached_property
     def _pixels(self) -> _PixelTable:

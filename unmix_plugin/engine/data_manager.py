@@ -120,6 +120,11 @@ class DataManager(ABC):
             KeyError, TypeError, ValueError, ConfigError: what is missing or wrong.
         """
 
+    def identity(self, summary: Mapping[str, Any]) -> dict[str, Any]:
+        """What of a `summary` makes it this scene and no other: compared, numbers with a tolerance, when a run is
+        resumed or evaluated."""
+        return {}
+
     def state_dict(self) -> dict[str, Tensor]:
         """What a resumed run needs beyond (seed, step) and the rays per batch; usually nothing."""
         return {}

@@ -38,6 +38,7 @@ class RecordedScene:
     has_labels: bool = False
     has_abundances: bool = False
     input_hashes: Mapping[str, str] = field(default_factory=dict)
+    truth_hashes: Mapping[str, str] = field(default_factory=dict)
     options: SceneOptions = SceneOptions()
 
 

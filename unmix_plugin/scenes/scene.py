@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Float32, Float64, UInt8
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.scenes.reading.arrays import map_array
+from unmix_plugin.scenes.reading.cube_values import InvalidPixels, find_invalid
 from unmix_plugin.scenes.reading.images import read_colour, read_labels, read_mask
 
 UNLABELLED = 255
@@ -27,9 +28,10 @@ class SceneOptions:
     """How to read a scene."""
 
     value_scale: float | None = None
-    """Cubes are divided by this number (needed for integer cubes: 255, 10000 or 65535); None takes them as they are."""
-    invalid_pixels: Literal["refuse", "mask"] = "refuse"
-    """What to do with pixels that hold NaN, infinite or negative values: refuse the scene, or leave them out."""
+    """Cubes are divided by this number (needed for integer cubes, such as 255 or 4095); None takes them as they are."""
+    invalid_pixels: InvalidPixels = "refuse"
+    """What to do with pixels that hold NaN, infinite or negative values: refuse the scene; leave them out (mask); or
+    set negative values to 0, as suits noise around black, and leave the others out (clip)."""
     allow_outside_paths: bool = False
     """Follow paths in transforms.json that lead out of the scene folder (`..`, absolute, symbolic links)."""
     eval_split: Literal["auto", "lists", "filename", "interval"] = "auto"
@@ -127,19 +129,21 @@ class Scene:
     has_abundances: bool
     """Every evaluation frame has abundances."""
     input_hashes: dict[str, str]
-    """SHA-256 of every file read, by its path relative to the scene folder."""
+    """SHA-256 of every file that a training reads, by its path relative to the scene folder."""
+    truth_hashes: dict[str, str]
+    """The same of files that only an evaluation reads: labels, abundances, endmembers."""
     options: SceneOptions
     """How the scene was read."""
 
     def cube(self, index: int) -> Float32[np.ndarray, "H W B"]:
         """Spectra of a view in [0, 1].
 
-        Values above 1 after the division by `value_scale` are clipped to 1, as a saturated sensor does, and with
-        `invalid_pixels="mask"` the spectra of invalid pixels are 0 (see `valid_mask`).
+        Values above 1 after the division by `value_scale` are clipped to 1, as a saturated sensor does. Unless
+        `invalid_pixels` is `refuse`, spectra of invalid pixels are 0 (see `valid_mask`).
         """
         values = self._scaled(index)
-        if self.options.invalid_pixels == "mask":
-            values[~_is_valid(values)] = 0.0
+        if self.options.invalid_pixels != "refuse":
+            values[find_invalid(values, self.options.invalid_pixels)] = 0.0
         return np.clip(values, 0.0, 1.0, out=values)
 
     def alpha(self, index: int) -> Float32[np.ndarray, "H W"] | None:
@@ -151,27 +155,26 @@ class Scene:
         path = self.frames[index].image_path
         if not self.has_alpha or path is None:
             return None
-        return read_colour(path)[..., 3].astype(np.float32) / np.float32(255.0)
+        return read_colour(path, self._size)[..., 3].astype(np.float32) / np.float32(255.0)
 
     def srgb(self, index: int) -> Float32[np.ndarray, "H W 3"] | None:
         """sRGB picture of a view in [0, 1], as stored (gamma-encoded); None if it has none."""
         path = self.frames[index].image_path
         if path is None:
             return None
-        return read_colour(path)[..., :3].astype(np.float32) / np.float32(255.0)
+        return read_colour(path, self._size)[..., :3].astype(np.float32) / np.float32(255.0)
 
     def labels(self, index: int) -> UInt8[np.ndarray, "H W"] | None:
         """Material index of each pixel, 255 = unlabelled; None if the view has no labels."""
         path = self.frames[index].label_path
-        return None if path is None else read_labels(path)
+        return None if path is None else read_labels(path, self._size)
 
     def valid_mask(self, index: int) -> Bool[np.ndarray, "H W"]:
-        """True where a pixel counts: not black in the view's mask and, with `invalid_pixels="mask"`, all bands
-        finite and not negative."""
+        """True where a pixel counts: not black in the view's mask and not invalid (see `SceneOptions`)."""
         path = self.frames[index].mask_path
-        valid = np.ones((self.cameras.height, self.cameras.width), bool) if path is None else read_mask(path)
-        if self.options.invalid_pixels == "mask":
-            valid = valid & _is_valid(self._scaled(index))
+        valid = np.ones(self._size, bool) if path is None else read_mask(path, self._size)
+        if self.options.invalid_pixels != "refuse":
+            valid = valid & ~find_invalid(self._scaled(index), self.options.invalid_pixels)
         return valid
 
     def abundances(self, index: int) -> Float32[np.ndarray, "H W K"] | None:
@@ -197,14 +200,15 @@ class Scene:
             "has_labels": self.has_labels,
             "has_abundances": self.has_abundances,
             "input_hashes": dict(self.input_hashes),
+            "truth_hashes": dict(self.truth_hashes),
             "options": asdict(self.options),
         }
+
+    @property
+    def _size(self) -> tuple[int, int]:
+        return self.cameras.height, self.cameras.width
 
     def _scaled(self, index: int) -> Float32[np.ndarray, "H W B"]:
         values = np.array(map_array(self.frames[index].cube_path), dtype=np.float32, order="C")
         scale = self.options.value_scale
         return values if scale is None else np.divide(values, np.float32(scale), out=values)
-
-
-def _is_valid(values: Float32[np.ndarray, "H W B"]) -> Bool[np.ndarray, "H W"]:
-    return np.all(np.isfinite(values) & (values >= 0.0), axis=-1)

@@ -19,6 +19,9 @@ from unmix_plugin.errors import SpectrumError
 VISIBLE_RANGE_NM = (380.0, 780.0)
 """What a band must lie in to count as visible: the range in which colour matching functions are noticeably non-zero."""
 
+MEASURABLE_RANGE_NM = (20.0, 1e6)
+"""Where optical sensors measure; numbers below are wavelengths in micrometres, numbers above are in no unit."""
+
 LONE_BAND_WIDTH_NM = 10.0
 """Width given to a band that has no neighbour to tell its spacing."""
 
@@ -109,6 +112,22 @@ class Bands:
                 f"no band at {wavelength_nm:g} nm: {self} cover {edges[0]:g}-{edges[-1]:g} nm; choose one in there"
             )
         return int(np.argmin(np.abs(self.centers_nm - wavelength_nm)))
+
+
+def require_nanometres(centers_nm: Float64[np.ndarray, " B"]) -> None:
+    """Refuse wavelengths that a file gives in another unit.
+
+    Raises:
+        SpectrumError: the wavelengths look like micrometres, or lie where no optical sensor measures.
+    """
+    low, high = MEASURABLE_RANGE_NM
+    first, last = float(centers_nm.min()), float(centers_nm.max())
+    if last < low:
+        raise SpectrumError(
+            f"wavelengths of {first:g} to {last:g} look like micrometres; expected nm: multiply them by 1000"
+        )
+    if first < low or last > high:
+        raise SpectrumError(f"wavelengths of {first:g} to {last:g} nm; expected {low:g} to {high:g} nm")
 
 
 def _require_one_axis(centers: np.ndarray) -> None:

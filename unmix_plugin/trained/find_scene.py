@@ -1,4 +1,4 @@
-"""The scene that a run was trained on, where it is still at hand: what was measured, to put beside predictions."""
+"""The scene that a run was trained on, where it can still be found: measurements to put beside predictions."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from unmix_plugin.engine.runs.same_scene import differences, name_differences
 from unmix_plugin.errors import RunError, SceneError
+from unmix_plugin.scenes.identity import scene_identity
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import Scene, SceneOptions
 
-_COMPARED = ("wavelengths_nm", "frames", "eval_indices", "normalisation", "input_hashes")
-
 
 def scene_at_hand(summary: Mapping[str, Any], run: Path, data: Path | None) -> Scene | None:
-    """The scene of a run, if it is where it was and is still the same.
+    """The scene of a run, if it is where it was and has not changed.
 
     Args:
         summary: What the run remembers of its scene.
@@ -33,12 +33,11 @@ def scene_at_hand(summary: Mapping[str, Any], run: Path, data: Path | None) -> S
         if data is None:
             return None
         raise
-    found = scene.summary()
-    differing = [key for key in _COMPARED if found[key] != summary.get(key)]
+    differing = differences(scene_identity(summary), scene_identity(scene.summary()))
     if not differing:
         return scene
     if data is None:
         return None
     raise RunError(
-        f"the scene at {root} is not the one that {run} was trained on: {', '.join(differing)} differ"
+        f"the scene at {root} is not the one that {run} was trained on: {name_differences(differing)}"
     )

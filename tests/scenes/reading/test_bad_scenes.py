@@ -11,6 +11,7 @@ from tests.scenes.scene_factory import HEIGHT, WIDTH, SceneFolder, fault_of, mak
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes import SceneOptions, load_scene
 from unmix_plugin.scenes.reading.faults import MAX_LISTED, Faults
+from unmix_plugin.scenes.reading.images import UnreadableImageError, read_colour
 
 
 @pytest.fixture
@@ -95,8 +96,45 @@ def test_float_cubes_in_other_units_get_a_scale_proposed_that_then_works(folder,
     assert load_scene(folder.root, SceneOptions(value_scale=float(scale))).cube(1).max() <= 1.0
 
 
+def test_noise_around_black_is_one_message_with_two_remedies(folder):
+    for index in range(6):
+        folder.edit_cube(index, lambda cube, i=index: cube - np.float16(0.001 * (i + 1)) * (cube < 0.1))
+    fault = fault_of(folder)
+    assert "faults in the scene" not in fault
+    assert "frames[2] cubes/view_2.npy and 3 more: their cubes have " in fault
+    assert "negative values in" in fault
+    assert "down to -0.006" in fault
+    assert "invalid_pixels 'mask'; for noise around black use 'clip'" in fault
+    scene = load_scene(folder.root, SceneOptions(invalid_pixels="clip"))
+    assert scene.valid_mask(3).all()
+    assert scene.cube(3).min() == 0.0
+
+
+def test_clipping_leaves_out_what_is_no_number(folder):
+    def spoil(cube):
+        cube[0, 0, 1], cube[1, 1, 2], cube[2, 2, 3] = np.nan, np.inf, -0.01
+
+    scene = load_scene(folder.edit_cube(2, spoil).root, SceneOptions(invalid_pixels="clip"))
+    assert np.argwhere(~scene.valid_mask(2)).tolist() == [[0, 0], [1, 1]]
+    assert np.isfinite(scene.cube(2)).all()
+    assert scene.cube(2).min() >= 0.0
+
+
+def test_a_cube_that_is_mostly_negative_is_not_clipped(folder):
+    folder.edit_cube(2, lambda cube: cube - 1)
+    assert "values far below 0, which is no noise" in fault_of(folder, invalid_pixels="clip")
+
+
 @pytest.mark.parametrize(
-    ("dtype", "factor", "scale"), [("u1", 255, "255"), ("<i2", 10000, "10000"), ("<u2", 65535, "65535")]
+    ("dtype", "factor", "scale"),
+    [
+        ("u1", 255, "255"),
+        ("<u2", 1023, "1023"),
+        ("<u2", 4095, "4095"),
+        ("<u2", 16383, "16383"),
+        ("<i2", 10000, "10000"),
+        ("<u2", 65535, "65535"),
+    ],
 )
 def test_integer_cubes_are_refused_with_the_scale_that_fits(folder, dtype, factor, scale):
     folder.edit_cubes(lambda cube: np.round(cube.astype(np.float64) * factor).astype(dtype))
@@ -110,7 +148,7 @@ def test_a_value_scale_that_is_much_too_small_is_refused(folder):
     assert "after division by value_scale 255" in fault_of(folder, value_scale=255.0)
 
 
-@pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("scale", [0.0, -1.0, 1e-320, float("nan"), float("inf")])
 def test_a_value_scale_that_is_no_positive_number_is_refused(folder, scale):
     assert "value_scale: is" in fault_of(folder, value_scale=scale)
 
@@ -144,6 +182,16 @@ def test_a_cube_that_was_cut_short_is_refused_wherever_the_cut_is(folder, kept_b
     path = folder.root / "cubes/view_2.npy"
     path.write_bytes(path.read_bytes()[:kept_bytes])
     assert "frames[2] cubes/view_2.npy: " in fault_of(folder)
+
+
+@pytest.mark.parametrize("shape", [b"(-1, 20, 4)", b"(True, 9, 4)", b"(-6,-2, 4) "])
+def test_a_header_with_an_impossible_shape_is_refused(folder, shape):
+    path = folder.root / "cubes/view_2.npy"
+    data = path.read_bytes()
+    assert data.count(b"(16, 20, 4)") == 1
+    extra = len(shape) - len(b"(16, 20, 4)")
+    path.write_bytes(data.replace(b"(16, 20, 4)", shape).replace(b" " * extra + b"\n", b"\n", 1))
+    assert "frames[2] cubes/view_2.npy: has the shape (" in fault_of(folder)
 
 
 def test_a_header_that_claims_more_than_the_file_holds_allocates_nothing(folder):
@@ -232,7 +280,21 @@ def test_a_picture_of_another_size_or_a_damaged_one_is_refused(folder):
     path.write_bytes(path.read_bytes()[:60])
     fault = fault_of(folder)
     assert "frames[1] images/view_1.png: the picture has 20 x 18 pixels" in fault
-    assert "frames[2] images/view_2.png: cannot be read as a picture" in fault
+    assert "frames[2] images/view_2.png: cannot be read as a PNG, JPEG or TIFF picture" in fault
+
+
+def test_a_small_file_that_decodes_to_gigabytes_is_refused_by_its_size(folder, monkeypatch):
+    path = folder.root / "images/view_2.png"
+    Image.new("RGBA", (3000, 2000)).save(path)
+    monkeypatch.setattr("PIL.ImageFile.ImageFile.load", lambda _: pytest.fail("it was decoded"))
+    with pytest.raises(UnreadableImageError, match="3000 x 2000 pixels"):
+        read_colour(path, (HEIGHT, WIDTH))
+
+
+@pytest.mark.parametrize("form", ["EPS", "GIF", "BMP", "PPM"])
+def test_a_picture_of_another_format_is_refused_whatever_its_name(folder, form):
+    Image.new("RGB", (WIDTH, HEIGHT)).save(folder.root / "images/view_2.png", form)
+    assert "view_2.png: cannot be read as a PNG, JPEG or TIFF picture" in fault_of(folder)
 
 
 def test_alpha_in_some_pictures_only_is_refused(folder):

@@ -30,7 +30,7 @@ def test_an_absent_transforms_json_is_named(folder):
     ("text", "message"),
     [
         ('{"frames": [{"file_path": ', "is not valid JSON"),
-        ("", "is not valid JSON"),
+        ("", "is empty; expected JSON"),
         ("[" * 100000, "is not readable as JSON"),
         ("[1, 2]", "holds a list of 2; expected an object"),
         ("null", "holds null; expected an object"),
@@ -77,6 +77,11 @@ def test_a_scene_without_frames_is_refused(folder):
             lambda c: c.update(wavelengths=[450, 520, 600]),
             "the cube has 4 bands; expected 3, as 'wavelengths' lists",
         ),
+        (
+            lambda c: c.update(wavelengths=[0.45, 0.52, 0.6, 0.68]),
+            "'wavelengths': wavelengths of 0.45 to 0.68 look like micrometres; expected nm: multiply them by 1000",
+        ),
+        (lambda c: c.update(wavelengths=[450, 520, 600, 1e300]), "expected 20 to 1e+06 nm"),
         (lambda c: c.update(materials="wood"), "'materials' is \"wood\"; expected a list of different names"),
         (
             lambda c: c.update(materials=["wood", "wood"]),
@@ -93,6 +98,8 @@ def test_a_scene_without_frames_is_refused(folder):
         (lambda c: c.update(fl_x="wide"), "'fl_x' is \"wide\"; expected a finite number"),
         (lambda c: c.update(fl_x=True), "'fl_x' is true; expected a finite number"),
         (lambda c: c.update(fl_x=0), "'fl_x' is 0; expected a focal length above 0"),
+        (lambda c: c.update(fl_x=1e-320), "'fl_x' is 9.99989e-321; expected a focal length above 0"),
+        (lambda c: c.update(cx=-1e300), "'cx' is -1e+300; expected a finite number, at most 1e9"),
         (lambda c: c.pop("fl_x"), "'fl_x' is absent"),
         (lambda c: (c.pop("fl_x"), c.update(camera_angle_x=4)), "'camera_angle_x' is 4; expected radians"),
         (lambda c: c.update(cx=float("inf")), "'cx' is Infinity; expected a finite number"),
@@ -126,6 +133,8 @@ def test_a_scene_without_frames_is_refused(folder):
             lambda c: c["frames"][2].pop("hyperspectral_file_path"),
             "frames[2]: has no 'hyperspectral_file_path'",
         ),
+        (set_frame(2, hyperspectral_file_path=None), "frames[2]: has no 'hyperspectral_file_path'"),
+        (set_frame(2, hyperspectral_file_path="\ud800.npy"), "is not readable as JSON (UnicodeEncodeError)"),
         (
             set_frame(2, hyperspectral_file_path=5),
             "frames[2]: 'hyperspectral_file_path' is 5; expected a path",

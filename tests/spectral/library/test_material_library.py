@@ -1,4 +1,6 @@
+import contextlib
 import math
+import time
 
 import numpy as np
 import pytest
@@ -221,6 +223,12 @@ def test_envi_scale_units_and_byte_order_are_followed(tmp_path):
         ({"data_type": 6}, "'data type' is 6; known"),
         ({"lines": 20}, "has 24 bytes; 20 spectra of 3 values need 240"),
         ({"lines": "two"}, "'lines' is two; expected a number"),
+        ({"lines": -1}, "'lines' is -1; expected a whole number of at least 1"),
+        ({"lines": "inf"}, "'lines' is inf; expected a finite number"),
+        ({"samples": "1e400"}, "'samples' is 1e400; expected a finite number"),
+        ({"header_offset": "nan"}, "'header offset' is nan; expected a finite number"),
+        ({"reflectance_scale_factor": 0}, "'reflectance scale factor' is 0"),
+        ({"wavelength": "{0.4, 0.5, 0.7}"}, "look like micrometres"),
         ({"spectra_names": "{oak}"}, "1 'spectra names' for 2 spectra"),
         ({"data_ignore_value": 0.25}, "must be finite; found nan in 'oak' at 500 nm"),
     ],
@@ -230,6 +238,18 @@ def test_a_spoilt_envi_library_is_refused_with_its_name_and_the_fault(tmp_path, 
     with pytest.raises(SpectrumError, match=said) as caught:
         read_library_table(path)
     assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "filling", [" " * 200_000 + "\n", "\n" * 200_000, "a" * 200_000, "=" * 200_000, "{\n" * 100_000]
+)
+def test_a_long_envi_header_takes_time_in_proportion(tmp_path, filling):
+    path, _ = written_by_spectral(tmp_path)
+    path.write_text(path.read_text() + filling)
+    started = time.process_time()
+    with contextlib.suppress(SpectrumError):
+        read_library_table(path)
+    assert time.process_time() - started < 2.0
 
 
 def test_missing_parts_of_an_envi_library_are_named(tmp_path):

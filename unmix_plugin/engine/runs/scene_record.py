@@ -1,6 +1,5 @@
 """`scene.json`: what a run keeps of its scene, validated when it is read."""
 
-import json
 from dataclasses import dataclass
 from pathlib import PurePath
 from typing import Any
@@ -12,6 +11,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.engine.runs.run_files import read_run_json
 from unmix_plugin.engine.runs.run_folder import RunFolder
+from unmix_plugin.engine.runs.same_scene import differences, name_differences
 from unmix_plugin.errors import ConfigError, RunError
 
 
@@ -68,20 +68,26 @@ def read_scene_record(run: RunFolder, kind: type[DataManager] = DataManager) -> 
 
 
 def check_same_scene(scene: SceneRecord, datamanager: DataManager, run: RunFolder) -> None:
-    """Refuse data that would give the model another shape or another space.
+    """Refuse another scene than the run's; numbers may differ by what machines round differently.
 
     Raises:
-        RunError: metadata or scene box differ from what the run was trained with.
+        RunError: metadata, scene box or identity differ from what the run was trained with.
     """
-    found = json.loads(json.dumps(datamanager.metadata()))  # as it would be read back: tuples become lists
-    differing = sorted(key for key in {*scene.metadata, *found} if scene.metadata.get(key) != found.get(key))
-    # Another machine's linear algebra may differ in the last bits of a box that is computed from the cameras.
-    if not torch.allclose(scene.scene_box.aabb, datamanager.scene_box.aabb.cpu(), rtol=1e-4):
-        differing.append("scene_box")
+    kept = {
+        **scene.metadata,
+        "scene_box": scene.scene_box.aabb.tolist(),
+        **datamanager.identity(scene.summary),
+    }
+    found = {
+        **datamanager.metadata(),
+        "scene_box": datamanager.scene_box.aabb.tolist(),
+        **datamanager.identity(datamanager.summary()),
+    }
+    differing = differences(kept, found)
     if differing:
         raise RunError(
             f"the scene at {datamanager.data} is not the one that {run.path} was trained on: "
-            f"{', '.join(differing)} differ; name the right one with --data"
+            f"{name_differences(differing)}; name the right one with --data"
         )
 
 

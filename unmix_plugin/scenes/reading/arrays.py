@@ -47,6 +47,8 @@ def read_array_header(path: Path) -> ArrayHeader:
         except Exception as error:  # numpy raises SyntaxError, TokenError, ValueError... for a damaged header
             raise UnreadableArrayError("has a damaged .npy header; write it again") from error
         found_bytes = path.stat().st_size - file.tell()
+    if not all(type(length) is int and length >= 0 for length in shape):
+        raise UnreadableArrayError(f"has the shape {shape} in its .npy header; write it again")
     if dtype.hasobject:
         raise UnreadableArrayError(
             "holds pickled Python objects, which are never loaded because they can run code; "

@@ -10,6 +10,10 @@ from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.json_values import describe, read_number
 
 SUPPORTED_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")
+GREATEST_PX = 1e9
+"""Of focal lengths and principal points; beyond, and below its inverse, float32 loses what is projected."""
+SMALLEST_ANGLE = 1e-6
+"""Field of view in radians that is still one, and how much less than pi it must be."""
 BENDING_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Also the order of nerfstudio's `distortion_params`."""
 
@@ -82,9 +86,9 @@ def _check_focal(
     faults: Faults,
 ) -> None:
     for key, focal in (("fl_x", focal_x), ("fl_y", focal_y)):
-        if focal is not None and focal <= 0.0:
+        if focal is not None and not 1.0 / GREATEST_PX <= focal <= GREATEST_PX:
             faults.add(where, f"'{key}' is {focal:g}; expected a focal length above 0 in pixels")
-    if angle_x is not None and not 0.0 < angle_x < math.pi:
+    if angle_x is not None and not SMALLEST_ANGLE <= angle_x <= math.pi - SMALLEST_ANGLE:
         faults.add(where, f"'camera_angle_x' is {angle_x:g}; expected radians between 0 and pi")
     if not numbers.has("fl_x") and not numbers.has("camera_angle_x"):
         faults.add(
@@ -107,9 +111,10 @@ class _Numbers:
         if value is None:
             return None
         number = read_number(value)
-        if number is None:
+        if number is None or abs(number) > GREATEST_PX:
             where = self._where if source is self._frame else "transforms.json"
-            self._faults.add(where, f"'{key}' is {describe(value)}; expected a finite number")
+            self._faults.add(where, f"'{key}' is {describe(value)}; expected a finite number, at most 1e9")
+            return None
         return number
 
     def read_size(self, key: str) -> int | None:
@@ -125,7 +130,9 @@ class _Numbers:
         if listed is None:
             return bending
         values = [read_number(value) for value in listed] if isinstance(listed, list) else []
-        if len(values) != len(BENDING_KEYS) or any(value is None for value in values):
+        if len(values) != len(BENDING_KEYS) or any(
+            value is None or abs(value) > GREATEST_PX for value in values
+        ):
             names = ", ".join(BENDING_KEYS)
             self._faults.add(
                 self._where, f"'distortion_params' is {describe(listed)}; expected the numbers {names}"

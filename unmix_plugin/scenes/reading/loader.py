@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -13,27 +12,25 @@ from jaxtyping import Float64
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.scenes.geometry.bounds import find_bounds
-from unmix_plugin.scenes.geometry.carving import matter_mask
 from unmix_plugin.scenes.reading.faults import Faults
-from unmix_plugin.scenes.reading.frame_files import (
-    ImageSize,
-    check_colours,
-    check_cubes,
-    check_truth,
-    locate_files,
-)
+from unmix_plugin.scenes.reading.frame_files import CheckedFiles, check_files, locate_files
+from unmix_plugin.scenes.reading.images import Size
 from unmix_plugin.scenes.reading.scene_paths import resolve_path, sha256_of
 from unmix_plugin.scenes.reading.spectra_files import read_endmembers, read_illuminant
 from unmix_plugin.scenes.reading.splits import Split, split_frames
 from unmix_plugin.scenes.reading.transforms_json import FILE_NAME, SceneEntry, read_transforms
 from unmix_plugin.scenes.scene import Frame, Normalisation, Scene, SceneOptions
 
+SCALE_RANGE = (1e-30, 1e30)
+"""Of `value_scale`: what float32 can divide by."""
+MEASURED_KEYS = ("hyperspectral_file_path", "file_path", "mask_path")
+"""Files of a frame that a training reads; the others are the truth, for evaluation only."""
+
 
 def load_scene(root: Path, options: SceneOptions | None = None) -> Scene:
     """Read and check a scene folder.
 
-    Every value of every cube and every picture is looked at once, a frame at a time; the `Scene` reads them again
-    from the files when asked.
+    Every cube and picture is read once, a frame at a time; the `Scene` reads them again when asked for pixels.
 
     Args:
         root: Folder that holds transforms.json.
@@ -46,15 +43,13 @@ def load_scene(root: Path, options: SceneOptions | None = None) -> Scene:
     _check_options(options, faults)
     entry = read_transforms(root, faults)
     located = locate_files(root, entry, options, faults)
-    size = check_cubes(entry, located, options, faults)
-    has_alpha = check_colours(entry, located, size, faults)
     truth = _read_truth(root, entry, options, faults)
     names = truth.material_names
-    check_truth(entry, located, size, None if names is None else len(names), faults)
+    checked = check_files(entry, located, None if names is None else len(names), options, faults)
     split = split_frames(entry, options.eval_split, options.eval_interval, faults)
     faults.raise_if_any()
-    assert size is not None
-    return _with_bounds(_assemble(root, entry, located, size, has_alpha, truth, split, options), entry)
+    assert checked is not None
+    return _assemble(root, entry, located, checked, truth, split, options)
 
 
 @dataclass(frozen=True)
@@ -64,12 +59,14 @@ class _Truth:
     material_names: tuple[str, ...] | None
     illuminant: Float64[np.ndarray, " B"] | None
     endmembers: Float64[np.ndarray, "K B"] | None
-    paths: tuple[Path, ...]
+    light_paths: tuple[Path, ...]
+    material_paths: tuple[Path, ...]
 
 
 def _check_options(options: SceneOptions, faults: Faults) -> None:
     scale = options.value_scale
-    if scale is not None and not (math.isfinite(scale) and scale > 0.0):
+    low, high = SCALE_RANGE
+    if scale is not None and not low <= scale <= high:
         faults.add(
             "value_scale", f"is {scale:g}; expected a positive number, the stored value that stands for 1"
         )
@@ -78,79 +75,81 @@ def _check_options(options: SceneOptions, faults: Faults) -> None:
 
 def _read_truth(root: Path, entry: SceneEntry, options: SceneOptions, faults: Faults) -> _Truth:
     names, illuminant, endmembers = entry.materials, None, None
-    paths: list[Path] = []
+    paths: dict[str, tuple[Path, ...]] = {}
     for key, text in (("illuminant_path", entry.illuminant_path), ("endmembers_path", entry.endmembers_path)):
         if text is None:
             continue
         path = resolve_path(root, text, options.allow_outside_paths, f"'{key}'", faults)
         if path is None or entry.wavelengths_nm is None:
             continue
-        paths.append(path)
+        paths[key] = (path,)
         if key == "illuminant_path":
             illuminant = read_illuminant(path, entry.wavelengths_nm, f"'{key}'", faults)
         else:
             table = read_endmembers(path, entry.wavelengths_nm, names, f"'{key}'", faults)
             names, endmembers = (names, None) if table is None else (table.names, table.spectra)
-    return _Truth(names, illuminant, endmembers, tuple(paths))
+    return _Truth(
+        names, illuminant, endmembers, paths.get("illuminant_path", ()), paths.get("endmembers_path", ())
+    )
 
 
 def _assemble(
     root: Path,
     entry: SceneEntry,
     located: tuple[dict[str, Path], ...],
-    size: ImageSize,
-    has_alpha: bool,
+    checked: CheckedFiles,
     truth: _Truth,
     split: Split,
     options: SceneOptions,
 ) -> Scene:
-    """The scene in a first model space, centred on the training cameras; `_with_bounds` gives it its own."""
     assert entry.wavelengths_nm is not None
-    positions = _world_poses(entry)[list(split.train), :, 3]
-    radius = float(np.linalg.norm(positions - positions.mean(axis=0), axis=-1).max())
-    first = Normalisation(np.eye(3), -positions.mean(axis=0), 1.0 / radius if radius > 0.0 else 1.0)
-    inputs = [root / FILE_NAME, *truth.paths, *(path for paths in located for path in paths.values())]
+    normalisation, scene_box = _find_model_space(root, entry, checked, split.train)
+    inputs = [path for paths in located for key, path in paths.items() if key in MEASURED_KEYS]
+    inputs += [root / FILE_NAME, *truth.light_paths]
+    truths = [path for paths in located for key, path in paths.items() if key not in MEASURED_KEYS]
+    truths += truth.material_paths
+    hashes = checked.cube_hashes
     evaluated = [located[index] for index in split.evaluation]
     return Scene(
         root=root,
         wavelengths_nm=entry.wavelengths_nm,
         frames=_name_frames(entry, located),
-        cameras=_make_cameras(entry, size, first),
+        cameras=_make_cameras(entry, checked.size, normalisation),
         train_indices=split.train,
         eval_indices=split.evaluation,
-        scene_box=SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])),
-        normalisation=first,
+        scene_box=scene_box,
+        normalisation=normalisation,
         material_names=truth.material_names,
         illuminant=truth.illuminant,
         endmembers=truth.endmembers,
-        has_alpha=has_alpha,
+        has_alpha=checked.matter is not None,
         has_labels=all("seg_file_path" in paths for paths in evaluated),
         has_abundances=all("abundance_file_path" in paths for paths in evaluated),
-        input_hashes={_relative(path, root): sha256_of(path) for path in inputs},
+        input_hashes={_relative(path, root): hashes.get(path) or sha256_of(path) for path in inputs},
+        truth_hashes={_relative(path, root): sha256_of(path) for path in truths},
         options=options,
     )
 
 
-def _with_bounds(scene: Scene, entry: SceneEntry) -> Scene:
-    """The scene with the box that its training views show, brought to [-1, 1]."""
-    train = list(scene.train_indices)
-    matter = [matter_mask(scene, index) for index in train] if scene.has_alpha else None
-    low, high = find_bounds(scene.root, scene.cameras[train], matter).aabb.double().numpy()
+def _find_model_space(
+    root: Path, entry: SceneEntry, checked: CheckedFiles, train: tuple[int, ...]
+) -> tuple[Normalisation, SceneBox]:
+    """The box that the training views show, and how its longest edge becomes [-1, 1].
+
+    The box is found in a space centred on the training cameras, where coordinates are of order 1.
+    """
+    positions = _world_poses(entry)[list(train), :, 3]
+    middle = positions.mean(axis=0)
+    radius = float(np.linalg.norm(positions - middle, axis=-1).max())
+    first = Normalisation(np.eye(3), -middle, 1.0 / radius if radius > 0.0 else 1.0)
+    cameras = _make_cameras(entry, checked.size, first)[list(train)]
+    matter = None if checked.matter is None else [checked.matter[index] for index in train]
+    low, high = find_bounds(root, cameras, matter).aabb.double().numpy()
     scale = float(2.0 / (high - low).max())
     half = 0.5 * scale * (high - low)
-    first = scene.normalisation
-    normalisation = Normalisation(
-        rotation=first.rotation,
-        translation=first.translation - 0.5 * (low + high) / first.scale,
-        scale=first.scale * scale,
-    )
-    size = ImageSize(scene.cameras.height, scene.cameras.width)
-    return replace(
-        scene,
-        cameras=_make_cameras(entry, size, normalisation),
-        normalisation=normalisation,
-        scene_box=SceneBox(torch.from_numpy(np.stack([-half, half])).float()),
-    )
+    translation = first.translation - 0.5 * (low + high) / first.scale
+    box = SceneBox(torch.from_numpy(np.stack([-half, half])).float())
+    return Normalisation(first.rotation, translation, first.scale * scale), box
 
 
 def _world_poses(entry: SceneEntry) -> Float64[np.ndarray, "N 3 4"]:
@@ -159,24 +158,25 @@ def _world_poses(entry: SceneEntry) -> Float64[np.ndarray, "N 3 4"]:
     return np.stack(poses)
 
 
-def _make_cameras(entry: SceneEntry, size: ImageSize, normalisation: Normalisation) -> Cameras:
+def _make_cameras(entry: SceneEntry, size: Size, normalisation: Normalisation) -> Cameras:
+    height, width = size
     lenses = [frame.intrinsics for frame in entry.frames if frame.intrinsics is not None]
     assert len(lenses) == len(entry.frames)
     poses = _world_poses(entry)
     rotations = normalisation.rotation @ poses[:, :, :3]
     positions = normalisation.to_model(poses[:, :, 3])
-    middle = (0.5 * size.width, 0.5 * size.height)
+    middle = (0.5 * width, 0.5 * height)
     centers = [
         [middle[axis] if value is None else value for axis, value in enumerate(lens.center_px)]
         for lens in lenses
     ]
     return Cameras(
         camera_to_world=torch.from_numpy(np.concatenate([rotations, positions[:, :, None]], axis=-1)).float(),
-        focal_px=torch.tensor([lens.focal_at(size.width) for lens in lenses], dtype=torch.float32),
+        focal_px=torch.tensor([lens.focal_at(width) for lens in lenses], dtype=torch.float32),
         center_px=torch.tensor(centers, dtype=torch.float32),
         distortion=torch.tensor([lens.distortion for lens in lenses], dtype=torch.float32),
-        width=size.width,
-        height=size.height,
+        width=width,
+        height=height,
     )
 
 

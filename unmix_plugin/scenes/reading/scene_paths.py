@@ -20,7 +20,7 @@ def resolve_path(root: Path, text: str, allow_outside: bool, where: str, faults:
     try:
         inside = path.resolve().is_relative_to(root.resolve()) and not Path(text).is_absolute()
         is_file = path.is_file()
-    except (OSError, RuntimeError) as error:  # a name too long, a loop of links
+    except (OSError, RuntimeError, ValueError) as error:  # a name too long, a loop of links, a zero byte
         faults.add(
             where,
             f"{text!r} cannot be followed ({type(error).__name__}); expected a file in the scene folder",

@@ -1,11 +1,10 @@
-"""transforms.json in nerfstudio's form with the keys of UnMix-NeRF: from text of unknown make to typed entries.
+"""transforms.json in nerfstudio's form with the keys of UnMix-NeRF: from text of unknown origin to typed entries.
 
 Nothing here opens a file other than transforms.json; a value of the wrong type becomes a noted fault and None.
 """
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,10 +12,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from unmix_plugin.errors import SpectrumError
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.intrinsics import Intrinsics, read_intrinsics
-from unmix_plugin.scenes.reading.json_values import describe, read_number
+from unmix_plugin.scenes.reading.json_values import UnreadableJsonError, describe, read_json_file, read_number
 from unmix_plugin.scenes.reading.poses import read_pose
+from unmix_plugin.spectral.bands import require_nanometres
 
 FILE_NAME = "transforms.json"
 SPLIT_KEYS = ("train_filenames", "val_filenames", "test_filenames")
@@ -35,6 +36,10 @@ class FrameEntry:
     """Camera to world, rotation orthonormal."""
     intrinsics: Intrinsics | None
     """Lens of this frame."""
+
+    def name_of(self, key: str) -> str:
+        """One of its files, for messages."""
+        return f"{self.where} {self.paths[key]}" if key in self.paths else self.where
 
 
 @dataclass(frozen=True)
@@ -86,17 +91,11 @@ def _read_object(path: Path, faults: Faults) -> dict[str, Any]:
     faults.raise_if_any()
     content: Any = None
     try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
+        content = read_json_file(path)
     except OSError as error:
         faults.add(FILE_NAME, f"cannot be read ({error.strerror})")
-    except json.JSONDecodeError as error:
-        at = f"line {error.lineno}, column {error.colno}"
-        faults.add(FILE_NAME, f"is not valid JSON ({error.msg} at {at}); was it cut short?")
-    except (
-        ValueError,
-        RecursionError,
-    ) as error:  # not UTF-8, numbers of thousands of digits, endless nesting
-        faults.add(FILE_NAME, f"is not readable as JSON ({type(error).__name__})")
+    except UnreadableJsonError as error:
+        faults.add(FILE_NAME, str(error))
     faults.raise_if_any()
     if not isinstance(content, dict):
         faults.add(
@@ -112,7 +111,7 @@ def _read_frame(content: dict[str, Any], frame: Any, index: int, faults: Faults)
         faults.add(where, f"is {describe(frame)}; expected an object")
         return FrameEntry(where, {}, None, None)
     paths = {key: _read_text(frame, key, where, faults) for key in FILE_KEYS}
-    if "hyperspectral_file_path" not in frame:
+    if frame.get("hyperspectral_file_path") is None:
         faults.add(where, "has no 'hyperspectral_file_path'; expected the path of its (H, W, B) .npy cube")
     return FrameEntry(
         where=where,
@@ -126,7 +125,7 @@ def _read_text(content: dict[str, Any], key: str, where: str, faults: Faults) ->
     value = content.get(key)
     if value is None:
         return None
-    if not isinstance(value, str) or not value or "\0" in value:
+    if not isinstance(value, str) or not value or any(character < " " for character in value):
         faults.add(where, f"'{key}' is {describe(value)}; expected a path")
         return None
     return value
@@ -155,6 +154,11 @@ def _read_wavelengths(content: dict[str, Any], faults: Faults) -> Float64[np.nda
         message = f"'wavelengths' must increase; got {a:g} nm then {b:g} nm at band {drops[0] + 1}"
         faults.add(FILE_NAME, message + "; sort the bands of wavelengths and cubes alike")
         return None
+    try:
+        require_nanometres(wavelengths)
+    except SpectrumError as error:
+        faults.add(FILE_NAME, f"'wavelengths': {error}")
+        return None
     return wavelengths
 
 
@@ -162,7 +166,7 @@ def _read_materials(content: dict[str, Any], faults: Faults) -> tuple[str, ...] 
     values = content.get("materials")
     if values is None:
         return None
-    is_list = isinstance(values, list) and values and all(isinstance(v, str) and v for v in values)
+    is_list = isinstance(values, list) and values and all(isinstance(v, str) and v.strip() for v in values)
     if not is_list or len(set(values)) != len(values):
         faults.add(FILE_NAME, f"'materials' is {describe(values)}; expected a list of different names")
         return None

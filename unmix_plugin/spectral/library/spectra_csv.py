@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from unmix_plugin.errors import RunError, SpectrumError
-from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.bands import Bands, require_nanometres
 
 TOLERANCE_NM = 1e-6
 """Reach beyond the data that counts as rounding, not as extrapolation."""
@@ -94,7 +94,9 @@ def read_spectra_csv(path: Path) -> SpectraTable:
         values = np.array([_parse_row(row, line, header) for line, row in rows], dtype=np.float64)
         if len(values) == 0:
             raise SpectrumError("there is a header but no row of values")
-        return SpectraTable(Bands(values[:, 0].copy()), names, np.ascontiguousarray(values[:, 1:].T))
+        bands = Bands(values[:, 0].copy())
+        require_nanometres(bands.centers_nm)
+        return SpectraTable(bands, names, np.ascontiguousarray(values[:, 1:].T))
     except SpectrumError as error:
         raise SpectrumError(f"{path}: {error}") from error
 

@@ -7,14 +7,14 @@ Of the header these keys count: `samples` (bands), `lines` (spectra), `data type
 
 from __future__ import annotations
 
-import re
+import math
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.bands import Bands, require_nanometres
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable
 
 _TYPES = {1: "u1", 2: "i2", 3: "i4", 4: "f4", 5: "f8", 12: "u2", 13: "u4", 14: "i8", 15: "u8"}
@@ -28,6 +28,8 @@ _NM_PER_UNIT = {
     "micrometer": 1e3,
     "microns": 1e3,
 }
+_GREATEST_COUNT = 2**53
+_SMALLEST_SCALE = 1e-30
 _DATA_SUFFIXES = (".sli", ".SLI", "", ".dat", ".img", ".lib", ".raw")
 
 
@@ -46,7 +48,13 @@ def read_spectra_envi(path: Path) -> SpectraTable:
         values = _read_values(header, header_path)
         centers = _numbers(header, "wavelength", values.shape[1]) * _nm_per_unit(header)
         names = _names(header, len(values))
-        return SpectraTable(Bands(centers), names, values / _number(header, "reflectance scale factor", 1.0))
+        bands, scale = Bands(centers), _number(header, "reflectance scale factor", 1.0)
+        require_nanometres(bands.centers_nm)
+        if not _SMALLEST_SCALE <= scale <= 1.0 / _SMALLEST_SCALE:
+            raise SpectrumError(
+                f"'reflectance scale factor' is {scale:g}; expected a number above 0, such as 10000"
+            )
+        return SpectraTable(bands, names, values / scale)
     except SpectrumError as error:
         raise SpectrumError(f"{header_path}: {error}") from error
     except OSError as error:
@@ -59,31 +67,43 @@ def _read_header(path: Path) -> dict[str, str]:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise SpectrumError(f"no ENVI header: not text in UTF-8 ({error.reason})") from error
-    lines = text.splitlines()
-    if not lines or lines[0].strip() != "ENVI":
+    lines = iter(text.splitlines())
+    if next(lines, "").strip() != "ENVI":
         raise SpectrumError("no ENVI header: its first line is not 'ENVI'")
-    body = "\n".join(line for line in lines[1:] if not line.lstrip().startswith(";"))
-    pairs = re.findall(r"^\s*([^=\n]+?)\s*=\s*(\{[^}]*\}|[^\n]*)", body, flags=re.MULTILINE)
-    return {key.lower(): value.strip().strip("{}").strip() for key, value in pairs}
+    header: dict[str, str] = {}
+    for line in lines:
+        key, equals, value = line.partition("=")
+        if not equals or line.lstrip().startswith(";"):
+            continue
+        parts = [value.strip()]
+        if parts[0].startswith("{"):
+            while "}" not in parts[-1] and (following := next(lines, None)) is not None:
+                parts.append("" if following.lstrip().startswith(";") else following)
+            parts = ["\n".join(parts).lstrip("{").partition("}")[0]]
+        header[" ".join(key.lower().split())] = parts[0].strip()
+    return header
 
 
 def _read_values(header: dict[str, str], header_path: Path) -> Float64[np.ndarray, "K B"]:
-    code = int(_number(header, "data type"))
+    code = _count(header, "data type")
     if code not in _TYPES:
         raise SpectrumError(f"'data type' is {code}; known: {', '.join(map(str, _TYPES))}")
-    shape = int(_number(header, "lines")), int(_number(header, "samples"))
-    order = ">" if int(_number(header, "byte order", 0.0)) else "<"
-    data_path = _data_path(header_path)
-    raw = data_path.read_bytes()[int(_number(header, "header offset", 0.0)) :]
-    kind = np.dtype(order + _TYPES[code])
-    if len(raw) < shape[0] * shape[1] * kind.itemsize:
+    shape = _count(header, "lines", least=1), _count(header, "samples", least=1)
+    kind = np.dtype((">" if _count(header, "byte order", 0) else "<") + _TYPES[code])
+    offset, data_path = _count(header, "header offset", 0), _data_path(header_path)
+    found = max(0, data_path.stat().st_size - offset)
+    needed = shape[0] * shape[1] * kind.itemsize
+    if found < needed:
         raise SpectrumError(
-            f"{data_path.name} has {len(raw)} bytes; {shape[0]} spectra of {shape[1]} values need "
-            f"{shape[0] * shape[1] * kind.itemsize}"
+            f"{data_path.name} has {found} bytes; {shape[0]} spectra of {shape[1]} values need {needed}"
         )
-    values = np.frombuffer(raw, kind, shape[0] * shape[1]).reshape(shape).astype(np.float64)
-    if "data ignore value" in header:
-        values[values == np.array(_number(header, "data ignore value")).astype(kind)] = np.nan
+    with data_path.open("rb") as file:
+        file.seek(offset)
+        stored = np.frombuffer(file.read(needed), kind).reshape(shape)
+    with np.errstate(all="ignore"):  # signalling NaN, and an ignored value that the type can't hold
+        values = stored.astype(np.float64)
+        if "data ignore value" in header:
+            values[values == np.array(_any_number(header, "data ignore value")).astype(kind)] = np.nan
     return values
 
 
@@ -103,7 +123,7 @@ def _nm_per_unit(header: dict[str, str]) -> float:
 
 
 def _names(header: dict[str, str], count: int) -> tuple[str, ...]:
-    names = tuple(re.sub(r"\s+", " ", name.strip()) for name in header.get("spectra names", "").split(","))
+    names = tuple(" ".join(name.split()) for name in header.get("spectra names", "").split(","))
     if names == ("",):
         return tuple(f"spectrum {index}" for index in range(count))
     if len(names) != count:
@@ -122,10 +142,26 @@ def _numbers(header: dict[str, str], key: str, count: int) -> Float64[np.ndarray
     return values
 
 
-def _number(header: dict[str, str], key: str, default: float | None = None) -> float:
+def _number(header: dict[str, str], key: str, default: float | int | None = None) -> float:
+    """A finite number."""
     if key not in header and default is not None:
-        return default
+        return float(default)
+    number = _any_number(header, key)
+    if not math.isfinite(number):
+        raise SpectrumError(f"'{key}' is {header[key]}; expected a finite number")
+    return number
+
+
+def _any_number(header: dict[str, str], key: str) -> float:
     try:
         return float(header[key])
     except (KeyError, ValueError):
         raise SpectrumError(f"'{key}' is {header.get(key, 'missing')}; expected a number") from None
+
+
+def _count(header: dict[str, str], key: str, default: int | None = None, least: int = 0) -> int:
+    """A whole number from `least` up."""
+    number = _number(header, key, default)
+    if number != int(number) or not least <= number <= _GREATEST_COUNT:
+        raise SpectrumError(f"'{key}' is {header[key]}; expected a whole number of at least {least}")
+    return int(number)

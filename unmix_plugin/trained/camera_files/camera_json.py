@@ -1,8 +1,7 @@
-"""What all camera files have in common: JSON of unknown make to checked cameras."""
+"""What all camera files have in common: JSON of unknown origin to checked cameras."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from jaxtyping import Float64
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.scenes.reading.faults import Faults
-from unmix_plugin.scenes.reading.json_values import describe, read_number
+from unmix_plugin.scenes.reading.json_values import UnreadableJsonError, describe, read_json_file, read_number
 from unmix_plugin.scenes.reading.poses import read_pose
 from unmix_plugin.trained.run_views import RunView
 
@@ -71,17 +70,11 @@ def read_camera_json(path: Path) -> dict[str, Any]:
         ConfigError: the file is missing, empty, no JSON object, or of another version.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")
-        if not text.strip():
-            raise ConfigError(f"{path} is empty; expected the JSON of a camera file")
-        content = json.loads(text)
+        content = read_json_file(path)
     except OSError as error:
         raise ConfigError(f"can't read the camera file {path}: {error.strerror or error}") from error
-    except json.JSONDecodeError as error:
-        at = f"line {error.lineno}, column {error.colno}"
-        raise ConfigError(f"{path} is not valid JSON ({error.msg} at {at}); was it cut short?") from error
-    except (ValueError, RecursionError) as error:  # not UTF-8, endless digits, endless nesting
-        raise ConfigError(f"{path} is not readable as JSON ({type(error).__name__})") from error
+    except UnreadableJsonError as error:
+        raise ConfigError(f"{path} {error}") from error
     if not isinstance(content, dict):
         raise ConfigError(f"{path} holds {describe(content)}; expected an object with cameras")
     version = content.get("format_version", FORMAT_VERSION)

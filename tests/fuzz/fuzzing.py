@@ -1,0 +1,64 @@
+"""Feed damaged inputs to a reader, and keep what it should not have done."""
+
+from __future__ import annotations
+
+import random
+import time
+import zlib
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from tests.fuzz.readers import READERS, Reader
+
+
+@dataclass
+class Outcome:
+    """What many cases of one reader came to."""
+
+    cases: int = 0
+    accepted: int = 0
+    """Cases that were read without an error."""
+    slowest_s: float = 0.0
+    slowest_case: int = 0
+    foreign: list[tuple[int, str]] = field(default_factory=list)
+    """Case and error of each exception that the reader does not promise."""
+
+
+def case_bytes(name: str, reader: Reader, seed: int, case: int) -> bytes:
+    """The input of a case; one and the same for a seed, on every machine."""
+    generator = random.Random(zlib.crc32(f"{name} {seed} {case}".encode()))
+    return reader.mutate(reader.samples, generator)
+
+
+def fuzz(name: str, folder: Path, seed: int, cases: range, until_s: float | None = None) -> Outcome:
+    """Run cases of a reader.
+
+    Args:
+        name: In `READERS`.
+        folder: An empty one, to write inputs to.
+        seed: Of all cases.
+        cases: Their numbers.
+        until_s: On the clock of `time.perf_counter`, when to stop early.
+    """
+    reader = READERS[name]()
+    for companion, data in reader.companions:
+        (folder / companion).write_bytes(data)
+    path, outcome = folder / reader.file_name, Outcome()
+    for case in cases:
+        if until_s is not None and time.perf_counter() > until_s:
+            break
+        path.unlink(missing_ok=True)  # some file systems flush a file that is truncated and written again
+        path.write_bytes(case_bytes(name, reader, seed, case))
+        started = time.perf_counter()
+        try:
+            reader.read(path)
+            outcome.accepted += 1
+        except reader.allowed:
+            pass
+        except Exception as error:  # noqa: BLE001 - any other exception is what fuzzing looks for
+            outcome.foreign.append((case, f"{type(error).__name__}: {error}"))
+        seconds = time.perf_counter() - started
+        if seconds > outcome.slowest_s:
+            outcome.slowest_s, outcome.slowest_case = seconds, case
+        outcome.cases += 1
+    return outcome
