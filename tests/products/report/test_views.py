@@ -1,22 +1,17 @@
 """What a report counts of views, and the sections it makes of them."""
 
+import json
 import math
 
 import numpy as np
 import pytest
 import torch
 
-from tests.figures.test_html_page import Outline
-from unmix_plugin.figures.html_page import Section
-from unmix_plugin.products.report.materials import materials_section
-from unmix_plugin.products.report.pictures import (
-    abundances_section,
-    error_section,
-    segmentation_section,
-    views_section,
-    worst_section,
-)
-from unmix_plugin.products.report.run import figures_section, read_metrics
+from tests.products.report.page_outline import Outline, assert_self_contained
+from unmix_plugin.products.report.layout import view_values
+from unmix_plugin.products.report.materials import TrueMaterials, material_cards
+from unmix_plugin.products.report.page import render_page
+from unmix_plugin.products.report.run import figure_rows, read_metrics, training_charts
 from unmix_plugin.products.report.views import ReportViews, evenly
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.composition import Materials
@@ -53,22 +48,42 @@ def gathered(offsets, with_truth=True, materials=MATERIALS):
     return views
 
 
-def outline(section: Section | None) -> Outline:
-    assert section is not None
-    return Outline(section.html)
+OTHERS = {
+    "title": "Title <x>",
+    "subtitle": "run",
+    "notes": ["so & so"],
+    "facts": [("<b>", "</dl>")],
+    "cards": [],
+    "num_known": 0,
+    "light_unknown": None,
+    "figures": None,
+    "figures_source": "",
+    "training": [],
+    "settings": "{}",
+    "versions": [],
+}
+
+
+def outline(views: ReportViews, **others) -> Outline:
+    return assert_self_contained(render_page({**OTHERS, **view_values(views), **others}))
+
+
+def shown_texts(views: ReportViews, **others) -> dict[str, str]:
+    """Text of each section."""
+    return outline(views, **others).section_texts
 
 
 def test_error_against_wavelength_is_over_pixels_that_show_matter():
     views = gathered([0.1, 0.0])
     np.testing.assert_allclose(views.rmse_of_bands, [0.1 / math.sqrt(2), 0, 0, 0, 0], atol=1e-7)
     np.testing.assert_allclose(views.bias_of_bands, [-0.05, 0, 0, 0, 0], atol=1e-7)
-    assert "mean of predicted less measured" in outline(error_section(views)).text
+    assert "mean of predicted less measured" in shown_texts(views)["error"]
 
 
 def test_worst_views_are_those_of_lowest_psnr():
     views = gathered([0.02, 0.1, 0.05, 0.01])
     assert [view.name for view in views.worst_first] == ["view_1", "view_2", "view_0", "view_3"]
-    text = outline(worst_section(views)).text
+    text = shown_texts(views)["worst"]
     assert text.index("view_1") < text.index("view_2") < text.index("view_0")
     assert "view_3" not in text
 
@@ -79,20 +94,29 @@ def test_proportions_are_of_what_is_seen():
 
 
 def test_without_the_scene_there_is_nothing_measured_and_no_error():
-    views = gathered([0.0, 0.0], with_truth=False)
-    assert error_section(views) is None
-    assert worst_section(views) is None
-    assert "measured" not in outline(views_section(views)).text
-    shown = outline(segmentation_section(views))
-    assert "leaf & stem" in shown.text
-    assert "intersection over union" not in shown.text
+    texts = shown_texts(gathered([0.0, 0.0], with_truth=False))
+    assert "error" not in texts
+    assert "worst" not in texts
+    assert "measured" not in texts["views"]
+    assert "leaf & stem" in texts["segmentation"]
+    assert "intersection over union" not in texts["segmentation"]
 
 
 def test_with_labels_segmentation_is_scored_and_matched():
-    shown = outline(segmentation_section(gathered([0.0])))
-    assert len(shown.fetched) == 3
-    assert shown.text.count("1.000") == 3
-    assert "<clay>" in shown.text
+    views = gathered([0.0])
+    assert len(view_values(views)["segmentation"].pictures) == 3
+    text = shown_texts(views)["segmentation"]
+    assert text.count("1.000") == 3
+    assert "<clay>" in text
+
+
+def test_text_is_escaped_and_links_lead_to_the_sections():
+    page = outline(gathered([0.0]), settings="<script>alert(1)</script>")
+    assert "Title <x>" in page.text
+    assert "so & so" in page.section_texts["scene"]
+    assert "<b></dl>" in page.section_texts["scene"]
+    assert "<script>alert(1)</script>" in page.section_texts["settings"]
+    assert page.links == [f"#{name}" for name in page.ids]
 
 
 @pytest.mark.parametrize("count", [1, 3, 7, 8, 26])
@@ -106,42 +130,56 @@ def test_there_is_a_map_for_each_endmember_in_the_views_chosen(count):
     )
     views.add("first", view, None)
     views.add("second", view, None)
-    shown = outline(abundances_section(views))
-    assert len(shown.fetched) == count + 1  # and the strip of colours
-    assert "first" not in shown.text
+    [(name, maps)] = view_values(views)["shares"]
+    assert name == "second"
+    assert [one.caption for one in maps] == list(materials.names)
+    text = shown_texts(views)["abundances"]
+    assert "first" not in text
+    assert all(name in text for name in materials.names)
 
 
 def test_each_endmember_has_its_three_nearest_known_materials_and_its_true_one():
-    truth = (["clay", "leaf", "paint"], SPECTRA.double().numpy())
-    section = materials_section(MATERIALS, np.array([0.5, 0.3, 0.2]), np.ones(5), measured_library(), truth)
-    shown = outline(section)
-    assert shown.text.count("true: clay") == 2  # in the drawing and in the table
-    assert shown.text.count("known material") == len(NAMES) + 1
-    assert "50.0% of what is seen" in shown.text
-    assert "taken as flat" not in shown.text
-    for matches in measured_library().nearest(SPECTRA.numpy(), BANDS):
-        for match in matches:
-            assert match.name in shown.text
-    unknown = materials_section(MATERIALS, np.zeros(3), None, measured_library(), None)
-    assert "taken as flat" in unknown.html
-    assert "true:" not in unknown.html
+    truth = TrueMaterials(["clay", "leaf", "paint"], SPECTRA.double().numpy())
+    library = measured_library()
+    cards = material_cards(MATERIALS, np.array([0.5, 0.3, 0.2]), np.ones(5), library, truth)
+    text = shown_texts(gathered([]), cards=cards)["materials"]
+    assert text.count("true: clay") == 1
+    assert text.count("known material") == len(NAMES) + 1
+    assert "50.0% of what is seen" in text
+    for matches in library.nearest(SPECTRA.numpy(), BANDS):
+        assert all(match.name in text for match in matches)
+    assert [len(card.chart.lines) for card in cards] == [5, 5, 5]
+    unknown = material_cards(MATERIALS, np.zeros(3), None, library, None)
+    text = shown_texts(gathered([]), cards=unknown, light_unknown="taken as flat")["materials"]
+    assert "taken as flat" in text
+    assert "true:" not in text
 
 
 def test_bands_that_no_known_material_covers_are_said():
     infrared = Materials(Bands.of([1000, 1100, 1200, 1300, 1400]), SPECTRA, torch.zeros(0, 5))
-    section = materials_section(infrared, np.zeros(3), None, measured_library(), None)
-    assert "No known material covers enough of the bands." in section.html
+    cards = material_cards(infrared, np.zeros(3), None, measured_library(), None)
+    text = shown_texts(gathered([]), cards=cards)["materials"]
+    assert text.count("No known material covers enough of the bands.") == 3
 
 
 def test_figures_come_with_their_definitions_or_with_what_to_do():
-    section = figures_section(
-        {"psnr": 31.25, "miou": None, "definitions": {"psnr": "as it was then"}}, "From a file."
-    )
-    text = outline(section).text
-    assert "31.25" in text
-    assert "as it was then" in text
-    assert "no truth" in text
-    assert "run unmix-eval" in figures_section(None, "").html
+    rows = figure_rows({"psnr": 31.25, "miou": None, "definitions": {"psnr": "as it was then"}})
+    text = shown_texts(gathered([]), figures=rows, figures_source="From a file.")["figures"]
+    assert all(part in text for part in ("31.25", "as it was then", "no truth", "From a file."))
+    assert "run unmix-eval" in shown_texts(gathered([]))["figures"]
+
+
+def test_a_training_is_drawn_with_its_evaluations(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    train = {"split": "train", "loss": 0.1, "psnr": 20, "lr/field": 0.01}
+    evaluated = {"split": "eval_all", "psnr": 19}
+    records = [{**kind, "seconds": second} for kind in (train, evaluated) for second in (1, 2)]
+    path.write_text("\n".join(map(json.dumps, records)))
+    charts = training_charts(path)
+    assert [chart.y_label for chart in charts] == ["loss", "PSNR (dB)", "learning rate", "rays a second"]
+    assert [line.label for line in charts[1].lines] == ["training batches", "evaluation views"]
+    assert "evaluation views" in shown_texts(gathered([]), training=charts)["training"]
+    assert training_charts(tmp_path / "none") == []
 
 
 def test_lines_that_a_killed_run_left_incomplete_are_passed_over(tmp_path):

@@ -1,4 +1,4 @@
-"""The report's sections put together."""
+"""The contents of a report put together."""
 
 from __future__ import annotations
 
@@ -9,29 +9,19 @@ from typing import Any
 import numpy as np
 
 from unmix_plugin.engine.runs.load_run import LoadedModel
-from unmix_plugin.figures.html_page import Section, paragraph, render_page
 from unmix_plugin.formats.files import write_file
-from unmix_plugin.products.report.materials import materials_section
-from unmix_plugin.products.report.pictures import (
-    abundances_section,
-    error_section,
-    segmentation_section,
-    views_section,
-    worst_section,
-)
+from unmix_plugin.products.abundances import SHARE_SCALE
+from unmix_plugin.products.report import pictures, run
+from unmix_plugin.products.report.materials import TrueMaterials, material_cards
+from unmix_plugin.products.report.page import render_page
 from unmix_plugin.products.report.report import report_path
-from unmix_plugin.products.report.run import (
-    figures_section,
-    scene_name,
-    scene_section,
-    settings_section,
-    training_section,
-    versions_section,
-)
-from unmix_plugin.products.report.views import ReportViews
+from unmix_plugin.products.report.views import ERROR_SCALE, ReportViews, evenly
+from unmix_plugin.spectral.colour.conversion import describe_colour
 from unmix_plugin.spectral.library.material_library import MaterialLibrary
 from unmix_plugin.trained.evaluation import finite_or_none
-from unmix_plugin.trained.library_matches import light_of
+from unmix_plugin.trained.library_matches import LIGHT_UNKNOWN, light_of
+
+_WORST_VIEWS = 3
 
 
 def write_report(
@@ -54,40 +44,57 @@ def write_report(
     Raises:
         RunError: the disk is full or refuses.
     """
-    materials = views.materials
-    values, source = stored_figures, "From the run's eval/metrics.json."
-    if values is None and views.evaluation is not None:
-        values = finite_or_none(views.evaluation.figures())
+    materials, light = views.materials, light_of(loaded.model)
+    figures, source = stored_figures, "From the run's eval/metrics.json."
+    if figures is None and views.evaluation is not None:
+        figures = finite_or_none(views.evaluation.figures())
         source = f"Of the {len(views.shown)} views rendered for this report."
-    light = light_of(loaded.model)
-    sections = [
-        scene_section(loaded, materials, values),
-        views_section(views),
-        materials_section(materials, views.proportions, light, library, _true_materials(loaded)),
-        abundances_section(views),
-        segmentation_section(views),
-        figures_section(values, source),
-        error_section(views),
-        worst_section(views),
-        training_section(loaded),
-        settings_section(loaded),
-        versions_section(loaded, ()),
-    ]
-    shown = [section for section in sections if section is not None]
-    if notes:
-        warnings = "".join(paragraph(note, "warning") for note in notes)
-        shown[0] = Section(shown[0].key, shown[0].title, warnings + shown[0].html)
-    title = f"{scene_name(loaded)}: spectral unmixing report"
-    subtitle = f"{loaded.config.method_name}, run {loaded.run.path.name}"
-    return write_file(report_path(folder), render_page(title, subtitle, shown).encode())
+    truth = _true_materials(loaded, light)
+    page = render_page(
+        {
+            "title": f"{run.scene_name(loaded)}: spectral unmixing report",
+            "subtitle": f"{loaded.config.method_name}, run {loaded.run.path.name}",
+            "notes": notes,
+            "facts": run.scene_facts(loaded, materials, figures),
+            "cards": material_cards(materials, views.proportions, light, library, truth),
+            "num_known": len(library.names),
+            "light_unknown": LIGHT_UNKNOWN if light is None else None,
+            "figures": None if figures is None else run.figure_rows(figures),
+            "figures_source": source,
+            "training": run.training_charts(loaded.run.metrics_path),
+            "settings": run.settings_text(loaded),
+            "versions": run.version_rows(loaded),
+            **view_values(views),
+        }
+    )
+    return write_file(report_path(folder), page.encode())
 
 
-def _true_materials(loaded: LoadedModel) -> tuple[list[str], np.ndarray] | None:
-    """Names and radiance of the true materials in the light of the model, as far as the run knows them."""
+def view_values(views: ReportViews) -> dict[str, Any]:
+    """What the template shows of views."""
+    shown, worst = evenly(views.shown, pictures.SHOWN_VIEWS), views.worst_first
+    colour = describe_colour(views.materials.bands)
+    return {
+        "colour_note": colour[0].upper() + colour[1:],
+        "views": pictures.colour_pictures(shown),
+        "is_compared": any(view.measured is not None for view in shown),
+        "worst": pictures.colour_pictures(worst[:_WORST_VIEWS]),
+        "num_worst": min(len(worst), _WORST_VIEWS),
+        "num_compared": len(worst),
+        "best_psnr_db": worst[-1].psnr_db if worst else None,
+        "shares": pictures.share_pictures(views),
+        "share_columns": pictures.map_columns(len(views.materials.names)),
+        "share_scale": (SHARE_SCALE, pictures.scale_strip(SHARE_SCALE)),
+        "error_scale": (ERROR_SCALE, pictures.scale_strip(ERROR_SCALE)),
+        "segmentation": pictures.segmentation_pictures(views),
+        "error_chart": pictures.error_chart(views),
+    }
+
+
+def _true_materials(loaded: LoadedModel, light: np.ndarray | None) -> TrueMaterials | None:
     summary = loaded.scene.summary
     if not summary.get("endmembers"):
         return None
     reflectance = np.array(summary["endmembers"], dtype=np.float64)
-    light = light_of(loaded.model)
     names = summary.get("material_names") or [f"material {index}" for index in range(len(reflectance))]
-    return [str(name) for name in names], reflectance if light is None else reflectance * light
+    return TrueMaterials([str(name) for name in names], reflectance if light is None else reflectance * light)

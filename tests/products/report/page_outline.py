@@ -1,0 +1,60 @@
+"""What is in a page, as a browser would read it."""
+
+import re
+from html.parser import HTMLParser
+
+VOID = {"meta", "img", "br", "line"}
+
+
+class Outline(HTMLParser):
+    """Checks that every element is closed in its place; keeps what a browser would fetch."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.fetched: list[str] = []
+        self.ids: list[str] = []
+        self.links: list[str] = []
+        self.text = ""
+        self.section_texts: dict[str, str] = {}
+        """Text of each section, by its id."""
+        self.feed(page)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        values = {name: value or "" for name, value in attrs}
+        self.fetched += [
+            values[name] for name in ("src", "srcset", "data", "action", "poster") if name in values
+        ]
+        self.ids += [values["id"]] if "id" in values else []
+        if tag == "a":
+            self.links.append(values["href"])
+        assert tag not in ("script", "iframe", "object", "embed", "base", "form")
+        assert not any(name.startswith("on") for name in values)
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.handle_starttag(tag, attrs)
+        if tag not in VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+        if "section" in self.open:
+            self.section_texts[self.ids[-1]] = self.section_texts.get(self.ids[-1], "") + data
+
+
+def assert_self_contained(page: str) -> Outline:
+    """The page is well-formed and fetches nothing; its links lead into itself."""
+    outline = Outline(page)
+    kinds = ("data:image/png;base64,", "data:image/svg+xml;base64,")
+    assert all(source.startswith(kinds) for source in outline.fetched)
+    assert {link.removeprefix("#") for link in outline.links} <= set(outline.ids)
+    assert not re.search(r"url\(|@import|https?://", page)
+    assert "default-src 'none'" in page
+    return outline
