@@ -1,10 +1,13 @@
 """Exit codes and error messages, shared by all commands."""
 
 import errno
+import os
+import signal
 import subprocess
 import sys
 
 import pytest
+import torch
 
 from unmix_plugin.commands.entry import run_command
 from unmix_plugin.errors import ConfigError, SceneError
@@ -58,6 +61,63 @@ def test_output_that_nobody_reads_to_the_end_is_no_error(lines):
         process.stdout.close()
         assert process.stderr.read() == b""
     assert process.returncode == 141
+
+
+def test_a_line_of_the_console_that_nobody_reads_is_no_error_either():
+    code = (
+        "from unmix_plugin.commands.entry import run_command; "
+        "from unmix_plugin.commands.reporting import CommandConsole, say; "
+        "run_command(lambda _: [say(CommandConsole(), 'line') for _ in range(10)], [])"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 141
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_a_signal_to_end_cleans_up_first(number, status):
+    cleaned = []
+
+    def command(_argv):
+        try:
+            os.kill(os.getpid(), number)
+        finally:
+            cleaned.append(True)
+
+    before = signal.signal(number, signal.SIG_DFL)
+    try:
+        assert end_of(command) == status
+        assert signal.getsignal(number) is signal.SIG_DFL
+    finally:
+        signal.signal(number, before)
+    assert cleaned == [True]
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        MemoryError(
+            "Unable to allocate 8.00 TiB for an array with shape (1099511627776,) and data type float64"
+        ),
+        torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB."),
+        RuntimeError(
+            "[enforce fail at alloc_cpu.cpp:121] DefaultCPUAllocator: can't allocate memory: you tried"
+        ),
+        RuntimeError("Failed to allocate 400 bytes on device 'cuda:0'"),
+    ],
+)
+def test_too_little_memory_is_the_users_error_with_what_to_do(capsys, error):
+    assert end_of(raising(error)) == 2
+    shown = capsys.readouterr().err
+    assert shown.startswith("error: out of memory: ")
+    assert "fewer, smaller" in shown
+    assert "bug" not in shown
 
 
 def test_a_broken_pipe_to_anything_else_is_told(capsys):

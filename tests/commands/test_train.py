@@ -176,6 +176,24 @@ def test_ctrl_c_saves_exits_130_and_says_how_to_go_on_which_then_works(trained, 
     assert (path / "endmembers.csv").is_file()
 
 
+def test_training_into_a_pipe_that_closes_saves_and_exits_141(trained, tmp_path):
+    """As `unmix-train ... | head -2`."""
+    argv = [str(word) for word in small_training(trained, tmp_path / "out", "--max-num-iterations", 10**6)]
+    code = "import sys; from unmix_plugin.commands.train import main; main()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code, *argv], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        for _ in range(2):
+            process.stdout.readline()
+        process.stdout.close()
+        said = process.stderr.read()
+    assert process.returncode == 141, said
+    (record,) = tmp_path.rglob("step-*.json")
+    assert f"go on with: unmix-train unmix-nerf --load-run {record.parent.parent}" in said
+
+
 def test_a_finished_run_without_a_larger_limit_says_that_there_is_nothing_to_train(run_copy):
     ended = run(train, "unmix-nerf", "--load-run", run_copy)
     assert ended.status == 0

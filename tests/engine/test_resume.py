@@ -4,6 +4,8 @@ import io
 import json
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -56,7 +58,7 @@ def train_lines(run: Path) -> list[dict]:
     return [{k: v for k, v in line.items() if k not in ("seconds", "rays_per_second")} for line in lines]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("average_decay", [None, 0.9])
 def test_stopped_and_resumed_equals_straight_to_the_bit(
     short_config: TrainerConfig, number: int, average_decay: float | None
@@ -138,6 +140,50 @@ def test_a_second_ctrl_c_stops_within_the_step_and_names_the_last_checkpoint(sho
     assert caught.value.step == 4
     assert checkpoint_steps(trainer.run.checkpoints) == [4]
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_lost_terminal_may_say_so_twice(short_config: TrainerConfig):
+    trainer = quiet_trainer(short_config)
+    call_after_step(trainer, 6, lambda: [os.kill(os.getpid(), signal.SIGHUP) for _ in range(2)])
+    with pytest.raises(Interrupted) as caught:
+        trainer.train()
+    assert caught.value.step == 6
+
+
+def test_under_nohup_a_lost_terminal_changes_nothing(short_config: TrainerConfig):
+    previous = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        trainer = quiet_trainer(short_config)
+        call_after_step(trainer, 6, lambda: os.kill(os.getpid(), signal.SIGHUP))
+        assert trainer.train().steps == 12
+    finally:
+        signal.signal(signal.SIGHUP, previous)
+
+
+def test_a_requested_stop_is_no_failure_in_the_log(short_config: TrainerConfig):
+    log = (stop_at(short_config, 6).run / "run.log").read_text()
+    assert "stopped at step 6: on request" in log
+    assert "failed" not in log
+
+
+def test_a_run_is_trained_by_one_process_at_a_time(short_config: TrainerConfig):
+    run = stop_at(short_config, 6).run
+    before = (run / "metrics.jsonl").read_bytes()
+    holding = "import sys; from pathlib import Path; from unmix_plugin.engine.runs.run_lock import RunLock; "
+    holding += "lock = RunLock(Path(sys.argv[1])); print('held', flush=True); sys.stdin.read()"
+    with subprocess.Popen(
+        [sys.executable, "-c", holding, str(run / "run.lock")],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "held\n"
+        with pytest.raises(RunError, match=rf"another training writes to {run} \(process {other.pid}\)"):
+            quiet_trainer(load_config(run))
+        assert (run / "metrics.jsonl").read_bytes() == before
+        other.communicate("")
+    assert quiet_trainer(load_config(run)).train().steps == 12
 
 
 def test_a_ctrl_c_before_any_checkpoint_says_there_is_none(short_config: TrainerConfig):

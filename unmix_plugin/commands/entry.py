@@ -1,25 +1,43 @@
 """What every command does around its work: exit codes, and an error shown as a sentence rather than a traceback.
 
-Exit codes: 0 done, 2 the user's error (a bad word, a bad file, a full disk), 130 interrupted, 141 nobody reads what is
-printed any more (as after `| head`), 1 a defect of ours.
+Exit codes: 0 done; 1 an internal error; 2 the user's error (a bad argument, a bad file, a full disk, too little
+memory); 130 Ctrl-C; 141 broken pipe (as after `| head`); 129 and 143 SIGHUP and SIGTERM, after cleaning up.
 """
 
 from __future__ import annotations
 
 import errno
+import io
 import os
 import select
+import signal
 import sys
+import threading
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from types import FrameType
 from typing import NoReturn
 
 from unmix_plugin.errors import UnmixError
 
-DONE, DEFECT, USER_ERROR, INTERRUPTED, UNREAD = 0, 1, 2, 130, 141
+DONE, INTERNAL_ERROR, USER_ERROR, INTERRUPTED, BROKEN_PIPE = 0, 1, 2, 130, 141
 
 _MACHINE_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM})
 """System errors that a user can mend: disk full, quota reached, read-only or forbidden place."""
+
+_OUT_OF_MEMORY = (
+    "OutOfMemoryError",
+    "DefaultCPUAllocator",
+    "Failed to allocate",
+    "CUDA error: out of memory",
+)
+"""What torch and Warp say, whose errors are RuntimeErrors."""
+
+_MEMORY_ADVICE = (
+    "Close other programs; use fewer, smaller or more coarsely binned images; lower "
+    "--pipeline.model.eval-num-rays-per-chunk in training; or take a machine with more memory"
+)
 
 
 def run_command(command: Callable[[list[str]], object], arguments: Sequence[str] | None = None) -> NoReturn:
@@ -28,29 +46,52 @@ def run_command(command: Callable[[list[str]], object], arguments: Sequence[str]
     Every command understands `--debug`, which it never sees itself: errors then come with their traceback.
 
     Args:
-        command: Takes the words after the program's name; raises `UnmixError` for what a user can mend.
-        arguments: These words; None takes the process's own.
+        command: Takes the arguments after the program's name; raises `UnmixError` for what a user can mend.
+        arguments: These arguments; None takes the process's own.
     Raises:
         SystemExit: always, with the exit code; one that the command raises (the parser's 0 or 2) passes through.
     """
-    words = list(sys.argv[1:] if arguments is None else arguments)
-    is_debug = "--debug" in words
+    argv = list(sys.argv[1:] if arguments is None else arguments)
+    is_debug = "--debug" in argv
     try:
-        command([word for word in words if word != "--debug"])
-        sys.stdout.flush()
+        if isinstance(sys.stdout, io.TextIOWrapper):
+            sys.stdout.reconfigure(errors="surrogateescape")  # names of files need not be text
+        with _signals_as_exits():
+            command([argument for argument in argv if argument != "--debug"])
+            sys.stdout.flush()
     except KeyboardInterrupt:
         _say("interrupted", is_debug)
         sys.exit(INTERRUPTED)
     except Exception as error:  # noqa: BLE001 - the one border where any error becomes an exit code
-        if isinstance(error, BrokenPipeError) and _is_unread():
-            sys.exit(UNREAD)
+        if isinstance(error, BrokenPipeError) and _is_output_closed():
+            sys.exit(BROKEN_PIPE)
         message, status = _verdict(error)
         _say(message, is_debug)
         sys.exit(status)
     sys.exit(DONE)
 
 
-def _is_unread() -> bool:
+@contextmanager
+def _signals_as_exits() -> Iterator[None]:
+    """Context in which SIGTERM and SIGHUP raise SystemExit, so that whatever was begun is cleaned up."""
+
+    def leave(number: int, _frame: FrameType | None) -> NoReturn:
+        sys.exit(128 + number)
+
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    # One that is ignored stays so, as under nohup; outside the main thread there are no handlers.
+    is_main = threading.current_thread() is threading.main_thread()
+    changed = [number for number in numbers if is_main and signal.getsignal(number) is signal.SIG_DFL]
+    for number in changed:
+        signal.signal(number, leave)
+    try:
+        yield
+    finally:
+        for number in changed:
+            signal.signal(number, signal.SIG_DFL)
+
+
+def _is_output_closed() -> bool:
     """Whether standard output is a pipe whose reader has gone; what is left in it is then thrown away."""
     try:
         output = sys.stdout.fileno()
@@ -73,10 +114,14 @@ def _verdict(error: Exception) -> tuple[str, int]:
     if isinstance(error, OSError) and error.errno in _MACHINE_ERRORS:
         return f"error: {error}", USER_ERROR
     text = f"{type(error).__name__}: {error}"
-    return f"this is a bug in unmix-nerf, please report it with what --debug shows: {text}", DEFECT
+    if isinstance(error, MemoryError) or any(sign in text for sign in _OUT_OF_MEMORY):
+        reason = str(error).strip().splitlines() or ["no more to be had"]
+        return f"error: out of memory: {reason[0]}. {_MEMORY_ADVICE}", USER_ERROR
+    return f"this is a bug in unmix-nerf, please report it with what --debug shows: {text}", INTERNAL_ERROR
 
 
 def _say(message: str, is_debug: bool) -> None:
-    if is_debug:
-        traceback.print_exc()
-    print(message, file=sys.stderr)
+    with suppress(OSError):  # the terminal may be gone
+        if is_debug:
+            traceback.print_exc()
+        print(message, file=sys.stderr)

@@ -60,14 +60,12 @@ def evaluate(words: list[str]) -> None:
     """
     options = tyro.cli(EvalOptions, prog="unmix-eval", args=words)
 
-    from rich.console import Console
-
-    from unmix_plugin.commands.reporting import working
+    from unmix_plugin.commands.reporting import CommandConsole, working
     from unmix_plugin.commands.run_choice import chosen_run
     from unmix_plugin.editing.edited_run import requested_recipe
     from unmix_plugin.engine.runs.load_run import load_pipeline
 
-    console = Console()
+    console = CommandConsole()
     path = chosen_run(options.run, options.output_dir)
     recipe = requested_recipe(options.edits, options.illuminant)
     with working(console, f"reading {path} and its scene"):

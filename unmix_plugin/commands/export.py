@@ -70,14 +70,12 @@ def _open(product: Product) -> Job:
     """Load the run that a product is of."""
     from functools import partial
 
-    from rich.console import Console
-
-    from unmix_plugin.commands.reporting import follow, say, working
+    from unmix_plugin.commands.reporting import CommandConsole, follow, say, working
     from unmix_plugin.commands.run_choice import chosen_run
     from unmix_plugin.editing.edited_run import edit_notes, load_edited_model
 
     _refuse_sensor(product)
-    console = Console()
+    console = CommandConsole()
     path = chosen_run(product.run, product.output_dir)
     with working(console, f"reading {path}"):
         loaded = load_edited_model(path, product.device, product.edits, product.illuminant, product.sensor)

@@ -78,16 +78,14 @@ def render(words: list[str]) -> None:
     options = tyro.cli(RenderOptions, prog="unmix-render", args=words)
     request = _camera_request(options)
 
-    from rich.console import Console
-
-    from unmix_plugin.commands.reporting import say, working
+    from unmix_plugin.commands.reporting import CommandConsole, say, working
     from unmix_plugin.commands.run_choice import chosen_run
     from unmix_plugin.editing.edited_run import edit_notes, load_edited_model
     from unmix_plugin.products.render.cameras import choose_cameras
     from unmix_plugin.products.render.outputs import choose_products, default_outputs
     from unmix_plugin.trained.run_materials import materials_of
 
-    console = Console()
+    console = CommandConsole()
     path = chosen_run(options.run, options.output_dir)
     with working(console, f"reading {path}"):
         loaded = load_edited_model(path, options.device, options.edits, options.illuminant, options.sensor)

@@ -5,14 +5,21 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
-if TYPE_CHECKING:
-    from rich.console import Console
+from rich.console import Console
 
 ItemT = TypeVar("ItemT")
 
 _PLAIN_INTERVAL_S = 5.0
+
+
+class CommandConsole(Console):
+    """Standard output, whose broken pipe is an exception like any other file's: rich would end the process."""
+
+    def on_broken_pipe(self) -> None:
+        """Raise it."""
+        raise
 
 
 @contextmanager

@@ -40,7 +40,7 @@ def train(words: list[str]) -> None:
         ConfigError: no or an unknown method, or impossible settings.
         SystemExit: help was asked for (0), words that do not parse (2), or a stop on request (130).
     """
-    from rich.console import Console
+    from unmix_plugin.engine.training.progress import ProgressConsole
 
     methods, broken = discover_methods()
     for plugin in broken:
@@ -49,7 +49,7 @@ def train(words: list[str]) -> None:
         print(_overview(methods))
         return
     config, viewing = parse_all(words)
-    console = Console()
+    console = ProgressConsole()
     trainer = _prepared(config, console)
     with _shown(trainer, viewing, console):
         _run(trainer, console)

@@ -68,16 +68,15 @@ def prepared(options: ViewOptions) -> Viewer:
         ConfigError: the method does not unmix spectra, the device is not there, or the recipe does not fit the run.
         SpectrumError: there is no such light.
     """
-    from rich.console import Console
 
-    from unmix_plugin.commands.reporting import working
+    from unmix_plugin.commands.reporting import CommandConsole, working
     from unmix_plugin.commands.run_choice import chosen_run
     from unmix_plugin.editing.edited_run import light_note, requested_recipe
     from unmix_plugin.engine.runs.load_run import load_model
     from unmix_plugin.viewer.rendering.model_source import source_of_run
     from unmix_plugin.viewer.server import Viewer
 
-    console = Console()
+    console = CommandConsole()
     recipe = requested_recipe(options.edits, options.illuminant)
     path = chosen_run(options.run, options.output_dir)
     with working(console, f"reading {path}"):

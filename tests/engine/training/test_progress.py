@@ -4,10 +4,12 @@ import io
 import re
 from dataclasses import replace
 
+import pytest
 from rich.console import Console
 
 from unmix_plugin.engine.configs import TrainerConfig
-from unmix_plugin.engine.training.progress import ProgressDisplay, TrainingStatus
+from unmix_plugin.engine.training.interrupts import Interrupted
+from unmix_plugin.engine.training.progress import ProgressConsole, ProgressDisplay, TrainingStatus
 from unmix_plugin.engine.training.trainer import Trainer
 
 STATUS = TrainingStatus(
@@ -47,6 +49,28 @@ def test_on_a_terminal_the_bar_is_redrawn_in_place_and_messages_stay_above():
     assert "\x1b[2K" in out.getvalue()
     assert "step 121" in out.getvalue()
     assert out.getvalue().count("a line that stays") == 1
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 100, 200])
+def test_the_time_left_is_never_cut_off(width: int):
+    out = io.StringIO()
+    with ProgressDisplay(Console(file=out, force_terminal=True, width=width, color_system=None)) as display:
+        display.show(STATUS)
+    assert "step 120   25 %" in out.getvalue()
+    assert "1:30 left" in out.getvalue()
+
+
+def test_a_console_that_is_gone_ends_training_with_all_saved(short_config: TrainerConfig, monkeypatch):
+    class Gone(io.StringIO):
+        def write(self, _: str) -> int:
+            raise BrokenPipeError
+
+    monkeypatch.setattr(ProgressDisplay, "is_due", property(lambda self: not self.is_closed))
+    trainer = Trainer(short_config, console=ProgressConsole(file=Gone()))
+    with pytest.raises(Interrupted) as stopped:
+        trainer.train()
+    assert stopped.value.step == 1
+    assert "its output is closed" in trainer.run.log_path.read_text()
 
 
 def test_training_off_a_terminal_prints_lines_without_control_codes(short_config: TrainerConfig, monkeypatch):

@@ -1,16 +1,19 @@
 """Watching and steering a training from another thread: it does as asked between steps, and nothing else changes."""
 
+import io
 import threading
 import time
 from dataclasses import replace
 
 import pytest
 import torch
+from rich.console import Console
 
 from tests.engine.test_resume import call_after_step, newest, quiet_trainer
 from unmix_plugin.engine.runs.checkpoints import checkpoint_steps
 from unmix_plugin.engine.runs.load_run import load_config
 from unmix_plugin.engine.training.interrupts import Interrupted
+from unmix_plugin.engine.training.trainer import Trainer
 
 
 def in_background(work):
@@ -112,6 +115,37 @@ def test_a_stop_ends_training_as_ctrl_c_does_and_it_can_go_on(short_config, is_p
     resumed = quiet_trainer(load_config(stopped.value.run))
     resumed.train()
     assert resumed.step == 12
+
+
+def test_a_guest_that_leaves_the_model_in_evaluation_mode_does_not_change_the_next_step(short_config):
+    trainer = quiet_trainer(short_config)
+    modes = []
+    call_after_step(trainer, 3, trainer.pipeline.eval)
+    for step in range(1, 13):
+        call_after_step(trainer, step, lambda: modes.append(trainer.pipeline.model.training))
+    trainer.pipeline.eval()  # a page that rendered before the first step
+    trainer.train()
+    assert modes == [True, True, False] + 9 * [True]
+
+
+def test_kernels_are_compiled_in_a_turn_of_training(short_config, monkeypatch):
+    trainer = quiet_trainer(short_config)
+    device, owners = trainer.control.device, []
+    monkeypatch.setattr(trainer.pipeline.model, "warm_up", lambda: owners.append(device._owner))
+    trainer.train()
+    assert owners == [threading.get_ident()]
+
+
+def test_the_terminal_says_when_training_pauses_and_goes_on(short_config):
+    out = io.StringIO()
+    trainer = Trainer(short_config, console=Console(file=out))
+    call_after_step(trainer, 5, trainer.control.pause)
+    thread = in_background(trainer.train)
+    wait_for(lambda: "paused at step 5" in out.getvalue())
+    trainer.control.resume()
+    thread.join(20)
+    assert out.getvalue().count("paused") == 1
+    assert "resumed at step 5" in out.getvalue()
 
 
 def test_the_status_follows_the_training(short_config, monkeypatch):

@@ -8,7 +8,7 @@ from typing import Any
 
 
 class Interrupted(Exception):  # noqa: N818
-    """Training was stopped by Ctrl-C or SIGTERM; the run can be resumed."""
+    """Training was stopped on request; the run can be resumed."""
 
     def __init__(self, run: Path, step: int | None) -> None:
         super().__init__(f"stopped; {'no checkpoint' if step is None else f'step {step}'} is saved in {run}")
@@ -19,12 +19,15 @@ class Interrupted(Exception):  # noqa: N818
 
 
 class StopSignals:
-    """Context in which the first Ctrl-C or SIGTERM is only noted, and a second one raises KeyboardInterrupt.
+    """Context in which Ctrl-C, SIGTERM or SIGHUP is only noted, and a second one raises KeyboardInterrupt.
 
-    In a thread that is not the main one signals can't be caught, and nothing is ever noted.
+    A lost terminal often sends SIGHUP twice, so that a second one of these changes nothing; under nohup it stays
+    ignored. In a thread that is not the main one signals can't be caught, and nothing is ever noted.
     """
 
-    SIGNALS = (signal.SIGINT, signal.SIGTERM)
+    SIGNALS = tuple(
+        getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+    )
 
     def __init__(self) -> None:
         self.requested = False
@@ -33,7 +36,11 @@ class StopSignals:
 
     def __enter__(self) -> "StopSignals":
         if threading.current_thread() is threading.main_thread():
-            self._previous = {number: signal.signal(number, self._note) for number in self.SIGNALS}
+            self._previous = {
+                number: signal.signal(number, self._note)
+                for number in self.SIGNALS
+                if number.name != "SIGHUP" or signal.getsignal(number) is not signal.SIG_IGN
+            }
         return self
 
     def __exit__(
@@ -43,6 +50,6 @@ class StopSignals:
             signal.signal(number, handler)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        if self.requested:
+        if self.requested and signal.Signals(number).name != "SIGHUP":
             raise KeyboardInterrupt
         self.requested = True

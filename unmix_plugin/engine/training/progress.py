@@ -1,11 +1,15 @@
 """Showing how training goes: a live bar on a terminal, a plain line every few seconds elsewhere."""
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import TracebackType
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
+
+_BAR_WIDTH, _WIDTH_WITH_BAR = 24, 100
 
 
 @dataclass(frozen=True)
@@ -31,12 +35,30 @@ class TrainingStatus:
         return self.seconds * (1.0 - self.progress) / self.progress if self.progress > 0 else None
 
     def __str__(self) -> str:
+        return self.fitted(1000)
+
+    def fitted(self, width: int) -> str:
+        """The status in at most `width` characters, where dropping all but step, percentage and time left will do."""
         psnr = "" if self.psnr is None else f"  psnr {self.psnr:.2f} dB"
         left = "" if self.seconds_left is None else f"  {_clock(self.seconds_left)} left"
-        return (
-            f"step {self.step}  {100 * self.progress:3.0f} %  loss {self.loss:.3g}{psnr}"
-            f"  {_count(self.rays_per_second)} rays/s{left}"
-        )
+        speed, loss = f"  {_count(self.rays_per_second)} rays/s", f"  loss {self.loss:.3g}"
+        text = ""
+        for parts in ((loss, psnr, speed), (loss, psnr), (psnr,), ()):
+            text = f"step {self.step}  {100 * self.progress:3.0f} %{''.join(parts)}{left}"
+            if len(text) <= width:
+                break
+        return text
+
+
+class ProgressConsole(Console):
+    """Standard output that falls silent when nobody reads it any more, where rich would end the process."""
+
+    is_closed = False
+    """Whether that has happened; training then stops as after Ctrl-C."""
+
+    def on_broken_pipe(self) -> None:
+        """Fall silent."""
+        self.is_closed = self.quiet = True
 
 
 class ProgressDisplay:
@@ -60,8 +82,10 @@ class ProgressDisplay:
     def __enter__(self) -> "ProgressDisplay":
         if self.console.is_terminal:
             # No refresh thread of its own: it would take time from the training threads.
-            columns = (BarColumn(bar_width=24), TextColumn("{task.description}"))
-            self._bar = Progress(*columns, console=self.console, auto_refresh=False)
+            bar = [BarColumn(bar_width=_BAR_WIDTH)] if self.console.width >= _WIDTH_WITH_BAR else []
+            self._bar = Progress(
+                *bar, TextColumn("{task.description}"), console=self.console, auto_refresh=False
+            )
             self._bar.add_task("starting", total=1.0)
             self._bar.start()
         return self
@@ -70,7 +94,8 @@ class ProgressDisplay:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         if self._bar is not None:
-            self._bar.stop()
+            with self._noting_a_closed_console():
+                self._bar.stop()
             self._bar = None
 
     @property
@@ -84,13 +109,29 @@ class ProgressDisplay:
         if self._bar is None:
             self.message(str(status))
             return
-        self._bar.update(
-            self._bar.task_ids[0], completed=status.progress, description=str(status), refresh=True
-        )
+        width = self.console.width - (_BAR_WIDTH + 1 if len(self._bar.columns) > 1 else 0)
+        text = status.fitted(width)
+        with self._noting_a_closed_console():
+            self._bar.update(self._bar.task_ids[0], completed=status.progress, description=text, refresh=True)
 
     def message(self, text: str) -> None:
         """Print a line that stays."""
-        self.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        with self._noting_a_closed_console():
+            self.console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether nobody reads what is shown any more."""
+        return isinstance(self.console, ProgressConsole) and self.console.is_closed
+
+    @contextmanager
+    def _noting_a_closed_console(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError:  # the terminal is gone
+            if not isinstance(self.console, ProgressConsole):
+                raise
+            self.console.on_broken_pipe()
 
 
 def _clock(seconds: float) -> str:

@@ -17,6 +17,7 @@ from unmix_plugin.engine.runs.config_json import config_to_json
 from unmix_plugin.engine.runs.load_run import require_checkpoint, require_data, write_config
 from unmix_plugin.engine.runs.run_files import write_run_json
 from unmix_plugin.engine.runs.run_folder import RunFolder, create_run_folder, open_run_folder
+from unmix_plugin.engine.runs.run_lock import RunLock
 from unmix_plugin.engine.runs.scene_record import check_same_scene, read_scene_record, scene_record_to_json
 from unmix_plugin.engine.training.averages import ParameterAverage
 from unmix_plugin.engine.training.callbacks import TrainingCallbackLocation, run_callbacks
@@ -25,7 +26,7 @@ from unmix_plugin.engine.training.interrupts import Interrupted, StopSignals
 from unmix_plugin.engine.training.limits import Limits, TrainingClock
 from unmix_plugin.engine.training.memory import keep_freed_memory
 from unmix_plugin.engine.training.optimizers import build_optimizer, set_learning_rates
-from unmix_plugin.engine.training.progress import ProgressDisplay, TrainingStatus
+from unmix_plugin.engine.training.progress import ProgressConsole, ProgressDisplay, TrainingStatus
 from unmix_plugin.engine.training.seeding import seed_everything
 from unmix_plugin.engine.training.training_control import TrainingControl
 from unmix_plugin.engine.training.training_state import (
@@ -61,7 +62,7 @@ class Trainer:
         """
         config_to_json(config)  # settings that can't be written down are refused before anything is
         self.config = _with_absolute_data(config)
-        self.console = console or Console()
+        self.console = console or ProgressConsole()
         self.control = control or TrainingControl()
         keep_freed_memory()
         device = resolve_device(config.device)
@@ -116,27 +117,32 @@ class Trainer:
         """Train to the limit, save, and write `training.json`.
 
         Raises:
-            Interrupted: Ctrl-C, SIGTERM or a stop through `control`; the step under way was ended and saved. A second
-                signal stops at once, and then the newest checkpoint is an older one.
+            Interrupted: Ctrl-C, SIGTERM, SIGHUP, a stop through `control`, or nobody reads the progress any more; the
+                step under way was ended and saved. A second signal stops at once, and then the newest checkpoint is
+                an older one.
             RunError: the disk is full, or loss and gradients stay non-finite.
         """
-        self.pipeline.train()
         try:
-            self.pipeline.model.warm_up()
+            with self.control.device.training_turn():
+                self.pipeline.model.warm_up()
             with StopSignals() as stop, ProgressDisplay(self.console) as display, self.control.running():
                 self._loop(stop, display)
         except KeyboardInterrupt as error:
             steps = checkpoint_steps(self.run.checkpoints)
             raise Interrupted(self.run.path, steps[0] if steps else None) from error
+        except Interrupted:
+            raise
         except Exception as error:
             with suppress(RunError):  # the disk may be full, which `error` says already
                 self.log.write(f"failed at step {self.step}: {type(error).__name__}: {error}")
             raise
+        else:
+            write_run_json(self.run.training_path, self.record.to_json())
+            self.log.write(f"finished: {self.step} steps, {self.clock.seconds:.1f} s, {self.total_rays} rays")
+            return self.record
         finally:
             self.writer.close()
-        write_run_json(self.run.training_path, self.record.to_json())
-        self.log.write(f"finished: {self.step} steps, {self.clock.seconds:.1f} s, {self.total_rays} rays")
-        return self.record
+            self._lock.release()
 
     def save(self) -> None:
         """Save a checkpoint of the present step.
@@ -158,8 +164,14 @@ class Trainer:
         self.log.write(f"saved step {self.step}")
 
     def _loop(self, stop: StopSignals, display: ProgressDisplay) -> None:
-        while not (self._is_at_limit or stop.requested or self.control.is_stop_requested):
-            if not self.control.is_paused:
+        said_paused = False
+        while not (
+            self._is_at_limit or stop.requested or self.control.is_stop_requested or display.is_closed
+        ):
+            if self.control.is_paused is not said_paused:
+                said_paused = not said_paused
+                display.message(f"{'paused' if said_paused else 'resumed'} at step {self.step}")
+            if not said_paused:
                 with self.control.device.training_turn():
                     self._iterate(display)
             elif self.control.wait_while_paused():
@@ -168,7 +180,8 @@ class Trainer:
         with self.control.device.training_turn():
             self.save()
         if not self._is_at_limit:
-            self.log.write(f"stopped on request at step {self.step}")
+            reason = "its output is closed" if display.is_closed else "on request"
+            self.log.write(f"stopped at step {self.step}: {reason}")
             raise Interrupted(self.run.path, self.step)
 
     def _iterate(self, display: ProgressDisplay) -> None:
@@ -193,6 +206,7 @@ class Trainer:
         with self.clock.running():
             progress, step, datamanager = self.progress, self.step, self.pipeline.datamanager
             num_rays = datamanager.get_train_rays_per_batch()
+            self.pipeline.train()  # a guest may have left it in evaluation mode
             self.pipeline.seed_step(step)
             self.learning_rates = set_learning_rates(self.optimizer, self.config.optimizers, progress)
             run_callbacks(self.callbacks, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, step, progress)
@@ -259,6 +273,7 @@ class Trainer:
         scene = scene_record_to_json(self.pipeline.datamanager)
         data = require_data(self.config)
         run = create_run_folder(self.config.output_dir, data.resolve().name, self.config.method_name)
+        self._lock = RunLock(run.lock_path)
         write_run_json(run.scene_path, scene)
         write_config(run, self.config)
         return run
@@ -267,7 +282,9 @@ class Trainer:
         """Restore all that the newest complete checkpoint holds."""
         datamanager = self.pipeline.datamanager
         check_same_scene(read_scene_record(self.run, type(datamanager)), datamanager, self.run)
-        checkpoint = require_checkpoint(self.run)
+        require_checkpoint(self.run)  # before anything is written
+        self._lock = RunLock(self.run.lock_path)
+        checkpoint = require_checkpoint(self.run)  # another training may have saved one since
         restore_training(checkpoint.tensors, self.pipeline.model, self.optimizer, datamanager)
         record = TrainingRecord.from_json(checkpoint.record)
         datamanager.set_train_rays_per_batch(record.num_rays)
