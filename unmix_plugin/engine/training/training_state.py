@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from unmix_plugin.engine.data_manager import DataManager
+from unmix_plugin.engine.instantiate import require_in_range
 from unmix_plugin.engine.runs.config_json import config_from_json
 from unmix_plugin.engine.training.averages import ParameterAverage
 from unmix_plugin.errors import ConfigError, RunError
@@ -36,6 +37,16 @@ class TrainingRecord:
     learning_rates: dict[str, float]
     """Of the last step, by parameter group."""
 
+    def __post_init__(self) -> None:
+        """Refuse numbers that no training counts.
+
+        Raises:
+            ConfigError: one is negative, or there are no rays.
+        """
+        for name in ("steps", "train_seconds", "total_rays", "skipped_steps", "average_updates"):
+            require_in_range(name, getattr(self, name), 0, 2**62)
+        require_in_range("num_rays", self.num_rays, 1, 2**30)
+
     @property
     def train_rays_per_second(self) -> float:
         """Rays a second of training; 0 before the first step."""
@@ -54,12 +65,9 @@ class TrainingRecord:
         """
         known = {name: values.get(name) for name in TrainingRecord.__dataclass_fields__}
         try:
-            record = config_from_json(known, TrainingRecord(0, 0.0, 0, 0, 1, 0, 0.0, {}), "the record")
+            return config_from_json(known, TrainingRecord(0, 0.0, 0, 0, 1, 0, 0.0, {}), "the record")
         except ConfigError as error:
             raise RunError(f"the checkpoint is damaged: {error}") from error
-        if min(*(value for value in known.values() if not isinstance(value, dict)), record.num_rays - 1) < 0:
-            raise RunError(f"the checkpoint is damaged: its record has a negative number: {known}")
-        return record
 
 
 def collect_tensors(
