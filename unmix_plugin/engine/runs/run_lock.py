@@ -28,7 +28,10 @@ class RunLock:
             if fcntl is not None:
                 fcntl.lockf(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            if self._descriptor is None or error.errno in (errno.EAGAIN, errno.EACCES):  # others: no locks here
+            if self._descriptor is None or error.errno in (
+                errno.EAGAIN,
+                errno.EACCES,
+            ):  # others: no locks here
                 raise RunError(self._refusal(path, error)) from error
         os.ftruncate(self._descriptor, 0)
         os.write(self._descriptor, str(os.getpid()).encode())
