@@ -195,7 +195,7 @@ def test_a_path_becomes_a_video_of_the_edited_scene(run_copy):
                 page.set(label, value)
             page.wait_until(lambda: "illuminant: A" in page.controls[page.control("recipe")]["value"])
             page.set("render a video", True)
-            page.wait_until(lambda: any("the video is in" in text for _, text in page.notices), START_S)
+            page.wait_until(lambda: any(name.endswith(".mp4") for name in page.downloads), START_S)
         (video,) = (run_copy / "exports" / "viewer").rglob("*.mp4")
         frames, _ = read_video(video)
         assert frames.shape == (3, 32, 32, 3)
@@ -256,7 +256,7 @@ def test_edits_that_are_none_are_refused(trained, words, message):
     assert message in ended.err
 
 
-def training_words(trained, folder, *words):
+def training_argv(trained, folder, *words):
     return [
         *("unmix-nerf", "--data", trained.scene, "--output-dir", folder, *SMALL_METHOD),
         *("--viewer.enabled", "--viewer.port", "0", *words),
@@ -264,11 +264,11 @@ def training_words(trained, folder, *words):
 
 
 def test_a_training_is_watched_while_it_runs_and_ends_as_without(trained, tmp_path):
-    words = training_words(trained, tmp_path, "--max-num-iterations", "20")
+    words = training_argv(trained, tmp_path, "--max-num-iterations", "20")
     with started("train", *words, "--viewer.keep-open") as command:
         with looking(command.address) as page:
             command.wait_for_line("the viewer stays open")
-            page.wait_until(lambda: "finished" in page.texts, START_S)
+            page.wait_until(lambda: ">done<" in page.texts, START_S)
             count = len(page.pictures)
             page.look_from(1.0)
             page.wait_until(lambda: len(page.pictures) > count)
@@ -282,20 +282,32 @@ def test_a_training_is_watched_while_it_runs_and_ends_as_without(trained, tmp_pa
 
 
 def test_without_keep_open_the_process_ends_with_the_training(trained, tmp_path):
-    ended = run(train, *training_words(trained, tmp_path, "--max-num-iterations", 3))
+    ended = run(train, *training_argv(trained, tmp_path, "--max-num-iterations", 3))
     assert ended.status == 0
     assert "viewer: http://127.0.0.1:" in ended.out
     assert ended.last_line.startswith("run: ")
     assert not [thread for thread in threading.enumerate() if "viewer" in thread.name]
 
 
+def test_the_viewer_stays_as_long_as_a_page_is_open_and_the_run_is_printed_last(trained, tmp_path):
+    words = training_argv(trained, tmp_path, "--max-seconds", "8")
+    with started("train", *words) as command:
+        with looking(command.address) as page:
+            command.wait_for_line("the viewer stays open while a page is; end it with Ctrl-C")
+            page.wait_until(lambda: ">done<" in page.texts, START_S)
+            assert command.process.poll() is None
+        assert command.end() == 0
+        assert command.lines[-1].startswith("run: ")
+
+
 def test_a_training_that_is_stopped_from_the_page_can_go_on(trained, tmp_path):
-    with started("train", *training_words(trained, tmp_path, "--max-seconds", "300")) as command:
+    with started("train", *training_argv(trained, tmp_path, "--max-seconds", "300")) as command:
         with looking(command.address) as page:
             page.wait_until(lambda: any(one.get("label") == "really stop" for one in page.controls.values()))
             page.set("really stop", True)
             page.set("stop training", True)
             assert command.end() == 130
+            assert "stopped, and saved" in page.texts
         assert any("go on with: unmix-train unmix-nerf --load-run" in line for line in command.lines)
         path = type(trained.run)(command.lines[-1].removeprefix("run: "))
     resumed = run(train, "unmix-nerf", "--load-run", path, "--max-num-iterations", 2)
@@ -303,7 +315,7 @@ def test_a_training_that_is_stopped_from_the_page_can_go_on(trained, tmp_path):
 
 
 def test_a_page_that_is_loaded_again_while_training_goes_on(trained, tmp_path):
-    with started("train", *training_words(trained, tmp_path, "--max-seconds", "300")) as command:
+    with started("train", *training_argv(trained, tmp_path, "--max-seconds", "300")) as command:
         for _ in range(4):
             with looking(command.address):
                 pass
@@ -339,10 +351,10 @@ def test_words_of_the_viewer_are_no_settings_of_the_training(trained):
 
 
 def test_impossible_words_of_the_viewer_end_before_training(trained, tmp_path):
-    ended = run(train, *training_words(trained, tmp_path / "out", "--viewer.share", "2"))
+    ended = run(train, *training_argv(trained, tmp_path / "out", "--viewer.share", "2"))
     assert ended.status == 2
     assert "--viewer.share is a part" in ended.err
-    ended = run(train, *training_words(trained, tmp_path / "out", "--viewer.host", "203.0.113.7"))
+    ended = run(train, *training_argv(trained, tmp_path / "out", "--viewer.host", "203.0.113.7"))
     assert ended.status == 2
     assert "can't listen" in ended.err
 

@@ -1,7 +1,6 @@
 """Files that a page asks for."""
 
 import math
-import time
 
 import numpy as np
 import pytest
@@ -30,7 +29,7 @@ def test_spectra_are_saved_as_exr(viewer):
         page.set("width", 32)
         page.set("height", 24)
         page.set("save the spectra (EXR)", True)
-        page.wait_until(lambda: any(title == "saved" for title, _ in page.notices))
+        page.wait_until(lambda: page.downloads == ["view.exr"])
         (path,) = viewer.services.folder.iterdir()
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = file.channels()
@@ -41,10 +40,21 @@ def test_spectra_are_saved_as_exr(viewer):
 def test_pictures_too_large_are_refused(viewer):
     with opened(viewer) as page:
         page.set("width", 8192)
-        page.set("height", 1e9)
+        page.set("height", 8192)
         page.set("save a screenshot (PNG)", True)
         page.wait_until(lambda: bool(page.notices))
         assert "8192 x 8192 pixels are too many" in page.notices[0][1]
+
+
+@pytest.mark.parametrize(("label", "value"), [("width", 100_000), ("height", 1e9), ("width", -3)])
+def test_a_size_out_of_bounds_is_refused_with_its_name(viewer, label, value):
+    with opened(viewer) as page:
+        page.set(label, value)
+        for button in ("save a screenshot (PNG)", "save the spectra (EXR)"):
+            page.set(button, True)
+        page.wait_until(lambda: bool(page.notices))
+        assert f"{label} is a number of pixels from 16 to 8192; found {value:g}" in page.notices[0][1]
+        assert not viewer.services.folder.exists()
 
 
 def test_a_path_through_key_frames_is_a_camera_file(viewer):
@@ -59,7 +69,6 @@ def test_a_path_through_key_frames_is_a_camera_file(viewer):
             page.wait_until(lambda key=key, number=number: key.get("value") == f"{number} of {number}")
         page.set("seconds", 1.0)
         page.set("frames a second", 10)
-        time.sleep(0.3)
         page.set("save the path", True)
         page.wait_until(lambda: any(title == "saved" for title, _ in page.notices))
         (path,) = viewer.services.folder.iterdir()

@@ -4,8 +4,11 @@ import socket
 import threading
 import time
 
+import pytest
+
 from tests.viewer.pages import has_control, opened, serving
 from tests.viewer.view_factory import make_source
+from unmix_plugin.engine.training.progress import TrainingStatus
 from unmix_plugin.engine.training.training_control import TrainingControl
 
 
@@ -64,3 +67,31 @@ def test_the_training_panel_steers_the_training(tmp_path):
         page.set("save a checkpoint", True)
         page.wait_until(lambda: any(title == "saving" for title, _ in page.notices))
         assert control.take_save_request()
+
+
+@pytest.mark.parametrize(("is_stopped", "said"), [(True, "stopped, and saved"), (False, "done")])
+def test_the_last_that_a_page_shows_is_how_training_ended(tmp_path, is_stopped, said):
+    control = TrainingControl()
+    with serving(make_source(tmp_path, control)) as (viewer, _), opened(viewer) as page:
+        with control.running():
+            control.show(TrainingStatus(7, 3.0, 0.25, 0.1, 20.0, 1000.0))
+            page.wait_until(lambda: "running" in page.texts and "9 s of training" in page.texts)
+            if is_stopped:
+                control.request_stop()
+        viewer.stop()
+        page.wait_until(lambda: page.is_closed)
+        assert said in page.texts
+        assert "s of training" not in page.texts
+        assert page.controls[page.control("pause")]["disabled"]
+
+
+def test_waiting_ends_when_no_page_is_left(source, monkeypatch):
+    monkeypatch.setattr("unmix_plugin.viewer.server._UNWATCHED_S", 1)
+    with serving(source) as (viewer, _):
+        waiting = threading.Thread(target=viewer.wait, args=(True,))
+        with opened(viewer):
+            waiting.start()
+            waiting.join(2.5)
+            assert waiting.is_alive()
+        waiting.join(30)
+        assert not waiting.is_alive()

@@ -212,10 +212,11 @@ def _shown(trainer: Trainer, viewing: TrainingViewerOptions, console: Console) -
     viewer.start()
     try:
         yield
-        if viewing.keep_open:
-            say(console, "training is done, the viewer stays open; end it with Ctrl-C")
+        if viewing.keep_open or viewer.num_clients:
+            until = "" if viewing.keep_open else " while a page is"
+            say(console, f"training is done, the viewer stays open{until}; end it with Ctrl-C")
             with suppress(KeyboardInterrupt):
-                viewer.wait()
+                viewer.wait(while_watched=not viewing.keep_open)
     finally:
         viewer.stop()
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -49,7 +48,6 @@ def view(argv: list[str]) -> None:
     """
     options = tyro.cli(ViewOptions, prog="unmix-view", args=argv)
     viewer = prepared(options)
-    _let_signals_interrupt()
     viewer.start()
     print("stop with Ctrl-C", flush=True)
     try:
@@ -95,14 +93,6 @@ def prepared(options: ViewOptions) -> Viewer:
             lambda line: print(line, flush=True),
             recipe,
         )
-
-
-def _let_signals_interrupt() -> None:
-    """Let SIGTERM and SIGHUP end the viewer as Ctrl-C does, with its children; what is ignored (nohup) stays so."""
-    for name in ("SIGTERM", "SIGHUP"):
-        number = getattr(signal, name, None)  # Windows has no SIGHUP
-        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, signal.default_int_handler)
 
 
 def _scene_of(source: ModelSource, data: Path | None) -> Scene:

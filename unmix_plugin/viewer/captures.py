@@ -121,15 +121,13 @@ class PictureCanvas:
         """Put a strip in its place."""
         self.pixels[first_row : first_row + len(strip)] = strip
 
-    def write(self, path: Path, description: str) -> bytes:
-        """Write a PNG; its bytes.
+    def write(self, path: Path, description: str) -> Path:
+        """Write a PNG.
 
         Raises:
             RunError: the disk is full or refuses.
         """
-        content = rgba_png_bytes(self.pixels, description)
-        write_file(path, content)
-        return content
+        return write_file(path, rgba_png_bytes(self.pixels, description))
 
 
 class SpectraCanvas:

@@ -42,7 +42,7 @@ class TrainingViewerOptions(ViewerOptions):
     enabled: bool = False
     """Serve the viewer while training; on by default where the output is a terminal."""
     keep_open: bool = False
-    """Serve on after training, until Ctrl-C."""
+    """Serve on after training until Ctrl-C, rather than as long as a page is open."""
     share: float = 0.3
     """Part of the device's time that the viewer may take while someone moves the camera; at rest it takes about a
     quarter of that."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import signal
 import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from unmix_plugin.editing import Recipe
@@ -21,12 +23,21 @@ from unmix_plugin.viewer.services import SceneReader, Services
 from unmix_plugin.viewer.session import Session
 from unmix_plugin.viewer.token_prompt import TokenPrompts
 from unmix_plugin.viewer.view_cameras import pose_of, up_direction
-from unmix_plugin.viewer.web_server import LABEL, address_of, close_soon, headers_of, open_server, quiet
+from unmix_plugin.viewer.web_server import (
+    LABEL,
+    address_of,
+    close_soon,
+    headers_of,
+    open_server,
+    quiet,
+    send_what_is_queued,
+)
 
 if TYPE_CHECKING:
     import viser
 
 _TICK_S = 0.5
+_UNWATCHED_S = 5
 
 
 class Viewer:
@@ -93,7 +104,10 @@ class Viewer:
             sessions = list(self._sessions.values())
             self._sessions.clear()
         for session in sessions:
+            session.tick()  # what has become of the training is the last that a page shows
             session.close()
+        if self._server is not None and sessions:
+            send_what_is_queued(self._server)
         self._services.stop()
         if self._server is not None:
             with quiet():
@@ -111,10 +125,19 @@ class Viewer:
         """What all sessions share."""
         return self._services
 
-    def wait(self) -> None:
-        """Serve until Ctrl-C, or until stopped by another thread."""
-        while not self._stopped.wait(1.0):
-            pass
+    def wait(self, while_watched: bool = False) -> None:
+        """Serve until Ctrl-C, SIGTERM or SIGHUP, which raise KeyboardInterrupt, or until stopped by another thread.
+
+        Args:
+            while_watched: End once no page has been open for some seconds, too; a page that is loaded again is back by
+                then.
+        """
+        unwatched_s = 0
+        with _interrupting_signals():
+            while not self._stopped.wait(1.0):
+                unwatched_s = 0 if self._sessions else unwatched_s + 1
+                if while_watched and unwatched_s >= _UNWATCHED_S:
+                    return
 
     def _dress(self, server: viser.ViserServer) -> None:
         """Looks, and where pages start to look from."""
@@ -193,6 +216,22 @@ class Viewer:
                 self._services.tick()
                 for session in list(self._sessions.values()):
                     session.tick()
+
+
+@contextmanager
+def _interrupting_signals() -> Iterator[None]:
+    """Context in which SIGTERM and SIGHUP are as Ctrl-C; a signal that is ignored, as under nohup, stays so."""
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        for name in ("SIGTERM", "SIGHUP"):
+            number = getattr(signal, name, None)  # Windows has no SIGHUP
+            if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
+                before[number] = signal.signal(number, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _warn(client: viser.ClientHandle, reason: str) -> None:

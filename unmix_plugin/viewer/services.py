@@ -26,7 +26,7 @@ from unmix_plugin.viewer.rendering.model_source import ModelSource
 from unmix_plugin.viewer.rendering.picture_maker import PictureMaker
 from unmix_plugin.viewer.rendering.reference import render_reference
 from unmix_plugin.viewer.rendering.render_loop import RenderLoop
-from unmix_plugin.viewer.rendering.video_job import VideoJob
+from unmix_plugin.viewer.rendering.video_job import VideoQueue
 from unmix_plugin.viewer.scene_objects import Thumbnail
 from unmix_plugin.viewer.training_curve import TrainingCurve
 
@@ -63,7 +63,7 @@ class Services:
         """The scene, once it is read."""
         self.measured: MeasuredViews | None = None
         self.why_not_measured = "the scene is still being read"
-        self.video = VideoJob()
+        self.videos = VideoQueue()
         self.curve = TrainingCurve()
         self._read_scene = read_scene
         self._reader = threading.Thread(target=self._read, name="unmix-viewer-scene", daemon=True)
@@ -101,7 +101,7 @@ class Services:
 
     def stop(self) -> None:
         """End rendering; waits for the scene if it is still being read."""
-        self.video.stop()
+        self.videos.stop()
         self.loop.stop()
         if self._reader.is_alive():
             # Not left behind: a thread in native code when the interpreter ends takes the process down with it.

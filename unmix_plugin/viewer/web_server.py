@@ -16,6 +16,7 @@ LABEL = "unmix-nerf"
 _MOST_CONNECTIONS = 64
 """Connections that may be open at once, served or not."""
 
+_SENDING_S = 0.2
 _READING_S = 2.0
 """How long a page that is turned away shows why before its connection is closed."""
 
@@ -66,6 +67,12 @@ def close_soon(client: viser.ClientHandle) -> None:
 
     client.flush()
     asyncio.run_coroutine_threadsafe(close(), client._viser_server._event_loop)
+
+
+def send_what_is_queued(server: viser.ViserServer) -> None:
+    """Give pages a moment to be sent what they were told, before a server is stopped."""
+    server.flush()
+    asyncio.run_coroutine_threadsafe(asyncio.sleep(_SENDING_S), server._event_loop).result()
 
 
 @contextlib.contextmanager

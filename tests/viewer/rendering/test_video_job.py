@@ -2,7 +2,6 @@
 
 import sys
 import threading
-import time
 from dataclasses import replace
 
 import pytest
@@ -11,7 +10,7 @@ from unmix_plugin.errors import ConfigError
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings
 from unmix_plugin.viewer.layers.layers import LAYERS
 from unmix_plugin.viewer.rendering import video_job
-from unmix_plugin.viewer.rendering.video_job import VideoJob, output_of, render_words
+from unmix_plugin.viewer.rendering.video_job import VideoJob, VideoQueue, output_of, render_argv
 
 
 @pytest.mark.parametrize("layer", [name for name in LAYERS if name != "error"])
@@ -39,7 +38,7 @@ def test_the_words_are_those_of_the_command(tmp_path):
 
     from unmix_plugin.commands.render import RenderOptions
 
-    words = render_words(tmp_path, tmp_path / "path.json", "rgb", tmp_path / "out", tmp_path / "recipe.yml")
+    words = render_argv(tmp_path, tmp_path / "path.json", "rgb", tmp_path / "out", tmp_path / "recipe.yml")
     options = tyro.cli(RenderOptions, args=words)
     assert (options.run, options.cameras) == (tmp_path, str(tmp_path / "path.json"))
     assert (options.outputs, options.formats, options.overwrite) == (("rgb",), ("mp4",), True)
@@ -52,61 +51,91 @@ def run_instead(monkeypatch):
     return lambda code: monkeypatch.setattr(video_job, "_LAUNCH", code)
 
 
-def ended(job, tmp_path):
-    done, said = threading.Event(), []
+class Ending:
+    """A video, and how it ended."""
 
-    def note(text):
-        said.append(text)
-        done.set()
+    def __init__(self, folder):
+        self.parts, self.video, self.reason = [], None, None
+        self._ended = threading.Event()
+        self.job = VideoJob(["--some", "words"], folder, self.parts.append, self._done)
 
-    job.start(["--some", "words"], tmp_path, note)
-    return done, said
+    def _done(self, video, reason):
+        self.video, self.reason = video, reason
+        self._ended.set()
+
+    def wait(self):
+        assert self._ended.wait(60)
+        return self
 
 
-def test_the_end_is_said(tmp_path, run_instead):
-    run_instead("import sys; assert sys.argv[1:] == ['--some', 'words']")
-    done, said = ended(VideoJob(), tmp_path)
-    assert done.wait(30)
-    assert said == [f"the video is in {tmp_path}"]
+def rendered(folder, queue=None):
+    one = Ending(folder)
+    (queue or VideoQueue()).start(one.job)
+    return one.wait()
+
+
+WRITE = "import sys, pathlib; pathlib.Path({folder!r}, 'a.mp4').write_bytes(b'video')"
+
+
+def test_the_video_is_handed_over(tmp_path, run_instead):
+    run_instead(WRITE.format(folder=str(tmp_path)) + "; assert sys.argv[1:] == ['--some', 'words']")
+    assert rendered(tmp_path).video == tmp_path / "a.mp4"
+
+
+def test_progress_is_told_as_the_command_prints_it(tmp_path, run_instead):
+    run_instead("print('rendering: 1 of 4 done'); print('other'); print('rendering: 3 of 4 done')")
+    assert rendered(tmp_path).parts == [0.25, 0.75]
+
+
+def test_the_command_prints_progress_as_it_is_read(capsys):
+    from rich.console import Console
+
+    from unmix_plugin.commands.reporting import follow
+
+    list(follow(Console(), "rendering", [1, 2]))
+    assert video_job._PROGRESS.match(capsys.readouterr().out)[2] == "2"
 
 
 def test_a_failure_is_said_with_its_reason(tmp_path, run_instead):
     run_instead("import sys; sys.exit('no checkpoint')")
-    done, said = ended(VideoJob(), tmp_path)
-    assert done.wait(30)
-    assert said == ["rendering the video failed: no checkpoint"]
+    ended = rendered(tmp_path)
+    assert (ended.video, ended.reason) == (None, "rendering the video failed: no checkpoint")
 
 
-def test_one_video_at_a_time_and_stopping_ends_it(tmp_path, run_instead):
-    run_instead("import time; time.sleep(60)")
-    job = VideoJob()
-    done, said = ended(job, tmp_path)
-    with pytest.raises(ConfigError, match="a video is being rendered already"):
-        job.start([], tmp_path, lambda _: None)
-    assert job.is_running
-    job.stop()
-    assert done.wait(30)
-    assert not job.is_running
-    assert said[0].startswith("rendering the video failed")
+WAIT = "import sys, time, pathlib; print('rendering: 0 of 1 done', flush=True); time.sleep(60)"
 
 
-def test_the_command_is_run_by_this_python(tmp_path, run_instead):
-    run_instead(f"import sys; assert sys.executable == {sys.executable!r}")
-    done, said = ended(VideoJob(), tmp_path)
-    assert done.wait(30)
-    assert said[0].startswith("the video is in")
+def test_videos_are_rendered_in_turn_and_can_be_cancelled(tmp_path, run_instead):
+    run_instead(WAIT)
+    queue, first, second, third = VideoQueue(), *(Ending(tmp_path) for _ in range(3))
+    begun = threading.Event()
+    first.job.progress = lambda _: begun.set()
+    queue.start(first.job)
+    assert begun.wait(60)
+    queue.start(second.job)
+    queue.cancel(second.job)
+    run_instead("print('rendering: 1 of 1 done')")
+    queue.start(third.job)
+    assert third.parts == []
+    queue.cancel(first.job)
+    assert [one.wait().reason for one in (first, second)] == ["cancelled", "cancelled"]
+    assert third.wait().parts == [1.0]
 
 
 def test_stopping_ends_the_encoder_that_the_render_started(tmp_path, run_instead):
     run_instead(
         "import subprocess, sys; child = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)']);"
-        f"open({str(tmp_path / 'child')!r}, 'w').write(str(child.pid)); child.wait()"
+        "print('rendering: 0 of 1 done', flush=True); child.wait()"
     )
-    job = VideoJob()
-    done, _ = ended(job, tmp_path)
-    until = time.monotonic() + 30
-    while not (tmp_path / "child").exists() or not (tmp_path / "child").read_text():
-        assert time.monotonic() < until
-        time.sleep(0.02)
-    job.stop()
-    assert done.wait(30)  # its output is closed only once the encoder, which has it too, has ended
+    queue, one, begun = VideoQueue(), Ending(tmp_path), threading.Event()
+    one.job.progress = lambda _: begun.set()
+    queue.start(one.job)
+    assert begun.wait(60)
+    queue.stop()
+    # Its output is read to the end, which comes only once the encoder, which shares it, has ended.
+    assert one.wait().reason == "cancelled"
+
+
+def test_the_command_is_run_by_this_python(tmp_path, run_instead):
+    run_instead(WRITE.format(folder=str(tmp_path)) + f"; assert sys.executable == {sys.executable!r}")
+    assert rendered(tmp_path).video is not None

@@ -180,6 +180,7 @@ class Trainer:
         with self.control.device.training_turn():
             self.save()
         if not self._is_at_limit:
+            self.control.request_stop()  # also where a signal asked for it: pages show what has become of the training
             reason = "its output is closed" if display.is_closed else "on request"
             self.log.write(f"stopped at step {self.step}: {reason}")
             raise Interrupted(self.run.path, self.step)
@@ -187,7 +188,7 @@ class Trainer:
     def _iterate(self, display: ProgressDisplay) -> None:
         """A step, and whatever is shown, written or measured after it."""
         loss, metrics = self._train_step()
-        if self.control.is_status_due:
+        if self.control.is_status_due or self.progress >= 1.0:
             self.control.show(self._status(loss, metrics))
         if display.is_due or self.progress >= 1.0:
             display.show(self._status(loss, metrics))

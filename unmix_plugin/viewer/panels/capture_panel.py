@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from unmix_plugin.editing import recipe_to_yaml
 from unmix_plugin.engine.geometry.cameras import Cameras
@@ -29,7 +30,7 @@ from unmix_plugin.viewer.captures import (
     check_size,
 )
 from unmix_plugin.viewer.inputs import new_file, number
-from unmix_plugin.viewer.rendering.video_job import output_of, render_words
+from unmix_plugin.viewer.rendering.video_job import VideoJob, output_of, render_argv
 from unmix_plugin.viewer.session import Session
 from unmix_plugin.viewer.view_cameras import ViewPose, camera_of, sized_camera
 
@@ -44,6 +45,7 @@ class CapturePanel:
     def __init__(self, session: Session) -> None:
         self._session = session
         self._capture: StripCapture | None = None
+        self._video: VideoJob | None = None
         self._keys: list[ViewPose] = []
         self._preview = threading.Event()
         gui = session.client.gui
@@ -71,6 +73,8 @@ class CapturePanel:
             )
             gui.add_button("render a video").on_click(session.guarded(self._render_video))
 
+            gui.add_button("cancel the video").on_click(session.guarded(self._cancel_video))
+            self._video_progress = gui.add_progress_bar(0.0)
         session.on_close.append(self._abandon)
 
     def _abandon(self) -> None:
@@ -83,16 +87,18 @@ class CapturePanel:
             self._capture.cancel()
 
     def _size(self) -> tuple[int, int]:
-        width, height = (
-            int(number(control.value, *SIDE_BOUNDS, fallback=1024)) for control in (self._width, self._height)
-        )
-        return width, height
+        """Width and height asked for.
+
+        Raises:
+            ConfigError: one is out of bounds.
+        """
+        return tuple(_side(control) for control in (self._width, self._height))
 
     def _camera(self, num_bands: int | None = None) -> Cameras:
         """What the client sees, in the size asked for: the vertical field of view stays.
 
         Raises:
-            ConfigError: too large a picture, or one with too many spectra.
+            ConfigError: too small or too large a picture, or one with too many spectra.
         """
         width, height = self._size()
         check_size(width, height, num_bands)
@@ -105,8 +111,8 @@ class CapturePanel:
         path = self._new_file(".png")
 
         def finish() -> None:
-            content = canvas.write(path, f"{settings.layer}, {camera.width} x {camera.height} pixels")
-            self._hand_over(path, content)
+            canvas.write(path, f"{settings.layer}, {camera.width} x {camera.height} pixels")
+            self._hand_over(path)
 
         self._begin(
             camera,
@@ -118,7 +124,7 @@ class CapturePanel:
         bands = self._session.materials().bands
         camera = self._camera(len(bands))
         canvas, path = SpectraCanvas(camera, len(bands)), self._new_file(".exr")
-        self._begin(camera, canvas.take, lambda: self._say_saved(canvas.write(path)))
+        self._begin(camera, canvas.take, lambda: self._hand_over(canvas.write(path)))
 
     def _begin(self, camera: Cameras, take: Callable[..., None], finish: Callable[[], None]) -> None:
         if self._capture is not None:
@@ -144,9 +150,10 @@ class CapturePanel:
     def _new_file(self, suffix: str) -> Path:
         return new_file(self._session.services.folder, self._name.value, suffix, "view")
 
-    def _hand_over(self, path: Path, content: bytes) -> None:
-        if len(content) <= _LARGEST_DOWNLOAD:
-            self._session.client.send_file_download(path.name, content)
+    def _hand_over(self, path: Path) -> None:
+        """Offer a file that was written to the browser as well, if it is not too large."""
+        if path.stat().st_size <= _LARGEST_DOWNLOAD:
+            self._session.client.send_file_download(path.name, path.read_bytes())
         self._say_saved(path)
 
     def _say_saved(self, path: Path) -> None:
@@ -187,10 +194,9 @@ class CapturePanel:
 
         def play() -> None:
             for pose in poses:
-                if stopped.is_set() or self._session.is_closed:
+                if stopped.wait(1 / _PREVIEW_FPS) or self._session.is_closed:
                     return
                 self._session.guarded(lambda pose=pose: self._session.look_from(camera_of(pose, 64)))()
-                time.sleep(1 / _PREVIEW_FPS)
 
         threading.Thread(target=play, name="unmix-viewer-preview", daemon=True).start()
 
@@ -210,6 +216,8 @@ class CapturePanel:
 
     def _render_video(self) -> None:
         session, services = self._session, self._session.services
+        if self._video is not None:
+            raise ConfigError("a video is being rendered already; wait for it or cancel it")
         output = output_of(session.view.settings)
         width, height = self._size()
         check_size(width, height)
@@ -219,9 +227,40 @@ class CapturePanel:
             text = recipe_to_yaml(session.view.edit.recipe).encode()
             recipe = write_file(cameras.with_suffix(".yml"), text)
         folder = cameras.with_suffix("")
-        words = render_words(services.source.run.path, cameras, output, folder, recipe)
-        services.video.start(words, folder, lambda text: session.say("video", text))
-        session.say("video", f"unmix-render writes it to {folder}")
+        argv = render_argv(services.source.run.path, cameras, output, folder, recipe)
+
+        def progress(fraction: float) -> None:
+            if not session.is_closed:
+                self._video_progress.value = 100.0 * fraction
+
+        def done(video: Path | None, reason: str) -> None:
+            self._video = None
+            progress(0.0)
+            if video is None:
+                session.say("no video", reason, is_warning=True)
+            else:
+                session.guarded(lambda: self._hand_over(video))()
+
+        self._video = VideoJob(argv, folder, progress, done)
+        services.videos.start(self._video)
+        session.say("video", f"unmix-render writes it to {folder}, after those of other pages")
+
+    def _cancel_video(self) -> None:
+        if self._video is not None:
+            self._session.services.videos.cancel(self._video)
+
+
+def _side(control: Any) -> int:
+    """A width or height that was typed.
+
+    Raises:
+        ConfigError: it is out of bounds.
+    """
+    low, high = SIDE_BOUNDS
+    found = number(control.value, -math.inf, math.inf, fallback=0)
+    if not low <= found <= high:
+        raise ConfigError(f"{control.label} is a number of pixels from {low} to {high}; found {found:g}")
+    return int(found)
 
 
 def _no_keys() -> tuple[str, ...]:

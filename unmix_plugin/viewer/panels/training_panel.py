@@ -27,9 +27,12 @@ class TrainingPanel:
         self._bar = gui.add_progress_bar(0.0)
         self._pause = gui.add_button("pause")
         self._pause.on_click(session.guarded(self._toggle))
-        gui.add_button("save a checkpoint").on_click(session.guarded(self._save))
+        save = gui.add_button("save a checkpoint")
+        save.on_click(session.guarded(self._save))
         self._sure = gui.add_checkbox("really stop", False)
-        gui.add_button("stop training", color="red").on_click(session.guarded(self._stop))
+        stop = gui.add_button("stop training", color="red")
+        stop.on_click(session.guarded(self._stop))
+        self._steering = (self._pause, save, self._sure, stop)
         low, high = SHARE_BOUNDS
         self._share = gui.add_slider(
             "viewer's share",
@@ -48,7 +51,9 @@ class TrainingPanel:
         """Renew the figures, and now and then the curves."""
         control, status = self._control, self._control.status
         self._pause.label = "resume" if control.is_paused else "pause"
-        self._state.content = html.table(_rows(status, self._condition()))
+        self._state.content = html.table(_rows(status, self._condition(), control.is_running))
+        for steering in self._steering:
+            steering.disabled = not control.is_running
         self._bar.value = 0.0 if status is None else 100 * status.progress
         if self._ticks % _TICKS_A_CHART == 0:
             self._draw_curves()
@@ -56,10 +61,10 @@ class TrainingPanel:
 
     def _condition(self) -> str:
         control = self._control
-        if not control.is_running:
-            return "has not begun" if control.status is None else "finished"
         if control.is_stop_requested:
-            return "stopping"
+            return "stopping" if control.is_running else "stopped, and saved"
+        if not control.is_running:
+            return "has not begun" if control.status is None else "done"
         return "paused" if control.is_paused else "running"
 
     def _draw_curves(self) -> None:
@@ -96,15 +101,17 @@ def is_training(services: Services) -> bool:
     return services.source.control is not None
 
 
-def _rows(status: TrainingStatus | None, condition: str) -> list[tuple[str, str]]:
+def _rows(status: TrainingStatus | None, condition: str, is_running: bool) -> list[tuple[str, str]]:
     if status is None:
         return [("training", condition)]
-    left = status.seconds_left
-    return [
+    rows = [
         ("training", condition),
         ("step", f"{status.step}, {100 * status.progress:.0f} %"),
         ("loss", f"{status.loss:.4g}"),
         ("PSNR of the batch", "-" if status.psnr is None else f"{status.psnr:.2f} dB"),
-        ("speed", f"{status.rays_per_second / 1000:.1f} k rays/s"),
-        ("time left", "-" if left is None else f"{left:.0f} s of training"),
     ]
+    if is_running:
+        left = status.seconds_left
+        rows.append(("speed", f"{status.rays_per_second / 1000:.1f} k rays/s"))
+        rows.append(("time left", "-" if left is None else f"{left:.0f} s of training"))
+    return rows

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
 import threading
+from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 from unmix_plugin.errors import ConfigError
@@ -27,6 +30,8 @@ _OUTPUTS = (
     "accumulation",
 )
 _WAIT_S = 10.0
+_LINES_KEPT = 100
+_PROGRESS = re.compile(r"rendering: (\d+) of ([1-9]\d*) done")
 
 
 def output_of(settings: LayerSettings) -> str:
@@ -48,46 +53,87 @@ def output_of(settings: LayerSettings) -> str:
     raise ConfigError(f"videos can't show the layer {settings.layer}; choose another one")
 
 
+@dataclass(eq=False)
 class VideoJob:
-    """At most one render at a time."""
+    """A video asked for by one page; its callbacks are called in a thread of its own."""
+
+    argv: list[str]
+    """Of `unmix-render`."""
+    folder: Path
+    """Where it writes."""
+    progress: Callable[[float], None]
+    """Told the part that is rendered, now and then."""
+    done: Callable[[Path | None, str], None]
+    """Takes the video, or None and what went wrong."""
+    is_cancelled: bool = False
+
+
+class VideoQueue:
+    """Renders videos one after another."""
 
     def __init__(self) -> None:
-        self._process: subprocess.Popen[str] | None = None
+        self._turn = threading.Lock()
         self._lock = threading.Lock()
+        self._is_stopping = False
+        self._running: tuple[VideoJob, subprocess.Popen[str]] | None = None
 
-    @property
-    def is_running(self) -> bool:
-        """Whether a video is being rendered."""
-        return self._process is not None and self._process.poll() is None
+    def start(self, job: VideoJob) -> None:
+        """Render a video when those before it are done."""
+        threading.Thread(target=self._run, args=(job,), name="unmix-viewer-video", daemon=True).start()
 
-    def start(self, words: list[str], folder: Path, done: Callable[[str], None]) -> None:
-        """Begin to render.
-
-        Args:
-            words: Of `unmix-render`.
-            folder: Where it writes.
-            done: Told the end, in a thread of its own.
-        Raises:
-            ConfigError: another video is being rendered.
-        """
+    def cancel(self, job: VideoJob) -> None:
+        """Do without a video, also one that is being rendered."""
         with self._lock:
-            if self.is_running:
-                raise ConfigError("a video is being rendered already; wait until it is done")
-            self._process = process = subprocess.Popen(
-                [sys.executable, "-c", _LAUNCH, *words],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                text=True,
-                start_new_session=True,
-            )
-        threading.Thread(target=_wait, args=(process, folder, done), daemon=True).start()
+            job.is_cancelled = True
+            if self._running is not None and self._running[0] is job:
+                _end(self._running[1])
 
     def stop(self) -> None:
-        """End a render under way."""
+        """Do without all videos."""
         with self._lock:
-            if self._process is not None and self._process.poll() is None:
-                _end(self._process)
+            self._is_stopping = True
+            if self._running is not None:
+                _end(self._running[1])
+
+    def _run(self, job: VideoJob) -> None:
+        with self._turn:
+            lines: deque[str] = deque(maxlen=_LINES_KEPT)
+            with self._lock:
+                process = None
+                if not self._is_stopping and not job.is_cancelled:
+                    process = _start(job.argv)
+                    self._running = (job, process)
+            if process is not None:
+                _follow(process, lines, job.progress)
+            with self._lock:
+                self._running = None
+        if process is not None and process.returncode == 0:
+            job.done(next(job.folder.rglob("*.mp4"), None), "no video was written")
+        elif job.is_cancelled or self._is_stopping:
+            job.done(None, "cancelled")
+        else:
+            job.done(None, f"rendering the video failed: {''.join(lines).strip()[-_LONGEST_MESSAGE:]}")
+
+
+def _start(argv: list[str]) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-c", _LAUNCH, *argv],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def _follow(process: subprocess.Popen[str], lines: deque[str], progress: Callable[[float], None]) -> None:
+    """Read what a render prints until it ends."""
+    with process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            lines.append(line)
+            if found := _PROGRESS.match(line):
+                progress(int(found[1]) / int(found[2]))
 
 
 def _end(process: subprocess.Popen[str]) -> None:
@@ -104,16 +150,8 @@ def _end(process: subprocess.Popen[str]) -> None:
             continue
 
 
-def render_words(run: Path, cameras: Path, output: str, folder: Path, recipe: Path | None) -> list[str]:
-    """Words of `unmix-render` for a video along a camera file."""
-    words = ["--run", str(run), "--cameras", str(cameras), "--outputs", output, "--formats", "mp4"]
-    words += ["--output", str(folder), "--overwrite"]
-    return words if recipe is None else [*words, "--edits", str(recipe)]
-
-
-def _wait(process: subprocess.Popen[str], folder: Path, done: Callable[[str], None]) -> None:
-    output, _ = process.communicate()
-    if process.returncode == 0:
-        done(f"the video is in {folder}")
-    else:
-        done(f"rendering the video failed: {output.strip()[-_LONGEST_MESSAGE:]}")
+def render_argv(run: Path, cameras: Path, output: str, folder: Path, recipe: Path | None) -> list[str]:
+    """Arguments of `unmix-render` for a video along a camera file."""
+    argv = ["--run", str(run), "--cameras", str(cameras), "--outputs", output, "--formats", "mp4"]
+    argv += ["--output", str(folder), "--overwrite"]
+    return argv if recipe is None else [*argv, "--edits", str(recipe)]
