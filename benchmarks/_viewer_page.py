@@ -35,7 +35,7 @@ class Page:
     pictures: list[tuple[float, int]] = field(default_factory=list)
     """When each picture came (monotonic seconds), and its bytes."""
     last_picture: bytes = b""
-    """The newest picture, JPEG."""
+    """The newest picture, PNG or JPEG."""
     last_depth: bytes | None = None
     """Its depth, PNG."""
     controls: dict[str, dict[str, Any]] = field(default_factory=dict)

@@ -179,6 +179,7 @@ def test_what_a_page_uploads_is_not_kept(source, token):
             page.wait_until(lambda: bool(page.pictures))
         else:
             try_a_wrong_token(page)
+        assert viewer._server is not None
         apis = [viewer._server.gui, *(client.gui for client in viewer._server.get_clients().values())]
         assert len(apis) == 2
         assert all(not api._current_file_upload_states for api in apis)

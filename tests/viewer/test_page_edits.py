@@ -5,9 +5,13 @@ import threading
 import numpy as np
 import pytest
 
-from tests.viewer.pages import decoded, opened, show_layer
-from unmix_plugin.editing import Retint
+from tests.viewer.pages import decoded, opened, serving, show_layer
+from tests.viewer.view_factory import make_source
+from unmix_plugin.editing import Light, Recipe, Retint
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.colour.illuminants import illuminant_names
+from unmix_plugin.viewer.rendering.edits import Edit
 
 
 def test_materials_are_edited_undone_saved_and_loaded(viewer):
@@ -123,3 +127,15 @@ def test_files_outside_the_folder_of_recipes_are_not_read(viewer, tmp_path):
         page.set("load", True)
         page.wait_until(lambda: bool(page.notices))
         assert "choose one of the recipes" in page.notices[0][1]
+
+
+def test_every_light_that_is_offered_can_be_chosen(tmp_path):
+    source = make_source(tmp_path)
+    infrared = Bands.of([700.0, 800.0, 900.0, 1000.0, 1100.0])
+    source._model.bands = infrared
+    source._model.metadata = {**source._model.metadata, "wavelengths_nm": infrared.centers_nm.tolist()}
+    with serving(source) as (viewer, _), opened(viewer) as page:
+        offered = page.controls[page.control("light")]["options"]
+        assert 3 < len(offered) < len(illuminant_names())
+        for name in offered[1:]:
+            viewer.services.maker.edited(Edit(Recipe(illuminant=Light(name))))

@@ -9,6 +9,8 @@ from tests.viewer.pages import decoded, opened, serving, show_layer
 from tests.viewer.view_factory import make_source
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.maps.indices import available_indices
+from unmix_plugin.viewer.layers.painting import BACKGROUNDS
+from unmix_plugin.viewer.rendering.edits import Edit
 
 
 def test_a_page_gets_a_picture_of_its_shape_that_shows_something(viewer):
@@ -24,6 +26,24 @@ def test_pages_become_finer_at_rest(viewer):
         page.look_from(0.9)
         page.wait_until(lambda: len(decoded(page.last_picture)) < 160)
         page.wait_until(lambda: len(decoded(page.last_picture)) == 160)
+
+
+def test_small_pictures_and_labels_are_sent_without_loss_and_large_ones_compressed(viewer):
+    with opened(viewer, rows=48) as page:
+        assert page.last_picture.startswith(b"\x89PNG")
+        page.set("finest picture (rows)", 256)
+        page.wait_until(lambda: len(decoded(page.last_picture)) == 256)
+        assert page.last_picture.startswith(b"\xff\xd8")
+        labels = show_layer(page, "segmentation")
+        assert page.last_picture.startswith(b"\x89PNG")
+        materials = viewer.services.maker.edited(Edit())
+        known = {
+            tuple(row) for row in (viewer.services.aids().colours_of(materials) * 255).round().int().tolist()
+        }
+        background = round(255 * BACKGROUNDS["grey"])
+        assert {tuple(row) for row in labels.reshape(-1, 3).astype(int).tolist()} <= known | {
+            (background,) * 3
+        }
 
 
 def test_each_page_has_its_own_layer(viewer):
@@ -83,6 +103,7 @@ def test_a_formula_is_shown_when_it_is_typed_not_letter_by_letter(viewer):
 def test_the_ends_of_a_range_are_shown_when_they_are_ones_own_and_begin_as_they_were(viewer):
     with opened(viewer) as page:
         show_layer(page, "depth")
+        page.wait_until(lambda: "distance along the viewing axis" in page.texts)
         low, high = (page.controls[page.control(label)] for label in ("low", "high"))
         assert (low["visible"], high["visible"]) == (False, False)
         before = decoded(page.last_picture)

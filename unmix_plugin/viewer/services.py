@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float64
 
-from unmix_plugin.editing import Recipe, sample_seen
+from unmix_plugin.editing import Light, Recipe, sample_seen
+from unmix_plugin.editing.light import relighting_factors
+from unmix_plugin.errors import SpectrumError
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.colour.illuminants import illuminant_names
 from unmix_plugin.spectral.composition import Coefficients
 from unmix_plugin.trained.run_views import RunView, views_of
 from unmix_plugin.viewer.failures import failures_said
@@ -89,6 +94,13 @@ class Services:
         """Where recipes of this run are kept."""
         return self.source.run.path / "recipes"
 
+    @cached_property
+    def usable_lights(self) -> tuple[str, ...]:
+        """Names of the lights that the scene can be shown in."""
+        unedited = Edit()
+        bands, recorded = self.maker.edited(unedited).bands, self.maker.light_of(unedited)
+        return tuple(name for name in illuminant_names() if _is_usable(name, bands, recorded))
+
     def start(self) -> None:
         """Begin to render, and to read the scene."""
         self.loop.start()
@@ -136,6 +148,7 @@ class Services:
 
     def _read(self) -> None:
         """Read the scene; without it the viewer only lacks what was measured."""
+        _ = self.usable_lights  # takes a second, which the first page need not wait for
         with failures_said("the scene could not be read", self._note_missing):
             scene = self._read_scene()
             self.scene = scene
@@ -144,6 +157,14 @@ class Services:
 
     def _note_missing(self, reason: str) -> None:
         self.why_not_measured = f"the scene is not at hand: {reason}"
+
+
+def _is_usable(light: str, bands: Bands, recorded: Float64[np.ndarray, " B"] | None) -> bool:
+    try:
+        relighting_factors(bands, recorded, Light(light))
+    except SpectrumError:
+        return False
+    return True
 
 
 def thumbnail(scene: Scene, name: str) -> Thumbnail | None:

@@ -31,8 +31,11 @@ if TYPE_CHECKING:
     from unmix_plugin.spectral.composition import Materials
     from unmix_plugin.viewer.panels import Panel
 
-_MOVING_QUALITY, _RESTING_QUALITY = 60, 90
+_MOVING_QUALITY, _RESTING_QUALITY = 80, 90
 """JPEG quality of pictures that are soon replaced, and of those that stay."""
+
+_SMALL_PIXELS = 1 << 14
+"""Pictures of so few pixels are enlarged so much that compression with loss would show; they are sent as PNG."""
 
 _NOTICE_S = 8.0
 
@@ -216,9 +219,10 @@ class Session:
     def _show(self, shown: Shown) -> None:
         if self.is_closed:
             return
+        height, width = shown.picture.shape[:2]
         self.client.scene.set_background_image(
             shown.picture,
-            format="jpeg",
+            format="png" if shown.is_labels or height * width <= _SMALL_PIXELS else "jpeg",
             jpeg_quality=_MOVING_QUALITY if shown.is_moving else _RESTING_QUALITY,
             depth=shown.depth,
         )
@@ -230,7 +234,6 @@ class Session:
                 (shown.legend.low, shown.legend.high) if isinstance(shown.legend, ColourMapLegend) else None
             )
         if self._status is not None and not self.view.has_reported:
-            height, width = shown.picture.shape[:2]
             speed = self.services.maker.speed.rays_per_second
             more = ", refining" if shown.is_moving else ""
             self._status.content = html.paragraph(f"{width} x {height}, {speed / 1000:.0f} k rays/s{more}")

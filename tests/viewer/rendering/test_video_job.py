@@ -93,7 +93,9 @@ def test_the_command_prints_progress_as_it_is_read(capsys):
     from unmix_plugin.commands.reporting import follow
 
     list(follow(Console(), "rendering", [1, 2]))
-    assert video_job._PROGRESS.match(capsys.readouterr().out)[2] == "2"
+    found = video_job._PROGRESS.match(capsys.readouterr().out)
+    assert found is not None
+    assert found.groups() == ("0", "2")
 
 
 def test_a_failure_is_said_with_its_reason(tmp_path, run_instead):

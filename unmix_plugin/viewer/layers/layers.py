@@ -49,6 +49,8 @@ class Layer:
     paint: Painter
     controls: frozenset[str]
     """Which of `wavelength`, `false-colour`, `endmember`, `index`, `tone`, `scale` apply."""
+    is_labels: bool = False
+    """Whether each colour stands for something of its own, so that pictures must not be compressed with loss."""
 
 
 def paint_layer(frame: Frame, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
@@ -231,7 +233,7 @@ LAYERS: dict[str, Layer] = {
         Layer("index", "spectral index", paint_index, frozenset({_SCALE, "index"})),
         Layer("abundance", "abundance of one endmember", _paint_abundance, frozenset({_SCALE, "endmember"})),
         Layer("abundances", "all abundances", _paint_abundances, frozenset()),
-        Layer("segmentation", "segmentation", _paint_segmentation, frozenset()),
+        Layer("segmentation", "segmentation", _paint_segmentation, frozenset(), is_labels=True),
         Layer("confidence", "segmentation confidence", _paint_confidence, frozenset({_SCALE})),
         Layer("diffuse", "diffuse part", _paint_colour(True, False), frozenset({_TONE})),
         Layer("specular", "specular part", _paint_colour(False, True), frozenset({_TONE})),

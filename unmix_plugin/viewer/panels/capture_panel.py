@@ -92,7 +92,7 @@ class CapturePanel:
         Raises:
             ConfigError: one is out of bounds.
         """
-        return tuple(_side(control) for control in (self._width, self._height))
+        return _side(self._width), _side(self._height)
 
     def _camera(self, num_bands: int | None = None) -> Cameras:
         """What the client sees, in the size asked for: the vertical field of view stays.

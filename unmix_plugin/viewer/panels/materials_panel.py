@@ -20,7 +20,6 @@ from unmix_plugin.editing import (
 )
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
-from unmix_plugin.spectral.colour.illuminants import illuminant_names
 from unmix_plugin.spectral.composition import Materials
 from unmix_plugin.spectral.library.material_library import measured_library
 from unmix_plugin.viewer import html
@@ -56,7 +55,7 @@ class MaterialsPanel:
         self._gui = session.client.gui
         self._recipe = RecipeControls(session, refused=self._show_chosen)
         self._listing = self._gui.add_html("")
-        self._light = self._gui.add_dropdown("light", _lights())
+        self._light = self._gui.add_dropdown("light", self._lights())
         self._on(self._light, self._change_light)
         self._recipe.add_history()
         names = session.materials().names
@@ -133,7 +132,7 @@ class MaterialsPanel:
 
     def _change_light(self) -> None:
         name = str(self._light.value)
-        if name != _OWN_LIGHT and name not in illuminant_names():
+        if name not in self._lights(self._recipe.recipe.illuminant):
             raise ConfigError(f"there is no light {name[:40]!r} to choose")
         self._recipe.change(with_light(self._recipe.recipe, None if name == _OWN_LIGHT else Light(name)))
         metadata = self._session.services.source.scene.metadata
@@ -202,7 +201,7 @@ class MaterialsPanel:
             # While a name is typed the field is the user's: "blue " may become "blue cloth".
             if not self._typed_name.is_waiting and text(self._name.value).strip() != materials.names[index]:
                 self._name.value = materials.names[index]
-            self._light.options = _lights(recipe.illuminant)
+            self._light.options = self._lights(recipe.illuminant)
             self._light.value = _OWN_LIGHT if recipe.illuminant is None else str(recipe.illuminant.light)
             spectrum = materials.endmembers[index : index + 1].double().cpu().numpy()
             alike = self._session.nearest_materials(spectrum, materials.bands)[0]
@@ -212,6 +211,14 @@ class MaterialsPanel:
             self._recipe.show()
         finally:
             self._is_showing = False
+
+    def _lights(self, present: Light | None = None) -> tuple[str, ...]:
+        """Lights to choose from: those that reach the bands, usual ones first, and the present one in any case."""
+        usable = self._session.services.usable_lights
+        common = [name for name in _COMMON_LIGHTS if name in usable]
+        names = (_OWN_LIGHT, *common, *(name for name in usable if name not in common))
+        shown = _OWN_LIGHT if present is None else str(present.light)
+        return names if shown in names else (*names, shown)
 
     def _colour_of(self, materials: Materials, index: int) -> tuple[int, int, int]:
         """8-bit sRGB colour that was asked for an endmember, or else that of its spectrum in full light."""
@@ -232,14 +239,6 @@ class MaterialsPanel:
             like = f", like {found[0].name} ({found[0].angle_rad:.2f} rad)" if found else ""
             entries.append((f"{name}{' (hidden)' if is_gone else ''}{like}", colours[index]))
         return html.swatches(entries)
-
-
-def _lights(present: Light | None = None) -> tuple[str, ...]:
-    """Names to choose from, usual ones first; that of the present light is among them."""
-    others = (name for name in illuminant_names() if name not in _COMMON_LIGHTS)
-    names = (_OWN_LIGHT, *_COMMON_LIGHTS, *others)
-    shown = _OWN_LIGHT if present is None else str(present.light)
-    return names if shown in names else (*names, shown)
 
 
 def _factor(value: Any) -> float:

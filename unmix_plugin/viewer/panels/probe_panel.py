@@ -58,7 +58,7 @@ class ProbePanel:
         gui.add_button("forget all").on_click(session.guarded(self._forget))
         session.client.scene.on_click()(self._clicked)
 
-    def _clicked(self, event: viser.ScenePointerEvent) -> None:
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
         x, y = event.screen_pos
         self._session.guarded(lambda: self._take(x, y))()
 

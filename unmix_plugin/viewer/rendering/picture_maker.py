@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.spectral.composition import Materials
 from unmix_plugin.viewer.layers.layer_settings import LayerAids, LayerSettings
-from unmix_plugin.viewer.layers.layers import paint_layer
+from unmix_plugin.viewer.layers.layers import layer_named, paint_layer
 from unmix_plugin.viewer.layers.painting import as_bytes
 from unmix_plugin.viewer.probing import Probe, probe
 from unmix_plugin.viewer.rendering.edits import Edit, See
@@ -135,4 +135,4 @@ class PictureMaker:
         """
         picture, legend = paint_layer(frame, settings, self._aids())
         depth = picture_depth(frame) if with_depth else None
-        return Shown(as_bytes(picture), depth, legend, is_moving)
+        return Shown(as_bytes(picture), depth, legend, is_moving, layer_named(settings.layer).is_labels)

@@ -31,6 +31,8 @@ class Shown:
     legend: Legend
     is_moving: bool
     """Whether a finer picture follows at once."""
+    is_labels: bool = False
+    """Whether its colours are exact."""
 
 
 @dataclass(eq=False)
