@@ -33,8 +33,6 @@ from unmix_plugin.scenes.scene import Scene, SceneOptions
 DEMO = Path("demo")
 """`--data demo` stands for the built-in scene."""
 
-_EVAL_STREAM = 2
-
 
 @dataclass(frozen=True)
 class HyperspectralDataManagerConfig(DataManagerConfig):
@@ -112,20 +110,6 @@ class HyperspectralDataManager(DataManager):
         generator = step_generator(self.seed, step)
         chosen = self._pixels.draw(self._pixels_for(self._num_rays), generator)
         return self._batch(self._device_cameras, self._pixels, chosen, generator)
-
-    def next_eval(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
-        """Random pixels of one evaluation view."""
-        view = self.scene.eval_indices[step % self.num_eval_images]
-        pixels = _PixelTable(self.scene, self.device, (view,))
-        generator = step_generator(self.seed, step, stream=_EVAL_STREAM)
-        num_pixels = self._pixels_for(self.config.eval_num_rays_per_batch)
-        chosen = pixels.draw(num_pixels, generator)
-        return self._batch(self.scene.cameras[[view]].to(self.device), pixels, chosen, generator)
-
-    def next_eval_image(self, step: int) -> tuple[int, Cameras, dict[str, Tensor]]:
-        """The evaluation views in turn."""
-        index = step % self.num_eval_images
-        return index, *self.eval_image(index)
 
     def eval_image(self, index: int) -> tuple[Cameras, dict[str, Tensor]]:
         """Camera and whole image of one evaluation view."""

@@ -9,16 +9,22 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from unmix_plugin.engine.configs import OptimizerConfig, Target, TrainerConfig
-from unmix_plugin.engine.data_manager import DataManager, DataManagerConfig
-from unmix_plugin.engine.field import Field
-from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.rays import RayBundle
-from unmix_plugin.engine.geometry.scene_box import SceneBox
-from unmix_plugin.engine.model import Model, ModelConfig
-from unmix_plugin.engine.pipeline import PipelineConfig
-from unmix_plugin.engine.registry import MethodSpecification
-from unmix_plugin.engine.training.seeding import step_generator
+from unmix_plugin.engine import (
+    Cameras,
+    DataManager,
+    DataManagerConfig,
+    Field,
+    MethodSpecification,
+    Model,
+    ModelConfig,
+    OptimizerConfig,
+    PipelineConfig,
+    RayBundle,
+    SceneBox,
+    Target,
+    TrainerConfig,
+    step_generator,
+)
 
 VIEWS, SIZE = 12, 20
 
@@ -42,14 +48,7 @@ class BallDataManager(DataManager):
         self.num_rays = config.train_num_rays_per_batch
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
-        return self._sample(self.train_cameras, step, stream=0)
-
-    def next_eval(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
-        return self._sample(self.eval_cameras, step, stream=2)
-
-    def next_eval_image(self, step: int) -> tuple[int, Cameras, dict[str, Tensor]]:
-        index = step % self.num_eval_images
-        return index, *self.eval_image(index)
+        return self._sample(self.train_cameras, step)
 
     def eval_image(self, index: int) -> tuple[Cameras, dict[str, Tensor]]:
         truth = _trace(self.eval_cameras.image_rays(index)).reshape(SIZE, SIZE, 3)
@@ -70,8 +69,8 @@ class BallDataManager(DataManager):
     def summary(self) -> dict[str, Any]:
         return {"scene": "ball"}
 
-    def _sample(self, cameras: Cameras, step: int, stream: int) -> tuple[RayBundle, dict[str, Tensor]]:
-        generator = step_generator(self.seed, step, stream=stream)
+    def _sample(self, cameras: Cameras, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
+        generator = step_generator(self.seed, step)
         indices = torch.randint(len(cameras), (self.num_rays,), generator=generator)
         rays = cameras.generate_rays(indices, SIZE * torch.rand(self.num_rays, 2, generator=generator))
         return rays.to(self.device), {"rgb": _trace(rays).to(self.device)}

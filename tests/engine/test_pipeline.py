@@ -52,7 +52,9 @@ def test_average_metrics_are_the_mean_over_the_evaluation_views_that_have_them(
 
     monkeypatch.setattr(pipeline.model, "get_image_metrics_and_images", metrics)
     pipeline.train()
-    assert pipeline.get_average_eval_image_metrics() == {"psnr": 15.0, "miou": 0.5}
+    metrics, pictures = pipeline.get_average_eval_image_metrics_and_images()
+    assert metrics == {"psnr": 15.0, "miou": 0.5}
+    assert set(pictures) == {"rgb"}
     assert seen == [False, False]
     assert pipeline.model.training
 
@@ -66,12 +68,11 @@ def test_what_a_step_draws_follows_from_the_seed_and_the_step_alone(pipeline: Pi
     assert loss(5) == loss(5) != loss(6)
 
 
-def test_a_training_step_has_gradients_and_an_evaluation_step_has_none(pipeline: Pipeline):
-    assert pipeline.get_train_loss_dict(0)[1]["rgb_loss"].requires_grad
-    outputs, losses, metrics = pipeline.get_eval_loss_dict(0)
-    assert not losses["rgb_loss"].requires_grad
+def test_a_training_step_has_outputs_metrics_and_losses_with_gradients(pipeline: Pipeline):
+    outputs, losses, metrics = pipeline.get_train_loss_dict(0)
+    assert losses["rgb_loss"].requires_grad
     assert set(outputs) == {"rgb", "accumulation"}
-    torch.testing.assert_close(metrics["psnr"], -10 * losses["rgb_loss"].log10())
+    torch.testing.assert_close(metrics["psnr"], -10 * losses["rgb_loss"].detach().log10())
 
 
 def test_evaluating_gives_back_the_mode_it_found():

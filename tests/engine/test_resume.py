@@ -63,7 +63,7 @@ def train_lines(run: Path) -> list[dict]:
 def test_stopped_and_resumed_equals_straight_to_the_bit(
     short_config: TrainerConfig, number: int, average_decay: float | None
 ):
-    config = replace(short_config, average_decay=average_decay, average_interval=2)
+    config = replace(short_config, average_decay=average_decay)
     straight = quiet_trainer(config)
     straight.train()
     stopped = stop_at(config, 6, number)

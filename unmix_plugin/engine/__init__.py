@@ -1,5 +1,81 @@
-"""The generic engine: configs, registry, cameras, base classes, trainer, run folders; it knows no spectrum.
+"""The generic engine: what a method is made of, training it, and bringing its runs back. It knows no spectrum.
 
-A method is a `MethodSpecification` (registry) around a `TrainerConfig` (configs) that names subclasses of
-`DataManager` (data_manager) and `Model` (model); `Trainer` (trainer) trains it, `load_model` (load_run) brings it back.
+A method is a `MethodSpecification` around a `TrainerConfig` that names subclasses of `DataManager` and `Model`;
+`Trainer` trains it, `load_model` brings it back. Methods import from here alone; the modules below may change.
 """
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from unmix_plugin.engine.configs import TrainerConfig
+    from unmix_plugin.engine.data_manager import DataManager, DataManagerConfig
+    from unmix_plugin.engine.field import Field
+    from unmix_plugin.engine.geometry.cameras import Cameras
+    from unmix_plugin.engine.geometry.rays import RayBundle
+    from unmix_plugin.engine.geometry.scene_box import SceneBox
+    from unmix_plugin.engine.instantiate import InstantiateConfig, Target
+    from unmix_plugin.engine.model import Model, ModelConfig
+    from unmix_plugin.engine.pipeline import Pipeline, PipelineConfig
+    from unmix_plugin.engine.registry import MethodSpecification, discover_methods, find_method
+    from unmix_plugin.engine.runs.load_run import LoadedModel, load_config, load_model, load_pipeline
+    from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
+    from unmix_plugin.engine.training.optimizers import OptimizerConfig
+    from unmix_plugin.engine.training.seeding import step_generator
+    from unmix_plugin.engine.training.trainer import Trainer
+
+_MODULES = {
+    "configs": ("TrainerConfig",),
+    "data_manager": ("DataManager", "DataManagerConfig"),
+    "field": ("Field",),
+    "geometry.cameras": ("Cameras",),
+    "geometry.rays": ("RayBundle",),
+    "geometry.scene_box": ("SceneBox",),
+    "instantiate": ("InstantiateConfig", "Target"),
+    "model": ("Model", "ModelConfig"),
+    "pipeline": ("Pipeline", "PipelineConfig"),
+    "registry": ("MethodSpecification", "discover_methods", "find_method"),
+    "runs.load_run": ("LoadedModel", "load_config", "load_model", "load_pipeline"),
+    "training.callbacks": ("TrainingCallback", "TrainingCallbackLocation"),
+    "training.optimizers": ("OptimizerConfig",),
+    "training.seeding": ("step_generator",),
+    "training.trainer": ("Trainer",),
+}
+
+__all__ = [
+    "Cameras",
+    "DataManager",
+    "DataManagerConfig",
+    "Field",
+    "InstantiateConfig",
+    "LoadedModel",
+    "MethodSpecification",
+    "Model",
+    "ModelConfig",
+    "OptimizerConfig",
+    "Pipeline",
+    "PipelineConfig",
+    "RayBundle",
+    "SceneBox",
+    "Target",
+    "Trainer",
+    "TrainerConfig",
+    "TrainingCallback",
+    "TrainingCallbackLocation",
+    "discover_methods",
+    "find_method",
+    "load_config",
+    "load_model",
+    "load_pipeline",
+    "step_generator",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used: a command that needs one should not pay for all."""
+    for module, names in _MODULES.items():
+        if name in names:
+            return getattr(import_module(f"{__name__}.{module}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -39,22 +39,15 @@ class TrainerConfig:
     """Where to compute; auto takes CUDA where there is one."""
     steps_per_save: int = 1000
     """Save a checkpoint every so many steps; 0: only at the end."""
-    steps_per_eval_image: int = 0
-    """Evaluate one view every so many steps; 0: never."""
     steps_per_eval_all_images: int = 0
     """Evaluate all evaluation views every so many steps; 0: never."""
     steps_per_log: int = 50
     """Write losses and metrics to metrics.jsonl every so many steps."""
     checkpoints_kept: int = 2
     """How many of the newest checkpoints stay in the run folder."""
-    max_skipped_steps: int = 20
-    """Training fails after so many steps in a row with a non-finite loss or gradient."""
     average_decay: float | None = None
-    """Evaluate and render with a moving average of the parameters that keeps at most this part of itself each step; it
-    never spans more than about a ninth of the training so far. None: with the last step's."""
-    average_interval: int = 8
-    """Update that average every so many steps, after the first so many; an update costs about as much as one of the
-    optimiser."""
+    """Decay a step of the moving average of the parameters with which the run is evaluated and rendered; early in
+    training it decays faster, to span at most about a ninth of the steps so far. None: no average."""
     load_run: Path | None = None
     """Run folder to continue instead of starting a new one."""
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)
@@ -73,13 +66,10 @@ class TrainerConfig:
             "max_seconds > 0 and finite": self.max_seconds is None or 0 < self.max_seconds < math.inf,
             "max_num_iterations or max_seconds": (self.max_num_iterations, self.max_seconds) != (None, None),
             "steps_per_save >= 0": self.steps_per_save >= 0,
-            "steps_per_eval_image >= 0": self.steps_per_eval_image >= 0,
             "steps_per_eval_all_images >= 0": self.steps_per_eval_all_images >= 0,
             "steps_per_log >= 1": self.steps_per_log >= 1,
             "checkpoints_kept >= 1": self.checkpoints_kept >= 1,
-            "max_skipped_steps >= 1": self.max_skipped_steps >= 1,
             "average_decay in [0, 1)": self.average_decay is None or 0 <= self.average_decay < 1,
-            "average_interval >= 1": self.average_interval >= 1,
             "a file name as method_name": bool(self.method_name) and "/" not in self.method_name,
         }
         broken = [rule for rule, holds in rules.items() if not holds]

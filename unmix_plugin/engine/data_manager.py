@@ -24,8 +24,6 @@ class DataManagerConfig(InstantiateConfig):
     _target: Target = field(default_factory=lambda: DataManager)
     train_num_rays_per_batch: int = 4096
     """Rays of the first training step; a model may adapt the number later."""
-    eval_num_rays_per_batch: int = 4096
-    """Rays of one evaluation batch."""
 
     def __post_init__(self) -> None:
         """Refuse impossible settings; a subclass with rules of its own calls this too.
@@ -33,8 +31,7 @@ class DataManagerConfig(InstantiateConfig):
         Raises:
             ConfigError: a number out of its range.
         """
-        for name in ("train_num_rays_per_batch", "eval_num_rays_per_batch"):
-            require_in_range(name, getattr(self, name), 1, 2**22)
+        require_in_range("train_num_rays_per_batch", self.train_num_rays_per_batch, 1, 2**22)
 
 
 class DataManager(ABC):
@@ -43,8 +40,8 @@ class DataManager(ABC):
     Sampling is a pure function of (seed, step): a step makes its own generator with `step_generator(seed, step)`, so
     that a resumed run sees the batches of a straight one.
 
-    A batch is a dictionary of tensors with one row a ray (`next_train`, `next_eval`), or with leading axes
-    (height, width) for a whole image (`next_eval_image`, `eval_image`).
+    A batch is a dictionary of tensors with one row a ray (`next_train`), or with leading axes (height, width) for a
+    whole image (`eval_image`).
     """
 
     train_cameras: Cameras
@@ -68,14 +65,6 @@ class DataManager(ABC):
     @abstractmethod
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
         """Rays of training step `step` and what was measured along them."""
-
-    @abstractmethod
-    def next_eval(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
-        """As `next_train`, from the evaluation views."""
-
-    @abstractmethod
-    def next_eval_image(self, step: int) -> tuple[int, Cameras, dict[str, Tensor]]:
-        """Index of an evaluation view chosen by `step`, its camera (one) and its whole image."""
 
     @abstractmethod
     def eval_image(self, index: int) -> tuple[Cameras, dict[str, Tensor]]:

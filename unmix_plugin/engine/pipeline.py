@@ -10,7 +10,6 @@ import torch
 from torch import Tensor, nn
 
 from unmix_plugin.engine.data_manager import DataManager, DataManagerConfig
-from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.instantiate import InstantiateConfig, Target
 from unmix_plugin.engine.model import Model, ModelConfig
 from unmix_plugin.engine.training.callbacks import TrainingCallback
@@ -71,32 +70,25 @@ class Pipeline(nn.Module):
 
     def get_train_loss_dict(self, step: int) -> TrainOutputs:
         """Outputs, losses and metrics of training step `step`."""
-        return self._losses(*self.datamanager.next_train(step))
+        ray_bundle, batch = self.datamanager.next_train(step)
+        outputs = self.model(ray_bundle)
+        metrics = self.model.get_metrics_dict(outputs, batch)
+        return outputs, self.model.get_loss_dict(outputs, batch, metrics), metrics
 
     @torch.no_grad()
-    def get_eval_loss_dict(self, step: int) -> TrainOutputs:
-        """The same on a batch of evaluation rays, without gradients."""
-        with evaluating(self.model):
-            return self._losses(*self.datamanager.next_eval(step))
-
-    @torch.no_grad()
-    def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Metrics and pictures of the evaluation view that `step` chooses."""
-        _, camera, batch = self.datamanager.next_eval_image(step)
-        with evaluating(self.model):
-            return self.model.get_image_metrics_and_images(self.model.get_outputs_for_camera(camera), batch)
-
-    @torch.no_grad()
-    def get_average_eval_image_metrics(self, step: int | None = None) -> dict[str, float]:
-        """Metrics averaged over all evaluation views, each over the views that have it, whatever the step."""
+    def get_average_eval_image_metrics_and_images(self) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Metrics averaged over all evaluation views, each over the views that have it, and pictures of the first."""
         values: dict[str, list[float]] = {}
+        pictures: dict[str, Tensor] = {}
         with evaluating(self.model):
             for index in range(self.datamanager.num_eval_images):
                 camera, batch = self.datamanager.eval_image(index)
                 outputs = self.model.get_outputs_for_camera(camera)
-                for name, value in self.model.get_image_metrics_and_images(outputs, batch)[0].items():
+                metrics, images = self.model.get_image_metrics_and_images(outputs, batch)
+                pictures = pictures or images
+                for name, value in metrics.items():
                     values.setdefault(name, []).append(float(value))
-        return {name: sum(found) / len(found) for name, found in values.items()}
+        return {name: sum(found) / len(found) for name, found in values.items()}, pictures
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """The model's parameters by optimizer name."""
@@ -105,11 +97,6 @@ class Pipeline(nn.Module):
     def get_training_callbacks(self) -> list[TrainingCallback]:
         """The data manager's callbacks, then the model's."""
         return self.datamanager.get_training_callbacks() + self.model.get_training_callbacks()
-
-    def _losses(self, ray_bundle: RayBundle, batch: dict[str, Tensor]) -> TrainOutputs:
-        outputs = self.model(ray_bundle)
-        metrics = self.model.get_metrics_dict(outputs, batch)
-        return outputs, self.model.get_loss_dict(outputs, batch, metrics), metrics
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 import io
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -11,6 +10,7 @@ from torch import nn
 
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.runs.checkpoints import newest_complete_checkpoint
+from unmix_plugin.engine.training import guards
 from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.engine.training.guards import GradientGuard
 from unmix_plugin.engine.training.optimizers import OptimizerConfig, build_optimizer
@@ -18,18 +18,18 @@ from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.errors import RunError
 
 
-def make_guard(max_gradient_norm: float | None = None, max_in_a_row: int = 3):
+def make_guard():
     params = [nn.Parameter(torch.zeros(2)), nn.Parameter(torch.zeros(3)), nn.Parameter(torch.zeros(1))]
-    configs = {"a": OptimizerConfig(max_gradient_norm=max_gradient_norm), "b": OptimizerConfig()}
+    configs = {"a": OptimizerConfig(), "b": OptimizerConfig()}
     optimizer = build_optimizer({"a": params[:2], "b": params[2:]}, configs)
     for param in params:
         param.grad = torch.ones_like(param)
-    return GradientGuard(optimizer, configs, max_in_a_row), params
+    return GradientGuard(optimizer), params
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_a_bad_loss_or_any_one_bad_gradient_entry_is_refused(bad: float):
-    guard, params = make_guard(max_in_a_row=10)
+    guard, params = make_guard()
     assert guard.check(torch.tensor(0.5)) == (True, 0.5)
     assert guard.check(torch.tensor(bad))[0] is False
     for param in params:
@@ -46,22 +46,9 @@ def test_parameters_without_gradient_do_not_matter():
     assert guard.check(torch.tensor(1.0))[0] is True
 
 
-def test_long_gradients_are_shortened_to_the_limit_of_their_group_alone():
-    guard, params = make_guard(max_gradient_norm=0.1)
-    guard.check(torch.tensor(1.0))
-    length = torch.cat([param.grad for param in params[:2] if param.grad is not None]).norm()
-    torch.testing.assert_close(length, torch.tensor(0.1))
-    torch.testing.assert_close(params[2].grad, torch.ones(1))
-
-
-def test_short_gradients_keep_their_length():
-    guard, params = make_guard(max_gradient_norm=100.0)
-    guard.check(torch.tensor(1.0))
-    torch.testing.assert_close(params[0].grad, torch.ones(2))
-
-
-def test_only_refusals_in_a_row_end_training():
-    guard, _ = make_guard(max_in_a_row=2)
+def test_only_refusals_in_a_row_end_training(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(guards, "MAX_IN_A_ROW", 2)
+    guard, _ = make_guard()
     for loss in (math.nan, 1.0, math.nan, 1.0):
         guard.check(torch.tensor(loss))
     assert guard.skipped == 2
@@ -97,8 +84,11 @@ def test_a_poisoned_step_changes_no_parameter_and_is_counted_and_logged(short_co
     assert '"loss": null' in trainer.run.metrics_path.read_text()
 
 
-def test_training_that_stays_poisoned_ends_with_the_last_checkpoint_whole(short_config: TrainerConfig):
-    trainer = poisoned_trainer(replace(short_config, max_skipped_steps=3), set(range(6, 100)))
+def test_training_that_stays_poisoned_ends_with_the_last_checkpoint_whole(
+    short_config: TrainerConfig, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(guards, "MAX_IN_A_ROW", 3)
+    trainer = poisoned_trainer(short_config, set(range(6, 100)))
     with pytest.raises(RunError, match="3 training steps in a row"):
         trainer.train()
     checkpoint = newest_complete_checkpoint(trainer.run.checkpoints)

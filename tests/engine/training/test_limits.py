@@ -67,19 +67,21 @@ def test_a_limit_in_seconds_ends_training_in_time_with_the_schedule_run_out(shor
 def test_seconds_of_evaluation_saving_and_warming_up_do_not_count(
     short_config: TrainerConfig, monkeypatch: pytest.MonkeyPatch
 ):
-    trainer = Trainer(replace(short_config, max_num_iterations=3, steps_per_eval_image=1, steps_per_save=1))
+    trainer = Trainer(
+        replace(short_config, max_num_iterations=3, steps_per_eval_all_images=1, steps_per_save=1)
+    )
     slow = {"eval": 0, "warm": 0}
 
-    def evaluate(step: int):
+    def evaluate():
         slow["eval"] += 1
         time.sleep(0.4)
-        return {"psnr": float(step)}, {}
+        return {"psnr": 1.0}, {}
 
     def warm_up() -> None:
         slow["warm"] += 1
         time.sleep(0.4)
 
-    monkeypatch.setattr(trainer.pipeline, "get_eval_image_metrics_and_images", evaluate)
+    monkeypatch.setattr(trainer.pipeline, "get_average_eval_image_metrics_and_images", evaluate)
     monkeypatch.setattr(trainer.pipeline.model, "warm_up", warm_up)
     record = trainer.train()
     assert slow == {"eval": 3, "warm": 1}

@@ -32,7 +32,7 @@ def wait_for(holds, timeout_s=20.0):
 
 @pytest.mark.parametrize("average_decay", [None, 0.9])
 def test_a_guest_on_the_device_changes_nothing_of_a_training(short_config, average_decay):
-    config = replace(short_config, average_decay=average_decay, average_interval=2)
+    config = replace(short_config, average_decay=average_decay)
     alone, watched = quiet_trainer(config), quiet_trainer(config)
     alone.train()
     model, camera = watched.pipeline.model, watched.pipeline.datamanager.eval_cameras[0]

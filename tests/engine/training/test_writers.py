@@ -30,13 +30,13 @@ def without_tensorboard(monkeypatch: pytest.MonkeyPatch):
 def test_each_write_is_one_json_line_and_what_is_not_finite_is_null(tmp_path: Path):
     writer = MetricsWriter(RunFolder(tmp_path))
     writer.write(1, 0.12345, "train", {"loss": 0.5, "psnr": math.inf})
-    writer.write(2, 1.0, "eval", {"psnr": 30.0})
+    writer.write(2, 1.0, "eval_all", {"psnr": 30.0})
     writer.write_images(2, {"rgb": torch.zeros(2, 2, 3)})
     writer.close()
     lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert lines == [
         {"step": 1, "seconds": 0.123, "split": "train", "loss": 0.5, "psnr": None},
-        {"step": 2, "seconds": 1.0, "split": "eval", "psnr": 30.0},
+        {"step": 2, "seconds": 1.0, "split": "eval_all", "psnr": 30.0},
     ]
     assert not (tmp_path / "tensorboard").exists()
 

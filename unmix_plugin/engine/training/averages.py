@@ -6,14 +6,16 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor, nn
 
+AVERAGE_INTERVAL = 8
+"""Steps of a training between updates, each of which costs about as much as a step of the optimiser."""
+
 
 class ParameterAverage:
     """Exponential moving average of a module's trained parameters.
 
-    The part of itself that it keeps rises as (1 + n) / (10 + n) with the number n of updates until it reaches the decay
-    asked for: until then it spans about the last ninth of the training so far, however long that is, and the first
-    values do not linger. The steps of the first interval are each taken in, so that a training of few steps isn't shown
-    as it began.
+    Its decay rises as (1 + n) / (10 + n) with the number n of updates until it reaches the one asked for: until then it
+    spans about the last ninth of the training so far, however long that is. Each step of the first interval is an
+    update, so that a training of few steps isn't shown as it began.
     """
 
     def __init__(self, module: nn.Module, decay: float, interval: int = 1) -> None:
@@ -21,7 +23,7 @@ class ParameterAverage:
 
         Args:
             module: Whose parameters to follow.
-            decay: Part of itself that the average keeps a step, in [0, 1).
+            decay: Of a step, in [0, 1).
             interval: Steps between updates after the first interval; each then counts for so many steps.
         """
         self.interval = interval
@@ -54,7 +56,7 @@ class ParameterAverage:
         return self.values
 
     def load_state_dict(self, values: Mapping[str, Tensor], updates: int) -> None:
-        """Take back `state_dict` and the number of updates."""
+        """Restore `state_dict` and the number of updates."""
         for name, value in self.values.items():
             value.copy_(values[name])
         self.updates = updates

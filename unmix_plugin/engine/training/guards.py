@@ -5,19 +5,17 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from unmix_plugin.engine.training.optimizers import OptimizerConfig
 from unmix_plugin.errors import RunError
+
+MAX_IN_A_ROW = 20
+"""Training fails after so many steps in a row with a non-finite loss or gradient."""
 
 
 class GradientGuard:
-    """Looks at loss and gradients before each update, shortens long gradients, and refuses non-finite ones."""
+    """Looks at loss and gradients before each update and refuses non-finite ones."""
 
-    def __init__(
-        self, optimizer: torch.optim.Optimizer, configs: Mapping[str, OptimizerConfig], max_in_a_row: int
-    ) -> None:
+    def __init__(self, optimizer: torch.optim.Optimizer) -> None:
         self.optimizer = optimizer
-        self.configs = configs
-        self.max_in_a_row = max_in_a_row
         self.skipped = 0
         """Steps refused so far."""
         self.in_a_row = 0
@@ -40,23 +38,14 @@ class GradientGuard:
         finite, value = torch.stack([torch.isfinite(numbers).all().float(), numbers[0]]).tolist()
         if finite:
             self.in_a_row = 0
-            self._shorten(gradients, norms)
         else:
             self._refuse(value, norms)
         return bool(finite), value
 
-    def _shorten(self, gradients: Mapping[str, list[Tensor]], norms: Mapping[str, Tensor]) -> None:
-        for name, norm in norms.items():
-            longest = self.configs[name].max_gradient_norm
-            if longest is not None:
-                factor = (longest / norm.clamp_min(1e-20)).clamp_max(1.0)
-                for gradient in gradients[name]:
-                    gradient.mul_(factor)
-
     def _refuse(self, loss: float, norms: Mapping[str, Tensor]) -> None:
         self.skipped += 1
         self.in_a_row += 1
-        if self.in_a_row >= self.max_in_a_row:
+        if self.in_a_row >= MAX_IN_A_ROW:
             bad = [name for name, norm in norms.items() if not torch.isfinite(norm)]
             raise RunError(
                 f"{self.in_a_row} training steps in a row had a non-finite loss or gradient (loss {loss:g}; "

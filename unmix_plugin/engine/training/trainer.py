@@ -19,7 +19,7 @@ from unmix_plugin.engine.runs.run_files import write_run_json
 from unmix_plugin.engine.runs.run_folder import RunFolder, create_run_folder, open_run_folder
 from unmix_plugin.engine.runs.run_lock import RunLock
 from unmix_plugin.engine.runs.scene_record import check_same_scene, read_scene_record, scene_record_to_json
-from unmix_plugin.engine.training.averages import ParameterAverage
+from unmix_plugin.engine.training.averages import AVERAGE_INTERVAL, ParameterAverage
 from unmix_plugin.engine.training.callbacks import TrainingCallbackLocation, run_callbacks
 from unmix_plugin.engine.training.guards import GradientGuard
 from unmix_plugin.engine.training.interrupts import Interrupted, StopSignals
@@ -75,7 +75,7 @@ class Trainer:
         if resumed is None:
             self.pipeline.initialise()
         self.optimizer = build_optimizer(self.pipeline.get_param_groups(), config.optimizers)
-        self.guard = GradientGuard(self.optimizer, config.optimizers, config.max_skipped_steps)
+        self.guard = GradientGuard(self.optimizer)
         self.callbacks = self.pipeline.get_training_callbacks()
         self.limits = Limits(config.max_num_iterations, config.max_seconds)
         self.clock = TrainingClock()
@@ -233,20 +233,14 @@ class Trainer:
         return loss, {**detached, **{name: torch.tensor(float(count)) for name, count in counts.items()}}
 
     def _evaluate(self, display: ProgressDisplay) -> None:
-        one = self._is_time_for(self.config.steps_per_eval_image)
-        every = self._is_time_for(self.config.steps_per_eval_all_images)
-        if not one and not every:
+        if not self._is_time_for(self.config.steps_per_eval_all_images):
             return
         with nullcontext() if self.average is None else self.average.swapped_in():
-            if one:
-                metrics, images = self.pipeline.get_eval_image_metrics_and_images(self.step)
-                self.writer.write(self.step, self.clock.seconds, "eval", metrics)
-                self.writer.write_images(self.step, images)
-            if every:
-                metrics = self.pipeline.get_average_eval_image_metrics(self.step)
-                self.writer.write(self.step, self.clock.seconds, "eval_all", metrics)
-                found = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items())
-                display.message(f"step {self.step}: evaluation views: {found}")
+            metrics, images = self.pipeline.get_average_eval_image_metrics_and_images()
+        self.writer.write(self.step, self.clock.seconds, "eval_all", metrics)
+        self.writer.write_images(self.step, images)
+        found = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items())
+        display.message(f"step {self.step}: evaluation views: {found}")
 
     def _write_metrics(self, loss: float, values: Mapping[str, Tensor]) -> None:
         rates = {f"lr/{name}": rate for name, rate in self.learning_rates.items()}
@@ -268,7 +262,7 @@ class Trainer:
     def _new_average(self) -> ParameterAverage | None:
         if self.config.average_decay is None:
             return None
-        return ParameterAverage(self.pipeline.model, self.config.average_decay, self.config.average_interval)
+        return ParameterAverage(self.pipeline.model, self.config.average_decay, AVERAGE_INTERVAL)
 
     def _new_run(self) -> RunFolder:
         scene = scene_record_to_json(self.pipeline.datamanager)

@@ -15,8 +15,8 @@ from unmix_plugin.atomic_files import write_file
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.errors import RunError
 
-Split = Literal["train", "eval", "eval_all"]
-"""Which rays a metric is of: a training batch, one evaluation view, all evaluation views."""
+Split = Literal["train", "eval_all"]
+"""Which rays a metric is of: a training batch, all evaluation views."""
 
 
 class MetricsWriter:

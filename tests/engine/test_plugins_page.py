@@ -1,0 +1,51 @@
+"""docs/plugins.md: the public names that it lists are those there are, and its example trains."""
+
+import importlib.metadata
+import re
+import sys
+import types
+from pathlib import Path
+
+import pytest
+
+import unmix_plugin.engine
+from tests.commands.running import run
+from unmix_plugin.commands.train import train
+from unmix_plugin.engine import registry
+from unmix_plugin.engine.runs.load_run import load_model
+from unmix_plugin.scenes.demo.scene import make_demo_scene
+
+PAGE = (Path(__file__).parents[2] / "docs" / "plugins.md").read_text(encoding="utf-8")
+
+
+def test_the_public_names_are_those_that_the_page_lists():
+    section = PAGE.split("## The public names")[1].split("\n## ")[0]
+    table = "".join(line for line in section.splitlines() if line.startswith("|"))
+    assert sorted(re.findall(r"`(\w+)`", table)) == sorted(unmix_plugin.engine.__all__)
+    for name in unmix_plugin.engine.__all__:
+        assert getattr(unmix_plugin.engine, name).__name__ == name or name == "Target"
+
+
+def test_no_other_name_is_public():
+    with pytest.raises(AttributeError, match="has no attribute 'GradientGuard'"):
+        _ = unmix_plugin.engine.GradientGuard
+    modules = [name for names in unmix_plugin.engine._MODULES.values() for name in names]
+    assert sorted(modules) == sorted(unmix_plugin.engine.__all__)
+
+
+def test_the_example_of_the_page_imports_public_names_only_and_trains(tmp_path, monkeypatch):
+    (code,) = re.findall(r"^`spectral_grid.py`\n\n```python\n(.*?)^```", PAGE, flags=re.DOTALL | re.MULTILINE)
+    ours = set(re.findall(r"from (unmix_plugin\S*) import", code))
+    assert ours == {"unmix_plugin.datamanager", "unmix_plugin.engine"}
+    module = types.ModuleType("spectral_grid")
+    monkeypatch.setitem(sys.modules, "spectral_grid", module)
+    exec(compile(code, "spectral_grid.py", "exec"), module.__dict__)
+    entry = importlib.metadata.EntryPoint("spectral-grid", "spectral_grid:method", registry.METHOD_GROUP)
+    monkeypatch.setattr(registry, "entry_points", lambda group: [entry])  # noqa: ARG005
+    make_demo_scene(tmp_path / "scene", 16, 4, 8)
+    argv = ["--data", tmp_path / "scene", "--output-dir", tmp_path / "out", "--pipeline.model.resolution", 8]
+    ended = run(train, "spectral-grid", *argv, "--max-num-iterations", 3, "--device", "cpu")
+    assert ended.status == 0, ended.err
+    loaded = load_model(Path(ended.last_line.removeprefix("run: ")), "cpu")
+    view = loaded.model.get_outputs_for_camera(loaded.scene.eval_cameras[0])
+    assert view["spectral"].shape == (16, 16, 4)
