@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.camera_paths import resized
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.figures.picture_grid import over_neutral
 from unmix_plugin.formats.files import write_file
@@ -86,10 +84,8 @@ def component_values(outputs: dict[str, Tensor], of: PcaOf) -> Float[Tensor, "N 
 
 def survey_view(model: Model, camera: Cameras, of: PcaOf) -> Float[Tensor, "N C"]:
     """What a small render of a view shows, to find components from."""
-    scale = min(1.0, math.sqrt(_PIXELS / (camera.width * camera.height)))
-    width, height = (max(1, round(scale * side)) for side in (camera.width, camera.height))
     names = ("spectral", "abundances", "accumulation")
-    return component_values(model.get_outputs_for_camera(resized(camera, width, height), names), of)
+    return component_values(model.get_outputs_for_camera(camera.shrunk(_PIXELS), names), of)
 
 
 def find_components(values: Sequence[Float[Tensor, "_ C"]], of: PcaOf) -> Components:

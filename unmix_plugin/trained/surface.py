@@ -16,7 +16,6 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.camera_paths import resized
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.model import UnmixModel
@@ -83,7 +82,7 @@ class SeenSurface:
     def look(self, camera: Cameras) -> None:
         """Render what one camera sees."""
         width, height = (max(1, round(self._factor * side)) for side in (camera.width, camera.height))
-        view = resized(camera, width, height).to("cpu")
+        view = camera.resized(width, height).to("cpu")
         found = self._model.get_image_coefficients(view, subpixels=1)
         accumulation = found.accumulation.flatten().cpu()
         distances = found.distance.flatten().cpu() / accumulation.clamp(min=1e-6)

@@ -6,7 +6,7 @@ import torch
 
 from tests.scenes.scene_factory import look_at
 from tests.trained.camera_files.camera_scenes import BOX, around, cameras_at, in_front
-from unmix_plugin.engine.geometry.camera_paths import interpolated, orbit, resized, rows_of
+from unmix_plugin.engine.geometry.camera_paths import interpolated, orbit, rows_of
 from unmix_plugin.errors import ConfigError
 
 
@@ -121,7 +121,7 @@ def test_a_path_needs_two_different_cameras():
 
 def test_another_size_keeps_the_vertical_view_and_square_pixels():
     cameras = around(2)
-    larger = resized(cameras, 200, 60)
+    larger = cameras.resized(200, 60)
     assert (larger.width, larger.height) == (200, 60)
     point = torch.tensor([[0.1, 0.2, 0.3]])
     before, after = cameras.project(point, 0)[0][0], larger.project(point, 0)[0][0]
@@ -133,7 +133,7 @@ def test_a_shifted_principal_point_stays_shifted_when_resized():
     shifted = type(camera)(
         camera.camera_to_world, camera.focal_px, torch.tensor([[23.0, 12.0]]), camera.distortion, 40, 30
     )
-    torch.testing.assert_close(resized(shifted, 80, 60).center_px, torch.tensor([[46.0, 24.0]]))
+    torch.testing.assert_close(shifted.resized(80, 60).center_px, torch.tensor([[46.0, 24.0]]))
 
 
 def test_rows_of_a_camera_have_the_rays_of_these_rows():
@@ -142,3 +142,12 @@ def test_rows_of_a_camera_have_the_rays_of_these_rows():
     assert (rows.width, rows.height) == (40, 12)
     whole, part = camera.image_rays(0), rows.image_rays(0)
     torch.testing.assert_close(part.directions, whole.directions[7 * 40 : 19 * 40], atol=1e-6, rtol=0)
+
+
+def test_a_shrunk_camera_has_few_pixels_of_the_same_view():
+    camera = around()[0]
+    small = camera.shrunk(300)
+    assert small.width * small.height == pytest.approx(300, rel=0.1)
+    assert small.width / small.height == pytest.approx(camera.width / camera.height, rel=0.1)
+    assert float(small.focal_px[0, 1]) / small.height == pytest.approx(float(camera.focal_px[0, 1]) / camera.height)
+    assert camera.shrunk(camera.width * camera.height) is camera

@@ -79,21 +79,6 @@ def interpolated(cameras: Cameras, box: SceneBox, num_frames: int) -> Cameras:
     return _with_lens(cameras, _straight_path(poses, along, at) if path is None else path)
 
 
-def resized(cameras: Cameras, width: int, height: int) -> Cameras:
-    """The same cameras with another number of pixels: the vertical field of view stays, the horizontal follows."""
-    scale = height / cameras.height
-    old, new = (torch.tensor(size) / 2 for size in ((cameras.width, cameras.height), (width, height)))
-    old, new = old.to(cameras.center_px), new.to(cameras.center_px)
-    return Cameras(
-        cameras.camera_to_world,
-        cameras.focal_px * scale,
-        (cameras.center_px - old) * scale + new,
-        cameras.distortion,
-        width,
-        height,
-    )
-
-
 def rows_of(camera: Cameras, start: int, stop: int) -> Cameras:
     """The camera of rows `start` to `stop` of the image, the last excluded."""
     above = torch.tensor([0.0, float(start)]).to(camera.center_px)

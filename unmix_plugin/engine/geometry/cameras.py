@@ -6,7 +6,7 @@ coordinates are x to the right and y down in pixels from the image's top left co
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -62,6 +62,20 @@ class Cameras:
             self.width,
             self.height,
         )
+
+    def resized(self, width: int, height: int) -> Cameras:
+        """The same cameras with another number of pixels: the vertical field of view stays, the horizontal follows."""
+        scale = height / self.height
+        old, new = (self.center_px.new_tensor(size) / 2 for size in ((self.width, self.height), (width, height)))
+        center_px = (self.center_px - old) * scale + new
+        return replace(self, focal_px=self.focal_px * scale, center_px=center_px, width=width, height=height)
+
+    def shrunk(self, num_pixels: int) -> Cameras:
+        """The same cameras with about `num_pixels` pixels, or themselves where they have no more."""
+        scale = (num_pixels / (self.width * self.height)) ** 0.5
+        if scale >= 1:
+            return self
+        return self.resized(max(1, round(scale * self.width)), max(1, round(scale * self.height)))
 
     @cached_property
     def is_distorted(self) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from unmix_plugin.engine.geometry.camera_paths import interpolated, orbit, resized
+from unmix_plugin.engine.geometry.camera_paths import interpolated, orbit
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.errors import ConfigError, did_you_mean
@@ -23,6 +23,8 @@ CAMERA_CHOICES = (*DATASET_CAMERAS, *PATH_CAMERAS)
 USUAL_FRAMES = 120
 _MOST_FRAMES = 100_000
 _GREATEST_DOWNSCALE = 1000
+_LEAST_PATH_HEIGHT = 512
+"""Rows of videos along a path that is made here, unless a size is asked for."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class CameraRequest:
     only: tuple[str, ...] = ()
     """Names of views, or numbers from 0; none: all."""
     size: tuple[int, int] | None = None
-    """Width and height in pixels; None: that of the dataset or of the file."""
+    """Width and height in pixels; None: that of the dataset or of the file, for paths made here at least 512 rows."""
     downscale: float | int | None = None
     """Division of width and height."""
     num_frames: int | None = None
@@ -74,7 +76,7 @@ def choose_cameras(scene: SceneRecord, request: CameraRequest) -> RenderCameras:
     width, height = _size(chosen.size, request)
     if (width, height) == chosen.size:
         return chosen
-    views = tuple(RunView(view.name, resized(view.camera, width, height)) for view in chosen.views)
+    views = tuple(RunView(view.name, view.camera.resized(width, height)) for view in chosen.views)
     return replace(chosen, views=views)
 
 
@@ -131,6 +133,8 @@ def _size(size: tuple[int, int], request: CameraRequest) -> tuple[int, int]:
         raise ConfigError("--size and --downscale both say how large pictures are; give one of them")
     if request.size is not None:
         return check_size(*request.size, "--size")
+    if request.downscale is None and request.source in PATH_CAMERAS and size[1] < _LEAST_PATH_HEIGHT:
+        return round(size[0] * _LEAST_PATH_HEIGHT / size[1]), _LEAST_PATH_HEIGHT
     if request.downscale is None:
         return size
     if not 1 / _GREATEST_DOWNSCALE <= request.downscale <= _GREATEST_DOWNSCALE:

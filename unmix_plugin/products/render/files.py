@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from unmix_plugin.figures.picture_canvas import Canvas, canvas_size
+from unmix_plugin.figures.picture_canvas import Canvas, CanvasLayout
 from unmix_plugin.formats.envi_cube import envi_cube_paths, envi_cube_rows
 from unmix_plugin.formats.exr import layer_names, write_exr
 from unmix_plugin.formats.files import write_file
@@ -97,10 +97,8 @@ def video(product: Product, setting: Setting, frames_per_second: float) -> Itera
     Raises:
         RunError: the disk is full or refuses.
     """
-    captions = 1 if product.output.kind.name == "spectra" else len(_captions(product.output, setting))
-    width, height = canvas_size(setting.size, captions)
     path = video_path(setting.folder, product)
-    with video_frames(path, width, height, frames_per_second) as add:
+    with video_frames(path, *_layout(product.output, setting).size, frames_per_second) as add:
         yield add
 
 
@@ -117,7 +115,7 @@ def frame(output: RenderOutput, progress: float, setting: Setting, add: FrameSin
     if output.kind.name == "spectra":
         bands = setting.materials.bands
         band = round(progress * (len(bands) - 1))
-        canvas = Canvas(setting.size, 3, [_band_name(bands.centers_nm[band])])
+        canvas = Canvas(_layout(output, setting), 3, [_band_name(bands.centers_nm[band])])
         yield lambda rows: canvas.put(
             rows.first, opaque_band(rows.values[output.name][..., band], rows.opacity)
         )
@@ -229,20 +227,28 @@ def _sweep(output: RenderOutput, path: Path, setting: Setting) -> Iterator[RowsS
 
     yield add
     usual = float(np.clip(len(wavelengths) / _SWEEP_SECONDS, *_SWEEP_FPS))
-    with video_frames(path, *canvas_size(setting.size, 1), setting.frames_per_second or usual) as show:
+    layout = _layout(output, setting)
+    with video_frames(path, *layout.size, setting.frames_per_second or usual) as show:
         for wavelength, one in zip(wavelengths, frames, strict=True):
-            canvas = Canvas(setting.size, 3, [_band_name(wavelength)])
+            canvas = Canvas(layout, 3, [_band_name(wavelength)])
             canvas.put(0, one[:, :, None])
             show(canvas.pixels)
 
 
 def _canvas(output: RenderOutput, setting: Setting, num_channels: int) -> Canvas:
-    captions = _captions(output, setting)
-    return Canvas(setting.size, num_channels, captions, list(setting.palette.colours) if captions else ())
+    layout = _layout(output, setting)
+    if output.kind.name != "shares":
+        return Canvas(layout, num_channels)
+    return Canvas(layout, num_channels, setting.palette.names, setting.palette.colours)
 
 
-def _captions(output: RenderOutput, setting: Setting) -> tuple[str, ...]:
-    return setting.palette.names if output.kind.name == "shares" else ()
+def _layout(output: RenderOutput, setting: Setting) -> CanvasLayout:
+    """One tile, or one for each endmember under its name; of spectra, one band at a time under its wavelength."""
+    if output.kind.name == "shares":
+        return CanvasLayout.of(setting.size, setting.palette.names)
+    if output.kind.name == "spectra":
+        return CanvasLayout.of(setting.size, _channel_names(output, setting), count=1)
+    return CanvasLayout.of(setting.size)
 
 
 def _band_name(wavelength_nm: float) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
@@ -10,8 +9,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.camera_paths import resized
-from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.model import Model
 from unmix_plugin.figures.picture_grid import ColourScale
 from unmix_plugin.spectral.composition import OCCUPIED_ACCUMULATION, reflectance_of
@@ -92,16 +89,11 @@ def _seen(model: Model, views: Sequence[RunView], outputs: Sequence[str]) -> dic
     outputs = [*outputs, "accumulation"]
     found: dict[str, list[Tensor]] = {name: [] for name in outputs}
     for view in views[::every]:
-        rendered = model.get_outputs_for_camera(_small(view.camera), outputs)
+        rendered = model.get_outputs_for_camera(view.camera.shrunk(_PIXELS), outputs)
         occupied = rendered["accumulation"] > OCCUPIED_ACCUMULATION
         for name in outputs:
             found[name].append(rendered[name][occupied].cpu())
     return {name: torch.cat(parts) for name, parts in found.items()}
-
-
-def _small(camera: Cameras) -> Cameras:
-    scale = min(1.0, math.sqrt(_PIXELS / (camera.width * camera.height)))
-    return resized(camera, max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
 
 
 def _scale(values: Float[Tensor, " N"], label: str) -> ColourScale:
