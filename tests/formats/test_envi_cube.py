@@ -9,6 +9,7 @@ import spectral.io.envi as envi
 from tests.formats.cubes import BANDS, WAVELENGTHS_NM, full_disk, random_cube
 from unmix_plugin.errors import RunError
 from unmix_plugin.formats.envi_cube import envi_cube_rows, write_envi_cube
+from unmix_plugin.spectral.bands import Bands
 
 
 def opened(path) -> Any:
@@ -39,8 +40,14 @@ def test_another_reader_gets_every_digit_of_the_wavelengths_and_their_unit(tmp_p
     write_envi_cube(tmp_path / "view", random_cube(), BANDS, None, "x")
     bands = opened(tmp_path / "view").bands
     assert tuple(bands.centers) == WAVELENGTHS_NM
-    np.testing.assert_array_equal(bands.bandwidths, BANDS.widths_nm)
+    np.testing.assert_allclose(bands.bandwidths, BANDS.widths_nm, atol=1e-6)
     assert bands.band_unit == "Nanometers"
+
+
+def test_a_width_has_no_digits_of_rounding(tmp_path):
+    """396.32 and 401.02 differ by 4.699999999999989 as floats."""
+    write_envi_cube(tmp_path / "view", random_cube()[..., :2], Bands.of([396.32, 401.02]), None, "x")
+    assert "fwhm = { 4.7, 4.7 }" in (tmp_path / "view.hdr").read_text()
 
 
 def test_names_survive_but_for_what_the_format_has_no_way_to_say(tmp_path):

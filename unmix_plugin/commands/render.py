@@ -42,7 +42,7 @@ class RenderOptions:
     """envi, exr, npy, png, mp4; each output is written in those that suit it. None given: what suits each best. mp4 of
     spectra goes through the bands."""
     size: str | None = None
-    """Width and height in pixels, as in 640x480; the vertical field of view stays. None: as the dataset's or the file's;
+    """Width and height in pixels, as in 640x480; the vertical field of view stays. None: the dataset's or the file's;
     orbit and interpolate have at least 512 rows."""
     downscale: float | None = None
     """Divide width and height by this."""

@@ -36,7 +36,9 @@ class CanvasLayout:
     """Height of a name above its tile."""
 
     @staticmethod
-    def of(tile_size: tuple[int, int], captions: Sequence[str] = (), count: int | None = None) -> CanvasLayout:
+    def of(
+        tile_size: tuple[int, int], captions: Sequence[str] = (), count: int | None = None
+    ) -> CanvasLayout:
         """The layout of one tile without a name, or of tiles with room for names.
 
         Args:
@@ -49,7 +51,7 @@ class CanvasLayout:
         """
         if count is None:
             count = max(1, len(captions))
-        widest = max((_SWATCH_PX + _text_px(caption) for caption in captions), default=0)
+        widest = max(map(_text_px, captions), default=0) + (_SWATCH_PX if count > 1 else 0)
         column_px = max(tile_size[0], min(widest, _LONGEST_CAPTION_PX))
         return CanvasLayout(tile_size, count, column_px, _CAPTION_PX if captions else 0)
 

@@ -50,8 +50,12 @@ def layout_entries(
 
 
 def wavelength_entries(bands: Bands) -> dict[str, HeaderValue]:
-    """Band centres and widths in nm; a width is that of the band's interval, an estimate from the spacing, to 1e-6 nm."""
-    return {"wavelength units": "Nanometers", "wavelength": bands.centers_nm, "fwhm": bands.widths_nm.round(6)}
+    """Band centres and widths in nm; a width is that of the band's interval, an estimate from the spacing."""
+    return {
+        "wavelength units": "Nanometers",
+        "wavelength": bands.centers_nm,
+        "fwhm": bands.widths_nm.round(6),
+    }
 
 
 def beside(path_without_suffix: Path, suffix: str) -> Path:

@@ -61,7 +61,8 @@ class Metamerism(Product):
             found = find_metamers(job.materials, scene_light, library_with(self.library), self)
             written = write_metamerism(job.folder, found)
         job.say(
-            f"{len(found.pairs)} pairs of {len(found.names)} materials, seen in {', '.join(found.lights)}"
+            f"{len(found.pairs)} pairs of {len(found.names)} materials, seen in {', '.join(found.lights)} "
+            f"over {found.bands}"
         )
         return written
 

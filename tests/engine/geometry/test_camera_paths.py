@@ -149,5 +149,7 @@ def test_a_shrunk_camera_has_few_pixels_of_the_same_view():
     small = camera.shrunk(300)
     assert small.width * small.height == pytest.approx(300, rel=0.1)
     assert small.width / small.height == pytest.approx(camera.width / camera.height, rel=0.1)
-    assert float(small.focal_px[0, 1]) / small.height == pytest.approx(float(camera.focal_px[0, 1]) / camera.height)
+    assert float(small.focal_px[0, 1]) / small.height == pytest.approx(
+        float(camera.focal_px[0, 1]) / camera.height
+    )
     assert camera.shrunk(camera.width * camera.height) is camera

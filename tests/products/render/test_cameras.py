@@ -66,6 +66,13 @@ def test_size_and_downscale_change_all_views():
         assert {(view.camera.width, view.camera.height) for view in cameras.views} == {size}
 
 
+@pytest.mark.parametrize("source", ["orbit", "interpolate"])
+def test_paths_that_are_made_here_have_at_least_512_rows_unless_a_size_is_asked_for(source):
+    assert chosen(source=source, num_frames=2).size == (683, 512)
+    assert chosen(source=source, num_frames=2, downscale=1).size == (40, 30)
+    assert chosen(source=source, num_frames=2, size=(20, 16)).size == (20, 16)
+
+
 BAD = {
     "unknown": (
         {"source": "orbti"},

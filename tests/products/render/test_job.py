@@ -12,6 +12,7 @@ from PIL import Image
 from tests.formats.video_reading import read_video
 from tests.products.render.render_factory import MODEL, read_envi, read_exr, render, truth, views
 from unmix_plugin.errors import RunError
+from unmix_plugin.figures.picture_canvas import CanvasLayout
 from unmix_plugin.products.render.files import still_paths
 from unmix_plugin.products.render.job import RenderJob, product_paths
 from unmix_plugin.products.render.survey import Survey
@@ -187,15 +188,17 @@ def test_one_tile_for_each_endmember_stands_in_a_picture_of_abundances(tmp_path)
     cameras = views(1)
     _, survey, job = render(tmp_path, ["abundances"], ["png"], cameras)
     rgba = iio.imread(tmp_path / "abundances" / "view.0.png")
-    assert rgba.shape[1] == 3 * 14 + 2 * 2
+    layout = CanvasLayout.of((14, 11), job.palette.names)
+    assert rgba.shape[1::-1] == layout.size
     expected = truth(cameras, 0, survey)
     shares = expected["abundances"] / np.maximum(expected["accumulation"], 1e-6)[..., None]
     for index in range(3):
-        tile = rgba[-11:, 16 * index : 16 * index + 14]
+        left = layout.corner(index)[1]
+        tile = rgba[-11:, left : left + 14]
         colours = np.round(255 * colormaps["viridis"](np.clip(shares[..., index], 0, 1))[..., :3])
         shown = tile[..., 3] > 0
         np.testing.assert_array_equal(tile[shown][:, :3], colours[shown])
-        swatch = rgba[8, 16 * index + 6, :3]
+        swatch = rgba[8, left + 6, :3]
         np.testing.assert_array_equal(swatch, np.round(255 * job.palette.colours[index]))
 
 
@@ -212,10 +215,10 @@ def test_a_moving_camera_makes_one_video_with_a_frame_a_view(tmp_path):
 
 
 def test_a_sweep_shows_band_after_band_from_one_camera(tmp_path):
-    cameras = views(2, width=36, height=28)
+    cameras = views(2, width=60, height=28)
     _, survey, _ = render(tmp_path, ["spectral"], ["mp4"], cameras)
     frames, facts = read_video(tmp_path / "spectral" / "view.1.mp4")
-    assert frames.shape == (5, 28 + 18, 36, 3)
+    assert frames.shape == (5, 28 + 18, 60, 3)
     assert facts["fps"] == 4.0
     expected = truth(cameras, 1, survey)
     grey = ((0.92 + 0.055) / 1.055) ** 2.4

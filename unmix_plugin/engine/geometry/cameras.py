@@ -66,7 +66,9 @@ class Cameras:
     def resized(self, width: int, height: int) -> Cameras:
         """The same cameras with another number of pixels: the vertical field of view stays, the horizontal follows."""
         scale = height / self.height
-        old, new = (self.center_px.new_tensor(size) / 2 for size in ((self.width, self.height), (width, height)))
+        old, new = (
+            self.center_px.new_tensor(size) / 2 for size in ((self.width, self.height), (width, height))
+        )
         center_px = (self.center_px - old) * scale + new
         return replace(self, focal_px=self.focal_px * scale, center_px=center_px, width=width, height=height)
 
