@@ -24,9 +24,10 @@ from unmix_plugin.editing.operations import (
     Swap,
 )
 from unmix_plugin.editing.recipe import Recipe
-from unmix_plugin.editing.retint import Surface, hexadecimal, retinted
+from unmix_plugin.editing.retint import Surface, retinted
 from unmix_plugin.editing.seen import look_at
 from unmix_plugin.errors import ConfigError, SpectrumError, UnmixError
+from unmix_plugin.figures.plotting import css_colour
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, srgb_to_linear
 from unmix_plugin.spectral.library.material_library import (
     DARK_LIGHT,
@@ -80,7 +81,7 @@ def _replace(state: MaterialState, edit: Replace, where: str) -> None:
         raise SpectrumError(f"{error}; extrapolate: true holds the outermost values instead") from error
     if reflectance.max() > _GREATEST_REFLECTANCE:
         raise SpectrumError(
-            f"{name} has reflectances of up to {reflectance.max():g}; give parts of 1, not per cent"
+            f"{name} has reflectances of up to {reflectance.max():g}; give values from 0 to 1, not per cent"
         )
     state.spectra[index] = reflectance * state.light
 
@@ -122,8 +123,7 @@ def _tell_nearest(state: MaterialState, what: str, asked: Colour, reached: np.nd
     """Note if a colour visibly differs from the one asked for."""
     if np.abs(reached - asked).max() > _VISIBLE_DIFFERENCE:
         state.notes.append(
-            f"{what} can't be {hexadecimal(np.array(asked))} in this light; took the nearest colour, "
-            f"{hexadecimal(reached)}"
+            f"{what} can't be {css_colour(asked)} in this light; took the nearest colour, {css_colour(reached)}"
         )
 
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float64
 
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
@@ -72,15 +72,6 @@ def retinted(
         method="bvls",
     )
     return np.clip(reflectance + base * solution.x, 0.0, max(greatest, float(reflectance.max())))
-
-
-def hexadecimal(srgb: Float[np.ndarray, "3"]) -> str:
-    """An sRGB colour as it is written; clipped to [0, 1].
-
-    >>> hexadecimal(np.array([1.2, 0.0, 0.5]))
-    '#ff0080'
-    """
-    return "#" + "".join(f"{round(255 * float(value)):02x}" for value in np.clip(srgb, 0, 1))
 
 
 def _srgb_slope(linear_rgb: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:

@@ -20,6 +20,7 @@ from unmix_plugin.editing.operations import Colour, Endmember, Operation
 from unmix_plugin.editing.recipe import LightName
 from unmix_plugin.editing.yaml_nodes import fault
 from unmix_plugin.errors import UnmixError
+from unmix_plugin.figures.plotting import css_colour
 from unmix_plugin.spectral.colour.illuminants import parse_light
 
 T = TypeVar("T")
@@ -144,7 +145,7 @@ def _without_none(hint: Any) -> Any:
     return Union[tuple(part for part in get_args(hint) if part is not NoneType)]  # noqa: UP007
 
 
-def _options(kind: type, name: str) -> list[type]:
+def _options(kind: type, name: str) -> list[Any]:
     """The dataclasses that a field may hold; none for a plain value."""
     return [option for option in get_args(_types(kind)[name]) if is_dataclass(option)]
 
@@ -192,7 +193,5 @@ def _written(hint: Any, value: Any) -> Any:
 
 def _written_colour(colour: Colour) -> str | list[float]:
     """As #rrggbb if that is exact."""
-    digits = [round(255 * value) for value in colour]
-    if all(digit / 255 == value for digit, value in zip(digits, colour, strict=True)):
-        return "#" + "".join(f"{digit:02x}" for digit in digits)
-    return list(colour)
+    is_exact = all(round(255 * value) / 255 == value for value in colour)
+    return css_colour(colour) if is_exact else list(colour)
