@@ -22,6 +22,7 @@ from PIL import Image
 from tests.fuzz.mutation import Mutator, mutate_bytes, mutate_json, mutate_png
 from tests.scenes.scene_factory import look_at
 from unmix_plugin.datamanager import HyperspectralDataManager
+from unmix_plugin.editing import read_recipe, recipe_from_yaml, recipe_to_yaml
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.registry import find_method
 from unmix_plugin.engine.runs.checkpoints import newest_complete_checkpoint
@@ -375,6 +376,34 @@ def _read_metrics(path: Path) -> None:
         raise RunError("lines were dropped")
 
 
+_RECIPE = b"""\
+illuminant: {light: D65, extrapolate: true}
+edits:
+- swap: &both [0, wood]
+- replace: {endmember: 2, library: checker/red}
+- replace: {endmember: 3, file: paints.csv, spectrum: ochre, extrapolate: yes}
+- retint: {endmember: 4, colour: '#3366cc', match: spectrum}
+- scale: {endmember: 0, factor: 1.5}
+- remove: *both
+- isolate: [7]
+- rename: {endmember: 1, name: red brick}
+- gloss: {endmember: 1, scale: 0, colour: [1, .5, 0]}
+"""
+
+
+def _recipe() -> Reader:
+    recipe_from_yaml("illuminant: A")  # imports colour-science: seconds that no case is to blame for
+    samples = (_RECIPE, b"illuminant: lamp.csv\n", b"%YAML 1.1\n---\nedits: [remove: !!int '0x1f']\n...\n")
+    return Reader(samples, "edits.yml", _read_recipe, (ConfigError,))
+
+
+def _read_recipe(path: Path) -> None:
+    recipe = read_recipe(path)
+    written = recipe_to_yaml(recipe)
+    written.encode()
+    assert recipe_from_yaml(written, folder=path.parent) == recipe
+
+
 READERS: dict[str, Callable[[], Reader]] = {
     "transforms.json": _transforms,
     "cube (.npy)": _cube,
@@ -390,5 +419,6 @@ READERS: dict[str, Callable[[], Reader]] = {
     "checkpoint record": _checkpoint_record,
     "checkpoint tensors": _checkpoint_tensors,
     "run metrics": _metrics,
+    "recipe": _recipe,
 }
 """By name, for messages and tables."""
