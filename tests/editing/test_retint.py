@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unmix_plugin.editing.retint import Surface, retinted
+from unmix_plugin.editing.retint import LitReflectance, retinted
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.colour.illuminants import illuminant_power
@@ -17,8 +17,8 @@ LIGHT = illuminant_power("D50", BANDS)
 TO_RGB = LIGHT[:, None] * rgb_matrix(BANDS, torch.float64).numpy()
 
 
-def surface(name: str = "red", bands: Bands = BANDS) -> Surface:
-    return Surface(
+def surface(name: str = "red", bands: Bands = BANDS) -> LitReflectance:
+    return LitReflectance(
         bands,
         measured_library().reflectance(f"checker/{name}", bands, "hold"),
         illuminant_power("D50", bands),
@@ -69,7 +69,7 @@ def test_no_random_change_to_the_same_colour_is_smoother():
 def test_a_change_of_colour_keeps_the_fine_structure_and_leaves_the_infrared_alone():
     bands = Bands.of(np.linspace(400, 1000, 121))
     reflectance = np.clip(0.4 + 0.03 * np.sin(bands.centers_nm / 4), 0, 1)
-    wide = Surface(bands, reflectance, np.ones(len(bands)))
+    wide = LitReflectance(bands, reflectance, np.ones(len(bands)))
     changed = retinted(wide, np.array([0.45, 0.35, 0.3]))
     ratio = changed / reflectance
     assert roughness(ratio) < 0.1 * roughness(reflectance)
@@ -77,7 +77,7 @@ def test_a_change_of_colour_keeps_the_fine_structure_and_leaves_the_infrared_alo
 
 
 def test_black_can_be_given_a_colour():
-    black = Surface(BANDS, np.zeros(len(BANDS)), LIGHT)
+    black = LitReflectance(BANDS, np.zeros(len(BANDS)), LIGHT)
     target = np.array([0.3, 0.2, 0.1])
     np.testing.assert_allclose(retinted(black, target) @ TO_RGB, target, atol=1e-5)
 

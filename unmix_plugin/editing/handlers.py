@@ -24,7 +24,7 @@ from unmix_plugin.editing.operations import (
     Swap,
 )
 from unmix_plugin.editing.recipe import Recipe
-from unmix_plugin.editing.retint import Surface, retinted
+from unmix_plugin.editing.retint import LitReflectance, retinted
 from unmix_plugin.editing.seen import look_at
 from unmix_plugin.errors import ConfigError, SpectrumError, UnmixError
 from unmix_plugin.figures.plotting import css_colour
@@ -107,7 +107,7 @@ def _retint(state: MaterialState, edit: Retint, where: str) -> None:
     is_lit = state.light > DARK_LIGHT * state.light.max()
     light = np.where(is_lit, state.light, 0.0)
     reflectance = np.where(is_lit, state.spectra[index] / np.where(is_lit, light, 1.0), 0.0)
-    surface = Surface(state.bands, reflectance, light)
+    surface = LitReflectance(state.bands, reflectance, light)
     if seen is None:
         changed = retinted(surface, _linear(edit.colour))
         reached = _srgb(changed @ surface.to_linear_rgb)
@@ -167,7 +167,7 @@ def _gloss(state: MaterialState, edit: Gloss, where: str) -> None:
     chosen = range(len(state.names)) if edit.endmember is None else [state.index_of(edit.endmember)]
     if edit.colour is not None and edit.colour not in state.mirror_reflectances:
         flat = np.ones(len(state.bands))
-        white = Surface(state.bands, flat, flat)
+        white = LitReflectance(state.bands, flat, flat)
         mirror = retinted(white, _linear(edit.colour))
         state.mirror_reflectances[edit.colour] = mirror
         _tell_nearest(state, f"{where}: highlights", edit.colour, _srgb(mirror @ white.to_linear_rgb))

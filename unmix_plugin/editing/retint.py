@@ -21,20 +21,20 @@ import torch
 from jaxtyping import Float64
 
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.colour.conversion import rgb_matrix
 
 _FLOOR = 0.05
 """f: reflectance below which a change counts as absolute rather than relative."""
 
 _REACH_NM = 300.0
-"""Distance over which a change fades that no colour asks for."""
+"""Distance over which the change fades outside the wavelengths that make the colour."""
 
 _EXACTNESS = 1e5
-"""Weight of the colour against smoothness: what it misses by vanishes as the inverse square."""
+"""Weight of the colour against smoothness; the error of the colour falls with its square."""
 
 
 @dataclass(frozen=True)
-class Surface:
+class LitReflectance:
     """A spectrum to change, and the light that it is seen in."""
 
     bands: Bands
@@ -49,9 +49,9 @@ class Surface:
 
 
 def retinted(
-    surface: Surface, linear_rgb: Float64[np.ndarray, "3"], greatest: float = 1.0
+    surface: LitReflectance, linear_rgb: Float64[np.ndarray, "3"], greatest: float = 1.0
 ) -> Float64[np.ndarray, " B"]:
-    """The reflectance most like a surface's own that has a colour in its light, or comes nearest to it.
+    """The reflectance most like a surface's own that has the wanted colour in its light, or comes nearest to it.
 
     Args:
         surface: What is changed.
@@ -75,11 +75,9 @@ def retinted(
 
 
 def _srgb_slope(linear_rgb: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
-    """Slope of the sRGB curve at each channel, from 12.92 at black to 0.44 at white."""
-    linear = torch.from_numpy(np.clip(linear_rgb, 0, 1)).requires_grad_()
-    linear_to_srgb(linear).sum().backward()
-    assert linear.grad is not None
-    return linear.grad.numpy()
+    """Slope of the sRGB curve at each channel: 12.92 in the dark, 0.44 at white."""
+    linear = np.clip(linear_rgb, 0.0031308, 1.0)
+    return np.where(linear_rgb <= 0.0031308, 12.92, 1.055 / 2.4 * linear ** (1 / 2.4 - 1))
 
 
 def _smoothness(bands: Bands) -> Float64[np.ndarray, "rows B"]:

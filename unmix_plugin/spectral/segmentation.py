@@ -1,12 +1,12 @@
-"""Materials of pixels by the nearest endmember, and their agreement with true labels.
+"""The material of each pixel, and agreement with true labels.
 
 Notation: `K` endmembers, predicted material ids 0..K-1; `M` true materials, labels 0..M-1; 255 says "nothing here" in a
 prediction and "unlabelled" in the truth.
 
-What counts: pixels whose true label is 255 are ignored. Predicted ids are matched to true materials one to one, once a
-scene, on intersection over union over all views. A predicted 255 and a surplus id that matches no material are misses
-of the true material, at whatever pixels they cover. A true material that no id is left for has IoU and F1 of 0. True
-materials that occur in no view are left out of means and of the matching.
+The protocol (docs/evaluation.md): pixels with the true label 255 are ignored. Predicted ids are matched to true
+materials one to one, once per scene, on intersection over union over all views. On a labelled pixel, a predicted 255
+and an id without a partner are misses of the true material. A true material without a partner has IoU and F1 of 0.
+One that occurs in no view is left out of the matching and of the means.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def material_ids(
 
 @dataclass(frozen=True)
 class SegmentationScores:
-    """Agreement with the truth over a scene; NaN where no labelled pixel was seen."""
+    """Agreement with the truth over a scene; NaN without labelled pixels."""
 
     miou: float
     """Mean intersection over union of the true materials that occur."""

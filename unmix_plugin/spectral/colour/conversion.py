@@ -6,9 +6,9 @@ light in sRGB primaries; `srgb` is encoded for a display. A matrix has shape (B,
 
 White. The flat spectrum 1 (illuminant E at the sensor's full scale) is rendered as the display's white: linear RGB
 (1, 1, 1), hence Y = 1. Each colour matching function is integrated over each band's interval, and the three linear RGB
-columns are then scaled one by one to sum to 1 (a von Kries adaptation whose cones are the sRGB primaries; it also makes
-good what a range cut at 450 or 650 nm lost of a channel). Nothing divides by the scene's lamp: a yellow lamp stays
-yellow. Of the conventions tried (no adaptation, Bradford from E or from the lamp to D65, XYZ scaling), this one
+columns are then scaled one by one to sum to 1 (a von Kries adaptation whose cones are the sRGB primaries; it also
+compensates a channel that a range cut at 450 or 650 nm shortens). The scene's lamp is not divided out: a yellow lamp
+stays yellow. Of the conventions tried (no adaptation, Bradford from E or from the lamp to D65, XYZ scaling), this one
 reproduces the sRGB images that come with path-traced cubes, to within their 8 bits.
 
 Sensors whose bands cannot tell colours get a false-colour composite instead: see `colour_mode`.
@@ -39,11 +39,11 @@ _SRGB_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 """Y of the sRGB primaries (IEC 61966-2-1:1999)."""
 
 _PRIMARY_REGIONS_NM = ((VISIBLE_RANGE_NM[0], 500.0), (500.0, 600.0), (600.0, VISIBLE_RANGE_NM[1]))
-"""Where a sensor needs a band to see what the blue, green and red primaries differ in."""
+"""A sensor needs a band in each to tell blue, green and red apart."""
 
 _MIN_WHITE = 0.2
-"""Least share of luminance that white must reach in each channel before scaling. A sensor that reaches less hardly
-sees that primary, and scaling it to white would amplify noise."""
+"""Smallest channel of unscaled white, relative to its luminance. Below it, a sensor hardly sees that primary, and
+scaling it to white would amplify noise."""
 
 
 def colour_mode(bands: Bands) -> ColourMode:
