@@ -1,5 +1,6 @@
 """What batches hold and which randomness they depend on."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -142,3 +143,19 @@ def test_without_alpha_one_ray_a_pixel_has_to_do_for_longer(tmp_path):
         callback.func(0, progress)
         pixels.append(len(manager.next_train(0)[1]["spectra"]))
     assert pixels == [64, 64, 64, 16]
+
+
+def test_poses_of_another_convention_are_warned_of_when_a_run_starts(tmp_path):
+    folder = make_scene(tmp_path / "bare", alpha=False)
+    make_demo_scene(tmp_path / "demo", size=48, bands=6, views=12)
+    path = tmp_path / "demo" / "transforms.json"
+    content = json.loads(path.read_text())
+    for frame in content["frames"]:
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1])).tolist()
+        frame["file_path"] = None
+    for key in ("train_filenames", "val_filenames", "test_filenames"):
+        del content[key]
+    path.write_text(json.dumps(content))
+    (warning,) = make(tmp_path / "demo").warnings()
+    assert "the poses look like camera to world, OpenCV axes" in warning
+    assert make(folder.root).warnings() == []

@@ -25,7 +25,9 @@ from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCal
 from unmix_plugin.engine.training.seeding import step_generator
 from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.scenes.geometry.carving import carve
+from unmix_plugin.scenes.geometry.pose_check import check_scene_poses
 from unmix_plugin.scenes.identity import scene_identity
+from unmix_plugin.scenes.pixel_store import PixelStore
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.recorded_scene import check_recorded_scene
 from unmix_plugin.scenes.scene import Scene, SceneOptions
@@ -174,14 +176,19 @@ class HyperspectralDataManager(DataManager):
         check_recorded_scene(metadata)
         check_recorded_scene(summary)
 
+    def warnings(self) -> list[str]:
+        """Poses that seem to follow another convention."""
+        warning = check_scene_poses(self.scene)
+        return [] if warning is None else [warning]
+
     def identity(self, summary: Mapping[str, Any]) -> dict[str, Any]:
         """Views, cameras, bands and the hashes of what was measured."""
         return scene_identity(summary)
 
     @cached_property
-    def _pixels(self) -> _PixelTable:
+    def _pixels(self) -> _DrawnPixels:
         """Read when training asks: evaluation needs none of it."""
-        return _PixelTable(self.scene, self.device)
+        return _DrawnPixels(self.scene, self.device, self.scene.train_indices)
 
     def _pixels_for(self, num_rays: int) -> int:
         return max(1, num_rays // self._subpixels**2)
@@ -207,7 +214,7 @@ class HyperspectralDataManager(DataManager):
         return self.scene.cameras.height, self.scene.cameras.width
 
     def _batch(
-        self, cameras: Cameras, pixels: _PixelTable, chosen: Int[Tensor, "R"], generator: torch.Generator
+        self, cameras: Cameras, pixels: _DrawnPixels, chosen: Int[Tensor, "R"], generator: torch.Generator
     ) -> tuple[RayBundle, dict[str, Tensor]]:
         height, width = self._image_shape
         within = chosen % (height * width)
@@ -216,7 +223,7 @@ class HyperspectralDataManager(DataManager):
         points = (corners[:, None] + offsets).flatten(0, 1)
         views = (chosen // (height * width)).repeat_interleave(offsets.shape[1])
         bundle = cameras.generate_rays(views, points)
-        return bundle, {"spectra": pixels.spectra[chosen], "alpha": pixels.alpha[chosen]}
+        return bundle, {"spectra": pixels.store.spectra(chosen), "alpha": pixels.store.alpha[chosen]}
 
 
 def _scattered_offsets(num_pixels: int, subpixels: int, generator: torch.Generator) -> Float[Tensor, "R P 2"]:
@@ -226,42 +233,29 @@ def _scattered_offsets(num_pixels: int, subpixels: int, generator: torch.Generat
     return (grid + torch.rand(num_pixels, subpixels**2, 2, generator=generator)) / subpixels
 
 
-class _PixelTable:
-    """All pixels of some views, row after row, and which of them count."""
+class _DrawnPixels:
+    """The pixels of some views, drawn evenly from the valid ones."""
 
-    spectra: Float[Tensor, "pixels B"]
-    alpha: Float[Tensor, "pixels"]
-
-    def __init__(self, scene: Scene, device: torch.device, views: tuple[int, ...] | None = None) -> None:
-        views = scene.train_indices if views is None else views
-        num_pixels = scene.cameras.height * scene.cameras.width
-        spectra = torch.empty(len(views), num_pixels, len(scene.wavelengths_nm), device=device)
-        alpha = torch.ones(len(views), num_pixels, device=device)
-        valid = torch.empty(len(views), num_pixels, dtype=torch.bool)
-        for row, view in enumerate(views):
-            spectra[row] = torch.from_numpy(scene.cube(view)).flatten(0, 1)
-            valid[row] = torch.from_numpy(scene.valid_mask(view)).flatten()
-            opacity = scene.alpha(view)
-            if opacity is not None:
-                alpha[row] = torch.from_numpy(opacity).flatten()
-        self.spectra, self.alpha = spectra.flatten(0, 1), alpha.flatten()
-        self._valid = None if bool(valid.all()) else valid.flatten().nonzero()[:, 0]
+    def __init__(self, scene: Scene, device: torch.device, views: tuple[int, ...]) -> None:
+        self.store = PixelStore(scene, device, views)
+        valid = self.store.valid
+        self._valid = None if bool(valid.all()) else valid.nonzero()[:, 0]
         if self._valid is not None and len(self._valid) == 0:
             raise ConfigError("no valid pixel is left in the training views: masks leave out every one")
 
     def draw(self, count: int, generator: torch.Generator) -> Int[Tensor, "R"]:
         """Indices of random valid pixels."""
-        pool = len(self.spectra) if self._valid is None else len(self._valid)
+        pool = len(self.store) if self._valid is None else len(self._valid)
         drawn = torch.randint(pool, (count,), generator=generator)
         chosen = drawn if self._valid is None else self._valid[drawn]
-        return chosen.to(self.spectra.device)
+        return chosen.to(self.store.alpha.device)
 
     def sample_opaque(self, count: int, seed: int) -> Float[np.ndarray, "pixels B"]:
-        """Spectra of at most `count` random valid pixels that show matter only."""
-        pool = torch.arange(len(self.spectra)) if self._valid is None else self._valid
-        opaque = pool[(self.alpha.cpu()[pool] > 0.99)]
+        """Spectra of at most `count` random valid pixels that are opaque."""
+        pool = torch.arange(len(self.store)) if self._valid is None else self._valid
+        opaque = pool[(self.store.alpha.cpu()[pool] > 0.99)]
         chosen = opaque[torch.randperm(len(opaque), generator=step_generator(seed, 0))[:count]]
-        return self.spectra[chosen.to(self.spectra.device)].cpu().numpy()
+        return self.store.spectra(chosen.to(self.store.alpha.device)).cpu().numpy()
 
 
 def _load(folder: Path, options: SceneOptions) -> Scene:

@@ -109,6 +109,10 @@ class DataManager(ABC):
             KeyError, TypeError, ValueError, ConfigError: what is missing or wrong.
         """
 
+    def warnings(self) -> list[str]:
+        """What looks wrong with the data though it can be trained on; asked once, when a new run starts."""
+        return []
+
     def identity(self, summary: Mapping[str, Any]) -> dict[str, Any]:
         """What of a `summary` makes it this scene and no other: compared, numbers with a tolerance, when a run is
         resumed or evaluated."""

@@ -58,9 +58,11 @@ class Pipeline(nn.Module):
         ).to(device)
 
     def initialise(self) -> None:
-        """Let the model of a new run take its first values from the scene."""
+        """Let the model of a new run take its first values from the scene; its warnings join `reasons`."""
         with torch.no_grad():
             self.model.initialise(self.datamanager.initial_data(), torch.Generator().manual_seed(self.seed))
+        warnings = [f"warning: {warning}" for warning in self.datamanager.warnings()]
+        self.reasons = "\n".join(filter(None, [self.reasons, *warnings]))
 
     def seed_step(self, step: int) -> None:
         """Make everything that the model draws in training step `step` a function of (seed, step)."""

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, Shaped, UInt8
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.scenes.reading.arrays import map_array
-from unmix_plugin.scenes.reading.cube_values import InvalidPixels, find_invalid
+from unmix_plugin.scenes.reading.cube_values import InvalidPixels, read_cube, read_invalid
 from unmix_plugin.scenes.reading.images import read_colour, read_labels, read_mask
 
 UNLABELLED = 255
@@ -141,10 +141,16 @@ class Scene:
         Values above 1 after the division by `value_scale` are clipped to 1, as a saturated sensor does. Unless
         `invalid_pixels` is `refuse`, spectra of invalid pixels are 0 (see `valid_mask`).
         """
-        values = self._scaled(index)
-        if self.options.invalid_pixels != "refuse":
-            values[find_invalid(values, self.options.invalid_pixels)] = 0.0
-        return np.clip(values, 0.0, 1.0, out=values)
+        return read_cube(self.frames[index].cube_path, self.options.value_scale, self.options.invalid_pixels)
+
+    def stored_type(self, index: int) -> str:
+        """NumPy's code of a cube's numbers, such as f2 or u2, in any byte order."""
+        return map_array(self.frames[index].cube_path).dtype.str[1:]
+
+    def stored_cube(self, index: int) -> Shaped[np.ndarray, "H W B"]:
+        """A cube as it is stored, before any division, in the machine's byte order."""
+        stored = map_array(self.frames[index].cube_path)
+        return np.array(stored, dtype=stored.dtype.newbyteorder("="), order="C")
 
     def alpha(self, index: int) -> Float32[np.ndarray, "H W"] | None:
         """Opacity of a view's pixels in [0, 1]; None if the scene has no alpha.
@@ -174,7 +180,8 @@ class Scene:
         path = self.frames[index].mask_path
         valid = np.ones(self._size, bool) if path is None else read_mask(path, self._size)
         if self.options.invalid_pixels != "refuse":
-            valid = valid & ~find_invalid(self._scaled(index), self.options.invalid_pixels)
+            path, options = self.frames[index].cube_path, self.options
+            valid = valid & ~read_invalid(path, options.value_scale, options.invalid_pixels)
         return valid
 
     def abundances(self, index: int) -> Float32[np.ndarray, "H W K"] | None:
@@ -207,8 +214,3 @@ class Scene:
     @property
     def _size(self) -> tuple[int, int]:
         return self.cameras.height, self.cameras.width
-
-    def _scaled(self, index: int) -> Float32[np.ndarray, "H W B"]:
-        values = np.array(map_array(self.frames[index].cube_path), dtype=np.float32, order="C")
-        scale = self.options.value_scale
-        return values if scale is None else np.divide(values, np.float32(scale), out=values)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float32
 
 from unmix_plugin.scenes.reading.arrays import map_array
 
@@ -118,6 +118,29 @@ def measure_cube(path: Path, value_scale: float | None, invalid_pixels: InvalidP
         *(int(total) for total in totals),
         invalid=invalid if invalid.any() else None,
     )
+
+
+def read_cube(
+    path: Path, value_scale: float | None, invalid_pixels: InvalidPixels
+) -> Float32[np.ndarray, "H W B"]:
+    """Spectra in [0, 1]: divided by the scale, values above 1 clipped as a saturated sensor does, unusable pixels 0."""
+    values = _read_scaled(path, value_scale)
+    if invalid_pixels != "refuse":
+        values[find_invalid(values, invalid_pixels)] = 0.0
+    return np.clip(values, 0.0, 1.0, out=values)
+
+
+def read_invalid(
+    path: Path, value_scale: float | None, invalid_pixels: InvalidPixels
+) -> Bool[np.ndarray, "H W"]:
+    """`find_invalid` of a file."""
+    return find_invalid(_read_scaled(path, value_scale), invalid_pixels)
+
+
+def _read_scaled(path: Path, value_scale: float | None) -> Float32[np.ndarray, "H W B"]:
+    with np.errstate(over="ignore"):  # a float64 beyond float32 is infinite, hence invalid
+        values = np.array(map_array(path), dtype=np.float32, order="C")
+    return values if value_scale is None else np.divide(values, np.float32(value_scale), out=values)
 
 
 def find_invalid(values: np.ndarray, invalid_pixels: InvalidPixels) -> Bool[np.ndarray, "H W"]:

@@ -31,7 +31,7 @@ class CheckedFiles:
     """For each frame the pixels that may show matter: not fully transparent, or not to be trusted. None where the
     scene has no alpha."""
     cube_hashes: dict[Path, str]
-    """SHA-256 of each cube."""
+    """SHA-256 of each cube, in the order of the frames."""
 
 
 def locate_files(

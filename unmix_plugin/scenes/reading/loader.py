@@ -11,7 +11,10 @@ from jaxtyping import Float64
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.geometry.bounds import find_bounds
+from unmix_plugin.scenes.geometry.pose_check import compare_conventions, describe
+from unmix_plugin.scenes.reading.cube_values import read_cube
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.frame_files import CheckedFiles, check_files, locate_files
 from unmix_plugin.scenes.reading.images import Size
@@ -103,7 +106,7 @@ def _assemble(
     options: SceneOptions,
 ) -> Scene:
     assert entry.wavelengths_nm is not None
-    normalisation, scene_box = _find_model_space(root, entry, checked, split.train)
+    normalisation, scene_box = _find_model_space(root, entry, checked, split.train, options)
     inputs = [path for paths in located for key, path in paths.items() if key in MEASURED_KEYS]
     inputs += [root / FILE_NAME, *truth.light_paths]
     truths = [path for paths in located for key, path in paths.items() if key not in MEASURED_KEYS]
@@ -132,19 +135,31 @@ def _assemble(
 
 
 def _find_model_space(
-    root: Path, entry: SceneEntry, checked: CheckedFiles, train: tuple[int, ...]
+    root: Path, entry: SceneEntry, checked: CheckedFiles, train: tuple[int, ...], options: SceneOptions
 ) -> tuple[Normalisation, SceneBox]:
     """The box that the training views show, and how its longest edge becomes [-1, 1].
 
     The box is found in a space centred on the training cameras, where coordinates are of order 1.
     """
+    cubes = list(checked.cube_hashes)
     positions = _world_poses(entry)[list(train), :, 3]
     middle = positions.mean(axis=0)
     radius = float(np.linalg.norm(positions - middle, axis=-1).max())
     first = Normalisation(np.eye(3), -middle, 1.0 / radius if radius > 0.0 else 1.0)
     cameras = _make_cameras(entry, checked.size, first)[list(train)]
     matter = None if checked.matter is None else [checked.matter[index] for index in train]
-    low, high = find_bounds(root, cameras, matter).aabb.double().numpy()
+    try:
+        low, high = find_bounds(root, cameras, matter).aabb.double().numpy()
+    except SceneError as error:
+        scale, invalid = options.value_scale, options.invalid_pixels
+        hint = describe(
+            compare_conventions(
+                _world_poses(entry)[list(train)],
+                cameras,
+                lambda view: read_cube(cubes[train[view]], scale, invalid),
+            )
+        )
+        raise SceneError(f"{error}\n{hint}" if hint else str(error)) from error
     scale = float(2.0 / (high - low).max())
     half = 0.5 * scale * (high - low)
     translation = first.translation - 0.5 * (low + high) / first.scale

@@ -1,0 +1,88 @@
+"""Poses of a wrong convention are told from right ones, and what they are is said."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from unmix_plugin.errors import SceneError
+from unmix_plugin.scenes import load_scene
+from unmix_plugin.scenes.demo.scene import make_demo_scene
+from unmix_plugin.scenes.geometry.pose_check import check_scene_poses, compare_conventions
+
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+WRONG = {
+    "camera to world, OpenCV axes": lambda pose: pose @ FLIP,
+    "world to camera, OpenGL axes": np.linalg.inv,
+    "world to camera, OpenCV axes": lambda pose: np.linalg.inv(pose @ FLIP),
+}
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("demo") / "scene"
+    make_demo_scene(folder, size=64, bands=8, views=16)
+    return folder
+
+
+def rewritten(demo, folder, change=lambda pose: pose, with_alpha=True, shift=0.0):
+    """The demo scene with other poses; without alpha its pictures are left out and its background is black."""
+    shutil.copytree(demo, folder)
+    path = folder / "transforms.json"
+    content = json.loads(path.read_text())
+    for frame in content["frames"]:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, 3] += shift
+        frame["transform_matrix"] = change(pose).tolist()
+        if not with_alpha:
+            frame["file_path"] = frame["hyperspectral_file_path"]
+    if not with_alpha:
+        for frame in content["frames"]:
+            name = frame.pop("file_path")
+            for key in ("train_filenames", "val_filenames", "test_filenames"):
+                stem = name.removeprefix("cubes/").removesuffix(".npy")
+                content[key] = [name if stem in old else old for old in content[key]]
+    path.write_text(json.dumps(content))
+    return folder
+
+
+@pytest.mark.parametrize("with_alpha", [True, False])
+@pytest.mark.parametrize("shift", [0.0, 1000.0])
+def test_right_poses_raise_no_alarm(demo, tmp_path, with_alpha, shift):
+    scene = load_scene(rewritten(demo, tmp_path / "scene", with_alpha=with_alpha, shift=shift))
+    assert check_scene_poses(scene) is None
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_wrong_poses_without_alpha_are_called_what_they_are(demo, tmp_path, wrong):
+    scene = load_scene(rewritten(demo, tmp_path / "scene", WRONG[wrong], with_alpha=False))
+    warning = check_scene_poses(scene)
+    assert warning is not None
+    assert f"the poses look like {wrong}" in warning
+
+
+def test_the_remedy_of_the_warning_mends_the_poses(demo, tmp_path):
+    as_colmap = rewritten(demo, tmp_path / "wrong", WRONG["world to camera, OpenCV axes"], with_alpha=False)
+    warning = check_scene_poses(load_scene(as_colmap))
+    assert "invert each, then multiply it from the right by diag(1, -1, -1, 1)" in warning
+    mended = rewritten(as_colmap, tmp_path / "mended", lambda pose: np.linalg.inv(pose) @ FLIP)
+    assert check_scene_poses(load_scene(mended)) is None
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_wrong_poses_with_alpha_are_called_what_they_are(demo, tmp_path, wrong):
+    folder = rewritten(demo, tmp_path / "scene", WRONG[wrong])
+    try:
+        said = check_scene_poses(load_scene(folder))
+    except SceneError as error:
+        said = str(error)
+    assert f"the poses look like {wrong}" in said
+
+
+def test_views_that_show_nothing_give_no_verdict(demo):
+    scene = load_scene(demo)
+    poses = scene.cameras.camera_to_world.double().numpy()
+    grey = np.full((64, 64, 8), 0.5, np.float32)
+    assert compare_conventions(poses, scene.cameras, lambda _: grey) == {}
+    assert compare_conventions(poses[:3], scene.cameras[[0, 1, 2]], scene.cube) == {}

@@ -1,0 +1,223 @@
+"""Do the poses mean what we take them for? Views are compared under this convention and under three common others.
+
+A point of the scene looks alike in all views that see it. So points along the rays of some pixels are projected into
+neighbouring views, and the best agreement along each ray counts. With the right poses it is close, with wrong ones
+rarely better than between unrelated pixels: what poses in OpenCV axes or from world to camera really mean is the
+convention under which views agree.
+
+Notation: `N` views, `F` features of a pixel, `P` pixels of one view, `D` points along a ray. Poses are camera to world
+with OpenGL axes, in world units, float64.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Float64, Int
+from torch import Tensor
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.scenes.scene import Scene
+
+NUM_REFERENCES, NUM_NEIGHBOURS, NUM_AGREEING = 8, 4, 3
+"""Views whose pixels are looked for, others that each is looked for in, and of these how many must agree: the one
+that agrees least may be hidden by something."""
+NUM_PIXELS, NUM_POINTS, NUM_FEATURES = 150, 192, 4
+BUSIEST_SHARE = 0.3
+"""Share of a view's pixels, those where it changes most, that are drawn from."""
+LONGEST_SIDE_PX = 128
+"""Larger views are thinned out to less than twice that."""
+DEPTHS = (0.4, 60.0)
+"""Nearest and farthest point along a ray, in median distances between neighbouring cameras."""
+SMALLEST_TURN_DEG = 3.0
+"""Neighbours are views that are turned against each other by at least this, if there are any."""
+MOST_DISAGREEMENT = 0.35
+"""Of the right convention, against that of unrelated pixels: 0.06 to 0.24 on scenes with 5 to 36 views."""
+LEAST_RATIO = 1.5
+"""Of the given convention's disagreement to the right one's: a wrong one has 1.7 and more."""
+
+GIVEN = "camera to world, OpenGL axes"
+_FLIP = np.diag([1.0, -1.0, -1.0])
+_REMEDIES = {
+    "camera to world, OpenCV axes": "multiply each from the right by diag(1, -1, -1, 1)",
+    "world to camera, OpenGL axes": "invert each",
+    "world to camera, OpenCV axes (as COLMAP writes them)": (
+        "invert each, then multiply it from the right by diag(1, -1, -1, 1)"
+    ),
+}
+
+Poses = Float64[np.ndarray, "N 3 4"]
+ReadView = Callable[[int], Float32[np.ndarray, "H W B"]]
+
+
+def check_scene_poses(scene: Scene) -> str | None:
+    """A warning if the training views agree much better under another convention than the one expected."""
+    train = list(scene.train_indices)
+    poses = scene.cameras.camera_to_world[train].double().numpy()
+    rotations = scene.normalisation.rotation.T @ poses[:, :, :3]
+    positions = scene.normalisation.to_world(poses[:, :, 3])
+    world = np.concatenate([rotations, positions[:, :, None]], axis=-1)
+    return describe(compare_conventions(world, scene.cameras[train], lambda view: scene.cube(train[view])))
+
+
+def compare_conventions(poses: Poses, lenses: Cameras, read_view: ReadView) -> dict[str, float]:
+    """How little the views agree under each convention, against unrelated pixels (1); inf where they share nothing.
+
+    Args:
+        poses: As the scene gives them.
+        lenses: Cameras of these views; only their lenses count.
+        read_view: The picture of a view.
+    """
+    if len(poses) < NUM_AGREEING + 1:
+        return {}
+    neighbours = _choose_neighbours(poses)
+    generator = torch.Generator().manual_seed(0)
+    used = sorted({*neighbours, *(other for others in neighbours.values() for other in others)})
+    stride = max(1, max(lenses.width, lenses.height) // LONGEST_SIDE_PX)
+    features = dict(
+        zip(used, _features([read_view(view)[::stride, ::stride] for view in used], generator), strict=True)
+    )
+    pixels = {view: _busy_pixels(features[view], generator) for view in neighbours}
+    drawn = torch.cat([features[view].flatten(0, 1)[pixels[view]] for view in neighbours])
+    chance = float((drawn - drawn[torch.randperm(len(drawn), generator=generator)]).norm(dim=-1).median())
+    if chance <= 0.0:  # nothing in the views changes
+        return {}
+    return {
+        name: _disagreement(_cameras(meant, lenses, features[used[0]], stride), features, pixels, neighbours)
+        / chance
+        for name, meant in _meanings(poses).items()
+    }
+
+
+def describe(disagreements: dict[str, float]) -> str | None:
+    """A warning, if another convention fits much better than the one expected."""
+    best = min(disagreements, key=lambda name: disagreements[name], default=GIVEN)
+    if best == GIVEN or disagreements[best] > MOST_DISAGREEMENT:
+        return None
+    if disagreements[GIVEN] < LEAST_RATIO * disagreements[best]:
+        return None
+    found = disagreements[GIVEN]
+    given = "they share nothing" if found == float("inf") else f"they differ by {found:.2f}"
+    return (
+        f"the poses look like {best}: read so, the training views differ by {disagreements[best]:.2f} of what unrelated "
+        f"pixels do; read as {GIVEN}, as expected, {given}. If so, take each 'transform_matrix' of transforms.json: "
+        f"{_REMEDIES[best]}"
+    )
+
+
+def _meanings(poses: Poses) -> dict[str, Poses]:
+    """What the given matrices are as camera to world with OpenGL axes, under each convention."""
+    rotations, positions = poses[:, :, :3], poses[:, :, 3:]
+    inverse = rotations.transpose(0, 2, 1)
+    origins = -(inverse @ positions)
+    opencv, world_to_camera, colmap = _REMEDIES
+    return {
+        GIVEN: poses,
+        opencv: np.concatenate([rotations @ _FLIP, positions], axis=-1),
+        world_to_camera: np.concatenate([inverse, origins], axis=-1),
+        colmap: np.concatenate([inverse @ _FLIP, origins], axis=-1),
+    }
+
+
+def _choose_neighbours(poses: Poses) -> dict[int, list[int]]:
+    """For some views the others that are turned least against them; the same under every convention."""
+    rotations, positions = poses[:, :, :3], poses[:, :, 3]
+    cosines = (np.einsum("iab,jab->ij", rotations, rotations) - 1.0) / 2.0
+    turns = np.rad2deg(np.arccos(np.clip(cosines, -1.0, 1.0)))
+    distances = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
+    ranks = turns + 0.1 * distances / max(float(distances.max()), 1e-30)
+    ranks[turns < SMALLEST_TURN_DEG] += 360.0
+    np.fill_diagonal(ranks, np.inf)
+    chosen = np.linspace(0, len(poses) - 1, min(NUM_REFERENCES, len(poses))).round().astype(int)
+    count = min(NUM_NEIGHBOURS, len(poses) - 1)
+    return {int(view): np.argsort(ranks[view])[:count].tolist() for view in chosen}
+
+
+def _features(
+    views: list[Float32[np.ndarray, "H W B"]], generator: torch.Generator
+) -> list[Float[Tensor, "H W F"]]:
+    """Principal components of the spectra of all views, the first with a spread of 1, smoothed a little."""
+    cubes = [torch.from_numpy(np.ascontiguousarray(view)) for view in views]
+    spectra = torch.cat([cube.flatten(0, 1) for cube in cubes])
+    some = spectra[torch.randperm(len(spectra), generator=generator)[:5000]]
+    mean = some.mean(dim=0)
+    _, spreads, axes = torch.linalg.svd(some - mean, full_matrices=False)
+    axes = axes[:NUM_FEATURES].T / (spreads[0] / len(some) ** 0.5).clamp(min=1e-12)
+    return [_smooth((cube - mean) @ axes) for cube in cubes]
+
+
+def _smooth(image: Float[Tensor, "H W F"]) -> Float[Tensor, "H W F"]:
+    pooled = torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), 3, 1, 1, count_include_pad=False)
+    return pooled.permute(1, 2, 0).contiguous()
+
+
+def _busy_pixels(image: Float[Tensor, "H W F"], generator: torch.Generator) -> Int[Tensor, " P"]:
+    """Random pixels among those where the image changes most, row-major numbers."""
+    change = torch.zeros(image.shape[:2])
+    across = (image[1:-1, 2:] - image[1:-1, :-2]).norm(dim=-1)
+    change[1:-1, 1:-1] = across + (image[2:, 1:-1] - image[:-2, 1:-1]).norm(dim=-1)
+    order = change.flatten().argsort(descending=True)
+    busy = order[: max(NUM_PIXELS, int(BUSIEST_SHARE * int((change > 0).sum())))]
+    return busy[torch.randperm(len(busy), generator=generator)[:NUM_PIXELS]]
+
+
+def _cameras(poses: Poses, lenses: Cameras, image: Float[Tensor, "H W F"], stride: int) -> Cameras:
+    """Cameras of thinned-out views, in coordinates of order 1."""
+    poses = poses.copy()
+    poses[:, :, 3] -= poses[:, :, 3].mean(axis=0)
+    poses[:, :, 3] /= max(float(np.linalg.norm(poses[:, :, 3], axis=-1).max()), 1e-30)
+    height, width = image.shape[:2]
+    # Pixel (c, r) of a thinned-out view is pixel (c stride, r stride) of the whole one; centres are at + 0.5.
+    center = (lenses.center_px - 0.5) / stride + 0.5
+    matrices = torch.from_numpy(poses).float()
+    return Cameras(matrices, lenses.focal_px / stride, center, lenses.distortion, width, height)
+
+
+def _disagreement(
+    cameras: Cameras,
+    features: dict[int, Float[Tensor, "H W F"]],
+    pixels: dict[int, Int[Tensor, " P"]],
+    neighbours: dict[int, list[int]],
+) -> float:
+    """Median over pixels of the least difference along their rays; inf where too few neighbours see a ray."""
+    positions = cameras.camera_to_world[:, :, 3]
+    gaps = [
+        float((positions[view] - positions[other]).norm())
+        for view in neighbours
+        for other in neighbours[view]
+    ]
+    if np.median(gaps) <= 0.0:
+        return float("inf")
+    nearest, farthest = DEPTHS
+    depths = float(np.median(gaps)) / torch.linspace(1.0 / nearest, 1.0 / farthest, NUM_POINTS)
+    least = []
+    for view, others in neighbours.items():
+        chosen = pixels[view]
+        coords = torch.stack([chosen % cameras.width, chosen // cameras.width], dim=-1).float() + 0.5
+        rays = cameras.generate_rays(torch.full((len(chosen),), view), coords)
+        points = (rays.origins[:, None] + rays.directions[:, None] * depths[:, None]).flatten(0, 1)
+        own = features[view].flatten(0, 1)[chosen]
+        seen = [_differences(points, own, features[other], cameras, other) for other in others]
+        ranked = torch.stack(seen, dim=-1).sort(dim=-1).values[..., :NUM_AGREEING]
+        least.append(ranked.mean(dim=-1).min(dim=-1).values)
+    return float(torch.cat(least).median())
+
+
+def _differences(
+    points: Float[Tensor, "PD 3"],
+    own: Float[Tensor, "P F"],
+    image: Float[Tensor, "H W F"],
+    cameras: Cameras,
+    view: int,
+) -> Float[Tensor, "P D"]:
+    """Between a pixel and what another view shows of each point of its ray; inf where that does not see it."""
+    coords, depths = cameras.project(points, view)
+    size = torch.tensor([cameras.width, cameras.height])
+    is_seen = (depths > 0.0) & ((coords > 0.5) & (coords < size - 0.5)).all(dim=-1)
+    grid = (coords / size * 2.0 - 1.0).clamp(-2.0, 2.0)[None, :, None]
+    sampled = torch.nn.functional.grid_sample(image.permute(2, 0, 1)[None], grid, align_corners=False)
+    shown = sampled[0, :, :, 0].T.reshape(len(own), -1, own.shape[-1])
+    differences = (shown - own[:, None]).norm(dim=-1)
+    return differences.masked_fill(~is_seen.reshape(differences.shape), torch.inf)
