@@ -30,7 +30,15 @@ def case_bytes(name: str, reader: Reader, seed: int, case: int) -> bytes:
     return reader.mutate(reader.samples, generator)
 
 
-def fuzz(name: str, folder: Path, seed: int, cases: range, until_s: float | None = None) -> Outcome:
+def prepare(reader: Reader, folder: Path) -> Path:
+    """Write what lies beside the input of a reader; gives the path of the input."""
+    for companion, data in reader.companions:
+        (folder / companion).parent.mkdir(exist_ok=True)
+        (folder / companion).write_bytes(data)
+    return folder / reader.file_name
+
+
+def fuzz(name: str, folder: Path, seed: int, cases: range) -> Outcome:
     """Run cases of a reader.
 
     Args:
@@ -38,15 +46,10 @@ def fuzz(name: str, folder: Path, seed: int, cases: range, until_s: float | None
         folder: An empty one, to write inputs to.
         seed: Of all cases.
         cases: Their numbers.
-        until_s: On the clock of `time.perf_counter`, when to stop early.
     """
     reader = READERS[name]()
-    for companion, data in reader.companions:
-        (folder / companion).write_bytes(data)
-    path, outcome = folder / reader.file_name, Outcome()
+    path, outcome = prepare(reader, folder), Outcome()
     for case in cases:
-        if until_s is not None and time.perf_counter() > until_s:
-            break
         path.unlink(missing_ok=True)  # some file systems flush a file that is truncated and written again
         path.write_bytes(case_bytes(name, reader, seed, case))
         started = time.perf_counter()

@@ -104,7 +104,9 @@ def _transforms() -> Reader:
         "frames": frames[1:],
     }
     samples = tuple(json.dumps(content).encode() for content in (whole, bare))
-    return Reader(samples, "transforms.json", _read_transforms, (SceneError,), mutate_json)
+    named = {path for frame in frames for key, path in frame.items() if key.endswith("_path")}
+    beside = tuple((str(path), b"") for path in sorted(named))
+    return Reader(samples, "transforms.json", _read_transforms, (SceneError,), mutate_json, beside)
 
 
 def _read_transforms(path: Path) -> None:

@@ -135,13 +135,14 @@ class Scene:
     options: SceneOptions
     """How the scene was read."""
 
-    def cube(self, index: int) -> Float32[np.ndarray, "H W B"]:
+    def cube(self, index: int, part: tuple[slice, ...] = ()) -> Float32[np.ndarray, "H W B"]:
         """Spectra of a view in [0, 1].
 
         Values above 1 after the division by `value_scale` are clipped to 1, as a saturated sensor does. Unless
         `invalid_pixels` is `refuse`, spectra of invalid pixels are 0 (see `valid_mask`).
         """
-        return read_cube(self.frames[index].cube_path, self.options.value_scale, self.options.invalid_pixels)
+        options = self.options
+        return read_cube(self.frames[index].cube_path, options.value_scale, options.invalid_pixels, part)
 
     def stored_type(self, index: int) -> str:
         """NumPy's code of a cube's numbers, such as f2 or u2, in any byte order."""

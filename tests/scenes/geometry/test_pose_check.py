@@ -84,5 +84,5 @@ def test_views_that_show_nothing_give_no_verdict(demo):
     scene = load_scene(demo)
     poses = scene.cameras.camera_to_world.double().numpy()
     grey = np.full((64, 64, 8), 0.5, np.float32)
-    assert compare_conventions(poses, scene.cameras, lambda _: grey) == {}
+    assert compare_conventions(poses, scene.cameras, lambda _, part: grey[part]) == {}
     assert compare_conventions(poses[:3], scene.cameras[[0, 1, 2]], scene.cube) == {}

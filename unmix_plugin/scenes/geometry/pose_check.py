@@ -27,8 +27,8 @@ that agrees least may be hidden by something."""
 NUM_PIXELS, NUM_POINTS, NUM_FEATURES = 150, 192, 4
 BUSIEST_SHARE = 0.3
 """Share of a view's pixels, those where it changes most, that are drawn from."""
-LONGEST_SIDE_PX = 128
-"""Larger views are thinned out to less than twice that."""
+LONGEST_SIDE_PX, MOST_BANDS = 128, 32
+"""Of what is compared: larger views are thinned out."""
 DEPTHS = (0.4, 60.0)
 """Nearest and farthest point along a ray, in median distances between neighbouring cameras."""
 SMALLEST_TURN_DEG = 3.0
@@ -49,7 +49,8 @@ _REMEDIES = {
 }
 
 Poses = Float64[np.ndarray, "N 3 4"]
-ReadView = Callable[[int], Float32[np.ndarray, "H W B"]]
+ReadView = Callable[[int, tuple[slice, ...]], Float32[np.ndarray, "H W B"]]
+"""From a view, and the rows, columns and bands wanted, to its picture."""
 
 
 def check_scene_poses(scene: Scene) -> str | None:
@@ -59,7 +60,8 @@ def check_scene_poses(scene: Scene) -> str | None:
     rotations = scene.normalisation.rotation.T @ poses[:, :, :3]
     positions = scene.normalisation.to_world(poses[:, :, 3])
     world = np.concatenate([rotations, positions[:, :, None]], axis=-1)
-    return describe(compare_conventions(world, scene.cameras[train], lambda view: scene.cube(train[view])))
+    lenses = scene.cameras[train]
+    return describe(compare_conventions(world, lenses, lambda view, part: scene.cube(train[view], part)))
 
 
 def compare_conventions(poses: Poses, lenses: Cameras, read_view: ReadView) -> dict[str, float]:
@@ -68,17 +70,21 @@ def compare_conventions(poses: Poses, lenses: Cameras, read_view: ReadView) -> d
     Args:
         poses: As the scene gives them.
         lenses: Cameras of these views; only their lenses count.
-        read_view: The picture of a view.
+        read_view: Reads a part of a view.
     """
     if len(poses) < NUM_AGREEING + 1:
         return {}
     neighbours = _choose_neighbours(poses)
     generator = torch.Generator().manual_seed(0)
     used = sorted({*neighbours, *(other for others in neighbours.values() for other in others)})
-    stride = max(1, max(lenses.width, lenses.height) // LONGEST_SIDE_PX)
-    features = dict(
-        zip(used, _features([read_view(view)[::stride, ::stride] for view in used], generator), strict=True)
+    corner = read_view(used[0], (slice(1), slice(1)))
+    stride, band_step = (
+        -(-max(lenses.width, lenses.height) // LONGEST_SIDE_PX),
+        -(-corner.shape[2] // MOST_BANDS),
     )
+    part = (slice(None, None, stride), slice(None, None, stride), slice(None, None, band_step))
+    views = [read_view(view, part) for view in used]
+    features = dict(zip(used, _features(views, generator), strict=True))
     pixels = {view: _busy_pixels(features[view], generator) for view in neighbours}
     drawn = torch.cat([features[view].flatten(0, 1)[pixels[view]] for view in neighbours])
     chance = float((drawn - drawn[torch.randperm(len(drawn), generator=generator)]).norm(dim=-1).median())
@@ -101,9 +107,9 @@ def describe(disagreements: dict[str, float]) -> str | None:
     found = disagreements[GIVEN]
     given = "they share nothing" if found == float("inf") else f"they differ by {found:.2f}"
     return (
-        f"the poses look like {best}: read so, the training views differ by {disagreements[best]:.2f} of what unrelated "
-        f"pixels do; read as {GIVEN}, as expected, {given}. If so, take each 'transform_matrix' of transforms.json: "
-        f"{_REMEDIES[best]}"
+        f"the poses look like {best}: read so, the training views differ by {disagreements[best]:.2f} of what "
+        f"unrelated pixels do; read as {GIVEN}, as expected, {given}. If so, take each 'transform_matrix' of "
+        f"transforms.json: {_REMEDIES[best]}"
     )
 
 

@@ -121,10 +121,14 @@ def measure_cube(path: Path, value_scale: float | None, invalid_pixels: InvalidP
 
 
 def read_cube(
-    path: Path, value_scale: float | None, invalid_pixels: InvalidPixels
+    path: Path, value_scale: float | None, invalid_pixels: InvalidPixels, part: tuple[slice, ...] = ()
 ) -> Float32[np.ndarray, "H W B"]:
-    """Spectra in [0, 1]: divided by the scale, values above 1 clipped as a saturated sensor does, unusable pixels 0."""
-    values = _read_scaled(path, value_scale)
+    """Spectra in [0, 1]: divided by the scale, values above 1 clipped as a saturated sensor does, unusable pixels 0.
+
+    Args:
+        part: Rows, columns and bands to read; all by default.
+    """
+    values = _read_scaled(path, value_scale, part)
     if invalid_pixels != "refuse":
         values[find_invalid(values, invalid_pixels)] = 0.0
     return np.clip(values, 0.0, 1.0, out=values)
@@ -137,9 +141,11 @@ def read_invalid(
     return find_invalid(_read_scaled(path, value_scale), invalid_pixels)
 
 
-def _read_scaled(path: Path, value_scale: float | None) -> Float32[np.ndarray, "H W B"]:
+def _read_scaled(
+    path: Path, value_scale: float | None, part: tuple[slice, ...] = ()
+) -> Float32[np.ndarray, "H W B"]:
     with np.errstate(over="ignore"):  # a float64 beyond float32 is infinite, hence invalid
-        values = np.array(map_array(path), dtype=np.float32, order="C")
+        values = np.array(map_array(path)[part], dtype=np.float32, order="C")
     return values if value_scale is None else np.divide(values, np.float32(value_scale), out=values)
 
 

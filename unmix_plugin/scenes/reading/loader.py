@@ -156,7 +156,7 @@ def _find_model_space(
             compare_conventions(
                 _world_poses(entry)[list(train)],
                 cameras,
-                lambda view: read_cube(cubes[train[view]], scale, invalid),
+                lambda view, part: read_cube(cubes[train[view]], scale, invalid, part),
             )
         )
         raise SceneError(f"{error}\n{hint}" if hint else str(error)) from error
