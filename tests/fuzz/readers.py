@@ -117,8 +117,9 @@ def _read_transforms(path: Path) -> None:
         split_frames(entry, method, 2, faults)
     for frame in entry.frames:
         if frame.intrinsics is not None:
-            assert np.isfinite(np.float32(frame.intrinsics.focal_at(20))).all()
-            assert np.float32(frame.intrinsics.focal_at(20)).min() > 0
+            focal = np.array(frame.intrinsics.focal_at(20), dtype=np.float32)
+            assert np.isfinite(focal).all()
+            assert focal.min() > 0
     faults.raise_if_any()
 
 

@@ -65,6 +65,7 @@ def test_wrong_poses_without_alpha_are_called_what_they_are(demo, tmp_path, wron
 def test_the_remedy_of_the_warning_mends_the_poses(demo, tmp_path):
     as_colmap = rewritten(demo, tmp_path / "wrong", WRONG["world to camera, OpenCV axes"], with_alpha=False)
     warning = check_scene_poses(load_scene(as_colmap))
+    assert warning is not None
     assert "invert each, then multiply it from the right by diag(1, -1, -1, 1)" in warning
     mended = rewritten(as_colmap, tmp_path / "mended", lambda pose: np.linalg.inv(pose) @ FLIP)
     assert check_scene_poses(load_scene(mended)) is None
@@ -77,7 +78,7 @@ def test_wrong_poses_with_alpha_are_called_what_they_are(demo, tmp_path, wrong):
         said = check_scene_poses(load_scene(folder))
     except SceneError as error:
         said = str(error)
-    assert f"the poses look like {wrong}" in said
+    assert f"the poses look like {wrong}" in str(said)
 
 
 def test_views_that_show_nothing_give_no_verdict(demo):

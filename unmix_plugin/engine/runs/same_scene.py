@@ -48,9 +48,8 @@ def name_differences(places: list[str]) -> str:
 
 
 def _agree(expected: Any, found: Any) -> bool:
-    numbers = [_as_numbers(value) for value in (expected, found)]
-    if numbers[0] is not None and numbers[1] is not None:
-        a, b = numbers
+    a, b = _as_numbers(expected), _as_numbers(found)
+    if a is not None and b is not None:
         if a.shape != b.shape:
             return False
         scale = max(float(np.abs(a).max(initial=0.0)), float(np.abs(b).max(initial=0.0)))

@@ -35,7 +35,7 @@ def check_cube_headers(
         headers.append(header)
         if header is None:
             continue
-        found = header.shape[:2]
+        found = header.shape[0], header.shape[1]
         if size is None:
             size, size_from = found, f"as {where} has"
         if bands is None:
@@ -99,7 +99,7 @@ def check_abundances(
     header = read_header(path, "(H, W, K)", where, faults)
     if header is None:
         return
-    found = header.shape[:2]
+    found = header.shape[0], header.shape[1]
     if size is not None and found != size:
         faults.add(
             where,
