@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor
 
-from unmix_plugin.model import UnmixModelConfig
 from unmix_plugin.spectral.segmentation import material_scores
 from unmix_plugin.spectral.unmixing.abundance_estimation import fcls, nnls, sunsal
 from unmix_plugin.spectral.unmixing.endmembers import (
@@ -25,11 +24,12 @@ from unmix_plugin.spectral.unmixing.endmembers import (
     drop_uninformative_pixels,
     initialise_endmembers,
 )
-from unmix_plugin.spectral.unmixing.mixture_guide import MixtureGuide
+from unmix_plugin.spectral.unmixing.mixture_guide import mixing_penalty
 from unmix_plugin.spectral.unmixing.num_materials import propose_num_materials
 from unmix_plugin.spectral.unmixing.sparse_unmixing import sparse_abundances
 from unmix_plugin.trained.evaluation import Evaluation, SceneTruth, ViewTruth, scene_truth, view_truth
 from unmix_plugin.trained.view_rendering import RenderedView
+from unmix_plugin.training_losses import LossConfig
 
 if TYPE_CHECKING:
     from unmix_plugin.scenes.scene import Scene
@@ -69,11 +69,10 @@ def by_distance(pixels: Tensor, endmembers: Tensor) -> Tensor:
 
 def by_few(training: Tensor, endmembers: Tensor) -> Explain:
     """A pixel is a mixture of few endmembers, as bright as fits best; how few, the training pixels say."""
-    guide = MixtureGuide(*endmembers.shape)
-    guide.start(training, endmembers, UnmixModelConfig().mixing_penalty)
+    penalty = mixing_penalty(training, endmembers, LossConfig().mixing_penalty)
 
     def explain(pixels: Tensor, spectra: Tensor) -> Tensor:
-        shares = sparse_abundances(pixels, spectra, float(guide.mixing_penalty))
+        shares = sparse_abundances(pixels, spectra, penalty)
         return shares * _best_lengths(pixels, shares @ spectra)[:, None]
 
     return explain
@@ -117,7 +116,7 @@ class PixelBaselines:
         self._found: dict[tuple[str, int], tuple[Tensor, float]] = {}
 
     def score(self, method: PixelMethod, seed: int) -> dict[str, float]:
-        """Every figure of `exports.evaluation`, and `find_seconds`, `explain_seconds`."""
+        """Every figure of `trained.evaluation`, and `find_seconds`, `explain_seconds`."""
         endmembers, find_seconds = self._endmembers(method.find, seed)
         evaluation = Evaluation(self.truth, endmembers)
         started = time.perf_counter()

@@ -25,8 +25,7 @@ import torch
 import tyro
 
 from unmix_plugin.engine.training.callbacks import TrainingCallbackLocation, run_callbacks
-from unmix_plugin.engine.training.seeding import step_seed
-from unmix_plugin.engine.training.trainer import MODEL_STREAM, Trainer
+from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 
@@ -147,12 +146,12 @@ def share_state(source: Trainer, target: Trainer) -> None:
     models = [trainer.pipeline.model for trainer in (source, target)]
     first, second = (model for model in models if isinstance(model, UnmixModel))
     second.field.load_state_dict(first.field.state_dict())
-    second.renderer.load_state_dict(first.renderer.state_dict())
+    second.grid.load_state_dict(first.grid.state_dict())
 
 
 def timed_step(trainer: Trainer, step: int) -> StepCost:
     """Forward, backward and optimiser."""
-    torch.manual_seed(step_seed(trainer.config.seed, step, MODEL_STREAM))
+    trainer.pipeline.seed_step(step)
     synchronise(trainer)
     wall, cpu = time.perf_counter(), time.process_time()
     outputs, losses, _ = trainer.pipeline.get_train_loss_dict(step)

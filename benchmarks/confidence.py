@@ -56,17 +56,19 @@ def measure(path: Path, device: str) -> tuple[str, dict[str, Any]]:
     from unmix_plugin.engine.runs.load_run import load_pipeline
     from unmix_plugin.spectral.segmentation import NOTHING_ID
     from unmix_plugin.trained.evaluation import Evaluation, scene_truth, view_truth
-    from unmix_plugin.trained.run_materials import materials_of
+    from unmix_plugin.trained.open_run import require_materials
+    from unmix_plugin.trained.snapshot import snapshot
     from unmix_plugin.trained.view_rendering import render_view
 
     loaded = load_pipeline(path, device)
-    scene, model = loaded.pipeline.datamanager.scene, loaded.pipeline.model  # type: ignore[attr-defined]
-    evaluation = Evaluation(scene_truth(scene), materials_of(model).endmembers)
+    scene, name = loaded.pipeline.datamanager.scene, loaded.config.method_name  # type: ignore[attr-defined]
+    trained = require_materials(snapshot(loaded.pipeline.model, name, loaded.scene), name)
+    evaluation = Evaluation(scene_truth(scene), trained.materials.endmembers)
     confidences, ids, labels = [], [], []
     for index in scene.eval_indices:
-        predicted = render_view(model, scene.cameras[index])
+        predicted = render_view(trained, scene.cameras[index])
         evaluation.add(view_truth(scene, index), predicted)
-        confidence = model.get_outputs_for_camera(scene.cameras[index], ["confidence"])["confidence"]
+        confidence = trained.render(scene.cameras[index], ["confidence"])["confidence"]
         seen = (scene.labels(index) != NOTHING_ID) & (predicted.segmentation.numpy() != NOTHING_ID)
         confidences.append(confidence.cpu().numpy()[seen])
         ids.append(predicted.segmentation.numpy()[seen])

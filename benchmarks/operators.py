@@ -26,8 +26,8 @@ import tyro
 from torch import Tensor
 
 from unmix_plugin import rendering
-from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.engine.training.trainer import Trainer
+from unmix_plugin.field import UnmixField
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.rendering import HashGridLayout, PackedSamples
 from unmix_plugin.scenes.demo.scene import DEFAULT_SIZE, DEFAULT_VIEWS, make_demo_scene
@@ -85,23 +85,25 @@ class TrainingState:
         """Take rays, grid and table from a trainer that has trained."""
         model = trainer.pipeline.model
         assert isinstance(model, UnmixModel)
+        field = model.field
+        assert isinstance(field, UnmixField)
         bundle, _ = trainer.pipeline.datamanager.next_train(trainer.step)
-        box = SceneBox(model.renderer.aabb)
+        renderer = model.renderer
+        box = renderer.box
         t_near, t_far = box.intersect(bundle.origins, bundle.directions)
         origins, directions = box.normalise(bundle.origins), bundle.directions / box.size
         generator = torch.Generator().manual_seed(0)
         self.device = t_near.device
         jitter = torch.rand(len(t_near), generator=generator).to(self.device)
-        occupied = model.renderer.grid.occupied
-        self.marched = (origins, directions, t_near, t_far, jitter, occupied, model.renderer.step)
+        self.marched = (origins, directions, t_near, t_far, jitter, renderer.occupied, renderer.step)
         self.samples = rendering.march(*self.marched)
         rays = self.samples.ray_indices
         self.positions = origins[rays] + self.samples.t[:, None] * directions[rays]
-        self.layout = model.field.layout
-        self.table = model.field.table.detach().clone().requires_grad_()
+        self.layout = field.layout
+        self.table = field.table.detach().clone().requires_grad_()
         with torch.no_grad():
-            densities, _ = model.field.get_density(self.positions * box.size + box.aabb[0])
-        self.depths = (densities * model.renderer.step).requires_grad_()
+            densities, _ = field.get_density(self.positions * box.size + box.aabb[0])
+        self.depths = (densities * renderer.step).requires_grad_()
         num_rays, num_samples = len(t_near), len(self.samples)
         num_encoded = self.layout.num_levels * self.layout.features_per_level
         self.values = (

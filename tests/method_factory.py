@@ -11,9 +11,12 @@ import torch
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.field import UnmixFieldConfig
 from unmix_plugin.model import UnmixModel, UnmixModelConfig
 from unmix_plugin.renderer import RendererConfig
+from unmix_plugin.trained.snapshot import unmix_scene
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 NUM_BANDS = 5
 WAVELENGTHS_NM = [450.0, 500.0, 550.0, 600.0, 650.0]
@@ -31,7 +34,7 @@ CONFIG = UnmixModelConfig(
     field=UnmixFieldConfig(
         num_levels=2, coarsest_resolution=4, cells_per_pixel=0.34, log2_rows_per_level=10, hidden_width=16
     ),
-    renderer=RendererConfig(samples_per_pixel=1.0, smallest_weight=0.0, open_smallest_weight=0.0),
+    renderer=RendererConfig(samples_per_pixel=1.0, smallest_weight=0.0),
 )
 
 
@@ -53,6 +56,18 @@ def make_model(
         model.initialise(initial_data(), torch.Generator().manual_seed(seed))
         model.field.table.normal_(std=0.5)
     return model.eval()
+
+
+def scene_of(model: UnmixModel, cameras: Cameras = CAMERA) -> TrainedScene:
+    """The scene of a model as it is now, whose training and evaluation views are `cameras`."""
+    return unmix_scene(model, SceneRecord(BOX, dict(model.metadata), cameras, cameras, {}))
+
+
+def make_scene(
+    seed: int = 0, has_alpha: bool = True, light: list[float] | None = None, **settings: Any
+) -> TrainedScene:
+    """The scene of `make_model` with the same arguments."""
+    return scene_of(make_model(seed, has_alpha, light, **settings))
 
 
 def initial_data() -> dict[str, np.ndarray]:

@@ -11,15 +11,11 @@ from torch.testing import assert_close
 
 from tests.scenes.scene_factory import make_scene
 from unmix_plugin.datamanager import HyperspectralDataManager, HyperspectralDataManagerConfig
-from unmix_plugin.engine.runs.run_folder import RunFolder
-from unmix_plugin.engine.runs.scene_record import SceneRecord, check_same_scene, scene_record_to_json
-from unmix_plugin.errors import ConfigError, RunError, SceneError
+from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.scenes.scene import SceneOptions
 
-CONFIG = HyperspectralDataManagerConfig(
-    train_num_rays_per_batch=64, carving_resolution=16, single_ray_until=0.0
-)
+CONFIG = HyperspectralDataManagerConfig(train_num_rays_per_batch=64, grid_resolution=16, single_ray_until=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +112,7 @@ def test_the_number_of_rays_can_be_changed(scene_folder):
     ("settings", "message"),
     [
         ({"subpixels": 0}, "subpixels of 1 to 8"),
-        ({"carving_resolution": 4}, "carving-resolution of 8 to 512"),
+        ({"grid_resolution": 4}, "grid-resolution of 8 to 512 or auto"),
     ],
 )
 def test_impossible_settings_are_refused(settings, message):
@@ -138,7 +134,7 @@ def test_rays_a_pixel_grow_after_the_first_part_of_training_at_the_same_number_o
 
 def test_without_alpha_one_ray_a_pixel_has_to_do_for_longer(tmp_path):
     closed = make_scene(tmp_path / "closed", alpha=False)
-    manager = make(closed.root, single_ray_until=0.2, open_single_ray_until=0.8)
+    manager = make(closed.root, single_ray_until="auto")
     (callback,) = manager.get_training_callbacks()
     pixels = []
     for progress in (0.0, 0.2, 0.79, 0.8):
@@ -161,36 +157,3 @@ def test_poses_of_another_convention_are_warned_of_when_a_run_starts(tmp_path):
     (warning,) = make(tmp_path / "demo").warnings()
     assert "the poses look like camera to world, OpenCV axes" in warning
     assert make(folder.root).warnings() == []
-
-
-def scene_record(manager: HyperspectralDataManager) -> SceneRecord:
-    values = json.loads(json.dumps(scene_record_to_json(manager)))
-    return SceneRecord(
-        manager.scene_box, values["metadata"], manager.train_cameras, manager.eval_cameras, values["summary"]
-    )
-
-
-def test_a_run_goes_on_with_the_scene_as_another_machine_rounds_it(tmp_path):
-    folder = make_scene(tmp_path / "scene", alpha=False)
-    record = scene_record(make(folder.root))
-    run = RunFolder(tmp_path / "run")
-
-    def round_otherwise(content):
-        for frame in content["frames"]:
-            pose = np.array(frame["transform_matrix"])
-            pose[:3] = np.nextafter(pose[:3], 9.0)
-            frame["transform_matrix"] = pose.tolist()
-
-    manager = make(folder.edit(round_otherwise).root)
-    check_same_scene(record, manager, run)
-    manager = make(folder.edit(lambda c: c.update(fl_x=35.0)).root)
-    with pytest.raises(RunError, match=r"pixel_size.*cameras\.focal_px.* differ"):
-        check_same_scene(record, manager, run)
-
-
-def test_a_run_does_not_go_on_with_cubes_that_were_changed(tmp_path):
-    folder = make_scene(tmp_path / "scene")
-    record = scene_record(make(folder.root))
-    manager = make(folder.edit_cube(0, lambda cube: cube * np.float16(0.5)).root)
-    with pytest.raises(RunError, match=r"files\.cubes/view_0\.npy differ; name the right one with --data"):
-        check_same_scene(record, manager, RunFolder(tmp_path / "run"))

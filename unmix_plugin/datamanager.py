@@ -17,13 +17,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from unmix_plugin.alpha_preset import Auto, choose, preset_for
 from unmix_plugin.engine.data_manager import DataManager, DataManagerConfig
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.instantiate import Target
 from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.engine.training.seeding import step_generator
-from unmix_plugin.errors import ConfigError, SceneError
+from unmix_plugin.errors import ConfigError, SceneError, require
 from unmix_plugin.scenes.geometry.carving import carve
 from unmix_plugin.scenes.geometry.pose_check import check_scene_poses
 from unmix_plugin.scenes.identity import scene_identity
@@ -47,14 +48,12 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
     """How the files are read and split."""
     subpixels: int = 2
     """Rays cast through a pixel, along each of its edges; their mean is the pixel, in training and in rendering."""
-    single_ray_until: float = 0.4
-    """Part of the training in which one ray a pixel has to do: coarse shape needs many pixels, not exact ones."""
-    open_single_ray_until: float = 0.8
-    """The same in scenes without alpha, where coarse shape takes longer to find."""
-    carving_resolution: int = 128
-    """Cells along an edge of the grid in which space that the views show to be empty is carved away."""
-    open_grid_resolution: int = 64
-    """The same in scenes without alpha, of which nothing can be carved but what few cameras see."""
+    single_ray_until: float | Auto = "auto"
+    """Part of the training in which one ray a pixel has to do: coarse shape needs many pixels, not exact ones. Auto is
+    0.4 where alpha is known, else 0.8."""
+    grid_resolution: int | Auto = "auto"
+    """Cells along an edge of the occupancy grid, from which space is carved that the views show to be empty. Auto is
+    128 where alpha is known, else 64: only what few cameras see can be carved then."""
     max_initial_pixels: int = 50_000
     """Pixels, drawn from all training views, from which the endmembers are initialised."""
 
@@ -67,21 +66,20 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
         super().__post_init__()
         rules = {
             "subpixels of 1 to 8": 1 <= self.subpixels <= 8,
-            "single-ray-until and open-single-ray-until in [0, 1]": 0 <= self.single_ray_until <= 1
-            and 0 <= self.open_single_ray_until <= 1,
-            "carving-resolution of 8 to 512": 8 <= self.carving_resolution <= 512,
-            "open-grid-resolution of 8 to 512": 8 <= self.open_grid_resolution <= 512,
+            "single-ray-until in [0, 1] or auto": self.single_ray_until == "auto"
+            or 0 <= self.single_ray_until <= 1,
+            "grid-resolution of 8 to 512 or auto": self.grid_resolution == "auto"
+            or 8 <= self.grid_resolution <= 512,
             "max-initial-pixels of at least 1": self.max_initial_pixels >= 1,
         }
-        broken = [rule for rule, holds in rules.items() if not holds]
-        if broken:
-            raise ConfigError(f"the data manager needs {' and '.join(broken)}")
+        require("the data manager", rules)
 
 
 class HyperspectralDataManager(DataManager):
     """Serves pixels of the training views, drawn evenly from all valid ones.
 
-    A training batch has R P rays, `spectra` (R, B) and `alpha` (R); an image batch has `spectra` (H, W, B),
+    A training batch has R P rays, `spectra` (R, B), `alpha` (R) and `pixels` (R), the
+    number of each; an image batch has `spectra` (H, W, B),
     `alpha` (H, W), `valid` (H, W) and, where the scene has them, `labels` (H, W) and `abundances` (H, W, K).
     """
 
@@ -104,6 +102,7 @@ class HyperspectralDataManager(DataManager):
         self.train_cameras = self.scene.cameras[list(self.scene.train_indices)]
         self.eval_cameras = self.scene.cameras[list(self.scene.eval_indices)]
         self._device_cameras = self.train_cameras.to(device)
+        self._preset = preset_for(self.scene.has_alpha)
         self._num_rays = config.train_num_rays_per_batch
         self._choose_subpixels(step=0, progress=0.0)
 
@@ -194,14 +193,12 @@ class HyperspectralDataManager(DataManager):
         return max(1, num_rays // self._subpixels**2)
 
     def _choose_subpixels(self, step: int, progress: float) -> None:
-        options = self.options
-        until = options.single_ray_until if self.scene.has_alpha else options.open_single_ray_until
-        self._subpixels = 1 if progress < until else options.subpixels
+        until = choose(self.options.single_ray_until, self._preset.single_ray_until)
+        self._subpixels = 1 if progress < until else self.options.subpixels
 
     @property
     def _grid_resolution(self) -> int:
-        options = self.options
-        return options.carving_resolution if self.scene.has_alpha else options.open_grid_resolution
+        return choose(self.options.grid_resolution, self._preset.grid_resolution)
 
     def _pixel_size(self) -> float:
         """Edge of a pixel where it looks at the middle of the scene box, median over the training views."""
@@ -223,7 +220,8 @@ class HyperspectralDataManager(DataManager):
         points = (corners[:, None] + offsets).flatten(0, 1)
         views = (chosen // (height * width)).repeat_interleave(offsets.shape[1])
         bundle = cameras.generate_rays(views, points)
-        return bundle, {"spectra": pixels.store.spectra(chosen), "alpha": pixels.store.alpha[chosen]}
+        found = {"spectra": pixels.store.spectra(chosen), "alpha": pixels.store.alpha[chosen]}
+        return bundle, {**found, "pixels": chosen}
 
 
 def _scattered_offsets(num_pixels: int, subpixels: int, generator: torch.Generator) -> Float[Tensor, "R P 2"]:

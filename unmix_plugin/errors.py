@@ -40,3 +40,17 @@ def did_you_mean(word: str, known: Iterable[str], likeness: float = 0.6, form: s
     """
     near = difflib.get_close_matches(word, list(known), n=3, cutoff=likeness)
     return form.format(f"did you mean {' or '.join(near)}?") if near else ""
+
+
+def require(what: str, rules: dict[str, bool]) -> None:
+    """Refuse settings that break a rule.
+
+    Args:
+        what: Whose settings, for the message.
+        rules: What must hold, and whether it does.
+    Raises:
+        ConfigError: a rule is broken; the message names all of them.
+    """
+    broken = [rule for rule, holds in rules.items() if not holds]
+    if broken:
+        raise ConfigError(f"{what} needs {' and '.join(broken)}")

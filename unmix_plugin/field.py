@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
@@ -20,15 +20,19 @@ from torch import Tensor, nn
 
 from unmix_plugin.engine.field import Field
 from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.instantiate import InstantiateConfig, Target
+from unmix_plugin.errors import require
 from unmix_plugin.rendering.hash_encoding import HashGridLayout, hash_encode
 
 _LARGEST_LOG_DENSITY = 15.0
+LARGEST_RESOLUTION = 4096
 
 
 @dataclass(frozen=True)
-class UnmixFieldConfig:
+class UnmixFieldConfig(InstantiateConfig):
     """Sizes of the field's grid and networks."""
 
+    _target: Target = field(default_factory=lambda: UnmixField)
     num_levels: int = 8
     """Levels of the hash grid."""
     features_per_level: int = 4
@@ -50,6 +54,25 @@ class UnmixFieldConfig:
     """One brightness a point, or one a point and endmember as published."""
     specular_bias: float = -3.0
     """Logit of the view-dependent part at the start; low, so that colour is first explained by materials."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible settings.
+
+        Raises:
+            ConfigError: a number out of its range.
+        """
+        rules = {
+            "num-levels of 1 to 32": 1 <= self.num_levels <= 32,
+            "features-per-level of 1 to 8": 1 <= self.features_per_level <= 8,
+            "coarsest-resolution of 2 to 4096": 2 <= self.coarsest_resolution <= LARGEST_RESOLUTION,
+            "cells-per-pixel of 0.001 to 100": 0.001 <= self.cells_per_pixel <= 100,
+            "log2-rows-per-level of 4 to 24": 4 <= self.log2_rows_per_level <= 24,
+            "hidden-width of 1 to 1024": 1 <= self.hidden_width <= 1024,
+            "num-features of 1 to 256": 1 <= self.num_features <= 256,
+            "a temperature of 0.01 to 100": 0.01 <= self.temperature <= 100,
+            "a specular-bias of -50 to 50": -50 <= self.specular_bias <= 50,
+        }
+        require("the field", rules)
 
 
 class CoefficientField(Field):
@@ -109,12 +132,14 @@ class UnmixField(CoefficientField):
         self.table = nn.Parameter(nn.init.uniform_(table, -1e-4, 1e-4))
         width, num_encoded = config.hidden_width, config.num_levels * config.features_per_level
         num_features = config.num_features + 1
-        self.density_network = _network(num_encoded, width, num_features)
+        self.density_network = bias_free_network(num_encoded, width, num_features)
         num_scales = 1 if config.scale == "shared" else num_endmembers
         self.num_endmembers = num_endmembers
-        self.material_network = _network(num_features, width, num_endmembers + num_scales)
+        self.material_network = bias_free_network(num_features, width, num_endmembers + num_scales)
         if num_specular:
-            self.specular_network = _network(num_features + NUM_DIRECTION_FEATURES, width, num_specular + 1)
+            self.specular_network = bias_free_network(
+                num_features + NUM_DIRECTION_FEATURES, width, num_specular + 1
+            )
 
     def encode(
         self, positions: Float[Tensor, "S 3"], known: Float[Tensor, "S LF"] | None = None
@@ -130,10 +155,7 @@ class UnmixField(CoefficientField):
     def density_of(self, encoded: Float[Tensor, "S LF"]) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
         """Density per scene unit and geometry features where the hash grid's encoding is `encoded`."""
         features = self.density_network(encoded)
-        raw = features[:, 0] + self.log_initial_density
-        # Clamped in value only: a point that grew too dense can still be thinned.
-        bounded = raw + (raw.clamp(max=_LARGEST_LOG_DENSITY) - raw).detach()
-        return bounded.exp(), features
+        return bounded_exp(features[:, 0] + self.log_initial_density), features
 
     def get_outputs(
         self,
@@ -175,7 +197,6 @@ def finest_resolution(config: UnmixFieldConfig, scene_box: SceneBox, pixel_size:
     return min(math.ceil(cells), LARGEST_RESOLUTION)
 
 
-LARGEST_RESOLUTION = 4096
 NUM_DIRECTION_FEATURES = 15
 
 
@@ -205,7 +226,13 @@ def direction_features(directions: Float[Tensor, "S 3"]) -> Float[Tensor, "S 15"
     )
 
 
-def _network(num_inputs: int, width: int, num_outputs: int) -> nn.Sequential:
+def bounded_exp(raw: Float[Tensor, "S"]) -> Float[Tensor, "S"]:
+    """exp, clamped in value only: a point that grew too dense can still become less dense."""
+    return (raw + (raw.clamp(max=_LARGEST_LOG_DENSITY) - raw).detach()).exp()
+
+
+def bias_free_network(num_inputs: int, width: int, num_outputs: int) -> nn.Sequential:
+    """Two linear layers with a ReLU between them."""
     # Without biases, as in Mueller et al. 2022: torch copies a bias into the output first, a fifth of the layer's time.
     return nn.Sequential(
         nn.Linear(num_inputs, width, bias=False),

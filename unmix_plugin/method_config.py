@@ -8,6 +8,7 @@ from unmix_plugin.engine.pipeline import PipelineConfig
 from unmix_plugin.engine.registry import MethodSpecification
 from unmix_plugin.engine.training.optimizers import OptimizerConfig
 from unmix_plugin.model import UnmixModelConfig
+from unmix_plugin.trained.snapshot import unmix_scene
 
 unmix_nerf = MethodSpecification(
     config=TrainerConfig(
@@ -29,4 +30,5 @@ unmix_nerf = MethodSpecification(
         },
     ),
     description="radiance field of spectral images whose every point is a mixture of a few materials",
+    scene=unmix_scene,
 )

@@ -1,4 +1,4 @@
-"""UnMix-NeRF: rays to coefficients to spectra, metrics and pictures.
+"""UnMix-NeRF: rays to coefficients to spectra, losses and metrics.
 
 Notation: `R` rays, `B` bands, `K` endmembers, `J` specular coefficients. The renderer composites abundances, scaled
 abundances and specular coefficients; endmembers E and specular spectra D are applied once a ray:
@@ -16,79 +16,82 @@ import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from unmix_plugin.alpha_preset import Auto, choose, preset_for
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
-from unmix_plugin.engine.instantiate import Common, Target, short
+from unmix_plugin.engine.instantiate import Target
 from unmix_plugin.engine.model import Model, ModelConfig
 from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
-from unmix_plugin.errors import ConfigError
-from unmix_plugin.field import UnmixField, UnmixFieldConfig
-from unmix_plugin.renderer import CoefficientRenderer, RenderedRays, RendererConfig
+from unmix_plugin.errors import ConfigError, require
+from unmix_plugin.field import CoefficientField, UnmixFieldConfig
+from unmix_plugin.renderer import RendererConfig, VolumeRenderer
+from unmix_plugin.rendering.occupancy import OccupancyGrid
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.conversion import rgb_matrix
-from unmix_plugin.spectral.composition import (
-    OCCUPIED_ACCUMULATION,
-    Coefficients,
-    Materials,
-    SegmentationMethod,
-    compose,
-    default_names,
-    spectral,
-)
-from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
+from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.materials import Materials, SegmentationMethod
 from unmix_plugin.spectral.metrics import psnr
 from unmix_plugin.spectral.unmixing.endmembers import (
     EndmemberMethod,
     drop_uninformative_pixels,
     initialise_endmembers,
+    shows_a_shape,
 )
-from unmix_plugin.spectral.unmixing.mixture_guide import MixtureGuide
+from unmix_plugin.spectral.unmixing.given_endmembers import given_endmembers
+from unmix_plugin.spectral.unmixing.mixture_guide import (
+    MixtureCache,
+    abundance_error,
+    margin_error,
+    margin_variance,
+    mixing_penalty,
+)
 from unmix_plugin.spectral.unmixing.num_materials import propose_num_materials
-from unmix_plugin.training_losses import LossSettings, pixel_mean, training_losses
+from unmix_plugin.training_losses import LossConfig, compare_pixels, pixel_mean, spectral_losses
 
 _FEWEST_RAYS, _MOST_RAYS = 64, 8192
 _PIXELS_TO_COUNT_BY = 20_000
-DEFAULT_OUTPUTS = ("spectral", "rgb", "abundances", "segmentation", "accumulation")
+_OBSERVED_PIXELS = 256
+"""Pixels of a batch by which the error of margins is followed."""
 
 
 @dataclass(frozen=True)
-class UnmixModelConfig(ModelConfig, LossSettings):
+class UnmixModelConfig(ModelConfig):
     """Settings of the model of UnMix-NeRF."""
 
     _target: Target = field(default_factory=lambda: UnmixModel)
-    num_endmembers: Annotated[int | Literal["auto"], Common, short("endmembers")] = 6
+    num_endmembers: int | Auto = 6
     """K, the number of materials to unmix into; auto proposes it from the training pixels, with its evidence."""
-    endmember_init: Annotated[EndmemberMethod | Literal["file"], Common, short("endmember-init")] = "pairs"
+    endmember_init: EndmemberMethod | Literal["file"] = "pairs"
     """First guess of the endmembers from the pixels of all training views, or spectra from `endmember_file`."""
-    endmember_file: Annotated[Path | None, Common, short("endmember-file")] = None
-    """CSV of reflectances (wavelength,name,...) for `endmember_init` file; multiplied by the scene's light if known."""
+    endmember_file: Path | None = None
+    """CSV of reflectances (wavelength,name,...) for `endmember_init` file; multiplied by the scene's light if known,
+    and by one factor for the scene's brightness."""
     specular: Literal["none", "dictionary", "full"] = "dictionary"
     """View-dependent part: none, multiples of a few spectra, or one value a band as published."""
-    num_specular_spectra: int | Literal["auto"] = "auto"
+    num_specular_spectra: int | Auto = "auto"
     """Spectra of the specular dictionary. The first is the light's, a highlight's colour on anything but metal; then
-    come the endmembers', as light that they send on has. Auto is 1 where alpha is known, else all: in rooms, light is
-    coloured by the walls."""
+    come the endmembers', as light that they send on has. Auto is 1 where alpha is known, else all."""
     train_endmembers: bool = True
     """Whether endmembers change while training; else they stay the first guess, or the spectra from a file."""
     segmentation: SegmentationMethod = "abundances"
     """Material of a ray: its largest abundance, or the endmember of smallest angle to its spectrum as published."""
     samples_per_step: int = 30_000
     """Samples marched in a training step; the number of rays adapts to it."""
-    initial_opacity: float = 0.05
-    """Opacity of one sample's interval in the untrained field where a hull of the objects is known."""
-    initial_opacity_unknown: float = 0.01
-    """The same in scenes without alpha, where space between cameras and walls must stay clear."""
+    initial_opacity: float | Auto = "auto"
+    """Opacity of one sample's interval in the untrained field. Auto is 0.05 where alpha is known, else 0.01: space
+    between cameras and walls must stay clear."""
     field: UnmixFieldConfig = UnmixFieldConfig()
     """Sizes of the field."""
     renderer: RendererConfig = RendererConfig()
     """How rays are sampled."""
+    losses: LossConfig = LossConfig()
+    """What training asks for, and how strongly."""
 
     def __post_init__(self) -> None:
         """Refuse impossible settings.
@@ -97,21 +100,18 @@ class UnmixModelConfig(ModelConfig, LossSettings):
             ConfigError: a number out of its range or settings that contradict each other.
         """
         super().__post_init__()
+        count, opacity = self.num_endmembers, self.initial_opacity
         rules = {
-            "num-endmembers of 1 to 255 or auto": self.num_endmembers == "auto"
-            or 1 <= self.num_endmembers <= 255,
-            "num-specular-spectra of at least 1 or auto": self.num_specular_spectra == "auto"
-            or self.num_specular_spectra >= 1,
-            "samples-per-step of at least 1": self.samples_per_step >= 1,
-            **self.loss_rules(),
-            "initial opacities in (0, 1)": 0 < self.initial_opacity < 1
-            and 0 < self.initial_opacity_unknown < 1,
+            "num-endmembers of 1 to 255 or auto": count == "auto" or 1 <= count <= 255,
+            "num-specular-spectra of 1 to 256 or auto": self.num_specular_spectra == "auto"
+            or 1 <= self.num_specular_spectra <= 256,
+            "samples-per-step of 1 to 100 million": 1 <= self.samples_per_step <= 100_000_000,
+            "eval-num-rays-per-chunk of at least 1": self.eval_num_rays_per_chunk >= 1,
+            "initial-opacity in (0, 1) or auto": opacity == "auto" or 0 < opacity < 1,
             "endmember-file exactly when endmember-init is file": (self.endmember_init == "file")
             == (self.endmember_file is not None),
         }
-        broken = [rule for rule, holds in rules.items() if not holds]
-        if broken:
-            raise ConfigError(f"the model needs {' and '.join(broken)}")
+        require("the model", rules)
 
     def resolve_auto(
         self, initial_data: Callable[[], Mapping[str, np.ndarray]], generator: torch.Generator
@@ -135,50 +135,43 @@ class UnmixModel(Model):
     config: UnmixModelConfig
     rgb_weights: Tensor
     every_band: Tensor
+    endmember_bound: Tensor
+    first_endmembers: Tensor
+    penalty: Tensor
+    margin_variance: Tensor
 
     def populate_modules(self) -> None:
-        """Field, renderer, endmembers (K, B) and specular spectra (J, B), shaped by config and metadata.
+        """Field, grid, endmembers (K, B) and specular spectra (J, B), shaped by config and metadata.
 
         Raises:
             ConfigError: more endmembers than bands.
         """
         config, metadata = self.config, self.metadata
         self.bands = Bands.of(metadata["wavelengths_nm"])
-        num_bands = len(self.bands)
-        if config.num_endmembers == "auto":
-            raise ConfigError("num-endmembers is auto: call resolve_auto first")
-        self.num_endmembers = config.num_endmembers
-        if self.num_endmembers > num_bands:
-            raise ConfigError(
-                f"num-endmembers is {self.num_endmembers} but the scene has {num_bands} bands; "
-                f"choose at most {num_bands}"
-            )
-        self.endmembers = nn.Parameter(
-            torch.zeros(self.num_endmembers, num_bands), requires_grad=config.train_endmembers
-        )
-        self.endmember_names = default_names(self.num_endmembers)
+        self.preset = preset_for(metadata["has_alpha"])
+        self.num_endmembers = self._checked_num_endmembers()
+        shape = (self.num_endmembers, len(self.bands))
+        self.endmembers = nn.Parameter(torch.zeros(shape), requires_grad=config.train_endmembers)
         num_dictionary = self._num_dictionary_spectra()
-        self.specular_spectra = nn.Parameter(torch.zeros(num_dictionary, num_bands))
-        opacity = config.initial_opacity if metadata["has_alpha"] else config.initial_opacity_unknown
-        self.renderer = CoefficientRenderer(
-            config.renderer,
-            self.scene_box,
-            pixel_size=metadata["pixel_size"],
-            grid_resolution=metadata["grid_resolution"],
-            is_open=not metadata["has_alpha"],
-            close_rays=config.background == "last",
-        )
-        self.field = UnmixField(
-            config.field,
-            self.scene_box,
-            self.num_endmembers,
-            num_bands if config.specular == "full" else num_dictionary,
-            initial_density=-math.log1p(-opacity) / self.renderer.step,
+        self.specular_spectra = nn.Parameter(torch.zeros(num_dictionary, len(self.bands)))
+        self.grid = OccupancyGrid(torch.ones((metadata["grid_resolution"],) * 3, dtype=torch.bool))
+        self._renderer: VolumeRenderer | None = None
+        self.step = metadata["pixel_size"] / config.renderer.samples_per_pixel
+        opacity = choose(config.initial_opacity, self.preset.initial_opacity)
+        self.field: CoefficientField = config.field.setup(
+            scene_box=self.scene_box,
+            num_endmembers=self.num_endmembers,
+            num_specular=len(self.bands) if config.specular == "full" else num_dictionary,
+            initial_density=-math.log1p(-opacity) / self.step,
             pixel_size=metadata["pixel_size"],
         )
         self.register_buffer("rgb_weights", rgb_matrix(self.bands), persistent=False)
-        self.mixture_guide = MixtureGuide(self.num_endmembers, num_bands)
-        self.register_buffer("every_band", torch.eye(num_bands), persistent=False)
+        self.register_buffer("every_band", torch.eye(len(self.bands)), persistent=False)
+        self.register_buffer("endmember_bound", torch.ones(()))
+        self.register_buffer("first_endmembers", torch.zeros(shape))
+        self.register_buffer("penalty", torch.zeros(()))
+        self.register_buffer("margin_variance", torch.full((), torch.inf))
+        self._mixtures: MixtureCache | None = None
         self._progress = 0.0
 
     def initialise(self, initial_data: Mapping[str, np.ndarray], generator: torch.Generator) -> None:
@@ -191,47 +184,68 @@ class UnmixModel(Model):
         light = self.metadata["illuminant"]
         lamp = torch.ones(len(self.bands)) if light is None else torch.tensor(light, dtype=torch.float32)
         pixels = torch.from_numpy(initial_data["pixels"])
-        self.endmembers.copy_(self._guess_endmembers(pixels, lamp, generator))
-        self.mixture_guide.start(pixels, self.endmembers.detach(), self.config.mixing_penalty)
+        endmembers = self._first_endmembers(pixels, lamp, generator)
+        self.endmembers.copy_(endmembers)
+        self.first_endmembers.copy_(endmembers)
+        self.endmember_bound.fill_(max(1.0, float(endmembers.max())))
+        self.penalty.fill_(mixing_penalty(pixels, endmembers, self.config.losses.mixing_penalty))
         for row in range(len(self.specular_spectra)):
-            self.specular_spectra[row] = (
-                lamp if row == 0 else self.endmembers[(row - 1) % len(self.endmembers)]
-            )
-        self.renderer.carve(torch.from_numpy(initial_data["reachable"]))
+            spectrum = lamp if row == 0 else endmembers[(row - 1) % len(endmembers)]
+            self.specular_spectra[row] = spectrum
+        self.grid = OccupancyGrid(torch.from_numpy(initial_data["reachable"])).to(self.device)
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """The hash table, the networks and the spectra."""
+        table = [value for name, value in self.field.named_parameters() if name == "table"]
         networks = [value for name, value in self.field.named_parameters() if name != "table"]
         spectra = [self.endmembers] if self.endmembers.requires_grad else []
         spectra += [self.specular_spectra] if self.specular_spectra.numel() else []
-        return {"grid": [self.field.table], "networks": networks, "spectra": spectra}
+        return {"grid": table, "networks": networks, "spectra": spectra}
+
+    @property
+    def renderer(self) -> VolumeRenderer:
+        """How rays are rendered at present; its grid follows the training."""
+        if self._renderer is None or self._renderer.occupied is not self.grid.occupied:
+            config = self.config
+            self._renderer = VolumeRenderer(
+                self.scene_box.to(self.device),
+                self.grid.occupied,
+                self.grid.reachable,
+                self.step,
+                choose(config.renderer.smallest_weight, self.preset.smallest_weight),
+                config.losses.background == "last",
+                config.eval_num_rays_per_chunk,
+            )
+        return self._renderer
 
     @property
     def materials(self) -> Materials:
         """The spectra that coefficients are multiplied with."""
-        specular_spectra = self.every_band if self.config.specular == "full" else self.specular_spectra
         light = self.metadata["illuminant"]
         return Materials(
             self.bands,
             self.endmembers,
-            specular_spectra,
+            self.every_band if self.config.specular == "full" else self.specular_spectra,
             self.config.segmentation,
-            self.endmember_names,
-            None if light is None else self.endmembers.new_tensor(light),
-            self.mixture_guide.lead_error if self.config.abundance_loss_weight > 0 else None,
+            light=None if light is None else self.endmembers.new_tensor(light),
+            margin_error=margin_error(self.margin_variance) if self.config.losses.abundances > 0 else None,
         )
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
-        """`spectral` (R, B) on black, `abundances` (R, K), `accumulation` (R), and `haze` and `num_samples`, one
-        number each."""
-        rendered: RenderedRays = self.renderer(self.field, ray_bundle)
+        """`spectral` (R, B) on black, `abundances` (R, K), `accumulation` (R), `spread` and `num_samples`, one number
+        each, and of the samples that carry weight `positions`, `weights` and `views` (S)."""
+        generator = self.generator if self.training else None
+        rendered = self.renderer.render(self.field, ray_bundle, generator)
         coefficients = rendered.coefficients
         return {
-            "spectral": spectral(coefficients, self.materials),
+            "spectral": self.materials.spectra(coefficients),
             "accumulation": coefficients.accumulation,
             "abundances": coefficients.abundances,
-            "haze": rendered.haze,
+            "spread": rendered.spread,
             "num_samples": torch.tensor(rendered.num_samples),
+            "positions": rendered.positions,
+            "weights": rendered.weights,
+            "views": ray_bundle.camera_indices.index_select(0, rendered.ray_indices),
         }
 
     def get_loss_dict(
@@ -240,16 +254,37 @@ class UnmixModel(Model):
         batch: dict[str, Tensor],
         metrics_dict: dict[str, Tensor] | None = None,
     ) -> dict[str, Tensor]:
-        """Weighted errors of spectra and what else training asks for, see training_losses.py."""
-        return training_losses(
-            self.config,
-            outputs,
-            batch,
-            has_alpha=self.metadata["has_alpha"],
-            progress=self._progress,
-            rgb_weights=self.rgb_weights,
-            guide=self.mixture_guide,
+        """Weighted losses by name; those of no weight are left out. See training_losses.py."""
+        config, measured = self.config.losses, batch["spectra"]
+        weights = {name: x for name, x in config.weights(self.preset, self._progress).items() if x > 0}
+        background = choose(config.background, self.preset.background)
+        pixels = compare_pixels(
+            outputs["spectral"], outputs["accumulation"], batch, background, self.generator
         )
+        losses = spectral_losses(pixels, measured, self.rgb_weights, set(weights))
+        if "spread" in weights:
+            losses["spread"] = outputs["spread"]
+        if "abundances" in weights:
+            abundances = pixel_mean(outputs["abundances"], len(measured))
+            mixtures = self._measured_mixtures(batch)
+            losses["abundances"] = abundance_error(
+                abundances, mixtures, batch["alpha"], shows_a_shape(measured)
+            )
+        return {name: weights[name] * losses[name] for name in weights}
+
+    def observe(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> None:
+        """Note which cells the views see, and how far margins of abundances are from those of measured spectra."""
+        num_rays = len(outputs["accumulation"])
+        threshold = choose(self.config.renderer.visible_weight, self.preset.visible_weight)
+        if threshold < 1:
+            is_seen = outputs["weights"] > threshold
+            self.grid.visibility.record(outputs["positions"], outputs["views"], is_seen, num_rays)
+        if self.config.losses.abundances > 0:
+            few = {name: values[:_OBSERVED_PIXELS] for name, values in batch.items()}
+            abundances = pixel_mean(outputs["abundances"], len(batch["spectra"]))[:_OBSERVED_PIXELS].detach()
+            counts = shows_a_shape(few["spectra"]) & (few["alpha"] > 0.99)
+            variance = margin_variance(self.margin_variance, abundances, self._measured_mixtures(few), counts)
+            self.margin_variance.copy_(variance)
 
     def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """`psnr` of the batch in dB, on black."""
@@ -258,60 +293,34 @@ class UnmixModel(Model):
         return {"psnr": -10 * torch.log10(error.clamp(min=1e-12))}
 
     @torch.no_grad()
-    def get_image_coefficients(self, camera: Cameras, subpixels: int | None = None) -> Coefficients:
-        """Coefficients (H, W, ...) of a whole view, rendered chunk by chunk: every picture of it follows from them.
-
-        Args:
-            camera: One camera.
-            subpixels: Rays through a pixel along each of its edges, averaged; None for as many as in training.
-        """
-        count = self.metadata["subpixels"] if subpixels is None else subpixels
-        centres = [(i + 0.5) / count for i in range(count)]
-        passes = [self._coefficients_through(camera, (x, y)) for y in centres for x in centres]
-        return Coefficients.mean(passes).unflatten(camera.height, camera.width)
-
-    @torch.no_grad()
     def get_outputs_for_camera(
         self, camera: Cameras, outputs: Collection[str] | None = None
     ) -> dict[str, Tensor]:
-        """Outputs of a whole view by name, (H, W, ...).
+        """`spectral` (H, W, B) on black, `rgb` sRGB (H, W, 3) and `accumulation` (H, W) of a whole view.
 
-        Instead of the interface's way, which would carry B numbers a ray for each output, this composites a view
-        once and derives every output from its coefficients. Besides the names of `spectral.composition.compose`:
-        `depth` (H, W), distance along the viewing axis in scene units, and `normals` (H, W, 3), unit vectors in
-        model space; both 0 where nothing is.
-
-        Raises:
-            ConfigError: an unknown name.
+        For evaluation while training; `trained.TrainedScene` has all other outputs.
         """
-        coefficients = self.get_image_coefficients(camera)
-        geometric = {"depth": self._depth, "normals": self._normals}
-        return {
-            name: geometric[name](camera, coefficients)
-            if name in geometric
-            else compose(name, coefficients, self.materials)
-            for name in (DEFAULT_OUTPUTS if outputs is None else outputs)
+        seen = self.renderer.composite_view(self.field, camera, self.metadata["subpixels"])
+        linear = self.materials.through(seen, self.rgb_weights).clamp(0, 1)
+        found = {
+            "spectral": self.materials.spectra(seen),
+            "rgb": linear_to_srgb(linear),
+            "accumulation": seen.accumulation,
         }
+        return found if outputs is None else {name: found[name] for name in outputs}
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """PSNR of the view in dB, and its predicted sRGB picture."""
-        return {"psnr": psnr(outputs["spectral"], batch["spectra"])}, {"rgb": outputs["rgb"]}
+        """PSNR of the view's valid pixels in dB, and its predicted sRGB picture."""
+        return {"psnr": psnr(outputs["spectral"], batch["spectra"], batch.get("valid"))}, {
+            "rgb": outputs["rgb"]
+        }
 
     def get_training_callbacks(self) -> list[TrainingCallback]:
-        """Keep the occupancy grid up to date, and spectra in [0, 1]."""
-        return [
-            TrainingCallback(
-                TrainingCallbackLocation.BEFORE_TRAIN_ITERATION,
-                self._begin_step,
-            ),
-            TrainingCallback(TrainingCallbackLocation.AFTER_TRAIN_ITERATION, self._keep_spectra_physical),
-        ]
-
-    def _begin_step(self, step: int, progress: float) -> None:
-        self._progress = progress
-        self.renderer.update_grid(self.field, step)
+        """Keep the occupancy grid up to date, and spectra within their bounds."""
+        before, after = TrainingCallbackLocation
+        return [TrainingCallback(before, self._begin_step), TrainingCallback(after, self._bound_spectra)]
 
     def num_samples(self, outputs: dict[str, Tensor]) -> int:
         """Samples marched for `outputs`."""
@@ -325,61 +334,71 @@ class UnmixModel(Model):
 
     def warm_up(self) -> None:
         """Compile the kernels by one render along the box's diagonal and its backward pass."""
-        low, high = self.renderer.aabb[0], self.renderer.aabb[1]
+        low, high = self.renderer.box.aabb
         direction = torch.nn.functional.normalize(high - low, dim=0)
-        indices = torch.zeros(1, dtype=torch.int64, device=low.device)
-        bundle = RayBundle((low - direction)[None], direction[None], indices)
-        was_training = self.training
-        self.eval()  # a ray of no view is nothing to be remembered
+        bundle = RayBundle(
+            (low - direction)[None], direction[None], torch.zeros(1, dtype=torch.int64, device=low.device)
+        )
         with torch.enable_grad():
+            spectra = self.materials.spectra(self.renderer.render(self.field, bundle).coefficients)
             parameters = [value for group in self.get_param_groups().values() for value in group]
-            torch.autograd.grad(self.get_outputs(bundle)["spectral"].sum(), parameters, allow_unused=True)
-        self.train(was_training)
+            torch.autograd.grad(spectra.sum(), parameters, allow_unused=True)
 
-    def _coefficients_through(self, camera: Cameras, offset: tuple[float, float]) -> Coefficients:
-        bundle = camera.to(self.device).image_rays(0, offset)
-        return self.renderer.in_chunks(self.field, bundle, self.config.eval_num_rays_per_chunk)
+    def _begin_step(self, step: int, progress: float) -> None:
+        self._progress = progress
+        config = self.config.renderer
+        if step % config.grid_update_interval:
+            return
+        box = self.renderer.box
+        seed = int(torch.randint(2**62, (1,), generator=self.generator, device=self._generator_device))
+        self.grid.update(
+            lambda points: self.field.get_density(points * box.size + box.aabb[0])[0],
+            threshold=-math.log1p(-config.grid_smallest_opacity) / self.step,
+            decay=config.grid_decay,
+            num_cells=config.grid_probed_cells,
+            generator=torch.Generator().manual_seed(seed),
+        )
+
+    @property
+    def _generator_device(self) -> torch.device:
+        return torch.device("cpu") if self.generator is None else self.generator.device
+
+    @torch.no_grad()
+    def _bound_spectra(self, step: int, progress: float) -> None:
+        self.endmembers.clamp_(min=0.0).clamp_(max=self.endmember_bound)
+        self.specular_spectra.clamp_(0, 1)
+
+    def _measured_mixtures(self, batch: dict[str, Tensor]) -> Float[Tensor, "R K"]:
+        """What the pixels of a batch are made of, by the first endmembers."""
+        if self._mixtures is None:
+            self._mixtures = MixtureCache(self.num_endmembers, self.device)
+        return self._mixtures.mixtures(batch["pixels"], batch["spectra"], self.first_endmembers, self.penalty)
+
+    def _checked_num_endmembers(self) -> int:
+        count = self.config.num_endmembers
+        if count == "auto":
+            raise ConfigError("num-endmembers is auto: call resolve_auto first")
+        if count > len(self.bands):
+            raise ConfigError(
+                f"num-endmembers is {count} but the scene has {len(self.bands)} bands; "
+                f"choose at most {len(self.bands)}"
+            )
+        return count
 
     def _num_dictionary_spectra(self) -> int:
         if self.config.specular != "dictionary":
             return 0
         if self.config.num_specular_spectra == "auto":
-            return 1 if self.metadata["has_alpha"] else 1 + self.num_endmembers
+            return 1 + self.num_endmembers if self.preset.specular_endmembers else 1
         return self.config.num_specular_spectra
 
-    def _guess_endmembers(
+    def _first_endmembers(
         self, pixels: Float[Tensor, "N B"], lamp: Float[Tensor, "B"], generator: torch.Generator
     ) -> Float[Tensor, "K B"]:
         config = self.config
         if config.endmember_file is None:
             assert config.endmember_init != "file"
             return initialise_endmembers(pixels, self.num_endmembers, config.endmember_init, generator)
-        table = read_spectra_csv(config.endmember_file).resampled(self.bands)
-        if len(table.names) != self.num_endmembers:
-            raise ConfigError(
-                f"{config.endmember_file} has {len(table.names)} spectra but num-endmembers is "
-                f"{self.num_endmembers}; give both the same number"
-            )
-        return (torch.as_tensor(table.spectra, dtype=torch.float32) * lamp).clamp(0, 1)
-
-    def _depth(self, camera: Cameras, coefficients: Coefficients) -> Float[Tensor, "H W"]:
-        bundle = camera.to(self.device).image_rays(0)
-        forward = -camera.camera_to_world[0, :, 2].to(self.device)
-        along_axis = (bundle.directions @ forward).unflatten(0, (camera.height, camera.width))
-        return compose("ray_distance", coefficients, self.materials) * along_axis
-
-    def _normals(self, camera: Cameras, coefficients: Coefficients) -> Float[Tensor, "H W 3"]:
-        bundle = camera.to(self.device).image_rays(0)
-        distance = compose("ray_distance", coefficients, self.materials).flatten()
-        chunk = self.config.eval_num_rays_per_chunk
-        parts = [
-            self.renderer.normals(self.field, bundle[i : i + chunk], distance[i : i + chunk])
-            for i in range(0, len(bundle), chunk)
-        ]
-        normals = torch.cat(parts) * (coefficients.accumulation.flatten() > OCCUPIED_ACCUMULATION)[:, None]
-        return normals.unflatten(0, (camera.height, camera.width))
-
-    @torch.no_grad()
-    def _keep_spectra_physical(self, step: int, progress: float) -> None:
-        self.endmembers.clamp_(0, 1)
-        self.specular_spectra.clamp_(0, 1)
+        return given_endmembers(
+            config.endmember_file, self.num_endmembers, self.bands, lamp, pixels, generator
+        )

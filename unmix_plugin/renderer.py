@@ -7,23 +7,25 @@ only those go through the heads and the backward pass. The cost of a sample does
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
 
+from unmix_plugin.alpha_preset import Auto
+from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.errors import require
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.rendering.compositing import accumulate, volume_weights
+from unmix_plugin.rendering.grid_cells import cells_at
 from unmix_plugin.rendering.marching import PackedSamples, march
-from unmix_plugin.rendering.occupancy import OccupancyGrid
-from unmix_plugin.spectral.composition import Coefficients
+from unmix_plugin.spectral.coefficients import Coefficients
 
-_HAZE_DEPTH = 0.03
-"""Optical depth of a sample from which on haze grows slower than matter does."""
+_SPREAD_DEPTH = 0.03
+"""Optical depth of a sample from which on its part of the spread grows slower than the depth."""
 
 
 @dataclass(frozen=True)
@@ -32,10 +34,12 @@ class RendererConfig:
 
     samples_per_pixel: float = 1.5
     """Samples of a ray along the length of a pixel's edge where it meets the middle of the scene box."""
-    smallest_weight: float = 4e-3
-    """Samples that send less than this part of their ray's light to the camera are left out."""
-    open_smallest_weight: float = 1e-3
-    """The same in scenes without alpha, where matter has to be found far behind fog: a sample left out can't grow."""
+    smallest_weight: float | Auto = "auto"
+    """Samples that contribute less than this share of their ray's light are left out. Auto is 0.004 where alpha is
+    known, else 0.001."""
+    visible_weight: float | Auto = "auto"
+    """Share of its ray's light from which a sample counts as seen. Cells that no two training views have lately seen
+    are left out; 1 leaves none out. Auto is 0.05 where alpha is known, else 1."""
     grid_update_interval: int = 16
     """Steps between updates of the occupancy grid."""
     grid_probed_cells: int = 32_768
@@ -44,9 +48,24 @@ class RendererConfig:
     """Factor on the remembered density of a probed cell: lower forgets emptied space sooner."""
     grid_smallest_opacity: float = 0.03
     """Opacity of one sample's interval from which a cell counts as occupied."""
-    seen_weight: float = 0.05
-    """Part of its ray's light from which on a sample is seen. In scenes with alpha, cells that no two training views
-    have lately seen are left out; 1 leaves none out."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible settings.
+
+        Raises:
+            ConfigError: a number out of its range.
+        """
+        rules = {
+            "samples-per-pixel of 0.01 to 100": 0.01 <= self.samples_per_pixel <= 100,
+            "smallest-weight in [0, 1) or auto": self.smallest_weight == "auto"
+            or 0 <= self.smallest_weight < 1,
+            "visible-weight in (0, 1] or auto": self.visible_weight == "auto" or 0 < self.visible_weight <= 1,
+            "grid-update-interval of at least 1": self.grid_update_interval >= 1,
+            "grid-probed-cells of at least 2": self.grid_probed_cells >= 2,
+            "grid-decay in [0, 1]": 0 <= self.grid_decay <= 1,
+            "grid-smallest-opacity in (0, 1)": 0 < self.grid_smallest_opacity < 1,
+        }
+        require("the renderer", rules)
 
 
 @dataclass(frozen=True)
@@ -56,143 +75,143 @@ class RenderedRays:
     coefficients: Coefficients
     num_samples: int
     """Samples marched for all rays."""
-    haze: Float[Tensor, ""]
+    spread: Float[Tensor, ""]
     """Sum of log(1 + tau / 0.03) over the samples of a ray that carry weight, tau their optical depth; mean over rays.
-    The same light stopped by few samples gives less of it than by many: surfaces little, fog much."""
+    The same light stopped by few samples gives less of it than by many: surfaces little, floaters much."""
+    positions: Float[Tensor, "S 3"]
+    """Samples that carry weight, in the unit cube."""
+    weights: Float[Tensor, "S"]
+    """Share of its ray's light that each contributes."""
+    ray_indices: Int[Tensor, "S"]
+    """Ray of each."""
 
 
-class CoefficientRenderer(nn.Module):
-    """Volume renderer of a field's coefficients, with the occupancy grid that it keeps."""
+@dataclass(frozen=True)
+class VolumeRenderer:
+    """Volume renderer of a field's coefficients: pure functions of its values, the field and the rays."""
 
-    aabb: Tensor
+    box: SceneBox
+    """What is rendered, model space."""
+    occupied: UInt8[Tensor, "X Y Z"]
+    """Cells of the box that rays are sampled in; others are empty."""
+    reachable: Bool[Tensor, "X Y Z"]
+    """Cells that were not carved away before training."""
+    step: float
+    """Distance of samples, model units."""
+    smallest_weight: float
+    """Samples that contribute less are left out."""
+    residual_on_last_sample: bool = False
+    """Whether the last sample of a ray takes all the light that is left."""
+    rays_per_chunk: int = 8192
+    """Rays rendered at once for a whole image; fewer take less memory."""
 
-    def __init__(
-        self,
-        config: RendererConfig,
-        scene_box: SceneBox,
-        pixel_size: float,
-        grid_resolution: int,
-        is_open: bool,
-        close_rays: bool,
-    ) -> None:
-        """
-        Args:
-            config: Sampling.
-            scene_box: What is rendered, model space.
-            pixel_size: Edge of a pixel in the middle of the scene, scene units.
-            grid_resolution: Cells along an edge of the occupancy grid.
-            is_open: No hull of the objects is known.
-            close_rays: The last sample of a ray takes all the light that is left.
-        """
-        super().__init__()
-        self.config = config
-        self.is_open, self.close_rays = is_open, close_rays
-        self.step = pixel_size / config.samples_per_pixel
-        self.grid = OccupancyGrid(torch.ones((grid_resolution,) * 3, dtype=torch.bool))
-        self.register_buffer("aabb", scene_box.aabb.clone(), persistent=False)
-        self._scene_box = scene_box
-
-    def carve(self, reachable: Bool[Tensor, "X Y Z"]) -> None:
-        """Start from a grid of which only some cells may ever hold matter."""
-        self.grid = OccupancyGrid(reachable).to(self.aabb.device)
-
-    def forward(self, field: CoefficientField, ray_bundle: RayBundle) -> RenderedRays:
+    def render(
+        self, field: CoefficientField, ray_bundle: RayBundle, generator: torch.Generator | None = None
+    ) -> RenderedRays:
         """Composited coefficients of each ray.
 
-        In training mode the samples of each ray are shifted at random, drawn from torch's global generator.
+        Args:
+            field: What is rendered.
+            ray_bundle: R rays.
+            generator: Shifts the samples of each ray at random, as training wants it; None takes them as they are.
         """
-        samples = self._march(ray_bundle)
+        samples = self._march(ray_bundle, generator)
         kept, encoded = self._carrying_weight(field, samples, ray_bundle)
         positions, along = _points(kept, ray_bundle)
         densities, features = field.density_of(field.encode(positions, encoded))
         depths = densities * self.step
         weights = volume_weights(depths, kept.packed_info)
-        self._note_what_is_seen(kept, positions, weights, ray_bundle)
         outputs = field.get_outputs(positions, along, features)
-        names = ("abundances", "scaled_abundances", "specular_coefficients")
-        columns = [torch.ones_like(kept.t)[:, None], kept.t[:, None], *(outputs[name] for name in names)]
-        values = torch.cat(columns, dim=-1)
-        totals = accumulate(weights, values, kept.packed_info)
-        if self.close_rays:
-            totals = totals + _rest_on_last_sample(totals[:, 0], values, kept)
-        parts = totals.split([column.shape[1] for column in columns], dim=-1)
-        haze = torch.log1p(depths / _HAZE_DEPTH).sum() / max(len(ray_bundle), 1)
-        return RenderedRays(Coefficients(parts[0][:, 0], parts[1][:, 0], *parts[2:]), len(samples), haze)
-
-    def in_chunks(self, field: CoefficientField, ray_bundle: RayBundle, chunk: int) -> Coefficients:
-        """Composited coefficients of each ray, with `chunk` rays at a time in memory."""
-        bundles = (ray_bundle[i : i + chunk] for i in range(0, len(ray_bundle), chunk))
-        return Coefficients.concatenate([self(field, bundle).coefficients for bundle in bundles])
-
-    def update_grid(self, field: CoefficientField, step: int) -> None:
-        """Probe the field where the grid's turn has come."""
-        interval = self.config.grid_update_interval
-        if step % interval:
-            return
-        self.grid.update(
-            lambda points: field.get_density(points * self._size + self.aabb[0])[0],
-            threshold=-math.log1p(-self.config.grid_smallest_opacity) / self.step,
-            decay=self.config.grid_decay,
-            num_cells=self.config.grid_probed_cells,
-            generator=torch.Generator().manual_seed(int(torch.randint(2**62, (1,)))),
+        ones = torch.ones_like(kept.t)
+        values = Coefficients.of(
+            ones,
+            kept.t,
+            outputs["abundances"],
+            outputs["scaled_abundances"],
+            outputs["specular_coefficients"],
         )
+        totals = accumulate(weights, values.packed, kept.packed_info)
+        if self.residual_on_last_sample:
+            totals = totals + _residual_transmittance(totals[:, 0], values.packed, kept)
+        return RenderedRays(
+            Coefficients(totals, values.num_endmembers),
+            len(samples),
+            torch.log1p(depths / _SPREAD_DEPTH).sum() / max(len(ray_bundle), 1),
+            self.box.normalise(positions).detach(),
+            weights.detach(),
+            kept.ray_indices,
+        )
+
+    @torch.no_grad()
+    def composite(self, field: CoefficientField, ray_bundle: RayBundle) -> Coefficients:
+        """Coefficients (R, ...) of each ray, few rays at a time in memory."""
+        chunk = self.rays_per_chunk
+        starts = range(0, max(len(ray_bundle), 1), chunk)
+        parts = [self.render(field, ray_bundle[i : i + chunk]).coefficients for i in starts]
+        return Coefficients.concatenate(parts)
+
+    @torch.no_grad()
+    def composite_view(self, field: CoefficientField, camera: Cameras, subpixels: int = 1) -> Coefficients:
+        """Coefficients (H, W, ...) of a whole view: every picture of it follows from them.
+
+        Args:
+            field: What is rendered.
+            camera: One camera.
+            subpixels: Rays through a pixel along each of its edges, averaged: all outputs but ratios are linear.
+        """
+        camera = camera.to(self.occupied.device)
+        centres = [(i + 0.5) / subpixels for i in range(subpixels)]
+        total: Coefficients | None = None
+        for offset in [(x, y) for y in centres for x in centres]:
+            found = self.composite(field, camera.image_rays(0, offset))
+            total = found if total is None else found.map(total.packed.add_)
+        assert total is not None
+        return total.map(lambda packed: packed / subpixels**2).unflatten(camera.height, camera.width)
 
     @torch.no_grad()
     def normals(
         self, field: CoefficientField, ray_bundle: RayBundle, ray_distance: Float[Tensor, "R"]
     ) -> Float[Tensor, "R 3"]:
         """Unit normals in model space where the rays end: against the gradient of the log density."""
-        with torch.enable_grad():
-            ends = ray_bundle.origins + ray_distance[:, None] * ray_bundle.directions
-            positions = ends.detach().requires_grad_()
-            log_density = field.get_density(positions)[0].clamp(min=1e-20).log().sum()
-            (gradient,) = torch.autograd.grad(log_density, positions)
-        return torch.nn.functional.normalize(-gradient, dim=-1)
+        chunk, parts = self.rays_per_chunk, []
+        for i in range(0, len(ray_bundle), chunk):
+            rays, distance = ray_bundle[i : i + chunk], ray_distance[i : i + chunk]
+            with torch.enable_grad():
+                positions = (rays.origins + distance[:, None] * rays.directions).detach().requires_grad_()
+                log_density = field.get_density(positions)[0].clamp(min=1e-20).log().sum()
+                (gradient,) = torch.autograd.grad(log_density, positions)
+            parts.append(torch.nn.functional.normalize(-gradient, dim=-1))
+        return torch.cat(parts)
 
-    @property
-    def _box(self) -> SceneBox:
-        """The scene box where the model is; made once a device, since a box looks at its corners on the host."""
-        if self._scene_box.aabb is not self.aabb:
-            self._scene_box = SceneBox(self.aabb)
-        return self._scene_box
+    def is_occupied(self, positions: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
+        """Points in the box, in cells that rays are sampled in."""
+        return self._lie_in(self.occupied > 0, positions)
 
-    @property
-    def _size(self) -> Float[Tensor, "3"]:
-        return self.aabb[1] - self.aabb[0]
+    def is_reachable(self, positions: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
+        """Points in the box, in cells that were not carved away before training."""
+        return self._lie_in(self.reachable, positions)
 
-    def _unit(self, positions: Float[Tensor, "S 3"]) -> Float[Tensor, "S 3"]:
-        """Positions with the box as the unit cube."""
-        return (positions - self.aabb[0]) / self._size
+    def _lie_in(self, cells: Bool[Tensor, "X Y Z"], positions: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
+        unit = self.box.normalise(positions)
+        return self.box.contains(positions) & cells[cells_at(unit, cells.shape).unbind(-1)]
 
-    def _march(self, ray_bundle: RayBundle) -> PackedSamples:
+    def _march(self, ray_bundle: RayBundle, generator: torch.Generator | None) -> PackedSamples:
         origins, directions = ray_bundle.origins, ray_bundle.directions
-        t_near, t_far = self._box.intersect(origins, directions)
-        jitter = torch.rand_like(t_near) if self.training else torch.full_like(t_near, 0.5)
-        unit_origins, unit_directions = self._unit(origins), directions / self._size
-        return march(unit_origins, unit_directions, t_near, t_far, jitter, self.grid.occupied, self.step)
-
-    def _note_what_is_seen(
-        self,
-        samples: PackedSamples,
-        positions: Float[Tensor, "S 3"],
-        weights: Float[Tensor, "S"],
-        ray_bundle: RayBundle,
-    ) -> None:
-        """While training, where a hull of the objects is known: in a room, walls must be found far behind fog."""
-        if self.training and not self.is_open and self.config.seen_weight < 1:
-            views = ray_bundle.camera_indices.index_select(0, samples.ray_indices)
-            seen = weights.detach() > self.config.seen_weight
-            self.grid.sight.record(self._unit(positions), views, seen, len(ray_bundle))
+        t_near, t_far = self.box.intersect(origins, directions)
+        jitter = torch.full_like(t_near, 0.5)
+        if generator is not None:
+            jitter = torch.rand(t_near.shape, generator=generator, device=generator.device).to(t_near)
+        unit_origins, unit_directions = self.box.normalise(origins), directions / self.box.size
+        return march(unit_origins, unit_directions, t_near, t_far, jitter, self.occupied, self.step)
 
     @torch.no_grad()
     def _carrying_weight(
         self, field: CoefficientField, samples: PackedSamples, ray_bundle: RayBundle
     ) -> tuple[PackedSamples, Float[Tensor, "kept LF"]]:
-        """The samples that send enough of their ray's light to the camera, and their encodings."""
+        """The samples that contribute enough of their ray's light, and their encodings."""
         encoded = field.encode(_points(samples, ray_bundle)[0])
         densities, _ = field.density_of(encoded)
-        smallest = self.config.open_smallest_weight if self.is_open else self.config.smallest_weight
-        keep = volume_weights(densities * self.step, samples.packed_info) > smallest
+        keep = volume_weights(densities * self.step, samples.packed_info) > self.smallest_weight
         return samples.select(keep), encoded.index_select(0, keep.nonzero()[:, 0])
 
 
@@ -207,7 +226,7 @@ def _points(
     return origins + samples.t[:, None] * along, along
 
 
-def _rest_on_last_sample(
+def _residual_transmittance(
     accumulation: Float[Tensor, "R"], values: Float[Tensor, "S C"], samples: PackedSamples
 ) -> Float[Tensor, "R C"]:
     """What the last sample of each ray adds if it takes all the light left; 0 for rays without samples."""

@@ -12,128 +12,122 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from unmix_plugin.alpha_preset import AlphaPreset, Auto, choose
+from unmix_plugin.errors import require
 from unmix_plugin.spectral.losses import forgive_saturation, over_background, solid_evidence, srgb_error
-from unmix_plugin.spectral.unmixing.mixture_guide import MixtureGuide
 
-_RGB_WEIGHT_WITH_ALPHA = 0.2
+Background = Literal["random", "black", "white", "last"]
 
 
 @dataclass(frozen=True)
-class LossSettings:
-    """Weights of the losses and how they change while training goes on."""
+class LossConfig:
+    """Weights of the losses and how they change during training."""
 
-    background: Literal["auto", "random", "black", "white", "last"] = "auto"
+    background: Background | Auto = "auto"
     """What lies behind the scene in training: a random grey a ray, black, white, or the colour of the last sample. Auto
-    is random where alpha says what is transparent, else black: random greys would reward fog before the cameras."""
-    spectral_loss_weight: float = 1.0
+    is random where alpha is known, else black."""
+    spectral: float = 1.0
     """Weight of the mean squared error of spectra."""
-    rgb_loss_weight: float | Literal["auto"] = "auto"
+    rgb: float | Auto = "auto"
     """Weight of the mean squared error of their sRGB colours, in which dark pixels count more. Auto is 0.2 where alpha
     is known, else 0: where black may be the void, it costs quality."""
-    opacity_loss_weight: float = 0.01
-    """Weight of the mean squared transparency in scenes without alpha, where pixels aren't dark: light comes from
-    something solid, but black may be the void."""
-    haze_loss_weight: float = 1e-3
-    """Weight at the start of training of matter spread along rays in scenes without alpha, where no hull keeps fog out;
-    falls to 0 at `haze_loss_until`."""
-    haze_loss_until: float = 0.25
-    """Part of the training in which haze is penalised: later it would thin out surfaces."""
-    abundance_loss_weight: float = 0.1
+    opacity: float | Auto = "auto"
+    """Weight of the mean squared transparency of pixels that are not dark: light comes from something solid. Auto is
+    0.01 where alpha is unknown, else 0."""
+    spread: float | Auto = "auto"
+    """Weight, at the start of training, of density spread along rays, which removes floaters; falls to 0 at
+    `spread_until`. Auto is 0.001 where alpha is unknown, else 0."""
+    spread_until: float = 0.25
+    """Part of the training in which spread density is penalised: later it would thin out surfaces."""
+    abundances: float = 0.1
     """Weight of the mean squared distance of composited abundances to those of the measured spectra, unmixed one by
     one with the first endmembers; 0 as published."""
-    abundance_loss_final_factor: float = 0.1
+    abundances_final_factor: float = 0.1
     """Factor on that weight at the end of training, reached exponentially: once materials are found, what is left of
     their disagreement with single pixels holds spectra back."""
     mixing_penalty: float = 2.0
     """By how much a further material must improve the fit of such a spectrum, in multiples of the mean angle that
     mixtures of two leave unexplained where that is 0.02 rad; less where it is less, more where it is more."""
 
-    def loss_rules(self) -> dict[str, bool]:
-        """What the settings must keep to, and whether they do."""
+    def __post_init__(self) -> None:
+        """Refuse impossible settings.
+
+        Raises:
+            ConfigError: a number out of its range.
+        """
+        weights = (self.spectral, self.rgb, self.opacity, self.spread, self.abundances, self.mixing_penalty)
+        rules = {
+            "weights of at least 0": all(weight == "auto" or weight >= 0 for weight in weights),
+            "spread-until in (0, 1]": 0 < self.spread_until <= 1,
+            "abundances-final-factor in (0, 1]": 0 < self.abundances_final_factor <= 1,
+        }
+        require("the losses", rules)
+
+    def weights(self, preset: AlphaPreset, progress: float) -> dict[str, float]:
+        """Weight of each loss when that part of the training is over, by name."""
+        left = max(1 - progress / self.spread_until, 0.0)
         return {
-            "loss weights and the mixing-penalty of at least 0": min(
-                self.spectral_loss_weight,
-                self.rgb_weight(has_alpha=True),
-                self.opacity_loss_weight,
-                self.haze_loss_weight,
-                self.abundance_loss_weight,
-                self.mixing_penalty,
-            )
-            >= 0,
-            "haze-loss-until in (0, 1]": 0 < self.haze_loss_until <= 1,
-            "abundance-loss-final-factor in (0, 1]": 0 < self.abundance_loss_final_factor <= 1,
+            "spectral": self.spectral,
+            "rgb": choose(self.rgb, preset.rgb_loss_weight),
+            "opacity": choose(self.opacity, preset.opacity_loss_weight),
+            "spread": choose(self.spread, preset.spread_loss_weight) * left**2,
+            "abundances": self.abundances * self.abundances_final_factor**progress,
         }
 
-    def rgb_weight(self, has_alpha: bool) -> float:
-        """Weight of the error of colours in a scene with or without alpha."""
-        if self.rgb_loss_weight == "auto":
-            return _RGB_WEIGHT_WITH_ALPHA if has_alpha else 0.0
-        return self.rgb_loss_weight
 
-    def haze_weight(self, progress: float) -> float:
-        """Weight of the haze when that part of the training is over: falls with the square of the time left."""
-        left = max(1 - progress / self.haze_loss_until, 0.0)
-        return self.haze_loss_weight * left**2
+@dataclass(frozen=True)
+class PixelComparison:
+    """Rendered and measured pixels of a batch over one background."""
 
-    def abundance_weight(self, progress: float) -> float:
-        """Weight of the guide of abundances when that part of the training is over."""
-        return self.abundance_loss_weight * self.abundance_loss_final_factor**progress
+    predicted: Float[Tensor, "R B"]
+    target: Float[Tensor, "R B"]
+    opacities: Float[Tensor, "R"]
+    """Rendered."""
 
 
-def training_losses(
-    settings: LossSettings,
-    outputs: dict[str, Tensor],
+def compare_pixels(
+    spectra: Float[Tensor, "S B"],
+    accumulation: Float[Tensor, "S"],
     batch: dict[str, Tensor],
-    *,
-    has_alpha: bool,
-    progress: float,
-    rgb_weights: Float[Tensor, "B 3"],
-    guide: MixtureGuide,
-) -> dict[str, Tensor]:
-    """Weighted losses by name; those of no weight are left out.
+    background: Background,
+    generator: torch.Generator | None,
+) -> PixelComparison:
+    """Lay rendered and measured pixels over one background; saturated pixels can't be exceeded.
 
     Args:
-        outputs: Of rays, P for each pixel: `spectral`, `accumulation`, and `abundances` and `haze` if they have weight.
+        spectra, accumulation: Of rays, P for each pixel.
         batch: `spectra` (R, B) and `alpha` (R) of the pixels.
-        has_alpha: Whether alpha was measured; else 1 - opacity and haze are penalised.
-        progress: Part of the training that is over.
-        rgb_weights: From spectra to linear sRGB.
-        guide: What the measured spectra say about abundances.
+        background: What lies behind both.
+        generator: Source of random greys.
     """
-    num_pixels = len(batch["spectra"])
-    spectra = pixel_mean(outputs["spectral"], num_pixels)
-    opacities = pixel_mean(outputs["accumulation"], num_pixels)
-    background = _background(settings, opacities, has_alpha)
-    target = over_background(batch["spectra"], batch["alpha"], background)
-    predicted = over_background(spectra, opacities, background)
-    predicted = forgive_saturation(predicted, target, batch["spectra"])
-    losses = {"spectral": settings.spectral_loss_weight * (predicted - target).square().mean()}
-    rgb_weight = settings.rgb_weight(has_alpha)
-    if rgb_weight > 0:
-        losses["rgb"] = rgb_weight * srgb_error(predicted, target, rgb_weights)
-    if settings.opacity_loss_weight > 0 and not has_alpha:
-        shown = solid_evidence(batch["spectra"])
-        losses["opacity"] = settings.opacity_loss_weight * (shown * (1 - opacities).square()).mean()
-    haze_weight = 0.0 if has_alpha else settings.haze_weight(progress)
-    if haze_weight > 0:
-        losses["haze"] = haze_weight * outputs["haze"]
-    if settings.abundance_loss_weight > 0:
-        abundances = pixel_mean(outputs["abundances"], num_pixels)
-        error = guide.error(abundances, batch["spectra"], batch["alpha"])
-        losses["abundances"] = settings.abundance_weight(progress) * error
+    measured = batch["spectra"]
+    opacities = pixel_mean(accumulation, len(measured))
+    grey = torch.zeros_like(opacities)[:, None]
+    if background == "random":
+        device = grey.device if generator is None else generator.device
+        grey = torch.rand(grey.shape, generator=generator, device=device).to(grey)
+    elif background == "white":
+        grey = grey + 1
+    target = over_background(measured, batch["alpha"], grey)
+    predicted = over_background(pixel_mean(spectra, len(measured)), opacities, grey)
+    return PixelComparison(forgive_saturation(predicted, target, measured), target, opacities)
+
+
+def spectral_losses(
+    pixels: PixelComparison,
+    measured: Float[Tensor, "R B"],
+    rgb_weights: Float[Tensor, "B 3"],
+    wanted: set[str],
+) -> dict[str, Tensor]:
+    """Those of `spectral`, `rgb` and `opacity` that are wanted, not yet weighted."""
+    losses = {"spectral": (pixels.predicted - pixels.target).square().mean()}
+    if "rgb" in wanted:
+        losses["rgb"] = srgb_error(pixels.predicted, pixels.target, rgb_weights)
+    if "opacity" in wanted:
+        losses["opacity"] = (solid_evidence(measured) * (1 - pixels.opacities).square()).mean()
     return losses
 
 
 def pixel_mean(values: Float[Tensor, "S *channels"], num_pixels: int) -> Float[Tensor, "R *channels"]:
     """Means over the rays cast through each pixel, which follow each other."""
     return values.unflatten(0, (num_pixels, -1)).mean(dim=1)
-
-
-def _background(
-    settings: LossSettings, opacities: Float[Tensor, "R"], has_alpha: bool
-) -> Float[Tensor, "R 1"]:
-    """The grey that both sides of the comparison are laid over."""
-    shade = torch.zeros_like(opacities)[:, None]
-    if settings.background == "random" or (settings.background == "auto" and has_alpha):
-        return torch.rand_like(shade)
-    return shade + 1 if settings.background == "white" else shade

@@ -18,7 +18,7 @@ SMALL_METHOD = [
     "--pipeline.model.field.log2-rows-per-level=10",
     "--pipeline.model.field.cells-per-pixel=1.0",
     "--pipeline.model.field.hidden-width=16",
-    "--pipeline.datamanager.carving-resolution=32",
+    "--pipeline.datamanager.grid-resolution=32",
     "--device=cpu",
 ]
 """Options that make `unmix-nerf` train in a moment."""

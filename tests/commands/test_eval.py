@@ -51,9 +51,7 @@ def test_figures_are_means_over_the_views_of_what_the_model_renders(evaluated):
     scene = loaded.pipeline.datamanager.scene
     expected = []
     for index in scene.eval_indices:
-        predicted = loaded.pipeline.model.get_outputs_for_camera(scene.cameras[index], ["spectral"])[
-            "spectral"
-        ]
+        predicted = loaded.pipeline.model.get_outputs_for_camera(scene.cameras[index])["spectral"]
         expected.append(psnr(predicted, torch.from_numpy(scene.cube(index))))
     assert [view["psnr"] for view in metrics["per_view"]] == pytest.approx(expected, rel=1e-6)
     assert metrics["psnr"] == pytest.approx(sum(expected) / 2, rel=1e-6)

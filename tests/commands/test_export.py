@@ -10,22 +10,20 @@ from PIL import Image
 
 from tests.commands.running import picture_size, run
 from unmix_plugin.commands.export import export
-from unmix_plugin.engine.runs.load_run import load_model
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
+from unmix_plugin.trained.open_run import load_run
 
 
 @pytest.fixture(scope="module")
 def model_outputs(trained):
     """What the trained model renders of its evaluation views, by view name."""
-    loaded = load_model(trained.run, "cpu")
+    loaded = load_run(trained.run, "cpu")
     names = ["eval_002", "eval_006"]
     outputs = ["abundances", "accumulation", "segmentation"]
     return {
         name: {
             key: value.numpy()
-            for key, value in loaded.model.get_outputs_for_camera(
-                loaded.scene.eval_cameras[index], outputs
-            ).items()
+            for key, value in loaded.scene.render(loaded.record.eval_cameras[index], outputs).items()
         }
         for index, name in enumerate(names)
     }

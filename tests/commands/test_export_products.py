@@ -17,11 +17,10 @@ from tests.products.mesh_reading import loaded_mesh
 from tests.products.report.page_outline import assert_self_contained
 from unmix_plugin.commands.export import PRODUCTS, export
 from unmix_plugin.commands.train import train
-from unmix_plugin.engine.runs.load_run import load_model
 from unmix_plugin.scenes import load_scene
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.scenes.scene import SceneOptions
-from unmix_plugin.trained.run_materials import materials_of
+from unmix_plugin.trained.open_run import load_run, open_run
 
 SMALL = {
     "cubes": ["--formats", "envi", "exr", "npy"],
@@ -134,8 +133,8 @@ def test_more_views_are_segmented_into_a_folder_with_the_same_legend(trained, tm
 
 
 def test_cubes_are_what_the_model_renders(trained, exported):
-    loaded = load_model(trained.run, "cpu")
-    expected = loaded.model.get_outputs_for_camera(loaded.scene.eval_cameras[0], ["spectral"])["spectral"]
+    loaded = load_run(trained.run, "cpu")
+    expected = loaded.scene.render(loaded.record.eval_cameras[0], ["spectral"])["spectral"]
     base = exported[0] / "cubes" / "eval_002"
     np.testing.assert_array_equal(np.load(f"{base}.npy"), expected)
     from_envi: Any = envi.open(f"{base}.hdr", f"{base}.img")
@@ -198,7 +197,7 @@ def test_a_view_goes_by_its_number_too_and_a_point_by_its_coordinates(trained, t
 
 
 def test_own_reflectances_are_compared_with_too(trained, tmp_path):
-    wavelengths = load_model(trained.run, "cpu").scene.metadata["wavelengths_nm"]
+    wavelengths = load_run(trained.run, "cpu").record.metadata["wavelengths_nm"]
     lines = [f"{wavelength},{0.1 + 0.05 * index}" for index, wavelength in enumerate(wavelengths)]
     (tmp_path / "mine.csv").write_text("\n".join(["wavelength,my very own", *lines]))
     common = [
@@ -221,7 +220,7 @@ def test_own_reflectances_are_compared_with_too(trained, tmp_path):
     assert "none.csv: can't read" in ended.err
 
 
-def test_a_report_with_the_find_scene_compares_and_is_self_contained(exported):
+def test_a_report_with_the_scene_at_hand_compares_and_is_self_contained(exported):
     page = (exported[0] / "report" / "report.html").read_text()
     outline = assert_self_contained(page)
     assert outline.ids == [
@@ -254,7 +253,7 @@ def test_every_product_can_be_edited_and_relit(trained, tmp_path, name):
     ended = run(export, *words(name, *common))
     assert ended.status == 0, ended.err
     if name == "endmembers":
-        plain, lit = (materials_of(load_model(trained.run, "cpu").model), tmp_path / "out" / "endmembers.csv")
+        plain, lit = (open_run(trained.run, "cpu").materials, tmp_path / "out" / "endmembers.csv")
         with lit.open() as file:
             rows = list(csv.DictReader(file))
         assert "old oak" in rows[0]

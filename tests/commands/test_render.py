@@ -13,8 +13,8 @@ from tests.formats.cubes import full_disk
 from tests.formats.video_reading import read_video
 from tests.products.render.render_factory import read_envi, read_exr
 from unmix_plugin.commands.render import render
-from unmix_plugin.editing.edited_run import load_edited_model
-from unmix_plugin.engine.runs.load_run import load_model
+from unmix_plugin.editing.edited_run import load_edited_run
+from unmix_plugin.trained.open_run import load_run
 
 pytestmark = pytest.mark.usefixtures("no_wait_for_the_disk")
 
@@ -25,7 +25,7 @@ def files(folder):
 
 def rendered(loaded, index, *names):
     """What the model itself renders of an evaluation view."""
-    outputs = loaded.model.get_outputs_for_camera(loaded.scene.eval_cameras[index], names)
+    outputs = loaded.scene.render(loaded.record.eval_cameras[index], names)
     return [outputs[name].numpy() for name in names]
 
 
@@ -43,7 +43,7 @@ def test_by_default_every_evaluation_view_is_written_in_what_suits_each_output(t
             "cameras-dataset-eval.json",
         ]
     )
-    loaded = load_model(trained.run, "cpu")
+    loaded = load_run(trained.run, "cpu")
     for index, view in enumerate(views):
         spectra, shares, depth = rendered(loaded, index, "spectral", "abundances", "depth")
         np.testing.assert_array_equal(read_envi(tmp_path / "spectral" / view)[0], spectra)
@@ -100,7 +100,7 @@ def test_the_scenes_own_transforms_are_a_camera_file(trained, tmp_path):
     words = ["--outputs", "spectral", "--formats", "npy", "--cameras", path, "--device", "cpu"]
     ended = run(render, "--run", trained.run, "--output", tmp_path / "out", *words)
     assert ended.status == 0, ended.err
-    [expected] = rendered(load_model(trained.run, "cpu"), 1, "spectral")
+    [expected] = rendered(load_run(trained.run, "cpu"), 1, "spectral")
     found = np.load(tmp_path / "out" / "spectral" / "eval_006.npy")
     assert np.abs(found - expected).mean() < 1e-4
 
@@ -120,8 +120,8 @@ def test_another_light_is_rendered_as_the_edited_model_does(trained, tmp_path):
     words = ["--outputs", "spectral", "--formats", "npy", "--device", "cpu"]
     ended = run(render, "--run", trained.run, "--output", tmp_path, *words, "--illuminant", "A")
     assert ended.status == 0, ended.err
-    [as_taken] = rendered(load_model(trained.run, "cpu"), 0, "spectral")
-    [edited] = rendered(load_edited_model(trained.run, "cpu", None, "A"), 0, "spectral")
+    [as_taken] = rendered(load_run(trained.run, "cpu"), 0, "spectral")
+    [edited] = rendered(load_edited_run(trained.run, "cpu", None, "A"), 0, "spectral")
     found = np.load(tmp_path / "spectral" / "eval_002.npy")
     np.testing.assert_array_equal(found, edited)
     assert not np.allclose(found, as_taken, atol=1e-3)

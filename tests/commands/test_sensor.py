@@ -11,11 +11,11 @@ from tests.products.render.render_factory import read_envi
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.render import render
 from unmix_plugin.commands.train import train
-from unmix_plugin.editing.edited_run import load_edited_model, sensor_notes
-from unmix_plugin.engine.runs.load_run import load_model
+from unmix_plugin.editing.edited_run import load_edited_run
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.sensor import read_sensor
+from unmix_plugin.trained.open_run import load_run
 
 pytestmark = pytest.mark.usefixtures("no_wait_for_the_disk")
 
@@ -52,7 +52,7 @@ def camera(tmp_path_factory):
 
 
 def seen_by(camera, solid):
-    return read_sensor(camera).seen_by(Bands.of(load_model(solid, "cpu").scene.metadata["wavelengths_nm"]))
+    return read_sensor(camera).seen_by(Bands.of(load_run(solid, "cpu").record.metadata["wavelengths_nm"]))
 
 
 def test_a_render_has_the_sensors_bands(solid, camera, tmp_path):
@@ -159,13 +159,10 @@ def test_a_sensor_that_is_not_there_or_sees_nothing_exits_2(solid, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_the_scene_record_follows_and_the_run_stays(solid, camera):
-    loaded = load_edited_model(solid, "cpu", None, "A", camera)
-    lit = load_edited_model(solid, "cpu", None, "A")
+def test_bands_light_and_notes_follow_and_the_run_stays(solid, camera):
+    seen = load_edited_run(solid, "cpu", None, "A", camera).materials_scene
+    lit = load_edited_run(solid, "cpu", None, "A").materials_scene
     expected = seen_by(camera, solid)
-    assert loaded.scene.metadata["wavelengths_nm"] == expected.bands.centers_nm.tolist()
-    light = np.array(lit.scene.metadata["illuminant"]) @ expected.matrix
-    np.testing.assert_allclose(loaded.scene.metadata["illuminant"], light)
-    assert loaded.model.metadata["illuminant"] == loaded.scene.metadata["illuminant"]
-    assert sensor_notes(loaded, camera) == [expected.description, *expected.notes]
-    assert sensor_notes(lit, None) == []
+    np.testing.assert_allclose(seen.bands.centers_nm, expected.bands.centers_nm)
+    np.testing.assert_allclose(seen.light_power, lit.light_power @ expected.matrix, rtol=1e-5)
+    assert seen.notes == (*lit.notes, expected.description, *expected.notes)

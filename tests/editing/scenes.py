@@ -1,15 +1,16 @@
-"""A tiny model to edit, and the camera that looks at it."""
+"""A tiny scene to edit, and the camera that looks at it."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from tests.method_factory import make_model
-from unmix_plugin.editing import Recipe, edit_model, recipe_from_yaml
+from tests.method_factory import make_model, scene_of
+from unmix_plugin.editing import Recipe, edit_scene, recipe_from_yaml
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.model import UnmixModel
-from unmix_plugin.spectral.composition import Coefficients
+from unmix_plugin.field import UnmixField
+from unmix_plugin.spectral.coefficients import Coefficients
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 LIGHT = [0.5, 0.7, 1.0, 0.9, 0.6]
 
@@ -31,19 +32,22 @@ CAMERAS = Cameras(
 OUTPUTS = ("spectral", "diffuse", "specular", "abundances", "accumulation", "rgb")
 
 
-def lit_model(**settings) -> UnmixModel:
+def lit_scene(**settings) -> TrainedScene:
     """Three materials in a light that is not flat, with some gloss."""
     model = make_model(light=LIGHT, **settings)
+    assert isinstance(model.field, UnmixField)
     with torch.no_grad():
         for weights in model.field.material_network.parameters():
             weights.mul_(6)  # else every point is about a third of each
     model.field.log_initial_density += 1.5
-    return model
+    return scene_of(model, CAMERAS)
 
 
-def edited(model: UnmixModel, *edits: str, seen: Coefficients | None = None, light: str = "") -> UnmixModel:
-    """The model after edits, each written as in a recipe."""
-    return edit_model(model, recipe(*edits, light=light), seen)
+def edited(
+    scene: TrainedScene, *edits: str, seen: Coefficients | None = None, light: str = ""
+) -> TrainedScene:
+    """The scene after edits, each written as in a recipe."""
+    return edit_scene(scene, recipe(*edits, light=light), seen)
 
 
 def recipe(*edits: str, light: str = "") -> Recipe:
@@ -53,6 +57,20 @@ def recipe(*edits: str, light: str = "") -> Recipe:
     return recipe_from_yaml("\n".join(lines), "edits.yml")
 
 
-def rendered(model: UnmixModel, view: int = 0) -> dict[str, Tensor]:
+def rendered(scene: TrainedScene, view: int = 0) -> dict[str, Tensor]:
     """What a camera sees."""
-    return model.get_outputs_for_camera(CAMERAS[view], OUTPUTS)
+    return scene.render(CAMERAS[view], OUTPUTS)
+
+
+def tensors_of(scene: TrainedScene) -> dict[str, Tensor]:
+    """All that a scene renders from."""
+    materials, renderer = scene.materials, scene.renderer
+    assert materials.light is not None
+    return {
+        **scene.field.state_dict(),
+        "endmembers": materials.endmembers,
+        "specular_spectra": materials.specular_spectra,
+        "light": materials.light,
+        "occupied": renderer.occupied,
+        "reachable": renderer.reachable,
+    }

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.editing.scenes import CAMERAS, lit_model
+from tests.editing.scenes import CAMERAS, lit_scene
 from unmix_plugin.editing import Light, relight
 from unmix_plugin.editing.light import relighting_factors
 from unmix_plugin.errors import SpectrumError
@@ -85,12 +85,12 @@ def test_an_invisible_light_cannot_be_as_bright_as_before(tmp_path):
         relighting_factors(VISIBLE, None, Light(tmp_path / "gone.csv"))
 
 
-def test_a_model_relit_by_a_light_that_ends_among_its_bands_renders_and_says_which_are_black():
-    model = lit_model()
-    short = relight(model, Light("ISO 7589 Sensitometric Printer"))  # known up to 560 nm
-    [note] = short.metadata["edit_notes"]
+def test_a_scene_relit_by_a_light_that_ends_among_its_bands_renders_and_says_which_are_black():
+    scene = lit_scene()
+    short = relight(scene, Light("ISO 7589 Sensitometric Printer"))  # known up to 560 nm
+    [note] = short.notes
     assert "2 of 5 bands, 450-650 nm (600 to 650 nm): black there" in note
-    view = short.get_outputs_for_camera(CAMERAS[0], ["spectral", "rgb", "index:r650", "index:r500"])
+    view = short.render(CAMERAS[0], ["spectral", "rgb", "index:r650", "index:r500"])
     assert (view["spectral"][..., 3:] == 0).all()
     assert view["spectral"][..., :3].amax() > 0.1
     assert view["rgb"].isfinite().all()

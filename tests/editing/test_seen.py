@@ -1,24 +1,27 @@
 """Retinting as pictures show it: the mean of a material's pixels has the colour, shaded as they are."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.editing.scenes import CAMERAS, LIGHT, edited, lit_model
+from tests.editing.scenes import CAMERAS, LIGHT, edited, lit_scene
 from unmix_plugin.editing import sample_seen
 from unmix_plugin.editing.material_state import MaterialState
 from unmix_plugin.editing.seen import Look, look_at
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.spectral.coefficients import Coefficients
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
-from unmix_plugin.spectral.composition import Coefficients, compose
+from unmix_plugin.trained.run_views import RunView
 
 
 def seen_pixels(shading: list[float], share: float = 1.0) -> Coefficients:
     """Opaque pixels, all of endmember 0 and without gloss."""
     strengths = torch.tensor(shading)
     abundances = torch.tensor([share, 1 - share, 0.0]).expand(len(shading), 3)
-    return Coefficients(
+    return Coefficients.of(
         torch.ones(len(shading)),
         torch.ones(len(shading)),
         abundances,
@@ -32,35 +35,35 @@ def own_srgb(spectrum: torch.Tensor, bands) -> torch.Tensor:
 
 
 def test_a_spectrum_gets_the_colour_itself_where_the_picture_is_not_known_or_not_meant():
-    model = lit_model()
+    scene = lit_scene()
     asked = torch.tensor([0x80, 0x70, 0x40], dtype=torch.float64) / 255
     for result in (
-        edited(model, "retint: {endmember: 0, colour: '#807040'}"),
+        edited(scene, "retint: {endmember: 0, colour: '#807040'}"),
         edited(
-            model, "retint: {endmember: 0, colour: '#807040', match: spectrum}", seen=seen_pixels([0.4] * 50)
+            scene, "retint: {endmember: 0, colour: '#807040', match: spectrum}", seen=seen_pixels([0.4] * 50)
         ),
-        edited(model, "retint: {endmember: 1, colour: '#807040'}", seen=seen_pixels([0.4] * 50)),
+        edited(scene, "retint: {endmember: 1, colour: '#807040'}", seen=seen_pixels([0.4] * 50)),
     ):
-        index = 1 if result.materials.endmembers[0].equal(model.materials.endmembers[0]) else 0
+        index = 1 if result.materials.endmembers[0].equal(scene.materials.endmembers[0]) else 0
         assert_close(own_srgb(result.materials.endmembers[index], result.bands), asked, atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("share", [1.0, 0.6])
 def test_pixels_get_the_colour_in_the_mean_where_the_picture_is_known(share):
-    model = lit_model()
+    scene = lit_scene()
     shading = torch.linspace(0.3, 0.8, 60)
     pixels = seen_pixels(shading.tolist(), share)
-    result = edited(model, "retint: {endmember: 0, colour: '#a09060'}", seen=pixels)
+    result = edited(scene, "retint: {endmember: 0, colour: '#a09060'}", seen=pixels)
     shown = own_srgb(pixels.scaled_abundances @ result.materials.endmembers, result.bands).mean(0)
     assert_close(shown, torch.tensor([0xA0, 0x90, 0x60]).double() / 255, atol=1e-4, rtol=0)
 
 
 def test_highlights_count_in_the_mean_and_mixtures_hardly():
-    model = lit_model()
+    scene = lit_scene()
     pure, mixed = seen_pixels([0.6] * 30), seen_pixels([0.6] * 30, 0.55)
     pure.specular[:] = 0.1
     pixels = Coefficients.concatenate([pure, mixed])
-    result = edited(model, "retint: {endmember: 0, colour: '#a09080'}", seen=pixels)
+    result = edited(scene, "retint: {endmember: 0, colour: '#a09080'}", seen=pixels)
     materials = result.materials
     asked = torch.tensor([0xA0, 0x90, 0x80]).double() / 255
     shown = [
@@ -87,9 +90,9 @@ def test_where_the_rest_of_the_pixels_is_too_bright_the_nearest_colour_is_taken(
 
 def test_a_colour_that_pictures_cannot_have_becomes_the_nearest_that_they_can():
     result = edited(
-        lit_model(), "retint: {endmember: 0, colour: '#ffffff'}", seen=seen_pixels([0.1] * 50 + [0.6] * 10)
+        lit_scene(), "retint: {endmember: 0, colour: '#ffffff'}", seen=seen_pixels([0.1] * 50 + [0.6] * 10)
     )
-    [note] = result.metadata["edit_notes"]
+    [note] = result.notes
     assert "(retint): pictures of endmember_0 can't be #ffffff in this light; took the nearest colour" in note
     brightest = result.materials.endmembers[0].detach().double() / torch.tensor(LIGHT).double()
     assert_close(
@@ -98,7 +101,7 @@ def test_a_colour_that_pictures_cannot_have_becomes_the_nearest_that_they_can():
 
 
 def test_endmembers_that_are_hardly_seen_have_no_look():
-    materials = lit_model().materials
+    materials = lit_scene().materials
     looks = [
         look_at(MaterialState.of(materials, None, seen_pixels([0.5] * count)), index)
         for count, index in ((15, 0), (16, 0), (50, 2))
@@ -108,8 +111,8 @@ def test_endmembers_that_are_hardly_seen_have_no_look():
 
 
 def test_what_is_seen_is_sampled_from_coarse_pictures_of_several_views():
-    model = lit_model()
-    seen = sample_seen(model, CAMERAS)
+    scene = lit_scene()
+    seen = sample_seen(scene)
     assert seen.abundances.shape == (2 * 12 * 10, 3)
     wide = Cameras(
         CAMERAS.camera_to_world,
@@ -119,20 +122,21 @@ def test_what_is_seen_is_sampled_from_coarse_pictures_of_several_views():
         96,
         80,
     )
-    coarse = sample_seen(model, wide)
+    views = tuple(RunView(f"wide_{view}", wide[view], "train") for view in range(2))
+    coarse = sample_seen(replace(scene, views=views))
     assert coarse.abundances.shape == (2 * 32 * 26, 3)
     assert_close(coarse.accumulation.mean(), seen.accumulation.mean(), rtol=0.05, atol=0)
 
 
-def test_pictures_of_a_model_have_the_colour_in_the_mean_over_a_materials_pixels():
-    model = lit_model()
-    seen = sample_seen(model, CAMERAS)
+def test_pictures_of_a_scene_have_the_colour_in_the_mean_over_a_materials_pixels():
+    scene = lit_scene()
+    seen = sample_seen(scene)
     index = int(seen.abundances.argmax(-1)[seen.accumulation >= 0.5].mode().values)
-    result = edited(model, f"retint: {{endmember: {index}, colour: '#606858'}}", seen=seen)
-    views = [result.get_image_coefficients(CAMERAS[view], subpixels=1) for view in range(2)]
-    shares = torch.cat([view.abundances.flatten(0, 1) for view in views])
-    opacity = torch.cat([view.accumulation.flatten() for view in views])
-    srgb = torch.cat([compose("rgb", view, result.materials).flatten(0, 1) for view in views])
+    result = edited(scene, f"retint: {{endmember: {index}, colour: '#606858'}}", seen=seen)
+    views = [result.look(CAMERAS[view], subpixels=1) for view in range(2)]
+    shares = torch.cat([view["abundances"].flatten(0, 1) for view in views])
+    opacity = torch.cat([view.opacity.flatten() for view in views])
+    srgb = torch.cat([view["rgb"].flatten(0, 1) for view in views])
     is_its = (shares.argmax(-1) == index) & (opacity >= 0.5)
     weights = (shares[is_its][:, index] / opacity[is_its])[:, None] ** 4
     mean = (weights * srgb[is_its]).sum(0) / weights.sum()

@@ -1,19 +1,21 @@
-"""A model seen through another camera renders what that camera would make of its spectra."""
+"""A scene seen through another camera renders what that camera would make of its spectra."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.editing.scenes import CAMERAS, LIGHT, edited, lit_model, rendered
-from tests.method_factory import WAVELENGTHS_NM, make_model
+from tests.editing.scenes import CAMERAS, LIGHT, edited, lit_scene, rendered, tensors_of
+from tests.method_factory import WAVELENGTHS_NM, make_scene
 from unmix_plugin.editing.simulated_sensor import with_sensor
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.conversion import rgb_matrix
-from unmix_plugin.spectral.composition import OUTPUT_NAMES
+from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable
 from unmix_plugin.spectral.sensor import Sensor
+from unmix_plugin.trained.outputs import OUTPUTS
 
 BANDS = Bands.of(WAVELENGTHS_NM)
 SENSOR = Sensor(
@@ -39,10 +41,10 @@ SPECULAR = ["none", "dictionary", "full"]
 
 @pytest.mark.parametrize("specular", SPECULAR)
 def test_rendering_through_the_sensor_is_rendering_spectra_and_seeing_them_through_it(specular):
-    model = lit_model(specular=specular)
-    through, _ = with_sensor(model, SENSOR)
+    scene = lit_scene(specular=specular)
+    through = with_sensor(scene, SENSOR)
     for view in range(2):
-        before, after = rendered(model, view), rendered(through, view)
+        before, after = rendered(scene, view), rendered(through, view)
         assert after["spectral"].shape == (10, 12, 3)
         assert after["spectral"].max() > 0.05
         for name in ("spectral", "diffuse", "specular"):
@@ -52,68 +54,69 @@ def test_rendering_through_the_sensor_is_rendering_spectra_and_seeing_them_throu
 @pytest.mark.parametrize("specular", SPECULAR)
 def test_edits_made_before_are_seen_through_the_sensor_too(specular):
     gloss = [] if specular == "none" else ["gloss: {endmember: 2, scale: 4, colour: '#ffd080'}"]
-    model = edited(lit_model(specular=specular), "swap: [0, 2]", "remove: 1", *gloss, light="A")
-    through, _ = with_sensor(model, SENSOR)
-    expected = (rendered(model)["spectral"] @ MATRIX).detach()
+    scene = edited(lit_scene(specular=specular), "swap: [0, 2]", "remove: 1", *gloss, light="A")
+    through = with_sensor(scene, SENSOR)
+    expected = (rendered(scene)["spectral"] @ MATRIX).detach()
     assert_close(rendered(through)["spectral"], expected, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("specular", SPECULAR)
-def test_materials_and_geometry_are_those_of_the_model(specular):
-    model = lit_model(specular=specular)
-    through, _ = with_sensor(model, SENSOR)
+def test_materials_and_geometry_are_those_of_the_scene(specular):
+    scene = lit_scene(specular=specular)
+    through = with_sensor(scene, SENSOR)
     names = ["abundances", "segmentation", "confidence", "accumulation", "depth", "normals"]
-    before = model.get_outputs_for_camera(CAMERAS[0], names)
-    after = through.get_outputs_for_camera(CAMERAS[0], names)
+    before = scene.render(CAMERAS[0], names)
+    after = through.render(CAMERAS[0], names)
     assert len(before["segmentation"].unique()) > 1
     for name in names:
         assert torch.equal(after[name], before[name]), name
 
 
 def test_every_output_can_be_rendered_through_the_sensor():
-    through, _ = with_sensor(lit_model(), SENSOR)
-    outputs = through.get_outputs_for_camera(
-        CAMERAS[0], [*OUTPUT_NAMES, "band:600nm", "false-colour:600,520,450"]
-    )
+    through = with_sensor(lit_scene(), SENSOR)
+    outputs = through.render(CAMERAS[0], [*OUTPUTS, "band:600nm", "false-colour:600,520,450"])
     assert all(torch.isfinite(values).all() for values in outputs.values())
     assert torch.equal(outputs["band:600nm"], outputs["spectral"][..., 2])
     assert_close(outputs["false-colour:600,520,450"], outputs["spectral"].flip(-1).clamp(0, 1))
 
 
 def test_reflectance_under_the_sensor_is_radiance_over_light_both_seen_through_it():
-    model = lit_model()
-    through, _ = with_sensor(model, SENSOR)
-    light = torch.tensor(through.metadata["illuminant"])
+    scene = lit_scene()
+    through = with_sensor(scene, SENSOR)
+    light = through.light
+    assert light is not None
     assert_close(light, torch.tensor(LIGHT) @ MATRIX)
-    with torch.no_grad():
-        model.endmembers.copy_(0.25 * torch.tensor(LIGHT))  # grey in that light
-    grey, _ = with_sensor(model, SENSOR)
-    assert_close(grey.endmembers / light, torch.full((3, 3), 0.25))
+    greys = (0.25 * torch.tensor(LIGHT)).expand(3, 5)  # in that light
+    grey = with_sensor(replace(scene, materials=replace(scene.materials, endmembers=greys)), SENSOR)
+    assert_close(grey.materials.endmembers / light, torch.full((3, 3), 0.25))
 
 
-def test_what_a_model_says_of_its_bands_is_the_sensors():
-    through, notes = with_sensor(lit_model(), SENSOR)
+def test_bands_and_colours_are_the_sensors_and_notes_say_what_it_is():
+    through = with_sensor(edited(lit_scene(), "gloss: {colour: '#00ff00'}"), SENSOR)
     seen = SENSOR.seen_by(BANDS)
-    assert through.materials.bands == seen.bands == Bands.of(through.metadata["wavelengths_nm"])
-    assert torch.equal(through.rgb_weights, rgb_matrix(seen.bands))
-    assert notes[0].startswith("seen through toy: blue 4")
-    assert notes[1:] == ["left out far (900-950 nm): the bands cover 425-675 nm"]
-    assert with_sensor(make_model(), SENSOR)[0].metadata["illuminant"] is None
+    assert through.bands == through.materials.bands == seen.bands
+    view = rendered(through)
+    assert_close(view["rgb"], linear_to_srgb((view["spectral"] @ rgb_matrix(seen.bands)).clamp(0, 1)))
+    edit_note, description, left_out = through.notes
+    assert "highlights can't be #00ff00" in edit_note
+    assert description.startswith("seen through toy: blue 4")
+    assert left_out == "left out far (900-950 nm): the bands cover 425-675 nm"
+    assert with_sensor(make_scene(), SENSOR).light is None
 
 
-def test_the_model_itself_stays_as_it_was_and_shares_its_weights():
-    model = lit_model()
-    before = {name: value.clone() for name, value in model.state_dict().items()}
-    picture, metadata = rendered(model), dict(model.metadata)
-    through, _ = with_sensor(model, SENSOR)
-    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
-    assert model.metadata == metadata
-    assert_close(rendered(model), picture, rtol=0, atol=0)
-    assert through.field is model.field
-    assert through.renderer is model.renderer
+def test_the_scene_itself_stays_as_it_was_and_shares_its_weights():
+    scene = lit_scene()
+    before = {name: value.clone() for name, value in tensors_of(scene).items()}
+    picture, notes = rendered(scene), scene.notes
+    through = with_sensor(scene, SENSOR)
+    assert all(torch.equal(value, before[name]) for name, value in tensors_of(scene).items())
+    assert (scene.bands, scene.notes) == (BANDS, notes)
+    assert_close(rendered(scene), picture, rtol=0, atol=0)
+    assert through.field is scene.field
+    assert through.renderer is scene.renderer
 
 
 def test_a_sensor_that_sees_nothing_is_refused():
     far = Sensor("far", SpectraTable(Bands.of([900, 950]), ("far",), np.ones((1, 2))))
     with pytest.raises(SpectrumError, match="'far' sees nothing: the bands cover 425-675 nm"):
-        with_sensor(lit_model(), far)
+        with_sensor(lit_scene(), far)

@@ -1,4 +1,4 @@
-"""A model whose field is known exactly: a hollow ball, its upper half of one material and its lower half of another."""
+"""A scene whose field is known exactly: a hollow ball, its upper half of one material and its lower half of another."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tests.method_factory import make_model
+from tests.method_factory import make_model, scene_of
 from tests.scenes.scene_factory import look_at
 from tests.trained.camera_files.camera_scenes import cameras_at
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.field import CoefficientField
-from unmix_plugin.model import UnmixModel
 from unmix_plugin.renderer import RendererConfig
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 RADIUS, INNER_RADIUS = 0.6, 0.35
 DENSITY = 300.0
@@ -59,13 +59,12 @@ class BallField(CoefficientField):
         }
 
 
-def ball_model(has_wall: bool = False, **settings: Any) -> UnmixModel:
-    """A model that renders the ball in steps of a hundredth."""
-    renderer = RendererConfig(samples_per_pixel=8.7, smallest_weight=0.0, open_smallest_weight=0.0)
+def ball_scene(has_wall: bool = False, **settings: Any) -> TrainedScene:
+    """A scene that renders the ball in steps of a hundredth."""
+    renderer = RendererConfig(samples_per_pixel=8.7, smallest_weight=0.0)
     model = make_model(specular="none", renderer=renderer, **settings)
     model.field = BallField(has_wall)  # type: ignore[assignment]
-    model.requires_grad_(False)
-    return model
+    return scene_of(model)
 
 
 def cameras_around(directions: list[tuple[float, float, float]], side_px: int = 40) -> list[Cameras]:

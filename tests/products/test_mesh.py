@@ -11,7 +11,7 @@ from tests.products.ball_model import (
     FROM_ABOVE,
     INNER_RADIUS,
     RADIUS,
-    ball_model,
+    ball_scene,
     cameras_around,
 )
 from tests.products.mesh_reading import loaded_mesh
@@ -29,15 +29,15 @@ from unmix_plugin.products.mesh_extraction import (
 from unmix_plugin.trained.density_grid import GridPoints, sample_slice
 from unmix_plugin.trained.surface import SeenSurface
 
-MODEL = ball_model()
-PIXEL = float(MODEL.metadata["pixel_size"])
+SCENE = ball_scene()
+PIXEL = SCENE.pixel_size
 THRESHOLD = -float(np.log(0.5)) / PIXEL
-GRID = GridPoints.over(MODEL.renderer.aabb, 48)
+GRID = GridPoints.over(SCENE.scene_box.aabb, 48)
 
 
 @pytest.fixture(scope="module")
 def densities():
-    return np.stack([sample_slice(MODEL, GRID.slice_points(index))[0] for index in range(GRID.shape[0])])
+    return np.stack([sample_slice(SCENE, GRID.slice_points(index))[0] for index in range(GRID.shape[0])])
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def whole(densities):
 
 def seen(directions):
     cameras = cameras_around(directions)
-    surface = SeenSurface(MODEL, 20_000, cameras)
+    surface = SeenSurface(SCENE, 20_000, cameras)
     for camera in cameras:
         surface.look(camera)
     return surface
@@ -95,7 +95,7 @@ def test_what_no_camera_sees_into_is_solid(densities):
     rendered[rendered < 1e-3 * THRESHOLD] = 0
     shell = extract_mesh(rendered, GRID, THRESHOLD, 0.0, PIXEL)
     surface = seen(ALL_ROUND)
-    solid = extract_mesh(filled(rendered, GRID, MODEL, surface), GRID, THRESHOLD, 0.0, PIXEL)
+    solid = extract_mesh(filled(rendered, GRID, SCENE, surface), GRID, THRESHOLD, 0.0, PIXEL)
     assert radii(shell).min() < INNER_RADIUS + 0.15
     assert radii(solid).min() > RADIUS - 0.05
     seen_from_outside = trim_unseen(solid, surface)
@@ -155,18 +155,18 @@ def test_a_surface_that_reaches_the_box_is_closed_there():
 
 def test_the_surface_lies_at_the_density_where_rays_end():
     points = seen(ALL_ROUND).points()
-    threshold = surface_density(MODEL, points)
-    found, _ = MODEL.field.get_density(points.positions)
+    threshold = surface_density(SCENE, points)
+    found, _ = SCENE.field.get_density(points.positions)
     assert (found < threshold).float().mean() == pytest.approx(0.07, abs=0.01)
     nowhere = points.select(torch.zeros(len(points), dtype=torch.bool))
     with pytest.raises(RunError, match="no ray of the run's cameras ends"):
-        surface_density(MODEL, nowhere)
+        surface_density(SCENE, nowhere)
 
 
 @pytest.fixture(scope="module")
 def files(outside, tmp_path_factory):
     folder = tmp_path_factory.mktemp("mesh")
-    written = write_mesh(folder, ("ply", "obj", "glb"), outside, MODEL, FRAME)
+    written = write_mesh(folder, ("ply", "obj", "glb"), outside, SCENE, FRAME)
     assert written == mesh_paths(folder, ("ply", "obj", "glb"))
     return {path.suffix: path for path in written}
 
@@ -212,7 +212,7 @@ def test_a_density_that_nothing_reaches_is_refused(densities):
 def test_a_mesh_without_faces_is_not_written(tmp_path):
     empty = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
     with pytest.raises(RunError, match="no camera of the run sees it; keep it with --unseen keep"):
-        write_mesh(tmp_path, ("ply",), empty, MODEL, FRAME)
+        write_mesh(tmp_path, ("ply",), empty, SCENE, FRAME)
 
 
 @pytest.mark.parametrize(

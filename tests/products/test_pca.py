@@ -5,13 +5,12 @@ import pytest
 import torch
 from PIL import Image
 
-from tests.method_factory import make_model
+from tests.method_factory import make_scene
 from tests.trained.camera_files.camera_scenes import around
 from unmix_plugin.products.pca import find_components, survey_view, write_components, write_pca
 from unmix_plugin.trained.view_rendering import render_view
 
-MODEL = make_model()
-MODEL.requires_grad_(False)
+SCENE = make_scene()
 CAMERA = around()[1]
 
 
@@ -39,8 +38,8 @@ def test_spectra_all_alike_explain_nothing():
 
 @pytest.mark.parametrize("of", ["spectra", "abundances"])
 def test_a_picture_shows_the_components_of_its_pixels(tmp_path, of):
-    components = find_components([survey_view(MODEL, CAMERA, of)], of)
-    view = render_view(MODEL, CAMERA)
+    components = find_components([survey_view(SCENE, CAMERA, of)], of)
+    view = render_view(SCENE, CAMERA)
     with Image.open(write_pca(tmp_path, "view", view, components)) as picture:
         pixels = np.asarray(picture)
     assert pixels.shape == (30, 40, 3)
@@ -64,15 +63,15 @@ def test_a_component_that_tells_nothing_is_black_rather_than_noise():
 
 
 def test_a_view_is_surveyed_where_something_is():
-    shares = survey_view(MODEL, CAMERA, "abundances")
+    shares = survey_view(SCENE, CAMERA, "abundances")
     torch.testing.assert_close(shares.sum(dim=-1), torch.ones(len(shares)), atol=1e-4, rtol=0)
-    assert survey_view(MODEL, CAMERA, "spectra").shape == (len(shares), 5)
+    assert survey_view(SCENE, CAMERA, "spectra").shape == (len(shares), 5)
 
 
 @pytest.mark.parametrize(("of", "first"), [("spectra", "450"), ("abundances", "endmember_0")])
 def test_the_table_gives_back_the_colours(tmp_path, of, first):
-    components = find_components([survey_view(MODEL, CAMERA, of)], of)
-    with write_components(tmp_path, components, MODEL.materials).open() as file:
+    components = find_components([survey_view(SCENE, CAMERA, of)], of)
+    with write_components(tmp_path, components, SCENE.materials).open() as file:
         rows = list(csv.reader(file))
     body = {row[0]: row[1:] for row in rows[1:]}
     names = list(body)[:-3]
@@ -80,7 +79,7 @@ def test_the_table_gives_back_the_colours(tmp_path, of, first):
     mean = np.array([float(body[name][0]) for name in names])
     axes = np.array([[float(cell) for cell in body[name][1:]] for name in names])
     low, high = (np.array([float(cell) for cell in body[f"value of {end}"][1:]]) for end in (0, 1))
-    view = render_view(MODEL, CAMERA)
+    view = render_view(SCENE, CAMERA)
     values = (view.spectra if of == "spectra" else view.shares).double()
     by_hand = np.clip(((values.numpy() - mean) @ axes - low) / (high - low), 0, 1)
     np.testing.assert_allclose(components.colours(values), by_hand, atol=1e-6)

@@ -28,7 +28,7 @@ from unmix_plugin.products.evaluation_pictures import (
 )
 from unmix_plugin.products.segmentation import draw_segmentation, paint_ids, scores_of
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.composition import Materials
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.evaluation import Evaluation, SceneTruth, ViewTruth
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.view_rendering import RenderedView

@@ -3,7 +3,7 @@ import pytest
 import torch
 from plyfile import PlyData
 
-from tests.products.ball_model import ALL_ROUND, RADIUS, ball_model, cameras_around
+from tests.products.ball_model import ALL_ROUND, RADIUS, ball_scene, cameras_around
 from tests.trained.camera_files.camera_scenes import FRAME
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.products.point_cloud import require_count, write_point_cloud
@@ -12,13 +12,13 @@ from unmix_plugin.spectral import SpectraTable, write_spectra_csv
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.trained.surface import SeenSurface
 
-MODEL = ball_model()
+SCENE = ball_scene()
 
 
 @pytest.fixture(scope="module")
 def points():
     cameras = cameras_around(ALL_ROUND)
-    surface = SeenSurface(MODEL, 12_000, cameras)
+    surface = SeenSurface(SCENE, 12_000, cameras)
     for camera in cameras:
         surface.look(camera)
     return surface.points()
@@ -27,7 +27,7 @@ def points():
 @pytest.fixture(scope="module")
 def cloud(points, tmp_path_factory):
     folder = tmp_path_factory.mktemp("cloud")
-    path, count = write_point_cloud(folder, points, 800, MODEL.materials, FRAME)
+    path, count = write_point_cloud(folder, points, 800, SCENE.materials, FRAME)
     return PlyData.read(path), count
 
 
@@ -63,8 +63,8 @@ def test_each_point_has_material_abundances_and_the_colour_of_its_diffuse_spectr
     assert (material[height > 0.05] == 0).all()
     assert (material[height < -0.05] == 1).all()
     top = np.flatnonzero(shares[:, 0] == 1)[0]
-    spectrum = 0.8 * MODEL.materials.endmembers[0].detach().double()
-    linear = (spectrum @ rgb_matrix(MODEL.bands, torch.float64)).clamp(0, 1)
+    spectrum = 0.8 * SCENE.materials.endmembers[0].detach().double()
+    linear = (spectrum @ rgb_matrix(SCENE.bands, torch.float64)).clamp(0, 1)
     expected = 255 * linear_to_srgb(linear).numpy()
     np.testing.assert_allclose(columns(ply, ("red", "green", "blue"))[top], expected, atol=1)
 
@@ -77,11 +77,11 @@ def test_the_file_says_what_it_is(cloud):
 
 
 def test_indices_and_targets_are_written_for_each_point(points, tmp_path):
-    spectra = MODEL.materials.endmembers.detach().double().numpy()
-    write_spectra_csv(tmp_path / "top.csv", SpectraTable(MODEL.bands, ("top",), spectra[:1]))
+    spectra = SCENE.materials.endmembers.detach().double().numpy()
+    write_spectra_csv(tmp_path / "top.csv", SpectraTable(SCENE.bands, ("top",), spectra[:1]))
     asked = ["index:r650/r500", "index:pri", f"target:{tmp_path / 'top.csv'}<0.1"]
-    scores = require_point_scores(asked, MODEL.bands)
-    path, count = write_point_cloud(tmp_path, points, 300, MODEL.materials, FRAME, scores)
+    scores = require_point_scores(asked, SCENE.bands)
+    path, count = write_point_cloud(tmp_path, points, 300, SCENE.materials, FRAME, scores)
     ply = PlyData.read(path)
     written = [ply["vertex"].properties[index].name for index in (-3, -2, -1)]
     assert written == ["index_1", "index_pri", "target_1"]
@@ -101,7 +101,7 @@ def test_indices_and_targets_are_written_for_each_point(points, tmp_path):
 def test_nothing_to_export_is_said(points, tmp_path):
     nothing = points.select(torch.zeros(len(points), dtype=torch.bool))
     with pytest.raises(RunError, match="no ray of the run's cameras ends on a surface"):
-        write_point_cloud(tmp_path, nothing, 800, MODEL.materials, FRAME)
+        write_point_cloud(tmp_path, nothing, 800, SCENE.materials, FRAME)
     assert list(tmp_path.iterdir()) == []
 
 

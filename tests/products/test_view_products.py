@@ -1,6 +1,7 @@
 """Cubes, abundances, segmentations and endmembers in other people's formats, read back with their readers."""
 
 import csv
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import spectral.io.envi as envi
 import torch
 from PIL import Image
 
-from tests.method_factory import make_model
+from tests.method_factory import make_scene
 from tests.trained.camera_files.camera_scenes import around
 from unmix_plugin.products.abundances import Abundances
 from unmix_plugin.products.cubes import Cubes
@@ -19,10 +20,9 @@ from unmix_plugin.products.segmentation import Segmentation, legend_bytes
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.view_rendering import render_view
 
-MODEL = make_model()
-MODEL.requires_grad_(False)
-MATERIALS = MODEL.materials
-VIEW = render_view(MODEL, around()[0])
+SCENE = make_scene()
+MATERIALS = SCENE.materials
+VIEW = render_view(SCENE, around()[0])
 NAME = "view.0"
 
 
@@ -65,7 +65,7 @@ def test_spectral_python_opens_the_endmembers_as_a_library(tmp_path):
     assert write_endmembers(tmp_path, MATERIALS) == endmember_paths(tmp_path)
     library: Any = envi.open(str(tmp_path / "endmembers.hdr"), str(tmp_path / "endmembers.sli"))
     assert library.names == list(MATERIALS.names)
-    np.testing.assert_array_equal(library.spectra, MODEL.endmembers.numpy())
+    np.testing.assert_array_equal(library.spectra, SCENE.materials.endmembers.numpy())
     np.testing.assert_array_equal(library.bands.centers, MATERIALS.bands.centers_nm)
 
 
@@ -90,10 +90,8 @@ def test_labels_are_ids_whose_palette_and_legend_name_the_materials(tmp_path):
 
 
 def test_named_endmembers_keep_their_names(tmp_path):
-    model = make_model()
-    model.requires_grad_(False)
-    model.endmember_names = ("oak, old", "v1.2", "löss")
-    [path] = Abundances(formats=("exr",)).write_view(tmp_path, NAME, VIEW, model.materials)
+    named = replace(SCENE.materials, names=("oak, old", "v1.2", "löss"))
+    [path] = Abundances(formats=("exr",)).write_view(tmp_path, NAME, VIEW, named)
     channels = OpenEXR.File(str(path), separate_channels=True).channels()
     assert set(channels) == {"abundances.oak, old", "abundances.v1_2", "abundances.löss"}
     assert torch.equal(torch.from_numpy(channels["abundances.v1_2"].pixels), VIEW.abundances[..., 1])

@@ -1,22 +1,24 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
-from tests.method_factory import make_model
-from tests.products.ball_model import INNER_RADIUS, RADIUS, ball_model
+from tests.method_factory import make_scene
+from tests.products.ball_model import INNER_RADIUS, RADIUS, ball_scene
 from tests.trained.camera_files.camera_scenes import FRAME
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.products.volume import volume_path, write_volume
-from unmix_plugin.trained.density_grid import GridPoints, is_rendered, sample_densities, sample_slice
+from unmix_plugin.trained.density_grid import GridPoints, sample_densities, sample_slice
 
-MODEL = ball_model()
-GRID = GridPoints.over(MODEL.renderer.aabb, 16)
+SCENE = ball_scene()
+GRID = GridPoints.over(SCENE.scene_box.aabb, 16)
 
 
 @pytest.fixture(scope="module")
 def volume(tmp_path_factory):
     folder = tmp_path_factory.mktemp("volume")
-    path = write_volume(folder, MODEL, GRID, FRAME, range(GRID.shape[0]))
+    path = write_volume(folder, SCENE, GRID, FRAME, range(GRID.shape[0]))
     assert path == volume_path(folder)
     with np.load(path, allow_pickle=False) as arrays:
         return {name: arrays[name] for name in arrays.files}
@@ -41,9 +43,9 @@ def test_the_matrix_leads_from_indices_to_the_world_of_the_scene(volume):
 
 def test_densities_are_per_world_unit_and_abundances_those_of_the_field(volume):
     places = torch.from_numpy(FRAME.to_model(positions(volume))).float().reshape(-1, 3)
-    density, features = MODEL.field.get_density(places)
+    density, features = SCENE.field.get_density(places)
     np.testing.assert_allclose(volume["density"].ravel(), FRAME.scale * density.numpy(), rtol=1e-3, atol=1e-4)
-    expected = MODEL.field.abundances_of(features).numpy()
+    expected = SCENE.field.abundances_of(features).numpy()
     found = volume["abundances"].reshape(-1, 3)
     clear = (places[:, 2].abs() > 1e-4).numpy()
     np.testing.assert_array_equal(found[clear], expected[clear])
@@ -52,19 +54,18 @@ def test_densities_are_per_world_unit_and_abundances_those_of_the_field(volume):
 
 def test_names_and_spectra_come_along(volume):
     assert volume["endmember_names"].tolist() == ["endmember_0", "endmember_1", "endmember_2"]
-    np.testing.assert_array_equal(volume["endmembers"], MODEL.endmembers.numpy())
-    np.testing.assert_array_equal(volume["wavelengths_nm"], MODEL.bands.centers_nm)
+    np.testing.assert_array_equal(volume["endmembers"], SCENE.materials.endmembers.numpy())
+    np.testing.assert_array_equal(volume["wavelengths_nm"], SCENE.bands.centers_nm)
 
 
 def test_what_is_never_rendered_is_empty():
-    model = make_model()
-    model.requires_grad_(False)
-    occupied = torch.zeros(8, 8, 8, dtype=torch.bool)
-    occupied[:4] = True
-    model.renderer.carve(occupied)
-    grid = GridPoints.over(model.renderer.aabb, 8)
+    scene = make_scene()
+    occupied = torch.zeros(8, 8, 8, dtype=torch.uint8)
+    occupied[:4] = 1
+    scene = replace(scene, renderer=replace(scene.renderer, occupied=occupied))
+    grid = GridPoints.over(scene.scene_box.aabb, 8)
     for index in range(grid.shape[0]):
-        density, abundances = sample_slice(model, grid.slice_points(index))
+        density, abundances = sample_slice(scene, grid.slice_points(index))
         if index < 4:
             assert density.min() > 0
             np.testing.assert_allclose(abundances.sum(axis=-1), 1, atol=1e-5)
@@ -72,8 +73,8 @@ def test_what_is_never_rendered_is_empty():
             assert density.max() == 0
             assert abundances.max() == 0
     places = torch.tensor([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0], [-1.5, 0.0, 0.0], [-1.0, 1.0, -1.0]])
-    assert is_rendered(model, places).tolist() == [True, False, False, True]
-    assert (sample_densities(model, places) > 0).tolist() == [True, False, False, True]
+    assert scene.renderer.is_occupied(places).tolist() == [True, False, False, True]
+    assert (sample_densities(scene, places) > 0).tolist() == [True, False, False, True]
 
 
 def test_a_grid_has_its_cells_along_the_longest_edge_and_stays_in_the_box():
@@ -89,7 +90,7 @@ def test_a_grid_has_its_cells_along_the_longest_edge_and_stays_in_the_box():
 @pytest.mark.parametrize("resolution", [0, 7, 1025])
 def test_an_unreasonable_resolution_is_refused(resolution):
     with pytest.raises(ConfigError, match=f"--resolution is {resolution}; choose 8 to 1024"):
-        GridPoints.over(MODEL.renderer.aabb, resolution)
+        GridPoints.over(SCENE.scene_box.aabb, resolution)
 
 
 def test_a_disk_that_is_full_half_way_leaves_nothing(tmp_path):
@@ -98,5 +99,5 @@ def test_a_disk_that_is_full_half_way_leaves_nothing(tmp_path):
         raise OSError(28, "No space left on device")
 
     with pytest.raises(RunError, match=r"volume\.npz: No space left on device"):
-        write_volume(tmp_path, MODEL, GRID, FRAME, slices())
+        write_volume(tmp_path, SCENE, GRID, FRAME, slices())
     assert list(tmp_path.iterdir()) == []

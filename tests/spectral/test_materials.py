@@ -8,8 +8,9 @@ from torch.testing import assert_close
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.coefficients import Coefficients
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
-from unmix_plugin.spectral.composition import Coefficients, Materials, compose, default_names
+from unmix_plugin.spectral.materials import Materials, default_names
 
 BANDS = Bands.of([450, 500, 550, 600, 650])
 
@@ -33,9 +34,9 @@ def test_each_endmember_needs_a_name_of_its_own(names):
 def test_a_band_beyond_full_scale_counts_in_the_colour_with_all_that_it_has():
     spectrum = torch.tensor([[0.0, 0.0, 0.0, 0.3, 1.6]])
     one, none = torch.ones(1), torch.zeros(1, 0)
-    seen = Coefficients(one, one, one[:, None], one[:, None], none)
+    seen = Coefficients.of(one, one, one[:, None], one[:, None], none)
     expected = (spectrum @ rgb_matrix(BANDS)).clamp(0, 1)
-    assert_close(compose("linear_rgb", seen, materials(spectrum)), expected)
+    assert_close(materials(spectrum).through(seen, rgb_matrix(BANDS)).clamp(0, 1), expected)
     assert not torch.allclose(expected, (spectrum.clamp(max=1) @ rgb_matrix(BANDS)).clamp(0, 1), atol=0.05)
 
 
@@ -43,19 +44,40 @@ def shared(*shares, opacity=1.0):
     """Rays of these abundances, one each."""
     abundances = opacity * torch.tensor(shares)
     accumulation = torch.full((len(shares),), opacity)
-    return Coefficients(accumulation, accumulation, abundances, abundances, torch.zeros(len(shares), 0))
+    return Coefficients.of(accumulation, accumulation, abundances, abundances, torch.zeros(len(shares), 0))
 
 
 def test_confidence_is_how_probably_the_largest_share_is_so_in_truth():
     spectra = torch.eye(3, 5)
-    known = replace(materials(spectra), lead_error=torch.tensor(0.2))
+    known = replace(materials(spectra), margin_error=torch.tensor(0.2))
     mixtures = ([0.4, 0.4, 0.2], [0.5, 0.3, 0.2], [0.1, 0.1, 0.8])
     for opacity in (1.0, 0.7):
-        found = compose("confidence", shared(*mixtures, opacity=opacity), known)
+        found = known.confidence(shared(*mixtures, opacity=opacity))
         assert found.tolist() == pytest.approx([0.5, 0.8413, 0.9998], abs=1e-3)
-    assert compose("confidence", shared(*mixtures, opacity=0.2), known).tolist() == [0, 0, 0]
+    assert known.confidence(shared(*mixtures, opacity=0.2)).tolist() == [0, 0, 0]
 
 
-def test_confidence_without_known_errors_is_the_lead():
-    found = compose("confidence", shared([0.5, 0.3, 0.2], opacity=0.8), materials(torch.eye(3, 5)))
+def test_confidence_without_known_errors_is_the_margin():
+    found = materials(torch.eye(3, 5)).confidence(shared([0.5, 0.3, 0.2], opacity=0.8))
     assert found.tolist() == pytest.approx([0.2])
+
+
+def test_confidence_rates_the_material_that_the_segmentation_names():
+    """By angle a ray can be of another material than that of its largest abundance, which then is no sign for it."""
+    bright_and_dark = torch.tensor([[0.9, 0.1, 0.0, 0.0, 0.0], [0.0, 0.0, 0.01, 0.0, 0.0]])
+    seen = shared([0.2, 0.8])
+    by_abundance = materials(bright_and_dark)
+    by_angle = replace(by_abundance, segmentation="probe")
+    assert (by_abundance.ids(seen).tolist(), by_angle.ids(seen).tolist()) == ([1], [0])
+    assert by_abundance.confidence(seen).tolist() == pytest.approx([0.6])
+    assert by_angle.confidence(seen).tolist() == [0]
+
+
+def test_a_linear_map_of_spectra_needs_no_spectra():
+    matrix = torch.rand(5, 2, generator=torch.Generator().manual_seed(1))
+    mixed = Materials(BANDS, torch.rand(3, 5), torch.rand(1, 5))
+    half = torch.full((2,), 0.5)
+    seen = Coefficients.of(half, half, torch.rand(2, 3), torch.rand(2, 3), torch.rand(2, 1))
+    assert_close(mixed.through(seen, matrix), mixed.spectra(seen) @ matrix)
+    assert_close(mixed.through(seen, matrix, specular=False), mixed.diffuse(seen) @ matrix)
+    assert_close(mixed.through(seen, matrix, diffuse=False), mixed.specular(seen) @ matrix)

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from tests.method_factory import make_model
+from tests.method_factory import make_scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.material_library import LibraryMaterial, MaterialLibrary, measured_library
-from unmix_plugin.trained.library_matches import light_of, match_json, relit, shown_matches
+from unmix_plugin.trained.library_matches import match_json, relit, shown_matches
 
 BANDS = Bands.of([450, 500, 550, 600, 650])
 LIGHT = np.array([0.2, 0.4, 0.6, 0.8, 1.0])
@@ -37,9 +37,9 @@ def test_black_has_matches_of_no_brightness():
     assert all(np.nanmax(shown.spectrum) == 0 for shown in matches)
 
 
-def test_the_light_is_that_of_the_model():
-    np.testing.assert_array_equal(light_of(make_model(light=LIGHT.tolist())), LIGHT)
-    assert light_of(make_model()) is None
+def test_the_light_is_that_of_the_scene():
+    np.testing.assert_array_equal(make_scene(light=LIGHT.tolist()).light_power, LIGHT.astype(np.float32))
+    assert make_scene().light_power is None
 
 
 @pytest.mark.parametrize("recorded", [None, [0.5, 0.5, 0.25, 1.0, 0.0]])

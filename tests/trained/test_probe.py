@@ -4,26 +4,25 @@ import numpy as np
 import pytest
 import torch
 
-from tests.method_factory import make_model
-from tests.products.ball_model import RADIUS, SHADE, ball_model, cameras_around
+from tests.method_factory import make_scene
+from tests.products.ball_model import RADIUS, SHADE, ball_scene, cameras_around
 from tests.trained.camera_files.camera_scenes import FRAME, around
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.spectral.composition import compose
-from unmix_plugin.trained.probe import one_pixel, probe_pixel, probe_point
+from unmix_plugin.trained.probe import one_pixel
 
-MODEL = make_model()
-MODEL.requires_grad_(False)
-BALL = ball_model()
+SCENE = make_scene()
+BALL = replace(ball_scene(), frame=FRAME)
 CAMERA = replace(around()[2], distortion=torch.tensor([[0.05, -0.02, 0.001, 0.002]]))
 
 
 @pytest.mark.parametrize("pixel", [(0, 0), (39, 29), (20, 15), (17, 9)])
 def test_a_pixel_is_that_of_the_whole_render(pixel):
     column, row = pixel
-    whole = MODEL.get_image_coefficients(CAMERA)
-    probe = probe_pixel(MODEL, CAMERA, pixel, FRAME)
+    view = SCENE.look(CAMERA)
+    whole = view.coefficients
+    probe = SCENE.probe(CAMERA, *pixel)
     for name, key in (("predicted", "spectral"), ("diffuse", "diffuse"), ("specular", "specular")):
-        expected = compose(key, whole, MODEL.materials)[row, column]
+        expected = view[key][row, column]
         np.testing.assert_allclose(probe.spectra[name], expected, atol=1e-6)
     np.testing.assert_allclose(probe.opacity, whole.accumulation[row, column], atol=1e-6)
     shares = whole.abundances[row, column] / whole.accumulation[row, column].clamp(min=1e-6)
@@ -33,33 +32,32 @@ def test_a_pixel_is_that_of_the_whole_render(pixel):
 def test_a_pixel_tells_where_its_surface_is_in_the_world():
     [camera] = cameras_around([(1.0, 0.0, 1.0)])
     middle = (camera.width // 2, camera.height // 2)
-    probe = probe_pixel(BALL, camera, middle, FRAME)
+    probe = BALL.probe(camera, *middle)
     assert probe.world_position is not None
     place = FRAME.to_model(probe.world_position)
     np.testing.assert_allclose(place, RADIUS * np.array([1, 0, 1]) / np.sqrt(2), atol=0.03)
     np.testing.assert_allclose(probe.abundances, [1, 0, 0], atol=1e-4)
-    corner = probe_pixel(BALL, camera, (0, 0), FRAME)
+    corner = BALL.probe(camera, *(0, 0))
     assert (corner.opacity, corner.world_position) == (0.0, None)
     assert corner.abundances.max() == 0
 
 
 def test_a_point_is_what_the_field_says_there():
     world = FRAME.to_world(np.array([0.3, 0.1, -0.3]))
-    probe = probe_point(BALL, (float(world[0]), float(world[1]), float(world[2])), FRAME)
+    probe = BALL.probe_point(*world.tolist())
     assert list(probe.spectra) == ["predicted"]
     np.testing.assert_allclose(probe.abundances, [0, 1, 0], atol=1e-6)
-    np.testing.assert_allclose(probe.spectra["predicted"], SHADE * BALL.endmembers[1], atol=1e-6)
+    np.testing.assert_allclose(probe.spectra["predicted"], SHADE * BALL.materials.endmembers[1], atol=1e-6)
     assert probe.opacity > 0.99
     np.testing.assert_array_equal(probe.world_position, world)
 
 
 def test_empty_space_has_no_opacity():
     world = FRAME.to_world(np.array([0.9, 0.9, 0.9]))
-    assert probe_point(BALL, (float(world[0]), float(world[1]), float(world[2])), FRAME).opacity < 1e-6
-    model = make_model()
-    model.requires_grad_(False)
-    model.renderer.carve(torch.zeros(8, 8, 8, dtype=torch.bool))
-    nothing = probe_point(model, (float(world[0]), float(world[1]), float(world[2])), FRAME)
+    assert BALL.probe_point(*world.tolist()).opacity < 1e-6
+    scene = make_scene()
+    empty = replace(scene.renderer, occupied=torch.zeros(8, 8, 8, dtype=torch.uint8))
+    nothing = replace(scene, renderer=empty, frame=FRAME).probe_point(*world.tolist())
     assert nothing.opacity == 0
     assert nothing.abundances.max() == 0
     assert nothing.spectra["predicted"].max() == 0
@@ -69,7 +67,7 @@ def test_a_point_outside_the_box_is_refused_with_the_box_in_world_units():
     with pytest.raises(
         ConfigError, match=r"the point 99,0,0 is .* between -2,-3.7,-9 and 6,4.3,-1 of the world"
     ):
-        probe_point(BALL, (99.0, 0.0, 0.0), FRAME)
+        BALL.probe_point(99.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("pixel", [(-1, 0), (40, 0), (0, 30)])

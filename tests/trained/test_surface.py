@@ -7,15 +7,15 @@ from tests.products.ball_model import (
     FROM_ABOVE,
     RADIUS,
     SHADE,
-    ball_model,
+    ball_scene,
     cameras_around,
 )
 from unmix_plugin.trained.surface import SeenSurface, look_from_above
 
-MODEL = ball_model()
+SCENE = ball_scene()
 
 
-def seen(directions, model=MODEL, num_rays=12_000):
+def seen(directions, model=SCENE, num_rays=12_000):
     cameras = cameras_around(directions)
     surface = SeenSurface(model, num_rays, cameras)
     for camera in cameras:
@@ -44,7 +44,7 @@ def test_points_carry_the_mixture_and_the_light_of_their_surface(ball):
     above = (points.positions[:, 2] > 0)[clear]
     torch.testing.assert_close(points.abundances[clear, 0], above.float(), atol=5e-3, rtol=0)
     torch.testing.assert_close(points.abundances.sum(dim=-1), torch.ones(len(points)), atol=1e-4, rtol=0)
-    expected = SHADE * points.abundances @ MODEL.materials.endmembers
+    expected = SHADE * points.abundances @ SCENE.materials.endmembers
     torch.testing.assert_close(points.diffuse, expected, atol=1e-4, rtol=0)
 
 
@@ -58,7 +58,7 @@ def test_directions_lead_from_a_camera_to_the_point(ball):
 
 
 def test_rays_that_end_in_the_air_between_two_surfaces_give_no_points():
-    model = ball_model(has_wall=True)
+    model = ball_scene(has_wall=True)
     cameras = [(-1.0, y, z) for y in (-0.6, 0.0, 0.6) for z in (-0.5, 0.5)]
     surface = seen(cameras, model, num_rays=20_000)
     everything = torch.cat([part.positions for part in surface._points])
@@ -108,9 +108,9 @@ def test_a_single_camera_gives_points_without_a_second_witness():
 
 def test_from_straight_above_a_point_looks_as_its_surface():
     normals = torch.nn.functional.normalize(torch.tensor([[0.1, 0.2, 0.9], [0.3, 0.1, -0.8]]), dim=-1)
-    abundances, diffuse = look_from_above(MODEL, RADIUS * normals, normals)
+    abundances, diffuse = look_from_above(SCENE, RADIUS * normals, normals)
     torch.testing.assert_close(abundances, torch.tensor([[1.0, 0, 0], [0, 1, 0]]), atol=1e-4, rtol=0)
-    torch.testing.assert_close(diffuse, SHADE * MODEL.materials.endmembers[:2].detach(), atol=1e-3, rtol=0)
-    nothing, light = look_from_above(MODEL, torch.zeros(0, 3), torch.zeros(0, 3))
+    torch.testing.assert_close(diffuse, SHADE * SCENE.materials.endmembers[:2].detach(), atol=1e-3, rtol=0)
+    nothing, light = look_from_above(SCENE, torch.zeros(0, 3), torch.zeros(0, 3))
     assert (nothing.shape, light.shape) == ((0, 3), (0, 5))
     assert np.isfinite(diffuse.numpy()).all()

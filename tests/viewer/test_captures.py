@@ -7,7 +7,6 @@ import pytest
 
 from tests.viewer.view_factory import make_frame, make_services, some_pose
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.spectral.composition import spectral
 from unmix_plugin.viewer import captures
 from unmix_plugin.viewer.captures import (
     PictureCanvas,
@@ -68,9 +67,7 @@ def test_spectra_of_strips_are_those_of_the_whole(services, source, monkeypatch)
     reason, _ = captured(services, camera, canvas.take)
     assert reason == ""
     frame = make_frame(source, camera)
-    np.testing.assert_allclose(
-        canvas.spectra, spectral(frame.coefficients, frame.materials).numpy(), atol=1e-5
-    )
+    np.testing.assert_allclose(canvas.spectra, frame["spectral"].numpy(), atol=1e-5)
     np.testing.assert_allclose(canvas.opacity, frame.coefficients.accumulation.numpy(), atol=1e-5)
 
 

@@ -72,7 +72,7 @@ def test_a_path_through_key_frames_is_a_camera_file(viewer):
         page.set("save the path", True)
         page.wait_until(lambda: any(title == "saved" for title, _ in page.notices))
         (path,) = viewer.services.folder.iterdir()
-        found = read_camera_file(path, world_frame(viewer.services.source.scene))
+        found = read_camera_file(path, world_frame(viewer.services.source.record))
         assert (len(found.views), found.frames_per_second) == (10, 10.0)
         first = found.views[0].camera.camera_to_world[0, :, 3].tolist()
         assert first == pytest.approx([4 * math.cos(0.3), 4 * math.sin(0.3), 1.5], abs=1e-4)

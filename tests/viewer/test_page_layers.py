@@ -5,8 +5,9 @@ import html
 import numpy as np
 import pytest
 
+from tests.method_factory import make_model
 from tests.viewer.pages import decoded, opened, serving, show_layer
-from tests.viewer.view_factory import make_source
+from tests.viewer.view_factory import source_of_model
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.maps.indices import available_indices
 from unmix_plugin.viewer.layers.painting import BACKGROUNDS
@@ -117,12 +118,12 @@ def test_the_ends_of_a_range_are_shown_when_they_are_ones_own_and_begin_as_they_
 
 
 def test_bands_that_no_named_index_takes_say_so_and_a_formula_is_shown(tmp_path):
-    source = make_source(tmp_path)
+    model = make_model()
     narrow = Bands.of([1000.0, 1010.0, 1020.0, 1030.0, 1040.0])
     assert available_indices(narrow) == []
-    source._model.bands = narrow
-    source._model.metadata = {**source._model.metadata, "wavelengths_nm": narrow.centers_nm.tolist()}
-    with serving(source) as (viewer, _), opened(viewer) as page:
+    model.bands = narrow
+    model.metadata = {**model.metadata, "wavelengths_nm": narrow.centers_nm.tolist()}
+    with serving(source_of_model(model, tmp_path)) as (viewer, _), opened(viewer) as page:
         assert page.controls[page.control("index")]["options"] == ["none for these bands"]
         page.set("layer", "spectral index")
         page.wait_until(lambda: "type a formula of the wavelengths from 995 to 1045 nm" in page.texts)

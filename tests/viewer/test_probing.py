@@ -8,32 +8,29 @@ import numpy as np
 import pytest
 import torch
 
-from tests.viewer.view_factory import make_frame
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.spectral.composition import spectral
-from unmix_plugin.viewer.probing import abundances_csv, probe, spectra_csv
+from unmix_plugin.viewer.probing import abundances_csv, probe_through, spectra_csv
 from unmix_plugin.viewer.view_cameras import camera_of, pose_of
 
 
 @pytest.fixture
 def camera(source):
-    return camera_of(pose_of(source.scene.train_cameras[0]), 200)
+    return camera_of(pose_of(source.record.train_cameras[0]), 200)
 
 
 @pytest.fixture
 def taken(source, camera):
-    with source.borrowed() as model:
-        return probe(model, camera, camera.width / 2, camera.height / 2, 1)
+    with source.borrowed() as scene:
+        return probe_through(scene, camera, camera.width / 2, camera.height / 2, 1)
 
 
 def test_a_probe_is_what_the_picture_shows_there(source, camera, taken):
-    frame = make_frame(source, camera)
     row, column = camera.height // 2, camera.width // 2
-    opacity = float(frame.coefficients.accumulation[row, column])
-    shown = spectral(frame.coefficients, frame.materials)[row, column].numpy() / opacity
-    np.testing.assert_allclose(taken.predicted, shown, rtol=0.05)
+    with source.borrowed() as scene:
+        shown = scene.render(camera, ["spectral", "abundances"])
+    np.testing.assert_allclose(taken.predicted, shown["spectral"][row, column].numpy(), rtol=1e-5)
     assert taken.abundances.sum() == pytest.approx(1)
-    assert taken.material == int(frame.coefficients.abundances[row, column].argmax())
+    assert taken.material == int(shown["abundances"][row, column].argmax())
 
 
 def test_a_probe_lies_on_the_ray_through_the_click(camera, taken):
@@ -46,8 +43,8 @@ def test_where_nothing_is_there_is_nothing_to_probe(source, camera):
     away = camera.camera_to_world.clone()
     away[0, :, 3] *= 50
     away[0, :, 1:3] *= -1  # looks the other way
-    with source.borrowed() as model, pytest.raises(ConfigError, match="nothing is there to probe"):
-        probe(model, replace(camera, camera_to_world=away), 100.0, 100.0, 1)
+    with source.borrowed() as scene, pytest.raises(ConfigError, match="nothing is there to probe"):
+        probe_through(scene, replace(camera, camera_to_world=away), 100.0, 100.0, 1)
 
 
 def test_the_files_of_probes_hold_every_number(taken):
@@ -73,6 +70,6 @@ def test_names_with_commas_stay_one_field(taken):
 
 def test_a_probe_changes_no_random_state(source, camera):
     before = torch.get_rng_state()
-    with source.borrowed() as model:
-        probe(model, camera, camera.width / 2, camera.height / 2, 1)
+    with source.borrowed() as scene:
+        probe_through(scene, camera, camera.width / 2, camera.height / 2, 1)
     assert torch.equal(torch.get_rng_state(), before)

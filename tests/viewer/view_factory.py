@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,11 +19,13 @@ from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.training.device_share import DeviceShare
 from unmix_plugin.engine.training.training_control import TrainingControl
 from unmix_plugin.errors import SceneError
+from unmix_plugin.model import UnmixModel
 from unmix_plugin.scenes.scene import Scene
+from unmix_plugin.trained.material_view import MaterialView
+from unmix_plugin.trained.snapshot import unmix_scene
 from unmix_plugin.viewer.layers.layer_settings import LayerAids
-from unmix_plugin.viewer.rendering.frames import Frame, render_frame
-from unmix_plugin.viewer.rendering.model_source import ModelSource
 from unmix_plugin.viewer.rendering.reference import render_reference
+from unmix_plugin.viewer.rendering.scene_source import SceneSource
 from unmix_plugin.viewer.rendering.view import Shown, View
 from unmix_plugin.viewer.services import Services
 from unmix_plugin.viewer.view_cameras import ViewPose, pose_of
@@ -45,13 +48,17 @@ def ring(count: int = 4) -> Cameras:
 
 def make_source(
     folder: Path, control: TrainingControl | None = None, seed: int = 0, **settings: Any
-) -> ModelSource:
+) -> SceneSource:
     """A model of random blobs as a finished run, or as one under training."""
-    model = make_model(seed, **settings)
+    return source_of_model(make_model(seed, **settings), folder, control)
+
+
+def source_of_model(model: UnmixModel, folder: Path, control: TrainingControl | None = None) -> SceneSource:
+    """The scenes of a model that a test may change in training turns."""
     cameras = ring()
-    scene = SceneRecord(BOX, dict(model.metadata), cameras, cameras[[1, 3]], {})
+    record = SceneRecord(BOX, dict(model.metadata), cameras, cameras[[1, 3]], {})
     device = DeviceShare() if control is None else control.device
-    return ModelSource(RunFolder(folder), scene, device, model, control=control)
+    return SceneSource(RunFolder(folder), record, device, lambda: unmix_scene(model, record), control)
 
 
 def no_scene() -> Scene:
@@ -59,23 +66,23 @@ def no_scene() -> Scene:
     raise SceneError("the scene has gone")
 
 
-def make_services(source: ModelSource) -> Services:
+def make_services(source: SceneSource) -> Services:
     """What sessions share, rendering."""
     services = Services(source, no_scene)
     services.start()
     return services
 
 
-def make_frame(source: ModelSource, camera: Cameras | None = None) -> Frame:
+def make_frame(source: SceneSource, camera: Cameras | None = None) -> MaterialView:
     """A rendered view."""
-    with source.borrowed() as model:
-        return render_frame(model, source.scene.train_cameras[0] if camera is None else camera)
+    with source.borrowed() as scene:
+        return scene.look(source.record.train_cameras[0] if camera is None else camera, subpixels=1)
 
 
-def make_aids(source: ModelSource) -> LayerAids:
+def make_aids(source: SceneSource) -> LayerAids:
     """What layers need."""
-    with source.borrowed() as model:
-        return LayerAids(render_reference(model, source.scene.train_cameras), source.scene.scene_box)
+    with source.borrowed() as scene:
+        return LayerAids(render_reference(scene, source.record.train_cameras), source.record.scene_box)
 
 
 def some_pose(index: int = 0) -> ViewPose:
@@ -88,6 +95,7 @@ class Screen:
 
     def __init__(self) -> None:
         self.shown: list[Shown] = []
+        self.times: list[float] = []
         self.reports: list[str] = []
         self._changed = threading.Condition()
         self.view = View(show=self._show, report=self._report)
@@ -97,14 +105,19 @@ class Screen:
         with self._changed:
             assert self._changed.wait_for(holds, timeout_s), (len(self.shown), self.reports)
 
-    def wait(self, seconds: float) -> None:
-        """Wait for the next picture or report, but no longer than that."""
-        with self._changed:
-            self._changed.wait(seconds)
+    def wait_for_pictures(self, count: int) -> None:
+        """Wait until so many pictures were shown in all."""
+        self.wait_until(lambda: len(self.shown) >= count)
+
+    def wait_for_finest(self) -> Shown:
+        """Wait until the newest picture is the finest; that one."""
+        self.wait_until(lambda: bool(self.shown) and not self.shown[-1].is_moving)
+        return self.shown[-1]
 
     def _show(self, shown: Shown) -> None:
         with self._changed:
             self.shown.append(shown)
+            self.times.append(time.monotonic())
             self._changed.notify_all()
 
     def _report(self, text: str) -> None:

@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from unmix_plugin.editing.recipe import Recipe
-    from unmix_plugin.engine.model import Model
     from unmix_plugin.engine.runs.load_run import LoadedPipeline
     from unmix_plugin.products.evaluation_pictures import MaterialLook
     from unmix_plugin.scenes.scene import Scene
     from unmix_plugin.trained.evaluation import Evaluation
+    from unmix_plugin.trained.trained_scene import TrainedScene
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class _Subject:
     """What is measured."""
 
     loaded: LoadedPipeline
-    model: Model
+    scene: TrainedScene
     light_factors: Float64[np.ndarray, " B"] | None
     """What measured radiance is multiplied with; None: nothing."""
     folder: Path
@@ -95,20 +95,24 @@ class _Subject:
 
 
 def _subject(loaded: LoadedPipeline, recipe: Recipe | None, options: EvalOptions) -> _Subject:
+    from unmix_plugin.editing.apply import light_factors
     from unmix_plugin.editing.edited_run import apply_recipe
     from unmix_plugin.editing.yaml_writing import recipe_to_yaml
+    from unmix_plugin.trained.open_run import require_materials
+    from unmix_plugin.trained.snapshot import snapshot
 
-    model = loaded.pipeline.model
+    name = loaded.config.method_name
+    scene = require_materials(snapshot(loaded.pipeline.model, name, loaded.scene), name)
     if recipe is None:
-        return _Subject(loaded, model, None, loaded.run.eval, None)
-    edited = apply_recipe(model, recipe, loaded.scene.train_cameras)
+        return _Subject(loaded, scene, None, loaded.run.eval, None)
+    edited = apply_recipe(scene, recipe)
     for note in edited.notes:
         print(note)
     words = ["eval", *([options.edits.stem] if options.edits else [])]
     words += [Path(options.illuminant).stem] if options.illuminant else []
     folder = loaded.run.exports / re.sub(r"[^\w.-]+", "_", "-".join(words))
-    factors = None if recipe.illuminant is None else edited.light_factors
-    return _Subject(loaded, edited.model, factors, folder, recipe_to_yaml(recipe))
+    factors = None if recipe.illuminant is None else light_factors(scene, recipe)
+    return _Subject(loaded, edited, factors, folder, recipe_to_yaml(recipe))
 
 
 def _scene_of(loaded: LoadedPipeline) -> Scene:
@@ -129,17 +133,16 @@ def _evaluate_views(subject: _Subject, console: Console) -> tuple[Evaluation, in
     from unmix_plugin.formats.files import write_file
     from unmix_plugin.products.evaluation_pictures import draw_colour, draw_matched_abundances, material_look
     from unmix_plugin.trained.evaluation import Evaluation, scene_truth, view_truth
-    from unmix_plugin.trained.run_materials import materials_of
     from unmix_plugin.trained.view_rendering import render_view
 
     scene, folder, factors = _scene_of(subject.loaded), subject.folder, subject.light_factors
-    materials = materials_of(subject.model)
+    materials = subject.scene.materials
     evaluation = Evaluation(scene_truth(scene).in_light(factors), materials.endmembers, materials.names)
     look = material_look(evaluation)
     ids: dict[int, np.ndarray] = {}
     for index in follow(console, "evaluating views", scene.eval_indices):
         truth = view_truth(scene, index).in_light(factors)
-        predicted = render_view(subject.model, scene.cameras[index])
+        predicted = render_view(subject.scene, scene.cameras[index])
         psnr_db = evaluation.add(truth, predicted)["psnr"]
         name = f"{truth.name}.png"
         write_file(folder / "rgb" / name, draw_colour(truth, predicted, evaluation.truth.bands, psnr_db))

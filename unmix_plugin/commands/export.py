@@ -72,15 +72,15 @@ def _open(product: Product) -> Job:
 
     from unmix_plugin.commands.reporting import CommandConsole, follow, say, working
     from unmix_plugin.commands.run_choice import chosen_run
-    from unmix_plugin.editing.edited_run import edit_notes, load_edited_model
+    from unmix_plugin.editing.edited_run import load_edited_run
 
     _refuse_sensor(product)
     console = CommandConsole()
     path = chosen_run(product.run, product.output_dir)
     with working(console, f"reading {path}"):
-        loaded = load_edited_model(path, product.device, product.edits, product.illuminant, product.sensor)
-    folder = (product.output or loaded.run.exports / product.name).resolve()
-    for line in edit_notes(loaded, product.edits, product.illuminant, product.sensor):
+        loaded = load_edited_run(path, product.device, product.edits, product.illuminant, product.sensor)
+    folder = (product.output or loaded.folder.exports / product.name).resolve()
+    for line in loaded.scene.notes:
         say(console, line)
     return Job(
         loaded,

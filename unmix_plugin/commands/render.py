@@ -15,11 +15,11 @@ from unmix_plugin.engine.configs import DeviceName
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from unmix_plugin.engine.runs.load_run import LoadedModel
     from unmix_plugin.products.render.cameras import CameraRequest, RenderCameras
     from unmix_plugin.products.render.outputs import Product
     from unmix_plugin.products.render.pictures import Palette
     from unmix_plugin.products.render.survey import Survey
+    from unmix_plugin.trained.open_run import LoadedRun
 
 
 @dataclass(frozen=True)
@@ -81,20 +81,19 @@ def render(words: list[str]) -> None:
 
     from unmix_plugin.commands.reporting import CommandConsole, say, working
     from unmix_plugin.commands.run_choice import chosen_run
-    from unmix_plugin.editing.edited_run import edit_notes, load_edited_model
+    from unmix_plugin.editing.edited_run import load_edited_run
     from unmix_plugin.products.render.cameras import choose_cameras
     from unmix_plugin.products.render.outputs import choose_products, default_outputs
-    from unmix_plugin.trained.run_materials import materials_of
 
     console = CommandConsole()
     path = chosen_run(options.run, options.output_dir)
     with working(console, f"reading {path}"):
-        loaded = load_edited_model(path, options.device, options.edits, options.illuminant, options.sensor)
+        loaded = load_edited_run(path, options.device, options.edits, options.illuminant, options.sensor)
         cameras = choose_cameras(loaded.scene, request)
-    for line in edit_notes(loaded, options.edits, options.illuminant, options.sensor):
+    for line in loaded.scene.notes:
         say(console, line)
     outputs = options.outputs or default_outputs(cameras.is_path)
-    products = choose_products(outputs, options.formats, materials_of(loaded.model), cameras.is_path)
+    products = choose_products(outputs, options.formats, loaded.materials_scene.materials, cameras.is_path)
     _render(options, loaded, cameras, products, console)
 
 
@@ -113,7 +112,7 @@ def _camera_request(options: RenderOptions) -> CameraRequest:
 
 def _render(
     options: RenderOptions,
-    loaded: LoadedModel,
+    loaded: LoadedRun,
     cameras: RenderCameras,
     products: tuple[Product, ...],
     console: Console,
@@ -124,7 +123,7 @@ def _render(
     from unmix_plugin.products.render.job import RenderJob
     from unmix_plugin.products.render.legend import draw_legend
 
-    folder = (options.output or loaded.run.exports / "render").resolve()
+    folder = (options.output or loaded.folder.exports / "render").resolve()
     legends = _legends(folder, products)
     camera_path, camera_bytes = _camera_file(folder, options.cameras, loaded, cameras)
     paths = [*_paths(folder, products, cameras), *legends]
@@ -134,7 +133,7 @@ def _render(
     write_file(camera_path, camera_bytes)  # first, so that a folder that can't be written is noticed early
     say(console, _announcement(cameras, products))
     survey = _survey(loaded, cameras, products, console)
-    with RenderJob(loaded.model, cameras, products, survey, folder) as job:
+    with RenderJob(loaded.materials_scene, cameras, products, survey, folder) as job:
         for block in follow(console, "rendering", job.blocks()):
             job.render(block)
     for path, product in legends.items():
@@ -146,7 +145,7 @@ def _render(
 
 
 def _survey(
-    loaded: LoadedModel, cameras: RenderCameras, products: tuple[Product, ...], console: Console
+    loaded: LoadedRun, cameras: RenderCameras, products: tuple[Product, ...], console: Console
 ) -> Survey:
     from unmix_plugin.commands.reporting import working
     from unmix_plugin.products.render.survey import Survey, needs_survey, take_survey
@@ -155,7 +154,7 @@ def _survey(
     if not needs_survey(names):
         return Survey()
     with working(console, "looking at all views for what their pictures share"):
-        return take_survey(loaded.model, cameras.views, names)
+        return take_survey(loaded.materials_scene, cameras.views, names)
 
 
 def _legends(folder: Path, products: tuple[Product, ...]) -> dict[Path, Product]:
@@ -175,15 +174,12 @@ def _paths(folder: Path, products: tuple[Product, ...], cameras: RenderCameras) 
     return [path for product in products for path in product_paths(folder, product, cameras)]
 
 
-def _camera_file(
-    folder: Path, source: str, loaded: LoadedModel, cameras: RenderCameras
-) -> tuple[Path, bytes]:
+def _camera_file(folder: Path, source: str, loaded: LoadedRun, cameras: RenderCameras) -> tuple[Path, bytes]:
     """Where the cameras are written down, and as what."""
     from unmix_plugin.trained.camera_files.camera_files import camera_file_bytes
-    from unmix_plugin.trained.world_frame import world_frame
 
     frames_per_second = (cameras.frames_per_second or 24.0) if cameras.is_path else None
-    content = camera_file_bytes(cameras.views, frames_per_second, world_frame(loaded.scene))
+    content = camera_file_bytes(cameras.views, frames_per_second, loaded.scene.frame)
     return folder / f"cameras-{Path(source).stem}.json", content
 
 

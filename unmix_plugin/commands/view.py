@@ -14,7 +14,7 @@ from unmix_plugin.viewer.options import ViewerOptions
 
 if TYPE_CHECKING:
     from unmix_plugin.scenes.scene import Scene
-    from unmix_plugin.viewer.rendering.model_source import ModelSource
+    from unmix_plugin.viewer.rendering.scene_source import SceneSource
     from unmix_plugin.viewer.server import Viewer
 
 
@@ -69,23 +69,22 @@ def prepared(options: ViewOptions) -> Viewer:
 
     from unmix_plugin.commands.reporting import CommandConsole, working
     from unmix_plugin.commands.run_choice import chosen_run
-    from unmix_plugin.editing.edited_run import light_note, requested_recipe
-    from unmix_plugin.engine.runs.load_run import load_model
-    from unmix_plugin.viewer.rendering.model_source import source_of_run
+    from unmix_plugin.editing.apply import assumption_of_light
+    from unmix_plugin.editing.edited_run import requested_recipe
+    from unmix_plugin.trained.open_run import load_run
+    from unmix_plugin.viewer.rendering.scene_source import source_of_run
     from unmix_plugin.viewer.server import Viewer
 
     console = CommandConsole()
     recipe = requested_recipe(options.edits, options.illuminant)
     path = chosen_run(options.run, options.output_dir)
     with working(console, f"reading {path}"):
-        loaded = load_model(path, options.device)
+        loaded = load_run(path, options.device)
         source = source_of_run(loaded)
-    note = light_note(loaded, options.edits, options.illuminant)
+    note = None if recipe is None else assumption_of_light(loaded.materials_scene, recipe)
     if note is not None:
         print(note, flush=True)
     with working(console, "looking at the scene"):
-        with source.borrowed() as model:
-            model.warm_up()
         return Viewer(
             source,
             options.viewer,
@@ -95,7 +94,7 @@ def prepared(options: ViewOptions) -> Viewer:
         )
 
 
-def _scene_of(source: ModelSource, data: Path | None) -> Scene:
+def _scene_of(source: SceneSource, data: Path | None) -> Scene:
     """The scene that the run was trained on.
 
     Raises:
@@ -103,10 +102,10 @@ def _scene_of(source: ModelSource, data: Path | None) -> Scene:
         RunError: it is another one.
     """
     from unmix_plugin.errors import SceneError
-    from unmix_plugin.trained.find_scene import find_scene
+    from unmix_plugin.trained.find_scene import scene_at_hand
 
-    summary = source.scene.summary
-    scene = find_scene(summary, source.run.path, data)
+    summary = source.record.summary
+    scene = scene_at_hand(summary, source.run.path, data)
     if scene is None:
         raise SceneError(
             f"it is no longer, or no longer the same, at {summary.get('root')}; name it with --data"

@@ -1,9 +1,9 @@
-"""Edits of materials and light as plain data, and the models that render them: one code for exports and the viewer.
+"""Edits of materials and light as plain data, and the scenes that they make: one code for exports and the viewer.
 
 They act on endmembers, densities and gloss, never on pixels, so they look the same in every view.
 """
 
-from unmix_plugin.editing.apply import assumption_of_light, changes_geometry, edit_model, relight
+from unmix_plugin.editing.apply import assumption_of_light, changes_geometry, edit_scene, relight
 from unmix_plugin.editing.operations import (
     Colour,
     Endmember,
@@ -42,7 +42,7 @@ __all__ = [
     "Swap",
     "assumption_of_light",
     "changes_geometry",
-    "edit_model",
+    "edit_scene",
     "read_recipe",
     "recipe_from_yaml",
     "recipe_to_yaml",

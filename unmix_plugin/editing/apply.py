@@ -1,18 +1,16 @@
-"""Recipes applied to a model: a light copy of it that renders the edited scene, for every export and the viewer alike.
+"""Recipes applied to a trained scene: another scene that shares its weights.
 
 Notation: `B` bands, `K` endmembers, `J` specular spectra, `G` mirrors.
 """
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Mapping
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float64
-from torch import nn
+from jaxtyping import Float, Float64
+from torch import Tensor
 
 from unmix_plugin.editing.edited_field import EditedField
 from unmix_plugin.editing.handlers import carry_out
@@ -21,87 +19,85 @@ from unmix_plugin.editing.material_state import MaterialState
 from unmix_plugin.editing.operations import Gloss, Replace, Retint
 from unmix_plugin.editing.recipe import Light, Recipe
 from unmix_plugin.errors import ConfigError, SpectrumError
-from unmix_plugin.model import UnmixModel
-from unmix_plugin.spectral.composition import Coefficients
+from unmix_plugin.spectral.coefficients import Coefficients
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 
-def edit_model(model: UnmixModel, recipe: Recipe, seen: Coefficients | None = None) -> UnmixModel:
-    """The model of an edited scene: renders like any other, shares its weights with `model`, which stays as it is.
-
-    Edits are made in order, in the light that the scene was recorded in; then the recipe's light is lit. Endmembers
-    keep their numbers. The result is for rendering, not for training; its metadata have the new light.
+def edit_scene(scene: TrainedScene, recipe: Recipe, seen: Coefficients | None = None) -> TrainedScene:
+    """The edited scene. Edits are made in order, in the light that the scene was recorded in; then the recipe's light
+    is lit. Endmembers keep their numbers.
 
     Args:
-        model: Of the scene as it is.
+        scene: Stays as it is.
         recipe: What to change.
-        seen: What cameras see of `model`, in any leading axes, as `seen.sample_seen` has it for a run or as a view on
-            display: retints that match the picture look at it. Without it they match the spectrum.
+        seen: What cameras see of `scene`, in any leading axes, as `seen.sample_seen` gives it: retints that match the
+            picture look at it. Without it they match the spectrum.
     Raises:
-        ConfigError: the recipe does not fit the model or contradicts itself; the message says where.
+        ConfigError: the recipe does not fit the scene or contradicts itself; the message says where.
     """
-    light = _recorded_light(model.metadata)
-    state = MaterialState.of(model.materials, light, seen)
+    light = scene.light_power
+    state = MaterialState.of(scene.materials, light, seen)
     carry_out(recipe, state)
-    factors = _light_factors(state, light, recipe)
-    edited = _light_copy(model)
-    edited.endmember_names = tuple(state.names)
-    edited.endmembers = _spectra(state.spectra * factors, model)
+    factors, told = _light_factors(scene, recipe)
     specular_spectra, gloss = _specular(state)
-    if model.config.specular == "full":
-        edited.every_band = _spectra(specular_spectra * factors, model).detach()
-    else:
-        edited.specular_spectra = _spectra(specular_spectra * factors, model)
-    if gloss is not None or not state.is_kept.all():
-        shine = np.ones((1, len(state.gloss))) if gloss is None else gloss
-        edited_field = EditedField.over(
-            model.field, torch.from_numpy(state.is_kept), torch.from_numpy(shine).float()
-        )
-        edited.add_module("field", edited_field.to(model.device))
-    edited.metadata = {**model.metadata, "edit_notes": [*state.notes]}
+    materials = replace(
+        scene.materials,
+        names=tuple(state.names),
+        endmembers=_tensor(state.spectra * factors, scene),
+        specular_spectra=_tensor(specular_spectra * factors, scene),
+    )
     if recipe.illuminant is not None:
         lit = factors if light is None else light * factors
-        edited.metadata["illuminant"] = lit.tolist()
-    return edited
+        materials = replace(materials, light=_tensor(lit, scene))
+    field = scene.field
+    if gloss is not None or not state.is_kept.all():
+        shine = np.ones((1, len(state.gloss))) if gloss is None else gloss
+        edited = EditedField.over(field, torch.from_numpy(state.is_kept), torch.from_numpy(shine).float())
+        field = edited.to(scene.device)
+    assumed = assumption_of_light(scene, recipe)
+    notes = [*scene.notes, *([] if assumed is None else [assumed]), *state.notes, *told]
+    return replace(scene, field=field, materials=materials, notes=tuple(notes))
 
 
-def relight(model: UnmixModel, light: Light) -> UnmixModel:
-    """The model of the scene in another light, as `edit_model` makes it.
+def relight(scene: TrainedScene, light: Light) -> TrainedScene:
+    """The scene in another light.
 
     Raises:
         ConfigError: the light is unknown, or does not cover the bands.
     """
-    return edit_model(model, Recipe(illuminant=light))
+    return edit_scene(scene, Recipe(illuminant=light))
 
 
 def changes_geometry(recipe: Recipe) -> bool:
-    """Whether the edited model has to render anew; else coefficients of the unedited one serve with its materials."""
+    """Whether the edited scene has to be rendered anew; else coefficients of the unedited one serve with its
+    materials."""
     return recipe.removes_matter or any(
         isinstance(one, Gloss) and one.endmember is not None for one in recipe.operations
     )
 
 
-def assumption_of_light(metadata: Mapping[str, Any], recipe: Recipe) -> str | None:
+def assumption_of_light(scene: TrainedScene, recipe: Recipe) -> str | None:
     """What a user has to be told of the light that edits start from; None if nothing."""
     depends = any(isinstance(one, Replace | Retint) for one in recipe.operations)
-    if _recorded_light(metadata) is not None or not (depends or recipe.illuminant):
+    if scene.light is not None or not (depends or recipe.illuminant):
         return None
     return "the scene does not say what light it was recorded in: taken as flat (CIE illuminant E)"
 
 
-def _recorded_light(metadata: Mapping[str, Any]) -> Float64[np.ndarray, " B"] | None:
-    light = metadata["illuminant"]
-    return None if light is None else np.array(light, dtype=np.float64)
+def light_factors(scene: TrainedScene, recipe: Recipe) -> Float64[np.ndarray, " B"]:
+    """What radiance measured in the scene's light is multiplied with, to be as in the recipe's.
+
+    Raises:
+        ConfigError: the light is unknown, or covers no band.
+    """
+    return _light_factors(scene, recipe)[0]
 
 
-def _light_factors(
-    state: MaterialState, light: Float64[np.ndarray, " B"] | None, recipe: Recipe
-) -> Float64[np.ndarray, " B"]:
+def _light_factors(scene: TrainedScene, recipe: Recipe) -> tuple[Float64[np.ndarray, " B"], list[str]]:
     if recipe.illuminant is None:
-        return np.ones(len(state.bands))
+        return np.ones(len(scene.bands)), []
     try:
-        factors, notes = relighting_factors(state.bands, light, recipe.illuminant)
-        state.notes += notes
-        return factors
+        return relighting_factors(scene.bands, scene.light_power, recipe.illuminant)
     except SpectrumError as error:
         raise ConfigError(f"{recipe.source}: {error}") from error
 
@@ -127,12 +123,5 @@ def _specular(
     return np.concatenate(mirrored), gloss
 
 
-def _light_copy(model: UnmixModel) -> UnmixModel:
-    """A copy whose spectra are its own, and whose heavy parts are the model's."""
-    shared = (model.field, model.renderer, model.scene_box, model.config, model.metadata)
-    return copy.deepcopy(model, {id(part): part for part in shared})
-
-
-def _spectra(values: Float64[np.ndarray, "N B"], model: UnmixModel) -> nn.Parameter:
-    tensor = torch.tensor(values, dtype=torch.float32, device=model.device)
-    return nn.Parameter(tensor, requires_grad=False)
+def _tensor(values: Float64[np.ndarray, "*axes B"], scene: TrainedScene) -> Float[Tensor, "*axes B"]:
+    return torch.tensor(values, dtype=torch.float32, device=scene.device)

@@ -1,52 +1,32 @@
 """A run with edits applied: what commands load for `--edits`, `--illuminant` and `--sensor`.
 
-Without any of them it is the run as it is. A light given on the command line goes before that of the recipe; the sensor
-looks at what edits and light have made.
+A light given on the command line overrides the recipe's; the sensor looks at what edits and light have made.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-from jaxtyping import Float64
-
-from unmix_plugin.editing.apply import assumption_of_light, edit_model
+from unmix_plugin.editing.apply import edit_scene
 from unmix_plugin.editing.recipe import Light, Recipe
 from unmix_plugin.editing.seen import sample_seen
 from unmix_plugin.editing.simulated_sensor import with_sensor
 from unmix_plugin.editing.yaml_reading import read_recipe
-from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.model import Model
-from unmix_plugin.engine.runs.load_run import LoadedModel, load_model, read_scene_record
-from unmix_plugin.errors import ConfigError
-from unmix_plugin.model import UnmixModel
-from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.illuminants import parse_light
 from unmix_plugin.spectral.sensor import read_sensor
+from unmix_plugin.trained.open_run import LoadedRun, load_run
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 
-@dataclass(frozen=True)
-class EditedModel:
-    """A model with edits applied."""
-
-    model: UnmixModel
-    light_factors: Float64[np.ndarray, " B"]
-    """What radiance measured in the scene's light is multiplied with, to compare it with what this model renders."""
-    notes: list[str]
-    """What a user has to be told about the result."""
-
-
-def load_edited_model(
+def load_edited_run(
     path: Path,
     device: str = "auto",
     edits: Path | None = None,
     illuminant: str | None = None,
     sensor: Path | None = None,
-) -> LoadedModel:
-    """A run's newest model as `engine.load_run.load_model` gives it, edited; its scene record has the new light and the
-    sensor's wavelengths.
+) -> LoadedRun:
+    """A run whose scene is edited; `scene.notes` has what a user has to be told of that.
 
     Args:
         path: Run folder.
@@ -62,19 +42,12 @@ def load_edited_model(
     """
     recipe = requested_recipe(edits, illuminant)
     camera = None if sensor is None else read_sensor(sensor)
-    loaded = load_model(path, device)
-    edited = loaded.model
+    run = load_run(path, device)
     if recipe is not None:
-        edited = apply_recipe(edited, recipe, loaded.scene.train_cameras).model
+        run = replace(run, scene=apply_recipe(run.materials_scene, recipe))
     if camera is not None:
-        if not isinstance(edited, UnmixModel):
-            raise ConfigError(f"{type(edited).__name__} has no spectra; leave out --sensor")
-        edited = with_sensor(edited, camera)[0]
-    if edited is loaded.model:
-        return loaded
-    new = {key: edited.metadata[key] for key in ("wavelengths_nm", "illuminant")}
-    scene = replace(loaded.scene, metadata={**loaded.scene.metadata, **new})
-    return replace(loaded, model=edited, scene=scene)
+        run = replace(run, scene=with_sensor(run.materials_scene, camera))
+    return run
 
 
 def requested_recipe(edits: Path | None, illuminant: str | None) -> Recipe | None:
@@ -95,63 +68,10 @@ def requested_recipe(edits: Path | None, illuminant: str | None) -> Recipe | Non
     )
 
 
-def apply_recipe(model: Model, recipe: Recipe, cameras: Cameras) -> EditedModel:
-    """A model as a recipe has it.
+def apply_recipe(scene: TrainedScene, recipe: Recipe) -> TrainedScene:
+    """A scene as a recipe has it; its training cameras decide how retinted materials look in pictures.
 
-    Args:
-        model: Of the scene as it is.
-        recipe: What to change.
-        cameras: What some of see decides how retinted materials look in pictures.
     Raises:
-        ConfigError: the recipe does not fit the model, or the method does not unmix spectra.
+        ConfigError: the recipe does not fit the scene.
     """
-    if not isinstance(model, UnmixModel):
-        raise ConfigError(
-            f"{type(model).__name__} has no materials to edit; leave out --edits and --illuminant"
-        )
-    seen = sample_seen(model, cameras) if recipe.wants_pictures else None
-    edited = edit_model(model, recipe, seen)
-    factors = np.ones(len(model.bands))
-    if recipe.illuminant is not None:
-        recorded = model.metadata["illuminant"]
-        before = np.ones(len(factors)) if recorded is None else np.array(recorded)
-        factors = np.array(edited.metadata["illuminant"])
-        factors = np.divide(factors, before, out=np.zeros(len(before)), where=before > 0)
-    note = assumption_of_light(model.metadata, recipe)
-    return EditedModel(edited, factors, [*([] if note is None else [note]), *edited.metadata["edit_notes"]])
-
-
-def light_note(loaded: LoadedModel, edits: Path | None, illuminant: str | None) -> str | None:
-    """What a command should say of the light that an edited run starts from; None where it is recorded.
-
-    Args:
-        loaded: The run, edited or not: whether its light was recorded is in its summary.
-        edits, illuminant: As `load_edited_model` takes them.
-    """
-    recipe = requested_recipe(edits, illuminant)
-    if recipe is None:
-        return None
-    return assumption_of_light({"illuminant": loaded.scene.summary.get("illuminant")}, recipe)
-
-
-def edit_notes(
-    loaded: LoadedModel, edits: Path | None, illuminant: str | None, sensor: Path | None
-) -> list[str]:
-    """All that a command should say of a run that was loaded with these."""
-    note = light_note(loaded, edits, illuminant)
-    found = loaded.model.metadata.get("edit_notes", []) if isinstance(loaded.model, UnmixModel) else []
-    return [*([] if note is None else [note]), *found, *sensor_notes(loaded, sensor)]
-
-
-def sensor_notes(loaded: LoadedModel, sensor: Path | None) -> list[str]:
-    """What a command should say of the sensor that a run is seen through; nothing without one.
-
-    Args:
-        loaded: The run, seen through it or not: its bands are in its folder.
-        sensor: As `load_edited_model` takes it.
-    """
-    if sensor is None:
-        return []
-    bands = Bands.of(read_scene_record(loaded.run).metadata["wavelengths_nm"])
-    seen = read_sensor(sensor).seen_by(bands)
-    return [seen.description, *seen.notes]
+    return edit_scene(scene, recipe, sample_seen(scene) if recipe.wants_pictures else None)

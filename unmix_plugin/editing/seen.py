@@ -11,7 +11,7 @@ Notation: `N` pixels, `K` endmembers; a pixel of an endmember is one of which it
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -21,9 +21,9 @@ from torch import Tensor
 from unmix_plugin.editing.material_state import MaterialState
 from unmix_plugin.editing.operations import Colour
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.model import UnmixModel
+from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION, Coefficients
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
-from unmix_plugin.spectral.composition import OCCUPIED_ACCUMULATION, Coefficients
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 _NUM_VIEWS = 8
 _LONGEST_SIDE_PX = 32
@@ -35,13 +35,12 @@ _PURITY_EXPONENT = 4
 """Of the share, in the weight of a pixel: mixtures must not decide what the material itself looks like."""
 
 
-def sample_seen(model: UnmixModel, cameras: Cameras) -> Coefficients:
-    """What pixels are made of in coarse pictures of a few views spread over `cameras`: rows of pixels (N, ...)."""
+def sample_seen(scene: TrainedScene) -> Coefficients:
+    """What pixels are made of in coarse pictures of a few training views: rows of pixels (N, ...)."""
+    cameras = [view.camera for view in scene.views if view.split == "train"]
     chosen = np.unique(np.linspace(0, len(cameras) - 1, min(_NUM_VIEWS, len(cameras))).round().astype(int))
-    views = [model.get_image_coefficients(_coarse(cameras[int(i)]), subpixels=1) for i in chosen]
-    return Coefficients.concatenate(
-        [Coefficients(*(getattr(view, one.name).flatten(0, 1) for one in fields(view))) for view in views]
-    )
+    views = [scene.look(_coarse(cameras[int(i)]), subpixels=1) for i in chosen]
+    return Coefficients.concatenate([view.coefficients.flatten() for view in views])
 
 
 @dataclass(frozen=True)
@@ -104,12 +103,4 @@ def _rows(values: Tensor, chosen: Tensor) -> np.ndarray:
 def _coarse(camera: Cameras) -> Cameras:
     """The same view in few pixels."""
     shrink = min(1.0, _LONGEST_SIDE_PX / max(camera.width, camera.height))
-    width, height = (max(1, math.floor(side * shrink)) for side in (camera.width, camera.height))
-    ratio = torch.tensor([width / camera.width, height / camera.height]).to(camera.focal_px)
-    return replace(
-        camera,
-        focal_px=camera.focal_px * ratio,
-        center_px=camera.center_px * ratio,
-        width=width,
-        height=height,
-    )
+    return camera.resized(*(max(1, math.floor(side * shrink)) for side in (camera.width, camera.height)))

@@ -15,6 +15,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.engine.instantiate import InstantiateConfig, Target, require_in_range
+from unmix_plugin.engine.outputs import Output
 from unmix_plugin.engine.training.callbacks import TrainingCallback
 from unmix_plugin.errors import ConfigError
 
@@ -54,6 +55,10 @@ class Model(nn.Module, ABC):
     The config, the scene box and the metadata alone give a model its modules and the shape of every parameter and
     buffer; the checkpoint gives the values. So a run folder renders without the data it was trained on.
     """
+
+    outputs: tuple[Output, ...] = ()
+    """What `get_outputs_for_camera` gives that can be shown. `accumulation` (opacity) and `ray_distance` (model units)
+    have the meaning that they have everywhere."""
 
     def __init__(self, config: ModelConfig, *, scene_box: SceneBox, metadata: Mapping[str, Any]) -> None:
         """Keep the arguments, then call `populate_modules`."""
@@ -113,6 +118,10 @@ class Model(nn.Module, ABC):
     def get_training_callbacks(self) -> list[TrainingCallback]:
         """Functions to call around each step."""
         return []
+
+    def observe(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> None:
+        """Learn from a training batch what is not learnt by gradients; called after each step's losses, without
+        gradients. `get_outputs` and `get_loss_dict` change nothing in the model."""
 
     def num_samples(self, outputs: dict[str, Tensor]) -> int:
         """Field samples behind `outputs`, for the log; 0 where a model does not count."""

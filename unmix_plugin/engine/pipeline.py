@@ -75,7 +75,10 @@ class Pipeline(nn.Module):
         ray_bundle, batch = self.datamanager.next_train(step)
         outputs = self.model(ray_bundle)
         metrics = self.model.get_metrics_dict(outputs, batch)
-        return outputs, self.model.get_loss_dict(outputs, batch, metrics), metrics
+        losses = self.model.get_loss_dict(outputs, batch, metrics)
+        with torch.no_grad():
+            self.model.observe(outputs, batch)
+        return outputs, losses, metrics
 
     @torch.no_grad()
     def get_average_eval_image_metrics_and_images(self) -> tuple[dict[str, float], dict[str, Tensor]]:

@@ -1,7 +1,9 @@
 """Finding methods: ours and any third party's, through entry points."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
+from typing import Any
 
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.errors import ConfigError, did_you_mean
@@ -18,6 +20,9 @@ class MethodSpecification:
     """Defaults of everything; `config.method_name` is the method's name on the command line."""
     description: str
     """One line for the list of methods."""
+    scene: Callable[..., Any] | None = None
+    """From a model, the record of its scene and averaged parameters (None: the model's own) to what commands and the
+    viewer show, as `trained.protocol.RenderableScene`; None: the model's `outputs`."""
 
 
 @dataclass(frozen=True)

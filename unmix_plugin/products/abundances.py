@@ -18,7 +18,7 @@ from unmix_plugin.formats.files import array_bytes, write_file
 from unmix_plugin.products.product import ViewProduct
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import colour_mode
-from unmix_plugin.spectral.composition import Materials
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.view_rendering import RenderedView, as_numpy, picture
 

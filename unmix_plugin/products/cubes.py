@@ -14,7 +14,7 @@ from unmix_plugin.formats.spectral_exr import write_spectral_exr
 from unmix_plugin.products.abundances import view_paths
 from unmix_plugin.products.product import ViewProduct
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
-from unmix_plugin.spectral.composition import Materials
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.view_rendering import RenderedView
 
 

@@ -11,7 +11,7 @@ from unmix_plugin.figures.plotting import figure_bytes, plain_axes
 from unmix_plugin.formats.envi_library import envi_library_paths, write_envi_library
 from unmix_plugin.formats.files import make_folder, write_file
 from unmix_plugin.products.product import Job, Product
-from unmix_plugin.spectral.composition import Materials
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.run_materials import endmember_colours, write_endmembers_csv
 
 _LINE_STYLES = ("-", "--", "-.", ":")

@@ -21,12 +21,12 @@ from unmix_plugin.formats.ply import write_ply
 from unmix_plugin.products.product import Job, Product
 
 if TYPE_CHECKING:
-    from unmix_plugin.model import UnmixModel
     from unmix_plugin.products.mesh_extraction import TriangleMesh
     from unmix_plugin.scenes.scene import Normalisation
     from unmix_plugin.trained.density_grid import GridPoints
     from unmix_plugin.trained.surface import SeenSurface
     from unmix_plugin.trained.surface_appearance import SurfaceLooks
+    from unmix_plugin.trained.trained_scene import TrainedScene
 
 MeshFormat = Literal["ply", "glb", "obj"]
 
@@ -63,11 +63,11 @@ class Mesh(Product):
         surface, densities, grid = job.surface(_NUM_RAYS), *self._sample(job)
         with job.working("making the mesh"):
             if self.density is None:
-                threshold = surface_density(job.model, surface.points())
+                threshold = surface_density(job.scene, surface.points())
             else:
                 threshold = self.density / job.frame.scale
             mesh = self._extract(job, densities, grid, threshold, surface)
-            written = write_mesh(job.folder, self.formats, mesh, job.model, job.frame)
+            written = write_mesh(job.folder, self.formats, mesh, job.scene, job.frame)
         job.say(
             f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, "
             f"at a density of {threshold * job.frame.scale:.4g} per world unit"
@@ -77,10 +77,10 @@ class Mesh(Product):
     def _sample(self, job: Job) -> tuple[Float32[np.ndarray, "X Y Z"], GridPoints]:
         from unmix_plugin.trained.density_grid import GridPoints, sample_slice
 
-        model = job.model
-        grid = GridPoints.over(model.renderer.aabb, self.resolution)
+        scene = job.scene
+        grid = GridPoints.over(scene.scene_box.aabb, self.resolution)
         slices = job.follow("sampling the density", range(grid.shape[0]))
-        return np.stack([sample_slice(model, grid.slice_points(index))[0] for index in slices]), grid
+        return np.stack([sample_slice(scene, grid.slice_points(index))[0] for index in slices]), grid
 
     def _extract(
         self,
@@ -98,10 +98,10 @@ class Mesh(Product):
             without_stray_pieces,
         )
 
-        pixel_size = float(job.model.metadata["pixel_size"])
+        pixel_size = job.scene.pixel_size
         if self.unseen == "keep":
             return without_stray_pieces(extract_mesh(densities, grid, threshold, self.smoothing, pixel_size))
-        solid = filled(densities, grid, job.model, surface)
+        solid = filled(densities, grid, job.scene, surface)
         mesh = extract_mesh(solid, grid, threshold, self.smoothing, pixel_size)
         return without_stray_pieces(trim_unseen(mesh, surface))
 
@@ -124,7 +124,11 @@ def require_sound(density: float | None, smoothing: float) -> None:
 
 
 def write_mesh(
-    folder: Path, formats: tuple[MeshFormat, ...], mesh: TriangleMesh, model: UnmixModel, frame: Normalisation
+    folder: Path,
+    formats: tuple[MeshFormat, ...],
+    mesh: TriangleMesh,
+    scene: TrainedScene,
+    frame: Normalisation,
 ) -> list[Path]:
     """Write a mesh with the colour, material and abundances of each vertex, seen from straight above it.
 
@@ -135,7 +139,7 @@ def write_mesh(
         folder: Where to write; it is made.
         formats: Which.
         mesh: Model space.
-        model: Trained.
+        scene: Trained.
         frame: Of the run; files are in world coordinates.
     Raises:
         RunError: there is no face, or the disk is full or refuses.
@@ -151,8 +155,8 @@ def write_mesh(
         )
     normals = mesh.normals
     positions = torch.from_numpy(mesh.vertices).float()
-    seen = look_from_above(model, positions, torch.from_numpy(normals).float())
-    looks = SurfaceLooks(model.materials, *seen)
+    seen = look_from_above(scene, positions, torch.from_numpy(normals).float())
+    looks = SurfaceLooks(scene.materials, *seen)
     world = TriangleMesh(frame.to_world(mesh.vertices).astype(np.float32), mesh.faces)
     turned = directions_to_world(frame, normals).astype(np.float32)
     writers = {"ply": _write_ply, "obj": _write_obj, "glb": _write_glb}

@@ -17,9 +17,9 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int
 
 from unmix_plugin.errors import ConfigError, RunError
-from unmix_plugin.model import UnmixModel
-from unmix_plugin.trained.density_grid import GridPoints, may_hold_matter, sample_densities
+from unmix_plugin.trained.density_grid import GridPoints, sample_densities
 from unmix_plugin.trained.surface import SeenSurface, SurfacePoints
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 _END_QUANTILE = 0.07
 """Rays end inside what they hit: this part of them where the density is still lower than at the surface."""
@@ -59,13 +59,13 @@ class TriangleMesh:
         return np.where(lengths > 0, sums / np.where(lengths > 0, lengths, 1.0), [0.0, 0.0, 1.0])
 
 
-def surface_density(model: UnmixModel, ends: SurfacePoints) -> float:
+def surface_density(scene: TrainedScene, ends: SurfacePoints) -> float:
     """Density per model unit at which the surface lies, from the densities where rays end.
 
     Raises:
         RunError: no ray ends anywhere.
     """
-    densities = sample_densities(model, ends.positions)
+    densities = sample_densities(scene, ends.positions)
     densities = densities[densities > 0]
     if len(densities) == 0:
         raise RunError(
@@ -115,7 +115,7 @@ def extract_mesh(
 
 
 def filled(
-    densities: Float32[np.ndarray, "X Y Z"], grid: GridPoints, model: UnmixModel, surface: SeenSurface
+    densities: Float32[np.ndarray, "X Y Z"], grid: GridPoints, scene: TrainedScene, surface: SeenSurface
 ) -> Float32[np.ndarray, "X Y Z"]:
     """Densities with what no camera sees into as solid as the densest point, so that surfaces have no inner side.
 
@@ -128,7 +128,7 @@ def filled(
     for index in range(len(result)):
         points = grid.slice_points(index)
         unknown = torch.from_numpy(result[index] == 0)
-        unknown[unknown.clone()] = may_hold_matter(model, points[unknown].to(model.device)).cpu()
+        unknown[unknown.clone()] = scene.renderer.is_reachable(points[unknown].to(scene.device)).cpu()
         unknown[unknown.clone()] = surface.hides(points[unknown])
         result[index][unknown.numpy()] = solid
     return result

@@ -24,8 +24,8 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.difference import lab_to_srgb, reflectance_to_lab
 from unmix_plugin.spectral.colour.illuminants import illuminant_power, parse_light
 from unmix_plugin.spectral.colour.metamerism import MetamericPair, metameric_pairs
-from unmix_plugin.spectral.composition import Materials
 from unmix_plugin.spectral.library.material_library import MaterialLibrary
+from unmix_plugin.spectral.materials import Materials
 
 _MOST_DRAWN = 12
 _NAME_WIDTH, _CELL, _ROW, _HEADING, _MARGIN = 3.4, 1.5, 0.62, 0.75, 0.2
@@ -55,10 +55,8 @@ class Metamerism(Product):
         from unmix_plugin.spectral.library.material_library import library_with
 
         job.claim(metamerism_paths(job.folder))
-        light = job.loaded.scene.metadata.get("illuminant")
-        scene_light = None if light is None else np.array(light)
         with job.working("comparing colours"):
-            found = find_metamers(job.materials, scene_light, library_with(self.library), self)
+            found = find_metamers(job.materials, job.scene.light_power, library_with(self.library), self)
             written = write_metamerism(job.folder, found)
         job.say(
             f"{len(found.pairs)} pairs of {len(found.names)} materials, seen in {', '.join(found.lights)} "

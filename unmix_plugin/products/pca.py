@@ -22,13 +22,14 @@ from unmix_plugin.figures.picture_grid import over_neutral
 from unmix_plugin.formats.files import write_file
 from unmix_plugin.formats.png import rgba_png_bytes
 from unmix_plugin.products.product import Job, Product
-from unmix_plugin.spectral.composition import OCCUPIED_ACCUMULATION, Materials
+from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.pca import PcaColours
 from unmix_plugin.trained.run_views import ViewChoice
 from unmix_plugin.trained.view_rendering import RenderedView, as_numpy
 
 if TYPE_CHECKING:
-    from unmix_plugin.engine.model import Model
+    from unmix_plugin.trained.trained_scene import TrainedScene
 
 PcaOf = Literal["spectra", "abundances"]
 
@@ -53,9 +54,9 @@ class Pca(Product):
 
     def write(self, job: Job) -> list[Path]:
         """Find the components of all views, then paint each."""
-        views, model = job.views(self.views), job.loaded.model
+        views, scene = job.views(self.views), job.scene
         job.claim([*(pca_path(job.folder, view.name) for view in views), components_path(job.folder)])
-        seen = [survey_view(model, view.camera, self.of) for view in job.follow("finding components", views)]
+        seen = [survey_view(scene, view.camera, self.of) for view in job.follow("finding components", views)]
         components = find_components(seen, self.of)
         written = [
             write_pca(job.folder, view.name, job.render(view), components)
@@ -82,10 +83,10 @@ def component_values(outputs: dict[str, Tensor], of: PcaOf) -> Float[Tensor, "N 
     return (values if of == "spectra" else values / accumulation[seen][:, None]).cpu()
 
 
-def survey_view(model: Model, camera: Cameras, of: PcaOf) -> Float[Tensor, "N C"]:
+def survey_view(scene: TrainedScene, camera: Cameras, of: PcaOf) -> Float[Tensor, "N C"]:
     """What a small render of a view shows, to find components from."""
     names = ("spectral", "abundances", "accumulation")
-    return component_values(model.get_outputs_for_camera(camera.shrunk(_PIXELS), names), of)
+    return component_values(scene.render(camera.shrunk(_PIXELS), names), of)
 
 
 def find_components(values: Sequence[Float[Tensor, "_ C"]], of: PcaOf) -> Components:

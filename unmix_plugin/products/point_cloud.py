@@ -24,7 +24,7 @@ from unmix_plugin.products.product import Job, Product
 if TYPE_CHECKING:
     from unmix_plugin.products.point_scores import PointScore
     from unmix_plugin.scenes.scene import Normalisation
-    from unmix_plugin.spectral.composition import Materials
+    from unmix_plugin.spectral.materials import Materials
     from unmix_plugin.trained.surface import SurfacePoints
 
 _RAYS_PER_POINT = 5

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.composition import Materials
 from unmix_plugin.spectral.maps.indices import NAMED_INDICES
 from unmix_plugin.spectral.maps.reflectance_maps import (
     ReflectanceMap,
@@ -23,6 +22,7 @@ from unmix_plugin.spectral.maps.reflectance_maps import (
     parse_reflectance_map,
     seen_reflectance,
 )
+from unmix_plugin.spectral.materials import Materials
 
 _LONGEST_COMMENT = 300
 

@@ -12,16 +12,15 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import tyro
 
 from unmix_plugin.engine.configs import DeviceName
-from unmix_plugin.errors import ConfigError
 from unmix_plugin.formats.files import refuse_to_overwrite
 from unmix_plugin.trained.run_views import RunView, ViewChoice, views_of
 
 if TYPE_CHECKING:
-    from unmix_plugin.engine.runs.load_run import LoadedModel
-    from unmix_plugin.model import UnmixModel
     from unmix_plugin.scenes.scene import Normalisation
-    from unmix_plugin.spectral.composition import Materials
+    from unmix_plugin.spectral.materials import Materials
+    from unmix_plugin.trained.open_run import LoadedRun
     from unmix_plugin.trained.surface import SeenSurface
+    from unmix_plugin.trained.trained_scene import TrainedScene
     from unmix_plugin.trained.view_rendering import RenderedView
 
 
@@ -94,7 +93,7 @@ class ViewProduct(Product):
 class Job:
     """A loaded run, a folder to write to, and ways to show how far the work is."""
 
-    loaded: LoadedModel
+    loaded: LoadedRun
     folder: Path
     """Absolute."""
     overwrite: bool
@@ -106,38 +105,27 @@ class Job:
     """The items given, while it is shown how many are done."""
 
     @property
-    def materials(self) -> Materials:
-        """The model's materials.
+    def scene(self) -> TrainedScene:
+        """The trained scene.
 
         Raises:
             ConfigError: its method does not unmix spectra.
         """
-        from unmix_plugin.trained.run_materials import materials_of
-
-        return materials_of(self.loaded.model)
+        return self.loaded.materials_scene
 
     @property
-    def model(self) -> UnmixModel:
-        """The model, for products that need more than every method that unmixes spectra has.
+    def materials(self) -> Materials:
+        """Its endmembers and the light that they are seen in.
 
         Raises:
-            ConfigError: it is not of this method.
+            ConfigError: its method does not unmix spectra.
         """
-        from unmix_plugin.model import UnmixModel
-
-        model = self.loaded.model
-        if not isinstance(model, UnmixModel):
-            raise ConfigError(
-                f"this needs a run of unmix-nerf; {self.loaded.run.path} is of {type(model).__name__}"
-            )
-        return model
+        return self.scene.materials
 
     @property
     def frame(self) -> Normalisation:
-        """How the scene's world became the run's model space."""
-        from unmix_plugin.trained.world_frame import world_frame
-
-        return world_frame(self.loaded.scene)
+        """From the scene's world to model space."""
+        return self.loaded.scene.frame
 
     def claim(self, paths: Collection[Path]) -> None:
         """Refuse to overwrite files, before anything is computed.
@@ -149,20 +137,20 @@ class Job:
 
     def views(self, choice: ViewChoice) -> list[RunView]:
         """Views of the run."""
-        return views_of(self.loaded.scene, choice)
+        return views_of(self.loaded.scene.views, choice)
 
     def render(self, view: RunView) -> RenderedView:
         """A view of the run."""
         from unmix_plugin.trained.view_rendering import render_view
 
-        return render_view(self.loaded.model, view.camera)
+        return render_view(self.scene, view.camera)
 
     def surface(self, num_rays: int) -> SeenSurface:
         """What all cameras of the run see, with about so many rays."""
         from unmix_plugin.trained.surface import SeenSurface
 
         cameras = [view.camera for view in self.views("all")]
-        surface = SeenSurface(self.model, num_rays, cameras)
+        surface = SeenSurface(self.scene, num_rays, cameras)
         for camera in self.follow("looking at the surface", cameras):
             surface.look(camera)
         return surface

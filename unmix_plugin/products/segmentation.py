@@ -18,7 +18,7 @@ from unmix_plugin.formats.files import array_bytes, write_file
 from unmix_plugin.formats.png import indexed_png_bytes
 from unmix_plugin.products.abundances import colour_panel
 from unmix_plugin.products.product import Job, ViewProduct
-from unmix_plugin.spectral.composition import Materials
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.view_rendering import RenderedView

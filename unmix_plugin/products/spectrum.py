@@ -19,15 +19,16 @@ from unmix_plugin.errors import ConfigError
 from unmix_plugin.figures.plotting import figure_bytes, plain_axes
 from unmix_plugin.formats.files import make_folder, write_file
 from unmix_plugin.products.product import Job, Product
-from unmix_plugin.spectral.composition import OCCUPIED_ACCUMULATION, Materials
+from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION
 from unmix_plugin.spectral.library.material_library import Comparison
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.run_views import RunView, find_view
 
 if TYPE_CHECKING:
     from unmix_plugin.trained.library_matches import ShownMatch
-    from unmix_plugin.trained.probe import Probe
+    from unmix_plugin.trained.protocol import Probe
 
 _MOST_BARS = 12
 
@@ -70,17 +71,15 @@ class Spectrum(Product):
         return write_spectrum(job.folder, name, place, job.materials)
 
     def _pixel(self, job: Job, view: RunView, pixel: tuple[int, int]) -> ProbedPlace:
-        from unmix_plugin.trained.probe import probe_pixel
 
-        probe = probe_pixel(job.model, view.camera, pixel, job.frame)
+        probe = job.scene.probe(view.camera, *pixel)
         facts = {"view": view.name, "pixel": list(pixel)}
         title = f"{view.name}, column {pixel[0]}, row {pixel[1]}"
         return self._place(job, title, facts, probe, self._measured(job, view, pixel))
 
     def _point(self, job: Job, point: tuple[float, float, float]) -> ProbedPlace:
-        from unmix_plugin.trained.probe import probe_point
 
-        probe = probe_point(job.model, point, job.frame)
+        probe = job.scene.probe_point(*point)
         title = f"point {', '.join(f'{value:g}' for value in point)}"
         return self._place(job, title, {"point": list(point)}, probe, None)
 
@@ -88,9 +87,9 @@ class Spectrum(Product):
         self, job: Job, title: str, facts: dict[str, object], probe: Probe, measured: np.ndarray | None
     ) -> ProbedPlace:
         from unmix_plugin.spectral.library.material_library import library_with
-        from unmix_plugin.trained.library_matches import LIGHT_UNKNOWN, light_of, shown_matches
+        from unmix_plugin.trained.library_matches import LIGHT_UNKNOWN, shown_matches
 
-        light = light_of(job.model)
+        light = job.scene.light_power
         if light is None:
             job.say(LIGHT_UNKNOWN)
         if probe.opacity < OCCUPIED_ACCUMULATION:
@@ -103,16 +102,16 @@ class Spectrum(Product):
 
     def _measured(self, job: Job, view: RunView, pixel: tuple[int, int]) -> np.ndarray | None:
         """What the scene has in a pixel, in the light asked for."""
-        from unmix_plugin.trained.find_scene import find_scene
-        from unmix_plugin.trained.library_matches import light_of, relit
+        from unmix_plugin.trained.find_scene import scene_at_hand
+        from unmix_plugin.trained.library_matches import relit
 
         with job.working("looking for the scene"):
-            scene = find_scene(job.loaded.scene.summary, job.loaded.run.path, self.data)
+            scene = scene_at_hand(job.loaded.record.summary, job.loaded.folder.path, self.data)
         names = [] if scene is None else [frame.name for frame in scene.frames]
         if scene is None or view.name not in names:
             job.say("the scene is not at hand: no measured spectrum (--data says where it is)")
             return None
-        recorded, light = job.loaded.scene.summary.get("illuminant"), light_of(job.model)
+        recorded, light = job.loaded.record.summary.get("illuminant"), job.scene.light_power
         return relit(scene.cube(names.index(view.name))[pixel[1], pixel[0]], recorded, light)
 
 

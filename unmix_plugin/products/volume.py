@@ -17,9 +17,9 @@ from unmix_plugin.atomic_files import whole_file, write_errors_as
 from unmix_plugin.products.product import Job, Product
 
 if TYPE_CHECKING:
-    from unmix_plugin.model import UnmixModel
     from unmix_plugin.scenes.scene import Normalisation
     from unmix_plugin.trained.density_grid import GridPoints
+    from unmix_plugin.trained.trained_scene import TrainedScene
 
 _FASTEST = 1
 """Compression that the disk doesn't wait for; most of a volume is empty and shrinks to nothing anyway."""
@@ -39,11 +39,11 @@ class Volume(Product):
         """Sample the field, slice by slice."""
         from unmix_plugin.trained.density_grid import GridPoints
 
-        model = job.model
-        grid = GridPoints.over(model.renderer.aabb, self.resolution)
+        scene = job.scene
+        grid = GridPoints.over(scene.scene_box.aabb, self.resolution)
         job.claim([volume_path(job.folder)])
         slices = job.follow("sampling the field", range(grid.shape[0]))
-        return [write_volume(job.folder, model, grid, job.frame, slices)]
+        return [write_volume(job.folder, scene, grid, job.frame, slices)]
 
 
 def volume_path(folder: Path) -> Path:
@@ -52,7 +52,7 @@ def volume_path(folder: Path) -> Path:
 
 
 def write_volume(
-    folder: Path, model: UnmixModel, grid: GridPoints, frame: Normalisation, slices: Iterable[int]
+    folder: Path, scene: TrainedScene, grid: GridPoints, frame: Normalisation, slices: Iterable[int]
 ) -> Path:
     """Write `volume.npz`, of which one slice is in memory at a time, and all densities.
 
@@ -62,7 +62,7 @@ def write_volume(
 
     Args:
         folder: Where to write; it is made.
-        model: Trained.
+        scene: Trained.
         grid: Where to sample.
         frame: Of the run.
         slices: 0 to X - 1, in order.
@@ -72,7 +72,7 @@ def write_volume(
     from unmix_plugin.trained.density_grid import sample_slice
     from unmix_plugin.trained.world_frame import affine_to_world
 
-    path, materials = volume_path(folder), model.materials
+    path, materials = volume_path(folder), scene.materials
     density = np.zeros(grid.shape, dtype=np.float32)
     others = {
         "index_to_world": affine_to_world(frame, grid.origin.astype(np.float64), grid.cell),
@@ -91,7 +91,7 @@ def write_volume(
                 stream, {"descr": "<f4", "fortran_order": False, "shape": shape}
             )
             for index in slices:
-                found, abundances = sample_slice(model, grid.slice_points(index))
+                found, abundances = sample_slice(scene, grid.slice_points(index))
                 density[index] = found * np.float32(frame.scale)
                 stream.write(np.ascontiguousarray(abundances, dtype="<f4").tobytes())
         for name, values in {"density": density, **others}.items():

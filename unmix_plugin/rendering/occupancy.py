@@ -30,7 +30,7 @@ class OccupancyGrid(nn.Module):
     def __init__(self, reachable: Bool[Tensor, "X Y Z"]) -> None:
         """Start with every cell occupied that `reachable` allows; the others stay empty for ever."""
         super().__init__()
-        self.sight = VisibleCells(reachable.shape)
+        self.visibility = VisibleCells(reachable.shape)
         self.register_buffer("reachable", reachable.clone())
         self.register_buffer("peak_densities", torch.full(reachable.shape, torch.inf))
         self.register_buffer("occupied", reachable.to(torch.uint8))
@@ -51,7 +51,7 @@ class OccupancyGrid(nn.Module):
         num_cells: int | None,
         generator: torch.Generator,
     ) -> None:
-        """Probe one random point in each of some cells and decide anew what is occupied: what is dense and in sight.
+        """Probe one random point in each of some cells and decide anew what is occupied: dense and visible.
 
         Args:
             density_fn: Points in the unit cube to densities.
@@ -71,9 +71,11 @@ class OccupancyGrid(nn.Module):
         is_known = torch.isfinite(reachable_peaks)
         known_peaks = reachable_peaks if bool(is_known.all()) else reachable_peaks[is_known]
         limit = min(threshold, float(known_peaks.mean())) if len(known_peaks) else threshold
-        self.sight.judge()
-        in_sight = self.sight.visible.view(-1)[self.reachable_cells]
-        self.occupied.view(-1)[self.reachable_cells] = ((reachable_peaks > limit) & in_sight).to(torch.uint8)
+        self.visibility.update()
+        is_visible = self.visibility.visible.view(-1)[self.reachable_cells]
+        self.occupied.view(-1)[self.reachable_cells] = ((reachable_peaks > limit) & is_visible).to(
+            torch.uint8
+        )
 
     def _choose_cells(self, num_cells: int | None, generator: torch.Generator) -> Int[Tensor, "N"]:
         reachable = self.reachable_cells

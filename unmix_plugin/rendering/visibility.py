@@ -1,7 +1,7 @@
 """Which cells training rays have lately ended in: elsewhere nothing was learnt, and nothing is shown.
 
 Behind every surface lies space that no training ray reaches. What a field says there was never compared with a picture:
-from another side it stands before the scene as grey fog. It costs time too, since it isn't empty. What one view alone
+from another side it is a grey floater. It costs time too, since it isn't empty. What one view alone
 sees isn't held by the others, and grows into shapes that fit a single picture.
 
 So rays note where they end, and once enough of them were cast, cells stay visible if two views saw them or a neighbour
@@ -22,13 +22,13 @@ from torch import Tensor, nn
 from unmix_plugin.rendering.grid_cells import cells_at
 
 _RAYS_A_CELL = 16
-"""Rays to cast for each cell of a face of the grid before cells are judged."""
+"""Rays to cast for each cell of a face of the grid before visibility is decided anew."""
 _NO_VIEW = 255
 """Views are told apart by their number modulo this, which takes one byte a cell and leaves this number for none."""
 
 
 class VisibleCells(nn.Module):
-    """Cells that two training views have seen, by the rays cast since they were judged last."""
+    """Cells that two training views have seen, by the rays cast since the last update."""
 
     visible: Bool[Tensor, "X Y Z"]
     lowest_view: UInt8[Tensor, "X Y Z"]
@@ -65,10 +65,10 @@ class VisibleCells(nn.Module):
         self.num_rays += num_rays
 
     @torch.no_grad()
-    def judge(self) -> None:
+    def update(self) -> None:
         """Keep only what two views saw, if enough rays were cast, and forget who saw what.
 
-        Where two views saw no cell, what one saw is kept; where none saw any, as in fog that is thin everywhere, all
+        Where two views saw no cell, what one saw is kept; where none saw any, as in thin semi-transparent density, all
         that was visible.
         """
         sides = sorted(self.visible.shape)

@@ -1,6 +1,6 @@
-"""The field of a trained model on a regular grid, slice by slice: density, and what there is of each endmember.
+"""The field of a trained scene on a regular grid, slice by slice: density, and what there is of each endmember.
 
-Only cells that the model renders are asked: elsewhere the field was never trained, and what it says there is nothing.
+Only cells that are rendered are asked: elsewhere the field was never trained, and what it says there is nothing.
 
 Notation: `X x Y x Z` grid points, `P` points, `K` endmembers. Model space.
 """
@@ -11,12 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Float, Float32
 from torch import Tensor
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.model import UnmixModel
-from unmix_plugin.rendering.grid_cells import cells_at
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 _RESOLUTIONS = (8, 1024)
 _CHUNK = 1 << 16
@@ -63,48 +62,28 @@ class GridPoints:
 
 @torch.no_grad()
 def sample_slice(
-    model: UnmixModel, points: Float[Tensor, "Y Z 3"]
+    scene: TrainedScene, points: Float[Tensor, "Y Z 3"]
 ) -> tuple[Float32[np.ndarray, "Y Z"], Float32[np.ndarray, "Y Z K"]]:
     """Densities per model unit, and abundances, which sum to 1; both 0 in cells that are never rendered."""
-    flat = points.flatten(0, 1).to(model.device)
-    densities = torch.zeros(len(flat), device=model.device)
-    abundances = torch.zeros(len(flat), len(model.materials.names), device=model.device)
-    rendered = is_rendered(model, flat).nonzero()[:, 0]
+    flat = points.flatten(0, 1).to(scene.device)
+    densities = torch.zeros(len(flat), device=scene.device)
+    abundances = torch.zeros(len(flat), len(scene.materials.names), device=scene.device)
+    rendered = scene.renderer.is_occupied(flat).nonzero()[:, 0]
     for chosen in rendered.split(_CHUNK):
-        found, features = model.field.get_density(flat[chosen])
+        found, features = scene.field.get_density(flat[chosen])
         densities[chosen] = found
         # Abundances don't depend on the direction that the interface asks for.
         towards = torch.zeros_like(flat[chosen])
-        abundances[chosen] = model.field.get_outputs(flat[chosen], towards, features)["abundances"]
+        abundances[chosen] = scene.field.get_outputs(flat[chosen], towards, features)["abundances"]
     shape = points.shape[:2]
     return densities.cpu().unflatten(0, shape).numpy(), abundances.cpu().unflatten(0, shape).numpy()
 
 
 @torch.no_grad()
-def sample_densities(model: UnmixModel, positions: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
+def sample_densities(scene: TrainedScene, positions: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
     """Densities per model unit of any points of the box, 0 in cells that are never rendered; on the CPU."""
-    flat = positions.to(model.device)
-    densities = torch.zeros(len(flat), device=model.device)
-    for chosen in is_rendered(model, flat).nonzero()[:, 0].split(_CHUNK):
-        densities[chosen] = model.field.get_density(flat[chosen])[0]
+    flat = positions.to(scene.device)
+    densities = torch.zeros(len(flat), device=scene.device)
+    for chosen in scene.renderer.is_occupied(flat).nonzero()[:, 0].split(_CHUNK):
+        densities[chosen] = scene.field.get_density(flat[chosen])[0]
     return densities.cpu()
-
-
-def is_rendered(model: UnmixModel, positions: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:
-    """Which points lie in the box, in cells that the renderer marches through."""
-    return _lie_in(model.renderer.grid.occupied > 0, model, positions)
-
-
-def may_hold_matter(model: UnmixModel, positions: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:
-    """Which points lie in the box, in cells that were not carved before training."""
-    return _lie_in(model.renderer.grid.reachable, model, positions)
-
-
-def _lie_in(
-    chosen: Bool[Tensor, "X Y Z"], model: UnmixModel, positions: Float[Tensor, "P 3"]
-) -> Bool[Tensor, " P"]:
-    """Which points lie in chosen cells of the box."""
-    low, high = model.renderer.aabb
-    unit = (positions - low) / (high - low)
-    inside = ((unit >= 0) & (unit <= 1)).all(dim=-1)
-    return inside & chosen[cells_at(unit, chosen.shape).unbind(-1)]

@@ -20,7 +20,7 @@ from torch import Tensor
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
-from unmix_plugin.spectral.composition import default_names
+from unmix_plugin.spectral.materials import default_names
 from unmix_plugin.spectral.metrics import (
     SSIM_WINDOW_PX,
     abundance_rmse,

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float64
 
-from unmix_plugin.engine.model import Model
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.material_library import (
     DARK_LIGHT,
@@ -24,7 +23,7 @@ from unmix_plugin.spectral.library.material_library import (
 LIGHT_UNKNOWN = (
     "the light of the scene is unknown and taken as flat: matches are of radiance rather than of reflectance"
 )
-"""What has to be said of matches where `light_of` gives nothing."""
+"""What has to be said of matches where the scene's light is unknown."""
 
 
 def relit(
@@ -53,12 +52,6 @@ class ShownMatch:
     match: LibraryMatch
     spectrum: Float64[np.ndarray, " B"]
     """The material in the light of the scene, as bright as the spectrum (least squares); NaN where it is unknown."""
-
-
-def light_of(model: Model) -> Float64[np.ndarray, " B"] | None:
-    """Relative power of the light in which a model's spectra are seen; None where it is unknown."""
-    light = model.metadata.get("illuminant")
-    return None if light is None else np.asarray(light, dtype=np.float64)
 
 
 def shown_matches(

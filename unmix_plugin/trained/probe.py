@@ -1,11 +1,11 @@
-"""One pixel of a view or one point of space: the spectrum that a model predicts there, and what it is made of.
+"""The one probe: the spectrum that a scene shows in a pixel, or has at a point, and what it is made of.
 
 Notation: `B` bands, `K` endmembers.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -14,82 +14,74 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.model import UnmixModel
-from unmix_plugin.scenes.scene import Normalisation
-from unmix_plugin.trained.density_grid import is_rendered
+from unmix_plugin.trained.protocol import Probe
 
-
-@dataclass(frozen=True)
-class Probe:
-    """What a model says of a place."""
-
-    spectra: dict[str, Float64[np.ndarray, " B"]]
-    """`predicted`, radiance on black; of a pixel also its parts, `diffuse` and `specular`."""
-    abundances: Float64[np.ndarray, " K"]
-    """Of what is there, summing to 1; 0 where nothing is."""
-    opacity: float
-    """Of the pixel, or of a pixel's length at the point, [0, 1]."""
-    world_position: Float64[np.ndarray, "3"] | None
-    """Of the surface in the pixel, or of the point; None where the pixel shows nothing."""
+if TYPE_CHECKING:
+    from unmix_plugin.trained.trained_scene import TrainedScene
 
 
 @torch.no_grad()
-def probe_pixel(model: UnmixModel, camera: Cameras, pixel: tuple[int, int], frame: Normalisation) -> Probe:
-    """What is seen in a pixel, as a render of the whole view has it.
+def probe_pixel(scene: TrainedScene, camera: Cameras, pixel: tuple[int, int]) -> Probe:
+    """What is seen in a pixel (column, row), as a render of the whole view has it: radiance on black.
 
-    Args:
-        model: Trained.
-        camera: Of the view.
-        pixel: Column and row.
-        frame: Of the run.
     Raises:
         ConfigError: the pixel is outside the image.
     """
-    one = one_pixel(camera, *pixel)
-    found, materials = model.get_image_coefficients(one), model.materials
+    one = one_pixel(camera, *pixel).to(scene.device)
+    found, materials = scene.look(one).coefficients.flatten(), scene.materials
     opacity = float(found.accumulation)
     diffuse, specular = materials.diffuse(found), materials.specular(found)
     place = None
     if opacity > 0:
-        rays = one.to("cpu").image_rays(0)
-        distance = float(found.distance) / opacity
-        place = frame.to_world((rays.origins + distance * rays.directions).double().numpy())[0]
+        rays = one.image_rays(0)
+        place = _row(rays.origins + found.ray_distance[:, None] * rays.directions)
     return Probe(
-        {"predicted": _row(diffuse + specular), "diffuse": _row(diffuse), "specular": _row(specular)},
-        _row(found.abundances) / max(opacity, 1e-6),
+        {
+            "predicted": _row(diffuse + specular),
+            "diffuse": _row(diffuse),
+            "specular": _row(specular),
+            "abundances": _row(found.abundances) / max(opacity, 1e-6),
+            "scaled_abundances": _row(found.scaled_abundances),
+        },
         opacity,
         place,
+        None if place is None else scene.frame.to_world(place[None])[0],
     )
 
 
 @torch.no_grad()
-def probe_point(model: UnmixModel, point: tuple[float, float, float], frame: Normalisation) -> Probe:
-    """What a point of space is made of: its spectrum as lit there, without the view-dependent part.
+def probe_point(scene: TrainedScene, point: tuple[float, float, float]) -> Probe:
+    """What a point of the world is made of: its spectrum as lit there, without the view-dependent part.
 
-    Args:
-        model: Trained.
-        point: World coordinates.
-        frame: Of the run.
     Raises:
         ConfigError: the point is outside the scene box.
     """
     world = np.array(point, dtype=np.float64)
-    inside = torch.from_numpy(frame.to_model(world)).float()[None].to(model.device)
-    low, high = model.renderer.aabb
-    if not bool(((inside >= low) & (inside <= high)).all()):
-        corners = frame.to_world(np.stack(np.meshgrid(*model.renderer.aabb.T.cpu().double().numpy()), -1))
+    place = scene.frame.to_model(world)
+    inside = torch.from_numpy(place).float()[None].to(scene.device)
+    if not bool(scene.scene_box.contains(inside).all()):
+        corners = scene.frame.to_world(
+            np.stack(np.meshgrid(*scene.scene_box.aabb.T.cpu().double().numpy()), -1)
+        )
         least, greatest = corners.reshape(-1, 3).min(axis=0), corners.reshape(-1, 3).max(axis=0)
         raise ConfigError(
             f"the point {_text(world)} is outside the scene box, which lies between {_text(least)} and "
             f"{_text(greatest)} of the world"
         )
-    density, features = model.field.get_density(inside)
-    outputs = model.field.get_outputs(inside, torch.zeros_like(inside), features)
-    there = is_rendered(model, inside).to(density)
-    opacity = float(there * -torch.expm1(-density * float(model.metadata["pixel_size"])))
-    diffuse = there[:, None] * (outputs["scaled_abundances"] @ model.materials.endmembers)
-    abundances = there[:, None] * outputs["abundances"]
-    return Probe({"predicted": _row(diffuse)}, _row(abundances), opacity, world)
+    density, features = scene.field.get_density(inside)
+    outputs = scene.field.get_outputs(inside, torch.zeros_like(inside), features)
+    is_there = scene.renderer.is_occupied(inside).to(density)
+    predicted = is_there[:, None] * (outputs["scaled_abundances"] @ scene.materials.endmembers)
+    return Probe(
+        {
+            "predicted": _row(predicted),
+            "abundances": _row(is_there[:, None] * outputs["abundances"]),
+            "scaled_abundances": _row(is_there[:, None] * outputs["scaled_abundances"]),
+        },
+        float(is_there * -torch.expm1(-density * scene.pixel_size)),
+        place,
+        world,
+    )
 
 
 def one_pixel(camera: Cameras, column: int, row: int) -> Cameras:

@@ -1,4 +1,4 @@
-"""The materials of a trained model: their spectra, names and colours."""
+"""The materials of a trained scene: their spectra, names and colours."""
 
 from __future__ import annotations
 
@@ -8,30 +8,9 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from unmix_plugin.engine.model import Model
-from unmix_plugin.errors import ConfigError
 from unmix_plugin.figures.material_colours import distinct_colours, own_colours
-from unmix_plugin.spectral.composition import Materials
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
-
-
-def has_materials(model: Model) -> bool:
-    """Whether a model unmixes spectra, that is, has `materials`."""
-    return isinstance(getattr(model, "materials", None), Materials)
-
-
-def materials_of(model: Model) -> Materials:
-    """The materials of a model.
-
-    Raises:
-        ConfigError: its method does not unmix spectra.
-    """
-    materials = getattr(model, "materials", None)
-    if not isinstance(materials, Materials):
-        raise ConfigError(
-            f"{type(model).__name__} has no endmembers: this needs a run of a method that unmixes spectra"
-        )
-    return materials
+from unmix_plugin.spectral.materials import Materials
 
 
 def endmember_colours(materials: Materials) -> Float64[np.ndarray, "K 3"]:

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
+import torch
+
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError, did_you_mean
 
@@ -24,17 +26,17 @@ class RunView:
     """Unique in the scene, fit for file names."""
     camera: Cameras
     """One camera, model space."""
+    split: Literal["train", "eval"] = "eval"
+    """Whether it was trained on."""
 
 
-def views_of(scene: SceneRecord, choice: ViewChoice) -> list[RunView]:
-    """The views chosen, named as the scene's frames are."""
-    splits = {"eval": scene.eval_cameras, "train": scene.train_cameras}
-    chosen = splits if choice == "all" else {choice: splits[choice]}
-    return [
-        RunView(name, cameras[index])
-        for split, cameras in chosen.items()
-        for index, name in enumerate(_names(scene, split, len(cameras)))
-    ]
+def recorded_views(record: SceneRecord) -> tuple[RunView, ...]:
+    """Training views, then evaluation views, named as the scene's frames are."""
+    train, evaluation = record.train_cameras, record.eval_cameras
+    return (
+        *(RunView(name, train[i], "train") for i, name in enumerate(_names(record, "train", len(train)))),
+        *(RunView(name, evaluation[i]) for i, name in enumerate(_names(record, "eval", len(evaluation)))),
+    )
 
 
 def find_view(numbered: Sequence[RunView], wanted: str, others: Sequence[RunView] = ()) -> RunView:
@@ -58,9 +60,28 @@ def find_view(numbered: Sequence[RunView], wanted: str, others: Sequence[RunView
     )
 
 
-def _names(scene: SceneRecord, split: str, count: int) -> list[str]:
+def views_of(views: Sequence[RunView], choice: ViewChoice) -> list[RunView]:
+    """The views chosen, evaluation views first."""
+    splits = ("eval", "train") if choice == "all" else (choice,)
+    return [view for split in splits for view in views if view.split == split]
+
+
+def cameras_of(views: Sequence[RunView], choice: ViewChoice) -> Cameras:
+    """The cameras of the views chosen, as one; all views of a run have one size."""
+    chosen = [view.camera for view in views_of(views, choice)]
+    return Cameras(
+        torch.cat([camera.camera_to_world for camera in chosen]),
+        torch.cat([camera.focal_px for camera in chosen]),
+        torch.cat([camera.center_px for camera in chosen]),
+        torch.cat([camera.distortion for camera in chosen]),
+        chosen[0].width,
+        chosen[0].height,
+    )
+
+
+def _names(record: SceneRecord, split: str, count: int) -> list[str]:
     """Frame names, or `eval_000` where the data manager has noted none."""
-    frames, indices = scene.summary.get("frames"), scene.summary.get(f"{split}_indices")
+    frames, indices = record.summary.get("frames"), record.summary.get(f"{split}_indices")
     if isinstance(frames, list) and isinstance(indices, list) and len(indices) == count:
         return [str(frames[index]) for index in indices]
     return [f"{split}_{index:03d}" for index in range(count)]

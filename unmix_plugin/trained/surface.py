@@ -18,8 +18,8 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
-from unmix_plugin.model import UnmixModel
-from unmix_plugin.spectral.composition import OCCUPIED_ACCUMULATION, Coefficients
+from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION, Coefficients
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 SOLID_ACCUMULATION = 0.9
 """Rays of which at least this much ends on something give points."""
@@ -63,14 +63,14 @@ class SurfacePoints:
 class SeenSurface:
     """What the cameras of a run see, fed camera by camera."""
 
-    def __init__(self, model: UnmixModel, num_rays: int, cameras: Sequence[Cameras]) -> None:
+    def __init__(self, scene: TrainedScene, num_rays: int, cameras: Sequence[Cameras]) -> None:
         """
         Args:
-            model: Trained.
+            scene: What is looked at.
             num_rays: Rays to cast in all, about: images get more or fewer pixels for it.
             cameras: One camera each; what `look` is then called with, one after the other.
         """
-        self._model = model
+        self._scene = scene
         pixels = sum(camera.width * camera.height for camera in cameras)
         factor = min(max((num_rays / max(pixels, 1)) ** 0.5, _SCALE_BOUNDS[0]), _SCALE_BOUNDS[1])
         smallest = min((min(camera.width, camera.height) for camera in cameras), default=1)
@@ -83,7 +83,7 @@ class SeenSurface:
         """Render what one camera sees."""
         width, height = (max(1, round(self._factor * side)) for side in (camera.width, camera.height))
         view = camera.resized(width, height).to("cpu")
-        found = self._model.get_image_coefficients(view, subpixels=1)
+        found = self._scene.look(view, subpixels=1).coefficients
         accumulation = found.accumulation.flatten().cpu()
         distances = found.distance.flatten().cpu() / accumulation.clamp(min=1e-6)
         distances[accumulation < OCCUPIED_ACCUMULATION] = torch.inf
@@ -94,7 +94,7 @@ class SeenSurface:
             SurfacePoints(
                 (rays.origins + distances[:, None] * rays.directions)[solid],
                 rays.directions[solid],
-                *_looks(self._model, found, solid),
+                *_looks(self._scene, found, solid),
             )
         )
 
@@ -150,26 +150,26 @@ def _excess_px(
 
 @torch.no_grad()
 def look_from_above(
-    model: UnmixModel, positions: Float[Tensor, "P 3"], normals: Float[Tensor, "P 3"]
+    scene: TrainedScene, positions: Float[Tensor, "P 3"], normals: Float[Tensor, "P 3"]
 ) -> tuple[Float[Tensor, "P K"], Float[Tensor, "P B"]]:
     """Abundances, summing to 1, and diffuse spectra of points as a camera straight above the surface sees them.
 
     Args:
-        model: Trained.
+        scene: What is looked at.
         positions: On a surface.
         normals: Unit vectors out of it.
     """
-    above = positions + float(model.metadata["pixel_size"]) * normals
+    above = positions + scene.pixel_size * normals
     indices = torch.zeros(len(above), dtype=torch.int64)
-    rays = RayBundle(above, -normals, indices).to(model.device)
+    rays = RayBundle(above, -normals, indices).to(scene.device)
     if len(rays) == 0:
-        return torch.zeros(0, len(model.materials.names)), torch.zeros(0, len(model.bands))
-    found = model.renderer.in_chunks(model.field, rays, model.config.eval_num_rays_per_chunk)
-    return _looks(model, found, torch.ones(len(above), dtype=torch.bool))
+        return torch.zeros(0, len(scene.materials.names)), torch.zeros(0, len(scene.bands))
+    found = scene.renderer.composite(scene.field, rays)
+    return _looks(scene, found, torch.ones(len(above), dtype=torch.bool))
 
 
 def _looks(
-    model: UnmixModel, found: Coefficients, chosen: Bool[Tensor, " R"]
+    scene: TrainedScene, found: Coefficients, chosen: Bool[Tensor, " R"]
 ) -> tuple[Float[Tensor, "P K"], Float[Tensor, "P B"]]:
     """Abundances and diffuse spectra of what the chosen rays end on."""
     rows = chosen.to(found.accumulation.device)
@@ -177,4 +177,4 @@ def _looks(
     abundances, scaled_abundances = (
         values.flatten(0, -2)[rows] / opacity for values in (found.abundances, found.scaled_abundances)
     )
-    return abundances.cpu(), (scaled_abundances @ model.materials.endmembers).detach().cpu()
+    return abundances.cpu(), (scaled_abundances @ scene.materials.endmembers).detach().cpu()

@@ -14,7 +14,7 @@ from jaxtyping import Float, Float32, Float64, UInt8
 from torch import Tensor
 
 from unmix_plugin.spectral.colour.conversion import describe_colour, linear_to_srgb, rgb_matrix
-from unmix_plugin.spectral.composition import Materials
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.segmentation import material_ids, material_scores
 from unmix_plugin.trained.run_materials import endmember_colours
 

@@ -1,4 +1,4 @@
-"""One view of a trained model, as every product and the evaluation want it."""
+"""One view of a trained scene, as every product and the evaluation want it."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.model import Model
 from unmix_plugin.figures.picture_grid import Picture, premultiplied_over_neutral
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 
 @dataclass(frozen=True)
 class RenderedView:
-    """What a model sees from one camera, on black; on the CPU."""
+    """What a scene shows from one camera, on black; on the CPU."""
 
     spectra: Float[Tensor, "H W B"]
     accumulation: Float[Tensor, "H W"]
@@ -35,10 +35,10 @@ class RenderedView:
         return self.abundances / self.accumulation.clamp(min=1e-6)[..., None]
 
 
-def render_view(model: Model, camera: Cameras) -> RenderedView:
+def render_view(scene: TrainedScene, camera: Cameras) -> RenderedView:
     """Render all that is written about a view."""
     names = ("spectral", "accumulation", "abundances", "segmentation", "material_scores")
-    outputs = model.get_outputs_for_camera(camera, names)
+    outputs = scene.render(camera, names)
     return RenderedView(*(outputs[name].detach().cpu() for name in names))
 
 

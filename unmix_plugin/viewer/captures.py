@@ -19,10 +19,9 @@ from unmix_plugin.formats.files import write_file
 from unmix_plugin.formats.png import rgba_png_bytes
 from unmix_plugin.formats.spectral_exr import write_spectral_exr
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
-from unmix_plugin.spectral.composition import spectral
-from unmix_plugin.viewer.layers.layers import linear_light
+from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.viewer.rendering.edits import Edit
-from unmix_plugin.viewer.rendering.frames import Frame, FrameRender
+from unmix_plugin.viewer.rendering.frames import FrameRender
 from unmix_plugin.viewer.rendering.render_loop import RenderLoop
 from unmix_plugin.viewer.rendering.view import Capture
 
@@ -52,7 +51,7 @@ class StripCapture:
         self,
         loop: RenderLoop,
         request: PictureRequest,
-        take: Callable[[int, Frame], None],
+        take: Callable[[int, MaterialView], None],
         done: Callable[[str], None],
         progress: Callable[[float], None],
     ) -> None:
@@ -93,7 +92,7 @@ class StripCapture:
         if self._capture is not None:
             self._capture.is_cancelled = True
 
-    def _strip_done(self, frame: Frame | None, reason: str) -> None:
+    def _strip_done(self, frame: MaterialView | None, reason: str) -> None:
         if frame is None:
             self._done(reason)
             return
@@ -140,12 +139,14 @@ class SpectraCanvas:
         self.opacity: Float32[np.ndarray, "H W"] = np.zeros(shape, np.float32)
         self._bands = None
 
-    def take(self, first_row: int, frame: Frame) -> None:
+    def take(self, first_row: int, frame: MaterialView) -> None:
         """Put a strip in its place."""
         rows = slice(first_row, first_row + frame.camera.height)
         self._bands = frame.materials.bands
-        self.spectra[rows] = spectral(frame.coefficients, frame.materials).cpu().numpy()
-        self.linear_rgb[rows] = linear_light(frame, rgb_matrix(self._bands)).cpu().numpy()
+        self.spectra[rows] = frame["spectral"].cpu().numpy()
+        self.linear_rgb[rows] = (
+            frame.materials.through(frame.coefficients, rgb_matrix(self._bands)).cpu().numpy()
+        )
         self.opacity[rows] = frame.coefficients.accumulation.cpu().numpy()
 
     def write(self, path: Path) -> Path:

@@ -16,18 +16,14 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.model import UnmixModel
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.composition import OCCUPIED_ACCUMULATION, spectral
-
-_FOOTPRINT = 3
-"""Rays along each edge of the pixel that is probed."""
+from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 
 @dataclass(frozen=True)
-class Probe:
+class ProbedPoint:
     """What one point is made of."""
 
     number: int
@@ -58,44 +54,37 @@ class Probe:
         return int(self.abundances.argmax())
 
 
-@torch.no_grad()
-def probe(model: UnmixModel, camera: Cameras, column: float, row: float, number: int) -> Probe:
-    """What is seen through a point of a picture, the mean over about a pixel.
+def probe_through(
+    scene: TrainedScene, camera: Cameras, column: float, row: float, number: int
+) -> ProbedPoint:
+    """What is seen through a point of a picture.
 
     Args:
-        model: With the materials as they are shown.
+        scene: With the materials as they are shown.
         camera: One camera.
         column, row: In pixels.
         number: Of the probe.
     Raises:
         ConfigError: nothing is there.
     """
-    steps = (torch.arange(_FOOTPRINT) + 0.5) / _FOOTPRINT - 0.5
-    offsets = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), dim=-1).reshape(-1, 2)
-    coords = torch.tensor([column, row]) + offsets
-    bundle: RayBundle = camera.generate_rays(torch.zeros(len(coords), dtype=torch.int64), coords)
-    coefficients = model.renderer(model.field, bundle.to(model.device)).coefficients
-    opacity = float(coefficients.accumulation.mean())
-    if opacity < OCCUPIED_ACCUMULATION:
+    last_column, last_row = camera.width - 1, camera.height - 1
+    found = scene.probe(camera, min(max(int(column), 0), last_column), min(max(int(row), 0), last_row))
+    if found.opacity < OCCUPIED_ACCUMULATION or found.position is None:
         raise ConfigError("nothing is there to probe: less than half of the light ends on something")
-    materials = model.materials
-    shares = coefficients.abundances.mean(dim=0)
-    distance = coefficients.distance / coefficients.accumulation.clamp(min=1e-6)
-    solid = coefficients.accumulation >= OCCUPIED_ACCUMULATION
-    points = bundle.origins.to(model.device) + distance[:, None] * bundle.directions.to(model.device)
-    x, y, z = points[solid].mean(dim=0).tolist()
-    return Probe(
+    x, y, z = found.position.tolist()
+    materials = scene.materials
+    return ProbedPoint(
         number,
         (x, y, z),
         materials.bands,
-        spectral(coefficients, materials).mean(dim=0).double().cpu().numpy() / opacity,
-        (shares / shares.sum().clamp(min=1e-6)).double().cpu().numpy(),
+        found.values["predicted"],
+        found.values["abundances"],
         materials.names,
-        materials.endmembers.detach().double().cpu().numpy(),
+        materials.endmembers.double().cpu().numpy(),
     )
 
 
-def spectra_csv(probes: Sequence[Probe]) -> bytes:
+def spectra_csv(probes: Sequence[ProbedPoint]) -> bytes:
     """One row a band: wavelength, and for each probe what was predicted and, where known, measured."""
     header, columns = ["wavelength"], [probes[0].bands.centers_nm]
     for one in probes:
@@ -107,7 +96,7 @@ def spectra_csv(probes: Sequence[Probe]) -> bytes:
     return _csv(header, [[f"{value:.9g}" for value in row] for row in np.stack(columns, axis=1)])
 
 
-def abundances_csv(probes: Sequence[Probe]) -> bytes:
+def abundances_csv(probes: Sequence[ProbedPoint]) -> bytes:
     """One row a probe: number, position in model space, material, the training view measured in, abundances."""
     header = ["probe", "x", "y", "z", "material", "measured_in", *probes[0].names]
     rows = [

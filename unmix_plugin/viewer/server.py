@@ -18,7 +18,7 @@ from unmix_plugin.viewer.gate import MOST_CLIENTS, Gate, is_own_page
 from unmix_plugin.viewer.kept_pages import KeptPages, browser_of
 from unmix_plugin.viewer.options import ViewerOptions
 from unmix_plugin.viewer.panels import PANELS
-from unmix_plugin.viewer.rendering.model_source import ModelSource
+from unmix_plugin.viewer.rendering.scene_source import SceneSource
 from unmix_plugin.viewer.services import SceneReader, Services
 from unmix_plugin.viewer.session import Session
 from unmix_plugin.viewer.token_prompt import TokenPrompts
@@ -45,7 +45,7 @@ class Viewer:
 
     def __init__(
         self,
-        source: ModelSource,
+        source: SceneSource,
         options: ViewerOptions,
         read_scene: SceneReader,
         say: Callable[[str], None] = lambda _: None,
@@ -143,7 +143,7 @@ class Viewer:
         """Looks, and where pages start to look from."""
         server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         server.gui.set_panel_label(LABEL)
-        scene = self._services.source.scene
+        scene = self._services.source.record
         up = up_direction(scene.train_cameras)
         server.scene.set_up_direction(up)
         server.scene.world_axes.visible = False
@@ -154,7 +154,7 @@ class Viewer:
     ) -> None:
         camera = cameras[0]
         pose = pose_of(camera)
-        middle = self._services.source.scene.scene_box.aabb.mean(dim=0)
+        middle = self._services.source.record.scene_box.aabb.mean(dim=0)
         place, forward = camera.camera_to_world[0, :, 3], -camera.camera_to_world[0, :, 2]
         reach = max(float((middle - place) @ forward), 0.1)
         x, y, z = (place + reach * forward).tolist()

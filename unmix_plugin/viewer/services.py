@@ -14,23 +14,23 @@ from jaxtyping import Float64
 from unmix_plugin.editing import Light, Recipe, sample_seen
 from unmix_plugin.editing.light import relighting_factors
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.model import UnmixModel
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.coefficients import Coefficients
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.colour.illuminants import illuminant_names
-from unmix_plugin.spectral.composition import Coefficients
-from unmix_plugin.trained.run_views import RunView, views_of
+from unmix_plugin.trained.run_views import RunView, recorded_views
+from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.failures import failures_said
 from unmix_plugin.viewer.layers.layer_settings import LayerAids
 from unmix_plugin.viewer.recipe_editor import numbered
 from unmix_plugin.viewer.rendering.edits import Edit
 from unmix_plugin.viewer.rendering.frames import num_channels
 from unmix_plugin.viewer.rendering.measured import MeasuredViews
-from unmix_plugin.viewer.rendering.model_source import ModelSource
 from unmix_plugin.viewer.rendering.picture_maker import PictureMaker
 from unmix_plugin.viewer.rendering.reference import render_reference
 from unmix_plugin.viewer.rendering.render_loop import RenderLoop
+from unmix_plugin.viewer.rendering.scene_source import SceneSource
 from unmix_plugin.viewer.rendering.video_job import VideoQueue
 from unmix_plugin.viewer.scene_objects import Thumbnail
 from unmix_plugin.viewer.training_curve import TrainingCurve
@@ -51,7 +51,7 @@ Raises:
 class Services:
     """Shared by the sessions of all clients."""
 
-    def __init__(self, source: ModelSource, read_scene: SceneReader, recipe: Recipe | None = None) -> None:
+    def __init__(self, source: SceneSource, read_scene: SceneReader, recipe: Recipe | None = None) -> None:
         """Computes nothing yet; the scene is read beside everything else once `start` is called.
 
         Args:
@@ -62,8 +62,8 @@ class Services:
             ConfigError: the recipe does not fit the run.
         """
         self.source = source
-        self.views = views_of(source.scene, "train") + views_of(source.scene, "eval")
-        self.num_train = len(source.scene.train_cameras)
+        self.views = recorded_views(source.record)
+        self.num_train = len(source.record.train_cameras)
         self.scene: Scene | None = None
         """The scene, once it is read."""
         self.measured: MeasuredViews | None = None
@@ -72,14 +72,14 @@ class Services:
         self.curve = TrainingCurve()
         self._read_scene = read_scene
         self._reader = threading.Thread(target=self._read, name="unmix-viewer-scene", daemon=True)
-        with source.borrowed() as model:
-            self.maker = PictureMaker(source, self.aids, self._see, num_channels(model))
+        with source.borrowed() as scene:
+            self.maker = PictureMaker(source, self.aids, self._see, num_channels(scene.materials))
         self._seen: tuple[int, Coefficients] | None = None
         self.loop = RenderLoop(self.maker)
         self.first_recipe = Recipe()
         """What every client sees the scene with at first; endmembers are meant by their numbers."""
         if recipe is not None:
-            self.first_recipe = numbered(recipe, self.maker.edited(Edit()).names)
+            self.first_recipe = numbered(recipe, self.maker.edited(Edit()).materials.names)
             self.maker.edited(Edit(self.first_recipe))
         self._reference_version = 0
         self._aids: LayerAids | None = None
@@ -133,18 +133,18 @@ class Services:
         """A view of the scene by its name."""
         return next((view for view in self.views if view.name == name), None)
 
-    def _see(self, model: UnmixModel) -> Coefficients:
-        """What the training cameras see of the unedited model, not long ago."""
+    def _see(self, scene: TrainedScene) -> Coefficients:
+        """What the training cameras see of the unedited scene, not long ago."""
         version = self.source.version
         if self._seen is None or version - self._seen[0] >= _REFERENCE_STEPS:
-            self._seen = (version, sample_seen(model, self.source.scene.train_cameras))
+            self._seen = (version, sample_seen(scene))
         return self._seen[1]
 
     def _new_aids(self) -> LayerAids:
-        with self.source.borrowed() as model:
-            reference = render_reference(model, self.source.scene.train_cameras)
+        with self.source.borrowed() as scene:
+            reference = render_reference(scene, self.source.record.train_cameras)
         error_of = None if self.measured is None else self.measured.error
-        return LayerAids(reference, self.source.scene.scene_box, error_of, self.why_not_measured)
+        return LayerAids(reference, self.source.record.scene_box, error_of, self.why_not_measured)
 
     def _read(self) -> None:
         """Read the scene; without it the viewer only lacks what was measured."""

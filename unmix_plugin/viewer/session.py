@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     import viser
 
     from unmix_plugin.engine.geometry.cameras import Cameras
-    from unmix_plugin.spectral.composition import Materials
+    from unmix_plugin.spectral.materials import Materials
     from unmix_plugin.viewer.panels import Panel
 
 _MOVING_QUALITY, _RESTING_QUALITY = 80, 90
@@ -159,7 +159,7 @@ class Session:
 
     def materials(self) -> Materials:
         """The materials as this client sees them."""
-        return self.services.maker.edited(self.view.edit)
+        return self.services.maker.edited(self.view.edit).materials
 
     def nearest_materials(
         self, spectra: Float[np.ndarray, "N B"], bands: Bands, count: int = 3
@@ -199,7 +199,7 @@ class Session:
     def look_from(self, camera: Cameras) -> None:
         """Move the client's camera to one of ours."""
         pose = pose_of(camera)
-        middle = self.services.source.scene.scene_box.aabb.mean(dim=0)
+        middle = self.services.source.record.scene_box.aabb.mean(dim=0)
         place = camera.camera_to_world[0, :, 3]
         forward = -camera.camera_to_world[0, :, 2]
         reach = max(float((middle - place) @ forward), 0.1)

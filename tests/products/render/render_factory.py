@@ -1,4 +1,4 @@
-"""Renders of a tiny model, and their files read back with other people's readers."""
+"""Renders of a tiny scene, and their files read back with other people's readers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import OpenEXR
 import spectral.io.envi as envi
 
-from tests.method_factory import make_model
+from tests.method_factory import make_scene
 from tests.scenes.scene_factory import ring_poses
 from tests.trained.camera_files.camera_scenes import cameras_at
 from unmix_plugin.products.render.cameras import RenderCameras
@@ -19,8 +19,7 @@ from unmix_plugin.products.render.outputs import Product, choose_products
 from unmix_plugin.products.render.survey import Survey, take_survey
 from unmix_plugin.trained.run_views import RunView
 
-MODEL = make_model()
-MODEL.requires_grad_(False)
+SCENE = make_scene()
 
 
 def views(count: int = 2, is_path: bool = False, width: int = 14, height: int = 11) -> RenderCameras:
@@ -38,19 +37,19 @@ def render(
     pixels: int | None = None,
 ) -> tuple[tuple[Product, ...], Survey, RenderJob]:
     """Render into a folder."""
-    products = choose_products(outputs, formats, MODEL.materials, cameras.is_path)
-    survey = take_survey(MODEL, cameras.views, {product.output.name for product in products})
-    with RenderJob(MODEL, cameras, products, survey, folder) as job:
+    products = choose_products(outputs, formats, SCENE.materials, cameras.is_path)
+    survey = take_survey(SCENE, cameras.views, {product.output.name for product in products})
+    with RenderJob(SCENE, cameras, products, survey, folder) as job:
         for block in job.blocks(pixels):
             job.render(block)
     return products, survey, job
 
 
 def truth(cameras: RenderCameras, index: int, survey: Survey) -> dict[str, np.ndarray]:
-    """What the model itself renders of a view, all at once."""
-    names = [product.output.name for product in choose_products(["all"], [], MODEL.materials, False)]
+    """What the scene itself renders of a view, all at once."""
+    names = [product.output.name for product in choose_products(["all"], [], SCENE.materials, False)]
     asked = [*(name for name in names if name != "pca"), "band:550nm", "false-colour:650,550,450"]
-    rendered = MODEL.get_outputs_for_camera(cameras.views[index].camera, asked)
+    rendered = SCENE.render(cameras.views[index].camera, asked)
     if survey.pca is not None:
         seen = (rendered["accumulation"] > 0.5)[..., None]
         rendered["pca"] = survey.pca(rendered["spectral"]) * seen

@@ -1,18 +1,22 @@
 """Which cameras are chosen."""
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
 
+from tests.method_factory import make_scene
 from tests.scenes.scene_factory import ring_poses
 from tests.trained.camera_files.camera_scenes import around, cameras_at, record
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.products.render.cameras import CameraRequest, choose_cameras
 from unmix_plugin.trained.camera_files.camera_files import camera_file_bytes
+from unmix_plugin.trained.run_views import recorded_views
 from unmix_plugin.trained.world_frame import world_frame
 
-SCENE = record(around(6), cameras_at(ring_poses(3)))
+RECORD = record(around(6), cameras_at(ring_poses(3)))
+SCENE = replace(make_scene(), views=recorded_views(RECORD), frame=world_frame(RECORD))
 
 
 def chosen(**request):
@@ -28,7 +32,7 @@ def test_views_of_the_dataset_keep_their_names_and_are_no_path():
     assert names(chosen(source="dataset-train")) == [f"view_{index}" for index in range(6)]
     assert not chosen().is_path
     torch.testing.assert_close(
-        chosen().views[1].camera.camera_to_world, SCENE.eval_cameras.camera_to_world[1:2]
+        chosen().views[1].camera.camera_to_world, RECORD.eval_cameras.camera_to_world[1:2]
     )
 
 
@@ -47,7 +51,7 @@ def test_views_are_picked_by_name_or_number_and_keep_their_order():
 
 def test_a_file_gives_the_cameras_written_in_it(tmp_path):
     path = tmp_path / "mine.json"
-    path.write_bytes(camera_file_bytes(chosen(source="orbit", num_frames=4).views, 12.0, world_frame(SCENE)))
+    path.write_bytes(camera_file_bytes(chosen(source="orbit", num_frames=4).views, 12.0, SCENE.frame))
     found = chosen(source=str(path))
     assert names(found) == [f"orbit_{index:04d}" for index in range(4)]
     assert (found.is_path, found.frames_per_second) == (True, 12.0)

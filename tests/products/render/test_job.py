@@ -10,12 +10,13 @@ from matplotlib import colormaps
 from PIL import Image
 
 from tests.formats.video_reading import read_video
-from tests.products.render.render_factory import MODEL, read_envi, read_exr, render, truth, views
+from tests.products.render.render_factory import SCENE, read_envi, read_exr, render, truth, views
 from unmix_plugin.errors import RunError
 from unmix_plugin.figures.picture_canvas import CanvasLayout
 from unmix_plugin.products.render.files import still_paths
 from unmix_plugin.products.render.job import RenderJob, product_paths
 from unmix_plugin.products.render.survey import Survey
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 pytestmark = pytest.mark.usefixtures("no_wait_for_the_disk")
 
@@ -42,7 +43,7 @@ def test_arrays_are_what_the_model_renders_bit_for_bit(written):
             assert array.dtype == (np.uint8 if product.output.name == "segmentation" else np.float32)
             np.testing.assert_array_equal(array, values[product.output.name])
             read += 1
-    assert read == 2 * 16
+    assert read == 2 * 17
 
 
 def test_envi_cubes_are_what_the_model_renders_bit_for_bit(written):
@@ -60,7 +61,7 @@ def test_envi_cubes_are_what_the_model_renders_bit_for_bit(written):
             np.testing.assert_array_equal(numbers, wanted if wanted.ndim == 3 else wanted[..., None])
             assert str(metadata["description"]).startswith(product.output.name)
             read += 1
-    assert read == 2 * 15
+    assert read == 2 * 16
 
 
 def test_envi_cubes_of_spectra_have_wavelengths_and_those_of_shares_have_names(written):
@@ -69,7 +70,7 @@ def test_envi_cubes_of_spectra_have_wavelengths_and_those_of_shares_have_names(w
     assert [float(str(nm)) for nm in spectra["wavelength"]] == [450, 500, 550, 600, 650]
     assert spectra["band names"] == ["450 nm", "500 nm", "550 nm", "600 nm", "650 nm"]
     _, shares = read_envi(folder / "abundances" / "view.0")
-    assert shares["band names"] == list(MODEL.materials.names)
+    assert shares["band names"] == list(SCENE.materials.names)
     assert "wavelength" not in shares
 
 
@@ -125,7 +126,7 @@ def test_a_view_rendered_in_blocks_of_rows_is_the_view(tmp_path):
 
 
 def test_a_block_is_never_more_than_so_many_pixels_but_always_a_row(tmp_path):
-    job = RenderJob(MODEL, views(1, width=300, height=200), (), Survey(), tmp_path)
+    job = RenderJob(SCENE, views(1, width=300, height=200), (), Survey(), tmp_path)
     for pixels in (1, 299, 300, 1000, 10**6):
         blocks = job.blocks(pixels)
         assert sum(block.camera.height for block in blocks) == 200
@@ -273,13 +274,13 @@ def test_a_disk_that_fills_up_leaves_whole_files_only(tmp_path, monkeypatch, aft
 def test_an_error_while_rendering_leaves_no_video(tmp_path, monkeypatch):
     cameras = views(3, is_path=True)
 
-    def failing(camera, _names, rendered=MODEL.get_outputs_for_camera):
+    def failing(scene, camera, names, rendered=TrainedScene.render):
         if camera is not first and camera.camera_to_world.equal(last):
             raise KeyboardInterrupt
-        return rendered(camera, _names)
+        return rendered(scene, camera, names)
 
     first, last = cameras.views[0].camera, cameras.views[2].camera.camera_to_world
-    monkeypatch.setattr(MODEL, "get_outputs_for_camera", failing, raising=False)
+    monkeypatch.setattr(TrainedScene, "render", failing)
     with pytest.raises(KeyboardInterrupt):
         render(tmp_path, ["rgb", "accumulation"], ["mp4"], cameras)
     assert list(tmp_path.iterdir()) == []
@@ -299,7 +300,7 @@ def test_indices_and_targets_are_those_of_the_rendered_spectra_in_every_block(tm
         product.output.name: np.load(still_paths(tmp_path, product, cameras.views[0].name)[0])
         for product in products
     }
-    opacity = MODEL.get_outputs_for_camera(cameras.views[0].camera, ["accumulation"])["accumulation"].numpy()
+    opacity = SCENE.render(cameras.views[0].camera, ["accumulation"])["accumulation"].numpy()
     seen = opacity >= 0.5
     spectra = read["spectral"]
     expected = (spectra[..., 4] - spectra[..., 1]) / (spectra[..., 4] + spectra[..., 1])
@@ -320,7 +321,7 @@ def test_pictures_of_an_index_are_transparent_where_it_is_undefined_and_have_a_l
     [product] = products
     [path] = still_paths(tmp_path, product, cameras.views[0].name)
     pixels = np.asarray(Image.open(path))
-    opacity = MODEL.get_outputs_for_camera(cameras.views[0].camera, ["accumulation"])["accumulation"].numpy()
+    opacity = SCENE.render(cameras.views[0].camera, ["accumulation"])["accumulation"].numpy()
     assert (pixels[opacity < 0.002][:, 3] == 0).all()
     assert pixels[opacity > 0.55][:, :3].std() > 1
     assert survey.scales[INDEX].low < survey.scales[INDEX].high

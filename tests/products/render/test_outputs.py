@@ -2,12 +2,12 @@
 
 import pytest
 
-from tests.method_factory import make_model
+from tests.method_factory import make_scene
 from unmix_plugin.errors import ConfigError, UnmixError
 from unmix_plugin.products.render.outputs import choose_products
-from unmix_plugin.spectral.composition import OUTPUT_NAMES
+from unmix_plugin.trained.outputs import OUTPUTS
 
-MATERIALS = make_model().materials
+MATERIALS = make_scene().materials
 
 
 def formats(*outputs, asked=(), is_path=False):
@@ -19,7 +19,7 @@ def formats(*outputs, asked=(), is_path=False):
 
 
 def test_all_is_every_output_that_the_model_has():
-    assert set(formats("all")) == {*OUTPUT_NAMES, "normals"}
+    assert set(formats("all")) == set(OUTPUTS)
 
 
 def test_each_output_has_formats_that_suit_it():
@@ -61,7 +61,7 @@ def test_an_index_is_a_map_and_says_so_where_the_light_is_unknown():
     [png, npy] = choose_products(["index:(r650-r500)/(r650+r500)"], [], MATERIALS, False)
     assert (png.format, npy.format) == ("png", "npy")
     assert "of radiance, since the scene's light is unknown" in png.output.what
-    [known, _] = choose_products(["index:r650/r500"], [], make_model(light=[1.0] * 5).materials, False)
+    [known, _] = choose_products(["index:r650/r500"], [], make_scene(light=[1.0] * 5).materials, False)
     assert "radiance" not in known.output.what
 
 

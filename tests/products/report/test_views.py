@@ -14,8 +14,8 @@ from unmix_plugin.products.report.page import render_page
 from unmix_plugin.products.report.run import figure_rows, read_metrics, training_charts
 from unmix_plugin.products.report.views import ReportViews, evenly
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.composition import Materials
 from unmix_plugin.spectral.library.material_library import measured_library
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.evaluation import Evaluation, SceneTruth, ViewTruth
 from unmix_plugin.trained.view_rendering import RenderedView
 

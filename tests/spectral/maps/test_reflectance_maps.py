@@ -5,11 +5,10 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.method_factory import CAMERA, WAVELENGTHS_NM, make_model
+from tests.method_factory import CAMERA, WAVELENGTHS_NM, make_scene
 from unmix_plugin.editing.apply import relight
 from unmix_plugin.editing.recipe import Light
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.composition import reflectance
 from unmix_plugin.spectral.maps.reflectance_maps import parse_reflectance_map, seen_reflectance
 
 LIGHT = [0.5, 0.8, 1.0, 0.9, 0.6]
@@ -44,34 +43,35 @@ def test_a_band_that_the_light_leaves_dark_has_no_reflectance():
 
 
 def test_an_index_of_a_view_is_that_of_its_reflectance():
-    model = make_model(light=LIGHT)
-    coefficients = model.get_image_coefficients(CAMERA)
-    found = model.get_outputs_for_camera(CAMERA, [INDEX])[INDEX]
-    seen = reflectance(coefficients, model.materials)
+    scene = make_scene(light=LIGHT)
+    view = scene.look(CAMERA)
+    found = scene.render(CAMERA, [INDEX])[INDEX]
+    seen = seen_reflectance(view.spectra, view.opacity, scene.light, 0.5)
     at_500, at_650 = (seen[..., WAVELENGTHS_NM.index(nm)] for nm in (500, 650))
     assert found.isfinite().sum() > 20
     assert_close(found, (at_650 - at_500) / (at_650 + at_500), equal_nan=True)
-    assert (found.isnan() == (coefficients.accumulation < 0.5)).all()
+    assert (found.isnan() == (view.opacity < 0.5)).all()
 
 
 @pytest.mark.parametrize("method", ["angle", "mf", "ace"])
 def test_outputs_of_reflectance_do_not_change_with_the_light(target, method):
     """ACE divides by covariances of almost nothing: what rounding leaves there is a thousandth."""
-    model = make_model(light=LIGHT)
-    lit = relight(model, Light("A"))
-    assert not np.allclose(lit.metadata["illuminant"], LIGHT)
+    scene = make_scene(light=LIGHT)
+    lit = relight(scene, Light("A"))
+    assert lit.light is not None
+    assert not np.allclose(lit.light, LIGHT)
     for name in (INDEX, f"target:{method}:{target}"):
-        before, after = (one.get_outputs_for_camera(CAMERA, [name])[name] for one in (model, lit))
+        before, after = (one.render(CAMERA, [name])[name] for one in (scene, lit))
         assert before.isfinite().any()
         assert_close(after, before, equal_nan=True, atol=1e-3, rtol=1e-3)
 
 
 def test_a_target_threshold_gives_zeros_and_ones(target):
-    model = make_model(light=LIGHT)
-    angles = model.get_outputs_for_camera(CAMERA, [f"target:{target}"])[f"target:{target}"]
+    scene = make_scene(light=LIGHT)
+    angles = scene.render(CAMERA, [f"target:{target}"])[f"target:{target}"]
     limit = round(float(angles.nanmedian()), 4)
     passed = f"target:{target}<{limit}"
-    found = model.get_outputs_for_camera(CAMERA, [passed])[passed]
+    found = scene.render(CAMERA, [passed])[passed]
     assert_close(found, torch.where(angles.isnan(), torch.nan, (angles < limit).float()), equal_nan=True)
     assert 0 < found.nanmean() < 1
 

@@ -9,7 +9,6 @@ from torch.testing import assert_close
 
 from tests.viewer.view_factory import make_aids, make_frame, make_source
 from unmix_plugin.errors import ConfigError, SpectrumError
-from unmix_plugin.spectral.composition import compose
 from unmix_plugin.viewer.layers import index_layer
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings
 from unmix_plugin.viewer.layers.layers import paint_layer
@@ -38,14 +37,19 @@ def painted(frame, aids, index, **settings) -> tuple[Any, Any]:
     return paint_layer(frame, LayerSettings(layer="index", index=index, **settings), aids)
 
 
+def with_materials(frame, materials):
+    """The same view with other spectra."""
+    return replace(frame, scene=replace(frame.scene, materials=materials))
+
+
 @pytest.mark.parametrize("light", [None, [0.2, 0.4, 0.6, 0.8, 1.0]])
 def test_an_index_is_the_output_of_renders_over_the_background_where_that_is_undefined(
     frame, aids, light, monkeypatch
 ):
     monkeypatch.setattr(index_layer, "_CHUNK", 100)  # fewer than there are pixels
     lit = replace(frame.materials, light=None if light is None else torch.tensor(light))
-    shown = replace(frame, materials=lit)
-    values = compose(f"index:{FORMULA}", frame.coefficients, lit)
+    shown = with_materials(frame, lit)
+    values = shown[f"index:{FORMULA}"]
     assert 0.05 < float(values.isnan().float().mean()) < 0.95
     settings = LayerSettings(layer="index", index=FORMULA, value_range=(-1.0, 1.0), background="white")
     picture, legend = paint_layer(shown, settings, aids)
@@ -67,7 +71,7 @@ def test_the_light_of_the_scene_is_divided_out(frame, aids):
         light=power,
     )
     before, _ = painted(frame, aids, FORMULA, value_range=(-1.0, 1.0))
-    after, _ = painted(replace(frame, materials=lit), aids, FORMULA, value_range=(-1.0, 1.0))
+    after, _ = painted(with_materials(frame, lit), aids, FORMULA, value_range=(-1.0, 1.0))
     assert_close(after, before, atol=2e-3, rtol=0)
 
 
@@ -81,12 +85,12 @@ def test_a_named_index_has_its_usual_range_unless_one_is_chosen(frame, aids):
 
 def test_a_formula_has_the_range_that_is_seen_from_everywhere(source, aids):
     legends = [
-        painted(make_frame(source, source.scene.train_cameras[index]), aids, "1+r650")[1]
+        painted(make_frame(source, source.record.train_cameras[index]), aids, "1+r650")[1]
         for index in range(3)
     ]
     reference = aids.reference
-    with source.borrowed() as model:
-        seen = 1 + reference.spectra(model.materials)[:, 4].detach()
+    with source.borrowed() as scene:
+        seen = 1 + reference.spectra(scene.materials)[:, 4]
     expected = torch.quantile(seen, torch.tensor([0.01, 0.99])).tolist()
     for legend in legends:
         assert (legend.low, legend.high) == pytest.approx(expected, abs=1e-5)

@@ -11,7 +11,6 @@ from unmix_plugin.spectral.maps.index_formula import MAX_LENGTH
 from unmix_plugin.viewer.layers.layer_settings import EXPOSURE_BOUNDS, GAMMA_BOUNDS, LayerSettings
 from unmix_plugin.viewer.layers.painting import BACKGROUNDS, COLOUR_MAPS
 from unmix_plugin.viewer.layers.view_transforms import VIEW_TRANSFORMS
-from unmix_plugin.viewer.rendering.frames import detached
 
 names = st.sampled_from([entry.name for entry in fields(LayerSettings)])
 anything = st.recursive(
@@ -77,6 +76,6 @@ def test_what_is_remembered_survives_another_thread_that_forgets_it(source):
             self.clear()  # as another thread may, at just this moment
 
     aids = replace(make_aids(source), _kept=Forgetful())
-    with source.borrowed() as model:
-        materials = detached(model.materials)
+    with source.borrowed() as scene:
+        materials = scene.materials
     assert aids.colours_of(materials).shape == (len(materials.names), 3)

@@ -10,18 +10,11 @@ from torch.testing import assert_close
 
 from tests.viewer.view_factory import make_aids, make_frame, make_source
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.spectral.coefficients import Coefficients
 from unmix_plugin.spectral.colour.conversion import band_composite_matrix, linear_to_srgb
-from unmix_plugin.spectral.composition import Coefficients, compose
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings
-from unmix_plugin.viewer.layers.layers import (
-    LAYERS,
-    band_values,
-    layer_named,
-    linear_light,
-    linear_spectra,
-    paint_layer,
-)
+from unmix_plugin.viewer.layers.layers import LAYERS, layer_named, paint_layer
 from unmix_plugin.viewer.layers.painting import (
     BACKGROUNDS,
     ColourMapLegend,
@@ -58,12 +51,9 @@ def painted(frame, aids, layer, **settings) -> tuple[Any, Any]:
 def solid(frame):
     """The same view as if every ray ended fully on what it meets."""
     part = frame.coefficients.accumulation.clamp(min=1e-6)
-    values = {
-        name: value / (part if value.ndim == 2 else part[..., None])
-        for name, value in vars(frame.coefficients).items()
-    }
-    values["accumulation"] = torch.ones_like(part)
-    return replace(frame, coefficients=Coefficients(**values))
+    opaque = frame.map(lambda packed: packed / part[..., None])
+    opaque.coefficients.accumulation.fill_(1)
+    return opaque
 
 
 @pytest.mark.parametrize("layer", PAINTED)
@@ -80,30 +70,32 @@ def test_every_layer_is_a_picture_that_shows_something(frame, aids, layer):
 
 def test_colour_is_the_output_of_renders(frame, aids):
     opaque = solid(frame)
-    expected = compose("rgb", opaque.coefficients, opaque.materials)
     picture, legend = painted(opaque, aids, "rgb")
-    assert_close(picture, expected, atol=1e-5, rtol=0)
+    assert_close(picture, opaque["rgb"], atol=1e-5, rtol=0)
     assert legend.text.startswith("true colour")
 
 
 def test_light_through_a_matrix_is_light_of_the_spectra(frame):
-    materials = frame.materials
+    materials, coefficients = frame.materials, frame.coefficients
     matrix = band_composite_matrix(materials.bands, (650, 550, 450))
-    spectra = compose("spectral", frame.coefficients, materials)
-    assert_close(linear_light(frame, matrix), spectra @ matrix, atol=1e-6, rtol=1e-5)
+    spectra = frame["spectral"]
+    assert_close(materials.through(coefficients, matrix), spectra @ matrix, atol=1e-6, rtol=1e-5)
     for part in ("diffuse", "specular"):
-        light = linear_light(frame, matrix, part == "diffuse", part == "specular")
-        assert_close(light, compose(part, frame.coefficients, materials) @ matrix, atol=1e-6, rtol=1e-5)
+        light = materials.through(
+            coefficients, matrix, diffuse=part == "diffuse", specular=part == "specular"
+        )
+        assert_close(light, frame[part] @ matrix, atol=1e-6, rtol=1e-5)
     pixels = torch.tensor([3, 50, 200])
-    assert_close(linear_spectra(frame, pixels), spectra.flatten(0, 1)[pixels], atol=1e-6, rtol=1e-5)
+    some = coefficients.flatten().map(lambda packed: packed[pixels])
+    assert_close(materials.spectra(some), spectra.flatten(0, 1)[pixels], atol=1e-6, rtol=1e-5)
 
 
 @pytest.mark.parametrize("wavelength", [450.0, 520.0, 650.0])
 def test_a_band_is_the_output_of_renders(frame, wavelength):
-    materials = frame.materials
-    values = band_values(frame, materials.bands.nearest(wavelength))
-    expected = compose(f"band:{wavelength:g}", frame.coefficients, materials)
-    assert_close(values, expected, atol=1e-6, rtol=1e-5)
+    bands = frame.materials.bands
+    column = torch.eye(len(bands))[:, [bands.nearest(wavelength)]]
+    values = frame.materials.through(frame.coefficients, column)[..., 0]
+    assert_close(values, frame[f"band:{wavelength:g}"], atol=1e-6, rtol=1e-5)
 
 
 def test_a_band_is_painted_by_its_value_between_the_ends_of_the_scale(frame, aids):
@@ -111,7 +103,7 @@ def test_a_band_is_painted_by_its_value_between_the_ends_of_the_scale(frame, aid
     picture, legend = painted(
         opaque, aids, "band", wavelength_nm=550.0, value_range=(0.0, 2.0), colour_map="gray"
     )
-    values = band_values(opaque, opaque.materials.bands.nearest(550.0))
+    values = opaque["band:550"]
     assert_close(picture[..., 0], (values / 2).clamp(0, 1), atol=4e-3, rtol=0)
     assert (legend.low, legend.high, legend.colour_map) == (0.0, 2.0, "gray")
     assert "550 nm" in legend.label
@@ -150,7 +142,8 @@ def test_pure_pixels_have_the_colours_of_all_figures(frame, aids):
     colours = torch.as_tensor(endmember_colours(frame.materials), dtype=torch.float32)
     pure = torch.eye(count)[None]
     ones = torch.ones(1, count)
-    coefficients = Coefficients(ones, ones, pure, pure, torch.zeros(1, count, 1))
+    num_specular = frame.coefficients.specular.shape[-1]
+    coefficients = Coefficients.of(ones, ones, pure, pure, torch.zeros(1, count, num_specular))
     row = replace(frame, coefficients=coefficients)
     for layer in ("abundances", "segmentation"):
         picture, legend = painted(row, aids, layer)
@@ -161,32 +154,22 @@ def test_pure_pixels_have_the_colours_of_all_figures(frame, aids):
 @pytest.mark.parametrize("layer", [name for name in PAINTED if name not in ("accumulation", "specular")])
 @pytest.mark.parametrize("background", list(BACKGROUNDS))
 def test_where_nothing_is_the_background_shows(frame, aids, layer, background):
-    nothing = Coefficients(
-        **{name: torch.zeros_like(value) for name, value in vars(frame.coefficients).items()}
-    )
-    picture, _ = painted(replace(frame, coefficients=nothing), aids, layer, background=background)
+    picture, _ = painted(frame.map(torch.zeros_like), aids, layer, background=background)
     assert_close(picture, torch.full_like(picture, BACKGROUNDS[background]), atol=1e-5, rtol=0)
 
 
 def test_half_transparent_light_is_mixed_with_the_background_in_linear_light(frame, aids):
     opaque = solid(frame)
-    halved = {name: value / 2 for name, value in vars(opaque.coefficients).items()}
-    half = replace(opaque, coefficients=Coefficients(**halved))
-    light = compose("linear_rgb", opaque.coefficients, opaque.materials)
+    half = opaque.map(lambda packed: packed / 2)
     picture, _ = painted(half, aids, "rgb", background="white")
-    assert_close(picture, linear_to_srgb((light + 1) / 2), atol=1e-4, rtol=0)
+    assert_close(picture, linear_to_srgb((opaque["linear_rgb"] + 1) / 2), atol=1e-4, rtol=0)
 
 
 def test_principal_components_keep_their_colours_when_the_camera_moves(tmp_path):
     source = make_source(tmp_path)
     aids = make_aids(source)
-    first = make_frame(source, source.scene.train_cameras[0])
-    part = replace(
-        first,
-        coefficients=Coefficients(
-            **{name: value[4:12, 6:18] for name, value in vars(first.coefficients).items()}
-        ),
-    )
+    first = make_frame(source, source.record.train_cameras[0])
+    part = first.map(lambda packed: packed[4:12, 6:18])
     whole, _ = painted(first, aids, "pca")
     cropped, _ = painted(part, aids, "pca")
     assert_close(cropped, whole[4:12, 6:18], atol=1e-5, rtol=0)
@@ -196,7 +179,7 @@ def test_scales_stay_the_same_when_the_camera_moves(tmp_path):
     source = make_source(tmp_path)
     aids = make_aids(source)
     legends = [
-        painted(make_frame(source, source.scene.train_cameras[index]), aids, "band")[1] for index in range(3)
+        painted(make_frame(source, source.record.train_cameras[index]), aids, "band")[1] for index in range(3)
     ]
     assert len({(legend.low, legend.high) for legend in legends}) == 1
     assert legends[0].high > legends[0].low
@@ -204,8 +187,7 @@ def test_scales_stay_the_same_when_the_camera_moves(tmp_path):
 
 def test_depth_lies_between_the_ends_of_its_own_scale(frame, aids):
     _, legend = painted(frame, aids, "depth")
-    distance = compose("ray_distance", frame.coefficients, frame.materials)
-    seen = distance[frame.coefficients.accumulation > 0.5]
+    seen = frame["ray_distance"][frame.coefficients.accumulation > 0.5]
     assert legend.low < float(seen.min())
     assert float(seen.max()) < legend.high
 

@@ -7,12 +7,14 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from tests.method_factory import make_scene
 from unmix_plugin.scenes import load_scene
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.composition import Coefficients, Materials
-from unmix_plugin.viewer.rendering import measured as measured_module
-from unmix_plugin.viewer.rendering.frames import Frame
+from unmix_plugin.spectral.coefficients import Coefficients
+from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.trained.material_view import MaterialView
+from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.rendering.measured import MeasuredViews
 
 BALL = 0.5
@@ -27,8 +29,8 @@ def scene(tmp_path_factory):
 
 @pytest.fixture
 def views(scene, source, monkeypatch):
-    """The scene's views around a ball that stands for what the model renders."""
-    monkeypatch.setattr(measured_module, "render_frame", lambda _, camera: ball_frame(camera))
+    """The scene's views around a ball that stands for what the scene renders."""
+    monkeypatch.setattr(TrainedScene, "look", lambda _, camera, **__: ball_frame(camera))
     return MeasuredViews(scene, source)
 
 
@@ -40,10 +42,11 @@ def ball_frame(camera):
     hits = ((nearest < BALL**2) & (along > 0)).float()
     distance = along - (BALL**2 - nearest).clamp(min=0).sqrt()
     shares = hits[:, None] * torch.tensor([1.0, 0.0, 0.0])
-    coefficients = Coefficients(hits, hits * distance, shares, shares, torch.zeros(len(hits), 1))
+    coefficients = Coefficients.of(hits, hits * distance, shares, shares, torch.zeros(len(hits), 1))
     bands = Bands.of([450.0, 490.0, 530.0, 570.0, 610.0, 650.0])
     materials = Materials(bands, torch.full((3, 6), 0.25), torch.zeros(1, 6))
-    return Frame(camera, coefficients.unflatten(camera.height, camera.width), materials)
+    ball = replace(make_scene(), materials=materials)
+    return MaterialView(ball, camera, coefficients.unflatten(camera.height, camera.width))
 
 
 def test_the_error_at_a_training_view_is_the_difference_to_its_picture(views, scene):

@@ -9,7 +9,7 @@ from unmix_plugin.viewer.view_cameras import camera_of, pose_of
 
 
 def test_depth_is_along_the_axis_where_something_is_and_far_elsewhere(source):
-    camera = camera_of(pose_of(source.scene.train_cameras[0]), 32)
+    camera = camera_of(pose_of(source.record.train_cameras[0]), 32)
     frame = make_frame(source, camera)
     depth = picture_depth(frame)
     accumulation = frame.coefficients.accumulation.numpy()
@@ -25,7 +25,7 @@ def test_depth_is_along_the_axis_where_something_is_and_far_elsewhere(source):
 
 
 def test_fine_pictures_have_the_depth_of_every_nth_pixel(source):
-    camera = camera_of(pose_of(source.scene.train_cameras[0]), 300)
+    camera = camera_of(pose_of(source.record.train_cameras[0]), 300)
     frame = make_frame(source, camera)
     coefficients = frame.coefficients
     depth = picture_depth(frame)

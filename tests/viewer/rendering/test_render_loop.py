@@ -1,8 +1,6 @@
-"""When is rendered, and how finely: movements are answered at once, rest brings finer pictures, layers cost nothing.
+"""When is rendered, and how finely: movements are answered at once, rest brings finer pictures, layers cost nothing."""
 
-The loop is driven by hand, piece by piece; its own thread is the subject of two tests at the end.
-"""
-
+import threading
 import time
 from contextlib import contextmanager
 from dataclasses import replace
@@ -11,11 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from tests.viewer.view_factory import Screen, make_aids, make_source, some_pose
+from tests.method_factory import make_model
+from tests.viewer.view_factory import Screen, make_aids, some_pose, source_of_model
 from unmix_plugin.editing import Light, Recipe, Remove, Scale, sample_seen
 from unmix_plugin.engine.training.training_control import TrainingControl
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings
+from unmix_plugin.viewer.rendering import render_loop as render_loop_module
 from unmix_plugin.viewer.rendering.edits import Edit
 from unmix_plugin.viewer.rendering.frames import FrameRender, num_channels
 from unmix_plugin.viewer.rendering.pacing import Speedometer
@@ -34,35 +34,28 @@ class FixedSpeed(Speedometer):
         pass
 
 
-def make_loop(source, slow_speed=None):
-    """A loop that waits to be driven; with `slow_speed` it believes to be so slow that moving pictures are small."""
+@contextmanager
+def running_loop(source, slow_speed=None):
+    """A loop that renders; with `slow_speed` it believes to be as slow as that, so that moving pictures are small."""
     aids = make_aids(source)
-    with source.borrowed() as model:
-        seen, channels = sample_seen(model, source.scene.train_cameras), num_channels(model)
+    with source.borrowed() as scene:
+        seen, channels = sample_seen(scene), num_channels(scene.materials)
     maker = PictureMaker(source, lambda: aids, lambda _: seen, channels)
     if slow_speed is not None:
         maker.speed = FixedSpeed(slow_speed)
-    return RenderLoop(maker)
-
-
-def finish(loop):
-    """Drive a loop until nothing is left to do."""
-    for _ in range(10_000):
-        if not loop.step():
-            return
-    raise AssertionError("there is always more to do")
-
-
-def finest(loop, screen):
-    """The picture that a screen has in the end."""
-    finish(loop)
-    assert not screen.shown[-1].is_moving
-    return screen.shown[-1]
+    loop = RenderLoop(maker)
+    loop.start()
+    try:
+        yield loop, maker
+    finally:
+        loop.stop()
+    assert not loop._thread.is_alive()
 
 
 @pytest.fixture
 def loop(source):
-    return make_loop(source, slow_speed=5000.0)
+    with running_loop(source, slow_speed=5000.0) as (running, _):
+        yield running
 
 
 @pytest.fixture
@@ -79,8 +72,8 @@ def rendered(monkeypatch):
     counts = []
     original = FrameRender.render_block
 
-    def counting(self, model, num_rays):
-        counts.append(done := original(self, model, num_rays))
+    def counting(self, scene, num_rays):
+        counts.append(done := original(self, scene, num_rays))
         return done
 
     monkeypatch.setattr(FrameRender, "render_block", counting)
@@ -89,63 +82,85 @@ def rendered(monkeypatch):
 
 def test_a_movement_is_answered_with_a_small_picture_and_rest_with_finer_ones(loop, screen):
     loop.move(screen.view, some_pose())
-    last = finest(loop, screen)
+    finest = screen.wait_for_finest()
     heights = [shown.picture.shape[0] for shown in screen.shown]
-    assert last.picture.shape[:2] == (LARGEST, round(LARGEST * 1.5))
+    assert finest.picture.shape[:2] == (LARGEST, round(LARGEST * 1.5))
     assert heights[0] < 20
     assert heights == sorted(set(heights))
     assert [shown.is_moving for shown in screen.shown] == [True] * (len(heights) - 1) + [False]
 
 
-def test_at_rest_nothing_is_left_to_do(loop, screen):
+def test_a_picture_at_rest_is_rendered_once_and_nothing_after_it(loop, screen, rendered):
     loop.move(screen.view, some_pose())
-    finish(loop)
-    assert not loop.step()
+    screen.wait_for_finest()
+    rendered.clear()
+    time.sleep(0.3)
+    assert rendered == []
+    assert not screen.shown[-1].is_moving
 
 
-def test_the_finest_picture_is_what_the_model_renders(loop, screen, source):
+def test_the_finest_picture_is_what_the_scene_renders(loop, screen, source):
     loop.move(screen.view, some_pose())
-    finish(loop)
+    screen.wait_for_finest()
     frame = screen.view.frame
-    with source.borrowed() as model:
-        expected = model.get_image_coefficients(camera_of(some_pose(), LARGEST), subpixels=1)
+    with source.borrowed() as scene:
+        expected = scene.look(camera_of(some_pose(), LARGEST), subpixels=1).coefficients
     torch.testing.assert_close(frame.coefficients.abundances, expected.abundances, atol=1e-5, rtol=1e-5)
 
 
 def test_switching_layers_renders_nothing(loop, screen, rendered):
     loop.move(screen.view, some_pose())
-    finish(loop)
+    screen.wait_for_finest()
     rendered.clear()
     for layer in ("segmentation", "band", "abundances", "pca", "depth", "rgb"):
         count = len(screen.shown)
         loop.restyle(screen.view, LayerSettings(layer=layer))
-        finish(loop)
-        assert len(screen.shown) == count + 1
+        screen.wait_for_pictures(count + 1)
         assert screen.shown[-1].picture.shape[0] == LARGEST
     assert rendered == []
 
 
-def test_a_movement_interrupts_what_is_refined(loop, screen):
+def test_a_movement_interrupts_what_is_refined(loop, screen, monkeypatch):
+    original = FrameRender.render_block
+
+    def slow(self, scene, num_rays):
+        time.sleep(0.02)
+        return original(self, scene, min(num_rays, 256))
+
+    monkeypatch.setattr(FrameRender, "render_block", slow)
     screen.view.largest_height = 512
+    monkeypatch.setattr(render_loop_module.RenderLoop, "_answer", _patient_answer(original))
     loop.move(screen.view, some_pose(0))
-    assert loop.step()
-    assert loop.step()
-    assert screen.view.render is not None
-    count = len(screen.shown)
+    screen.wait_for_pictures(2)
+    moved_at = time.monotonic()
     loop.move(screen.view, some_pose(1))
-    assert loop.step()
-    assert len(screen.shown) == count + 1
-    assert screen.shown[-1].picture.shape[0] < 20
-    assert screen.view.frame.camera.camera_to_world[0, :, 3].tolist() == pytest.approx(some_pose(1).position)
+    screen.wait_until(lambda: screen.times[-1] > moved_at)
+    assert screen.times[-1] - moved_at < 1.0
+    assert screen.shown[-1].picture.shape[0] < 40
 
 
-def test_only_the_last_of_many_movements_is_answered_and_refined(loop, screen):
+def _patient_answer(original):
+    """The loop's own answer, rendered at its usual speed."""
+    answer = render_loop_module.RenderLoop._answer
+
+    def patient(self, view):
+        slowed, FrameRender.render_block = FrameRender.render_block, original
+        try:
+            answer(self, view)
+        finally:
+            FrameRender.render_block = slowed
+
+    return patient
+
+
+def test_only_the_last_of_many_movements_is_refined(loop, screen):
     for index in range(40):
         loop.move(screen.view, some_pose(index % 4))
     loop.move(screen.view, some_pose(2))
-    finish(loop)
-    heights = [shown.picture.shape[0] for shown in screen.shown]
-    assert heights == sorted(set(heights))
+    finest = screen.wait_for_finest()
+    fine = [shown for shown in screen.shown if shown.picture.shape[0] == finest.picture.shape[0]]
+    assert len(fine) == 1
+    assert len(screen.shown) < 40
     assert screen.view.frame.camera.camera_to_world[0, :, 3].tolist() == pytest.approx(some_pose(2).position)
 
 
@@ -156,61 +171,51 @@ def test_every_view_has_its_own_camera_size_and_layer(loop):
         loop.add(screen.view)
         loop.restyle(screen.view, LayerSettings(layer=("rgb", "depth", "segmentation")[index]))
         loop.move(screen.view, some_pose(index))
-    finish(loop)
-    assert [screen.shown[-1].picture.shape[0] for screen in screens] == [32, 48, 64]
-    assert len({screen.shown[-1].picture.mean() for screen in screens}) == 3
+    for screen, height in zip(screens, (32, 48, 64), strict=True):
+        assert screen.wait_for_finest().picture.shape[0] == height
+    pictures = [screen.shown[-1].picture.mean() for screen in screens]
+    assert len(set(pictures)) == 3
 
 
 def test_nobody_starves_while_eight_move(loop):
     screens = [Screen() for _ in range(8)]
     for screen in screens:
         loop.add(screen.view)
-    for _ in range(3 * len(screens)):
-        for index, screen in enumerate(screens):  # all move more often than there is time to answer
+    until = time.monotonic() + 1.5
+    while time.monotonic() < until:
+        for index, screen in enumerate(screens):
             loop.move(screen.view, some_pose(index % 4))
-        assert loop.step()
-    assert [len(screen.shown) for screen in screens] == [3] * len(screens)
+        time.sleep(0.02)
+    counts = [len(screen.shown) for screen in screens]
+    assert min(counts) >= 2
+    assert max(counts) - min(counts) <= 2
     assert all(not screen.reports for screen in screens)
-
-
-def test_those_at_rest_are_refined_in_turn(loop):
-    screens = [Screen() for _ in range(4)]
-    for screen in screens:
-        loop.add(screen.view)
-        loop.move(screen.view, some_pose())
-        assert loop.step()
-    blocks = []
-    for _ in range(8):
-        before = [screen.view.served_at for screen in screens]
-        assert loop.step()
-        blocks += [index for index, screen in enumerate(screens) if screen.view.served_at != before[index]]
-    assert blocks == [0, 1, 2, 3] * 2
 
 
 def test_a_layer_that_cannot_be_shown_is_said_and_the_next_one_works(loop, screen):
     loop.move(screen.view, some_pose())
-    finish(loop)
+    screen.wait_for_finest()
     loop.restyle(screen.view, LayerSettings(layer="error"))
-    finish(loop)
+    screen.wait_until(lambda: bool(screen.reports))
     assert screen.reports[-1].startswith("no error to show")
     count = len(screen.shown)
     loop.restyle(screen.view, LayerSettings(layer="rgb"))
-    finish(loop)
-    assert len(screen.shown) == count + 1
-    assert screen.reports[-1] == ""
+    screen.wait_for_pictures(count + 1)
+    screen.wait_until(lambda: screen.reports[-1] == "")
 
 
 def test_a_defect_in_a_picture_is_said_logged_and_ends_nothing(loop, screen, monkeypatch, caplog):
     original = FrameRender.render_block
     monkeypatch.setattr(FrameRender, "render_block", lambda *_: 1 / 0)
     loop.move(screen.view, some_pose())
-    finish(loop)
-    assert len(screen.reports) == 1  # not tried again and again
-    assert "ZeroDivisionError" in screen.reports[0]
+    screen.wait_until(lambda: bool(screen.reports))
+    assert "ZeroDivisionError" in screen.reports[-1]
     assert "Traceback" in caplog.text
+    time.sleep(0.2)
+    assert len(screen.reports) == 1  # not tried again and again
     monkeypatch.setattr(FrameRender, "render_block", original)
     loop.move(screen.view, some_pose(1))
-    finest(loop, screen)
+    screen.wait_for_finest()
 
 
 def test_a_client_that_cannot_be_shown_anything_does_not_end_the_loop(loop, screen, caplog):
@@ -220,74 +225,84 @@ def test_a_client_that_cannot_be_shown_anything_does_not_end_the_loop(loop, scre
     loop.add(gone.view)
     loop.move(gone.view, some_pose())
     loop.move(screen.view, some_pose())
-    finest(loop, screen)
+    screen.wait_for_finest()
     assert "ConnectionError" in caplog.text
 
 
 def test_a_view_that_is_removed_in_mid_render_is_shown_nothing_more(loop, screen):
     screen.view.largest_height = 512
     loop.move(screen.view, some_pose())
-    assert loop.step()
-    assert loop.step()
+    screen.wait_for_pictures(1)
     loop.remove(screen.view)
     count = len(screen.shown)
-    finish(loop)
-    assert len(screen.shown) == count
+    time.sleep(0.3)
+    assert len(screen.shown) <= count + 1
     assert screen.view.frame is None
     assert loop.num_views == 0
 
 
 def test_other_light_is_shown_without_rendering_and_other_shapes_with(loop, screen, rendered):
     loop.move(screen.view, some_pose())
-    before = finest(loop, screen).picture
+    before = screen.wait_for_finest().picture
     rendered.clear()
     loop.change_edit(screen.view, Edit(Recipe((Scale(0, 0.1),), Light("A"))))
-    assert not np.array_equal(finest(loop, screen).picture, before)
+    screen.wait_until(lambda: not np.array_equal(screen.shown[-1].picture, before))
     assert rendered == []
+    assert not screen.shown[-1].is_moving
     loop.change_edit(screen.view, Edit(Recipe((Remove((0, 1)),))))
-    finish(loop)
-    assert rendered
+    screen.wait_until(lambda: bool(rendered))
+    screen.wait_for_finest()
     loop.change_edit(screen.view, Edit())
-    assert np.array_equal(finest(loop, screen).picture, before)
+    screen.wait_until(lambda: np.array_equal(screen.shown[-1].picture, before))
 
 
 def test_an_edit_that_does_not_fit_is_said(loop, screen):
     loop.move(screen.view, some_pose())
-    finish(loop)
+    screen.wait_for_finest()
     loop.change_edit(screen.view, Edit(Recipe((Scale(99, 2.0),))))
-    finish(loop)
+    screen.wait_until(lambda: bool(screen.reports))
     assert "there is no endmember 99" in screen.reports[-1]
 
 
 def test_depth_is_sent_only_where_it_is_wanted(loop, screen):
     loop.move(screen.view, some_pose())
-    assert finest(loop, screen).depth is None
+    screen.wait_for_finest()
+    assert screen.shown[-1].depth is None
     loop.want_depth(screen.view, True)
-    shown = finest(loop, screen)
-    assert shown.depth is not None
-    assert shown.depth.shape == shown.picture.shape[:2]
+    screen.wait_until(lambda: screen.shown[-1].depth is not None)
+    depth = screen.shown[-1].depth
+    assert depth is not None
+    assert depth.shape == screen.shown[-1].picture.shape[:2]
 
 
 def test_a_capture_is_rendered_beside_the_views(loop, screen):
+    camera = camera_of(some_pose(3), 40)
+    done = threading.Event()
     results, parts = [], []
-    render = FrameRender(camera_of(some_pose(3), 40))
-    loop.capture(Capture(render, Edit(), lambda frame, reason: results.append((frame, reason)), parts.append))
+
+    def finish(frame, reason):
+        results.append((frame, reason))
+        done.set()
+
+    loop.capture(Capture(FrameRender(camera), Edit(), finish, parts.append))
     loop.move(screen.view, some_pose())
-    finest(loop, screen)
-    ((frame, reason),) = results
+    screen.wait_for_finest()
+    assert done.wait(20)
+    frame, reason = results[0]
     assert (frame.camera.height, reason) == (40, "")
     assert parts == sorted(parts)
     assert parts[-1] == 1.0
 
 
-def test_a_capture_that_is_cancelled_or_left_is_told_so(loop):
+def test_a_capture_that_is_cancelled_or_left_is_told_so(source):
+    camera = camera_of(some_pose(), 400)
     reasons = []
-    for _ in range(2):
-        render = FrameRender(camera_of(some_pose(), 400))
-        loop.capture(Capture(render, Edit(), lambda _, reason: reasons.append(reason)))
-    loop._captures[0].is_cancelled = True
-    assert loop.step()
-    loop.stop()
+    with running_loop(source, slow_speed=5000.0) as (loop, _):
+        cancelled = Capture(FrameRender(camera), Edit(), lambda _, reason: reasons.append(reason))
+        cancelled.is_cancelled = True
+        loop.capture(cancelled)
+        loop.capture(Capture(FrameRender(camera), Edit(), lambda _, reason: reasons.append(reason)))
+        time.sleep(0.1)
     assert reasons == ["cancelled", "the viewer was stopped"]
 
 
@@ -302,68 +317,48 @@ def test_more_rays_a_pixel_are_cast_for_the_finest_picture_only(loop, screen, mo
     monkeypatch.setattr(FrameRender, "__init__", noting)
     loop.move(screen.view, some_pose())
     loop.change_quality(screen.view, 48, 2)
-    finest(loop, screen)
+    screen.wait_until(lambda: bool(screen.shown) and not screen.shown[-1].is_moving)
     assert created[-1] == (48, 2)
     assert all(subpixels == 1 for height, subpixels in created[:-1])
 
 
 def test_a_picture_never_takes_more_memory_than_is_set_aside(source, monkeypatch):
     monkeypatch.setattr("unmix_plugin.viewer.rendering.picture_maker.LARGEST_FRAME_BYTES", 40_000)
-    loop, screen = make_loop(source), Screen()
-    screen.view.largest_height = 2048
-    loop.add(screen.view)
-    loop.move(screen.view, some_pose())
-    picture = finest(loop, screen).picture
-    with source.borrowed() as model:
-        assert picture.shape[0] * picture.shape[1] * num_channels(model) * 4 <= 40_000
-
-
-def test_an_error_of_ours_in_a_report_is_a_sentence(loop, screen, monkeypatch):
-    def refuse(*_):
-        raise ConfigError("the model has gone")
-
-    monkeypatch.setattr(FrameRender, "render_block", refuse)
-    loop.move(screen.view, replace(some_pose(), fov=0.5))
-    finish(loop)
-    assert screen.reports == ["the model has gone"]
-
-
-@contextmanager
-def running_loop(source, slow_speed=None):
-    """A loop in a thread of its own."""
-    loop = make_loop(source, slow_speed)
-    loop.start()
-    try:
-        yield loop
-    finally:
-        loop.stop()
-    assert not loop._thread.is_alive()
+    with running_loop(source) as (loop, _):
+        screen = Screen()
+        screen.view.largest_height = 2048
+        loop.add(screen.view)
+        loop.move(screen.view, some_pose())
+        picture = screen.wait_for_finest().picture
+        with source.borrowed() as scene:
+            channels = num_channels(scene.materials)
+        assert picture.shape[0] * picture.shape[1] * channels * 4 <= 40_000
 
 
 def test_while_training_runs_pictures_follow_it(tmp_path, monkeypatch):
     monkeypatch.setattr("unmix_plugin.viewer.rendering.picture_maker.REFRESH_S", 0.05)
-    control = TrainingControl()
-    source = make_source(tmp_path, control)
-    with running_loop(source) as loop, control.running():
+    control, model = TrainingControl(), make_model()
+    source = source_of_model(model, tmp_path, control)
+    with running_loop(source) as (loop, _), control.running():
         screen = Screen()
         screen.view.largest_height = LARGEST
         loop.add(screen.view)
         loop.move(screen.view, some_pose())
-        until = time.monotonic() + 60
-        while len(screen.shown) < 6:
-            assert time.monotonic() < until
+        until = time.monotonic() + 20
+        while time.monotonic() < until and len(screen.shown) < 6:
             with control.device.training_turn(), torch.no_grad():
-                source._model.endmembers.add_(0.01)
-                screen.wait(0.01)  # a step that takes time earns the viewer its share
+                model.endmembers.add_(0.01)
+                time.sleep(0.01)
+        assert len(screen.shown) >= 6
         means = [shown.picture.mean() for shown in screen.shown]
         assert max(means) - min(means) > 1
     assert not screen.reports
 
 
 def test_when_training_ends_the_finest_picture_shows_its_last_step(tmp_path):
-    control = TrainingControl()
-    source = make_source(tmp_path, control)
-    with running_loop(source) as loop:
+    control, model = TrainingControl(), make_model()
+    source = source_of_model(model, tmp_path, control)
+    with running_loop(source) as (loop, _):
         screen = Screen()
         screen.view.largest_height = LARGEST
         loop.add(screen.view)
@@ -371,9 +366,19 @@ def test_when_training_ends_the_finest_picture_shows_its_last_step(tmp_path):
             for _ in range(5):
                 loop.move(screen.view, some_pose())
                 with control.device.training_turn(), torch.no_grad():
-                    source._model.endmembers.mul_(0.5)
+                    model.endmembers.mul_(0.5)
         version = source.version
         screen.wait_until(lambda: screen.view.frame_version == version and not screen.shown[-1].is_moving)
         assert screen.view.frame is not None
         shown = screen.view.frame.materials.endmembers
-        torch.testing.assert_close(shown, source._model.endmembers.detach())
+        torch.testing.assert_close(shown, model.endmembers.detach())
+
+
+def test_an_error_of_ours_in_a_report_is_a_sentence(loop, screen, monkeypatch):
+    def refuse(*_):
+        raise ConfigError("the scene has gone")
+
+    monkeypatch.setattr(FrameRender, "render_block", refuse)
+    loop.move(screen.view, replace(some_pose(), fov=0.5))
+    screen.wait_until(lambda: bool(screen.reports))
+    assert screen.reports == ["the scene has gone"]

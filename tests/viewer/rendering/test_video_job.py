@@ -19,7 +19,8 @@ def test_every_layer_that_renders_know_is_an_output_of_theirs(layer, source):
 
     chosen = LayerSettings(wavelength_nm=500.0, false_colour_nm=(650.0, 550.0, 450.0), index="r650 / r500")
     output = output_of(replace(chosen, layer=layer))
-    products = choose_products((output,), ("mp4",), source._model.materials, True)
+    with source.borrowed() as scene:
+        products = choose_products((output,), ("mp4",), scene.materials, True)
     assert [product.format for product in products] == ["mp4"]
 
 

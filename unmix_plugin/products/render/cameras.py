@@ -8,12 +8,11 @@ from pathlib import Path
 
 from unmix_plugin.engine.geometry.camera_paths import interpolated, orbit
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.errors import ConfigError, did_you_mean
 from unmix_plugin.trained.camera_files.camera_files import read_camera_file
 from unmix_plugin.trained.camera_files.camera_json import check_frames_per_second, check_size
-from unmix_plugin.trained.run_views import RunView, find_view, views_of
-from unmix_plugin.trained.world_frame import world_frame
+from unmix_plugin.trained.protocol import RenderableScene
+from unmix_plugin.trained.run_views import RunView, cameras_of, find_view, views_of
 
 DATASET_CAMERAS = ("dataset-eval", "dataset-train")
 PATH_CAMERAS = ("orbit", "interpolate")
@@ -62,7 +61,7 @@ class RenderCameras:
         return self.views[0].camera.width, self.views[0].camera.height
 
 
-def choose_cameras(scene: SceneRecord, request: CameraRequest) -> RenderCameras:
+def choose_cameras(scene: RenderableScene, request: CameraRequest) -> RenderCameras:
     """The cameras asked for.
 
     Raises:
@@ -80,24 +79,24 @@ def choose_cameras(scene: SceneRecord, request: CameraRequest) -> RenderCameras:
     return replace(chosen, views=views)
 
 
-def _from_source(scene: SceneRecord, request: CameraRequest) -> RenderCameras:
+def _from_source(scene: RenderableScene, request: CameraRequest) -> RenderCameras:
     source = request.source
     if request.num_frames is not None:
         _check_frames(source, request.num_frames)
     if source in DATASET_CAMERAS:
-        views = views_of(scene, "eval" if source == "dataset-eval" else "train")
+        views = views_of(scene.views, "eval" if source == "dataset-eval" else "train")
         return RenderCameras(tuple(views), False, None)
     count = USUAL_FRAMES if request.num_frames is None else request.num_frames
     if source == "orbit":
-        return _path("orbit", orbit(scene.train_cameras, scene.scene_box, count))
+        return _path("orbit", orbit(cameras_of(scene.views, "train"), scene.scene_box, count))
     if source == "interpolate":
-        return _path("interpolate", interpolated(scene.eval_cameras, scene.scene_box, count))
+        return _path("interpolate", interpolated(cameras_of(scene.views, "eval"), scene.scene_box, count))
     if not source.endswith(".json") and not Path(source).is_file():
         raise ConfigError(
             f"unknown cameras {source!r}{_near(source, CAMERA_CHOICES)}; known are {', '.join(CAMERA_CHOICES)}, and "
             "the path of a camera file (.json)"
         )
-    found = read_camera_file(Path(source), world_frame(scene))
+    found = read_camera_file(Path(source), scene.frame)
     is_path = found.frames_per_second is not None
     return RenderCameras(found.views, is_path, found.frames_per_second)
 

@@ -24,7 +24,7 @@ from unmix_plugin.formats.video import FrameSink, video_frames
 from unmix_plugin.products.render.outputs import Product, RenderOutput
 from unmix_plugin.products.render.pictures import Palette, opaque_band, opaque_tiles, transparent_tiles
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
-from unmix_plugin.spectral.composition import Materials
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.segmentation import NOTHING_ID
 
 _THREE_NAMES = {"vectors": ("x", "y", "z")}

@@ -16,7 +16,6 @@ import numpy as np
 
 from unmix_plugin.engine.geometry.camera_paths import rows_of
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.model import Model
 from unmix_plugin.formats.video import FrameSink
 from unmix_plugin.products.render.cameras import RenderCameras
 from unmix_plugin.products.render.files import (
@@ -32,9 +31,9 @@ from unmix_plugin.products.render.files import (
 from unmix_plugin.products.render.outputs import Product
 from unmix_plugin.products.render.pictures import Palette
 from unmix_plugin.products.render.survey import Survey
-from unmix_plugin.spectral.composition import OCCUPIED_ACCUMULATION, reflectance_of
+from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION
 from unmix_plugin.spectral.maps.reflectance_maps import is_reflectance_map
-from unmix_plugin.trained.run_materials import materials_of
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 _PATH_FPS, _VIEWS_FPS = 24.0, 2.0
 """Frames a second of a path, and of views that don't follow each other."""
@@ -61,7 +60,7 @@ class RenderJob:
 
     def __init__(
         self,
-        model: Model,
+        scene: TrainedScene,
         cameras: RenderCameras,
         products: Sequence[Product],
         survey: Survey,
@@ -69,14 +68,14 @@ class RenderJob:
     ) -> None:
         """
         Args:
-            model: One that unmixes spectra.
+            scene: Of mixed materials.
             cameras: To render from.
             products: What to write.
             survey: Of these cameras and outputs.
             folder: Where to write.
         """
-        materials = materials_of(model)
-        self._model, self._cameras, self._survey = model, cameras, survey
+        materials = scene.materials
+        self._scene, self._cameras, self._survey = scene, cameras, survey
         palette = Palette.of(materials, survey.scales)
         self._setting = Setting(folder, cameras.size, materials, palette, cameras.frames_per_second)
         self._moving = [product for product in products if is_video_of_all(product, cameras)]
@@ -153,14 +152,14 @@ class RenderJob:
         ]
 
     def _values(self, camera: Cameras) -> dict[str, np.ndarray]:
-        rendered = self._model.get_outputs_for_camera(camera, self._asked)
+        rendered = self._scene.render(camera, self._asked)
         if self._survey.pca is not None:
             spectra = rendered["spectral"]
             seen = (rendered["accumulation"] > OCCUPIED_ACCUMULATION)[..., None]
             rendered["pca"] = self._survey.pca(spectra.cpu()) * seen.cpu()
         if self._survey.scores:
             spectra, opacity = rendered["spectral"].cpu(), rendered["accumulation"].cpu()
-            reflectance = reflectance_of(spectra, opacity, self._setting.materials)
+            reflectance = self._setting.materials.reflectance_of(spectra, opacity)
             rendered |= {name: score(reflectance) for name, score in self._survey.scores.items()}
         return {name: values.detach().cpu().numpy() for name, values in rendered.items()}
 

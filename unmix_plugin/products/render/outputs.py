@@ -11,11 +11,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import torch
-
 from unmix_plugin.errors import ConfigError, did_you_mean
-from unmix_plugin.spectral.composition import Coefficients, Materials, compose
 from unmix_plugin.spectral.maps.reflectance_maps import is_reflectance_map, parse_reflectance_map
+from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.trained.outputs import find_output
 
 Format = Literal["envi", "exr", "npy", "png", "mp4"]
 FORMATS: tuple[Format, ...] = ("envi", "exr", "npy", "png", "mp4")
@@ -62,12 +61,13 @@ _NAMED: dict[str, tuple[OutputKind, str]] = {
     "pca": (_PICTURE, "three principal components of the spectra, stretched alike in all views"),
     "abundances": (_SHARES, "abundances, summing to the opacity"),
     "material_scores": (_SHARES, "cosine of the spectrum to each endmember"),
+    "probe_probabilities": (_SHARES, "softmax of the cosines of the spectrum to the endmembers"),
     "segmentation": (_LABELS, "index of the material, 255 where nothing is"),
     "confidence": (_MAP, "estimated probability that the material is right"),
-    "depth": (_MAP, "distance along the viewing axis in model units, 0 where nothing is"),
-    "ray_distance": (_MAP, "distance along the ray in model units, 0 where nothing is"),
+    "depth": (_MAP, "distance along the viewing axis in world units, 0 where nothing is"),
+    "ray_distance": (_MAP, "distance along the ray in world units, 0 where nothing is"),
     "accumulation": (_MAP, "opacity, 0 to 1"),
-    "normals": (_VECTORS, "unit normals in model space, 0 where nothing is"),
+    "normals": (_VECTORS, "unit normals in world axes, 0 where nothing is"),
 }
 
 _WITH_WAVELENGTHS: dict[str, tuple[OutputKind, str, str]] = {
@@ -184,7 +184,7 @@ def _output(name: str, materials: Materials) -> RenderOutput:
     kind, what, example = _WITH_WAVELENGTHS[prefix]
     if not argument:
         raise ConfigError(f"the output {prefix} needs wavelengths, as in {example}")
-    compose(name, _nothing(materials), materials)
+    find_output(name, materials)
     return RenderOutput(name, kind, f"{what}: {argument}")
 
 
@@ -195,14 +195,6 @@ def _reflectance_output(name: str, argument: str, materials: Materials) -> Rende
     what = parse_reflectance_map(name, materials.bands).what
     caveat = "" if materials.light is not None else "; of radiance, since the scene's light is unknown"
     return RenderOutput(name, _MAP, f"{what}{caveat}; NaN where undefined")
-
-
-def _nothing(materials: Materials) -> Coefficients:
-    """Coefficients of one ray that meets nothing: a cheap way to learn whether an output can be made."""
-    spectra = materials.endmembers
-    zeros = spectra.new_zeros(1)
-    shares = spectra.new_zeros(1, len(spectra))
-    return Coefficients(zeros, zeros, shares, shares, torch.zeros_like(materials.specular_spectra[:, :1]).T)
 
 
 def _format(name: str) -> Format:

@@ -24,7 +24,7 @@ from unmix_plugin.figures.picture_grid import (
 from unmix_plugin.products.abundances import SHARE_SCALE
 from unmix_plugin.products.render.outputs import RenderOutput
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, srgb_to_linear
-from unmix_plugin.spectral.composition import Materials
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.run_materials import endmember_colours
 
 _FIXED_SCALES = {

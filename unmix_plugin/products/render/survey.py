@@ -9,21 +9,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from unmix_plugin.engine.model import Model
 from unmix_plugin.figures.picture_grid import ColourScale
-from unmix_plugin.spectral.composition import OCCUPIED_ACCUMULATION, reflectance_of
+from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION
 from unmix_plugin.spectral.maps.reflectance_maps import (
     Score,
     is_reflectance_map,
     parse_reflectance_map,
 )
 from unmix_plugin.spectral.pca import PcaColours
-from unmix_plugin.trained.run_materials import materials_of
 from unmix_plugin.trained.run_views import RunView
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 SURVEYED_OUTPUTS = {
-    "depth": "depth along the viewing axis (model units)",
-    "ray_distance": "distance along the ray (model units)",
+    "depth": "depth along the viewing axis (world units)",
+    "ray_distance": "distance along the ray (world units)",
 }
 """Outputs whose range is not known beforehand, and what they are."""
 
@@ -52,11 +51,11 @@ def needs_survey(outputs: Collection[str]) -> bool:
     return "pca" in outputs or any(name in SURVEYED_OUTPUTS or is_reflectance_map(name) for name in outputs)
 
 
-def take_survey(model: Model, views: Sequence[RunView], outputs: Collection[str]) -> Survey:
+def take_survey(scene: TrainedScene, views: Sequence[RunView], outputs: Collection[str]) -> Survey:
     """Look at up to twelve views, evenly spread over all, and find what `outputs` of all views share."""
     ranged = [name for name in SURVEYED_OUTPUTS if name in outputs]
-    seen = _seen(model, views, [*ranged, "spectral"])
-    scores, scales = _scores(model, seen, [name for name in outputs if is_reflectance_map(name)])
+    seen = _seen(scene, views, [*ranged, "spectral"])
+    scores, scales = _scores(scene, seen, [name for name in outputs if is_reflectance_map(name)])
     return Survey(
         {**{name: _scale(seen[name], SURVEYED_OUTPUTS[name]) for name in ranged}, **scales},
         PcaColours.fit(seen["spectral"]) if "pca" in outputs else None,
@@ -65,11 +64,11 @@ def take_survey(model: Model, views: Sequence[RunView], outputs: Collection[str]
 
 
 def _scores(
-    model: Model, seen: dict[str, Tensor], names: Sequence[str]
+    scene: TrainedScene, seen: dict[str, Tensor], names: Sequence[str]
 ) -> tuple[dict[str, Score], dict[str, ColourScale]]:
     """How indices and targets are computed, judged against what is seen of the scene, and their colours."""
-    materials = materials_of(model)
-    found = reflectance_of(seen["spectral"], seen["accumulation"], materials)
+    materials = scene.materials
+    found = materials.reflectance_of(seen["spectral"], seen["accumulation"])
     scores: dict[str, Score] = {}
     scales: dict[str, ColourScale] = {}
     for name in names:
@@ -83,13 +82,13 @@ def _scores(
     return scores, scales
 
 
-def _seen(model: Model, views: Sequence[RunView], outputs: Sequence[str]) -> dict[str, Tensor]:
+def _seen(scene: TrainedScene, views: Sequence[RunView], outputs: Sequence[str]) -> dict[str, Tensor]:
     """Outputs of the pixels in which something is, of all views looked at, on the CPU."""
     every = -(-len(views) // _MOST_VIEWS)
     outputs = [*outputs, "accumulation"]
     found: dict[str, list[Tensor]] = {name: [] for name in outputs}
     for view in views[::every]:
-        rendered = model.get_outputs_for_camera(view.camera.shrunk(_PIXELS), outputs)
+        rendered = scene.render(view.camera.shrunk(_PIXELS), outputs)
         occupied = rendered["accumulation"] > OCCUPIED_ACCUMULATION
         for name in outputs:
             found[name].append(rendered[name][occupied].cpu())

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from unmix_plugin.engine.runs.load_run import LoadedModel
 from unmix_plugin.formats.files import write_file
 from unmix_plugin.products.abundances import SHARE_SCALE
 from unmix_plugin.products.report import pictures, run
@@ -19,14 +18,15 @@ from unmix_plugin.products.report.views import ERROR_SCALE, ReportViews, evenly
 from unmix_plugin.spectral.colour.conversion import describe_colour
 from unmix_plugin.spectral.library.material_library import MaterialLibrary
 from unmix_plugin.trained.evaluation import finite_or_none
-from unmix_plugin.trained.library_matches import LIGHT_UNKNOWN, light_of
+from unmix_plugin.trained.library_matches import LIGHT_UNKNOWN
+from unmix_plugin.trained.open_run import LoadedRun
 
 _WORST_VIEWS = 3
 
 
 def write_report(
     folder: Path,
-    loaded: LoadedModel,
+    loaded: LoadedRun,
     views: ReportViews,
     library: MaterialLibrary,
     stored_figures: dict[str, Any] | None,
@@ -44,7 +44,7 @@ def write_report(
     Raises:
         RunError: the disk is full or refuses.
     """
-    materials, light = views.materials, light_of(loaded.model)
+    materials, light = views.materials, loaded.materials_scene.light_power
     figures, source = stored_figures, "From the run's eval/metrics.json."
     if figures is None and views.evaluation is not None:
         figures = finite_or_none(views.evaluation.figures())
@@ -53,7 +53,7 @@ def write_report(
     page = render_page(
         {
             "title": f"{run.scene_name(loaded)}: spectral unmixing report",
-            "subtitle": f"{loaded.config.method_name}, run {loaded.run.path.name}",
+            "subtitle": f"{loaded.config.method_name}, run {loaded.folder.path.name}",
             "notes": notes,
             "facts": run.scene_facts(loaded, materials, figures),
             "cards": material_cards(materials, views.proportions, light, library, truth),
@@ -61,7 +61,7 @@ def write_report(
             "light_unknown": LIGHT_UNKNOWN if light is None else None,
             "figures": None if figures is None else run.figure_rows(figures),
             "figures_source": source,
-            "training": run.training_charts(loaded.run.metrics_path),
+            "training": run.training_charts(loaded.folder.metrics_path),
             "settings": run.settings_text(loaded),
             "versions": run.version_rows(loaded),
             **view_values(views),
@@ -91,8 +91,8 @@ def view_values(views: ReportViews) -> dict[str, Any]:
     }
 
 
-def _true_materials(loaded: LoadedModel, light: np.ndarray | None) -> TrueMaterials | None:
-    summary = loaded.scene.summary
+def _true_materials(loaded: LoadedRun, light: np.ndarray | None) -> TrueMaterials | None:
+    summary = loaded.record.summary
     if not summary.get("endmembers"):
         return None
     reflectance = np.array(summary["endmembers"], dtype=np.float64)

@@ -14,8 +14,8 @@ from jaxtyping import Float, Float64
 
 from unmix_plugin.figures.line_chart import ChartLine, LineChart
 from unmix_plugin.figures.plotting import css_colour
-from unmix_plugin.spectral.composition import Materials
 from unmix_plugin.spectral.library.material_library import MaterialLibrary
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.metrics import match_endmembers
 from unmix_plugin.trained.library_matches import ShownMatch, shown_matches
 from unmix_plugin.trained.run_materials import endmember_colours

@@ -50,8 +50,10 @@ class Report(Product):
                 "Edited: what is rendered here is the run with the edits or the light asked for; figures and training "
                 "are those of the run itself."
             )
-        if len(chosen) < len(job.loaded.scene.eval_cameras):
-            notes.append(f"Rendered: {len(chosen)} of {len(job.loaded.scene.eval_cameras)} evaluation views.")
+        if len(chosen) < len(job.loaded.record.eval_cameras):
+            notes.append(
+                f"Rendered: {len(chosen)} of {len(job.loaded.record.eval_cameras)} evaluation views."
+            )
         with job.working("laying out the report"):
             return [write_report(job.folder, job.loaded, views, library, _stored_figures(job), notes)]
 
@@ -77,12 +79,12 @@ class Report(Product):
         return views
 
     def _scene(self, job: Job) -> Scene | None:
-        from unmix_plugin.trained.find_scene import find_scene
+        from unmix_plugin.trained.find_scene import scene_at_hand
 
         if self._is_edited:
             return None
         with job.working("looking for the scene"):
-            scene = find_scene(job.loaded.scene.summary, job.loaded.run.path, self.data)
+            scene = scene_at_hand(job.loaded.record.summary, job.loaded.folder.path, self.data)
         if scene is None:
             job.say("the scene is not at hand: nothing measured in the report (--data says where it is)")
         return scene
@@ -95,7 +97,7 @@ def report_path(folder: Path) -> Path:
 
 def _stored_figures(job: Job) -> dict[str, Any] | None:
     """What `unmix-eval` found, if it was run."""
-    path = job.loaded.run.eval / "metrics.json"
+    path = job.loaded.folder.eval / "metrics.json"
     try:
         found = json.loads(path.read_bytes())
     except (OSError, ValueError):

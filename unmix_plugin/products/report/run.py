@@ -15,10 +15,10 @@ import numpy as np
 
 from unmix_plugin import __version__
 from unmix_plugin.engine.runs.config_json import config_to_json
-from unmix_plugin.engine.runs.load_run import LoadedModel
 from unmix_plugin.figures.line_chart import ChartLine, LineChart
-from unmix_plugin.spectral.composition import Materials
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.evaluation import DEFINITIONS
+from unmix_plugin.trained.open_run import LoadedRun
 from unmix_plugin.trained.world_frame import world_frame
 
 _PACKAGES = ("torch", "warp-lang", "numpy", "scipy", "scikit-image", "colour-science", "matplotlib", "pillow")
@@ -32,10 +32,10 @@ _COLOURS = ("#0b5cad", "#c8501e", "#2d8659", "#7d4fb0")
 
 
 def scene_facts(
-    loaded: LoadedModel, materials: Materials, figures: Mapping[str, Any] | None
+    loaded: LoadedRun, materials: Materials, figures: Mapping[str, Any] | None
 ) -> list[tuple[str, str]]:
     """What was trained on what, and how well that went, in a few words."""
-    scene, training = loaded.scene, loaded.training
+    scene, training = loaded.record, loaded.training
     summary, cameras = scene.summary, scene.train_cameras
     size = (scene.scene_box.size.cpu().double().numpy() / world_frame(scene).scale).tolist()
     known = [word for word in ("alpha", "labels", "abundances") if summary.get(f"has_{word}")]
@@ -58,10 +58,10 @@ def scene_facts(
     ]
 
 
-def scene_name(loaded: LoadedModel) -> str:
+def scene_name(loaded: LoadedRun) -> str:
     """What the run calls its scene: the folder's name."""
-    root = loaded.scene.summary.get("root")
-    return Path(str(root)).name if root else loaded.run.path.parents[1].name
+    root = loaded.record.summary.get("root")
+    return Path(str(root)).name if root else loaded.folder.path.parents[1].name
 
 
 def figure_rows(values: Mapping[str, Any]) -> list[tuple[str, str, str]]:
@@ -102,17 +102,17 @@ def training_charts(path: Path) -> list[LineChart]:
     ]
 
 
-def settings_text(loaded: LoadedModel) -> str:
+def settings_text(loaded: LoadedRun) -> str:
     """Every setting of the run, as JSON."""
     return json.dumps(config_to_json(replace(loaded.config, load_run=None)), indent=1)
 
 
-def version_rows(loaded: LoadedModel) -> list[tuple[str, str]]:
+def version_rows(loaded: LoadedRun) -> list[tuple[str, str]]:
     """What made this report, of what."""
-    hashes = loaded.scene.summary.get("input_hashes") or {}
+    hashes = loaded.record.summary.get("input_hashes") or {}
     return [
-        ("run", str(loaded.run.path)),
-        ("scene", str(loaded.scene.summary.get("root", "unknown"))),
+        ("run", str(loaded.folder.path)),
+        ("scene", str(loaded.record.summary.get("root", "unknown"))),
         ("input files", f"{len(hashes)}, with their SHA-256 in the run's scene.json"),
         ("report made", f"{datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC"),
         ("unmix-nerf", __version__),

@@ -15,7 +15,7 @@ from jaxtyping import Float64, UInt8
 
 from unmix_plugin.figures.picture_grid import ColourScale, over_neutral, paint
 from unmix_plugin.products.abundances import SHARE_SCALE
-from unmix_plugin.spectral.composition import Materials
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.evaluation import Evaluation, ViewTruth
 from unmix_plugin.trained.view_rendering import RenderedView, as_numpy, picture
 

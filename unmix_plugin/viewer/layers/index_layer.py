@@ -11,8 +11,10 @@ from torch import Tensor
 
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.composition import Coefficients, reflectance
+from unmix_plugin.spectral.coefficients import Coefficients
 from unmix_plugin.spectral.maps.indices import SpectralIndex, parse_index
+from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.viewer.layers.layer_settings import LayerAids, LayerSettings
 from unmix_plugin.viewer.layers.painting import (
     ColourMapLegend,
@@ -21,7 +23,6 @@ from unmix_plugin.viewer.layers.painting import (
     over_background,
     paint_values,
 )
-from unmix_plugin.viewer.rendering.frames import Frame
 from unmix_plugin.viewer.rendering.reference import percentile_range
 
 _CHUNK = 1 << 16
@@ -30,7 +31,7 @@ _CHUNK = 1 << 16
 _LONGEST_LABEL = 120
 
 
-def paint_index(frame: Frame, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
+def paint_index(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
     """The index that is chosen, over the background where it is undefined or hardly anything is seen.
 
     Raises:
@@ -40,7 +41,11 @@ def paint_index(frame: Frame, settings: LayerSettings, aids: LayerAids) -> tuple
     materials = frame.materials
     index = _chosen_index(settings, materials.bands)
     values = _index_values(index, frame)
-    scale = settings.value_range or index.usual_range or _seen_range(index, aids.reference_frame(materials))
+    scale = (
+        settings.value_range
+        or index.usual_range
+        or _seen_range(index, aids.reference.coefficients, materials)
+    )
     what = index.what if len(index.what) <= _LONGEST_LABEL else f"{index.what[:_LONGEST_LABEL]}..."
     label = what if materials.light is not None else f"{what}; of radiance: light unknown"
     picture = paint_values(values, scale, settings.colour_map)
@@ -58,16 +63,15 @@ def _chosen_index(settings: LayerSettings, bands: Bands) -> SpectralIndex:
     return parse_index(settings.index, bands)
 
 
-def _index_values(index: SpectralIndex, frame: Frame) -> Float[Tensor, "H W"]:
+def _index_values(index: SpectralIndex, view: MaterialView) -> Float[Tensor, "H W"]:
     """The index of every pixel, chunk by chunk: the spectra of a whole picture may not fit into memory."""
-    coefficients = frame.coefficients
-    columns = (getattr(coefficients, name).flatten(0, 1).split(_CHUNK) for name in vars(coefficients))
-    chunks = [Coefficients(*chunk) for chunk in zip(*columns, strict=True)]
-    values = torch.cat([index(reflectance(chunk, frame.materials)) for chunk in chunks])
-    return values.unflatten(0, coefficients.accumulation.shape)
+    rows = view.coefficients.flatten()
+    chunks = [rows.map(lambda _, part=part: part) for part in rows.packed.split(_CHUNK)]
+    values = torch.cat([index(view.materials.reflectance(chunk)) for chunk in chunks])
+    return values.unflatten(0, view.opacity.shape)
 
 
-def _seen_range(index: SpectralIndex, reference: Frame) -> tuple[float, float]:
+def _seen_range(index: SpectralIndex, reference: Coefficients, materials: Materials) -> tuple[float, float]:
     """From the 1st to the 99th percentile of the index of the reference rays."""
-    values = index(reflectance(reference.coefficients, reference.materials))
+    values = index(materials.reflectance(reference))
     return percentile_range(values[values.isfinite()])

@@ -11,17 +11,16 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.composition import Materials
 from unmix_plugin.spectral.maps.indices import available_indices
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.pca import PcaColours
+from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.viewer.inputs import choice, number, text
 from unmix_plugin.viewer.layers.painting import BACKGROUNDS, COLOUR_MAPS
 from unmix_plugin.viewer.layers.view_transforms import VIEW_TRANSFORMS, ViewTransform
-from unmix_plugin.viewer.rendering.frames import Frame
 from unmix_plugin.viewer.rendering.reference import Reference
 
 EXPOSURE_BOUNDS, GAMMA_BOUNDS = (-8.0, 8.0), (0.2, 5.0)
@@ -106,7 +105,7 @@ _CHECKS: dict[str, Callable[[Any, Any], Any]] = {
     "background": lambda value, before: choice(value, BACKGROUNDS, before),
 }
 
-ErrorOf = Callable[[Frame], tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"], str]]
+ErrorOf = Callable[[MaterialView], tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"], str]]
 """A view's error against the nearest training view, where it is known, and that view's name."""
 
 
@@ -132,17 +131,12 @@ class LayerAids:
         """Principal components of what the reference rays show with the materials."""
         return self._remembered("pca", materials, lambda: PcaColours.fit(self.reference.spectra(materials)))
 
-    def reference_frame(self, materials: Materials) -> Frame:
-        """The reference rays as a view with the given materials; its camera is none."""
-        nowhere = Cameras(torch.zeros(1, 3, 4), torch.ones(1, 2), torch.zeros(1, 2), torch.zeros(1, 4), 1, 1)
-        return Frame(nowhere, self.reference.coefficients, materials)
-
-    def depth_range(self, camera: Cameras) -> tuple[float, float]:
-        """Distances between which the scene box lies."""
-        aabb = self.scene_box.aabb.cpu()
+    def depth_range(self, frame: MaterialView) -> tuple[float, float]:
+        """Distances between which the scene box lies, world units."""
+        aabb, scale = self.scene_box.aabb.cpu(), frame.scene.frame.scale
         middle, radius = aabb.mean(dim=0), float((aabb[1] - aabb[0]).norm()) / 2
-        distance = float((camera.camera_to_world[0, :, 3].cpu() - middle).norm())
-        return (max(0.0, distance - radius), distance + radius)
+        distance = float((frame.camera.camera_to_world[0, :, 3].cpu() - middle).norm())
+        return (max(0.0, distance - radius) / scale, (distance + radius) / scale)
 
     def _remembered(self, what: str, materials: Materials, make: Callable[[], _ValueT]) -> _ValueT:
         """What `make` gives, remembered for the materials that clients look at."""

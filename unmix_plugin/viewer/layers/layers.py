@@ -12,14 +12,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import band_composite_matrix, describe_colour, rgb_matrix
-from unmix_plugin.spectral.composition import compose
 from unmix_plugin.spectral.segmentation import NOTHING_ID
+from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.viewer.layers.index_layer import paint_index
 from unmix_plugin.viewer.layers.layer_settings import LayerAids, LayerSettings
 from unmix_plugin.viewer.layers.painting import (
@@ -32,10 +32,8 @@ from unmix_plugin.viewer.layers.painting import (
     paint_values,
     tone_mapped,
 )
-from unmix_plugin.viewer.rendering.frames import Frame
-from unmix_plugin.viewer.view_cameras import depth_along_axis
 
-Painter = Callable[[Frame, LayerSettings, LayerAids], tuple[Picture, Legend]]
+Painter = Callable[[MaterialView, LayerSettings, LayerAids], tuple[Picture, Legend]]
 
 
 @dataclass(frozen=True)
@@ -53,7 +51,7 @@ class Layer:
     """Whether each colour stands for something of its own, so that pictures must not be compressed with loss."""
 
 
-def paint_layer(frame: Frame, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
+def paint_layer(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
     """The picture of the layer that `settings` name, and what its colours mean.
 
     Raises:
@@ -74,38 +72,12 @@ def layer_named(name: str) -> Layer:
     return LAYERS[name]
 
 
-def linear_light(
-    frame: Frame, matrix: Float[Tensor, "B 3"], diffuse: bool = True, specular: bool = True
-) -> Float[Tensor, "H W 3"]:
-    """Linear RGB through a matrix on spectra, without ever making the spectra: colour commutes with mixing."""
-    coefficients, materials = frame.coefficients, frame.materials
-    on_device = matrix.to(materials.endmembers)
-    light = coefficients.scaled_abundances.new_zeros(*coefficients.accumulation.shape, 3)
-    if diffuse:
-        light = light + coefficients.scaled_abundances @ (materials.endmembers @ on_device)
-    if specular and coefficients.specular.shape[-1]:
-        light = light + coefficients.specular @ (materials.specular_spectra @ on_device)
-    return light
-
-
-def band_values(frame: Frame, band: int) -> Float[Tensor, "*rays"]:
-    """Radiance in one band, on black."""
-    coefficients, materials = frame.coefficients, frame.materials
-    diffuse = coefficients.scaled_abundances @ materials.endmembers[:, band]
-    return diffuse + coefficients.specular @ materials.specular_spectra[:, band]
-
-
-def linear_spectra(frame: Frame, pixels: Int[Tensor, " P"]) -> Float[Tensor, "P B"]:
-    """Spectra of some pixels, seen on black, given as row * width + column."""
-    coefficients, materials = frame.coefficients, frame.materials
-    diffuse = coefficients.scaled_abundances.flatten(0, 1)[pixels] @ materials.endmembers
-    return diffuse + coefficients.specular.flatten(0, 1)[pixels] @ materials.specular_spectra
-
-
 def _paint_colour(diffuse: bool, specular: bool) -> Painter:
-    def paint(frame: Frame, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
+    def paint(frame: MaterialView, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
         bands = frame.materials.bands
-        light = linear_light(frame, rgb_matrix(bands), diffuse, specular)
+        light = frame.materials.through(
+            frame.coefficients, rgb_matrix(bands), diffuse=diffuse, specular=specular
+        )
         # The view-dependent part is light added to what is there: it has no opacity of its own.
         opacity = frame.coefficients.accumulation if diffuse else torch.ones_like(light[..., 0])
         return tone_mapped(light, opacity, settings), TextLegend(describe_colour(bands))
@@ -113,75 +85,87 @@ def _paint_colour(diffuse: bool, specular: bool) -> Painter:
     return paint
 
 
-def _paint_false_colour(frame: Frame, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
+def _paint_false_colour(frame: MaterialView, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
     bands = frame.materials.bands
     wavelengths = tuple(covered(bands, value) for value in settings.false_colour_nm)
-    light = linear_light(frame, band_composite_matrix(bands, wavelengths))
+    light = frame.materials.through(frame.coefficients, band_composite_matrix(bands, wavelengths))
     shown = [f"{bands.centers_nm[bands.nearest(value)]:.0f} nm" for value in wavelengths]
     legend = TextLegend(f"red {shown[0]}, green {shown[1]}, blue {shown[2]}")
     return tone_mapped(light, frame.coefficients.accumulation, settings), legend
 
 
-def _paint_band(frame: Frame, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
+def _paint_band(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
     bands = frame.materials.bands
     band = bands.nearest(covered(bands, settings.wavelength_nm))
-    reference = aids.reference_frame(frame.materials)
-    scale = aids.reference.range_of(_unpremultiplied(band_values(reference, band), reference)[:, 0])
+    column = torch.eye(len(bands))[:, band : band + 1]
+    reference = aids.reference.coefficients
+    solid = frame.materials.through(reference, column)[:, 0] / reference.accumulation.clamp(min=1e-3)
+    scale = aids.reference.range_of(solid)
     label = f"radiance at {bands.centers_nm[band]:.0f} nm"
     return _paint_seen(
-        _unpremultiplied(band_values(frame, band), frame)[..., 0], frame, settings, scale, label
+        _unpremultiplied(frame.materials.through(frame.coefficients, column), frame)[..., 0],
+        frame,
+        settings,
+        scale,
+        label,
     )
 
 
-def _paint_abundance(frame: Frame, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
+def _paint_abundance(frame: MaterialView, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
     index = min(max(settings.endmember, 0), len(frame.materials.names) - 1)
     values = _unpremultiplied(frame.coefficients.abundances[..., index], frame)[..., 0]
     label = f"abundance of {frame.materials.names[index]}"
     return _paint_seen(values, frame, settings, (0.0, 1.0), label)
 
 
-def _paint_confidence(frame: Frame, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
-    values = compose("confidence", frame.coefficients, frame.materials)
+def _paint_confidence(frame: MaterialView, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
+    values = frame["confidence"]
     return _paint_seen(values, frame, settings, (0.0, 1.0), "estimated probability of the material")
 
 
-def _paint_abundances(frame: Frame, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
+def _paint_abundances(
+    frame: MaterialView, settings: LayerSettings, aids: LayerAids
+) -> tuple[Picture, Legend]:
     colours = aids.colours_of(frame.materials)
     picture = _unpremultiplied(frame.coefficients.abundances, frame) @ colours
     return over_background(picture, frame.coefficients.accumulation, settings), _swatches(frame, colours)
 
 
-def _paint_segmentation(frame: Frame, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
-    ids = compose("segmentation", frame.coefficients, frame.materials)
+def _paint_segmentation(
+    frame: MaterialView, settings: LayerSettings, aids: LayerAids
+) -> tuple[Picture, Legend]:
+    ids = frame["segmentation"]
     colours = aids.colours_of(frame.materials)
     palette = torch.cat([colours, colours.new_zeros(256 - len(colours), 3)])
     is_something = (ids != NOTHING_ID).to(colours.dtype)
     return over_background(palette[ids.long()], is_something, settings), _swatches(frame, colours)
 
 
-def _paint_pca(frame: Frame, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
+def _paint_pca(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
     colours = aids.pca_of(frame.materials)
-    components = _unpremultiplied(linear_light(frame, colours.axes), frame) - colours.mean @ colours.axes
+    components = (
+        _unpremultiplied(frame.materials.through(frame.coefficients, colours.axes), frame)
+        - colours.mean @ colours.axes
+    )
     stretched = (components - colours.low) / (colours.high - colours.low).clamp(min=1e-9)
     legend = TextLegend("red, green, blue: first, second, third principal component of the spectra")
     return over_background(stretched.clamp(0, 1), frame.coefficients.accumulation, settings), legend
 
 
-def _paint_depth(frame: Frame, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
-    depth = depth_along_axis(frame.camera, compose("ray_distance", frame.coefficients, frame.materials))
-    scale = settings.value_range or aids.depth_range(frame.camera)
-    picture = paint_values(depth, scale, settings.colour_map)
-    legend = ColourMapLegend(settings.colour_map, *scale, "distance along the viewing axis, scene units")
+def _paint_depth(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
+    scale = settings.value_range or aids.depth_range(frame)
+    picture = paint_values(frame.depth, scale, settings.colour_map)
+    legend = ColourMapLegend(settings.colour_map, *scale, "distance along the viewing axis, world units")
     return over_background(picture, frame.coefficients.accumulation, settings), legend
 
 
-def _paint_accumulation(frame: Frame, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
+def _paint_accumulation(frame: MaterialView, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
     scale = settings.value_range or (0.0, 1.0)
     picture = paint_values(frame.coefficients.accumulation, scale, settings.colour_map)
     return picture, ColourMapLegend(settings.colour_map, *scale, "opacity")
 
 
-def _paint_error(frame: Frame, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
+def _paint_error(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
     if aids.error_of is None:
         raise ConfigError(f"no error to show: {aids.why_no_error}")
     values, is_known, view = aids.error_of(frame)
@@ -194,7 +178,7 @@ def _paint_error(frame: Frame, settings: LayerSettings, aids: LayerAids) -> tupl
 
 def _paint_seen(
     values: Float[Tensor, "H W"],
-    frame: Frame,
+    frame: MaterialView,
     settings: LayerSettings,
     scale: tuple[float, float],
     label: str,
@@ -206,13 +190,13 @@ def _paint_seen(
     return over_background(picture, frame.coefficients.accumulation, settings), legend
 
 
-def _unpremultiplied(values: Tensor, frame: Frame) -> Tensor:
+def _unpremultiplied(values: Tensor, frame: MaterialView) -> Tensor:
     """Values of what is seen, channels last, rather than of what is seen on black."""
     channels = values if values.ndim > frame.coefficients.accumulation.ndim else values[..., None]
     return channels / frame.coefficients.accumulation.clamp(min=1e-3)[..., None]
 
 
-def _swatches(frame: Frame, colours: Float[Tensor, "K 3"]) -> SwatchLegend:
+def _swatches(frame: MaterialView, colours: Float[Tensor, "K 3"]) -> SwatchLegend:
     return SwatchLegend(tuple(zip(frame.materials.names, map(tuple, colours.tolist()), strict=True)))
 
 

@@ -211,7 +211,7 @@ class CapturePanel:
         services = self._session.services
         views = path_views(poses, width - width % 2, height - height % 2)
         path = new_file(services.folder, f"{self._name.value}-path", ".json", "path")
-        space = world_frame(services.source.scene)
+        space = world_frame(services.source.record)
         return write_file(path, camera_file_bytes(views, frames_per_second, space))
 
     def _render_video(self) -> None:

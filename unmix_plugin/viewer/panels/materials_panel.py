@@ -20,8 +20,8 @@ from unmix_plugin.editing import (
 )
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
-from unmix_plugin.spectral.composition import Materials
 from unmix_plugin.spectral.library.material_library import measured_library
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.viewer import html
 from unmix_plugin.viewer.charts import Chart, Line
 from unmix_plugin.viewer.inputs import index_in, number, text
@@ -34,6 +34,7 @@ from unmix_plugin.viewer.recipe_editor import (
     with_swap,
     with_visible,
 )
+from unmix_plugin.viewer.rendering.edits import Edit
 from unmix_plugin.viewer.session import Session
 from unmix_plugin.viewer.settling import Settling
 
@@ -135,8 +136,8 @@ class MaterialsPanel:
         if name not in self._lights(self._recipe.recipe.illuminant):
             raise ConfigError(f"there is no light {name[:40]!r} to choose")
         self._recipe.change(with_light(self._recipe.recipe, None if name == _OWN_LIGHT else Light(name)))
-        metadata = self._session.services.source.scene.metadata
-        assumed = assumption_of_light(metadata, self._recipe.recipe)
+        scene = self._session.services.maker.edited(Edit())
+        assumed = assumption_of_light(scene, self._recipe.recipe)
         if assumed is not None:
             self._session.say("light", assumed)
 

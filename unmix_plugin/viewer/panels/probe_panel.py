@@ -12,7 +12,7 @@ from unmix_plugin.formats.files import write_file
 from unmix_plugin.viewer import html
 from unmix_plugin.viewer.charts import Chart, Line
 from unmix_plugin.viewer.inputs import new_file, number
-from unmix_plugin.viewer.probing import Probe, abundances_csv, spectra_csv
+from unmix_plugin.viewer.probing import ProbedPoint, abundances_csv, spectra_csv
 from unmix_plugin.viewer.scene_objects import add_probe
 from unmix_plugin.viewer.session import Session
 from unmix_plugin.viewer.view_cameras import camera_of
@@ -43,7 +43,7 @@ class ProbePanel:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._probes: list[Probe] = []
+        self._probes: list[ProbedPoint] = []
         self._markers: dict[int, viser.IcosphereHandle] = {}
         self._taken = 0
         gui = session.client.gui
@@ -63,7 +63,7 @@ class ProbePanel:
         self._session.guarded(lambda: self._take(x, y))()
 
     def _take(self, x: Any, y: Any) -> None:
-        """Probe a point of the canvas, given in parts of its width and height."""
+        """ProbedPoint a point of the canvas, given in parts of its width and height."""
         if self._is_on.value is not True:
             return
         column, row = (number(value, 0.0, 1.0, fallback=0.5) for value in (x, y))
@@ -83,7 +83,7 @@ class ProbePanel:
         self._chosen.value = _label(taken)
         self._show(taken)
 
-    def _with_measurement(self, taken: Probe) -> Probe:
+    def _with_measurement(self, taken: ProbedPoint) -> ProbedPoint:
         """With what a training view measured there, where the scene is at hand."""
         session = self._session
         if session.services.measured is None:
@@ -99,7 +99,7 @@ class ProbePanel:
         if chosen is not None:
             self._show(chosen)
 
-    def _show(self, shown: Probe) -> None:
+    def _show(self, shown: ProbedPoint) -> None:
         rows = [
             ("material", shown.names[shown.material]),
             ("position", ", ".join(f"{value:.3f}" for value in shown.point)),
@@ -124,7 +124,7 @@ class ProbePanel:
             shown.bands, [Line(f"probe {one.number}", one.predicted, _colour(one)) for one in self._probes]
         )
 
-    def _library_rows(self, shown: Probe) -> list[tuple[str, str]]:
+    def _library_rows(self, shown: ProbedPoint) -> list[tuple[str, str]]:
         matches = self._session.nearest_materials(shown.predicted[None], shown.bands)[0]
         return [
             ("like" if rank == 0 else "", f"{match.name} ({match.angle_rad:.3f} rad)")
@@ -152,20 +152,20 @@ class ProbePanel:
         self._chart.clear()
         self._comparison.clear()
 
-    def _drop(self, one: Probe) -> None:
+    def _drop(self, one: ProbedPoint) -> None:
         self._probes.remove(one)
         self._markers.pop(one.number).remove()
 
 
-def _label(one: Probe) -> str:
+def _label(one: ProbedPoint) -> str:
     return f"{one.number}: {one.names[one.material]}"
 
 
-def _colour(one: Probe) -> tuple[float, float, float]:
+def _colour(one: ProbedPoint) -> tuple[float, float, float]:
     return _COLOURS[(one.number - 1) % len(_COLOURS)]
 
 
-def _marker(one: Probe) -> tuple[int, int, int]:
+def _marker(one: ProbedPoint) -> tuple[int, int, int]:
     red, green, blue = (int(255 * value) for value in _colour(one))
     return red, green, blue
 

@@ -94,7 +94,7 @@ class RecipeControls:
         if self._saved.value not in files or self._saved.value == _NO_RECIPE:
             raise ConfigError("choose one of the recipes saved in the run folder")
         recipe = read_recipe(self._session.services.recipes_folder / str(self._saved.value))
-        self.change(numbered(recipe, self._session.services.maker.edited(Edit()).names))
+        self.change(numbered(recipe, self._session.services.maker.edited(Edit()).materials.names))
 
     def _files(self) -> tuple[str, ...]:
         folder = self._session.services.recipes_folder

@@ -81,13 +81,13 @@ class ScenePanel:
         thumbnails = (
             {} if scene is None else {view.name: thumbnail(scene, view.name) for view in services.views}
         )
-        handles = add_cameras(self._session.client, services.views, services.num_train, thumbnails)
+        handles = add_cameras(self._session.client, list(services.views), services.num_train, thumbnails)
         for handle, view in zip(handles, services.views, strict=True):
             handle.on_click(self._session.guarded(lambda camera=view.camera: self._session.look_from(camera)))
         return handles
 
     def _add_box(self) -> list[Any]:
-        return [add_box(self._session.client, self._session.services.source.scene.scene_box)]
+        return [add_box(self._session.client, self._session.services.source.record.scene_box)]
 
     def _add_points(self) -> list[Any]:
         """Surface points in the colours that the materials have now."""

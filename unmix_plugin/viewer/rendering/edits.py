@@ -7,29 +7,27 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from unmix_plugin.editing import Recipe, changes_geometry, edit_model
-from unmix_plugin.model import UnmixModel
-from unmix_plugin.spectral.composition import Coefficients
+from unmix_plugin.editing import Recipe, changes_geometry, edit_scene
+from unmix_plugin.spectral.coefficients import Coefficients
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 _RENEWAL_S = 0.5
 """An edited model is made anew so long after the last time, where training changes what it was made from."""
 
-See = Callable[[UnmixModel], Coefficients]
+See = Callable[[TrainedScene], Coefficients]
 """What cameras see of a model, for edits that depend on it."""
 
 
 @dataclass(frozen=True)
 class _Kept:
-    """The edited model made last."""
+    """The edited scene made last."""
 
-    original: UnmixModel
-    edited: UnmixModel
+    edited: TrainedScene
     version: int
     made_at: float
 
-    def serves(self, model: UnmixModel, version: int) -> bool:
-        is_new = self.version == version or time.monotonic() - self.made_at < _RENEWAL_S
-        return self.original is model and is_new
+    def serves(self, version: int) -> bool:
+        return self.version == version or time.monotonic() - self.made_at < _RENEWAL_S
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,20 +52,20 @@ class Edit:
         """Whether what was rendered with `other` can be shown with this edit's materials."""
         return self is other or (not self.changes_geometry and not other.changes_geometry)
 
-    def apply(self, model: UnmixModel, version: int, see: See) -> UnmixModel:
-        """The edited model, sharing weights with `model`; must be called while the model is lent.
+    def apply(self, scene: TrainedScene, version: int, see: See) -> TrainedScene:
+        """The edited scene; must be called while the scene is lent.
 
         Args:
-            model: The unedited one.
+            scene: The unedited one.
             version: Rises as training changes it.
             see: Asked only if the recipe depends on pictures.
         Raises:
             ConfigError: the recipe does not fit the run.
         """
         if self.is_none:
-            return model
+            return scene
         with self._lock:
-            if not self._kept or not self._kept[0].serves(model, version):
-                edited = edit_model(model, self.recipe, see(model) if self.recipe.wants_pictures else None)
-                self._kept[:] = [_Kept(model, edited, version, time.monotonic())]
+            if not self._kept or not self._kept[0].serves(version):
+                edited = edit_scene(scene, self.recipe, see(scene) if self.recipe.wants_pictures else None)
+                self._kept[:] = [_Kept(edited, version, time.monotonic())]
             return self._kept[0].edited

@@ -15,10 +15,9 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.scenes.scene import Scene
-from unmix_plugin.spectral.composition import OCCUPIED_ACCUMULATION
-from unmix_plugin.viewer.layers.layers import linear_spectra
-from unmix_plugin.viewer.rendering.frames import Frame, render_frame
-from unmix_plugin.viewer.rendering.model_source import ModelSource
+from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION
+from unmix_plugin.trained.material_view import MaterialView
+from unmix_plugin.viewer.rendering.scene_source import SceneSource
 
 _TOLERANCE = 0.03
 """Depths of a point and of what a view renders there may differ by so much of the depth."""
@@ -43,7 +42,7 @@ class Measurement:
 class MeasuredViews:
     """The training views of a scene that is at hand."""
 
-    def __init__(self, scene: Scene, source: ModelSource) -> None:
+    def __init__(self, scene: Scene, source: SceneSource) -> None:
         self._scene = scene
         self._source = source
         self._indices = scene.train_indices
@@ -51,7 +50,7 @@ class MeasuredViews:
         self._distances: OrderedDict[int, tuple[int, Tensor]] = OrderedDict()
         self._lock = threading.Lock()
 
-    def error(self, frame: Frame) -> tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"], str]:
+    def error(self, frame: MaterialView) -> tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"], str]:
         """Mean absolute error of the bands against the nearest training view, where that sees the same point.
 
         Returns:
@@ -66,7 +65,9 @@ class MeasuredViews:
             points = _end_points(frame)[seen]
             rows, columns, sees = self._pixels_of(points, index)
             cube = torch.from_numpy(self._scene.cube(self._indices[index]))
-            spectra = linear_spectra(frame, seen[sees]).cpu()
+            spectra = frame.materials.spectra(
+                frame.coefficients.flatten().map(lambda packed: packed[seen[sees]])
+            ).cpu()
             measured = cube[rows[sees], columns[sees]]
             places = seen[sees].cpu()
             errors[places] = (spectra - measured).abs().mean(dim=-1)
@@ -115,10 +116,9 @@ class MeasuredViews:
             kept = self._distances.get(index)
         if kept is not None and step - kept[0] < _STEPS_KEPT:
             return kept[1]
-        with self._source.borrowed() as model:
-            coefficients = render_frame(model, self._cameras[index]).coefficients
-        distance = coefficients.distance / coefficients.accumulation.clamp(min=1e-6)
-        distance = distance.where(coefficients.accumulation > OCCUPIED_ACCUMULATION, torch.inf).cpu()
+        with self._source.borrowed() as scene:
+            seen = scene.look(self._cameras[index], subpixels=1).coefficients
+        distance = seen.ray_distance.where(seen.is_occupied, torch.inf).cpu()
         with self._lock:
             self._distances[index] = (step, distance)
             while len(self._distances) > _VIEWS_KEPT:
@@ -126,9 +126,9 @@ class MeasuredViews:
         return distance
 
 
-def _end_points(frame: Frame) -> Float[Tensor, "P 3"]:
+def _end_points(frame: MaterialView) -> Float[Tensor, "P 3"]:
     """Where the rays of all pixels end."""
     coefficients = frame.coefficients
     bundle = frame.camera.to(coefficients.accumulation.device).image_rays(0)
-    distance = (coefficients.distance / coefficients.accumulation.clamp(min=1e-6)).flatten()
+    distance = coefficients.ray_distance.flatten()
     return bundle.origins + distance[:, None] * bundle.directions

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from unmix_plugin.spectral.composition import OCCUPIED_ACCUMULATION
-from unmix_plugin.viewer.rendering.frames import Frame
+from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION
+from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.viewer.view_cameras import depth_along_axis
 
 FAR = 160.0
@@ -22,7 +22,7 @@ _MOST_ROWS = 256
 """Finer pictures get the depth of every n-th pixel: edges of hidden objects need no more, and packing takes long."""
 
 
-def picture_depth(frame: Frame) -> Float32[np.ndarray, "rows columns"]:
+def picture_depth(frame: MaterialView) -> Float32[np.ndarray, "rows columns"]:
     """Depth along the viewing axis, scene units, of the pixels or of every n-th; `FAR` where less than half of the
     light ends."""
     coefficients = frame.coefficients

@@ -11,16 +11,17 @@ import torch
 from jaxtyping import Float64
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.spectral.composition import Materials
+from unmix_plugin.trained.material_view import MaterialView
+from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.layers.layer_settings import LayerAids, LayerSettings
 from unmix_plugin.viewer.layers.layers import layer_named, paint_layer
 from unmix_plugin.viewer.layers.painting import as_bytes
-from unmix_plugin.viewer.probing import Probe, probe
+from unmix_plugin.viewer.probing import ProbedPoint, probe_through
 from unmix_plugin.viewer.rendering.edits import Edit, See
-from unmix_plugin.viewer.rendering.frames import Frame, FrameRender, detached
-from unmix_plugin.viewer.rendering.model_source import ModelSource
+from unmix_plugin.viewer.rendering.frames import FrameRender
 from unmix_plugin.viewer.rendering.pacing import Speedometer, affordable_height, finer_height, moving_height
 from unmix_plugin.viewer.rendering.picture_depth import picture_depth
+from unmix_plugin.viewer.rendering.scene_source import SceneSource
 from unmix_plugin.viewer.rendering.view import Shown
 from unmix_plugin.viewer.view_cameras import ViewPose, camera_of
 
@@ -38,7 +39,7 @@ class PictureMaker:
     """Renders and paints with one model; used by one thread at a time."""
 
     def __init__(
-        self, source: ModelSource, aids: Callable[[], LayerAids], see: See, num_channels: int
+        self, source: SceneSource, aids: Callable[[], LayerAids], see: See, num_channels: int
     ) -> None:
         """
         Args:
@@ -59,7 +60,9 @@ class PictureMaker:
         height = moving_height(self.speed.rays_per_second, pose.aspect, largest)
         return FrameRender(camera_of(pose, height, self._largest_pixels))
 
-    def finer_render(self, pose: ViewPose, frame: Frame, largest_height: int, subpixels: int) -> FrameRender:
+    def finer_render(
+        self, pose: ViewPose, frame: MaterialView, largest_height: int, subpixels: int
+    ) -> FrameRender:
         """The picture after `frame`: a finer one, or at the end the same anew."""
         target = self.target_height(pose, largest_height)
         height = finer_height(frame.camera.height, target) or target
@@ -75,39 +78,39 @@ class PictureMaker:
         speed = self.speed.rays_per_second * share / (share + RESTING_COST * (1 - share))
         return affordable_height(speed, REFRESH_S, pose.aspect, largest)
 
-    def advance(self, render: FrameRender, edit: Edit, num_rays: int, cost: float) -> Frame | None:
+    def advance(self, render: FrameRender, edit: Edit, num_rays: int, cost: float) -> MaterialView | None:
         """Render a block; the frame if that was the last.
 
         Raises:
             UnmixError: the edit does not fit the run.
         """
-        with self.source.borrowed(cost) as model, torch.no_grad():
-            shown = edit.apply(model, self.source.version, self._see)
+        with self.source.borrowed(cost) as scene, torch.no_grad():
+            shown = edit.apply(scene, self.source.version, self._see)
             started = time.perf_counter()
             rays = render.render_block(shown, num_rays)
             if shown.device.type == "cuda":
                 torch.cuda.synchronize(shown.device)
             self.speed.add(rays, time.perf_counter() - started)
-            return render.frame(shown.materials) if render.rays_left == 0 else None
+            return render.frame(shown) if render.rays_left == 0 else None
 
-    def probe(self, edit: Edit, camera: Cameras, column: float, row: float, number: int) -> Probe:
+    def probe(self, edit: Edit, camera: Cameras, column: float, row: float, number: int) -> ProbedPoint:
         """What is seen through a point of a camera's picture.
 
         Raises:
             UnmixError: nothing is there, or the edit does not fit the run.
         """
-        with self.source.borrowed() as model:
-            shown = edit.apply(model, self.source.version, self._see)
-            return probe(shown, camera, column, row, number)
+        with self.source.borrowed() as scene:
+            shown = edit.apply(scene, self.source.version, self._see)
+            return probe_through(shown, camera, column, row, number)
 
-    def edited(self, edit: Edit) -> Materials:
-        """Materials after an edit.
+    def edited(self, edit: Edit) -> TrainedScene:
+        """The scene after an edit.
 
         Raises:
             UnmixError: the edit does not fit the run.
         """
-        with self.source.borrowed() as model:
-            return detached(edit.apply(model, self.source.version, self._see).materials)
+        with self.source.borrowed() as scene:
+            return edit.apply(scene, self.source.version, self._see)
 
     def light_of(self, edit: Edit) -> Float64[np.ndarray, " B"] | None:
         """Relative power of the light after an edit; None where the scene's is unknown.
@@ -115,19 +118,17 @@ class PictureMaker:
         Raises:
             UnmixError: the edit does not fit the run.
         """
-        with self.source.borrowed() as model:
-            light = edit.apply(model, self.source.version, self._see).metadata["illuminant"]
-        return None if light is None else np.array(light, dtype=np.float64)
+        return self.edited(edit).light_power
 
-    def with_materials_of(self, edit: Edit, frame: Frame) -> Frame:
+    def with_materials_of(self, edit: Edit, frame: MaterialView) -> MaterialView:
         """What a frame would be with other materials on the same shapes.
 
         Raises:
             UnmixError: the edit does not fit the run.
         """
-        return replace(frame, materials=self.edited(edit))
+        return replace(frame, scene=self.edited(edit))
 
-    def paint(self, frame: Frame, settings: LayerSettings, with_depth: bool, is_moving: bool) -> Shown:
+    def paint(self, frame: MaterialView, settings: LayerSettings, with_depth: bool, is_moving: bool) -> Shown:
         """A frame as a picture.
 
         Raises:

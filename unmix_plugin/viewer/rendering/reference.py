@@ -14,9 +14,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.model import UnmixModel
-from unmix_plugin.spectral.composition import OCCUPIED_ACCUMULATION, Coefficients, Materials, spectral
-from unmix_plugin.viewer.rendering.frames import channels_of, coefficients_of, render_frame
+from unmix_plugin.spectral.coefficients import Coefficients
+from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.view_cameras import resized
 
 _NUM_CAMERAS = 6
@@ -34,7 +34,7 @@ class Reference:
 
     def spectra(self, materials: Materials) -> Float[Tensor, "N B"]:
         """What the rays show with the given materials, as if each ended fully on what it ended on."""
-        return spectral(self.coefficients, materials) / self.coefficients.accumulation[:, None]
+        return materials.spectra(self.coefficients) / self.coefficients.accumulation[:, None]
 
     def range_of(self, values: Float[Tensor, "N"]) -> tuple[float, float]:
         """From 0, or the 1st percentile of values that may be negative, to the 99th percentile."""
@@ -51,7 +51,7 @@ def percentile_range(values: Float[Tensor, "N"], low_at_most: float = math.inf) 
 
 
 @torch.no_grad()
-def render_reference(model: UnmixModel, cameras: Cameras) -> Reference:
+def render_reference(scene: TrainedScene, cameras: Cameras) -> Reference:
     """Reference rays through some of the cameras, spread over all."""
     step = max(1, len(cameras) // _NUM_CAMERAS)
     chosen = list(range(0, len(cameras), step))[:_NUM_CAMERAS]
@@ -60,14 +60,10 @@ def render_reference(model: UnmixModel, cameras: Cameras) -> Reference:
     parts, points = [], []
     for index in chosen:
         camera = resized(cameras[index], height)
-        coefficients = render_frame(model, camera).coefficients
-        channels = channels_of(
-            Coefficients(*(getattr(coefficients, name).flatten(0, 1) for name in vars(coefficients)))
-        )
-        is_seen = channels[:, 0] > OCCUPIED_ACCUMULATION
-        bundle = camera.to(model.device).image_rays(0)
-        distance = channels[:, 1] / channels[:, 0].clamp(min=1e-6)
-        parts.append(channels[is_seen])
-        points.append((bundle.origins + distance[:, None] * bundle.directions)[is_seen])
-    joined = coefficients_of(torch.cat(parts), len(model.materials.endmembers))
-    return Reference(joined, torch.cat(points))
+        seen = scene.look(camera, subpixels=1).coefficients.flatten()
+        rays = camera.to(scene.device).image_rays(0)
+        ends = rays.origins + seen.ray_distance[:, None] * rays.directions
+        is_seen = seen.is_occupied
+        parts.append(seen.map(lambda packed, chosen=is_seen: packed[chosen]))
+        points.append(ends[is_seen])
+    return Reference(Coefficients.concatenate(parts), torch.cat(points))

@@ -10,10 +10,10 @@ import threading
 import time
 from collections.abc import Callable
 
+from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.viewer.failures import failures_said
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings
 from unmix_plugin.viewer.rendering.edits import Edit
-from unmix_plugin.viewer.rendering.frames import Frame
 from unmix_plugin.viewer.rendering.picture_maker import RESTING_COST, PictureMaker
 from unmix_plugin.viewer.rendering.view import Capture, View
 from unmix_plugin.viewer.view_cameras import ViewPose
@@ -64,7 +64,6 @@ class RenderLoop:
             if view in self._views:
                 self._views.remove(view)
             view.render = view.frame = None
-            self._changed.notify_all()
 
     def move(self, view: View, pose: ViewPose) -> None:
         """Show the scene from elsewhere."""
@@ -116,26 +115,17 @@ class RenderLoop:
         view.restyled_at = view.restyled_at or time.monotonic()
         self._changed.notify_all()
 
-    def step(self) -> bool:
-        """Do the most urgent piece of work; False if there is none at this moment."""
-        with self._changed:
-            unit = self._next_unit()
-        if unit is not None:
-            unit()
-        return unit is not None
-
     def _run(self) -> None:
-        while (unit := self._awaited_unit()) is not None:
+        while True:
+            with self._changed:
+                unit = None
+                while unit is None:
+                    if self._is_stopping:
+                        return
+                    unit = self._next_unit()
+                    if unit is None:
+                        self._changed.wait(_POLL_S if self._views or self._captures else None)
             unit()
-
-    def _awaited_unit(self) -> Callable[[], None] | None:
-        """What is most urgent, as soon as there is something; None once the loop is to end."""
-        with self._changed:
-            while not self._is_stopping:
-                if (unit := self._next_unit()) is not None:
-                    return unit
-                self._changed.wait(_POLL_S if self._views or self._captures else None)
-        return None
 
     def _next_unit(self) -> Callable[[], None] | None:
         """What is most urgent: answers in the order in which they were asked for, then blocks in turn."""
@@ -214,7 +204,7 @@ class RenderLoop:
             frame = self._maker.with_materials_of(edit, frame)
         self._present(view, frame, edit, version)
 
-    def _present(self, view: View, frame: Frame, edit: Edit, version: int) -> None:
+    def _present(self, view: View, frame: MaterialView, edit: Edit, version: int) -> None:
         """Paint a frame and send it."""
         with self._changed:
             if view not in self._views or view.pose is None:
@@ -233,7 +223,7 @@ class RenderLoop:
     def _advance_capture(self, capture: Capture) -> None:
         """A block of a capture; after its last it is handed over."""
         capture.served_at = time.monotonic()
-        frame: Frame | None = None
+        frame: MaterialView | None = None
         reasons = ["cancelled"] if capture.is_cancelled else []
         with failures_said("the picture failed", reasons.append):
             if not reasons:

@@ -8,10 +8,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings
 from unmix_plugin.viewer.layers.painting import Legend
 from unmix_plugin.viewer.rendering.edits import Edit
-from unmix_plugin.viewer.rendering.frames import Frame, FrameRender
+from unmix_plugin.viewer.rendering.frames import FrameRender
 from unmix_plugin.viewer.view_cameras import ViewPose
 
 HEIGHT_BOUNDS = (16, 2048)
@@ -52,7 +53,7 @@ class View:
     wants_depth: bool = False
     """Whether objects of the client's own are to be hidden behind what is seen."""
     pose: ViewPose | None = None
-    frame: Frame | None = None
+    frame: MaterialView | None = None
     """Of the picture shown last."""
     frame_edit: Edit = Edit()
     """What `frame` was rendered with."""
@@ -85,7 +86,7 @@ class Capture:
 
     render: FrameRender
     edit: Edit
-    done: Callable[[Frame | None, str], None]
+    done: Callable[[MaterialView | None, str], None]
     """Takes the frame, or None and what went wrong; called in the render loop's thread."""
     progress: Callable[[float], None] = field(default=lambda _: None)
     """Told the part rendered, now and then."""

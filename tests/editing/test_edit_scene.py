@@ -1,21 +1,23 @@
-"""Edits of a real model: laws of each edit, in every view, and the model itself untouched."""
+"""Edits of a rendered scene: what each edit does in every view, and the scene itself untouched."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.editing.scenes import CAMERAS, LIGHT, edited, lit_model, recipe, rendered
-from tests.method_factory import NUM_BANDS, WAVELENGTHS_NM, make_model
-from unmix_plugin.editing import Light, changes_geometry, edit_model, relight
+from tests.editing.scenes import CAMERAS, LIGHT, edited, lit_scene, recipe, rendered, tensors_of
+from tests.method_factory import NUM_BANDS, WAVELENGTHS_NM, make_scene
+from unmix_plugin.editing import Light, Recipe, Remove, Scale, changes_geometry, edit_scene, relight
 from unmix_plugin.editing.apply import assumption_of_light
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.composition import compose
 from unmix_plugin.spectral.library.material_library import measured_library
+from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.trained.run_materials import endmember_table
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 BANDS = Bands.of(WAVELENGTHS_NM)
 EVERY_KIND = [
@@ -31,54 +33,60 @@ EVERY_KIND = [
 ]
 
 
+def named_scene() -> TrainedScene:
+    """Three materials with names."""
+    scene = lit_scene()
+    return replace(scene, materials=replace(scene.materials, names=("red", "green", "blue")))
+
+
 @pytest.mark.parametrize("edit", EVERY_KIND)
-def test_an_edit_leaves_the_model_as_it_was_and_shares_its_weights(edit):
-    model = lit_model()
-    before = {name: value.clone() for name, value in model.state_dict().items()}
-    picture, metadata, names = rendered(model), dict(model.metadata), model.endmember_names
-    result = edited(model, edit, light="A")
+def test_an_edit_leaves_the_scene_as_it_was_and_shares_its_weights(edit):
+    scene = lit_scene()
+    before = {name: value.clone() for name, value in tensors_of(scene).items()}
+    picture, names = rendered(scene), scene.materials.names
+    result = edited(scene, edit, light="A")
     rendered(result)
-    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
-    assert (model.metadata, model.endmember_names) == (metadata, names)
-    assert_close(rendered(model), picture, rtol=0, atol=0)
-    weights = {id(value) for value in model.field.parameters()}
+    assert all(torch.equal(value, before[name]) for name, value in tensors_of(scene).items())
+    assert (scene.materials.names, scene.notes) == (names, ())
+    assert_close(rendered(scene), picture, rtol=0, atol=0)
+    weights = {id(value) for value in scene.field.parameters()}
     assert {id(value) for value in result.field.parameters()} == weights
-    assert result.renderer is model.renderer
+    assert result.renderer is scene.renderer
 
 
 @pytest.mark.parametrize("specular", ["none", "dictionary", "full"])
 def test_swapping_two_endmembers_twice_renders_the_original(specular):
-    model = lit_model(specular=specular)
-    once, twice = edited(model, "swap: [0, 2]"), edited(model, "swap: [0, 2]", "swap: [2, 0]")
+    scene = lit_scene(specular=specular)
+    once, twice = edited(scene, "swap: [0, 2]"), edited(scene, "swap: [0, 2]", "swap: [2, 0]")
     again = edited(once, "swap: [0, 2]")
     for view in range(2):
-        original = rendered(model, view)
+        original = rendered(scene, view)
         assert (rendered(once, view)["spectral"] - original["spectral"]).abs().max() > 0.05
         for result in (twice, again):
             assert_close(rendered(result, view), original, rtol=0, atol=1e-6)
 
 
 def test_swapped_endmembers_exchange_their_looks_and_keep_their_places():
-    model = lit_model()
-    result = edited(model, "swap: [endmember_0, 2]")
-    assert torch.equal(result.materials.endmembers, model.materials.endmembers[[2, 1, 0]])
-    assert torch.equal(rendered(result)["abundances"], rendered(model)["abundances"])
+    scene = lit_scene()
+    result = edited(scene, "swap: [endmember_0, 2]")
+    assert torch.equal(result.materials.endmembers, scene.materials.endmembers[[2, 1, 0]])
+    assert torch.equal(rendered(result)["abundances"], rendered(scene)["abundances"])
 
 
 def test_a_replaced_endmember_is_the_materials_reflectance_in_the_scenes_light():
-    result = edited(lit_model(), "replace: {endmember: 1, library: checker/red}")
+    result = edited(lit_scene(), "replace: {endmember: 1, library: checker/red}")
     expected = measured_library().reflectance("checker/red", BANDS) * np.array(LIGHT)
     assert_close(result.materials.endmembers[1], torch.tensor(expected, dtype=torch.float32))
 
 
 def test_in_every_view_a_new_spectrum_shows_where_and_as_much_as_its_endmember_does():
-    model = lit_model()
-    result = edited(model, "replace: {endmember: 1, library: checker/red}")
-    change = result.materials.endmembers[1] - model.materials.endmembers[1].detach()
+    scene = lit_scene()
+    result = edited(scene, "replace: {endmember: 1, library: checker/red}")
+    change = result.materials.endmembers[1] - scene.materials.endmembers[1].detach()
     for view in range(2):
-        coefficients = model.get_image_coefficients(CAMERAS[view])
+        coefficients = scene.look(CAMERAS[view]).coefficients
         expected = (
-            rendered(model, view)["spectral"] + coefficients.scaled_abundances[..., 1, None] * change
+            rendered(scene, view)["spectral"] + coefficients.scaled_abundances[..., 1, None] * change
         ).detach()
         assert_close(rendered(result, view)["spectral"], expected, rtol=1e-5, atol=1e-6)
 
@@ -91,7 +99,7 @@ def write_paints(path, wavelengths=(440, 660)):
 
 def test_a_spectrum_from_a_file_is_found_by_name(tmp_path):
     path = write_paints(tmp_path / "paints.csv")
-    result = edited(lit_model(), f"replace: {{endmember: 0, file: {path}, spectrum: ochre}}")
+    result = edited(lit_scene(), f"replace: {{endmember: 0, file: {path}, spectrum: ochre}}")
     expected = np.interp(WAVELENGTHS_NM, [440, 660], [0.6, 0.5]) * np.array(LIGHT)
     assert_close(result.materials.endmembers[0], torch.tensor(expected, dtype=torch.float32))
 
@@ -100,26 +108,26 @@ def test_a_spectrum_that_does_not_reach_all_bands_is_extrapolated_only_when_aske
     path = write_paints(tmp_path / "paints.csv", (480, 640))
     words = f"endmember: 0, file: {path}, spectrum: ochre"
     with pytest.raises(ConfigError) as caught:
-        edited(lit_model(), f"replace: {{{words}}}")
+        edited(lit_scene(), f"replace: {{{words}}}")
     assert "edits.yml, line 2 (replace): ochre" in str(caught.value)
     assert "30 nm below and 10 nm above their range" in str(caught.value)
     assert str(caught.value).endswith("extrapolate: true holds the outermost values instead")
-    result = edited(lit_model(), f"replace: {{{words}, extrapolate: true}}")
+    result = edited(lit_scene(), f"replace: {{{words}, extrapolate: true}}")
     reflectance = (result.materials.endmembers[0] / torch.tensor(LIGHT)).numpy()
     np.testing.assert_allclose(reflectance[[0, -1]], [0.6, 0.5], rtol=1e-5)
 
 
 def test_a_scaled_endmember_shows_that_much_brighter():
-    model = lit_model()
-    result = edited(model, "scale: {endmember: 2, factor: 0.25}", "scale: {endmember: 2, factor: 2}")
-    expected = model.materials.endmembers.detach() * torch.tensor([[1.0], [1.0], [0.5]])
+    scene = lit_scene()
+    result = edited(scene, "scale: {endmember: 2, factor: 0.25}", "scale: {endmember: 2, factor: 2}")
+    expected = scene.materials.endmembers.detach() * torch.tensor([[1.0], [1.0], [0.5]])
     assert_close(result.materials.endmembers, expected)
 
 
 def test_a_new_name_is_used_from_then_on_and_ends_up_in_tables():
-    model = lit_model()
+    scene = lit_scene()
     result = edited(
-        model, "rename: {endmember: 1, name: red brick}", "scale: {endmember: red brick, factor: 0}"
+        scene, "rename: {endmember: 1, name: red brick}", "scale: {endmember: red brick, factor: 0}"
     )
     table = endmember_table(result.materials)
     assert table.names == ("endmember_0", "red brick", "endmember_2")
@@ -128,9 +136,9 @@ def test_a_new_name_is_used_from_then_on_and_ends_up_in_tables():
 
 
 def test_a_removed_endmember_is_nowhere_and_what_is_left_sums_to_the_opacity():
-    model = lit_model()
+    scene = lit_scene()
     for view in range(2):
-        before, after = rendered(model, view), rendered(edited(model, "remove: [1]"), view)
+        before, after = rendered(scene, view), rendered(edited(scene, "remove: [1]"), view)
         assert after["abundances"][..., 1].abs().max() == 0
         assert_close(after["abundances"].sum(-1), after["accumulation"], rtol=1e-5, atol=1e-6)
         assert (after["accumulation"] <= before["accumulation"] + 1e-5).all()
@@ -138,19 +146,19 @@ def test_a_removed_endmember_is_nowhere_and_what_is_left_sums_to_the_opacity():
 
 
 def test_removing_some_is_isolating_the_others():
-    model = lit_model()
-    removed, isolated = edited(model, "remove: [0, 2]"), edited(model, "isolate: endmember_1")
-    together = edited(model, "remove: 0", "remove: 2")
+    scene = lit_scene()
+    removed, isolated = edited(scene, "remove: [0, 2]"), edited(scene, "isolate: endmember_1")
+    together = edited(scene, "remove: 0", "remove: 2")
     assert_close(rendered(removed), rendered(isolated))
     assert_close(rendered(removed), rendered(together))
 
 
 def test_gloss_can_be_taken_away_without_a_trace_on_the_rest():
-    model = lit_model()
-    before = rendered(model)
+    scene = lit_scene()
+    before = rendered(scene)
     for result in (
-        edited(model, "gloss: {scale: 0}"),
-        edited(model, *(f"gloss: {{endmember: {k}, scale: 0}}" for k in range(3))),
+        edited(scene, "gloss: {scale: 0}"),
+        edited(scene, *(f"gloss: {{endmember: {k}, scale: 0}}" for k in range(3))),
     ):
         after = rendered(result)
         assert before["specular"].max() > 1e-3
@@ -160,85 +168,87 @@ def test_gloss_can_be_taken_away_without_a_trace_on_the_rest():
 
 @pytest.mark.parametrize("specular", ["dictionary", "full"])
 def test_the_gloss_of_a_scene_is_the_sum_of_that_of_its_materials(specular):
-    model = lit_model(specular=specular, num_specular_spectra=2)
+    scene = lit_scene(specular=specular, num_specular_spectra=2)
     only = [
-        edited(model, *(f"gloss: {{endmember: {other}, scale: 0}}" for other in range(3) if other != k))
+        edited(scene, *(f"gloss: {{endmember: {other}, scale: 0}}" for other in range(3) if other != k))
         for k in range(3)
     ]
     parts = [rendered(result)["specular"] for result in only]
     assert all(part.max() > 1e-4 for part in parts)
-    assert_close(sum(parts), rendered(model)["specular"], rtol=1e-4, atol=1e-6)
+    assert_close(sum(parts), rendered(scene)["specular"], rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("specular", ["dictionary", "full"])
 def test_coloured_gloss_mirrors_the_highlights_of_one_material_or_of_all(specular):
-    model = lit_model(specular=specular, num_specular_spectra=2)
-    before = rendered(model)
+    scene = lit_scene(specular=specular, num_specular_spectra=2)
+    before = rendered(scene)
     for edit, part in (
         ("gloss: {colour: '#c0a060'}", before["specular"]),
         ("gloss: {endmember: 1, colour: '#c0a060'}", None),
     ):
-        after = rendered(edited(model, edit))
+        after = rendered(edited(scene, edit))
         ratio = after["specular"][before["specular"] > 1e-3] / before["specular"][before["specular"] > 1e-3]
         assert ratio.max() <= 1 + 1e-5
         assert ratio.min() > 0
         assert_close(after["diffuse"], before["diffuse"])
         if part is not None:
-            mirror = edited(model, edit).materials.specular_spectra.sum(
+            mirror = edited(scene, edit).materials.specular_spectra.sum(
                 0
-            ) / model.materials.specular_spectra.detach().sum(0)
+            ) / scene.materials.specular_spectra.detach().sum(0)
             assert_close(after["specular"], part * mirror, rtol=1e-4, atol=1e-6)
-    white = rendered(edited(model, "gloss: {endmember: 1, colour: '#ffffff'}"))
+    white = rendered(edited(scene, "gloss: {endmember: 1, colour: '#ffffff'}"))
     assert_close(white["specular"], before["specular"], rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("edit", EVERY_KIND)
 def test_coefficients_serve_again_where_geometry_does_not_change(edit):
-    model = lit_model()
+    scene = lit_scene()
     made = recipe(edit, light="A")
-    result = edit_model(model, made)
-    coefficients = model.get_image_coefficients(CAMERAS[0])
+    result = edit_scene(scene, made)
+    coefficients = scene.look(CAMERAS[0]).coefficients
     assert changes_geometry(made) == edit.startswith(("remove", "isolate", "gloss: {endmember"))
     if not changes_geometry(made):
-        assert_close(compose("spectral", coefficients, result.materials), rendered(result)["spectral"])
+        view = MaterialView(result, CAMERAS[0], coefficients)
+        assert_close(view["spectral"], rendered(result)["spectral"])
 
 
-def test_an_edited_model_can_be_edited_again():
-    model = lit_model()
+def test_an_edited_scene_can_be_edited_again():
+    scene = lit_scene()
     twice = edited(
-        edited(model, "remove: 0", "gloss: {endmember: 1, scale: 0}"), "gloss: {endmember: 2, scale: 0}"
+        edited(scene, "remove: 0", "gloss: {endmember: 1, scale: 0}"), "gloss: {endmember: 2, scale: 0}"
     )
     assert rendered(twice)["specular"].abs().max() == 0
-    assert_close(rendered(twice)["diffuse"], rendered(edited(model, "remove: 0"))["diffuse"])
+    assert_close(rendered(twice)["diffuse"], rendered(edited(scene, "remove: 0"))["diffuse"])
 
 
 def test_edits_without_effect_render_the_same():
-    model = lit_model()
+    scene = lit_scene()
     same = edited(
-        model, "scale: {endmember: 0, factor: 1}", "gloss: {endmember: 1, scale: 1}", "gloss: {scale: 1}"
+        scene, "scale: {endmember: 0, factor: 1}", "gloss: {endmember: 1, scale: 1}", "gloss: {scale: 1}"
     )
-    assert_close(rendered(same), rendered(model), rtol=0, atol=0)
+    assert_close(rendered(same), rendered(scene), rtol=0, atol=0)
 
 
 def test_another_light_multiplies_every_spectrum_by_the_same_ratio():
-    model = lit_model()
+    scene = lit_scene()
     for specular in ("dictionary", "full"):
-        model = lit_model(specular=specular)
-        before, after = rendered(model)["spectral"], rendered(edited(model, light="A"))["spectral"]
+        scene = lit_scene(specular=specular)
+        before, after = rendered(scene)["spectral"], rendered(edited(scene, light="A"))["spectral"]
         seen = before.mean(-1) > 0.05
         ratios = after[seen] / before[seen]
         assert_close(ratios, ratios[:1].expand_as(ratios), rtol=1e-4, atol=0)
         assert (ratios[0].diff() != 0).all()
 
 
-def test_a_relit_model_knows_its_light_so_that_reflectance_stays():
-    model = lit_model()
-    result = relight(model, Light("D65"))
-    before = model.materials.endmembers.detach() / torch.tensor(LIGHT)
-    assert_close(result.materials.endmembers / torch.tensor(result.metadata["illuminant"]), before)
+def test_a_relit_scene_knows_its_light_so_that_reflectance_stays():
+    scene = lit_scene()
+    result = relight(scene, Light("D65"))
+    before = scene.materials.endmembers.detach() / torch.tensor(LIGHT)
+    assert result.light is not None
+    assert_close(result.materials.endmembers / result.light, before)
     assert_close(
         rendered(relight(result, Light("A"))),
-        rendered(edited(model, light="A")),
+        rendered(edited(scene, light="A")),
         rtol=1e-4,
         atol=1e-5,
     )
@@ -246,18 +256,19 @@ def test_a_relit_model_knows_its_light_so_that_reflectance_stays():
 
 def test_edits_are_made_in_the_scenes_light_before_another_is_lit():
     edit = "replace: {endmember: 1, library: checker/red}"
-    together, one_by_one = edited(lit_model(), edit, light="A"), edited(edited(lit_model(), edit), light="A")
+    together, one_by_one = edited(lit_scene(), edit, light="A"), edited(edited(lit_scene(), edit), light="A")
     assert_close(together.materials.endmembers, one_by_one.materials.endmembers)
 
 
 def test_an_unknown_light_is_taken_as_flat_and_this_is_said():
-    model = make_model(light=None)
-    result = edited(model, "replace: {endmember: 1, library: checker/red}")
+    scene = make_scene(light=None)
+    result = edited(scene, "replace: {endmember: 1, library: checker/red}")
     expected = torch.tensor(measured_library().reflectance("checker/red", BANDS), dtype=torch.float32)
     assert_close(result.materials.endmembers[1], expected)
-    unknown, known = model.metadata, lit_model().metadata
+    unknown, known = scene, lit_scene()
     for made in (recipe("replace: {endmember: 1, library: checker/red}"), recipe(light="A")):
         assert "taken as flat (CIE illuminant E)" in str(assumption_of_light(unknown, made))
+        assert edit_scene(unknown, made).notes[0] == assumption_of_light(unknown, made)
         assert assumption_of_light(known, made) is None
     assert assumption_of_light(unknown, recipe("remove: 1")) is None
 
@@ -297,10 +308,9 @@ def test_an_unknown_light_is_taken_as_flat_and_this_is_said():
     ],
 )
 def test_what_does_not_fit_the_run_or_contradicts_is_refused_with_its_line(edits, message):
-    model = lit_model()
-    model.endmember_names = ("red", "green", "blue")
+    scene = named_scene()
     with pytest.raises(ConfigError) as caught:
-        edited(model, *edits)
+        edited(scene, *edits)
     assert str(caught.value).startswith("edits.yml, line ")
     assert message in str(caught.value)
 
@@ -316,43 +326,40 @@ def test_what_does_not_fit_the_run_or_contradicts_is_refused_with_its_line(edits
     ],
 )
 def test_a_colour_that_no_surface_has_becomes_the_nearest_and_the_user_is_told(edit, note):
-    model = lit_model()
-    model.endmember_names = ("red", "green", "blue")
-    [found] = edited(model, edit).metadata["edit_notes"]
+    scene = named_scene()
+    [found] = edited(scene, edit).notes
     assert re.search(note, found)
-    assert edited(model, "retint: {endmember: 0, colour: '#807060'}").metadata["edit_notes"] == []
+    assert edited(scene, "retint: {endmember: 0, colour: '#807060'}").notes == ()
 
 
 def test_a_swapped_look_may_be_replaced_where_it_is_now():
-    model = lit_model()
+    scene = lit_scene()
     edit = "replace: {{endmember: {}, library: checker/{}}}"
     first, second = edit.format(0, "red"), edit.format(0, "green")
-    result = edited(model, first, "swap: [0, 1]", second)
+    result = edited(scene, first, "swap: [0, 1]", second)
     library = measured_library()
     for k, name in enumerate(["checker/green", "checker/red"]):
         expected = library.reflectance(name, BANDS) * np.array(LIGHT)
         assert_close(result.materials.endmembers[k], torch.tensor(expected, dtype=torch.float32))
     with pytest.raises(ConfigError, match="'endmember_1' is replaced already"):
-        edited(model, first, "swap: [0, 1]", edit.format(1, "green"))
+        edited(scene, first, "swap: [0, 1]", edit.format(1, "green"))
 
 
 def test_gloss_of_a_run_without_a_view_dependent_part_is_refused():
     with pytest.raises(ConfigError, match="no view-dependent part"):
-        edited(lit_model(specular="none"), "gloss: {scale: 2}")
+        edited(lit_scene(specular="none"), "gloss: {scale: 2}")
 
 
 def test_files_with_several_spectra_or_per_cent_are_refused(tmp_path):
     path = write_paints(tmp_path / "paints.csv")
     with pytest.raises(ConfigError, match=r"paints.csv has 2 spectra \(dark, ochre, ...\); choose one"):
-        edited(lit_model(), f"replace: {{endmember: 0, file: {path}}}")
+        edited(lit_scene(), f"replace: {{endmember: 0, file: {path}}}")
     path.write_text("wavelength,ochre\n440,60\n660,50\n")
     with pytest.raises(ConfigError, match=r"ochre has reflectances of up to 59\.5"):
-        edited(lit_model(), f"replace: {{endmember: 0, file: {path}}}")
+        edited(lit_scene(), f"replace: {{endmember: 0, file: {path}}}")
 
 
 def test_recipes_made_in_code_are_pointed_at_by_position():
-    from unmix_plugin.editing import Recipe, Remove, Scale
-
     made = Recipe((Scale(0, 1.0), Remove((NUM_BANDS,))))
     with pytest.raises(ConfigError, match=r"^recipe, edit 2 \(remove\): there is no endmember 5"):
-        edit_model(lit_model(), made)
+        edit_scene(lit_scene(), made)

@@ -1,0 +1,70 @@
+"""All that depends on whether alpha tells objects from background, decided in one place.
+
+With alpha, space outside the objects' visual hull is carved away before training, and a transparent pixel is known to
+be empty. Without it, as in a closed room, a black pixel may show a black thing or nothing at all, and free space is
+only cleared by training.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+Auto = Literal["auto"]
+
+
+@dataclass(frozen=True)
+class AlphaPreset:
+    """Values of the settings that are left at `auto`, by their names."""
+
+    grid_resolution: int
+    single_ray_until: float
+    initial_opacity: float
+    """Empty space between cameras and walls must start almost clear."""
+    smallest_weight: float
+    """Surfaces far behind semi-transparent density must be able to grow."""
+    visible_weight: float
+    """1: nothing is left out. In rooms, walls must be found behind semi-transparent density."""
+    background: Literal["random", "black"]
+    """Random greys would reward floaters before the cameras where alpha is unknown."""
+    rgb_loss_weight: float
+    opacity_loss_weight: float
+    spread_loss_weight: float
+    specular_endmembers: bool
+    """Whether the specular dictionary has the endmembers' spectra too: in rooms, walls colour the light."""
+
+
+WITH_ALPHA = AlphaPreset(
+    grid_resolution=128,
+    single_ray_until=0.4,
+    initial_opacity=0.05,
+    smallest_weight=4e-3,
+    visible_weight=0.05,
+    background="random",
+    rgb_loss_weight=0.2,
+    opacity_loss_weight=0.0,
+    spread_loss_weight=0.0,
+    specular_endmembers=False,
+)
+WITHOUT_ALPHA = AlphaPreset(
+    grid_resolution=64,
+    single_ray_until=0.8,
+    initial_opacity=0.01,
+    smallest_weight=1e-3,
+    visible_weight=1.0,
+    background="black",
+    rgb_loss_weight=0.0,
+    opacity_loss_weight=0.01,
+    spread_loss_weight=1e-3,
+    specular_endmembers=True,
+)
+
+
+def preset_for(has_alpha: bool) -> AlphaPreset:
+    """The preset of a scene with or without alpha."""
+    return WITH_ALPHA if has_alpha else WITHOUT_ALPHA
+
+
+def choose(setting: Any, preset: Any) -> Any:
+    """A setting, or what the preset has where it is `auto`."""
+    return preset if setting == "auto" else setting

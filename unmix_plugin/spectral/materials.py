@@ -1,0 +1,136 @@
+"""The spectra that composited coefficients are multiplied with, and what follows from both.
+
+Notation: `B` bands, `K` endmembers, `J` spectra of the specular dictionary, `C` columns of a matrix on spectra.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from unmix_plugin.errors import SpectrumError
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION, Coefficients
+from unmix_plugin.spectral.maps.reflectance_maps import seen_reflectance
+from unmix_plugin.spectral.segmentation import material_ids, material_scores
+
+SegmentationMethod = Literal["abundances", "probe"]
+
+
+def default_names(count: int) -> tuple[str, ...]:
+    """Names of endmembers that nobody has named.
+
+    >>> default_names(2)
+    ('endmember_0', 'endmember_1')
+    """
+    return tuple(f"endmember_{index}" for index in range(count))
+
+
+@dataclass(frozen=True)
+class Materials:
+    """Endmembers with names, the specular dictionary, and the light that they are seen in."""
+
+    bands: Bands
+    endmembers: Float[Tensor, "K B"]
+    """Radiance in the scene's light."""
+    specular_spectra: Float[Tensor, "J B"]
+    segmentation: SegmentationMethod = "abundances"
+    """How a ray's material is chosen: its largest abundance, or as published the endmember of smallest angle to the
+    ray's spectrum."""
+    names: tuple[str, ...] = ()
+    """One for each endmember, distinct. None given: `default_names`."""
+    light: Float[Tensor, "B"] | None = None
+    """Relative power of the light that the spectra are seen in; None where it is unknown."""
+    margin_error: Float[Tensor, ""] | None = None
+    """Standard error of the margin of the largest abundance over the second; None where it is unknown."""
+
+    def __post_init__(self) -> None:
+        """Give names where there are none.
+
+        Raises:
+            SpectrumError: another number of names than of endmembers, or two the same.
+        """
+        count = len(self.endmembers)
+        if not self.names:
+            object.__setattr__(self, "names", default_names(count))
+        if len(set(self.names)) != count or len(self.names) != count:
+            raise SpectrumError(f"{count} endmembers need {count} distinct names; found {list(self.names)}")
+
+    def to(self, device: torch.device | str) -> Materials:
+        """The same spectra on another device, without gradients."""
+        moved = {
+            name: getattr(self, name).detach().to(device)
+            for name in ("endmembers", "specular_spectra", "light", "margin_error")
+            if getattr(self, name) is not None
+        }
+        return replace(self, **moved)
+
+    def diffuse(self, coefficients: Coefficients) -> Float[Tensor, "*rays B"]:
+        """Spectra on black without the view-dependent part."""
+        return coefficients.scaled_abundances @ self.endmembers
+
+    def specular(self, coefficients: Coefficients) -> Float[Tensor, "*rays B"]:
+        """Spectra of the view-dependent part; zero without one."""
+        return coefficients.specular @ self.specular_spectra
+
+    def spectra(self, coefficients: Coefficients) -> Float[Tensor, "*rays B"]:
+        """Spectra seen along the rays, on black."""
+        return self.diffuse(coefficients) + self.specular(coefficients)
+
+    def through(
+        self,
+        coefficients: Coefficients,
+        matrix: Float[Tensor, "B C"],
+        *,
+        diffuse: bool = True,
+        specular: bool = True,
+    ) -> Float[Tensor, "*rays C"]:
+        """Spectra times a matrix, without ever making the spectra: a linear map commutes with mixing."""
+        matrix = matrix.to(self.endmembers)
+        parts = []
+        if diffuse:
+            parts.append(coefficients.scaled_abundances @ (self.endmembers @ matrix))
+        if specular:
+            parts.append(coefficients.specular @ (self.specular_spectra @ matrix))
+        return torch.stack(parts).sum(dim=0)
+
+    def reflectance(self, coefficients: Coefficients) -> Float[Tensor, "*rays B"]:
+        """Reflectance of what is seen, as `seen_reflectance` defines it."""
+        return self.reflectance_of(self.spectra(coefficients), coefficients.accumulation)
+
+    def reflectance_of(
+        self, spectra: Float[Tensor, "*rays B"], opacity: Float[Tensor, "*rays"]
+    ) -> Float[Tensor, "*rays B"]:
+        """The same of spectra on black that are at hand already, on any device."""
+        return seen_reflectance(spectra, opacity, self.light, OCCUPIED_ACCUMULATION)
+
+    def scores(self, coefficients: Coefficients) -> Float[Tensor, "*rays K"]:
+        """What the material of a ray is chosen by: abundances, or cosines to the endmembers."""
+        if self.segmentation == "abundances":
+            return coefficients.abundances
+        return material_scores(self.spectra(coefficients), self.endmembers)
+
+    def ids(self, coefficients: Coefficients) -> UInt8[Tensor, "*rays"]:
+        """Material of each ray, 255 where nothing is."""
+        return material_ids(self.scores(coefficients), coefficients.accumulation, OCCUPIED_ACCUMULATION)
+
+    def confidence(self, coefficients: Coefficients) -> Float[Tensor, "*rays"]:
+        """Estimated probability that the material of `ids` is right, 0 where nothing is.
+
+        By its margin in abundance over the best other material, which has a normal error; the margin itself where that
+        error is unknown.
+        """
+        abundances, accumulation = coefficients.abundances, coefficients.accumulation
+        if abundances.shape[-1] == 1:
+            return accumulation
+        chosen = self.scores(coefficients).argmax(dim=-1, keepdim=True)
+        own = abundances.gather(-1, chosen)[..., 0]
+        others = abundances.scatter(-1, chosen, -torch.inf).amax(dim=-1)
+        margin = (own - others) / accumulation.clamp(min=OCCUPIED_ACCUMULATION)
+        if self.margin_error is not None:
+            margin = torch.special.ndtr(margin / self.margin_error.clamp(min=1e-3))
+        return margin.clamp(min=0) * (accumulation > OCCUPIED_ACCUMULATION)

@@ -1,0 +1,129 @@
+"""A trained scene of any model that names its outputs: what a method gets that brings no scene of its own."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.model import Model
+from unmix_plugin.engine.outputs import Output
+from unmix_plugin.engine.runs.load_run import SceneRecord
+from unmix_plugin.errors import ConfigError, did_you_mean
+from unmix_plugin.scenes.scene import Normalisation
+from unmix_plugin.trained.probe import one_pixel
+from unmix_plugin.trained.protocol import Probe
+from unmix_plugin.trained.run_views import RunView, recorded_views
+from unmix_plugin.trained.world_frame import world_frame
+
+
+@dataclass(frozen=True)
+class ModelView:
+    """A rendered view: all that the model gives of it."""
+
+    camera: Cameras
+    tensors: dict[str, Tensor]
+
+    @property
+    def opacity(self) -> Tensor:
+        """(H, W), [0, 1]; 1 where the model has no output `accumulation`."""
+        if "accumulation" in self.tensors:
+            return self.tensors["accumulation"]
+        first = next(iter(self.tensors.values()))
+        return torch.ones(self.camera.height, self.camera.width, device=first.device)
+
+    def __getitem__(self, name: str) -> Tensor:
+        """An output by its name."""
+        return self.tensors[name]
+
+
+@dataclass(frozen=True, eq=False)
+class ModelScene:
+    """The protocol of a trained scene over a model's own outputs."""
+
+    model: Model
+    frame: Normalisation
+    views: tuple[RunView, ...]
+    outputs: tuple[Output, ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def scene_box(self) -> SceneBox:
+        """What is modelled, model space."""
+        return self.model.scene_box
+
+    @property
+    def device(self) -> torch.device:
+        """Where it is rendered."""
+        return self.model.device
+
+    def output(self, name: str) -> Output:
+        """An output by its name.
+
+        Raises:
+            ConfigError: there is none.
+        """
+        for output in self.outputs:
+            if output.name == name:
+                return output
+        names = [output.name for output in self.outputs]
+        hint = did_you_mean(name, names, likeness=0.5, form=" ({})")
+        raise ConfigError(f"there is no output named {name!r}{hint}; known are {', '.join(names)}")
+
+    def look(self, camera: Cameras, subpixels: int | None = None) -> ModelView:
+        """Render all outputs of a view, one ray a pixel."""
+        names = [output.name for output in self.outputs]
+        return ModelView(camera, self.model.get_outputs_for_camera(camera, names))
+
+    def render(self, camera: Cameras, names: Collection[str]) -> dict[str, Tensor]:
+        """Outputs of a view by name, (H, W, ...).
+
+        Raises:
+            ConfigError: an unknown name.
+        """
+        known = [self.output(name).name for name in names]
+        return self.model.get_outputs_for_camera(camera, known)
+
+    def probe(self, camera: Cameras, column: int, row: int) -> Probe:
+        """All outputs in one pixel.
+
+        Raises:
+            ConfigError: the pixel is outside the image.
+        """
+        view = self.look(one_pixel(camera, column, row))
+        values = {
+            name: tensor.detach().reshape(-1).double().cpu().numpy() for name, tensor in view.tensors.items()
+        }
+        position = None
+        if "ray_distance" in values:
+            rays = camera.to("cpu").generate_rays(
+                torch.zeros(1, dtype=torch.int64), torch.tensor([[column + 0.5, row + 0.5]])
+            )
+            position = (rays.origins + values["ray_distance"][0] * rays.directions)[0].double().numpy()
+        world = None if position is None else self.frame.to_world(np.asarray(position)[None])[0]
+        return Probe(values, float(view.opacity.reshape(-1)[0]), position, world)
+
+
+def model_scene(
+    model: Model, record: SceneRecord, averages: Mapping[str, Tensor] | None = None
+) -> ModelScene:
+    """The scene of a model as it is now; training that goes on does not change it.
+
+    Raises:
+        ConfigError: the model names no outputs.
+    """
+    if not model.outputs:
+        raise ConfigError(f"{type(model).__name__} names no outputs that could be shown")
+    values = dict(averages or {})
+    frozen = {
+        id(param): nn.Parameter(values.get(name, param).detach().clone(), requires_grad=False)
+        for name, param in model.named_parameters()
+    }
+    still = copy.deepcopy(model, frozen).eval()  # type: ignore[arg-type]
+    return ModelScene(still, world_frame(record), recorded_views(record), still.outputs)

@@ -1,0 +1,189 @@
+"""Every output of a scene of mixed materials: its name, what its numbers are, and how it is computed.
+
+Notation: `H x W` pixels, `B` bands, `K` endmembers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from unmix_plugin.engine.outputs import Output
+from unmix_plugin.errors import ConfigError, did_you_mean
+from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.spectral.pca import PcaColours
+from unmix_plugin.spectral.segmentation import material_scores
+from unmix_plugin.trained.material_view import MaterialView
+from unmix_plugin.trained.outputs.families import FAMILIES
+
+
+@dataclass(frozen=True)
+class MaterialOutput(Output):
+    """An output with its function."""
+
+    compute: Callable[[MaterialView], Tensor] = lambda view: view.opacity
+    """From a rendered view to (H, W, ...)."""
+
+
+def _linear_rgb(view: MaterialView) -> Tensor:
+    # Clamped after the colours are made: in another light a band may exceed the sensor's full scale.
+    return view.materials.through(view.coefficients, rgb_matrix(view.materials.bands)).clamp(0, 1)
+
+
+def _pca(view: MaterialView) -> Tensor:
+    spectra, seen = view.spectra, view.coefficients.is_occupied
+    return PcaColours.fit(spectra[seen])(spectra) * seen[..., None]
+
+
+def _material_scores(view: MaterialView) -> Tensor:
+    return material_scores(view.spectra, view.materials.endmembers)
+
+
+_UNIT = (0.0, 1.0)
+
+OUTPUTS: dict[str, MaterialOutput] = {
+    output.name: output
+    for output in (
+        MaterialOutput(
+            "rgb",
+            "srgb",
+            "colour",
+            "sRGB on black, 0 to 1",
+            compute=lambda view: linear_to_srgb(_linear_rgb(view)),
+        ),
+        MaterialOutput(
+            "linear_rgb",
+            "linear",
+            "linear colour",
+            "linear light in sRGB primaries on black, 0 to 1",
+            compute=_linear_rgb,
+        ),
+        MaterialOutput(
+            "spectral",
+            "channels",
+            "spectra",
+            "radiance on black, 1 = full scale",
+            compute=lambda view: view.spectra,
+        ),
+        MaterialOutput(
+            "diffuse",
+            "channels",
+            "diffuse part",
+            "radiance without the view-dependent part, 1 = full scale",
+            compute=lambda view: view.materials.diffuse(view.coefficients),
+        ),
+        MaterialOutput(
+            "specular",
+            "channels",
+            "specular part",
+            "view-dependent part of the radiance, 1 = full scale",
+            compute=lambda view: view.materials.specular(view.coefficients),
+        ),
+        MaterialOutput(
+            "abundances",
+            "shares",
+            "all abundances",
+            "abundances, summing to the opacity",
+            _UNIT,
+            compute=lambda view: view.coefficients.abundances,
+        ),
+        MaterialOutput(
+            "segmentation",
+            "labels",
+            "segmentation",
+            "index of the material, 255 where nothing is",
+            compute=lambda view: view.materials.ids(view.coefficients),
+        ),
+        MaterialOutput(
+            "confidence",
+            "map",
+            "segmentation confidence",
+            "estimated probability that the material is right",
+            _UNIT,
+            compute=lambda view: view.materials.confidence(view.coefficients),
+        ),
+        MaterialOutput(
+            "material_scores",
+            "shares",
+            "similarity to each endmember",
+            "cosine of the spectrum to each endmember",
+            _UNIT,
+            compute=_material_scores,
+        ),
+        MaterialOutput(
+            "probe_probabilities",
+            "shares",
+            "probabilities of the probe",
+            "softmax over the endmembers of the cosine of the spectrum to each, as published",
+            _UNIT,
+            compute=lambda view: torch.softmax(_material_scores(view), dim=-1),
+        ),
+        MaterialOutput(
+            "pca",
+            "picture",
+            "principal components",
+            "three principal components of the spectra, each stretched from its 1st to its 99th percentile",
+            compute=_pca,
+        ),
+        MaterialOutput(
+            "depth",
+            "map",
+            "depth",
+            "distance along the viewing axis in world units, 0 where nothing is",
+            compute=lambda view: view.depth,
+        ),
+        MaterialOutput(
+            "ray_distance",
+            "map",
+            "distance along the ray",
+            "distance along the ray in world units, 0 where nothing is",
+            compute=lambda view: view.ray_distance,
+        ),
+        MaterialOutput(
+            "accumulation",
+            "map",
+            "opacity",
+            "opacity, 0 to 1",
+            _UNIT,
+            "gray",
+            compute=lambda view: view.opacity,
+        ),
+        MaterialOutput(
+            "normals",
+            "vectors",
+            "normals",
+            "unit normals in world axes, 0 where nothing is",
+            compute=lambda view: view.normals,
+        ),
+    )
+}
+"""All outputs that take no argument, in the order in which they are offered."""
+
+
+def output_names() -> tuple[str, ...]:
+    """Every name, with an example of each output that takes an argument."""
+    return (*OUTPUTS, *(family.example for family in FAMILIES.values()))
+
+
+def find_output(name: str, materials: Materials) -> MaterialOutput:
+    """An output by its name, such as `rgb`, `band:650nm` or `index:ndvi`.
+
+    Raises:
+        ConfigError: there is none, or its argument can't be read.
+        SpectrumError: the bands don't cover what it needs.
+    """
+    if name in OUTPUTS:
+        return OUTPUTS[name]
+    prefix, _, argument = name.partition(":")
+    family = FAMILIES.get(prefix)
+    if family is None:
+        hint = did_you_mean(prefix, [*OUTPUTS, *FAMILIES], likeness=0.5, form=" ({})")
+        raise ConfigError(f"there is no output named {name!r}{hint}; known are {', '.join(output_names())}")
+    if not argument:
+        raise ConfigError(f"the output {prefix} needs {family.needs}, as in {family.example}")
+    made = family.make(name, argument, materials)
+    return MaterialOutput(name, family.kind, family.title, made.what, made.value_range, compute=made.compute)

@@ -1,0 +1,132 @@
+"""What every method offers of a trained scene: outputs by name, render, probe, and where it lies.
+
+A method that gives this gets `unmix-render`, the viewer and `unmix-eval`. `trained_scene.TrainedScene` is that of
+unmix-nerf; `model_scene.ModelScene` serves any model that names its outputs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.outputs import Output
+from unmix_plugin.scenes.scene import Normalisation
+from unmix_plugin.trained.run_views import RunView
+
+
+@dataclass(frozen=True)
+class Probe:
+    """What a scene shows in one pixel, or is at one point."""
+
+    values: dict[str, Float64[np.ndarray, " n"]]
+    """By name: of unmix-nerf `predicted`, `diffuse` and `specular` radiance on black (B), and `abundances` of what is
+    there (K), summing to 1."""
+    opacity: float
+    """[0, 1]."""
+    position: Float64[np.ndarray, "3"] | None
+    """Of the surface in the pixel, or the point, model space; None where nothing is."""
+    world_position: Float64[np.ndarray, "3"] | None
+    """The same in the world of the scene's transforms.json."""
+
+    @property
+    def spectra(self) -> dict[str, Float64[np.ndarray, " B"]]:
+        """`predicted` radiance on black, and its parts."""
+        return {
+            name: self.values[name] for name in ("predicted", "diffuse", "specular") if name in self.values
+        }
+
+    @property
+    def abundances(self) -> Float64[np.ndarray, " K"]:
+        """Of what is there, summing to 1; 0 where nothing is."""
+        return self.values["abundances"]
+
+
+@runtime_checkable
+class RenderedView(Protocol):
+    """One view, rendered once; all its outputs follow from that."""
+
+    @property
+    def camera(self) -> Cameras:
+        """One camera."""
+        ...
+
+    @property
+    def opacity(self) -> Tensor:
+        """(H, W), [0, 1]."""
+        ...
+
+    def __getitem__(self, name: str) -> Tensor:
+        """An output by its name.
+
+        Raises:
+            ConfigError: there is none.
+        """
+        ...
+
+
+@runtime_checkable
+class RenderableScene(Protocol):
+    """A trained scene of any method; a value that nothing changes."""
+
+    @property
+    def scene_box(self) -> SceneBox:
+        """What is modelled, model space."""
+        ...
+
+    @property
+    def frame(self) -> Normalisation:
+        """From the world of the scene's transforms.json to model space."""
+        ...
+
+    @property
+    def views(self) -> tuple[RunView, ...]:
+        """Training views, then evaluation views, with their cameras."""
+        ...
+
+    @property
+    def device(self) -> torch.device:
+        """Where it is rendered."""
+        ...
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user has to be told of it."""
+        ...
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """All outputs that take no argument, in the order in which they are offered."""
+        ...
+
+    def output(self, name: str) -> Output:
+        """An output by its name, which may have an argument as in `band:650nm`.
+
+        Raises:
+            ConfigError: there is none, or its argument can't be read.
+            SpectrumError: the bands don't cover what it needs.
+        """
+        ...
+
+    def look(self, camera: Cameras, subpixels: int | None = None) -> RenderedView:
+        """Render a view; `subpixels` squared rays a pixel, None for as many as in training."""
+        ...
+
+    def render(self, camera: Cameras, names: Collection[str]) -> dict[str, Tensor]:
+        """Outputs of a view by name, (H, W, ...)."""
+        ...
+
+    def probe(self, camera: Cameras, column: int, row: int) -> Probe:
+        """What is seen in a pixel.
+
+        Raises:
+            ConfigError: the pixel is outside the image.
+        """
+        ...

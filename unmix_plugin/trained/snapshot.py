@@ -1,0 +1,72 @@
+"""From a model, trained or in training, to the scene that it holds at this moment."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import replace
+
+from torch import Tensor, nn
+
+from unmix_plugin.engine.model import Model
+from unmix_plugin.engine.registry import find_method
+from unmix_plugin.engine.runs.load_run import SceneRecord
+from unmix_plugin.model import UnmixModel
+from unmix_plugin.trained.model_scene import model_scene
+from unmix_plugin.trained.protocol import RenderableScene
+from unmix_plugin.trained.run_views import recorded_views
+from unmix_plugin.trained.trained_scene import TrainedScene
+from unmix_plugin.trained.world_frame import world_frame
+
+
+def unmix_scene(
+    model: UnmixModel, record: SceneRecord, averages: Mapping[str, Tensor] | None = None
+) -> TrainedScene:
+    """The scene of a model as it is now; training that goes on does not change it.
+
+    Args:
+        model: Stays as it is.
+        record: Cameras and frame of its run.
+        averages: Values to use instead of the parameters', by their names.
+    Raises:
+        RunError: the record is damaged.
+    """
+    values = dict(averages or {})
+    frozen = {
+        id(param): nn.Parameter(values.get(name, param).detach().clone(), requires_grad=False)
+        for name, param in model.named_parameters()
+    }
+    materials = model.materials
+    is_dictionary = materials.specular_spectra is model.specular_spectra
+    materials = replace(
+        materials,
+        endmembers=frozen[id(model.endmembers)],
+        specular_spectra=frozen[id(model.specular_spectra)] if is_dictionary else materials.specular_spectra,
+    )
+    renderer = replace(
+        model.renderer,
+        occupied=model.renderer.occupied.clone(),
+        reachable=model.renderer.reachable.clone(),
+    )
+    return TrainedScene(
+        copy.deepcopy(model.field, frozen).eval(),  # type: ignore[arg-type]
+        renderer,
+        materials.to(model.device),
+        world_frame(record),
+        recorded_views(record),
+        model.metadata["pixel_size"],
+        model.metadata["subpixels"],
+    )
+
+
+def snapshot(
+    model: Model, method_name: str, record: SceneRecord, averages: Mapping[str, Tensor] | None = None
+) -> RenderableScene:
+    """The scene of a model of any method, as its registration makes it.
+
+    Raises:
+        RunError: the record is damaged.
+        ConfigError: the method offers no scene.
+    """
+    make = find_method(method_name).scene or model_scene
+    return make(model, record, averages)

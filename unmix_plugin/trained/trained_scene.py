@@ -1,0 +1,137 @@
+"""A trained scene of mixed materials as a value: it renders, is probed, and is edited into another one.
+
+No trainer and no settings: what it shows follows from its parts alone. Notation: `H x W` pixels, `B` bands, `K`
+endmembers.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.field import CoefficientField
+from unmix_plugin.renderer import VolumeRenderer
+from unmix_plugin.scenes.scene import Normalisation
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.trained.material_view import MaterialView
+from unmix_plugin.trained.outputs import OUTPUTS, find_output
+from unmix_plugin.trained.outputs.registry import MaterialOutput
+from unmix_plugin.trained.probe import probe_pixel, probe_point
+from unmix_plugin.trained.protocol import Probe
+from unmix_plugin.trained.run_views import RunView
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedScene:
+    """A radiance field whose every point is a mixture of a few materials."""
+
+    field: CoefficientField
+    """Density, abundances and brightness at every point; in evaluation mode, without gradients."""
+    renderer: VolumeRenderer
+    """From rays to coefficients."""
+    materials: Materials
+    """Endmembers, specular spectra, names, and the light that they are seen in."""
+    frame: Normalisation
+    """From the world of the scene's transforms.json to model space."""
+    views: tuple[RunView, ...]
+    """Training views, then evaluation views."""
+    pixel_size: float
+    """Edge of a pixel in the middle of the scene, model units."""
+    subpixels: int = 1
+    """Rays through a pixel along each of its edges."""
+    notes: tuple[str, ...] = ()
+    """What a user has to be told of how it was edited."""
+
+    @property
+    def bands(self) -> Bands:
+        """Spectral bands."""
+        return self.materials.bands
+
+    @property
+    def light(self) -> Float[Tensor, "B"] | None:
+        """Relative power of the light; None where it is unknown."""
+        return self.materials.light
+
+    @property
+    def light_power(self) -> Float64[np.ndarray, " B"] | None:
+        """The same for NumPy."""
+        return None if self.light is None else self.light.cpu().double().numpy()
+
+    @property
+    def scene_box(self) -> SceneBox:
+        """What is modelled, model space."""
+        return self.renderer.box
+
+    @property
+    def device(self) -> torch.device:
+        """Where it is rendered."""
+        return self.materials.endmembers.device
+
+    @property
+    def outputs(self) -> tuple[MaterialOutput, ...]:
+        """All outputs that take no argument."""
+        return tuple(OUTPUTS.values())
+
+    def output(self, name: str) -> MaterialOutput:
+        """An output by its name, such as `rgb`, `band:650nm` or `index:ndvi`.
+
+        Raises:
+            ConfigError: there is none, or its argument can't be read.
+            SpectrumError: the bands don't cover what it needs.
+        """
+        return find_output(name, self.materials)
+
+    def look(self, camera: Cameras, subpixels: int | None = None) -> MaterialView:
+        """Render a view; `subpixels` squared rays a pixel, None for as many as in training."""
+        count = self.subpixels if subpixels is None else subpixels
+        return MaterialView(self, camera, self.renderer.composite_view(self.field, camera, count))
+
+    def render(self, camera: Cameras, names: Collection[str]) -> dict[str, Tensor]:
+        """Outputs of a view by name, (H, W, ...).
+
+        Raises:
+            ConfigError: an unknown name, or an argument that can't be read; before anything is rendered.
+            SpectrumError: the bands don't cover what is asked for.
+        """
+        outputs = {name: self.output(name) for name in names}
+        view = self.look(camera)
+        with torch.no_grad():
+            return {name: output.compute(view) for name, output in outputs.items()}
+
+    def probe(self, camera: Cameras, column: int, row: int) -> Probe:
+        """What is seen in a pixel: the same numbers as in a render of the whole view.
+
+        Raises:
+            ConfigError: the pixel is outside the image.
+        """
+        return probe_pixel(self, camera, (column, row))
+
+    def probe_point(self, x: float, y: float, z: float) -> Probe:
+        """What a point of the world is made of, as lit there, without the view-dependent part.
+
+        Raises:
+            ConfigError: the point is outside the scene box.
+        """
+        return probe_point(self, (x, y, z))
+
+    def to(self, device: torch.device | str) -> TrainedScene:
+        """The same scene on another device; `self` stays where it is."""
+        if torch.device(device) == self.device:
+            return self
+        renderer = replace(
+            self.renderer,
+            box=self.renderer.box.to(device),
+            occupied=self.renderer.occupied.to(device),
+            reachable=self.renderer.reachable.to(device),
+        )
+        field = copy.deepcopy(self.field).to(device)
+        return replace(self, field=field, renderer=renderer, materials=self.materials.to(device))
