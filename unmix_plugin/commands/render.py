@@ -15,11 +15,13 @@ from unmix_plugin.engine.configs import DeviceName
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from unmix_plugin.engine.outputs import Output
     from unmix_plugin.products.render.cameras import CameraRequest, RenderCameras
-    from unmix_plugin.products.render.outputs import Product
+    from unmix_plugin.products.render.formats import FormattedOutput
     from unmix_plugin.products.render.pictures import Palette
     from unmix_plugin.products.render.survey import Survey
     from unmix_plugin.trained.open_run import LoadedRun
+    from unmix_plugin.trained.protocol import RenderableScene
 
 
 @dataclass(frozen=True)
@@ -66,8 +68,8 @@ class RenderOptions:
     """Replace files of an earlier render."""
 
 
-def render(argv: list[str]) -> None:
-    """Parse the arguments, render each view, say what is where.
+def render(words: list[str]) -> None:
+    """Parse the words, render each view, say what is where.
 
     Raises:
         RunError: the run is unusable, or a file can't be written.
@@ -76,14 +78,14 @@ def render(argv: list[str]) -> None:
             that is not there.
         SpectrumError: a wavelength outside the bands, a light that is unknown, or a sensor that sees nothing in them.
     """
-    options = tyro.cli(RenderOptions, prog="unmix-render", args=argv)
+    options = tyro.cli(RenderOptions, prog="unmix-render", args=words)
     request = _camera_request(options)
 
     from unmix_plugin.commands.reporting import CommandConsole, say, working
     from unmix_plugin.commands.run_choice import chosen_run
     from unmix_plugin.editing.edited_run import load_edited_run
     from unmix_plugin.products.render.cameras import choose_cameras
-    from unmix_plugin.products.render.outputs import choose_products, default_outputs
+    from unmix_plugin.products.render.formats import choose_formats
 
     console = CommandConsole()
     path = chosen_run(options.run, options.output_dir)
@@ -92,9 +94,8 @@ def render(argv: list[str]) -> None:
         cameras = choose_cameras(loaded.scene, request)
     for line in loaded.scene.notes:
         say(console, line)
-    outputs = options.outputs or default_outputs(cameras.is_path)
-    products = choose_products(outputs, options.formats, loaded.materials_scene.materials, cameras.is_path)
-    _render(options, loaded, cameras, products, console)
+    outputs = choose_formats(options.outputs, options.formats, loaded.scene, cameras.is_path)
+    _render(options, loaded, cameras, outputs, console)
 
 
 def _camera_request(options: RenderOptions) -> CameraRequest:
@@ -114,64 +115,62 @@ def _render(
     options: RenderOptions,
     loaded: LoadedRun,
     cameras: RenderCameras,
-    products: tuple[Product, ...],
+    outputs: tuple[FormattedOutput, ...],
     console: Console,
 ) -> None:
     """Render block by block, then list what was written."""
     from unmix_plugin.commands.reporting import follow, say
     from unmix_plugin.formats.files import refuse_to_overwrite, write_file
-    from unmix_plugin.products.render.job import RenderJob
+    from unmix_plugin.products.render.job import RenderJob, output_paths
     from unmix_plugin.products.render.legend import draw_legend
 
     folder = (options.output or loaded.folder.exports / "render").resolve()
-    legends = _legends(folder, products)
+    legends = _legends(folder, outputs, loaded.scene)
     camera_path, camera_bytes = _camera_file(folder, options.cameras, loaded, cameras)
-    paths = [*_paths(folder, products, cameras), *legends]
+    paths = [path for one in outputs for path in output_paths(folder, one, cameras)]
+    paths += legends
     if not camera_path.is_file() or camera_path.read_bytes() != camera_bytes:
         paths.append(camera_path)
     refuse_to_overwrite(paths, options.overwrite)
     write_file(camera_path, camera_bytes)  # first, so that a folder that can't be written is noticed early
-    say(console, _announcement(cameras, products))
-    survey = _survey(loaded, cameras, products, console)
-    with RenderJob(loaded.materials_scene, cameras, products, survey, folder) as job:
+    say(console, _announcement(cameras, outputs))
+    survey = _survey(loaded, cameras, outputs, console)
+    with RenderJob(loaded.scene, cameras, outputs, survey, folder) as job:
         for block in follow(console, "rendering", job.blocks()):
             job.render(block)
-    for path, product in legends.items():
-        write_file(path, draw_legend(product.output, job.palette))
-    _list(folder, products, cameras, job.palette)
+    for path, output in legends.items():
+        write_file(path, draw_legend(output, job.palette))
+    _list(folder, outputs, cameras, job.palette)
     for path in legends:
         print(f"{path}  what the colours mean")
     print(f"{camera_path}  the cameras, to be given to --cameras again")
 
 
 def _survey(
-    loaded: LoadedRun, cameras: RenderCameras, products: tuple[Product, ...], console: Console
+    loaded: LoadedRun, cameras: RenderCameras, outputs: tuple[FormattedOutput, ...], console: Console
 ) -> Survey:
     from unmix_plugin.commands.reporting import working
     from unmix_plugin.products.render.survey import Survey, needs_survey, take_survey
 
-    names = {product.output.name for product in products}
-    if not needs_survey(names):
+    asked = dict.fromkeys(one.output for one in outputs)
+    if not needs_survey(asked):
         return Survey()
     with working(console, "looking at all views for what their pictures share"):
-        return take_survey(loaded.materials_scene, cameras.views, names)
+        return take_survey(loaded.scene, cameras.views, asked)
 
 
-def _legends(folder: Path, products: tuple[Product, ...]) -> dict[Path, Product]:
-    """Files of legends, each with a product that needs it."""
+def _legends(
+    folder: Path, outputs: tuple[FormattedOutput, ...], scene: RenderableScene
+) -> dict[Path, Output]:
+    """Files of legends, each with the output that it explains."""
+    from unmix_plugin.products.render.formats import file_name
     from unmix_plugin.products.render.legend import needs_legend
 
     return {
-        folder / f"{product.output.file_name}_legend.png": product
-        for product in products
-        if needs_legend(product)
+        folder / f"{file_name(one.output)}_legend.png": one.output
+        for one in outputs
+        if needs_legend(one, scene)
     }
-
-
-def _paths(folder: Path, products: tuple[Product, ...], cameras: RenderCameras) -> list[Path]:
-    from unmix_plugin.products.render.job import product_paths
-
-    return [path for product in products for path in product_paths(folder, product, cameras)]
 
 
 def _camera_file(folder: Path, source: str, loaded: LoadedRun, cameras: RenderCameras) -> tuple[Path, bytes]:
@@ -183,21 +182,23 @@ def _camera_file(folder: Path, source: str, loaded: LoadedRun, cameras: RenderCa
     return folder / f"cameras-{Path(source).stem}.json", content
 
 
-def _announcement(cameras: RenderCameras, products: tuple[Product, ...]) -> str:
-    names = dict.fromkeys(product.output.name for product in products)
+def _announcement(cameras: RenderCameras, outputs: tuple[FormattedOutput, ...]) -> str:
+    names = dict.fromkeys(one.output.name for one in outputs)
     width, height = cameras.size
     views = f"{len(cameras.views)} view{'' if len(cameras.views) == 1 else 's'}"
     return f"{views} of {width} x {height} pixels: {', '.join(names)}"
 
 
-def _list(folder: Path, products: tuple[Product, ...], cameras: RenderCameras, palette: Palette) -> None:
-    """A line for each product: where, how many, what."""
-    from unmix_plugin.products.render.job import is_video_of_all, product_paths
+def _list(
+    folder: Path, outputs: tuple[FormattedOutput, ...], cameras: RenderCameras, palette: Palette
+) -> None:
+    """A line for each output and format: where, how many, what."""
+    from unmix_plugin.products.render.job import is_video_of_all, output_paths
 
-    for product in products:
-        paths = product_paths(folder, product, cameras)
-        what = palette.describe(product.output) if product.format in ("png", "mp4") else product.output.what
-        if is_video_of_all(product, cameras):
+    for one in outputs:
+        paths = output_paths(folder, one, cameras)
+        what = palette.describe(one.output) if one.format in ("png", "mp4") else one.output.what
+        if is_video_of_all(one, cameras):
             print(f"{paths[0]}  {len(cameras.views)} frames; {what}")
         elif len(paths) == 1:
             print(f"{paths[0]}  {what}")

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int
 
 from unmix_plugin.errors import ConfigError, RunError
-from unmix_plugin.trained.density_grid import GridPoints, sample_densities
+from unmix_plugin.trained.density_grid import GridPoints, may_be_solid, sample_densities
 from unmix_plugin.trained.surface import SeenSurface, SurfacePoints
 from unmix_plugin.trained.trained_scene import TrainedScene
 
@@ -128,7 +128,7 @@ def filled(
     for index in range(len(result)):
         points = grid.slice_points(index)
         unknown = torch.from_numpy(result[index] == 0)
-        unknown[unknown.clone()] = scene.renderer.is_reachable(points[unknown].to(scene.device)).cpu()
+        unknown[unknown.clone()] = may_be_solid(scene, points[unknown])
         unknown[unknown.clone()] = surface.hides(points[unknown])
         result[index][unknown.numpy()] = solid
     return result

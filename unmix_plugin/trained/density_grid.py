@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
 from unmix_plugin.errors import ConfigError
@@ -87,3 +87,8 @@ def sample_densities(scene: TrainedScene, positions: Float[Tensor, "P 3"]) -> Fl
     for chosen in scene.renderer.is_occupied(flat).nonzero()[:, 0].split(_CHUNK):
         densities[chosen] = scene.field.get_density(flat[chosen])[0]
     return densities.cpu()
+
+
+def may_be_solid(scene: TrainedScene, points: Float[Tensor, "*grid 3"]) -> Bool[Tensor, "*grid"]:
+    """Which points lie where anything may be: not in the space that was found to be empty before training; CPU."""
+    return scene.renderer.is_reachable(points.to(scene.device)).cpu()

@@ -14,8 +14,8 @@ from tests.method_factory import make_scene
 from tests.scenes.scene_factory import ring_poses
 from tests.trained.camera_files.camera_scenes import cameras_at
 from unmix_plugin.products.render.cameras import RenderCameras
+from unmix_plugin.products.render.formats import FormattedOutput, choose_formats
 from unmix_plugin.products.render.job import RenderJob
-from unmix_plugin.products.render.outputs import Product, choose_products
 from unmix_plugin.products.render.survey import Survey, take_survey
 from unmix_plugin.trained.run_views import RunView
 
@@ -35,10 +35,10 @@ def render(
     formats: Sequence[str],
     cameras: RenderCameras,
     pixels: int | None = None,
-) -> tuple[tuple[Product, ...], Survey, RenderJob]:
+) -> tuple[tuple[FormattedOutput, ...], Survey, RenderJob]:
     """Render into a folder."""
-    products = choose_products(outputs, formats, SCENE.materials, cameras.is_path)
-    survey = take_survey(SCENE, cameras.views, {product.output.name for product in products})
+    products = choose_formats(outputs, formats, SCENE, cameras.is_path)
+    survey = take_survey(SCENE, cameras.views, {product.output for product in products})
     with RenderJob(SCENE, cameras, products, survey, folder) as job:
         for block in job.blocks(pixels):
             job.render(block)
@@ -47,7 +47,7 @@ def render(
 
 def truth(cameras: RenderCameras, index: int, survey: Survey) -> dict[str, np.ndarray]:
     """What the scene itself renders of a view, all at once."""
-    names = [product.output.name for product in choose_products(["all"], [], SCENE.materials, False)]
+    names = [product.output.name for product in choose_formats(["all"], [], SCENE, False)]
     asked = [*(name for name in names if name != "pca"), "band:550nm", "false-colour:650,550,450"]
     rendered = SCENE.render(cameras.views[index].camera, asked)
     if survey.pca is not None:

@@ -14,7 +14,7 @@ from tests.products.render.render_factory import SCENE, read_envi, read_exr, ren
 from unmix_plugin.errors import RunError
 from unmix_plugin.figures.picture_canvas import CanvasLayout
 from unmix_plugin.products.render.files import still_paths
-from unmix_plugin.products.render.job import RenderJob, product_paths
+from unmix_plugin.products.render.job import RenderJob, output_paths
 from unmix_plugin.products.render.survey import Survey
 from unmix_plugin.trained.trained_scene import TrainedScene
 
@@ -209,7 +209,7 @@ def test_a_moving_camera_makes_one_video_with_a_frame_a_view(tmp_path):
     products, _, _ = render(tmp_path, outputs, ["mp4"], cameras)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(f"{name}.mp4" for name in outputs)
     for product in products:
-        frames, facts = read_video(product_paths(tmp_path, product, cameras)[0])
+        frames, facts = read_video(output_paths(tmp_path, product, cameras)[0])
         assert len(frames) == 4
         assert facts["fps"] == 24.0
         assert np.abs(np.diff(frames.astype(float), axis=0)).mean() > 0.5, "the camera moves"
@@ -274,13 +274,13 @@ def test_a_disk_that_fills_up_leaves_whole_files_only(tmp_path, monkeypatch, aft
 def test_an_error_while_rendering_leaves_no_video(tmp_path, monkeypatch):
     cameras = views(3, is_path=True)
 
-    def failing(scene, camera, names, rendered=TrainedScene.render):
+    def failing(scene, camera, subpixels=None, look=TrainedScene.look):
         if camera is not first and camera.camera_to_world.equal(last):
             raise KeyboardInterrupt
-        return rendered(scene, camera, names)
+        return look(scene, camera, subpixels)
 
     first, last = cameras.views[0].camera, cameras.views[2].camera.camera_to_world
-    monkeypatch.setattr(TrainedScene, "render", failing)
+    monkeypatch.setattr(TrainedScene, "look", failing)
     with pytest.raises(KeyboardInterrupt):
         render(tmp_path, ["rgb", "accumulation"], ["mp4"], cameras)
     assert list(tmp_path.iterdir()) == []
@@ -325,5 +325,5 @@ def test_pictures_of_an_index_are_transparent_where_it_is_undefined_and_have_a_l
     assert (pixels[opacity < 0.002][:, 3] == 0).all()
     assert pixels[opacity > 0.55][:, :3].std() > 1
     assert survey.scales[INDEX].low < survey.scales[INDEX].high
-    assert needs_legend(product)
+    assert needs_legend(product, SCENE)
     assert draw_legend(product.output, job.palette).startswith(b"\x89PNG")

@@ -15,12 +15,12 @@ from unmix_plugin.viewer.rendering.video_job import VideoJob, VideoQueue, output
 
 @pytest.mark.parametrize("layer", [name for name in LAYERS if name != "error"])
 def test_every_layer_that_renders_know_is_an_output_of_theirs(layer, source):
-    from unmix_plugin.products.render.outputs import choose_products
+    from unmix_plugin.products.render.formats import choose_formats
 
     chosen = LayerSettings(wavelength_nm=500.0, false_colour_nm=(650.0, 550.0, 450.0), index="r650 / r500")
     output = output_of(replace(chosen, layer=layer))
     with source.borrowed() as scene:
-        products = choose_products((output,), ("mp4",), scene.materials, True)
+        products = choose_formats((output,), ("mp4",), scene, True)
     assert [product.format for product in products] == ["mp4"]
 
 

@@ -35,7 +35,7 @@ class TrainingRecord:
     progress: float
     """Fraction of the training done, [0, 1]."""
     learning_rates: dict[str, float]
-    """Learning rates of the last step, by parameter group."""
+    """Of the last step, by parameter group."""
 
     def __post_init__(self) -> None:
         """Refuse numbers that no training counts.

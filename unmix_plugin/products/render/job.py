@@ -16,23 +16,25 @@ import numpy as np
 
 from unmix_plugin.engine.geometry.camera_paths import rows_of
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.outputs import Output
 from unmix_plugin.formats.video import FrameSink
 from unmix_plugin.products.render.cameras import RenderCameras
 from unmix_plugin.products.render.files import (
+    RenderSetting,
     Rows,
     RowsSink,
-    Setting,
     frame,
     still,
     still_paths,
     video,
     video_path,
 )
-from unmix_plugin.products.render.outputs import Product
+from unmix_plugin.products.render.formats import FormattedOutput
 from unmix_plugin.products.render.pictures import Palette
 from unmix_plugin.products.render.survey import Survey
 from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION
-from unmix_plugin.spectral.maps.reflectance_maps import is_reflectance_map
+from unmix_plugin.trained.probe import one_pixel
+from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 _PATH_FPS, _VIEWS_FPS = 24.0, 2.0
@@ -60,27 +62,34 @@ class RenderJob:
 
     def __init__(
         self,
-        scene: TrainedScene,
+        scene: RenderableScene,
         cameras: RenderCameras,
-        products: Sequence[Product],
+        outputs: Sequence[FormattedOutput],
         survey: Survey,
         folder: Path,
     ) -> None:
         """
         Args:
-            scene: Of mixed materials.
+            scene: Of any method.
             cameras: To render from.
-            products: What to write.
+            outputs: What to write.
             survey: Of these cameras and outputs.
             folder: Where to write.
         """
-        materials = scene.materials
         self._scene, self._cameras, self._survey = scene, cameras, survey
-        palette = Palette.of(materials, survey.scales)
-        self._setting = Setting(folder, cameras.size, materials, palette, cameras.frames_per_second)
-        self._moving = [product for product in products if is_video_of_all(product, cameras)]
-        self._still = [product for product in products if product not in self._moving]
-        self._asked = _asked_of_model(products)
+        materials = scene.materials if isinstance(scene, TrainedScene) else None
+        self._materials = materials
+        self._setting = RenderSetting(
+            folder,
+            cameras.size,
+            Palette.of(materials, survey.scales),
+            None if materials is None else materials.bands,
+            _channel_names(scene, cameras.views[0].camera, [one.output for one in outputs]),
+            cameras.frames_per_second,
+        )
+        self._moving = [one for one in outputs if is_video_of_all(one, cameras)]
+        self._still = [one for one in outputs if one not in self._moving]
+        self._asked = self._asked_of_scene([one.output.name for one in outputs])
         self._files, self._view = ExitStack(), ExitStack()
         self._frame_sinks: list[FrameSink] = []
         self._sinks: list[RowsSink] = []
@@ -98,7 +107,8 @@ class RenderJob:
         """
         width, height = self._cameras.size
         if pixels is None:
-            pixels = min(_BLOCK_PIXELS, _BLOCK_NUMBERS // len(self._setting.materials.bands))
+            most = max((len(names) for names in self._setting.channels.values()), default=1)
+            pixels = min(_BLOCK_PIXELS, _BLOCK_NUMBERS // most)
         rows = max(1, pixels // width)
         return [
             Block(
@@ -113,8 +123,7 @@ class RenderJob:
         frames_per_second = self._cameras.frames_per_second or usual
         with ExitStack() as opening:
             self._frame_sinks = [
-                opening.enter_context(video(product, self._setting, frames_per_second))
-                for product in self._moving
+                opening.enter_context(video(one, self._setting, frames_per_second)) for one in self._moving
             ]
             self._view = opening.enter_context(ExitStack())
             self._files = opening.pop_all()
@@ -143,44 +152,62 @@ class RenderJob:
         views = self._cameras.views
         progress = index / max(1, len(views) - 1)
         self._sinks = [
-            self._view.enter_context(still(product, views[index].name, self._setting))
-            for product in self._still
+            self._view.enter_context(still(one, views[index].name, self._setting)) for one in self._still
         ]
         self._sinks += [
-            self._view.enter_context(frame(product.output, progress, self._setting, add))
-            for product, add in zip(self._moving, self._frame_sinks, strict=True)
+            self._view.enter_context(frame(one.output, progress, self._setting, add))
+            for one, add in zip(self._moving, self._frame_sinks, strict=True)
         ]
 
+    def _asked_of_scene(self, names: Sequence[str]) -> tuple[str, ...]:
+        """What has to be rendered for `names`: what all views share is computed here, from spectra."""
+        own = {name for name in names if name in self._survey.scores}
+        own |= {"pca"} if self._survey.pca is not None else set()
+        needed = dict.fromkeys([*(name for name in names if name not in own), *(["spectral"] if own else [])])
+        return tuple(name for name in needed if name != "accumulation")
+
     def _values(self, camera: Cameras) -> dict[str, np.ndarray]:
-        rendered = self._scene.render(camera, self._asked)
+        view = self._scene.look(camera)
+        rendered = {name: view[name] for name in self._asked}
+        rendered["accumulation"] = opacity = view.opacity
         if self._survey.pca is not None:
-            spectra = rendered["spectral"]
-            seen = (rendered["accumulation"] > OCCUPIED_ACCUMULATION)[..., None]
-            rendered["pca"] = self._survey.pca(spectra.cpu()) * seen.cpu()
-        if self._survey.scores:
-            spectra, opacity = rendered["spectral"].cpu(), rendered["accumulation"].cpu()
-            reflectance = self._setting.materials.reflectance_of(spectra, opacity)
+            seen = (opacity > OCCUPIED_ACCUMULATION)[..., None]
+            rendered["pca"] = self._survey.pca(rendered["spectral"].cpu()) * seen.cpu()
+        if self._survey.scores and self._materials is not None:
+            reflectance = self._materials.reflectance_of(rendered["spectral"].cpu(), opacity.cpu())
             rendered |= {name: score(reflectance) for name, score in self._survey.scores.items()}
         return {name: values.detach().cpu().numpy() for name, values in rendered.items()}
 
 
-def is_video_of_all(product: Product, cameras: RenderCameras) -> bool:
-    """Whether a product is one video of all views: but a sweep through the bands is one video a view, unless the
-    camera moves."""
-    is_sweep = product.output.kind.name == "spectra" and not (cameras.is_path and len(cameras.views) > 1)
-    return product.format == "mp4" and not is_sweep
+def is_video_of_all(formatted: FormattedOutput, cameras: RenderCameras) -> bool:
+    """Whether a file is one video of all views: but a sweep through the bands is one video a view, unless the camera
+    moves."""
+    is_sweep = formatted.output.kind == "channels" and not (cameras.is_path and len(cameras.views) > 1)
+    return formatted.format == "mp4" and not is_sweep
 
 
-def product_paths(folder: Path, product: Product, cameras: RenderCameras) -> list[Path]:
-    """Files of a product."""
-    if is_video_of_all(product, cameras):
-        return [video_path(folder, product)]
-    return [path for view in cameras.views for path in still_paths(folder, product, view.name)]
+def output_paths(folder: Path, formatted: FormattedOutput, cameras: RenderCameras) -> list[Path]:
+    """Files of an output."""
+    if is_video_of_all(formatted, cameras):
+        return [video_path(folder, formatted)]
+    return [path for view in cameras.views for path in still_paths(folder, formatted, view.name)]
 
 
-def _asked_of_model(products: Sequence[Product]) -> tuple[str, ...]:
-    names = {product.output.name: None for product in products}
-    for name in [name for name in names if name == "pca" or is_reflectance_map(name)]:
-        names.pop(name)
-        names["spectral"] = None
-    return (*names, *(() if "accumulation" in names else ("accumulation",)))
+def _channel_names(
+    scene: RenderableScene, camera: Cameras, outputs: Sequence[Output]
+) -> dict[str, tuple[str, ...]]:
+    """Names of the channels of outputs that have several; a scene without materials is asked how many."""
+    names: dict[str, tuple[str, ...]] = {}
+    for output in outputs:
+        if output.kind in ("grey", "map", "labels"):
+            continue
+        if output.kind not in ("channels", "shares"):
+            names[output.name] = ("x", "y", "z") if output.kind == "vectors" else ("red", "green", "blue")
+        elif not isinstance(scene, TrainedScene):
+            pixel = scene.render(one_pixel(camera, 0, 0), [output.name])[output.name]
+            names[output.name] = tuple(f"{output.title} {index}" for index in range(pixel.shape[-1]))
+        elif output.kind == "shares":
+            names[output.name] = scene.materials.names
+        else:
+            names[output.name] = tuple(f"{wavelength:g} nm" for wavelength in scene.bands.centers_nm)
+    return names

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+from unmix_plugin.engine.outputs import Output
 from unmix_plugin.figures.picture_grid import ColourScale
 from unmix_plugin.figures.plotting import draw_colour_bar, draw_swatch, figure_bytes
-from unmix_plugin.products.render.outputs import Product, RenderOutput
+from unmix_plugin.products.render.formats import FormattedOutput
 from unmix_plugin.products.render.pictures import Palette
+from unmix_plugin.trained.protocol import RenderableScene
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 _WIDTH, _BAR_ROW, _NAME_ROW, _MARGIN = 5.2, 0.66, 0.26, 0.16
 """Inches."""
@@ -16,18 +19,20 @@ _LONGEST_NAME = 24
 _FONT_PT = 9
 
 
-def needs_legend(product: Product) -> bool:
-    """Whether a product has colours that have to be explained."""
-    return product.format in ("png", "mp4") and product.output.kind.name in ("map", "shares", "labels")
+def needs_legend(formatted: FormattedOutput, scene: RenderableScene) -> bool:
+    """Whether an output's pictures have colours that have to be explained, and that can be."""
+    kind = formatted.output.kind
+    has_meaning = kind in ("map", "shares") or (kind == "labels" and isinstance(scene, TrainedScene))
+    return formatted.format in ("png", "mp4") and has_meaning
 
 
-def draw_legend(output: RenderOutput, palette: Palette) -> bytes:
+def draw_legend(output: Output, palette: Palette) -> bytes:
     """The legend of an output as a PNG."""
     from matplotlib.figure import Figure
 
-    scale = palette.scales.get(output.name)
-    has_names = output.kind.name in ("labels", "shares")
-    names = list(zip(palette.names, palette.colours, strict=True)) if has_names else []
+    scale = palette.scale(output)
+    has_names = output.kind in ("labels", "shares")
+    names = list(zip(palette.names, palette.colours, strict=False)) if has_names else []
     bar = 0.0 if scale is None else _BAR_ROW
     height = 2 * _MARGIN + bar + -(-len(names) // _NAMES_A_ROW) * _NAME_ROW
     figure = Figure(figsize=(_WIDTH, height), facecolor="white")

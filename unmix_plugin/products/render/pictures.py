@@ -8,12 +8,14 @@ Notation: `h x W` pixels, some rows of an image; `T` tiles, `K` endmembers.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float64, UInt8
 
+from unmix_plugin.engine.outputs import Output
 from unmix_plugin.figures.picture_grid import (
     NEUTRAL,
     ColourScale,
@@ -21,20 +23,11 @@ from unmix_plugin.figures.picture_grid import (
     paint,
     premultiplied_over_neutral,
 )
-from unmix_plugin.products.abundances import SHARE_SCALE
-from unmix_plugin.products.render.outputs import RenderOutput
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, srgb_to_linear
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.run_materials import endmember_colours
 
-_FIXED_SCALES = {
-    "accumulation": ColourScale("gray", 0.0, 1.0, "opacity"),
-    "confidence": ColourScale("viridis", 0.0, 1.0, "probability of the material"),
-    "abundances": SHARE_SCALE,
-    "material_scores": ColourScale("viridis", 0.0, 1.0, "cosine to the endmember"),
-}
-
-_LIGHT_KINDS = frozenset({"srgb", "light", "radiance"})
+_LIGHT_KINDS = frozenset({"srgb", "linear", "grey"})
 """Outputs seen on black, hence multiplied by opacity already."""
 
 
@@ -43,37 +36,52 @@ class Palette:
     """The colours of a render, the same in all its pictures."""
 
     names: tuple[str, ...]
-    """Of the endmembers."""
+    """Of the endmembers; none where the scene has no materials."""
     colours: Float64[np.ndarray, "K 3"]
-    """sRGB colours that stand for the endmembers."""
+    """sRGB colours that stand for the endmembers, or for ids where there are none."""
     scales: dict[str, ColourScale]
-    """Colours of the outputs that have a scale."""
+    """Scales that depend on the views, by output."""
 
     @staticmethod
-    def of(materials: Materials, surveyed: dict[str, ColourScale]) -> Palette:
-        """That of a model, with the scales that depend on the views."""
-        return Palette(materials.names, endmember_colours(materials), {**_FIXED_SCALES, **surveyed})
+    def of(materials: Materials | None, surveyed: dict[str, ColourScale]) -> Palette:
+        """The palette of a scene, with the scales that depend on the views."""
+        if materials is None:
+            from matplotlib import colormaps
+
+            return Palette((), colormaps["tab20"](np.arange(255) % 20)[:, :3].astype(np.float64), surveyed)
+        return Palette(materials.names, endmember_colours(materials), surveyed)
 
     @property
     def by_id(self) -> Float64[np.ndarray, "256 3"]:
-        """Colour of each id, neutral grey for those that no endmember has."""
+        """Colour of each id, neutral grey for those that stand for nothing."""
         colours = np.full((256, 3), NEUTRAL)
         colours[: len(self.colours)] = self.colours
         return colours
 
-    def describe(self, output: RenderOutput) -> str:
+    def scale(self, output: Output) -> ColourScale | None:
+        """The scale of an output's colours; None where its colours are no scale."""
+        if output.name in self.scales or output.value_range is None:
+            return self.scales.get(output.name)
+        return scale_of(output, *output.value_range)
+
+    def describe(self, output: Output) -> str:
         """What an output's colours mean."""
-        scale = self.scales.get(output.name)
+        scale = self.scale(output)
         if scale is None:
             return output.what
         return f"{output.what}; colours: {scale.colour_map} from {scale.low:.6g} to {scale.high:.6g}"
 
 
+def scale_of(output: Output, low: float, high: float) -> ColourScale:
+    """The output's colour map between two values."""
+    return ColourScale(output.colour_map, low, high, re.split("[,;]", output.what)[0])
+
+
 def opaque_tiles(
-    output: RenderOutput, values: np.ndarray, opacity: Float[np.ndarray, "h W"], palette: Palette
+    output: Output, values: np.ndarray, opacity: Float[np.ndarray, "h W"], palette: Palette
 ) -> UInt8[np.ndarray, "h W T 3"]:
     """Colours over the neutral grey."""
-    if output.kind.name in _LIGHT_KINDS:
+    if output.kind in _LIGHT_KINDS:
         return _over_grey(_linear(output, values), opacity)
     tiles = _symbols(output, values, opacity, palette)
     if output.name == "accumulation":
@@ -90,10 +98,10 @@ def opaque_band(
 
 
 def transparent_tiles(
-    output: RenderOutput, values: np.ndarray, opacity: Float[np.ndarray, "h W"], palette: Palette
+    output: Output, values: np.ndarray, opacity: Float[np.ndarray, "h W"], palette: Palette
 ) -> UInt8[np.ndarray, "h W T 4"]:
     """Colours with opacity as the fourth channel; black where nothing is."""
-    if output.kind.name in _LIGHT_KINDS:
+    if output.kind in _LIGHT_KINDS:
         straight = _linear(output, values) / np.maximum(opacity, 1e-6)[..., None]
         tiles = _encoded(straight)[:, :, None]
     else:
@@ -104,29 +112,30 @@ def transparent_tiles(
 
 
 def _symbols(
-    output: RenderOutput, values: np.ndarray, opacity: Float[np.ndarray, "h W"], palette: Palette
+    output: Output, values: np.ndarray, opacity: Float[np.ndarray, "h W"], palette: Palette
 ) -> Float[np.ndarray, "h W T 3"]:
     """sRGB colours that are not multiplied by opacity."""
-    kind = output.kind.name
+    kind = output.kind
     if kind == "picture":
         return np.asarray(values, dtype=np.float64)[:, :, None]
     if kind == "vectors":
         return (0.5 + 0.5 * np.asarray(values, dtype=np.float64))[:, :, None]
     if kind == "labels":
         return palette.by_id[values][:, :, None]
-    scale = palette.scales[output.name]
+    scale = palette.scale(output)
+    assert scale is not None, output.name
     if output.name == "abundances":  # of what is seen: that a pixel is half covered is told by its opacity
         values = values / np.maximum(opacity, 1e-6)[..., None]
     maps = values[..., None] if kind == "map" else values
     return np.stack([paint(np.asarray(one, np.float64), scale) for one in np.moveaxis(maps, -1, 0)], axis=2)
 
 
-def _linear(output: RenderOutput, values: np.ndarray) -> Float64[np.ndarray, "h W 3"]:
+def _linear(output: Output, values: np.ndarray) -> Float64[np.ndarray, "h W 3"]:
     """Linear light on black, in [0, 1]."""
     light = np.clip(np.asarray(values, dtype=np.float64), 0, 1)
-    if output.kind.name == "srgb":
+    if output.kind == "srgb":
         return srgb_to_linear(torch.from_numpy(light)).numpy()
-    return _grey(light) if output.kind.name == "radiance" else light
+    return _grey(light) if output.kind == "grey" else light
 
 
 def _grey(light: Float64[np.ndarray, "h W"]) -> Float64[np.ndarray, "h W 3"]:

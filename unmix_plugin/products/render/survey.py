@@ -9,22 +9,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from unmix_plugin.engine.outputs import Output
 from unmix_plugin.figures.picture_grid import ColourScale
+from unmix_plugin.products.render.pictures import scale_of
 from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION
-from unmix_plugin.spectral.maps.reflectance_maps import (
-    Score,
-    is_reflectance_map,
-    parse_reflectance_map,
-)
+from unmix_plugin.spectral.maps.reflectance_maps import Score, is_reflectance_map, parse_reflectance_map
 from unmix_plugin.spectral.pca import PcaColours
+from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.run_views import RunView
 from unmix_plugin.trained.trained_scene import TrainedScene
-
-SURVEYED_OUTPUTS = {
-    "depth": "depth along the viewing axis (world units)",
-    "ray_distance": "distance along the ray (world units)",
-}
-"""Outputs whose range is not known beforehand, and what they are."""
 
 _MOST_VIEWS = 12
 _PIXELS = 32 * 32
@@ -39,66 +32,63 @@ class Survey:
     """What all pictures of a render share."""
 
     scales: dict[str, ColourScale] = field(default_factory=dict)
-    """Colours of `SURVEYED_OUTPUTS` and of indices and targets, as far as asked for."""
+    """Colours of outputs whose range only the views tell, by output."""
     pca: PcaColours | None = None
-    """Colours of the output `pca`, if asked for."""
+    """Colours of the output `pca` of a scene of materials, if asked for."""
     scores: dict[str, Score] = field(default_factory=dict)
     """From reflectance to each index and target that is asked for."""
 
 
-def needs_survey(outputs: Collection[str]) -> bool:
+def needs_survey(outputs: Collection[Output]) -> bool:
     """Whether pictures of `outputs` share anything that has to be found out first."""
-    return "pca" in outputs or any(name in SURVEYED_OUTPUTS or is_reflectance_map(name) for name in outputs)
-
-
-def take_survey(scene: TrainedScene, views: Sequence[RunView], outputs: Collection[str]) -> Survey:
-    """Look at up to twelve views, evenly spread over all, and find what `outputs` of all views share."""
-    ranged = [name for name in SURVEYED_OUTPUTS if name in outputs]
-    seen = _seen(scene, views, [*ranged, "spectral"])
-    scores, scales = _scores(scene, seen, [name for name in outputs if is_reflectance_map(name)])
-    return Survey(
-        {**{name: _scale(seen[name], SURVEYED_OUTPUTS[name]) for name in ranged}, **scales},
-        PcaColours.fit(seen["spectral"]) if "pca" in outputs else None,
-        scores,
+    return any(
+        output.name == "pca" or is_reflectance_map(output.name) or _is_ranged(output) for output in outputs
     )
 
 
-def _scores(
-    scene: TrainedScene, seen: dict[str, Tensor], names: Sequence[str]
-) -> tuple[dict[str, Score], dict[str, ColourScale]]:
-    """How indices and targets are computed, judged against what is seen of the scene, and their colours."""
-    materials = scene.materials
-    found = materials.reflectance_of(seen["spectral"], seen["accumulation"])
-    scores: dict[str, Score] = {}
-    scales: dict[str, ColourScale] = {}
-    for name in names:
-        asked = parse_reflectance_map(name, materials.bands)
-        scores[name] = asked.fit(found)
-        if asked.usual_range is None:
-            values = scores[name](found)
-            scales[name] = _scale(values[values.isfinite()], asked.what)
-        else:
-            scales[name] = ColourScale("viridis", *asked.usual_range, asked.what)
-    return scores, scales
+def take_survey(scene: RenderableScene, views: Sequence[RunView], outputs: Collection[Output]) -> Survey:
+    """Look at up to twelve views, evenly spread over all, and find what `outputs` of all views share."""
+    maps = [output for output in outputs if is_reflectance_map(output.name)]
+    ranged = [output for output in outputs if _is_ranged(output) and output not in maps]
+    has_pca = any(output.name == "pca" for output in outputs)
+    is_mixed = isinstance(scene, TrainedScene)
+    spectra = ["spectral"] if is_mixed and (maps or has_pca) else []
+    seen = _seen(scene, views, [*(output.name for output in ranged), *spectra])
+    scales = {output.name: scale_of(output, *_bounds(seen[output.name])) for output in ranged}
+    if not is_mixed or not spectra:
+        return Survey(scales)
+    reflectance = scene.materials.reflectance_of(seen["spectral"], seen["accumulation"])
+    scores = {
+        output.name: parse_reflectance_map(output.name, scene.bands).fit(reflectance) for output in maps
+    }
+    for output in maps:
+        if output.value_range is None:
+            scales[output.name] = scale_of(output, *_bounds(scores[output.name](reflectance)))
+    return Survey(scales, PcaColours.fit(seen["spectral"]) if has_pca else None, scores)
 
 
-def _seen(scene: TrainedScene, views: Sequence[RunView], outputs: Sequence[str]) -> dict[str, Tensor]:
-    """Outputs of the pixels in which something is, of all views looked at, on the CPU."""
+def _is_ranged(output: Output) -> bool:
+    """Whether only the views tell between which values an output's colours go."""
+    return output.kind in ("map", "shares") and output.value_range is None
+
+
+def _seen(scene: RenderableScene, views: Sequence[RunView], outputs: Sequence[str]) -> dict[str, Tensor]:
+    """Outputs and `accumulation` of the pixels in which something is, of all views looked at, on the CPU."""
     every = -(-len(views) // _MOST_VIEWS)
-    outputs = [*outputs, "accumulation"]
-    found: dict[str, list[Tensor]] = {name: [] for name in outputs}
+    found: dict[str, list[Tensor]] = {name: [] for name in (*outputs, "accumulation")}
     for view in views[::every]:
-        rendered = scene.render(view.camera.shrunk(_PIXELS), outputs)
-        occupied = rendered["accumulation"] > OCCUPIED_ACCUMULATION
+        looked = scene.look(view.camera.shrunk(_PIXELS))
+        occupied = looked.opacity > OCCUPIED_ACCUMULATION
         for name in outputs:
-            found[name].append(rendered[name][occupied].cpu())
+            found[name].append(looked[name][occupied].cpu())
+        found["accumulation"].append(looked.opacity[occupied].cpu())
     return {name: torch.cat(parts) for name, parts in found.items()}
 
 
-def _scale(values: Float[Tensor, " N"], label: str) -> ColourScale:
-    low, high = (
-        torch.quantile(values.double(), torch.tensor(_RANGE, dtype=torch.float64)).tolist()
-        if len(values)
-        else (0.0, 1.0)
-    )
-    return ColourScale("viridis", low, max(high, low + 1e-6), label)
+def _bounds(values: Float[Tensor, "..."]) -> tuple[float, float]:
+    """Between which values nearly all of them lie."""
+    known = values[values.isfinite()].double()
+    if len(known) == 0:
+        return 0.0, 1.0
+    low, high = torch.quantile(known, torch.tensor(_RANGE, dtype=torch.float64)).tolist()
+    return low, max(high, low + 1e-6)

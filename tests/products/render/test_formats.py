@@ -4,16 +4,16 @@ import pytest
 
 from tests.method_factory import make_scene
 from unmix_plugin.errors import ConfigError, UnmixError
-from unmix_plugin.products.render.outputs import choose_products
+from unmix_plugin.products.render.formats import choose_formats, file_name
 from unmix_plugin.trained.outputs import OUTPUTS
 
-MATERIALS = make_scene().materials
+SCENE = make_scene()
 
 
 def formats(*outputs, asked=(), is_path=False):
     """Formats by output."""
     found = {}
-    for product in choose_products(outputs, asked, MATERIALS, is_path):
+    for product in choose_formats(outputs, asked, SCENE, is_path):
         found.setdefault(product.output.name, []).append(product.format)
     return found
 
@@ -53,15 +53,15 @@ def test_an_output_asked_for_twice_is_written_once():
 
 
 def test_names_of_files_have_no_odd_letters():
-    [product] = choose_products(["false-colour:650,550,450"], [], MATERIALS, False)
-    assert product.output.file_name == "false-colour-650-550-450"
+    [product] = choose_formats(["false-colour:650,550,450"], [], SCENE, False)
+    assert file_name(product.output) == "false-colour-650-550-450"
 
 
 def test_an_index_is_a_map_and_says_so_where_the_light_is_unknown():
-    [png, npy] = choose_products(["index:(r650-r500)/(r650+r500)"], [], MATERIALS, False)
+    [png, npy] = choose_formats(["index:(r650-r500)/(r650+r500)"], [], SCENE, False)
     assert (png.format, npy.format) == ("png", "npy")
     assert "of radiance, since the scene's light is unknown" in png.output.what
-    [known, _] = choose_products(["index:r650/r500"], [], make_scene(light=[1.0] * 5).materials, False)
+    [known, _] = choose_formats(["index:r650/r500"], [], make_scene(light=[1.0] * 5), False)
     assert "radiance" not in known.output.what
 
 
@@ -69,25 +69,23 @@ def test_a_target_is_named_for_its_file_not_for_where_that_lies(tmp_path):
     (tmp_path / "paint.csv").write_text("wavelength,gold,red\n450,0.1,0.3\n650,0.9,0.8\n")
     [output] = {
         product.output
-        for product in choose_products([f"target:ace:{tmp_path}/paint.csv#gold>0.5"], [], MATERIALS, False)
+        for product in choose_formats([f"target:ace:{tmp_path}/paint.csv#gold>0.5"], [], SCENE, False)
     }
-    assert output.file_name == "target-ace-paint.csv-gold-0.5"
+    assert file_name(output) == "target-ace-paint.csv-gold-0.5"
 
 
 def test_a_long_formula_has_a_file_name_of_its_own():
     long = "index:" + "+".join(["r500"] * 60)
-    one, other = (
-        choose_products([name], ["npy"], MATERIALS, False)[0].output for name in (long, long + "+r600")
-    )
-    assert len(one.file_name) < 120
-    assert one.file_name != other.file_name
+    one, other = (choose_formats([name], ["npy"], SCENE, False)[0].output for name in (long, long + "+r600"))
+    assert len(file_name(one)) < 120
+    assert file_name(one) != file_name(other)
 
 
 BAD = {
     "unknown output": (
         ["spectrl"],
         [],
-        r"no output named 'spectrl' \(did you mean spectral.*\?\); known are spectral",
+        r"no output named 'spectrl' \(did you mean spectral.*\?\); known are rgb",
     ),
     "unknown kind": (["ban:650nm"], [], r"no output named 'ban:650nm' \(did you mean band\?\)"),
     "index of none": (["index"], [], "the output index needs to know which, as in index:ndvi"),
@@ -95,7 +93,7 @@ BAD = {
     "target without file": (["target:"], [], "the output target needs to know which, as in target:paint.csv"),
     "nearly an index": (["indx:ndvi"], [], "did you mean index or band"),
     "argument of none": (["rgb:1"], [], "no output named 'rgb:1'"),
-    "band without wavelength": (["band"], [], "the output band needs wavelengths, as in band:650nm"),
+    "band without wavelength": (["band"], [], "the output band needs a wavelength, as in band:650nm"),
     "band of no number": (["band:red"], [], "'red' in the output band:red is not a wavelength"),
     "two wavelengths": (["false-colour:650,550"], [], "false-colour takes three wavelengths"),
     "outside the bands": (["band:900nm"], [], "no band at 900 nm: 5 bands, 450-650 nm"),

@@ -1,0 +1,114 @@
+"""A scene of a method without endmembers: whatever it can show is written, in every format that suits it."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tests.formats.video_reading import read_video
+from tests.products.render.render_factory import read_envi, read_exr, views
+from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.outputs import Output
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.products.render.files import still_paths
+from unmix_plugin.products.render.formats import choose_formats
+from unmix_plugin.products.render.job import RenderJob, output_paths
+from unmix_plugin.products.render.legend import draw_legend, needs_legend
+from unmix_plugin.products.render.survey import take_survey
+from unmix_plugin.trained.protocol import RenderableScene
+
+pytestmark = pytest.mark.usefixtures("no_wait_for_the_disk")
+
+OUTPUTS = (
+    Output("rgb", "srgb", "colour", "sRGB on black"),
+    Output("heat", "map", "heat", "temperature in K"),
+    Output("classes", "labels", "classes", "class, 255 where nothing is"),
+    Output("likelihood", "shares", "likelihood", "likelihood of each class", (0.0, 1.0)),
+    Output("filters", "channels", "filters", "light through each filter"),
+    Output("normals", "vectors", "normals", "unit normals"),
+)
+CHANNELS = {"rgb": 3, "likelihood": 4, "filters": 7, "normals": 3}
+
+
+@dataclass(frozen=True)
+class Glow:
+    """What a camera sees: numbers that follow from the row and the column."""
+
+    camera: Any
+
+    @property
+    def opacity(self):
+        return torch.ones(self.camera.height, self.camera.width)
+
+    def __getitem__(self, name):
+        rays = self.camera.image_rays(0).directions.unflatten(0, (self.camera.height, self.camera.width))
+        if name == "classes":
+            return (rays[..., 0] > 0).to(torch.uint8)
+        if name == "heat":
+            return 300 + 10 * rays[..., 0]
+        return rays[..., :1].abs().expand(-1, -1, CHANNELS[name]).contiguous()
+
+
+@dataclass(frozen=True)
+class GlowScene:
+    """The small protocol and nothing more."""
+
+    outputs: tuple[Output, ...] = OUTPUTS
+    scene_box: SceneBox = field(default_factory=lambda: SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3])))
+    frame: Any = None
+    views: tuple[Any, ...] = ()
+    device: torch.device = torch.device("cpu")
+    notes: tuple[str, ...] = ()
+
+    def output(self, name):
+        for output in self.outputs:
+            if output.name == name:
+                return output
+        raise ConfigError(f"there is no output named {name!r}")
+
+    def look(self, camera, subpixels=None):
+        return Glow(camera)
+
+    def render(self, camera, names):
+        return {name: Glow(camera)[name] for name in names}
+
+    def probe(self, camera, column, row):
+        raise NotImplementedError
+
+
+SCENE = GlowScene()
+
+
+@pytest.mark.parametrize("is_path", [False, True])
+def test_everything_that_it_shows_is_written_in_every_format(tmp_path, is_path):
+    assert isinstance(SCENE, RenderableScene)
+    cameras = views(2, is_path=is_path)
+    outputs = choose_formats(["all"], ["npy", "envi", "exr", "png", "mp4"], SCENE, is_path)
+    survey = take_survey(SCENE, cameras.views, [one.output for one in outputs])
+    assert 290 < survey.scales["heat"].low < survey.scales["heat"].high < 310
+    with RenderJob(SCENE, cameras, outputs, survey, tmp_path) as job:
+        for block in job.blocks(30):
+            job.render(block)
+    for one in outputs:
+        assert all(path.is_file() for path in output_paths(tmp_path, one, cameras))
+        assert not needs_legend(one, SCENE) or len(draw_legend(one.output, job.palette)) > 1000
+    for one in outputs:
+        if one.format == "npy":
+            [path] = still_paths(tmp_path, one, "view.1")
+            expected = Glow(cameras.views[1].camera)[one.output.name].numpy()
+            np.testing.assert_allclose(np.load(path), expected, atol=1e-4)
+    numbers, header = read_envi(tmp_path / "filters" / "view.0")
+    assert numbers.shape == (11, 14, 7)
+    assert header["band names"][6] == "filters 6"
+    assert set(read_exr(tmp_path / "likelihood" / "view.0.exr")) == {
+        f"likelihood.likelihood {n}" for n in range(4)
+    }
+    assert len(read_video(tmp_path / "heat.mp4")[0]) == 2
+
+
+def test_without_a_wish_it_gets_what_is_usual_of_what_it_has():
+    assert {one.output.name for one in choose_formats([], [], SCENE, False)} == {"rgb"}
+    odd = GlowScene(OUTPUTS[1:3])
+    assert {one.output.name for one in choose_formats([], [], odd, True)} == {"heat", "classes"}
