@@ -6,11 +6,15 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --co
 DEMO_SECONDS := 45
 BENCHMARKS := $(sort $(wildcard benchmarks/[a-z]*.py))
 
-.PHONY: demo test lint format bench clean help
+MINIMUM := .venv-minimum
+MINIMUM_TESTS := tests/engine tests/spectral tests/editing tests/formats tests/scenes tests/figures tests/viewer/test_server.py
+
+.PHONY: demo test test-minimum lint format bench clean help
 
 help:
 	@echo "make demo    train on the built-in scene, evaluate, export abundance maps"
 	@echo "make test    run every test"
+	@echo "make test-minimum   run the core of the tests on the lowest versions that are allowed"
 	@echo "make lint    check format, lint rules, types and the import law"
 	@echo "make format  rewrite the code in the one format"
 	@echo "make bench   run every benchmark, results into benchmarks/results"
@@ -44,6 +48,13 @@ $(VENV)/.system-packages: scripts/install_system_packages.sh | $(BIN)/python
 test: $(VENV)/.installed-dev $(VENV)/.system-packages
 	$(BIN)/python -m pytest
 
+# Deprecations that old releases warn of are no failures here, and old checkers of shapes are left out.
+test-minimum:
+	$(PYTHON) -m venv $(MINIMUM)
+	$(MINIMUM)/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints-minimum.txt \
+	  --editable . hypothesis imageio plyfile pytest spectral trimesh
+	$(MINIMUM)/bin/python -m pytest -W default --override-ini addopts=--import-mode=importlib $(MINIMUM_TESTS)
+
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
@@ -58,4 +69,4 @@ bench: $(VENV)/.installed-dev
 	@set -e; for benchmark in $(BENCHMARKS); do echo "== $$benchmark"; $(BIN)/python $$benchmark; done
 
 clean:
-	rm -rf $(VENV) build .pytest_cache .ruff_cache .hypothesis *.egg-info
+	rm -rf $(VENV) $(MINIMUM) build .pytest_cache .ruff_cache .hypothesis *.egg-info

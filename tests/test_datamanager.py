@@ -11,7 +11,9 @@ from torch.testing import assert_close
 
 from tests.scenes.scene_factory import make_scene
 from unmix_plugin.datamanager import HyperspectralDataManager, HyperspectralDataManagerConfig
-from unmix_plugin.errors import ConfigError, SceneError
+from unmix_plugin.engine.runs.run_folder import RunFolder
+from unmix_plugin.engine.runs.scene_record import SceneRecord, check_same_scene, scene_record_to_json
+from unmix_plugin.errors import ConfigError, RunError, SceneError
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.scenes.scene import SceneOptions
 
@@ -157,3 +159,36 @@ def test_poses_of_another_convention_are_warned_of_when_a_run_starts(tmp_path):
     (warning,) = make(tmp_path / "demo").warnings()
     assert "the poses look like camera to world, OpenCV axes" in warning
     assert make(folder.root).warnings() == []
+
+
+def scene_record(manager: HyperspectralDataManager) -> SceneRecord:
+    values = json.loads(json.dumps(scene_record_to_json(manager)))
+    return SceneRecord(
+        manager.scene_box, values["metadata"], manager.train_cameras, manager.eval_cameras, values["summary"]
+    )
+
+
+def test_a_run_goes_on_with_the_scene_as_another_machine_rounds_it(tmp_path):
+    folder = make_scene(tmp_path / "scene", alpha=False)
+    record = scene_record(make(folder.root))
+    run = RunFolder(tmp_path / "run")
+
+    def round_otherwise(content):
+        for frame in content["frames"]:
+            pose = np.array(frame["transform_matrix"])
+            pose[:3] = np.nextafter(pose[:3], 9.0)
+            frame["transform_matrix"] = pose.tolist()
+
+    manager = make(folder.edit(round_otherwise).root)
+    check_same_scene(record, manager, run)
+    manager = make(folder.edit(lambda c: c.update(fl_x=35.0)).root)
+    with pytest.raises(RunError, match=r"pixel_size.*cameras\.focal_px.* differ"):
+        check_same_scene(record, manager, run)
+
+
+def test_a_run_does_not_go_on_with_cubes_that_were_changed(tmp_path):
+    folder = make_scene(tmp_path / "scene")
+    record = scene_record(make(folder.root))
+    manager = make(folder.edit_cube(0, lambda cube: cube * np.float16(0.5)).root)
+    with pytest.raises(RunError, match=r"files\.cubes/view_0\.npy differ; name the right one with --data"):
+        check_same_scene(record, manager, RunFolder(tmp_path / "run"))

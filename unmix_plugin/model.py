@@ -16,7 +16,7 @@ import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from unmix_plugin.alpha_preset import Auto, choose, preset_for
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
-from unmix_plugin.engine.instantiate import Target
+from unmix_plugin.engine.instantiate import Common, Target, short
 from unmix_plugin.engine.model import Model, ModelConfig
 from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.errors import ConfigError, require
@@ -65,11 +65,11 @@ class UnmixModelConfig(ModelConfig):
     """Settings of the model of UnMix-NeRF."""
 
     _target: Target = field(default_factory=lambda: UnmixModel)
-    num_endmembers: int | Auto = 6
+    num_endmembers: Annotated[int | Auto, Common, short("endmembers")] = 6
     """K, the number of materials to unmix into; auto proposes it from the training pixels, with its evidence."""
-    endmember_init: EndmemberMethod | Literal["file"] = "pairs"
+    endmember_init: Annotated[EndmemberMethod | Literal["file"], Common, short("endmember-init")] = "pairs"
     """First guess of the endmembers from the pixels of all training views, or spectra from `endmember_file`."""
-    endmember_file: Path | None = None
+    endmember_file: Annotated[Path | None, Common, short("endmember-file")] = None
     """CSV of reflectances (wavelength,name,...) for `endmember_init` file; multiplied by the scene's light if known,
     and by one factor for the scene's brightness."""
     specular: Literal["none", "dictionary", "full"] = "dictionary"

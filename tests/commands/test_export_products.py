@@ -220,7 +220,7 @@ def test_own_reflectances_are_compared_with_too(trained, tmp_path):
     assert "none.csv: can't read" in ended.err
 
 
-def test_a_report_with_the_scene_at_hand_compares_and_is_self_contained(exported):
+def test_a_report_with_the_find_scene_compares_and_is_self_contained(exported):
     page = (exported[0] / "report" / "report.html").read_text()
     outline = assert_self_contained(page)
     assert outline.ids == [

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,10 @@ import pytest
 import torch
 
 from tests.commands.running import SMALL_METHOD, run
-from unmix_plugin.commands import train as train_module
-from unmix_plugin.commands.train import parse, train
+from unmix_plugin.commands import train_arguments
+from unmix_plugin.commands.train import train
+from unmix_plugin.commands.train_arguments import parse
+from unmix_plugin.datamanager import HyperspectralDataManagerConfig
 from unmix_plugin.engine import registry
 from unmix_plugin.engine.runs.load_run import load_model
 from unmix_plugin.engine.training.trainer import Trainer
@@ -59,6 +62,30 @@ def test_the_words_of_the_contract_work_right_after_the_method(tmp_path):
     assert (config.max_num_iterations, config.max_seconds) == (5, 7.5)
     assert isinstance(config.pipeline.model, UnmixModelConfig)
     assert config.pipeline.model.num_endmembers == 7
+
+
+def test_settings_that_most_people_need_have_short_names(tmp_path):
+    argv = f"unmix-nerf --endmembers 4 --endmember-init file --endmember-file {tmp_path} --value-scale 4095"
+    config = parse([*argv.split(), "--invalid-pixels", "mask"])
+    assert isinstance(config.pipeline.model, UnmixModelConfig)
+    assert isinstance(config.pipeline.datamanager, HyperspectralDataManagerConfig)
+    model, scene = config.pipeline.model, config.pipeline.datamanager.scene
+    assert (model.num_endmembers, model.endmember_init, model.endmember_file) == (4, "file", tmp_path)
+    assert (scene.value_scale, scene.invalid_pixels) == (4095.0, "mask")
+    assert parse(["unmix-nerf", "--pipeline.model.num-endmembers", "4"]).pipeline.model == replace(
+        parse(["unmix-nerf"]).pipeline.model, num_endmembers=4
+    )
+
+
+def test_help_shows_the_common_options_and_help_all_the_others_too():
+    common, everything = (run(train, "unmix-nerf", flag) for flag in ("--help", "--help-all"))
+    assert common.status == everything.status == 0
+    for flag in ("--data", "--max-seconds", "--endmembers", "--value-scale", "--help-all"):
+        assert flag in common.out
+    for flag in ("--optimizers.grid.lr", "--pipeline.model.field", "--viewer.port", "--steps-per-save"):
+        assert flag not in common.out
+        assert flag in everything.out
+    assert len(common.out.splitlines()) < 60
 
 
 @pytest.mark.parametrize(
@@ -129,7 +156,7 @@ def test_a_broken_plugin_is_a_warning_and_the_others_go_on(monkeypatch):
     assert "  unmix-nerf  radiance field" in ended.out
 
 
-@pytest.mark.parametrize("words", [["--help"], ["unmix-nerf", "--help"]])
+@pytest.mark.parametrize("words", [["--help"], ["unmix-nerf", "--help"], ["unmix-nerf", "--help-all"]])
 def test_help_imports_nothing_heavy_but_torch(words):
     code = (
         "import sys\nfrom unmix_plugin.commands.entry import run_command\n"
@@ -203,7 +230,7 @@ def test_a_finished_run_without_a_larger_limit_says_that_there_is_nothing_to_tra
 
 def test_a_run_of_another_method_is_not_gone_on_with(run_copy, monkeypatch):
     ours = registry.discover_methods()[0]["unmix-nerf"]
-    monkeypatch.setattr(train_module, "find_method", lambda _name: ours)
+    monkeypatch.setattr(train_arguments, "find_method", lambda _name: ours)
     with pytest.raises(ConfigError, match="is a run of unmix-nerf, not of other-nerf"):
         parse(["other-nerf", "--load-run", str(run_copy)])
 

@@ -32,7 +32,7 @@ from unmix_plugin.engine.runs.run_files import RUN_FORMAT
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.runs.scene_record import read_scene_record
 from unmix_plugin.engine.training.training_state import TrainingRecord
-from unmix_plugin.engine.training.writers import MetricsWriter
+from unmix_plugin.engine.training.writers import _keep_until
 from unmix_plugin.errors import ConfigError, RunError, SceneError, SpectrumError
 from unmix_plugin.scenes.reading.arrays import UnreadableArrayError, read_array_header
 from unmix_plugin.scenes.reading.cube_values import measure_cube
@@ -372,7 +372,7 @@ def _metrics() -> Reader:
 
 def _read_metrics(path: Path) -> None:
     before = path.read_bytes()
-    MetricsWriter(RunFolder(path.parent), resumed_step=2)
+    _keep_until(path, 2)  # the part of MetricsWriter that reads; TensorBoard's would start a thread a case
     for line in path.read_text(encoding="utf-8").splitlines():
         assert json.loads(line)["step"] <= 2
     if path.read_bytes() != before:

@@ -8,7 +8,7 @@ import pytest
 from tests.scenes.scene_factory import make_scene
 from unmix_plugin.errors import RunError, SceneError
 from unmix_plugin.scenes import SceneOptions, load_scene
-from unmix_plugin.trained.find_scene import scene_at_hand
+from unmix_plugin.trained.find_scene import find_scene
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def run_on(root):
 
 
 def find(summary, data=None):
-    return scene_at_hand(summary, Path("/runs/this"), data)
+    return find_scene(summary, Path("/runs/this"), data)
 
 
 def test_a_scene_that_is_where_it_was_is_found(folder):
@@ -75,7 +75,7 @@ def test_a_scene_that_is_damaged_is_passed_over_unless_it_was_named(copy):
         find(run, copy)
 
 
-def test_a_run_that_kept_no_root_has_no_scene_at_hand(folder):
+def test_a_run_that_kept_no_root_has_no_find_scene(folder):
     for root in (None, "relative/place"):
         assert find({**run_on(folder), "root": root}) is None
 

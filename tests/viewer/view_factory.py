@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -95,7 +94,6 @@ class Screen:
 
     def __init__(self) -> None:
         self.shown: list[Shown] = []
-        self.times: list[float] = []
         self.reports: list[str] = []
         self._changed = threading.Condition()
         self.view = View(show=self._show, report=self._report)
@@ -105,19 +103,14 @@ class Screen:
         with self._changed:
             assert self._changed.wait_for(holds, timeout_s), (len(self.shown), self.reports)
 
-    def wait_for_pictures(self, count: int) -> None:
-        """Wait until so many pictures were shown in all."""
-        self.wait_until(lambda: len(self.shown) >= count)
-
-    def wait_for_finest(self) -> Shown:
-        """Wait until the newest picture is the finest; that one."""
-        self.wait_until(lambda: bool(self.shown) and not self.shown[-1].is_moving)
-        return self.shown[-1]
+    def wait(self, seconds: float) -> None:
+        """Wait for the next picture or report, but no longer than that."""
+        with self._changed:
+            self._changed.wait(seconds)
 
     def _show(self, shown: Shown) -> None:
         with self._changed:
             self.shown.append(shown)
-            self.times.append(time.monotonic())
             self._changed.notify_all()
 
     def _report(self, text: str) -> None:

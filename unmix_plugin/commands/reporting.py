@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TypeVar
 
 from rich.console import Console
@@ -12,6 +14,7 @@ from rich.console import Console
 ItemT = TypeVar("ItemT")
 
 _PLAIN_INTERVAL_S = 5.0
+_COMPILING_INTERVAL_S = 0.2
 
 
 class CommandConsole(Console):
@@ -31,6 +34,29 @@ def working(console: Console, doing: str) -> Iterator[None]:
         return
     with console.status(doing):
         yield
+
+
+@contextmanager
+def saying_when_kernels_compile(console: Console) -> Iterator[None]:
+    """Context that says so if the kernels it needs are not in Warp's cache, as happens once on a machine."""
+    from unmix_plugin.rendering.launching import warp
+
+    cache, is_over = Path(warp().config.kernel_cache_dir), threading.Event()
+    known = set(cache.glob("*"))
+
+    def watch() -> None:
+        while not is_over.wait(_COMPILING_INTERVAL_S):
+            if not known.issuperset(cache.glob("*")):
+                say(console, "compiling kernels (once on a machine) ...")
+                return
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        is_over.set()
+        watcher.join()
 
 
 def follow(console: Console, doing: str, items: Sequence[ItemT]) -> Iterator[ItemT]:

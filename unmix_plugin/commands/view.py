@@ -102,10 +102,10 @@ def _scene_of(source: SceneSource, data: Path | None) -> Scene:
         RunError: it is another one.
     """
     from unmix_plugin.errors import SceneError
-    from unmix_plugin.trained.find_scene import scene_at_hand
+    from unmix_plugin.trained.find_scene import find_scene
 
     summary = source.record.summary
-    scene = scene_at_hand(summary, source.run.path, data)
+    scene = find_scene(summary, source.run.path, data)
     if scene is None:
         raise SceneError(
             f"it is no longer, or no longer the same, at {summary.get('root')}; name it with --data"

@@ -4,11 +4,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
 
-from unmix_plugin.engine.instantiate import InstantiateConfig, Target
+from unmix_plugin.engine.instantiate import Common, InstantiateConfig, Target
 from unmix_plugin.engine.pipeline import PipelineConfig
 from unmix_plugin.engine.training.optimizers import OptimizerConfig
 from unmix_plugin.errors import ConfigError
@@ -25,17 +25,17 @@ class TrainerConfig:
 
     method_name: tyro.conf.Suppress[str] = "unnamed"
     """Name under which the method is registered."""
-    data: Path | None = None
+    data: Annotated[Path | None, Common] = None
     """The scene's folder."""
-    output_dir: Path = Path("outputs")
+    output_dir: Annotated[Path, Common] = Path("outputs")
     """Folder under which the run's own folder is made."""
-    max_num_iterations: int | None = 20_000
+    max_num_iterations: Annotated[int | None, Common] = 20_000
     """Training ends after so many steps (None: no such limit)."""
-    max_seconds: float | None = None
+    max_seconds: Annotated[float | None, Common] = None
     """Training ends after so many seconds of training; reading, compiling, evaluating and saving not counted."""
-    seed: int = 42
+    seed: Annotated[int, Common] = 42
     """Everything random follows from this."""
-    device: DeviceName = "auto"
+    device: Annotated[DeviceName, Common] = "auto"
     """Where to compute; auto takes CUDA where there is one."""
     steps_per_save: int = 1000
     """Save a checkpoint every so many steps; 0: only at the end."""
@@ -48,7 +48,7 @@ class TrainerConfig:
     average_decay: float | None = None
     """Decay a step of the moving average of the parameters with which the run is evaluated and rendered; early in
     training it decays faster, to span at most about a ninth of the steps so far. None: no average."""
-    load_run: Path | None = None
+    load_run: Annotated[Path | None, Common] = None
     """Run folder to continue instead of starting a new one."""
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)
     """Data and model."""

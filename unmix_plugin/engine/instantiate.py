@@ -14,6 +14,14 @@ from unmix_plugin.errors import ConfigError
 Target = tyro.conf.Suppress[type]
 """Annotation of `_target`: the class that a config sets up; neither shown on the command line nor written to a file."""
 
+Common = "common"
+"""Annotation of a setting that most people need: `Annotated[int, Common, short("name")]`; --help shows only these."""
+
+
+def short(name: str) -> Any:
+    """Annotation that gives a setting the flag `--name` beside its long one."""
+    return tyro.conf.arg(aliases=(f"--{name}",))
+
 
 @dataclass(frozen=True)
 class InstantiateConfig:

@@ -102,11 +102,11 @@ class Spectrum(Product):
 
     def _measured(self, job: Job, view: RunView, pixel: tuple[int, int]) -> np.ndarray | None:
         """What the scene has in a pixel, in the light asked for."""
-        from unmix_plugin.trained.find_scene import scene_at_hand
+        from unmix_plugin.trained.find_scene import find_scene
         from unmix_plugin.trained.library_matches import relit
 
         with job.working("looking for the scene"):
-            scene = scene_at_hand(job.loaded.record.summary, job.loaded.folder.path, self.data)
+            scene = find_scene(job.loaded.record.summary, job.loaded.folder.path, self.data)
         names = [] if scene is None else [frame.name for frame in scene.frames]
         if scene is None or view.name not in names:
             job.say("the scene is not at hand: no measured spectrum (--data says where it is)")

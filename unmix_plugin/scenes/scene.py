@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Shaped, UInt8
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.instantiate import Common, short
 from unmix_plugin.scenes.reading.arrays import map_array
 from unmix_plugin.scenes.reading.cube_values import InvalidPixels, read_cube, read_invalid
 from unmix_plugin.scenes.reading.images import read_colour, read_labels, read_mask
@@ -27,9 +28,9 @@ UNLABELLED = 255
 class SceneOptions:
     """How to read a scene."""
 
-    value_scale: float | None = None
+    value_scale: Annotated[float | None, Common, short("value-scale")] = None
     """Cubes are divided by this number (needed for integer cubes, such as 255 or 4095); None takes them as they are."""
-    invalid_pixels: InvalidPixels = "refuse"
+    invalid_pixels: Annotated[InvalidPixels, Common, short("invalid-pixels")] = "refuse"
     """What to do with pixels that hold NaN, infinite or negative values: refuse the scene; leave them out (mask); or
     set negative values to 0, as suits noise around black, and leave the others out (clip)."""
     allow_outside_paths: bool = False

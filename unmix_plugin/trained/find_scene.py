@@ -13,7 +13,7 @@ from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import Scene, SceneOptions
 
 
-def scene_at_hand(summary: Mapping[str, Any], run: Path, data: Path | None) -> Scene | None:
+def find_scene(summary: Mapping[str, Any], run: Path, data: Path | None) -> Scene | None:
     """The scene of a run, if it is where it was and has not changed.
 
     Args:

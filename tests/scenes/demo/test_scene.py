@@ -188,3 +188,14 @@ def test_a_cache_that_cannot_be_written_is_a_scene_error_with_a_way_out(tmp_path
     (tmp_path / "cache").write_text("a file where the folder should be")
     with pytest.raises(SceneError, match=r"XDG_CACHE_HOME .* unmix-demo-scene DIR"):
         demo_scene_path(tmp_path / "cache")
+
+
+@pytest.mark.usefixtures("one_ray_a_pixel")
+def test_a_full_disk_is_named_and_nothing_is_left(tmp_path, monkeypatch):
+    def fail(*_):
+        raise OSError("285696 requested and 276416 written")  # what numpy.save says
+
+    monkeypatch.setattr(np, "save", fail)
+    with pytest.raises(SceneError, match=r"can't write the demo scene to .*276416 written; make room"):
+        make_demo_scene(tmp_path / "scene", size=16, bands=4, views=4)
+    assert list(tmp_path.iterdir()) == []

@@ -79,12 +79,12 @@ class Report(Product):
         return views
 
     def _scene(self, job: Job) -> Scene | None:
-        from unmix_plugin.trained.find_scene import scene_at_hand
+        from unmix_plugin.trained.find_scene import find_scene
 
         if self._is_edited:
             return None
         with job.working("looking for the scene"):
-            scene = scene_at_hand(job.loaded.record.summary, job.loaded.folder.path, self.data)
+            scene = find_scene(job.loaded.record.summary, job.loaded.folder.path, self.data)
         if scene is None:
             job.say("the scene is not at hand: nothing measured in the report (--data says where it is)")
         return scene

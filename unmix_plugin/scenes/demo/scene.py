@@ -84,7 +84,7 @@ def make_demo_scene(
     Raises:
         ConfigError: a number out of bounds; a folder with something in it, or no folder at all.
         SpectrumError: an unknown light, or one that is not known at all bands.
-        OSError: the place can't be written.
+        SceneError: the folder can't be written, or the disk is full.
     """
     _check_bounds(size, bands, views)
     if directory.exists() and not directory.is_dir():
@@ -93,9 +93,15 @@ def make_demo_scene(
         raise ConfigError(
             f"{directory} is not empty; choose another folder, or replace the scene with --overwrite"
         )
-    with _staging_beside(directory) as staging:
-        _write_scene(staging / "scene", size, bands, views, illuminant)
-        _move_files(staging / "scene", directory)
+    try:
+        with _staging_beside(directory) as staging:
+            _write_scene(staging / "scene", size, bands, views, illuminant)
+            _move_files(staging / "scene", directory)
+    except OSError as error:  # NumPy's own has no strerror
+        raise SceneError(
+            f"can't write the demo scene to {directory}: {error.strerror or error}; make room there or choose another "
+            "folder"
+        ) from error
 
 
 def is_complete(directory: Path) -> bool:

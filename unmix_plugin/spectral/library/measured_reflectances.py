@@ -52,9 +52,7 @@ def measured_reflectances() -> Iterator[Measured]:
 
     yield from _each("pmc", SDS_COLOURCHECKERS["PMC"], "Preferred Memory Color chart")
     yield from _each("checker", SDS_COLOURCHECKERS["ColorChecker N Ohta"], "ColorChecker, Ohta 1997")
-    known = SDS_TCS.get(
-        "CIE 2024", SDS_TCS["CIE 1995"]
-    )  # the older one has no Asian skin; colour-science below 0.4.7
+    known = SDS_TCS.get("CIE 2024", SDS_TCS)  # colour-science below 0.4.7 has the fourteen of 1995 alone
     samples: dict[str, Any] = dict(zip(_CRI_NAMES, known.values(), strict=False))
     yield from _each("cri", samples, "test colour samples, CIE 13.3:1995 and CIE 2024")
     extended = dict(SDS_VS["NIST CQS 9.0"].items())

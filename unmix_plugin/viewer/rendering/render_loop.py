@@ -64,6 +64,7 @@ class RenderLoop:
             if view in self._views:
                 self._views.remove(view)
             view.render = view.frame = None
+            self._changed.notify_all()
 
     def move(self, view: View, pose: ViewPose) -> None:
         """Show the scene from elsewhere."""
@@ -115,17 +116,26 @@ class RenderLoop:
         view.restyled_at = view.restyled_at or time.monotonic()
         self._changed.notify_all()
 
-    def _run(self) -> None:
-        while True:
-            with self._changed:
-                unit = None
-                while unit is None:
-                    if self._is_stopping:
-                        return
-                    unit = self._next_unit()
-                    if unit is None:
-                        self._changed.wait(_POLL_S if self._views or self._captures else None)
+    def step(self) -> bool:
+        """Do the most urgent piece of work; False if there is none at this moment."""
+        with self._changed:
+            unit = self._next_unit()
+        if unit is not None:
             unit()
+        return unit is not None
+
+    def _run(self) -> None:
+        while (unit := self._awaited_unit()) is not None:
+            unit()
+
+    def _awaited_unit(self) -> Callable[[], None] | None:
+        """What is most urgent, as soon as there is something; None once the loop is to end."""
+        with self._changed:
+            while not self._is_stopping:
+                if (unit := self._next_unit()) is not None:
+                    return unit
+                self._changed.wait(_POLL_S if self._views or self._captures else None)
+        return None
 
     def _next_unit(self) -> Callable[[], None] | None:
         """What is most urgent: answers in the order in which they were asked for, then blocks in turn."""
