@@ -144,3 +144,13 @@ def test_two_runs_of_one_seed_are_equal_and_of_another_seed_are_not(short_config
     first = trained(1)
     assert torch.equal(trained(1), first)
     assert not torch.equal(trained(2), first)
+
+
+def test_warnings_of_the_data_are_told_when_a_run_starts_and_not_when_one_is_loaded(
+    short_config: TrainerConfig, monkeypatch
+):
+    made = short_config.pipeline.setup(data=short_config.data, device=torch.device("cpu"), seed=3)
+    monkeypatch.setattr(made.datamanager, "warnings", lambda: ["the poses look odd"])
+    assert "odd" not in made.reasons
+    made.initialise()
+    assert made.reasons.splitlines()[-1] == "warning: the poses look odd"
