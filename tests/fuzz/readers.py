@@ -46,7 +46,7 @@ from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 from unmix_plugin.spectral.library.spectra_envi import read_spectra_envi
 from unmix_plugin.spectral.maps.index_formula import parse_formula
 from unmix_plugin.trained.camera_files.camera_files import read_camera_file
-from unmix_plugin.trained.run_views import views_of
+from unmix_plugin.trained.run_views import recorded_views
 from unmix_plugin.trained.world_frame import world_frame
 
 
@@ -323,7 +323,7 @@ def _scene_record() -> Reader:
 def _read_scene_record(path: Path) -> None:
     scene = read_scene_record(RunFolder(path.parent), HyperspectralDataManager)
     world_frame(scene)
-    for view in views_of(scene, "all"):
+    for view in recorded_views(scene):
         assert (path.parent / view.name).parent == path.parent
 
 
