@@ -165,9 +165,8 @@ class Server:
     @property
     def memory_mb(self) -> float:
         """Resident size."""
-        import psutil
-
-        return psutil.Process(self.process.pid).memory_info().rss / 1e6
+        found = subprocess.run(["ps", "-o", "rss=", "-p", str(self.process.pid)], capture_output=True, check=True)
+        return int(found.stdout) * 1024 / 1e6
 
     def errors(self) -> list[str]:
         """Lines of its output that tell of a failure."""

@@ -18,6 +18,7 @@ from unmix_plugin.engine import (
     Model,
     ModelConfig,
     OptimizerConfig,
+    Output,
     PipelineConfig,
     RayBundle,
     SceneBox,
@@ -104,6 +105,10 @@ class RgbNerf(Model):
     """Stratified samples through the box, composited front to back on black."""
 
     config: RgbNerfConfig
+    outputs = (
+        Output("rgb", "srgb", "colour", "sRGB on black, 0 to 1"),
+        Output("accumulation", "map", "opacity", "opacity, 0 to 1", (0.0, 1.0), "gray"),
+    )
 
     def populate_modules(self) -> None:
         self.field = GridField(self.metadata["grid_size"])

@@ -60,6 +60,7 @@ def evaluate(words: list[str]) -> None:
     """
     options = tyro.cli(EvalOptions, prog="unmix-eval", args=words)
 
+    from unmix_plugin.commands.eval_by_model import evaluate_by_model
     from unmix_plugin.commands.reporting import CommandConsole, working
     from unmix_plugin.commands.run_choice import chosen_run
     from unmix_plugin.editing.edited_run import requested_recipe
@@ -70,7 +71,10 @@ def evaluate(words: list[str]) -> None:
     recipe = requested_recipe(options.edits, options.illuminant)
     with working(console, f"reading {path} and its scene"):
         loaded = load_pipeline(path, options.device, options.data)
-        subject = _subject(loaded, recipe, options)
+    if recipe is None and not _has_spectral_scene(loaded):
+        evaluate_by_model(loaded, console)
+        return
+    subject = _subject(loaded, recipe, options)
     evaluation, num_pictures = _evaluate_views(subject, console)
     figures = _write_metrics(subject, evaluation)
     _show(console, figures, subject)
@@ -113,6 +117,12 @@ def _subject(loaded: LoadedPipeline, recipe: Recipe | None, options: EvalOptions
     folder = loaded.run.exports / re.sub(r"[^\w.-]+", "_", "-".join(words))
     factors = None if recipe.illuminant is None else light_factors(scene, recipe)
     return _Subject(loaded, edited, factors, folder, recipe_to_yaml(recipe))
+
+
+def _has_spectral_scene(loaded: LoadedPipeline) -> bool:
+    from unmix_plugin.scenes.scene import Scene
+
+    return isinstance(getattr(loaded.pipeline.datamanager, "scene", None), Scene)
 
 
 def _scene_of(loaded: LoadedPipeline) -> Scene:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from unmix_plugin.engine.geometry.scene_box import SceneBox
     from unmix_plugin.engine.instantiate import InstantiateConfig, Target
     from unmix_plugin.engine.model import Model, ModelConfig
+    from unmix_plugin.engine.outputs import Output
     from unmix_plugin.engine.pipeline import Pipeline, PipelineConfig
     from unmix_plugin.engine.registry import MethodSpecification, discover_methods, find_method
     from unmix_plugin.engine.runs.load_run import LoadedModel, load_config, load_model, load_pipeline
@@ -35,6 +36,7 @@ _MODULES = {
     "geometry.scene_box": ("SceneBox",),
     "instantiate": ("InstantiateConfig", "Target"),
     "model": ("Model", "ModelConfig"),
+    "outputs": ("Output",),
     "pipeline": ("Pipeline", "PipelineConfig"),
     "registry": ("MethodSpecification", "discover_methods", "find_method"),
     "runs.load_run": ("LoadedModel", "load_config", "load_model", "load_pipeline"),
@@ -55,6 +57,7 @@ __all__ = [
     "Model",
     "ModelConfig",
     "OptimizerConfig",
+    "Output",
     "Pipeline",
     "PipelineConfig",
     "RayBundle",
