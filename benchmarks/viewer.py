@@ -165,7 +165,9 @@ class Server:
     @property
     def memory_mb(self) -> float:
         """Resident size."""
-        found = subprocess.run(["ps", "-o", "rss=", "-p", str(self.process.pid)], capture_output=True, check=True)
+        found = subprocess.run(
+            ["ps", "-o", "rss=", "-p", str(self.process.pid)], capture_output=True, check=True
+        )
         return int(found.stdout) * 1024 / 1e6
 
     def errors(self) -> list[str]:
