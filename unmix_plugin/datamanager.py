@@ -159,7 +159,7 @@ class HyperspectralDataManager(DataManager):
         }
 
     def initial_data(self) -> Mapping[str, np.ndarray]:
-        """`pixels`: spectra pooled over all training views; `reachable`: where matter may be."""
+        """`pixels`: spectra pooled over all training views; `reachable`: where something may be."""
         return {
             "pixels": self._pixels.sample_opaque(self.options.max_initial_pixels, self.seed),
             "reachable": carve(self.scene, self._grid_resolution),

@@ -1,7 +1,7 @@
 """What can go wrong that is not our bug: one hierarchy, one clear message each.
 
 A message says what, where (file, frame, band), found against expected, and what to do. Commands print it without a
-traceback and exit with status 2; anything else that escapes is our own defect and exits with status 1.
+traceback and exit with status 2; anything else that escapes is an internal error and exits with status 1.
 """
 
 import difflib

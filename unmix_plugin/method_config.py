@@ -1,4 +1,4 @@
-"""What the package registers: the method `unmix-nerf`, a name, a description and all its settings."""
+"""What the package registers: the methods `unmix-nerf` and `unmix-nerf-published`, with all their settings."""
 
 from pathlib import Path
 
@@ -8,7 +8,10 @@ from unmix_plugin.engine.pipeline import PipelineConfig
 from unmix_plugin.engine.registry import MethodSpecification
 from unmix_plugin.engine.training.optimizers import OptimizerConfig
 from unmix_plugin.model import UnmixModelConfig
+from unmix_plugin.published_field import PublishedFieldConfig
+from unmix_plugin.renderer import RendererConfig
 from unmix_plugin.trained.snapshot import unmix_scene
+from unmix_plugin.training_losses import LossConfig
 
 unmix_nerf = MethodSpecification(
     config=TrainerConfig(
@@ -30,5 +33,31 @@ unmix_nerf = MethodSpecification(
         },
     ),
     description="radiance field of spectral images whose every point is a mixture of a few materials",
+    scene=unmix_scene,
+)
+
+_AS_PUBLISHED = OptimizerConfig(lr=2e-2, final_factor=5e-4)
+
+unmix_nerf_published = MethodSpecification(
+    config=TrainerConfig(
+        method_name="unmix-nerf-published",
+        output_dir=Path("outputs"),
+        max_num_iterations=30_000,
+        pipeline=PipelineConfig(
+            datamanager=HyperspectralDataManagerConfig(subpixels=1),
+            model=UnmixModelConfig(
+                endmember_init="vca",
+                specular="full",
+                segmentation="probe",
+                field=PublishedFieldConfig(),
+                renderer=RendererConfig(visible_weight=1.0),
+                losses=LossConfig(
+                    background="random", spectral=5.0, rgb=1.0, opacity=0.0, spread=0.0, abundances=0.0
+                ),
+            ),
+        ),
+        optimizers={"grid": _AS_PUBLISHED, "networks": _AS_PUBLISHED, "spectra": _AS_PUBLISHED},
+    ),
+    description="UnMix-NeRF as its authors publish it, for comparison; docs/method.md says what still differs",
     scene=unmix_scene,
 )

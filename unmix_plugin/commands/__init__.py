@@ -1,4 +1,4 @@
-"""The command line: thin functions that parse words, call the rooms and say what was written where."""
+"""The command line: thin functions that parse arguments, call the packages and say what was written where."""
 
 import os
 

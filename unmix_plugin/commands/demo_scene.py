@@ -34,7 +34,7 @@ class DemoSceneOptions:
 
 
 def write_demo_scene(arguments: list[str]) -> None:
-    """Parse the words, write the scene, say what is where."""
+    """Parse the arguments, write the scene, say what is where."""
     options = tyro.cli(DemoSceneOptions, prog="unmix-demo-scene", args=arguments)
     started = time.perf_counter()
     light = parse_light(options.illuminant)

@@ -48,8 +48,8 @@ class EvalOptions:
     """Where to compute; auto takes CUDA where there is one."""
 
 
-def evaluate(words: list[str]) -> None:
-    """Parse the words, render and measure each view, write and say what was found.
+def evaluate(argv: list[str]) -> None:
+    """Parse the arguments, render and measure each view, write and say what was found.
 
     Raises:
         RunError: the run is unusable, or its folder can't be written.
@@ -58,7 +58,7 @@ def evaluate(words: list[str]) -> None:
             not there.
         SpectrumError: there is no such light.
     """
-    options = tyro.cli(EvalOptions, prog="unmix-eval", args=words)
+    options = tyro.cli(EvalOptions, prog="unmix-eval", args=argv)
 
     from unmix_plugin.commands.eval_by_model import evaluate_by_model
     from unmix_plugin.commands.reporting import CommandConsole, working

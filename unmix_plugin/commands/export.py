@@ -42,8 +42,8 @@ _IN_THE_RUNS_BANDS = ("metamerism", "report", "spectrum")
 """Products that compare with spectra and lights known in the run's own bands, and that no sensor can come between."""
 
 
-def export(words: list[str]) -> None:
-    """Parse the words, write the product, say what is where.
+def export(argv: list[str]) -> None:
+    """Parse the arguments, write the product, say what is where.
 
     Raises:
         RunError: the run is unusable, or the folder can't be written.
@@ -57,7 +57,7 @@ def export(words: list[str]) -> None:
         {product.name: inspect.getdoc(product) or "" for product in PRODUCTS},
     )
     product: Product = tyro.cli(
-        choices, prog="unmix-export", description="Write products of a run as files.", args=words
+        choices, prog="unmix-export", description="Write products of a run as files.", args=argv
     )
     job = _open(product)
     written = product.write(job)

@@ -68,8 +68,8 @@ class RenderOptions:
     """Replace files of an earlier render."""
 
 
-def render(words: list[str]) -> None:
-    """Parse the words, render each view, say what is where.
+def render(argv: list[str]) -> None:
+    """Parse the arguments, render each view, say what is where.
 
     Raises:
         RunError: the run is unusable, or a file can't be written.
@@ -78,7 +78,7 @@ def render(words: list[str]) -> None:
             that is not there.
         SpectrumError: a wavelength outside the bands, a light that is unknown, or a sensor that sees nothing in them.
     """
-    options = tyro.cli(RenderOptions, prog="unmix-render", args=words)
+    options = tyro.cli(RenderOptions, prog="unmix-render", args=argv)
     request = _camera_request(options)
 
     from unmix_plugin.commands.reporting import CommandConsole, say, working

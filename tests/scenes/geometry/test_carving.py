@@ -1,4 +1,4 @@
-"""The hull never cuts into matter, and cuts away what views look through."""
+"""The hull never cuts into foreground, and cuts away what views look through."""
 
 import dataclasses
 
@@ -14,7 +14,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.scenes import carve, load_scene
 from unmix_plugin.scenes.geometry.bounds import find_bounds, focus_point
-from unmix_plugin.scenes.geometry.carving import carve_box, matter_mask
+from unmix_plugin.scenes.geometry.carving import carve_box, foreground_mask
 
 BOX = SceneBox(torch.tensor([[-1.0, -1.2, -0.9], [1.1, 1.0, 1.0]]))
 SIDE, FOCAL = 40, 60.0
@@ -73,19 +73,19 @@ def test_cells_are_indexed_x_y_z_from_the_smallest_corner():
 
 def test_a_grid_of_odd_size_agrees_with_one_that_is_refined_from_coarser_ones():
     poses = ring_poses(6)
-    cameras, matter = make_cameras(poses), ball_matter(poses, 0.5)
-    fine = carve_box(cameras, matter, BOX, 64)
+    cameras, foreground = make_cameras(poses), ball_matter(poses, 0.5)
+    fine = carve_box(cameras, foreground, BOX, 64)
     for cells in (63, 65):
-        other = carve_box(cameras, matter, BOX, cells)
+        other = carve_box(cameras, foreground, BOX, cells)
         assert abs(other.mean() - fine.mean()) < 0.02
 
 
 def test_refining_finds_exactly_what_testing_every_cell_finds(monkeypatch):
     poses = ring_poses(6)
-    cameras, matter = make_cameras(poses), ball_matter(poses, 0.5)
-    refined = carve_box(cameras, matter, BOX, 64)
+    cameras, foreground = make_cameras(poses), ball_matter(poses, 0.5)
+    refined = carve_box(cameras, foreground, BOX, 64)
     monkeypatch.setattr("unmix_plugin.scenes.geometry.carving.COARSEST_CELLS", 64)
-    direct = carve_box(cameras, matter, BOX, 64)
+    direct = carve_box(cameras, foreground, BOX, 64)
     assert (refined != direct).mean() < 1e-4  # rectangles of children may stick out by rounding
 
 
@@ -94,15 +94,15 @@ def test_the_hull_holds_the_ball_through_a_bent_lens_too(lens):
     poses = ring_poses(8)
     cameras = make_cameras(poses, lens)
     radius, cells = 0.5, 40
-    matter = []
+    foreground = []
     for index in range(len(poses)):
         rays = [cameras.image_rays(index, (x, y)) for x in (0.1, 0.5, 0.9) for y in (0.1, 0.5, 0.9)]
         hits = []
         for bundle in rays:
             along = -(bundle.directions * bundle.origins).sum(-1)
             hits.append((bundle.origins**2).sum(-1) - along**2 < radius**2)
-        matter.append(torch.stack(hits).any(dim=0).reshape(SIDE, SIDE).numpy())
-    hull = carve_box(cameras, matter, BOX, cells)
+        foreground.append(torch.stack(hits).any(dim=0).reshape(SIDE, SIDE).numpy())
+    hull = carve_box(cameras, foreground, BOX, cells)
     distances = np.linalg.norm(centres(BOX, cells), axis=-1)
     assert hull[distances < radius].all()
     assert hull.mean() < 4.0 * (distances < radius).mean()
@@ -163,9 +163,9 @@ def test_pixels_that_a_mask_ignores_count_as_matter(tmp_path):
     before = load_scene(folder.root)
     folder.edit(lambda c: c["frames"][1].update(mask_path="mask.png"))
     after = load_scene(folder.root)
-    assert matter_mask(after, 1)[:, 10:].all()
-    assert np.array_equal(matter_mask(after, 1)[:, :10], matter_mask(before, 1)[:, :10])
-    assert np.array_equal(matter_mask(after, 2), matter_mask(before, 2))
+    assert foreground_mask(after, 1)[:, 10:].all()
+    assert np.array_equal(foreground_mask(after, 1)[:, :10], foreground_mask(before, 1)[:, :10])
+    assert np.array_equal(foreground_mask(after, 2), foreground_mask(before, 2))
 
 
 def test_the_focus_is_where_all_axes_meet():
@@ -245,8 +245,8 @@ def test_the_model_box_is_centred_and_its_longest_edge_is_two(tmp_path, has_alph
 def test_cells_that_too_few_views_see_are_carved_and_the_others_stay():
     poses = [look_at(np.array([x, -2.0, 0.2]), np.array([x, 0.0, 0.0])) for x in (-0.6, 0.0, 0.6)]
     cameras = make_cameras(poses)
-    matter = [np.ones((SIDE, SIDE), bool)] * 3
-    kept = [carve_box(cameras, matter, BOX, 24, fewest_views=n) for n in (1, 2, 3)]
+    foreground = [np.ones((SIDE, SIDE), bool)] * 3
+    kept = [carve_box(cameras, foreground, BOX, 24, fewest_views=n) for n in (1, 2, 3)]
     points = torch.from_numpy(centres(BOX, 24).reshape(-1, 3)).float()
     count = torch.zeros(len(points))
     for index in range(3):

@@ -10,6 +10,7 @@ from PIL import Image
 
 from tests.scenes.scene_factory import FOCAL, HEIGHT, SPECTRUM, WAVELENGTHS, WIDTH, make_scene
 from unmix_plugin.scenes import Normalisation, SceneOptions, load_scene
+from unmix_plugin.scenes.reading import loader
 
 
 def test_every_part_of_a_scene_is_what_was_written(tmp_path):
@@ -238,3 +239,14 @@ def test_links_out_of_the_folder_are_followed_when_allowed(tmp_path):
     )
     scene = load_scene(folder.root, SceneOptions(allow_outside_paths=True))
     assert scene.cube(1).shape == scene.cube(2).shape == (HEIGHT, WIDTH, len(WAVELENGTHS))
+
+
+def test_cubes_are_hashed_while_they_are_checked_and_not_read_again(tmp_path, monkeypatch):
+    folder = make_scene(tmp_path / "scene").edit_cube(2, np.asfortranarray)
+    hashed = []
+    monkeypatch.setattr(loader, "sha256_of", lambda path: hashed.append(path) or "")
+    hashes = load_scene(folder.root).input_hashes
+    assert hashed
+    assert not any(path.parent.name == "cubes" for path in hashed)
+    for name in ("cubes/view_1.npy", "cubes/view_2.npy"):
+        assert hashes[name] == hashlib.sha256((folder.root / name).read_bytes()).hexdigest()

@@ -23,9 +23,9 @@ class TrainingStatus:
     progress: float
     """Fraction of the training done, [0, 1]."""
     loss: float
-    """Of the last step."""
+    """Loss of the last step."""
     psnr: float | None
-    """Of the last training batch, dB, where the model has such a metric."""
+    """PSNR of the last training batch, dB, where the model has such a metric."""
     rays_per_second: float
     """Training rays a second of training."""
 

@@ -35,7 +35,7 @@ class TrainingRecord:
     progress: float
     """Fraction of the training done, [0, 1]."""
     learning_rates: dict[str, float]
-    """Of the last step, by parameter group."""
+    """Learning rates of the last step, by parameter group."""
 
     def __post_init__(self) -> None:
         """Refuse numbers that no training counts.

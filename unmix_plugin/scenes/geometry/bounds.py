@@ -25,7 +25,7 @@ from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.geometry.carving import carve_box
-from unmix_plugin.scenes.geometry.matter_rays import MIN_EXPLAINED, rays_to_matter, share_through
+from unmix_plugin.scenes.geometry.foreground_rays import MIN_EXPLAINED, foreground_rays, share_through
 
 MIN_CONVERGENCE = 1e-3
 """Least mean squared sine between optical axes and their spread direction that still fixes a focus, (1.8 deg)^2."""
@@ -40,7 +40,7 @@ HULL_SHARES = (2.0 / 3.0, 1.0 / 3.0)
 """Tried in turn: the hull's cells count for its extent if this share of the cameras that see its best seen cell see
 them, as long as the box still explains the images."""
 MIN_CONSISTENT = 0.5
-"""Least share of the pixels with matter that must have hull behind them: only gross contradictions fall below, since
+"""Least share of the foreground pixels that must have hull behind them: only gross contradictions fall below, since
 masks that are a little off keep far more."""
 HULL_START = 1.25
 """The first box of the hull over the cameras' cube: room for things that reach out of the images."""
@@ -50,24 +50,24 @@ SEEN_CELLS = 32
 """Cells along an edge when the region that cameras share is sought."""
 
 
-def find_bounds(root: Path, cameras: Cameras, matter: list[Bool[np.ndarray, "H W"]] | None) -> SceneBox:
+def find_bounds(root: Path, cameras: Cameras, foreground: list[Bool[np.ndarray, "H W"]] | None) -> SceneBox:
     """The box that the training views show.
 
     Args:
         root: Scene folder, for messages.
         cameras: Training cameras, in coordinates of order 1.
-        matter: For each view True where it may show matter; None where there is no alpha.
+        foreground: For each view True where it may show something; None where there is no alpha.
     Returns:
         The box in the cameras' space.
     Raises:
         SceneError: with alpha, no place is opaque in all views that see it: poses and pictures contradict.
     """
     centre, half = _cube_of_views(cameras)
-    if matter is None:
+    if foreground is None:
         return _cut_to_shared_view(cameras, _box(centre - half, centre + half))
-    rays = rays_to_matter(cameras, matter)
+    rays = foreground_rays(cameras, foreground)
     box = _box(centre - HULL_START * half, centre + HULL_START * half)
-    hull = carve_box(cameras, matter, box, HULL_CELLS)
+    hull = carve_box(cameras, foreground, box, HULL_CELLS)
     # Near a camera that looks out of the others' images everything is consistent, so only shared places count.
     count = _count_views(cameras, box, HULL_CELLS)
     explained = share_through(rays, box, hull & (count >= HULL_SHARES[0] * count.max()))
@@ -79,7 +79,7 @@ def find_bounds(root: Path, cameras: Cameras, matter: list[Bool[np.ndarray, "H W
         )
     box = _tighten(cameras, rays, box, hull)
     # The second look has finer cells and so a thinner margin.
-    return _tighten(cameras, rays, box, carve_box(cameras, matter, box, HULL_CELLS))
+    return _tighten(cameras, rays, box, carve_box(cameras, foreground, box, HULL_CELLS))
 
 
 def focus_point(cameras: Cameras) -> Float64[np.ndarray, "3"] | None:

@@ -1,8 +1,8 @@
-"""Which cells of space may hold matter, judged by the training views alone and before any training.
+"""Which cells of space may be occupied, judged by the training views alone and before any training.
 
 A cell stays if enough training cameras see it and, where pictures have alpha, no training view looks through it: a view
 looks through a cell if the cell's whole footprint, widened by a margin, lies in the image on pixels of alpha 0. The
-footprint is the bounding rectangle of the cell's projection, rounded outwards, so the hull errs only towards matter.
+footprint is the bounding rectangle of the cell's projection, rounded outwards, so the hull is never too small.
 
 What one or two views see is not held by the others, and what grows there fits single images only: with alpha half of
 the views must see a cell, unless that leaves pixels unexplained, without alpha a tenth.
@@ -23,7 +23,7 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.camera_distortion import distort, undistort
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
-from unmix_plugin.scenes.geometry.matter_rays import MIN_EXPLAINED, rays_to_matter, share_through
+from unmix_plugin.scenes.geometry.foreground_rays import MIN_EXPLAINED, foreground_rays, share_through
 from unmix_plugin.scenes.scene import Scene
 
 PIXEL_MARGIN = 1.0
@@ -35,7 +35,7 @@ COARSEST_CELLS = 16
 BORDER_POINTS = 65
 """Points along each image edge when its undistorted bounds are sought."""
 FAIR_SHARE = 0.5
-"""Share of the training views that must see a cell of a scene with alpha, unless that leaves matter unexplained."""
+"""Share of the training views that must see a cell of a scene with alpha, unless that leaves foreground unexplained."""
 FAIR_SHARE_OPEN = 0.1
 """The same without alpha, where nothing tells what it leaves unexplained: only what hardly any view sees is carved,
 since walls would be continued there into the void beside a room."""
@@ -44,30 +44,30 @@ BLOCK_CELLS = 1 << 15
 
 
 def carve(scene: Scene, resolution: int) -> Bool[np.ndarray, "R R R"]:
-    """Cells of the scene box that may hold matter.
+    """Cells of the scene box that may be occupied.
 
     Args:
         scene: With alpha its hull is carved; without, what hardly any training camera sees.
         resolution: Cells along each edge of the box.
     Returns:
-        True where matter may be.
+        True where something may be.
     """
     indices = list(scene.train_indices)
     cameras, box = scene.cameras[indices], scene.scene_box
     if not scene.has_alpha:
         fewest_views = max(1, math.ceil(FAIR_SHARE_OPEN * len(indices)))
         return carve_box(cameras, None, box, resolution, fewest_views)
-    matter = [matter_mask(scene, index) for index in indices]
+    foreground = [foreground_mask(scene, index) for index in indices]
     fair = carve_box(
-        cameras, matter, box, resolution, fewest_views=max(1, math.ceil(FAIR_SHARE * len(indices)))
+        cameras, foreground, box, resolution, fewest_views=max(1, math.ceil(FAIR_SHARE * len(indices)))
     )
-    if share_through(rays_to_matter(cameras, matter), box, fair) >= MIN_EXPLAINED:
+    if share_through(foreground_rays(cameras, foreground), box, fair) >= MIN_EXPLAINED:
         return fair
-    return carve_box(cameras, matter, box, resolution)
+    return carve_box(cameras, foreground, box, resolution)
 
 
-def matter_mask(scene: Scene, index: int) -> Bool[np.ndarray, "H W"]:
-    """Pixels of a view behind which matter may be: not fully transparent, or not to be trusted."""
+def foreground_mask(scene: Scene, index: int) -> Bool[np.ndarray, "H W"]:
+    """Pixels of a view that may show something: not fully transparent, or not to be trusted."""
     alpha = scene.alpha(index)
     valid = scene.valid_mask(index)
     return ~valid if alpha is None else (alpha > 0.0) | ~valid
@@ -75,23 +75,23 @@ def matter_mask(scene: Scene, index: int) -> Bool[np.ndarray, "H W"]:
 
 def carve_box(
     cameras: Cameras,
-    matter: list[Bool[np.ndarray, "H W"]] | None,
+    foreground: list[Bool[np.ndarray, "H W"]] | None,
     box: SceneBox,
     resolution: int,
     fewest_views: int = 1,
 ) -> Bool[np.ndarray, "R R R"]:
-    """Cells of a box that may hold matter, by the given views.
+    """Cells of a box that may be occupied, by the given views.
 
     Args:
         cameras: One a view, in the space of the box.
-        matter: For each view True on pixels that may show matter; None where there is no alpha.
+        foreground: For each view True on pixels that may show something; None where there is no alpha.
         box: What is divided into cells.
         resolution: Cells along each edge, >= 1.
         fewest_views: Views that must see a cell for it to stay.
     """
     if resolution < 1:
         raise ValueError(f"resolution must be at least 1; got {resolution}")
-    views = [_View(cameras, i, None if matter is None else matter[i]) for i in range(len(cameras))]
+    views = [_View(cameras, i, None if foreground is None else foreground[i]) for i in range(len(cameras))]
     near = NEAR_DEPTH * 0.5 * float(box.size.max())
     sizes = [resolution]
     while sizes[-1] % 2 == 0 and sizes[-1] > COARSEST_CELLS:
@@ -103,11 +103,11 @@ def carve_box(
         candidates = np.flatnonzero(kept)
         for first in range(0, len(candidates), BLOCK_CELLS):
             block = candidates[first : first + BLOCK_CELLS]
-            kept.reshape(-1)[block] = _may_hold_matter(block, cells, views, box, near, fewest_views)
+            kept.reshape(-1)[block] = _may_be_occupied(block, cells, views, box, near, fewest_views)
     return kept
 
 
-def _may_hold_matter(
+def _may_be_occupied(
     flat_cells: Int64[np.ndarray, " M"],
     cells: int,
     views: list[_View],
@@ -144,9 +144,9 @@ class _Footprint:
 
 
 class _View:
-    """One camera with the running sum of its matter pixels, so that any rectangle is counted with four look-ups."""
+    """One camera with the running sum of its foreground pixels, so that any rectangle is counted with four look-ups."""
 
-    def __init__(self, cameras: Cameras, index: int, matter: Bool[np.ndarray, "H W"] | None) -> None:
+    def __init__(self, cameras: Cameras, index: int, foreground: Bool[np.ndarray, "H W"] | None) -> None:
         pose = cameras.camera_to_world[index].numpy()
         # OpenCV axes here (x right, y down, z forward), so that image and depth have the signs of pixels
         self._axes = (pose[:, :3] * np.array([1.0, -1.0, -1.0], dtype=np.float32)).T
@@ -157,9 +157,9 @@ class _View:
         self._columns, self._rows = cameras.width, cameras.height
         self._low, self._high = self._ideal_bounds()
         self.covered = None
-        if matter is not None:
+        if foreground is not None:
             sums = np.zeros((cameras.height + 1, cameras.width + 1), dtype=np.int32)
-            np.cumsum(np.cumsum(matter, axis=0, dtype=np.int32), axis=1, out=sums[1:, 1:])
+            np.cumsum(np.cumsum(foreground, axis=0, dtype=np.int32), axis=1, out=sums[1:, 1:])
             self.covered = sums.reshape(-1)
 
     def footprint(self, centres: Float32[np.ndarray, "3 M"], half: Float32[np.ndarray, "3"]) -> _Footprint:
@@ -179,7 +179,7 @@ class _View:
         return overlaps[0] & overlaps[1] & (footprint.farthest > near)
 
     def looks_through(self, footprint: _Footprint) -> Bool[np.ndarray, " M"]:
-        """Cells whose whole footprint lies in the image, on pixels without matter."""
+        """Cells whose whole footprint lies in the image, on background pixels."""
         assert self.covered is not None
         inside = (footprint.low >= self._low) & (footprint.high <= self._high)
         chosen = np.flatnonzero(inside[0] & inside[1] & (footprint.nearest > 1e-6))

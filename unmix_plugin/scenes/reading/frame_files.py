@@ -27,8 +27,8 @@ class CheckedFiles:
 
     size: Size
     """Of every image."""
-    matter: tuple[Bool[np.ndarray, "H W"], ...] | None
-    """For each frame the pixels that may show matter: not fully transparent, or not to be trusted. None where the
+    foreground: tuple[Bool[np.ndarray, "H W"], ...] | None
+    """For each frame the pixels that may show something: not fully transparent, or not to be trusted. None where the
     scene has no alpha."""
     cube_hashes: dict[Path, str]
     """SHA-256 of each cube, in the order of the frames."""
@@ -76,14 +76,16 @@ def check_files(
     if size is None or any(cube is None for cube in values):
         return None
     cubes = [cube for cube in values if cube is not None]
-    matter = None
+    foreground = None
     if seen is not None:
         everything = np.ones(size, bool)
-        matter = tuple(
+        foreground = tuple(
             (everything if shown is None else shown)
             | (False if cube.invalid is None else cube.invalid)
             | (False if mask is None else ~mask)
             for shown, cube, mask in zip(seen, cubes, masks, strict=True)
         )
     paths = [paths["hyperspectral_file_path"] for paths in located]
-    return CheckedFiles(size, matter, {path: cube.sha256 for path, cube in zip(paths, cubes, strict=True)})
+    return CheckedFiles(
+        size, foreground, {path: cube.sha256 for path, cube in zip(paths, cubes, strict=True)}
+    )

@@ -125,7 +125,7 @@ def _assemble(
         material_names=truth.material_names,
         illuminant=truth.illuminant,
         endmembers=truth.endmembers,
-        has_alpha=checked.matter is not None,
+        has_alpha=checked.foreground is not None,
         has_labels=all("seg_file_path" in paths for paths in evaluated),
         has_abundances=all("abundance_file_path" in paths for paths in evaluated),
         input_hashes={_relative(path, root): hashes.get(path) or sha256_of(path) for path in inputs},
@@ -147,9 +147,9 @@ def _find_model_space(
     radius = float(np.linalg.norm(positions - middle, axis=-1).max())
     first = Normalisation(np.eye(3), -middle, 1.0 / radius if radius > 0.0 else 1.0)
     cameras = _make_cameras(entry, checked.size, first)[list(train)]
-    matter = None if checked.matter is None else [checked.matter[index] for index in train]
+    foreground = None if checked.foreground is None else [checked.foreground[index] for index in train]
     try:
-        low, high = find_bounds(root, cameras, matter).aabb.double().numpy()
+        low, high = find_bounds(root, cameras, foreground).aabb.double().numpy()
     except SceneError as error:
         scale, invalid = options.value_scale, options.invalid_pixels
         hint = describe(

@@ -1,4 +1,4 @@
-"""Rays through the pixels that show matter, and whether a hull explains them."""
+"""Rays through the foreground of pictures, and whether a hull explains them."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from unmix_plugin.engine.geometry.scene_box import SceneBox
 MAX_RAYS = 20_000
 """Pixels that are asked for whether a hull explains them."""
 MIN_EXPLAINED = 0.999
-"""Share of the pixels with matter whose rays must cross what is kept."""
+"""Share of the foreground pixels whose rays must cross what is kept."""
 
 
-def rays_to_matter(cameras: Cameras, matter: list[Bool[np.ndarray, "H W"]]) -> RayBundle:
-    """Rays through pixels that may show matter, evenly thinned out to at most `MAX_RAYS`."""
-    flat = np.flatnonzero(np.stack(matter))
+def foreground_rays(cameras: Cameras, foreground: list[Bool[np.ndarray, "H W"]]) -> RayBundle:
+    """Rays through foreground pixels, evenly thinned out to at most `MAX_RAYS`."""
+    flat = np.flatnonzero(np.stack(foreground))
     chosen = torch.from_numpy(flat[:: max(1, -(-len(flat) // MAX_RAYS))])
     pixel = chosen % (cameras.height * cameras.width)
     coords = torch.stack([pixel % cameras.width, pixel // cameras.width], dim=-1).float() + 0.5
