@@ -73,7 +73,7 @@ def test_an_encoder_that_fails_is_quoted_and_leaves_nothing(tmp_path, monkeypatc
         )
         return [sys.executable, "-c", code]
 
-    monkeypatch.setattr(video, "_words", failing)
+    monkeypatch.setattr(video, "_command", failing)
 
     def write():
         with video_frames(tmp_path / "v.mp4", 48, 32, 24.0) as add:

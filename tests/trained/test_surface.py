@@ -45,7 +45,13 @@ def test_points_carry_the_mixture_and_the_light_of_their_surface(ball):
     torch.testing.assert_close(points.abundances[clear, 0], above.float(), atol=5e-3, rtol=0)
     torch.testing.assert_close(points.abundances.sum(dim=-1), torch.ones(len(points)), atol=1e-4, rtol=0)
     expected = SHADE * points.abundances @ SCENE.materials.endmembers
-    torch.testing.assert_close(points.diffuse, expected, atol=1e-4, rtol=0)
+    torch.testing.assert_close(points.diffuse(SCENE.materials), expected, atol=1e-4, rtol=0)
+
+
+def test_points_take_the_same_memory_however_many_bands_there_are(ball):
+    points, num_materials = ball.points(), len(SCENE.materials.names)
+    numbers = sum(values.numel() for values in vars(points).values())
+    assert numbers == len(points) * (3 + 3 + 2 * num_materials)
 
 
 def test_directions_lead_from_a_camera_to_the_point(ball):

@@ -43,7 +43,7 @@ _IN_THE_RUNS_BANDS = ("metamerism", "report", "spectrum")
 
 
 def export(argv: list[str]) -> None:
-    """Parse the arguments, write the product, say what is where.
+    """Parse the arguments, write the product, list its files.
 
     Raises:
         RunError: the run is unusable, or the folder can't be written.

@@ -51,7 +51,7 @@ class RenderOptions:
     frames: int | None = None
     """Number of cameras of orbit or interpolate; None: 120."""
     fps: float | None = None
-    """Frames a second of videos; None: as the camera file says, or whatever suits each."""
+    """Frames a second of videos; None: as the camera file says, or a default for each kind of video."""
     edits: Path | None = None
     """Recipe (YAML) of edits of materials and light to apply first."""
     illuminant: str | None = None
@@ -69,7 +69,7 @@ class RenderOptions:
 
 
 def render(argv: list[str]) -> None:
-    """Parse the arguments, render each view, say what is where.
+    """Parse the arguments, render each view, list the files.
 
     Raises:
         RunError: the run is unusable, or a file can't be written.

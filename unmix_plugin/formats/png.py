@@ -20,7 +20,7 @@ def rgba_png_bytes(rgba: UInt8[np.ndarray, "H W C"], description: str = "") -> b
 
     Args:
         rgba: Colours.
-        description: What is shown; stands in the file as its `Description`.
+        description: What is shown; written into the file as its `Description`.
     """
     from PIL import Image
 
@@ -39,7 +39,7 @@ def indexed_png_bytes(
         ids: Indices.
         palette: sRGB in [0, 1], at most 256.
         transparent: An id that is not painted.
-        description: What is shown; stands in the file as its `Description`.
+        description: What is shown; written into the file as its `Description`.
     """
     from PIL import Image
 

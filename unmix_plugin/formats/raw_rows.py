@@ -22,7 +22,7 @@ def raw_rows(path: Path, header: bytes, shape: tuple[int, ...], dtype: np.dtype)
 
     Args:
         path: File to write.
-        header: What stands before the pixels.
+        header: Bytes before the pixels.
         shape: Of the whole image, (H, W, ...).
         dtype: Of the numbers on disk.
     Raises:

@@ -20,7 +20,7 @@ LAYOUT_VERSION = "1.0"
 """Of the layout."""
 
 UNITS = "W.m^-2.sr^-1"
-"""What the layout has for emissive images; what 1 stands for is the sensor's matter."""
+"""What the layout has for emissive images; what 1 means depends on the sensor."""
 
 
 def channel_name(wavelength_nm: float) -> str:

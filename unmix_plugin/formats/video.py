@@ -52,7 +52,7 @@ def video_frames(path: Path, width: int, height: int, frames_per_second: float) 
 
     with whole_file(path) as temporary, tempfile.TemporaryFile() as log:
         size = (width + width % 2, height + height % 2)
-        encoder = _start(_words(temporary, size, frames_per_second), log)
+        encoder = _start(_command(temporary, size, frames_per_second), log)
         try:
             yield add
             _finish(encoder, path, log)
@@ -60,21 +60,21 @@ def video_frames(path: Path, width: int, height: int, frames_per_second: float) 
             _stop(encoder)
 
 
-def _words(path: Path, size: tuple[int, int], frames_per_second: float) -> list[str]:
+def _command(path: Path, size: tuple[int, int], frames_per_second: float) -> list[str]:
     """The encoder's command."""
     import imageio_ffmpeg
 
     frames = f"-f rawvideo -pix_fmt rgb24 -s {size[0]}x{size[1]} -r {frames_per_second:g} -i -"
     colours = f"-vf scale=out_color_matrix=bt709:out_range=tv,setparams={_TAGS} -pix_fmt yuv420p"
     codec = f"-an -c:v libx264 -crf {_QUALITY} -movflags +faststart -f mp4"
-    words = f"-hide_banner -loglevel error -nostdin -y {frames} {colours} {codec}"
-    return [imageio_ffmpeg.get_ffmpeg_exe(), *words.split(), str(path)]
+    options = f"-hide_banner -loglevel error -nostdin -y {frames} {colours} {codec}"
+    return [imageio_ffmpeg.get_ffmpeg_exe(), *options.split(), str(path)]
 
 
-def _start(words: list[str], log: IO[bytes]) -> subprocess.Popen[bytes]:
+def _start(command: list[str], log: IO[bytes]) -> subprocess.Popen[bytes]:
     # A session of its own: Ctrl-C is for us, and we end the encoder.
     return subprocess.Popen(
-        words, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=log, start_new_session=True
+        command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=log, start_new_session=True
     )
 
 
@@ -102,6 +102,6 @@ def _stop(encoder: subprocess.Popen[bytes]) -> None:
 def _failure(path: Path, log: IO[bytes]) -> RunError:
     log.seek(0)
     lines = log.read().decode(errors="replace").strip().splitlines()
-    # What stands in brackets is the part of the encoder that complains.
+    # The part in brackets names the encoder's component.
     reason = re.sub(r"^\[.*?\]\s*", "", lines[-1]) if lines else "the video encoder ended early"
     return cannot_write(path, reason)

@@ -140,7 +140,7 @@ def write_mesh(
         formats: Which.
         mesh: Model space.
         scene: Trained.
-        frame: Of the run; files are in world coordinates.
+        frame: From the scene's world to model space; files are in world coordinates.
     Raises:
         RunError: there is no face, or the disk is full or refuses.
     """

@@ -90,7 +90,7 @@ def extract_mesh(
         densities: At the grid's points, per model unit.
         grid: Of the densities, model space.
         threshold: Density of the surface, > 0.
-        softness: Standard deviation in cells of the blur that goes before; 0 for none.
+        softness: Standard deviation, in cells, of a blur applied first; 0 for none.
         pixel_size: Edge of a pixel in the middle of the scene, model units.
     Raises:
         ConfigError: no density passes the threshold.

@@ -92,7 +92,7 @@ def find_metamers(
     """Look at all pairs of surfaces in all lights.
 
     Args:
-        materials: Of the run.
+        materials: The run's materials.
         scene_light: What it was recorded in; None for flat light.
         library: Measured materials.
         options: Which materials and lights, and what counts as alike and as different.

@@ -93,9 +93,9 @@ def write_point_cloud(
         folder: Where to write; it is made.
         points: Candidates, model space.
         num_points: The most to write.
-        materials: Of the model.
-        frame: Of the run.
-        scores: More numbers for every point, of its diffuse spectrum, judged against the points of the cloud.
+        materials: The scene's materials.
+        frame: From the scene's world to model space.
+        scores: More numbers for every point, from its diffuse spectrum; targets take the cloud as background.
     Returns:
         The file, and how many points are in it.
     Raises:
@@ -114,14 +114,15 @@ def write_point_cloud(
     chosen = thinned(positions, num_points)
     normals = plane_normals(positions, -points.directions.double().numpy(), chosen)
     kept = points.select(torch.from_numpy(chosen))
-    looks = SurfaceLooks(materials, kept.abundances, kept.diffuse)
+    diffuse = kept.diffuse(materials)
+    looks = SurfaceLooks(materials, kept.abundances, diffuse)
     world = frame.to_world(positions[chosen]).astype(np.float32)
     turned = directions_to_world(frame, normals).astype(np.float32)
     vertices = {
         **{name: world[:, axis] for axis, name in enumerate("xyz")},
         **{f"n{name}": turned[:, axis] for axis, name in enumerate("xyz")},
         **looks.properties(),
-        **{score.property: score.values(kept.diffuse, materials.light) for score in scores},
+        **{score.property: score.values(diffuse, materials.light) for score in scores},
     }
     comments = looks.comments("surface points of an unmix-nerf run")
     comments += [score.comment(materials) for score in scores]

@@ -29,7 +29,7 @@ _LONGEST_COMMENT = 300
 
 @dataclass(frozen=True)
 class PointScore:
-    """One number that every point shall have."""
+    """A number to add to every point."""
 
     output: str
     """As asked for, such as `index:ndvi`."""
@@ -40,7 +40,7 @@ class PointScore:
     def values(
         self, diffuse: Float[Tensor, "P B"], light: Float[Tensor, "B"] | None
     ) -> Float32[np.ndarray, " P"]:
-        """The numbers, judged against all the points given; NaN where undefined.
+        """The numbers, relative to all the points given where a target needs a background; NaN where undefined.
 
         Args:
             diffuse: Spectra of points without the view-dependent part.
@@ -59,11 +59,11 @@ class PointScore:
 
 
 def require_point_scores(outputs: Sequence[str], bands: Bands) -> list[PointScore]:
-    """What points shall have besides what they always have; an output asked for twice is given once.
+    """Numbers to add to points; an output asked for twice is given once.
 
     Args:
         outputs: Such as `index:ndvi`, `index:r800/r670`, `target:ace:paint.csv`.
-        bands: Of the run.
+        bands: The run's bands.
     Raises:
         ConfigError: another output, an unknown index, a formula that can't be read.
         SpectrumError: the bands do not cover what one needs, or a target that can't be read.

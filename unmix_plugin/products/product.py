@@ -55,7 +55,7 @@ class Product(ABC):
         Returns:
             Its files.
         Raises:
-            UnmixError: whatever a user can mend.
+            UnmixError: something that a user can fix.
         """
 
 

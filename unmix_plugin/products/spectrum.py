@@ -36,7 +36,7 @@ _MOST_BARS = 12
 @dataclass(frozen=True)
 class Spectrum(Product):
     """Spectrum of a pixel (--view 3 --pixel 120,80) or of a point of space (--point=0.1,-0.2,0.5): predicted, and
-    measured where the scene is at hand, as CSV and plot; abundances and nearest known materials as JSON."""
+    measured where the scene folder is found, as CSV and plot; abundances and nearest known materials as JSON."""
 
     name = "spectrum"
 
@@ -109,7 +109,7 @@ class Spectrum(Product):
             scene = find_scene(job.loaded.record.summary, job.loaded.folder.path, self.data)
         names = [] if scene is None else [frame.name for frame in scene.frames]
         if scene is None or view.name not in names:
-            job.say("the scene is not at hand: no measured spectrum (--data says where it is)")
+            job.say("the scene folder was not found: no measured spectrum; give it with --data")
             return None
         recorded, light = job.loaded.record.summary.get("illuminant"), job.scene.light_power
         return relit(scene.cube(names.index(view.name))[pixel[1], pixel[0]], recorded, light)

@@ -64,7 +64,7 @@ def write_volume(
         folder: Where to write; it is made.
         scene: Trained.
         grid: Where to sample.
-        frame: Of the run.
+        frame: From the scene's world to model space.
         slices: 0 to X - 1, in order.
     Raises:
         RunError: the disk is full or refuses.

@@ -19,6 +19,7 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION, Coefficients
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 SOLID_ACCUMULATION = 0.9
@@ -41,23 +42,27 @@ class SurfacePoints:
     """Unit vectors away from the camera."""
     abundances: Float[Tensor, "P K"]
     """Of what the ray ends on, summing to 1."""
-    diffuse: Float[Tensor, "P B"]
-    """Spectra without the view-dependent part."""
+    scaled_abundances: Float[Tensor, "P K"]
+    """What the endmembers are multiplied with; spectra would take far more memory."""
 
     def __len__(self) -> int:
         return len(self.positions)
 
+    def diffuse(self, materials: Materials) -> Float[Tensor, "P B"]:
+        """Spectra without the view-dependent part."""
+        return self.scaled_abundances @ materials.endmembers.detach().cpu()
+
     def select(self, chosen: Bool[Tensor, " P"] | Int64[Tensor, " chosen"]) -> SurfacePoints:
         """Some of the points."""
-        return SurfacePoints(
-            self.positions[chosen], self.directions[chosen], self.abundances[chosen], self.diffuse[chosen]
-        )
+        return SurfacePoints(*(getattr(self, name)[chosen] for name in _POINT_FIELDS))
 
     @staticmethod
     def concatenate(parts: Sequence[SurfacePoints]) -> SurfacePoints:
         """The points of all parts, in order."""
-        names = ("positions", "directions", "abundances", "diffuse")
-        return SurfacePoints(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
+        return SurfacePoints(*(torch.cat([getattr(part, name) for part in parts]) for name in _POINT_FIELDS))
+
+
+_POINT_FIELDS = ("positions", "directions", "abundances", "scaled_abundances")
 
 
 class SeenSurface:
@@ -94,7 +99,7 @@ class SeenSurface:
             SurfacePoints(
                 (rays.origins + distances[:, None] * rays.directions)[solid],
                 rays.directions[solid],
-                *_looks(self._scene, found, solid),
+                *_shares(found, solid),
             )
         )
 
@@ -165,16 +170,18 @@ def look_from_above(
     if len(rays) == 0:
         return torch.zeros(0, len(scene.materials.names)), torch.zeros(0, len(scene.bands))
     found = scene.renderer.composite(scene.field, rays)
-    return _looks(scene, found, torch.ones(len(above), dtype=torch.bool))
+    abundances, scaled_abundances = _shares(found, torch.ones(len(above), dtype=torch.bool))
+    return abundances, scaled_abundances @ scene.materials.endmembers.detach().cpu()
 
 
-def _looks(
-    scene: TrainedScene, found: Coefficients, chosen: Bool[Tensor, " R"]
-) -> tuple[Float[Tensor, "P K"], Float[Tensor, "P B"]]:
-    """Abundances and diffuse spectra of what the chosen rays end on."""
+def _shares(
+    found: Coefficients, chosen: Bool[Tensor, " R"]
+) -> tuple[Float[Tensor, "P K"], Float[Tensor, "P K"]]:
+    """Abundances of what the chosen rays end on, and the same scaled; on the CPU."""
     rows = chosen.to(found.accumulation.device)
     opacity = found.accumulation.flatten()[rows].clamp(min=1e-6)[:, None]
     abundances, scaled_abundances = (
-        values.flatten(0, -2)[rows] / opacity for values in (found.abundances, found.scaled_abundances)
+        (values.flatten(0, -2)[rows] / opacity).cpu()
+        for values in (found.abundances, found.scaled_abundances)
     )
-    return abundances.cpu(), (scaled_abundances @ scene.materials.endmembers).detach().cpu()
+    return abundances, scaled_abundances

@@ -41,7 +41,7 @@ class CameraRequest:
     num_frames: int | None = None
     """Of a path that is made here."""
     frames_per_second: float | int | None = None
-    """Of videos; None: as in the file, or whatever suits each."""
+    """Of videos; None: as in the file, or a default for each kind of video."""
 
 
 @dataclass(frozen=True)

@@ -57,8 +57,8 @@ class Block:
 
 
 class RenderJob:
-    """A context: render its blocks, in their order. A view's files get their names when its last block is done, videos
-    at the end; whatever is not complete when an error comes is left without a trace."""
+    """A context in which to render the blocks, in their order. A view's files get their names when its last block is
+    done, videos at the end; after an error nothing incomplete is left."""
 
     def __init__(
         self,

@@ -37,9 +37,9 @@ def write_report(
     Args:
         folder: Where to write; it is made.
         loaded: The run.
-        views: All views that are to be shown have been added.
+        views: What was rendered.
         library: Known materials.
-        stored_figures: What `eval/metrics.json` has; None without it: then those of `views`, if the truth was at hand.
+        stored_figures: What `eval/metrics.json` has; None: those of `views`, if they were compared with measured ones.
         notes: What a reader has to know first.
     Raises:
         RunError: the disk is full or refuses.

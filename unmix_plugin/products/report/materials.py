@@ -55,7 +55,7 @@ def material_cards(
     """A card for each endmember.
 
     Args:
-        materials: Of the model.
+        materials: The scene's materials.
         proportions: Part of all that is seen that each is.
         light: In which the spectra are seen; None where it is unknown.
         library: Known materials.

@@ -18,7 +18,7 @@ _LARGEST_SIDE_PX = 640
 
 
 def render_page(values: Mapping[str, Any]) -> str:
-    """The template filled in; whatever is text is escaped."""
+    """The template filled in; text is escaped."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(

@@ -82,7 +82,7 @@ def map_columns(count: int) -> int:
 
 
 def error_chart(views: ReportViews) -> LineChart | None:
-    """Error against wavelength; None where the truth is not at hand."""
+    """Error against wavelength; None without measured views."""
     if not np.isfinite(views.rmse_of_bands).all():
         return None
     nm = views.materials.bands.centers_nm

@@ -22,7 +22,7 @@ _VIEWS_WITH_SHARES = 2
 class Report(Product):
     """One HTML file about the run, report.html, which needs nothing else: scene, views, materials with their nearest
     known ones, abundances, segmentation, figures of merit, errors, training, settings. Measured images and labels are
-    shown where the scene is at hand."""
+    shown where the scene folder is found."""
 
     name = "report"
 
@@ -62,7 +62,7 @@ class Report(Product):
         return self.edits is not None or self.illuminant is not None
 
     def _look(self, job: Job, chosen: list[RunView]) -> ReportViews:
-        """Render the views, and compare each with what was measured, if that is at hand and still fits."""
+        """Render the views, and compare each with what was measured, if the scene folder is found and unchanged."""
         from unmix_plugin.products.report.views import ReportViews, evenly
         from unmix_plugin.trained.evaluation import Evaluation, scene_truth, view_truth
 
@@ -86,7 +86,7 @@ class Report(Product):
         with job.working("looking for the scene"):
             scene = find_scene(job.loaded.record.summary, job.loaded.folder.path, self.data)
         if scene is None:
-            job.say("the scene is not at hand: nothing measured in the report (--data says where it is)")
+            job.say("the scene folder was not found: nothing measured in the report; give it with --data")
         return scene
 
 

@@ -60,8 +60,8 @@ class ReportViews:
     ) -> None:
         """
         Args:
-            materials: Of the model.
-            evaluation: Takes the figures of merit, where the truth is at hand.
+            materials: The scene's materials.
+            evaluation: Collects the figures of merit; None without measured views.
             with_shares: Names of the views whose abundances are shown.
         """
         num_bands = len(materials.bands)
@@ -95,7 +95,7 @@ class ReportViews:
 
     @property
     def rmse_of_bands(self) -> Float64[np.ndarray, " B"]:
-        """Root mean squared error of each band over pixels that show matter; NaN where no truth is at hand."""
+        """Root mean squared error of each band over pixels that show matter; NaN without measured views."""
         return np.sqrt(self._squares / self._pixels) if self._pixels else np.full(len(self._squares), np.nan)
 
     @property
