@@ -292,7 +292,7 @@ def test_spread_density_is_penalised_early_and_only_where_no_alpha_says_what_is_
 def test_abundances_are_drawn_to_those_that_measured_spectra_show():
     model = make_model(losses=LossConfig(abundances=0.5))
     shown = torch.tensor([0, 2, 1])
-    spectra = 0.5 * model.first_endmembers[shown]
+    spectra = 0.5 * model.guide.endmembers[shown]
     batch = {"spectra": spectra, "alpha": torch.ones(3), "pixels": torch.arange(3)}
     right = torch.eye(3)[shown]
     losses = [
@@ -311,7 +311,7 @@ def test_the_guide_of_abundances_lets_go_of_them_as_training_goes_on():
     model = make_model(losses=LossConfig(abundances=0.5, abundances_final_factor=0.01))
     begin_step = model.get_training_callbacks()[0].func
     batch = {
-        "spectra": 0.5 * model.first_endmembers,
+        "spectra": 0.5 * model.guide.endmembers,
         "alpha": torch.ones(3),
         "pixels": torch.arange(3),
     }

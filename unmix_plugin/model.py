@@ -23,6 +23,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from unmix_plugin.abundance_guide import AbundanceGuide
 from unmix_plugin.alpha_preset import Auto, choose, preset_for
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
@@ -41,23 +42,13 @@ from unmix_plugin.spectral.unmixing.endmembers import (
     EndmemberMethod,
     drop_uninformative_pixels,
     initialise_endmembers,
-    shows_a_shape,
 )
 from unmix_plugin.spectral.unmixing.given_endmembers import given_endmembers
-from unmix_plugin.spectral.unmixing.mixture_guide import (
-    MixtureCache,
-    abundance_error,
-    margin_error,
-    margin_variance,
-    mixing_penalty,
-)
 from unmix_plugin.spectral.unmixing.num_materials import propose_num_materials
 from unmix_plugin.training_losses import LossConfig, compare_pixels, pixel_mean, spectral_losses
 
 _FEWEST_RAYS, _MOST_RAYS = 64, 8192
 _PIXELS_TO_COUNT_BY = 20_000
-_OBSERVED_PIXELS = 256
-"""Pixels of a batch by which the error of margins is followed."""
 
 
 @dataclass(frozen=True)
@@ -136,9 +127,6 @@ class UnmixModel(Model):
     rgb_weights: Tensor
     every_band: Tensor
     endmember_bound: Tensor
-    first_endmembers: Tensor
-    penalty: Tensor
-    margin_variance: Tensor
 
     def populate_modules(self) -> None:
         """Field, grid, endmembers (K, B) and specular spectra (J, B), shaped by config and metadata.
@@ -168,10 +156,7 @@ class UnmixModel(Model):
         self.register_buffer("rgb_weights", rgb_matrix(self.bands), persistent=False)
         self.register_buffer("every_band", torch.eye(len(self.bands)), persistent=False)
         self.register_buffer("endmember_bound", torch.ones(()))
-        self.register_buffer("first_endmembers", torch.zeros(shape))
-        self.register_buffer("penalty", torch.zeros(()))
-        self.register_buffer("margin_variance", torch.full((), torch.inf))
-        self._mixtures: MixtureCache | None = None
+        self.guide = AbundanceGuide(*shape)
         self._progress = 0.0
 
     def initialise(self, initial_data: Mapping[str, np.ndarray], generator: torch.Generator) -> None:
@@ -186,9 +171,8 @@ class UnmixModel(Model):
         pixels = torch.from_numpy(initial_data["pixels"])
         endmembers = self._first_endmembers(pixels, lamp, generator)
         self.endmembers.copy_(endmembers)
-        self.first_endmembers.copy_(endmembers)
         self.endmember_bound.fill_(max(1.0, float(endmembers.max())))
-        self.penalty.fill_(mixing_penalty(pixels, endmembers, self.config.losses.mixing_penalty))
+        self.guide.start(pixels, endmembers, self.config.losses.mixing_penalty)
         for row in range(len(self.specular_spectra)):
             spectrum = lamp if row == 0 else endmembers[(row - 1) % len(endmembers)]
             self.specular_spectra[row] = spectrum
@@ -228,7 +212,7 @@ class UnmixModel(Model):
             self.every_band if self.config.specular == "full" else self.specular_spectra,
             self.config.segmentation,
             light=None if light is None else self.endmembers.new_tensor(light),
-            margin_error=margin_error(self.margin_variance) if self.config.losses.abundances > 0 else None,
+            margin_error=self.guide.margin_error if self.config.losses.abundances > 0 else None,
         )
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
@@ -266,10 +250,7 @@ class UnmixModel(Model):
             losses["spread"] = outputs["spread"]
         if "abundances" in weights:
             abundances = pixel_mean(outputs["abundances"], len(measured))
-            mixtures = self._measured_mixtures(batch)
-            losses["abundances"] = abundance_error(
-                abundances, mixtures, batch["alpha"], shows_a_shape(measured)
-            )
+            losses["abundances"] = self.guide.error(abundances, batch)
         return {name: weights[name] * losses[name] for name in weights}
 
     def observe(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> None:
@@ -280,11 +261,7 @@ class UnmixModel(Model):
             is_seen = outputs["weights"] > threshold
             self.grid.visibility.record(outputs["positions"], outputs["views"], is_seen, num_rays)
         if self.config.losses.abundances > 0:
-            few = {name: values[:_OBSERVED_PIXELS] for name, values in batch.items()}
-            abundances = pixel_mean(outputs["abundances"], len(batch["spectra"]))[:_OBSERVED_PIXELS].detach()
-            counts = shows_a_shape(few["spectra"]) & (few["alpha"] > 0.99)
-            variance = margin_variance(self.margin_variance, abundances, self._measured_mixtures(few), counts)
-            self.margin_variance.copy_(variance)
+            self.guide.observe(pixel_mean(outputs["abundances"], len(batch["spectra"])), batch)
 
     def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """`psnr` of the batch in dB, on black."""
@@ -367,12 +344,6 @@ class UnmixModel(Model):
     def _bound_spectra(self, step: int, progress: float) -> None:
         self.endmembers.clamp_(min=0.0).clamp_(max=self.endmember_bound)
         self.specular_spectra.clamp_(0, 1)
-
-    def _measured_mixtures(self, batch: dict[str, Tensor]) -> Float[Tensor, "R K"]:
-        """What the pixels of a batch are made of, by the first endmembers."""
-        if self._mixtures is None:
-            self._mixtures = MixtureCache(self.num_endmembers, self.device)
-        return self._mixtures.mixtures(batch["pixels"], batch["spectra"], self.first_endmembers, self.penalty)
 
     def _checked_num_endmembers(self) -> int:
         count = self.config.num_endmembers
