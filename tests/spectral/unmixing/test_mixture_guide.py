@@ -4,7 +4,7 @@ import torch
 from torch.testing import assert_close
 
 from tests.spectral.mixtures import seeded, smooth_endmembers
-from unmix_plugin.spectral.unmixing.endmembers import drop_uninformative_pixels, shows_a_shape
+from unmix_plugin.spectral.unmixing.endmembers import drop_uninformative_pixels, has_spectral_shape
 from unmix_plugin.spectral.unmixing.mixture_guide import (
     MixtureCache,
     abundance_error,
@@ -27,7 +27,7 @@ def penalty(noise: float) -> float:
 
 def error(abundances: torch.Tensor, measured: torch.Tensor, alpha: torch.Tensor) -> float:
     mixtures = sparse_abundances(measured, ENDMEMBERS, penalty(0.0))
-    return float(abundance_error(abundances, mixtures, alpha, shows_a_shape(measured)))
+    return float(abundance_error(abundances, mixtures, alpha, has_spectral_shape(measured)))
 
 
 def test_abundances_that_the_measured_spectra_show_are_no_error():

@@ -70,7 +70,7 @@ def drop_uninformative_pixels(pixels: Float[Tensor, "N B"]) -> Float[Tensor, "ke
     return unsaturated[rms > max(DARK_RMS, _DARK_SHARE * bright)]
 
 
-def shows_a_shape(pixels: Float[Tensor, "N B"]) -> Bool[Tensor, " N"]:
+def has_spectral_shape(pixels: Float[Tensor, "N B"]) -> Bool[Tensor, " N"]:
     """Where a pixel is neither black (root mean square over bands at most 0.005) nor saturated (1 or above)."""
     return (pixels.amax(dim=1) < 1) & (pixels.square().mean(dim=1).sqrt() > DARK_RMS)
 
