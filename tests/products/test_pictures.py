@@ -11,7 +11,7 @@ from PIL import Image
 from unmix_plugin.figures.picture_grid import (
     NEUTRAL,
     ColourScale,
-    Panel,
+    TitledPicture,
     draw_panels,
     in_rows,
     over_neutral,
@@ -78,7 +78,7 @@ def test_no_figure_is_cut_off_however_many_materials(count):
 
 @pytest.mark.parametrize(("height", "width"), [(4, 40), (40, 4), (1, 1), (700, 20)])
 def test_pictures_of_any_shape_fit_their_page(height, width):
-    panels = [Panel(np.zeros((height, width, 3)), "a title that is rather long", (0.5, 0.5, 0.5))] * 3
+    panels = [TitledPicture(np.zeros((height, width, 3)), "a title that is rather long", (0.5, 0.5, 0.5))] * 3
     legend = [("a material with a long name indeed", (1.0, 0.0, 0.0))] * 7
     assert_has_white_margins(draw_panels(in_rows(panels, 2), "heading", SCALE, legend))
 

@@ -35,7 +35,7 @@ Picture = Float[np.ndarray, "H W 3"]
 
 
 @dataclass(frozen=True)
-class Panel:
+class TitledPicture:
     """One picture of a figure."""
 
     image: Picture
@@ -84,14 +84,14 @@ def columns_for(count: int) -> int:
     return count if count <= 4 else max(4, int(np.ceil(np.sqrt(1.6 * count))))
 
 
-def in_rows(panels: Sequence[Panel], columns: int | None = None) -> list[Sequence[Panel]]:
+def in_rows(panels: Sequence[TitledPicture], columns: int | None = None) -> list[Sequence[TitledPicture]]:
     """Panels in rows of equal length, the last one perhaps shorter."""
     width = columns or columns_for(len(panels))
     return [panels[i : i + width] for i in range(0, len(panels), width)]
 
 
 def draw_panels(
-    rows: Sequence[Sequence[Panel]],
+    rows: Sequence[Sequence[TitledPicture]],
     heading: str,
     scale: ColourScale | None = None,
     legend: Sequence[tuple[str, Colour]] = (),
@@ -139,7 +139,7 @@ def _axes(figure: Any, box: tuple[float, float, float, float], page: tuple[float
 
 
 def _draw_panel(
-    figure: Any, panel: Panel, box: tuple[float, float, float, float], page: tuple[float, float]
+    figure: Any, panel: TitledPicture, box: tuple[float, float, float, float], page: tuple[float, float]
 ) -> None:
     axes = _axes(figure, box, page)
     axes.imshow(np.clip(panel.image, 0, 1))

@@ -11,7 +11,14 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from unmix_plugin.figures.picture_grid import ColourScale, Panel, draw_panels, in_rows, over_neutral, paint
+from unmix_plugin.figures.picture_grid import (
+    ColourScale,
+    TitledPicture,
+    draw_panels,
+    in_rows,
+    over_neutral,
+    paint,
+)
 from unmix_plugin.formats.envi_cube import envi_cube_paths, write_envi_cube
 from unmix_plugin.formats.exr import layer_names, write_exr
 from unmix_plugin.formats.files import array_bytes, write_file
@@ -66,10 +73,10 @@ def view_paths(folder: Path, view: str, kind: str) -> list[Path]:
     return envi_cube_paths(folder / view) if kind == "envi" else [folder / f"{view}.{kind}"]
 
 
-def colour_panel(view: RenderedView, bands: Bands) -> Panel:
+def colour_panel(view: RenderedView, bands: Bands) -> TitledPicture:
     """A view as an eye, or a camera with these bands, sees it."""
     title = "colour" if colour_mode(bands) == "true-colour" else "false colour"
-    return Panel(picture(view.spectra, view.accumulation, bands), title)
+    return TitledPicture(picture(view.spectra, view.accumulation, bands), title)
 
 
 def draw_abundances(name: str, view: RenderedView, materials: Materials) -> bytes:
@@ -84,10 +91,10 @@ def share_panels(
     opacity: Float[Tensor, "H W"],
     titles: Sequence[str],
     swatches: Float[np.ndarray, "K 3"],
-) -> list[Panel]:
+) -> list[TitledPicture]:
     """A panel for each material: its share of what is seen, faded by opacity."""
     images = [paint(image, SHARE_SCALE) for image in np.moveaxis(as_numpy(shares), -1, 0)]
     return [
-        Panel(over_neutral(image, as_numpy(opacity)), title, swatch)
+        TitledPicture(over_neutral(image, as_numpy(opacity)), title, swatch)
         for image, title, swatch in zip(images, titles, swatches, strict=True)
     ]

@@ -18,7 +18,7 @@ from unmix_plugin.figures.material_colours import distinct_colours, own_colours
 from unmix_plugin.figures.picture_grid import (
     NEUTRAL,
     ColourScale,
-    Panel,
+    TitledPicture,
     draw_panels,
     in_rows,
     over_neutral,
@@ -85,9 +85,9 @@ def draw_colour(view: ViewTruth, predicted: RenderedView, bands: Bands, psnr_db:
     )
     seen = np.maximum(as_numpy(view.opacity), as_numpy(predicted.accumulation))
     panels = [
-        Panel(picture(view.spectra, view.opacity, bands), "true"),
-        Panel(picture(predicted.spectra, predicted.accumulation, bands), "predicted"),
-        Panel(over_neutral(paint(error, _ERROR_SCALE), (seen > 0.01).astype(np.float64)), "error"),
+        TitledPicture(picture(view.spectra, view.opacity, bands), "true"),
+        TitledPicture(picture(predicted.spectra, predicted.accumulation, bands), "predicted"),
+        TitledPicture(over_neutral(paint(error, _ERROR_SCALE), (seen > 0.01).astype(np.float64)), "error"),
     ]
     heading = f"{view.name}: {describe_colour(bands).split(':')[0]}, spectral PSNR {psnr_db:.1f} dB"
     return draw_panels([panels], heading, _ERROR_SCALE)
@@ -104,14 +104,14 @@ def draw_matched_segmentation(
     colours = look.pred_colours(matching)
     as_true = np.full(256, NOTHING_ID, dtype=np.uint8)
     as_true[list(matching)] = list(matching.values())
-    panels = [Panel(paint_ids(ids, colours), "predicted")]
+    panels = [TitledPicture(paint_ids(ids, colours), "predicted")]
     seen = set(np.unique(as_true[ids]).tolist())
     extra: list[tuple[str, Colour]] = []
     if labels is not None:
         agreement = np.where((as_true[ids] != labels)[..., None], WRONG, RIGHT)
         agreement[labels == NOTHING_ID] = NEUTRAL
-        true = Panel(paint_ids(labels, dict(enumerate(look.true_colours))), "true")
-        panels = [true, *panels, Panel(agreement, "disagreement")]
+        true = TitledPicture(paint_ids(labels, dict(enumerate(look.true_colours))), "true")
+        panels = [true, *panels, TitledPicture(agreement, "disagreement")]
         seen |= set(np.unique(labels).tolist())
         extra = [("right", RIGHT), ("wrong", WRONG), ("unlabelled", (NEUTRAL,) * 3)]
     true_entries = [entry for index, entry in enumerate(look.true_entries) if index in seen]
@@ -134,7 +134,7 @@ def draw_matched_abundances(
         return draw_panels(in_rows(pred_panels), heading, SHARE_SCALE)
     has_truth = view.abundances.sum(dim=-1) > 0
     true_panels = share_panels(view.abundances, view.opacity * has_truth, look.true_names, look.true_colours)
-    blank = Panel(np.full_like(true_panels[0].image, NEUTRAL), "none matched")
+    blank = TitledPicture(np.full_like(true_panels[0].image, NEUTRAL), "none matched")
     partners = dict(zip(matching.true_ids, matching.pred_ids, strict=True))
     partner_panels = [
         pred_panels[partners[index]] if index in partners else blank for index in range(len(true_panels))

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Float64, UInt8
 from torch import Tensor
 
-from unmix_plugin.figures.picture_grid import NEUTRAL, Panel, Picture, draw_panels
+from unmix_plugin.figures.picture_grid import NEUTRAL, Picture, TitledPicture, draw_panels
 from unmix_plugin.figures.plotting import Colour
 from unmix_plugin.formats.files import array_bytes, write_file
 from unmix_plugin.formats.png import indexed_png_bytes
@@ -75,7 +75,7 @@ def draw_segmentation(name: str, view: RenderedView, materials: Materials) -> by
     """A figure of a view in colour and of its materials, with a legend of those that occur."""
     colours = endmember_colours(materials)
     ids = view.segmentation.numpy()
-    painted = Panel(paint_ids(ids, dict(enumerate(colours))), "materials")
+    painted = TitledPicture(paint_ids(ids, dict(enumerate(colours))), "materials")
     present = [index for index in range(len(colours)) if (ids == index).any()]
     legend = [(materials.names[index], colours[index]) for index in present]
     return draw_panels(

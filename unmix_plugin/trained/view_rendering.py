@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -12,7 +13,9 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.figures.picture_grid import Picture, premultiplied_over_neutral
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
-from unmix_plugin.trained.trained_scene import TrainedScene
+
+if TYPE_CHECKING:
+    from unmix_plugin.trained.trained_scene import TrainedScene
 
 
 @dataclass(frozen=True)
