@@ -2,6 +2,7 @@
 
 import socket
 import threading
+import urllib.request
 
 import pytest
 
@@ -93,3 +94,11 @@ def test_waiting_ends_when_no_page_is_left(source, monkeypatch):
             assert waiting.is_alive()
         waiting.join(30)
         assert not waiting.is_alive()
+
+
+def test_the_page_has_the_title_of_the_viewer(viewer):
+    with urllib.request.urlopen(f"http://127.0.0.1:{viewer.port}/") as answer:
+        page = answer.read().decode()
+    assert "<title>unmix-nerf</title>" in page
+    assert "<title>Viser" not in page
+    assert "prefers-color-scheme: dark" in page

@@ -16,7 +16,9 @@ from unmix_plugin.viewer.view_cameras import pose_of
 if TYPE_CHECKING:
     import viser
 
-_FRUSTUM_SIZE = 0.12
+_LARGEST_FRUSTUM = 0.12
+_FRUSTUM_SHARE = 0.3
+"""Size of a frustum in the distance to its nearest neighbour, so that frusta do not cover each other."""
 _POINT_SIZE = 0.012
 _MOST_POINTS = 20_000
 _PROBE_RADIUS = 0.015
@@ -32,7 +34,7 @@ def add_cameras(
     thumbnails: Mapping[str, Thumbnail | None],
 ) -> list[viser.CameraFrustumHandle]:
     """One frustum a view, with its image where there is one; the first `num_train` are training views."""
-    handles = []
+    handles, size = [], _frustum_size(views)
     for index, view in enumerate(views):
         pose = pose_of(view.camera)
         handles.append(
@@ -40,7 +42,7 @@ def add_cameras(
                 f"/cameras/{index:04d}",
                 fov=pose.fov,
                 aspect=pose.aspect,
-                scale=_FRUSTUM_SIZE,
+                scale=size,
                 color=_TRAIN_COLOUR if index < num_train else _EVAL_COLOUR,
                 image=thumbnails.get(view.name),
                 wxyz=pose.wxyz,
@@ -48,6 +50,14 @@ def add_cameras(
             )
         )
     return handles
+
+
+def _frustum_size(views: list[RunView]) -> float:
+    places = torch.cat([view.camera.camera_to_world[:, :, 3] for view in views]).cpu()
+    if len(places) < 2:
+        return _LARGEST_FRUSTUM
+    nearest = torch.cdist(places, places).fill_diagonal_(torch.inf).min(dim=1).values
+    return min(_LARGEST_FRUSTUM, max(_FRUSTUM_SHARE * float(nearest.median()), 1e-3))
 
 
 def add_box(client: viser.ClientHandle, box: SceneBox) -> viser.LineSegmentsHandle:

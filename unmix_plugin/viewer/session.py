@@ -6,6 +6,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,12 +16,13 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.material_library import LibraryMatch, measured_library
 from unmix_plugin.viewer import html
 from unmix_plugin.viewer.failures import failures_said
+from unmix_plugin.viewer.inputs import number
 from unmix_plugin.viewer.kept_pages import PageState
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings, first_settings
 from unmix_plugin.viewer.layers.painting import ColourMapLegend
 from unmix_plugin.viewer.recipe_editor import RecipeHistory
 from unmix_plugin.viewer.rendering.edits import Edit
-from unmix_plugin.viewer.rendering.view import Shown, View
+from unmix_plugin.viewer.rendering.view import DEFAULT_HEIGHT, HEIGHT_BOUNDS, Shown, View
 from unmix_plugin.viewer.services import Services
 from unmix_plugin.viewer.view_cameras import ViewPose, camera_of, checked_pose, pose_of
 
@@ -29,7 +31,6 @@ if TYPE_CHECKING:
 
     from unmix_plugin.engine.geometry.cameras import Cameras
     from unmix_plugin.spectral.materials import Materials
-    from unmix_plugin.viewer.panels import Panel
 
 _MOVING_QUALITY, _RESTING_QUALITY = 80, 90
 """JPEG quality of pictures that are soon replaced, and of those that stay."""
@@ -38,6 +39,20 @@ _SMALL_PIXELS = 1 << 14
 """Pictures of so few pixels are enlarged so much that compression with loss would show; they are sent as PNG."""
 
 _NOTICE_S = 8.0
+_ALIKE_RAD = 0.1
+"""Spectral angle up to which two materials are alike."""
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One tab of a client's controls."""
+
+    title: str
+    """Label of the tab."""
+    build: Callable[[Session], object]
+    """Builds the controls in the tab that is open; what follows a run or an edit asks the session to be told."""
+    applies: Callable[[Services], bool] = lambda _: True
+    """Whether clients of a viewer have it."""
 
 
 class Session:
@@ -64,6 +79,7 @@ class Session:
         self.view = View(show=self._show, report=self._report, edit=Edit(self.history.present))
         if state is None:
             self.view.settings = first_settings(self.materials().bands)
+            self.view.largest_height = _first_height(client.camera.image_height)
         else:
             self.view.settings, self.view.pose = state.settings, state.pose
             self.view.largest_height, self.view.subpixels = state.largest_height, state.subpixels
@@ -242,6 +258,17 @@ class Session:
         """What is wrong with the picture, in the panel until it is mended."""
         if self._status is not None and not self.is_closed and text:
             self._status.content = html.paragraph(text, is_warning=True)
+
+
+def likeness(match: LibraryMatch) -> str:
+    """A known material and how far it is off; matches that say little are marked."""
+    remark = "" if match.angle_rad <= _ALIKE_RAD else ", not alike"
+    return f"{match.name} ({match.angle_rad:.3f} rad{remark})"
+
+
+def _first_height(canvas_rows: Any) -> int:
+    """Rows of the finest picture of a new page: those of its canvas, within reason."""
+    return int(number(canvas_rows, DEFAULT_HEIGHT, HEIGHT_BOUNDS[1], fallback=DEFAULT_HEIGHT)) // 16 * 16
 
 
 def pose_from(camera: viser.CameraHandle) -> ViewPose:

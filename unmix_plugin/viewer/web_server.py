@@ -3,15 +3,29 @@
 from __future__ import annotations
 
 import asyncio
+import atexit
 import contextlib
 import io
+import shutil
+import tempfile
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from unittest import mock
 
 if TYPE_CHECKING:
     import viser
 
 LABEL = "unmix-nerf"
+
+_HEAD = f"""<title>{LABEL}</title>
+<script>
+  const asked = new URLSearchParams(location.search);
+  if (matchMedia("(prefers-color-scheme: dark)").matches && !asked.has("darkMode")) {{
+    asked.set("darkMode", "");
+    history.replaceState(null, "", "?" + asked);
+  }}
+</script>"""
 
 _MOST_CONNECTIONS = 64
 """Connections that may be open at once, served or not."""
@@ -29,7 +43,7 @@ def open_server(host: str, port: int) -> viser.ViserServer:
         def request_share_url(self, verbose: bool = True) -> str | None:
             return None
 
-    with quiet():
+    with quiet(), _own_page():
         server = LocalServer(host=host, port=port, label=LABEL, verbose=False)
     websocket_server = server._websock_server
     _refuse_uploads(websocket_server)
@@ -41,6 +55,26 @@ def open_server(host: str, port: int) -> viser.ViserServer:
 
     websocket_server.on_client_connect(accept)
     return server
+
+
+@contextlib.contextmanager
+def _own_page() -> Iterator[None]:
+    """Context in which servers send viser's page under our title, dark where the browser's user prefers that.
+
+    viser has no setting for either, and reads its page from a folder that only its websocket server is told.
+    """
+    from viser import infra
+
+    original, folder = infra.WebsockServer, Path(tempfile.mkdtemp(prefix="unmix-viewer-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+
+    def with_own_page(http_server_root: Path, **options: Any) -> infra.WebsockServer:
+        page = (http_server_root / "index.html").read_text()
+        (folder / "index.html").write_text(page.replace("<title>Viser</title>", _HEAD, 1))
+        return original(http_server_root=folder, **options)
+
+    with mock.patch.object(infra, "WebsockServer", with_own_page):
+        yield
 
 
 def headers_of(client: viser.ClientHandle) -> dict[str, str] | None:

@@ -35,7 +35,7 @@ from unmix_plugin.viewer.recipe_editor import (
     with_visible,
 )
 from unmix_plugin.viewer.rendering.edits import Edit
-from unmix_plugin.viewer.session import Session
+from unmix_plugin.viewer.session import Session, likeness
 from unmix_plugin.viewer.settling import Settling
 
 _OWN_LIGHT = "as recorded"
@@ -206,9 +206,7 @@ class MaterialsPanel:
             self._light.value = _OWN_LIGHT if recipe.illuminant is None else str(recipe.illuminant.light)
             spectrum = materials.endmembers[index : index + 1].double().cpu().numpy()
             alike = self._session.nearest_materials(spectrum, materials.bands)[0]
-            self._alike.content = html.table(
-                [("like", f"{one.name} ({one.angle_rad:.3f} rad)") for one in alike]
-            )
+            self._alike.content = html.table([("like", likeness(one)) for one in alike])
             self._recipe.show()
         finally:
             self._is_showing = False
@@ -237,7 +235,7 @@ class MaterialsPanel:
         entries = []
         for index, (name, found) in enumerate(zip(materials.names, matches, strict=False)):
             is_gone = index in hidden or (isolated and index not in isolated)
-            like = f", like {found[0].name} ({found[0].angle_rad:.2f} rad)" if found else ""
+            like = f", like {likeness(found[0])}" if found else ""
             entries.append((f"{name}{' (hidden)' if is_gone else ''}{like}", colours[index]))
         return html.swatches(entries)
 

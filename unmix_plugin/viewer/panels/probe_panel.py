@@ -14,7 +14,7 @@ from unmix_plugin.viewer.charts import Chart, Line
 from unmix_plugin.viewer.inputs import new_file, number
 from unmix_plugin.viewer.probing import ProbedPoint, abundances_csv, spectra_csv
 from unmix_plugin.viewer.scene_objects import add_probe
-from unmix_plugin.viewer.session import Session
+from unmix_plugin.viewer.session import Session, likeness
 from unmix_plugin.viewer.view_cameras import camera_of
 
 if TYPE_CHECKING:
@@ -126,10 +126,7 @@ class ProbePanel:
 
     def _library_rows(self, shown: ProbedPoint) -> list[tuple[str, str]]:
         matches = self._session.nearest_materials(shown.predicted[None], shown.bands)[0]
-        return [
-            ("like" if rank == 0 else "", f"{match.name} ({match.angle_rad:.3f} rad)")
-            for rank, match in enumerate(matches)
-        ]
+        return [("like" if rank == 0 else "", likeness(match)) for rank, match in enumerate(matches)]
 
     def _save(self) -> None:
         if not self._probes:
