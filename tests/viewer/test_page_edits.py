@@ -5,8 +5,9 @@ import threading
 import numpy as np
 import pytest
 
+from tests.method_factory import make_model
 from tests.viewer.pages import decoded, opened, serving, show_layer
-from tests.viewer.view_factory import make_source
+from tests.viewer.view_factory import source_of_model
 from unmix_plugin.editing import Light, Recipe, Retint
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.bands import Bands
@@ -130,11 +131,11 @@ def test_files_outside_the_folder_of_recipes_are_not_read(viewer, tmp_path):
 
 
 def test_every_light_that_is_offered_can_be_chosen(tmp_path):
-    source = make_source(tmp_path)
+    model = make_model()
     infrared = Bands.of([700.0, 800.0, 900.0, 1000.0, 1100.0])
-    source._model.bands = infrared
-    source._model.metadata = {**source._model.metadata, "wavelengths_nm": infrared.centers_nm.tolist()}
-    with serving(source) as (viewer, _), opened(viewer) as page:
+    model.bands = infrared
+    model.metadata = {**model.metadata, "wavelengths_nm": infrared.centers_nm.tolist()}
+    with serving(source_of_model(model, tmp_path)) as (viewer, _), opened(viewer) as page:
         offered = page.controls[page.control("light")]["options"]
         assert 3 < len(offered) < len(illuminant_names())
         for name in offered[1:]:

@@ -37,7 +37,7 @@ def test_small_pictures_and_labels_are_sent_without_loss_and_large_ones_compress
         assert page.last_picture.startswith(b"\xff\xd8")
         labels = show_layer(page, "segmentation")
         assert page.last_picture.startswith(b"\x89PNG")
-        materials = viewer.services.maker.edited(Edit())
+        materials = viewer.services.maker.edited(Edit()).materials
         known = {
             tuple(row) for row in (viewer.services.aids().colours_of(materials) * 255).round().int().tolist()
         }

@@ -20,6 +20,7 @@ from unmix_plugin.formats.png import rgba_png_bytes
 from unmix_plugin.formats.spectral_exr import write_spectral_exr
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
 from unmix_plugin.trained.material_view import MaterialView
+from unmix_plugin.trained.protocol import RenderedView
 from unmix_plugin.viewer.rendering.edits import Edit
 from unmix_plugin.viewer.rendering.frames import FrameRender
 from unmix_plugin.viewer.rendering.render_loop import RenderLoop
@@ -51,7 +52,7 @@ class StripCapture:
         self,
         loop: RenderLoop,
         request: PictureRequest,
-        take: Callable[[int, MaterialView], None],
+        take: Callable[[int, RenderedView], None],
         done: Callable[[str], None],
         progress: Callable[[float], None],
     ) -> None:
@@ -92,7 +93,7 @@ class StripCapture:
         if self._capture is not None:
             self._capture.is_cancelled = True
 
-    def _strip_done(self, frame: MaterialView | None, reason: str) -> None:
+    def _strip_done(self, frame: RenderedView | None, reason: str) -> None:
         if frame is None:
             self._done(reason)
             return
@@ -139,8 +140,9 @@ class SpectraCanvas:
         self.opacity: Float32[np.ndarray, "H W"] = np.zeros(shape, np.float32)
         self._bands = None
 
-    def take(self, first_row: int, frame: MaterialView) -> None:
+    def take(self, first_row: int, frame: RenderedView) -> None:
         """Put a strip in its place."""
+        assert isinstance(frame, MaterialView)
         rows = slice(first_row, first_row + frame.camera.height)
         self._bands = frame.materials.bands
         self.spectra[rows] = frame["spectral"].cpu().numpy()

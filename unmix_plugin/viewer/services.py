@@ -23,6 +23,7 @@ from unmix_plugin.trained.run_views import RunView, recorded_views
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.failures import failures_said
 from unmix_plugin.viewer.layers.layer_settings import LayerAids
+from unmix_plugin.viewer.layers.output_layers import layers_of
 from unmix_plugin.viewer.recipe_editor import numbered
 from unmix_plugin.viewer.rendering.edits import Edit
 from unmix_plugin.viewer.rendering.frames import num_channels
@@ -73,7 +74,12 @@ class Services:
         self._read_scene = read_scene
         self._reader = threading.Thread(target=self._read, name="unmix-viewer-scene", daemon=True)
         with source.borrowed() as scene:
-            self.maker = PictureMaker(source, self.aids, self._see, num_channels(scene.materials))
+            self.layers = layers_of(scene)
+            self.has_materials = isinstance(scene, TrainedScene)
+            channels = (
+                num_channels(scene.materials) if isinstance(scene, TrainedScene) else 4 * len(scene.outputs)
+            )
+            self.maker = PictureMaker(source, self.aids, self._see, channels, self.layers)
         self._seen: tuple[int, Coefficients] | None = None
         self.loop = RenderLoop(self.maker)
         self.first_recipe = Recipe()
@@ -119,8 +125,11 @@ class Services:
             # Not left behind: a thread in native code when the interpreter ends takes the process down with it.
             self._reader.join()
 
-    def aids(self) -> LayerAids:
-        """What layers need; its reference rays follow a training. Must not be called while the model is lent."""
+    def aids(self) -> LayerAids | None:
+        """What layers of materials need, None without; its reference rays follow a training. Must not be called while
+        the scene is lent."""
+        if not self.has_materials:
+            return None
         version = self.source.version
         age = version - self._reference_version
         is_stale = age >= _REFERENCE_STEPS or (age > 0 and not self.source.is_changing)
@@ -141,18 +150,20 @@ class Services:
         return self._seen[1]
 
     def _new_aids(self) -> LayerAids:
-        with self.source.borrowed() as scene:
+        with self.source.borrowed_materials() as scene:
             reference = render_reference(scene, self.source.record.train_cameras)
         error_of = None if self.measured is None else self.measured.error
         return LayerAids(reference, self.source.record.scene_box, error_of, self.why_not_measured)
 
     def _read(self) -> None:
         """Read the scene; without it the viewer only lacks what was measured."""
-        _ = self.usable_lights  # takes a second, which the first page need not wait for
+        if self.has_materials:
+            _ = self.usable_lights  # takes a second, which the first page need not wait for
         with failures_said("the scene could not be read", self._note_missing):
             scene = self._read_scene()
             self.scene = scene
-            self.measured = MeasuredViews(scene, self.source)
+            if self.has_materials:
+                self.measured = MeasuredViews(scene, self.source)
         self._reference_version = -_REFERENCE_STEPS
 
     def _note_missing(self, reason: str) -> None:

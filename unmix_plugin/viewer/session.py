@@ -78,7 +78,7 @@ class Session:
         self.history = RecipeHistory(services.first_recipe) if state is None else state.history
         self.view = View(show=self._show, report=self._report, edit=Edit(self.history.present))
         if state is None:
-            self.view.settings = first_settings(self.materials().bands)
+            self.view.settings = self._first_settings()
             self.view.largest_height = _first_height(client.camera.image_height)
         else:
             self.view.settings, self.view.pose = state.settings, state.pose
@@ -100,6 +100,12 @@ class Session:
         self._object_owners: set[str] = set()
         self._warning: viser.NotificationHandle | None = None
         self._warning_said = (-math.inf, "")
+
+    def _first_settings(self) -> LayerSettings:
+        if self.services.has_materials:
+            return first_settings(self.materials().bands)
+        layers = self.services.layers
+        return LayerSettings(layer="rgb" if "rgb" in layers else next(iter(layers), "rgb"))
 
     def open(self, panels: Sequence[Panel]) -> None:
         """Build the panels, in the order of their tabs, and begin to render."""
@@ -186,7 +192,9 @@ class Session:
 
     def colours(self) -> list[tuple[float, ...]]:
         """sRGB colours that stand for the materials as this client sees them."""
-        return [tuple(row) for row in self.services.aids().colours_of(self.materials()).tolist()]
+        aids = self.services.aids()
+        assert aids is not None
+        return [tuple(row) for row in aids.colours_of(self.materials()).tolist()]
 
     def change_edit(self, edit: Edit) -> None:
         """Show the scene with other materials or light.

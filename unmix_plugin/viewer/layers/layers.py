@@ -8,8 +8,9 @@ black.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -33,7 +34,8 @@ from unmix_plugin.viewer.layers.painting import (
     tone_mapped,
 )
 
-Painter = Callable[[MaterialView, LayerSettings, LayerAids], tuple[Picture, Legend]]
+Painter = Callable[[Any, LayerSettings, Any], tuple[Picture, Legend]]
+"""From a rendered view, of the kind of scene that has the layer, and what layers need of the run."""
 
 
 @dataclass(frozen=True)
@@ -61,15 +63,16 @@ def paint_layer(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -
         return layer_named(settings.layer).paint(frame, settings, aids)
 
 
-def layer_named(name: str) -> Layer:
-    """A layer by its name.
+def layer_named(name: str, layers: Mapping[str, Layer] | None = None) -> Layer:
+    """A layer by its name, of those given or of all of mixed materials.
 
     Raises:
         ConfigError: there is none.
     """
-    if name not in LAYERS:
-        raise ConfigError(f"there is no layer named {name[:40]!r}; known: {', '.join(LAYERS)}")
-    return LAYERS[name]
+    known = LAYERS if layers is None else layers
+    if name not in known:
+        raise ConfigError(f"there is no layer named {name[:40]!r}; known: {', '.join(known)}")
+    return known[name]
 
 
 def _paint_colour(diffuse: bool, specular: bool) -> Painter:

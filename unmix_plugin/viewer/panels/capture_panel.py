@@ -55,7 +55,8 @@ class CapturePanel:
             self._name = gui.add_text("file name", "view")
             self._progress = gui.add_progress_bar(0.0)
             gui.add_button("save a screenshot (PNG)").on_click(session.guarded(self._save_picture))
-            gui.add_button("save the spectra (EXR)").on_click(session.guarded(self._save_spectra))
+            if session.services.has_materials:
+                gui.add_button("save the spectra (EXR)").on_click(session.guarded(self._save_spectra))
             gui.add_button("cancel").on_click(session.guarded(self._cancel))
         with gui.add_folder("camera path"):
             gui.add_button("add a key frame here").on_click(session.guarded(self._add_key))

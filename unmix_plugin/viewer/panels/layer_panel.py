@@ -9,7 +9,7 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.maps.indices import available_indices
 from unmix_plugin.viewer.inputs import index_in, text
 from unmix_plugin.viewer.layers.layer_settings import EXPOSURE_BOUNDS, GAMMA_BOUNDS
-from unmix_plugin.viewer.layers.layers import LAYERS, covered, layer_named
+from unmix_plugin.viewer.layers.layers import covered, layer_named
 from unmix_plugin.viewer.layers.painting import BACKGROUNDS, COLOUR_MAPS
 from unmix_plugin.viewer.layers.view_transforms import VIEW_TRANSFORMS
 from unmix_plugin.viewer.session import Session
@@ -18,7 +18,8 @@ from unmix_plugin.viewer.settling import Settling
 if TYPE_CHECKING:
     import viser
 
-_TITLES = {layer.title: name for name, layer in LAYERS.items()}
+    from unmix_plugin.spectral.materials import Materials
+
 _TRANSFORMS = {title: name for name, title in VIEW_TRANSFORMS.items()}
 _NO_INDEX = "none for these bands"
 
@@ -31,12 +32,25 @@ class LayerPanel:
         self._settings = settings = session.view.settings
         self._gui = session.client.gui
         self._of_control: dict[str, list[Any]] = {}
-        materials = session.materials()
-        bands = materials.bands
+        self._layers = session.services.layers
+        titles = {one.title: name for name, one in self._layers.items()}
         layer = self._gui.add_dropdown(
-            "layer", tuple(_TITLES), initial_value=layer_named(settings.layer).title
+            "layer", tuple(titles), initial_value=layer_named(settings.layer, self._layers).title
         )
-        self._connect(layer, "layer", lambda: _TITLES.get(layer.value, layer.value))
+        self._connect(layer, "layer", lambda: titles.get(layer.value, layer.value))
+        if session.services.has_materials:
+            self._add_spectral(session.materials())
+        self._add_scale()
+        self._add_tone()
+        background = self._gui.add_dropdown(
+            "background", tuple(BACKGROUNDS), initial_value=settings.background
+        )
+        self._connect(background, "background", lambda: background.value)
+        self._show_controls()
+
+    def _add_spectral(self, materials: Materials) -> None:
+        """What is chosen by wavelength or by endmember."""
+        bands, settings = materials.bands, self._settings
         edges = bands.edges_nm
         self._low_nm, self._high_nm = float(edges[0]), float(edges[-1])
         wavelength = self._wavelength_slider("wavelength (nm)", covered(bands, settings.wavelength_nm))
@@ -46,14 +60,7 @@ class LayerPanel:
         self._endmember = self._gui.add_dropdown("endmember", materials.names, initial_value=endmember)
         self._connect(self._endmember, "endmember", self._chosen_endmember, "endmember")
         self._add_index(bands)
-        self._add_scale()
-        self._add_tone()
-        background = self._gui.add_dropdown(
-            "background", tuple(BACKGROUNDS), initial_value=settings.background
-        )
-        self._connect(background, "background", lambda: background.value)
-        self._show_controls()
-        session.on_edit.append(self._show_names)
+        self._session.on_edit.append(self._show_names)
 
     def _show_names(self) -> None:
         """Endmembers may have other names."""
@@ -151,7 +158,7 @@ class LayerPanel:
         return index_in(self._endmember)
 
     def _show_controls(self) -> None:
-        wanted = layer_named(self._settings.layer).controls
+        wanted = layer_named(self._settings.layer, self._layers).controls
         if "scale" in wanted and self._settings.value_range is not None:
             wanted = wanted | {"own-range"}
         for kind, controls in self._of_control.items():

@@ -45,12 +45,10 @@ class ScenePanel:
         for control in (self._height, self._subpixels):
             control.on_update(session.guarded(self._change_quality))
         with gui.add_folder("objects"):
-            for label, show in (
-                ("cameras", self._add_cameras),
-                ("scene box", self._add_box),
-                ("point cloud", self._add_points),
-            ):
-                self._add_switch(label, show)
+            self._add_switch("cameras", self._add_cameras)
+            self._add_switch("scene box", self._add_box)
+            if services.has_materials:
+                self._add_switch("point cloud", self._add_points)
 
     def _add_switch(self, label: str, make: Any) -> None:
         switch = self._session.client.gui.add_checkbox(label, False)
@@ -92,6 +90,7 @@ class ScenePanel:
     def _add_points(self) -> list[Any]:
         """Surface points in the colours that the materials have now."""
         aids, materials = self._session.services.aids(), self._session.materials()
+        assert aids is not None
         spectra = aids.reference.spectra(materials)
         linear = (spectra @ rgb_matrix(materials.bands).to(spectra)).clamp(0, 1)
         colours = (linear_to_srgb(linear) * 255).byte().cpu().numpy().astype(np.uint8)

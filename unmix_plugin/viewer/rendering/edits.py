@@ -1,4 +1,4 @@
-"""Recipes as the viewer applies them: to a model that may still be training, again and again, and cheaply."""
+"""Recipes as the viewer applies them: to a scene that may still be in training, again and again, and cheaply."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ from dataclasses import dataclass, field
 
 from unmix_plugin.editing import Recipe, changes_geometry, edit_scene
 from unmix_plugin.spectral.coefficients import Coefficients
+from unmix_plugin.trained.open_run import require_materials
+from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 _RENEWAL_S = 0.5
-"""An edited model is made anew so long after the last time, where training changes what it was made from."""
+"""An edited scene is made anew so long after the last time, where training changes what it was made from."""
 
 See = Callable[[TrainedScene], Coefficients]
-"""What cameras see of a model, for edits that depend on it."""
+"""What cameras see of a scene, for edits that depend on it."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class _Kept:
 
 @dataclass(frozen=True, eq=False)
 class Edit:
-    """A recipe, and the model that it last gave; compared by identity."""
+    """A recipe, and the scene that it last gave; compared by identity."""
 
     recipe: Recipe = Recipe()
     _kept: list[_Kept] = field(default_factory=list, repr=False)
@@ -52,7 +54,7 @@ class Edit:
         """Whether what was rendered with `other` can be shown with this edit's materials."""
         return self is other or (not self.changes_geometry and not other.changes_geometry)
 
-    def apply(self, scene: TrainedScene, version: int, see: See) -> TrainedScene:
+    def apply(self, scene: RenderableScene, version: int, see: See) -> RenderableScene:
         """The edited scene; must be called while the scene is lent.
 
         Args:
@@ -65,6 +67,7 @@ class Edit:
         if self.is_none:
             return scene
         with self._lock:
+            scene = require_materials(scene, "of this run")
             if not self._kept or not self._kept[0].serves(version):
                 edited = edit_scene(scene, self.recipe, see(scene) if self.recipe.wants_pictures else None)
                 self._kept[:] = [_Kept(edited, version, time.monotonic())]

@@ -8,11 +8,15 @@ from __future__ import annotations
 import math
 
 import torch
+from torch import Tensor
 
+from unmix_plugin.engine.geometry.camera_paths import rows_of
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.spectral.coefficients import Coefficients
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.material_view import MaterialView
+from unmix_plugin.trained.model_scene import ModelView
+from unmix_plugin.trained.protocol import RenderableScene, RenderedView
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.view_cameras import pixel_rays
 
@@ -36,6 +40,8 @@ class FrameRender:
         self._stride = _coprime_stride(self._num_pixels)
         self._rays_done = 0
         self._coefficients: Coefficients | None = None
+        self._strips: list[dict[str, Tensor]] = []
+        self._opacities: list[Tensor] = []
 
     @property
     def num_rays(self) -> int:
@@ -48,11 +54,15 @@ class FrameRender:
         return self.num_rays - self._rays_done
 
     @torch.no_grad()
-    def render_block(self, scene: TrainedScene, num_rays: int) -> int:
+    def render_block(self, scene: RenderableScene, num_rays: int) -> int:
         """Render up to `num_rays` more; how many it were."""
         done, chunk = 0, _CUDA_CHUNK if scene.device.type == "cuda" else _CPU_CHUNK
         while done < num_rays and self.rays_left:
-            done += self._render_chunk(scene, min(num_rays - done, chunk))
+            count = min(num_rays - done, chunk)
+            if isinstance(scene, TrainedScene):
+                done += self._render_chunk(scene, count)
+            else:
+                done += self._render_rows(scene, count)
         return done
 
     def _render_chunk(self, scene: TrainedScene, num_rays: int) -> int:
@@ -68,10 +78,25 @@ class FrameRender:
         self._rays_done += end - start
         return end - start
 
-    def frame(self, scene: TrainedScene) -> MaterialView:
-        """The finished view, with the materials of a scene."""
-        assert self._coefficients is not None
+    def _render_rows(self, scene: RenderableScene, num_rays: int) -> int:
+        """Whole rows from top to bottom, of a scene that only renders views; one ray a pixel."""
+        width, turns = self.camera.width, len(self._offsets)
+        first = self._rays_done // (width * turns)
+        last = min(first + max(1, num_rays // (width * turns)), self.camera.height)
+        strip = scene.look(rows_of(self.camera, first, last).to(scene.device))
+        self._strips.append({output.name: strip[output.name] for output in scene.outputs})
+        self._opacities.append(strip.opacity)
+        self._rays_done = last * width * turns
+        return (last - first) * width * turns
+
+    def frame(self, scene: RenderableScene) -> RenderedView:
+        """The finished view, with the materials of a scene that has some."""
         assert self.rays_left == 0
+        if not isinstance(scene, TrainedScene):
+            names = (output.name for output in scene.outputs)
+            tensors = {name: torch.cat([strip[name] for strip in self._strips]) for name in names}
+            return ModelView(self.camera, {"accumulation": torch.cat(self._opacities), **tensors})
+        assert self._coefficients is not None
         image = self._coefficients.unflatten(self.camera.height, self.camera.width)
         return MaterialView(scene, self.camera, image)
 

@@ -116,7 +116,7 @@ class MeasuredViews:
             kept = self._distances.get(index)
         if kept is not None and step - kept[0] < _STEPS_KEPT:
             return kept[1]
-        with self._source.borrowed() as scene:
+        with self._source.borrowed_materials() as scene:
             seen = scene.look(self._cameras[index], subpixels=1).coefficients
         distance = seen.ray_distance.where(seen.is_occupied, torch.inf).cpu()
         with self._lock:

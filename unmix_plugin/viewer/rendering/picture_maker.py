@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +12,11 @@ from jaxtyping import Float64
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.trained.material_view import MaterialView
+from unmix_plugin.trained.open_run import require_materials
+from unmix_plugin.trained.protocol import RenderedView
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.layers.layer_settings import LayerAids, LayerSettings
-from unmix_plugin.viewer.layers.layers import layer_named, paint_layer
+from unmix_plugin.viewer.layers.layers import LAYERS, Layer, layer_named
 from unmix_plugin.viewer.layers.painting import as_bytes
 from unmix_plugin.viewer.probing import ProbedPoint, probe_through
 from unmix_plugin.viewer.rendering.edits import Edit, See
@@ -39,7 +41,12 @@ class PictureMaker:
     """Renders and paints with one model; used by one thread at a time."""
 
     def __init__(
-        self, source: SceneSource, aids: Callable[[], LayerAids], see: See, num_channels: int
+        self,
+        source: SceneSource,
+        aids: Callable[[], LayerAids | None],
+        see: See,
+        num_channels: int,
+        layers: Mapping[str, Layer] = LAYERS,
     ) -> None:
         """
         Args:
@@ -47,11 +54,13 @@ class PictureMaker:
             aids: What layers need, asked anew for each picture.
             see: What cameras see of the model, asked while it is lent.
             num_channels: Numbers a pixel that a frame keeps.
+            layers: What can be shown, by name.
         """
         self.speed = Speedometer()
         self.source = source
         self._aids = aids
         self._see = see
+        self._layers = layers
         self._largest_pixels = max(256, LARGEST_FRAME_BYTES // (4 * num_channels))
 
     def first_render(self, pose: ViewPose, largest_height: int) -> FrameRender:
@@ -61,7 +70,7 @@ class PictureMaker:
         return FrameRender(camera_of(pose, height, self._largest_pixels))
 
     def finer_render(
-        self, pose: ViewPose, frame: MaterialView, largest_height: int, subpixels: int
+        self, pose: ViewPose, frame: RenderedView, largest_height: int, subpixels: int
     ) -> FrameRender:
         """The picture after `frame`: a finer one, or at the end the same anew."""
         target = self.target_height(pose, largest_height)
@@ -78,7 +87,7 @@ class PictureMaker:
         speed = self.speed.rays_per_second * share / (share + RESTING_COST * (1 - share))
         return affordable_height(speed, REFRESH_S, pose.aspect, largest)
 
-    def advance(self, render: FrameRender, edit: Edit, num_rays: int, cost: float) -> MaterialView | None:
+    def advance(self, render: FrameRender, edit: Edit, num_rays: int, cost: float) -> RenderedView | None:
         """Render a block; the frame if that was the last.
 
         Raises:
@@ -100,7 +109,7 @@ class PictureMaker:
             UnmixError: nothing is there, or the edit does not fit the run.
         """
         with self.source.borrowed() as scene:
-            shown = edit.apply(scene, self.source.version, self._see)
+            shown = require_materials(edit.apply(scene, self.source.version, self._see), "of this run")
             return probe_through(shown, camera, column, row, number)
 
     def edited(self, edit: Edit) -> TrainedScene:
@@ -110,7 +119,7 @@ class PictureMaker:
             UnmixError: the edit does not fit the run.
         """
         with self.source.borrowed() as scene:
-            return edit.apply(scene, self.source.version, self._see)
+            return require_materials(edit.apply(scene, self.source.version, self._see), "of this run")
 
     def light_of(self, edit: Edit) -> Float64[np.ndarray, " B"] | None:
         """Relative power of the light after an edit; None where the scene's is unknown.
@@ -120,20 +129,22 @@ class PictureMaker:
         """
         return self.edited(edit).light_power
 
-    def with_materials_of(self, edit: Edit, frame: MaterialView) -> MaterialView:
+    def with_materials_of(self, edit: Edit, frame: RenderedView) -> RenderedView:
         """What a frame would be with other materials on the same shapes.
 
         Raises:
             UnmixError: the edit does not fit the run.
         """
-        return replace(frame, scene=self.edited(edit))
+        return replace(frame, scene=self.edited(edit)) if isinstance(frame, MaterialView) else frame
 
-    def paint(self, frame: MaterialView, settings: LayerSettings, with_depth: bool, is_moving: bool) -> Shown:
+    def paint(self, frame: RenderedView, settings: LayerSettings, with_depth: bool, is_moving: bool) -> Shown:
         """A frame as a picture.
 
         Raises:
             UnmixError: the layer can't be shown.
         """
-        picture, legend = paint_layer(frame, settings, self._aids())
-        depth = picture_depth(frame) if with_depth else None
-        return Shown(as_bytes(picture), depth, legend, is_moving, layer_named(settings.layer).is_labels)
+        layer, aids = layer_named(settings.layer, self._layers), self._aids()
+        with torch.no_grad():
+            picture, legend = layer.paint(frame, settings, aids)
+        depth = picture_depth(frame) if with_depth and isinstance(frame, MaterialView) else None
+        return Shown(as_bytes(picture), depth, legend, is_moving, layer.is_labels)

@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from unmix_plugin.trained.material_view import MaterialView
+from unmix_plugin.trained.protocol import RenderedView
 from unmix_plugin.viewer.failures import failures_said
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings
 from unmix_plugin.viewer.rendering.edits import Edit
@@ -214,7 +214,7 @@ class RenderLoop:
             frame = self._maker.with_materials_of(edit, frame)
         self._present(view, frame, edit, version)
 
-    def _present(self, view: View, frame: MaterialView, edit: Edit, version: int) -> None:
+    def _present(self, view: View, frame: RenderedView, edit: Edit, version: int) -> None:
         """Paint a frame and send it."""
         with self._changed:
             if view not in self._views or view.pose is None:
@@ -233,7 +233,7 @@ class RenderLoop:
     def _advance_capture(self, capture: Capture) -> None:
         """A block of a capture; after its last it is handed over."""
         capture.served_at = time.monotonic()
-        frame: MaterialView | None = None
+        frame: RenderedView | None = None
         reasons = ["cancelled"] if capture.is_cancelled else []
         with failures_said("the picture failed", reasons.append):
             if not reasons:

@@ -12,6 +12,7 @@ from unmix_plugin.engine.training.device_share import DeviceShare
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.engine.training.training_control import TrainingControl
 from unmix_plugin.trained.open_run import LoadedRun, require_materials
+from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.snapshot import snapshot
 from unmix_plugin.trained.trained_scene import TrainedScene
 
@@ -26,14 +27,14 @@ class SceneSource:
     """What the run keeps of its input."""
     device: DeviceShare
     """Turns with training, if there is one."""
-    take: Callable[[], TrainedScene]
+    take: Callable[[], RenderableScene]
     """The scene at this moment; called while training waits."""
     control: TrainingControl | None = None
     """The training under way; None for a finished run."""
-    _taken: dict[int, TrainedScene] = field(default_factory=dict, repr=False)
+    _taken: dict[int, RenderableScene] = field(default_factory=dict, repr=False)
 
     @contextmanager
-    def borrowed(self, cost: float = 1.0) -> Iterator[TrainedScene]:
+    def borrowed(self, cost: float = 1.0) -> Iterator[RenderableScene]:
         """Context with the scene and the device to render it.
 
         Turns do not nest: whoever has the device must not ask for it again.
@@ -49,6 +50,16 @@ class SceneSource:
                 self._taken[self.version] = scene
             yield scene
 
+    @contextmanager
+    def borrowed_materials(self) -> Iterator[TrainedScene]:
+        """The same for a scene that must have endmembers.
+
+        Raises:
+            ConfigError: it has none.
+        """
+        with self.borrowed() as scene:
+            yield require_materials(scene, "of this run")
+
     @property
     def version(self) -> int:
         """Rises with each change of the scene: training steps that it has seen."""
@@ -61,28 +72,23 @@ class SceneSource:
 
 
 def source_of_run(run: LoadedRun) -> SceneSource:
-    """The scene of a finished run.
-
-    Raises:
-        ConfigError: its method does not unmix spectra.
-    """
-    scene = run.materials_scene
-    return SceneSource(run.folder, run.record, DeviceShare(), lambda: scene)
+    """The scene of a finished run."""
+    return SceneSource(run.folder, run.record, DeviceShare(), lambda: run.scene)
 
 
 def source_of_training(trainer: Trainer, record: SceneRecord) -> SceneSource:
     """The scene of a training, before or while it runs.
 
     Raises:
-        ConfigError: its method does not unmix spectra.
+        ConfigError: its method offers no scene.
     """
     name, model = trainer.config.method_name, trainer.pipeline.model
 
-    def take() -> TrainedScene:
+    def take() -> RenderableScene:
         averages = None if trainer.average is None else trainer.average.state_dict()
-        return require_materials(snapshot(model, name, record, averages), name)
+        return snapshot(model, name, record, averages)
 
     source = SceneSource(trainer.run, record, trainer.control.device, take, trainer.control)
     with source.borrowed():
-        pass  # refuses a method without materials before the page is served
+        pass  # refuses a method without a scene before the page is served
     return source

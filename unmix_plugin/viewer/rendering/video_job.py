@@ -18,17 +18,6 @@ from unmix_plugin.viewer.layers.layer_settings import LayerSettings
 
 _LAUNCH = "from unmix_plugin.commands.render import main; main()"
 _LONGEST_MESSAGE = 1000
-_OUTPUTS = (
-    "rgb",
-    "abundances",
-    "segmentation",
-    "confidence",
-    "diffuse",
-    "specular",
-    "pca",
-    "depth",
-    "accumulation",
-)
 _WAIT_S = 10.0
 _LINES_KEPT = 100
 _PROGRESS = re.compile(r"rendering: (\d+) of ([1-9]\d*) done")
@@ -48,9 +37,9 @@ def output_of(settings: LayerSettings) -> str:
         return f"index:{settings.index}"
     if settings.layer == "abundance":
         return "abundances"
-    if settings.layer in _OUTPUTS:
-        return settings.layer
-    raise ConfigError(f"videos can't show the layer {settings.layer}; choose another one")
+    if settings.layer in ("error", "index"):
+        raise ConfigError(f"videos can't show the layer {settings.layer}; choose another one")
+    return settings.layer
 
 
 @dataclass(eq=False)

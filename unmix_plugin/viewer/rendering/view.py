@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from unmix_plugin.trained.material_view import MaterialView
+from unmix_plugin.trained.protocol import RenderedView
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings
 from unmix_plugin.viewer.layers.painting import Legend
 from unmix_plugin.viewer.rendering.edits import Edit
@@ -53,7 +53,7 @@ class View:
     wants_depth: bool = False
     """Whether objects of the client's own are to be hidden behind what is seen."""
     pose: ViewPose | None = None
-    frame: MaterialView | None = None
+    frame: RenderedView | None = None
     """Of the picture shown last."""
     frame_edit: Edit = Edit()
     """What `frame` was rendered with."""
@@ -86,7 +86,7 @@ class Capture:
 
     render: FrameRender
     edit: Edit
-    done: Callable[[MaterialView | None, str], None]
+    done: Callable[[RenderedView | None, str], None]
     """Takes the frame, or None and what went wrong; called in the render loop's thread."""
     progress: Callable[[float], None] = field(default=lambda _: None)
     """Told the part rendered, now and then."""

@@ -1,0 +1,111 @@
+"""Layers that follow from the outputs that a scene names: each is painted by its kind.
+
+Notation: `H x W` pixels; pictures are sRGB in [0, 1].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from unmix_plugin.engine.outputs import Output, OutputKind
+from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION
+from unmix_plugin.spectral.colour.conversion import srgb_to_linear
+from unmix_plugin.spectral.segmentation import NOTHING_ID
+from unmix_plugin.trained.protocol import RenderableScene, RenderedView
+from unmix_plugin.trained.trained_scene import TrainedScene
+from unmix_plugin.viewer.layers.layer_settings import LayerAids, LayerSettings
+from unmix_plugin.viewer.layers.layers import LAYERS, Layer
+from unmix_plugin.viewer.layers.painting import (
+    ColourMapLegend,
+    Legend,
+    Picture,
+    TextLegend,
+    colour_table,
+    over_background,
+    paint_values,
+    tone_mapped,
+)
+from unmix_plugin.viewer.rendering.reference import percentile_range
+
+_Paint = Callable[[Tensor, RenderedView, LayerSettings, Output], tuple[Picture, Legend]]
+
+
+def layers_of(scene: RenderableScene) -> dict[str, Layer]:
+    """All that can be shown of a scene, by name: what its materials allow, and its outputs that can be painted."""
+    own, painters = {}, _PAINTERS
+    if isinstance(scene, TrainedScene):
+        own = LAYERS
+        painters = {kind: _PAINTERS[kind] for kind in ("map", "vectors")}  # its colours are among its own
+    others = (output for output in scene.outputs if output.name not in own and output.kind in painters)
+    return {**own, **{output.name: _layer(output) for output in others}}
+
+
+def _layer(output: Output) -> Layer:
+    paint, controls = _PAINTERS[output.kind]
+
+    def paint_output(
+        frame: RenderedView, settings: LayerSettings, _: LayerAids | None
+    ) -> tuple[Picture, Legend]:
+        return paint(frame[output.name], frame, settings, output)
+
+    return Layer(output.name, output.title, paint_output, controls, output.kind == "labels")
+
+
+def _paint_srgb(
+    values: Tensor, frame: RenderedView, settings: LayerSettings, output: Output
+) -> tuple[Picture, Legend]:
+    return _paint_linear(srgb_to_linear(values.clamp(0, 1)), frame, settings, output)
+
+
+def _paint_linear(
+    values: Tensor, frame: RenderedView, settings: LayerSettings, output: Output
+) -> tuple[Picture, Legend]:
+    return tone_mapped(values, frame.opacity, settings), TextLegend(output.what)
+
+
+def _paint_picture(
+    values: Tensor, frame: RenderedView, settings: LayerSettings, output: Output
+) -> tuple[Picture, Legend]:
+    return over_background(values.clamp(0, 1), frame.opacity, settings), TextLegend(output.what)
+
+
+def _paint_vectors(
+    values: Tensor, frame: RenderedView, settings: LayerSettings, output: Output
+) -> tuple[Picture, Legend]:
+    legend = TextLegend(f"{output.what}; red, green, blue: x, y, z from -1 to 1")
+    return over_background(((values + 1) / 2).clamp(0, 1), frame.opacity, settings), legend
+
+
+def _paint_map(
+    values: Tensor, frame: RenderedView, settings: LayerSettings, output: Output
+) -> tuple[Picture, Legend]:
+    is_known = values.isfinite()
+    seen = values[is_known & (frame.opacity > OCCUPIED_ACCUMULATION)]
+    scale = settings.value_range or output.value_range or percentile_range(seen)
+    picture = paint_values(values, scale, settings.colour_map)
+    legend = ColourMapLegend(settings.colour_map, *scale, output.what)
+    # Opacity itself is shown everywhere, also where there is little of it.
+    opacity = is_known.to(picture) if output.name == "accumulation" else frame.opacity * is_known
+    return over_background(picture, opacity, settings), legend
+
+
+def _paint_labels(
+    values: Tensor, frame: RenderedView, settings: LayerSettings, output: Output
+) -> tuple[Picture, Legend]:
+    palette = colour_table("turbo")[torch.arange(256) * 389 % 1024].to(frame.opacity)  # neighbours far apart
+    is_something = (values != NOTHING_ID).to(palette)
+    return over_background(palette[values.long()], is_something, settings), TextLegend(output.what)
+
+
+_PAINTERS: dict[OutputKind, tuple[_Paint, frozenset[str]]] = {
+    "srgb": (_paint_srgb, frozenset({"tone"})),
+    "linear": (_paint_linear, frozenset({"tone"})),
+    "picture": (_paint_picture, frozenset()),
+    "grey": (_paint_map, frozenset({"scale"})),
+    "map": (_paint_map, frozenset({"scale"})),
+    "labels": (_paint_labels, frozenset()),
+    "vectors": (_paint_vectors, frozenset()),
+}
