@@ -63,7 +63,7 @@ def draw_chart(chart: LineChart) -> bytes:
         axes.margins(x=0)
         axes.set_xlabel(chart.x_label, color=_INK)
         axes.set_ylabel(chart.y_label, color=_INK)
-        axes.tick_params(colors=_SOFT)
+        axes.tick_params(which="both", colors=_SOFT)
         plain_axes(axes)
         buffer = io.BytesIO()
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
