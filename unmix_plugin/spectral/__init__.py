@@ -53,6 +53,7 @@ from unmix_plugin.spectral.unmixing.kmeans_normalised import (
 from unmix_plugin.spectral.unmixing.minimum_volume import minimum_volume_simplex
 from unmix_plugin.spectral.unmixing.nfindr_winter1999 import nfindr, simplex_volume
 from unmix_plugin.spectral.unmixing.num_materials import MaterialCount, hysime, propose_num_materials
+from unmix_plugin.spectral.unmixing.pixel_unmixing import comparable_brightness, unmix_pixels
 from unmix_plugin.spectral.unmixing.two_material_mixtures import (
     TwoMaterialFit,
     two_material_endmembers,
@@ -74,6 +75,7 @@ __all__ = [
     "abundance_rmse",
     "band_composite_matrix",
     "colour_mode",
+    "comparable_brightness",
     "describe_colour",
     "drop_uninformative_pixels",
     "endmember_angle",
@@ -106,6 +108,7 @@ __all__ = [
     "sunsal",
     "two_material_endmembers",
     "two_material_fits",
+    "unmix_pixels",
     "vca",
     "write_spectra_csv",
     "xyz_matrix",

@@ -20,6 +20,9 @@ from unmix_plugin.spectral.unmixing.vca_nascimento2005 import vca
 
 EndmemberMethod = Literal["kmeans", "vca", "nfindr", "minimum-volume", "pairs"]
 
+_VCA_DRAWS = 5
+"""Of which that of the largest simplex stays. The other methods restart by themselves, as often."""
+
 DARK_RMS = 0.005
 """Root mean square over bands below which a pixel counts as black: its direction is noise."""
 
@@ -83,13 +86,21 @@ def _shapes(
 ) -> Float[Tensor, "K B"]:
     """Endmembers of any brightness."""
     if method == "vca":
-        return vca(usable, num_endmembers, generator).endmembers.clamp(min=0)
+        draws = [vca(usable, num_endmembers, generator).endmembers.clamp(min=0) for _ in range(_VCA_DRAWS)]
+        return max(draws, key=_log_volume)
     if method == "minimum-volume":
         return minimum_volume_simplex(usable, num_endmembers, generator)
     if method == "pairs":
         return two_material_endmembers(usable, num_endmembers, generator)
     # On spectra of one brightness: otherwise the darkest pixels are the corners of the largest simplex.
     return usable[nfindr(usable / usable.sum(dim=1, keepdim=True), num_endmembers, generator)]
+
+
+def _log_volume(spectra: Float[Tensor, "K B"]) -> float:
+    """Of their simplex at one brightness, up to a constant."""
+    shapes = spectra.double() / spectra.double().sum(dim=1, keepdim=True).clamp(min=1e-12)
+    edges = shapes[1:] - shapes[0]
+    return float(torch.linalg.slogdet(edges @ edges.T).logabsdet)
 
 
 def _usable_pixels(

@@ -23,9 +23,13 @@ _MIN_GAIN = 1e-9
 
 
 def nfindr(
-    pixels: Float[Tensor, "N B"], num_endmembers: int, generator: torch.Generator, max_sweeps: int = 10
+    pixels: Float[Tensor, "N B"],
+    num_endmembers: int,
+    generator: torch.Generator,
+    max_sweeps: int = 10,
+    restarts: int = 5,
 ) -> Int[Tensor, " K"]:
-    """Indices of the pixels whose simplex has (locally) the largest volume.
+    """Indices of the pixels whose simplex has (locally) the largest volume; the best of several restarts.
 
     Args:
         pixels: Spectra in one unit. Brightness counts: scale spectra to one brightness to ignore shading.
@@ -35,12 +39,19 @@ def nfindr(
     Raises:
         SpectrumError: K below 2, above the bands or the pixels, or the pixels' simplex is flat in K - 1 dimensions.
     """
-    # VCA on principal components (its branch for noise) starts with corners of a simplex that is not flat.
-    indices = vca(pixels, num_endmembers, generator, snr_db=-math.inf).indices
     lifted = _lifted_components(pixels.double(), num_endmembers)
+    runs = []
+    for _ in range(restarts):
+        # VCA on principal components (its branch for noise) starts with corners of a simplex that is not flat.
+        start = vca(pixels, num_endmembers, generator, snr_db=-math.inf).indices
+        runs.append(_swept(lifted, start, max_sweeps))
+    return max(runs, key=lambda indices: float(torch.linalg.det(lifted[indices]).abs()))
+
+
+def _swept(lifted: Tensor, indices: Tensor, max_sweeps: int) -> Int[Tensor, " K"]:
     for _ in range(max_sweeps):
         before = indices
-        for corner in range(num_endmembers):
+        for corner in range(len(indices)):
             indices = _replace_corner(lifted, indices, corner)
         if torch.equal(before, indices):
             break
