@@ -71,8 +71,10 @@ def read_mat(path: Path) -> tuple[Tensor, Tensor, Tensor]:
     """
     try:
         content = loadmat(path)
-    except (OSError, ValueError, TypeError, NotImplementedError, EOFError) as error:
-        raise SceneError(f"{path} can't be read as a .mat file of version 4 to 7: {error}") from error
+    except Exception as error:  # scipy raises errors of many kinds at files of another format
+        raise SceneError(
+            f"{path} can't be read as a .mat file of version 4 to 7: {' '.join(str(error).split())}"
+        ) from error
     missing = [key for key in ("Y", "A", "M") if key not in content]
     if missing:
         keys = ", ".join(key for key in content if not key.startswith("__"))

@@ -61,20 +61,21 @@ def judge(measured: dict[str, SceneFigures]) -> list[_common.Figure]:
 
 
 def tables(measured: dict[str, SceneFigures]) -> list[_common.DetailTable]:
-    """Means over scenes of the rows that all have, then every row of each scene."""
+    """Means over scenes of the medians of rows that all have, then every row of each scene."""
     scenes = [found.rows for found in measured.values()]
     common = [name for name in scenes[0] if all(name in rows for rows in scenes)]
     lines = [
-        [name, *(f"{_mean(mean(rows[name], key) for rows in scenes):.3f}" for key in SHOWN)]
+        [name, *(f"{_mean(median(rows[name], key) for rows in scenes):.3f}" for key in SHOWN)]
         for name in common
     ]
     means = _common.DetailTable("Mean over scenes", ["row", *SHOWN.values()], lines)
     return [means, *(_scene_table(scene, found.rows) for scene, found in measured.items())]
 
 
-def mean(seeds: Seeds, key: str = "miou") -> float:
+def median(seeds: Seeds, key: str = "miou") -> float:
     """Over seeds; not a number where a seed has no such figure."""
-    return _mean(_number(figures.get(key)) for figures in seeds.values())
+    values = [_number(figures.get(key)) for figures in seeds.values()]
+    return math.nan if any(map(math.isnan, values)) else statistics.median(values)
 
 
 def deviation(seeds: Seeds, key: str = "miou") -> float:
@@ -91,7 +92,7 @@ def best_pixel_row(rows: dict[str, Seeds], finder: Literal["theirs", "ours"] = "
     """
     fair = [name for name in rows if name.startswith("2d:") and "oracle" not in name]
     fair = [name for name in fair if name.startswith("2d:pairs") == (finder == "ours")]
-    return max(fair, key=lambda name: mean(rows[name]), default=None)
+    return max(fair, key=lambda name: median(rows[name]), default=None)
 
 
 def _judge_oracle(scene: str, rows: dict[str, Seeds]) -> list[_common.Figure]:
@@ -99,8 +100,8 @@ def _judge_oracle(scene: str, rows: dict[str, Seeds]) -> list[_common.Figure]:
         _common.required(
             f"{scene}: {SHOWN[key]} of {row.removeprefix('2d:')}",
             f"{expected[scene]:g} within 0.01",
-            abs(mean(rows[row], key) - expected[scene]) <= 0.01,
-            f"{mean(rows[row], key):.4g}",
+            abs(median(rows[row], key) - expected[scene]) <= 0.01,
+            f"{median(rows[row], key):.4g}",
         )
         for (row, key), expected in _KNOWN.items()
         if row in rows and scene in expected
@@ -124,21 +125,21 @@ def _judge_ours(scene: str, rows: dict[str, Seeds]) -> list[_common.Figure]:
         return []
     named = {"best 2-D row": best, "best 2-D row with the endmembers of ours": best_pixel_row(rows, "ours")}
     figures = [
-        _common.reported(f"{scene}: {what}", f"{row}, mIoU {mean(rows[row]):.3f}")
+        _common.reported(f"{scene}: {what}", f"{row}, mIoU {median(rows[row]):.3f}")
         for what, row in named.items()
         if row is not None
     ]
     if OURS in rows:
-        limit = _common.Limit(round(mean(rows[best]), 3))
-        figures.append(limit.judge(f"{scene}: mIoU of ours", mean(rows[OURS])))
+        limit = _common.Limit(round(median(rows[best]), 3))
+        figures.append(limit.judge(f"{scene}: mIoU of ours", median(rows[OURS])))
         if len(rows[OURS]) > 1:
             spread = deviation(rows[OURS])
             figures.append(_DEVIATION.judge(f"{scene}: deviation of its mIoU over seeds", spread))
-        best_psnr = max(mean(seeds, "psnr") for name, seeds in rows.items() if name.startswith("3d:"))
+        best_psnr = max(median(seeds, "psnr") for name, seeds in rows.items() if name.startswith("3d:"))
         limit = _common.Limit(round(best_psnr - _PSNR_LOSS_DB, 2), unit=" dB")
         figures.append(
             limit.judge(
-                f"{scene}: PSNR of ours, the best 3-D row's less {_PSNR_LOSS_DB}", mean(rows[OURS], "psnr")
+                f"{scene}: PSNR of ours, the best 3-D row's less {_PSNR_LOSS_DB}", median(rows[OURS], "psnr")
             )
         )
     return figures
@@ -148,27 +149,27 @@ def _judge_means(scenes: list[dict[str, Seeds]]) -> list[_common.Figure]:
     """The lines about means over the scenes that ours was trained on."""
     if not scenes:
         return []
-    gains = [mean(rows[OURS]) - mean(rows[best]) for rows in scenes if (best := best_pixel_row(rows))]
+    gains = [median(rows[OURS]) - median(rows[best]) for rows in scenes if (best := best_pixel_row(rows))]
     figures = (
         [_GAIN.judge("mIoU of ours above the best 2-D row, mean over scenes", _mean(gains))] if gains else []
     )
-    rmse = _mean(mean(rows[OURS], "abundance_rmse") for rows in scenes)
+    rmse = _mean(median(rows[OURS], "abundance_rmse") for rows in scenes)
     figures.append(_ABUNDANCE_RMSE.judge("abundance RMSE of ours, mean over scenes", rmse))
     if all("2d:VCA, NNLS" in rows for rows in scenes):
-        corners = _mean(mean(rows["2d:VCA, NNLS"], "endmember_angle") for rows in scenes)
+        corners = _mean(median(rows["2d:VCA, NNLS"], "endmember_angle") for rows in scenes)
         limit = _common.Limit(round(corners, 3), _ENDMEMBER_AIM_RAD, is_upper=True, unit=" rad")
-        angle = _mean(mean(rows[OURS], "endmember_angle") for rows in scenes)
+        angle = _mean(median(rows[OURS], "endmember_angle") for rows in scenes)
         figures.append(limit.judge("endmember angle of ours against VCA's, mean over scenes", angle))
     return figures
 
 
 def _scene_table(scene: str, rows: dict[str, Seeds]) -> _common.DetailTable:
     lines = [
-        [name, f"{mean(seeds):.3f} ± {deviation(seeds):.3f}"]
-        + [f"{mean(seeds, key):.3f}" for key in SHOWN if key != "miou"]
+        [name, str(len(seeds)), f"{median(seeds):.3f} ± {deviation(seeds):.3f}"]
+        + [f"{median(seeds, key):.3f}" for key in SHOWN if key != "miou"]
         for name, seeds in rows.items()
     ]
-    return _common.DetailTable(scene, ["row", *SHOWN.values()], lines)
+    return _common.DetailTable(scene, ["row", "seeds", *SHOWN.values()], lines)
 
 
 def _number(value: float | None) -> float:

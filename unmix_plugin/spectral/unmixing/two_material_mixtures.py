@@ -32,19 +32,22 @@ MOST_ENDMEMBERS = 64
 _DRAWS = 5
 """Sets of candidates that are searched one by one; the winners of all are candidates of the last search."""
 _NUM_CANDIDATES = 80
-_NUM_SEEDS = 5000
+_NUM_SEEDS = 10_000
 """Pixels of which the candidates of a draw are the cluster means."""
 _ITERATIONS = 10
 _NUM_JUDGES = 1500
 
-_DARK = 0.2
+_DARK = 0.3
 """Length below which a distance counts less, as a share of that of bright pixels (95th percentile)."""
-_POWER = 1.25
+_POWER = 1.2
 """Of a distance in the cost: squared, highlights would choose; by itself, the variability of a common material would
 outweigh a rare one."""
 
 _DISTINCT = 4e-10
 """Squared distance above which unit spectra are distinct; k-means then finds at least as many shapes."""
+
+_SAME_MATERIAL = 0.995
+"""Cosine above which members of two sets are one material: an angle of 0.1 rad."""
 
 _LEAST_GAIN = 1e-7
 """Least fall of the mean cost that counts: rounding errors must not swap for ever."""
@@ -79,15 +82,18 @@ def two_material_fits(
         )
     num_candidates = max(1, min(_NUM_CANDIDATES, _count_shapes(pixels, _NUM_CANDIDATES)))
     judges = _some(pixels, _NUM_JUDGES, generator).double()
-    winners = []
+    pool, draws = [], []
     for _ in range(_DRAWS if num_candidates == _NUM_CANDIDATES else 1):
         candidates = _candidates(pixels, num_candidates, generator)
         sets = _grown_sets(judges, candidates, most_endmembers)
-        winners.append(candidates[sorted({index for chosen in sets for index in chosen})])
-    candidates = torch.cat(winners)
-    sets = _grown_sets(judges, candidates, most_endmembers)
-    fits = [candidates[chosen].to(pixels.dtype) for chosen in sets]
-    return [TwoMaterialFit(spectra, mean_pair_distance(judges, spectra)) for spectra in fits]
+        pool.append(candidates[sorted({index for chosen in sets for index in chosen})])
+        draws.append([candidates[chosen] for chosen in sets])
+    candidates = torch.cat(pool)
+    fits = []
+    for chosen, *drawn in zip(_grown_sets(judges, candidates, most_endmembers), *draws, strict=False):
+        spectra = _averaged(candidates[chosen], drawn).to(pixels.dtype)
+        fits.append(TwoMaterialFit(spectra, mean_pair_distance(judges, spectra)))
+    return fits
 
 
 def two_material_endmembers(
@@ -160,6 +166,15 @@ def _grown_sets(judges: Float[Tensor, "N B"], candidates: Float[Tensor, "M B"], 
     for _ in range(min(most, len(candidates))):
         sets.append(search.improved(search.grown(sets[-1])))
     return sets[1:]
+
+
+def _averaged(members: Float[Tensor, "K B"], draws: list[Float[Tensor, "K B"]]) -> Float[Tensor, "K B"]:
+    """Mean shape of each member and of what is the same in other sets: chance decides less."""
+    means = members.clone()
+    for drawn in draws:
+        nearest = (members @ drawn.T).max(dim=1)
+        means += torch.where((nearest.values > _SAME_MATERIAL)[:, None], drawn[nearest.indices], 0.0)
+    return normalize(means, dim=1)
 
 
 class _Search:
