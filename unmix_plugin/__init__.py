@@ -1,3 +1,56 @@
-"""From posed spectral images to a 3-D scene that knows what it is made of."""
+"""From posed spectral images to a 3-D scene that knows what it is made of.
+
+The public names, for scripts and notebooks; docs/python.md shows each. They are imported when first used, so that
+`import unmix_plugin` costs nothing.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from unmix_plugin.editing.apply import edit_scene
+    from unmix_plugin.editing.recipe import Light, Recipe
+    from unmix_plugin.editing.yaml_reading import read_recipe
+    from unmix_plugin.engine.geometry.cameras import Cameras
+    from unmix_plugin.products.save import save
+    from unmix_plugin.trained.material_view import MaterialView
+    from unmix_plugin.trained.open_run import open_run
+    from unmix_plugin.trained.protocol import Probe
+    from unmix_plugin.trained.trained_scene import TrainedScene
 
 __version__ = "0.1.0"
+__all__ = [
+    "Cameras",
+    "Light",
+    "MaterialView",
+    "Probe",
+    "Recipe",
+    "TrainedScene",
+    "edit_scene",
+    "open_run",
+    "read_recipe",
+    "save",
+]
+
+_MODULES = {
+    "Cameras": "engine.geometry.cameras",
+    "Light": "editing.recipe",
+    "MaterialView": "trained.material_view",
+    "Probe": "trained.protocol",
+    "Recipe": "editing.recipe",
+    "TrainedScene": "trained.trained_scene",
+    "edit_scene": "editing.apply",
+    "open_run": "trained.open_run",
+    "read_recipe": "editing.yaml_reading",
+    "save": "products.save",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -11,8 +11,8 @@ from torch.testing import assert_close
 from tests.editing.scenes import lit_scene, tensors_of
 from tests.method_factory import make_model
 from unmix_plugin.editing import Light, Recipe, Rename, Scale, edited_run
-from unmix_plugin.editing.apply import light_factors
-from unmix_plugin.editing.edited_run import apply_recipe, load_edited_run, requested_recipe
+from unmix_plugin.editing.apply import edit_scene, light_factors
+from unmix_plugin.editing.edited_run import load_edited_run, requested_recipe
 from unmix_plugin.errors import ConfigError, RunError, SpectrumError
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.spectral.colour.illuminants import illuminant_power
@@ -88,7 +88,7 @@ def test_a_recipe_that_does_not_fit_names_its_file_and_line(run, tmp_path):
 
 def test_measured_radiance_is_comparable_after_the_lights_factors():
     scene, lamp, name = lit_scene(), Recipe(illuminant=Light("A")), Recipe((Rename(0, "clay"),))
-    relit, renamed = apply_recipe(scene, lamp), apply_recipe(scene, name)
+    relit, renamed = edit_scene(scene, lamp), edit_scene(scene, name)
     expected = scene.materials.endmembers * torch.from_numpy(light_factors(scene, lamp))
     assert_close(relit.materials.endmembers.double(), expected, rtol=1e-5, atol=1e-7)
     assert (light_factors(scene, name) == 1).all()
@@ -108,10 +108,10 @@ def test_a_scene_without_materials_is_refused(run, tmp_path, monkeypatch):
 
 def test_a_light_that_is_not_recorded_is_noted(tmp_path):
     scene, lamp = lit_scene(), Recipe(illuminant=Light("A"))
-    assert apply_recipe(scene, lamp).notes == ()
+    assert edit_scene(scene, lamp).notes == ()
     unlit = replace(scene, materials=replace(scene.materials, light=None))
-    [note] = apply_recipe(unlit, lamp).notes
+    [note] = edit_scene(unlit, lamp).notes
     assert "taken as flat" in note
     removal = requested_recipe(write_recipe(tmp_path, "edits:\n- remove: 0\n"), None)
     assert removal is not None
-    assert apply_recipe(unlit, removal).notes == ()
+    assert edit_scene(unlit, removal).notes == ()

@@ -99,8 +99,7 @@ class _Subject:
 
 
 def _subject(loaded: LoadedPipeline, recipe: Recipe | None, options: EvalOptions) -> _Subject:
-    from unmix_plugin.editing.apply import light_factors
-    from unmix_plugin.editing.edited_run import apply_recipe
+    from unmix_plugin.editing.apply import edit_scene, light_factors
     from unmix_plugin.editing.yaml_writing import recipe_to_yaml
     from unmix_plugin.trained.open_run import require_materials
     from unmix_plugin.trained.snapshot import snapshot
@@ -109,7 +108,7 @@ def _subject(loaded: LoadedPipeline, recipe: Recipe | None, options: EvalOptions
     scene = require_materials(snapshot(loaded.pipeline.model, name, loaded.scene), name)
     if recipe is None:
         return _Subject(loaded, scene, None, loaded.run.eval, None)
-    edited = apply_recipe(scene, recipe)
+    edited = edit_scene(scene, recipe)
     for note in edited.notes:
         print(note)
     words = ["eval", *([options.edits.stem] if options.edits else [])]

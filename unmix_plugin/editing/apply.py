@@ -18,6 +18,7 @@ from unmix_plugin.editing.light import relighting_factors
 from unmix_plugin.editing.material_state import MaterialState
 from unmix_plugin.editing.operations import Gloss, Replace, Retint
 from unmix_plugin.editing.recipe import Light, Recipe
+from unmix_plugin.editing.seen import sample_seen
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.spectral.coefficients import Coefficients
 from unmix_plugin.trained.trained_scene import TrainedScene
@@ -30,12 +31,14 @@ def edit_scene(scene: TrainedScene, recipe: Recipe, seen: Coefficients | None = 
     Args:
         scene: Stays as it is.
         recipe: What to change.
-        seen: What cameras see of `scene`, in any leading axes, as `seen.sample_seen` gives it: retints that match the
-            picture look at it. Without it they match the spectrum.
+        seen: What cameras see of `scene`, in any leading axes: retints that match the picture look at it. None: what
+            `sample_seen` finds, where it is needed.
     Raises:
         ConfigError: the recipe does not fit the scene or contradicts itself; the message says where.
     """
     light = scene.light_power
+    if seen is None and recipe.wants_pictures:
+        seen = sample_seen(scene)
     state = MaterialState.of(scene.materials, light, seen)
     carry_out(recipe, state)
     factors, told = _light_factors(scene, recipe)

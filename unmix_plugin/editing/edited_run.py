@@ -10,13 +10,11 @@ from pathlib import Path
 
 from unmix_plugin.editing.apply import edit_scene
 from unmix_plugin.editing.recipe import Light, Recipe
-from unmix_plugin.editing.seen import sample_seen
 from unmix_plugin.editing.simulated_sensor import with_sensor
 from unmix_plugin.editing.yaml_reading import read_recipe
 from unmix_plugin.spectral.colour.illuminants import parse_light
 from unmix_plugin.spectral.sensor import read_sensor
 from unmix_plugin.trained.open_run import LoadedRun, load_run
-from unmix_plugin.trained.trained_scene import TrainedScene
 
 
 def load_edited_run(
@@ -44,7 +42,7 @@ def load_edited_run(
     camera = None if sensor is None else read_sensor(sensor)
     run = load_run(path, device)
     if recipe is not None:
-        run = replace(run, scene=apply_recipe(run.materials_scene, recipe))
+        run = replace(run, scene=edit_scene(run.materials_scene, recipe))
     if camera is not None:
         run = replace(run, scene=with_sensor(run.materials_scene, camera))
     return run
@@ -66,12 +64,3 @@ def requested_recipe(edits: Path | None, illuminant: str | None) -> Recipe | Non
         if recipe is None
         else replace(recipe, illuminant=light)
     )
-
-
-def apply_recipe(scene: TrainedScene, recipe: Recipe) -> TrainedScene:
-    """A scene as a recipe has it; its training cameras decide how retinted materials look in pictures.
-
-    Raises:
-        ConfigError: the recipe does not fit the scene.
-    """
-    return edit_scene(scene, recipe, sample_seen(scene) if recipe.wants_pictures else None)

@@ -28,12 +28,13 @@ MOST_EDITS = 1000
 _KINDS = {kind.kind: kind for kind in OPERATIONS}
 
 
-def read_recipe(path: Path) -> Recipe:
+def read_recipe(path: str | Path) -> Recipe:
     """Read a recipe; relative paths in it start from its folder.
 
     Raises:
         ConfigError: it can't be read, or anything in it is wrong; one message names every fault with its line.
     """
+    path = Path(path)
     try:
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:

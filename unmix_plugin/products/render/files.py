@@ -87,8 +87,18 @@ def still(formatted: FormattedOutput, view_name: str, setting: RenderSetting) ->
     Raises:
         RunError: the disk is full or refuses.
     """
+    with still_at(still_paths(setting.folder, formatted, view_name)[0], formatted, setting) as sink:
+        yield sink
+
+
+@contextmanager
+def still_at(path: Path, formatted: FormattedOutput, setting: RenderSetting) -> Iterator[RowsSink]:
+    """The same in a file of any name; of ENVI's two, that of the header.
+
+    Raises:
+        RunError: the disk is full or refuses.
+    """
     open_file = {"npy": _npy, "envi": _envi, "exr": _exr, "png": _png, "mp4": _sweep}[formatted.format]
-    path = still_paths(setting.folder, formatted, view_name)[0]
     with open_file(formatted.output, path, setting) as sink:
         yield sink
 

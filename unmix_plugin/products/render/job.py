@@ -84,7 +84,7 @@ class RenderJob:
             cameras.size,
             Palette.of(materials, survey.scales),
             None if materials is None else materials.bands,
-            _channel_names(scene, cameras.views[0].camera, [one.output for one in outputs]),
+            channel_names(scene, cameras.views[0].camera, [one.output for one in outputs]),
             cameras.frames_per_second,
         )
         self._moving = [one for one in outputs if is_video_of_all(one, cameras)]
@@ -193,7 +193,7 @@ def output_paths(folder: Path, formatted: FormattedOutput, cameras: RenderCamera
     return [path for view in cameras.views for path in still_paths(folder, formatted, view.name)]
 
 
-def _channel_names(
+def channel_names(
     scene: RenderableScene, camera: Cameras, outputs: Sequence[Output]
 ) -> dict[str, tuple[str, ...]]:
     """Names of the channels of outputs that have several; a scene without materials is asked how many."""

@@ -1,0 +1,88 @@
+"""docs/python.md: its names are the public ones, and its code and the notebook's run as they stand."""
+
+import inspect
+import json
+import re
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import unmix_plugin
+from tests.docs.pages import blocks_of, text_of
+
+
+def test_the_public_names_are_those_that_the_page_lists():
+    table = text_of("docs/python.md").split("\n## ")[0]
+    assert sorted(re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)) == sorted(unmix_plugin.__all__)
+    assert len(unmix_plugin.__all__) <= 10
+    assert sorted(unmix_plugin._MODULES) == sorted(unmix_plugin.__all__)
+
+
+@pytest.mark.parametrize("name", unmix_plugin.__all__)
+def test_a_public_name_says_what_it_is(name):
+    thing = getattr(unmix_plugin, name)
+    assert thing.__name__ == name
+    assert not thing.__doc__.startswith(f"{name}(")  # what a dataclass writes if nobody else does
+    assert name in dir(unmix_plugin)
+    if inspect.isclass(thing):
+        methods = [one for key, one in vars(thing).items() if callable(one) and not key.startswith("_")]
+        assert all(method.__doc__ for method in methods)
+
+
+def test_no_other_name_is_public():
+    with pytest.raises(AttributeError, match="has no attribute 'Trainer'"):
+        _ = unmix_plugin.Trainer
+
+
+def test_the_examples_run_one_after_the_other(home):
+    names = {}
+    for code in blocks_of("docs/python.md", "python"):
+        exec(compile(code, "docs/python.md", "exec"), names)
+    height, width = names["rgb"].shape[:2]
+    assert names["cube"].shape == (height, width, len(names["wavelengths"]))
+    assert names["edited"].materials.names[2] == "wood"
+    assert not np.allclose(names["picture"], names["rgb"], atol=0.05)
+    np.testing.assert_allclose(np.load(home / "abundances.npy"), names["abundances"], atol=1e-6)
+    assert Image.open(home / "view.png").size == (width, height)
+    assert {path.name for path in home.glob("view.*")} == {"view.png", "view.hdr", "view.img"}
+
+
+@pytest.mark.usefixtures("home")
+def test_the_page_lists_every_output_and_each_has_the_shape_that_it_says():
+    names = {}
+    exec(blocks_of("docs/python.md", "python")[0], names)
+    scene = names["scene"]
+    section = text_of("docs/python.md").split("| output | shape | |\n")[1].split("\n\n")[0]
+    rows = [row.split("|")[1:3] for row in section.splitlines()[1:]]
+    shapes = {name: shape.strip() for named, shape in rows for name in re.findall(r"`([^`]+)`", named)}
+    assert {name for name in shapes if ":" not in name} == {output.name for output in scene.outputs}
+    camera = scene.views[-1].camera
+    length = {
+        "H": camera.height,
+        "W": camera.width,
+        "B": len(scene.bands),
+        "K": len(scene.materials.names),
+        "3": 3,
+    }
+    view = scene.look(camera)
+    for name in set(shapes) - {"target:paint.csv", "index:ndvi", "false-colour:860,650,550"}:
+        assert view[name].shape == tuple(length[axis] for axis in re.findall(r"\w", shapes[name])), name
+
+
+def test_the_notebook_runs_and_holds_no_outputs(home, monkeypatch):
+    notebook = json.loads(text_of("docs/example.ipynb"))
+    assert (notebook["nbformat"], notebook["nbformat_minor"]) == (4, 5)
+    assert len({cell["id"] for cell in notebook["cells"]}) == len(notebook["cells"])
+    (run,) = home.glob("outputs/*/*/*")
+    monkeypatch.setenv("UNMIX_RUN", str(run))
+    monkeypatch.setenv("UNMIX_RESULTS", str(home))
+    names = {}
+    for cell in notebook["cells"]:
+        code = "".join(cell["source"])
+        if cell["cell_type"] == "code":
+            assert cell["outputs"] == []
+            exec(compile(code, cell["id"], "exec"), names)
+    assert (home / "view.png").is_file()
+    assert (home / "view.img").is_file()
+    assert np.isfinite(names["probe"].spectra["predicted"]).all()

@@ -1,0 +1,72 @@
+"""One output of a view as a file: the same numbers, and words where it can't be."""
+
+import numpy as np
+import pytest
+import spectral.io.envi as envi
+from PIL import Image
+
+from tests.method_factory import make_scene
+from unmix_plugin import save
+from unmix_plugin.errors import ConfigError, RunError
+
+
+@pytest.fixture(scope="module")
+def view():
+    scene = make_scene()
+    return scene.look(scene.views[0].camera)
+
+
+def test_npy_holds_the_numbers_of_the_view(view, tmp_path):
+    path = save(view, "spectral", tmp_path / "cube.npy")
+    np.testing.assert_array_equal(np.load(path), view["spectral"].numpy())
+
+
+def test_envi_holds_the_same_with_wavelengths(view, tmp_path):
+    image = envi.open(save(view, "spectral", str(tmp_path / "some.cube.hdr")))
+    np.testing.assert_array_equal(np.array(image.open_memmap()), view["spectral"].numpy())
+    np.testing.assert_allclose(image.bands.centers, view.scene.bands.centers_nm)
+
+
+def test_exr_holds_the_same(view, tmp_path):
+    import OpenEXR
+
+    with OpenEXR.File(
+        str(save(view, "linear_rgb", tmp_path / "picture.exr")), separate_channels=True
+    ) as file:
+        found = np.stack([file.channels()[name].pixels for name in "RGB"], axis=-1)
+    np.testing.assert_array_equal(found, view["linear_rgb"].numpy())
+
+
+@pytest.mark.parametrize("name", ["rgb", "abundances", "segmentation", "depth", "pca", "band:550nm"])
+def test_png_is_a_picture_of_the_views_size_or_of_tiles_of_it(view, tmp_path, name):
+    with Image.open(save(view, name, tmp_path / "picture.png")) as picture:
+        width, height = picture.size
+    assert (width, height) >= (view.camera.width, view.camera.height)
+    assert name == "abundances" or (width, height) == (view.camera.width, view.camera.height)
+
+
+def test_a_file_that_is_there_is_replaced(view, tmp_path):
+    (tmp_path / "depth.npy").write_bytes(b"old")
+    save(view, "depth", tmp_path / "depth.npy")
+    assert np.load(tmp_path / "depth.npy").shape == tuple(view.opacity.shape)
+
+
+@pytest.mark.parametrize(
+    ("name", "file", "message"),
+    [
+        ("rgb", "view.jpg", r"the suffix '.jpg' says no format; give one of .npy, .png, .exr, .hdr"),
+        ("rgb", "view.exr", "ask for linear_rgb"),
+        ("spectral", "view.png", "a PNG shows colours"),
+        ("rbg", "view.png", "there is no output named 'rbg'"),
+    ],
+)
+def test_what_cannot_be_written_is_said(view, tmp_path, name, file, message):
+    with pytest.raises(ConfigError, match=message):
+        save(view, name, tmp_path / file)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_is_none_is_said(view, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunError):
+        save(view, "depth", tmp_path / "file" / "depth.npy")

@@ -1,0 +1,58 @@
+"""One output of one rendered view as a file, for scripts and notebooks; `render/` writes it as `unmix-render` does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.products.render.files import RenderSetting, Rows, still_at
+from unmix_plugin.products.render.formats import choose_formats
+from unmix_plugin.products.render.job import channel_names
+from unmix_plugin.products.render.pictures import Palette
+from unmix_plugin.products.render.survey import take_survey
+from unmix_plugin.trained.material_view import MaterialView
+from unmix_plugin.trained.run_views import RunView
+
+_FORMATS = {".npy": "npy", ".png": "png", ".exr": "exr", ".hdr": "envi"}
+
+
+def save(view: MaterialView, name: str, path: str | Path) -> Path:
+    """Write an output of a view; a file that is there is replaced.
+
+    Args:
+        view: As `TrainedScene.look` gives it.
+        name: Of the output, such as `rgb`, `abundances` or `band:650nm`.
+        path: File to write. Its suffix says how: .npy (the numbers), .png (a picture), .exr (OpenEXR), or .hdr (ENVI: a
+            header, and the data beside it as .img).
+    Returns:
+        The path.
+    Raises:
+        ConfigError: an unknown output or suffix, or an output that can't be written that way.
+        SpectrumError: the bands don't cover what the output needs.
+        RunError: the disk is full or refuses.
+    """
+    path = Path(path)
+    if path.suffix not in _FORMATS:
+        known = ", ".join(_FORMATS)
+        raise ConfigError(f"{path}: the suffix {path.suffix!r} says no format; give one of {known}")
+    scene, camera = view.scene, view.camera
+    (formatted,) = choose_formats([name], [_FORMATS[path.suffix]], scene, is_path=False)
+    output = formatted.output
+    survey = take_survey(scene, [RunView(path.stem, camera)], [output] if path.suffix == ".png" else [])
+    setting = RenderSetting(
+        folder=path.parent,
+        size=(camera.width, camera.height),
+        palette=Palette.of(scene.materials, survey.scales),
+        bands=scene.bands,
+        channels=channel_names(scene, camera, [output]),
+        frames_per_second=None,
+    )
+    values: dict[str, np.ndarray] = {
+        "accumulation": view.opacity.cpu().numpy(),
+        name: view[name].cpu().numpy(),
+    }
+    with still_at(path, formatted, setting) as add:
+        add(Rows(0, values))
+    return path
