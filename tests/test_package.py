@@ -47,7 +47,7 @@ def test_a_wheel_holds_every_file_of_the_package_and_nothing_else(wheel):
     assert {name for name in wheel.namelist() if ".dist-info/" not in name} == expected
 
 
-def test_a_wheel_declares_commands_and_the_method(wheel):
+def test_a_wheel_declares_commands_and_methods(wheel):
     entry_points = configparser.ConfigParser()
     entry_points.read_string(metadata_file(wheel, "entry_points.txt"))
     assert dict(entry_points["console_scripts"]) == {
@@ -59,7 +59,8 @@ def test_a_wheel_declares_commands_and_the_method(wheel):
         "unmix-view": "unmix_plugin.commands.view:main",
     }
     assert dict(entry_points["unmix_plugin.method_configs"]) == {
-        "unmix-nerf": "unmix_plugin.method_config:unmix_nerf"
+        "unmix-nerf": "unmix_plugin.method_config:unmix_nerf",
+        "unmix-nerf-published": "unmix_plugin.method_config:unmix_nerf_published",
     }
 
 
@@ -85,6 +86,11 @@ def lines_printed_by(code):
 
 
 LIST_MODULES = "print(*{name.partition('.')[0] for name in sys.modules})"
+
+
+def test_importing_the_package_imports_no_dependency():
+    [modules] = lines_printed_by(f"import sys, unmix_plugin; {LIST_MODULES}")
+    assert set(modules.split()).isdisjoint({*HEAVY, "torch", "numpy"})
 
 
 @pytest.mark.parametrize("command", COMMANDS)

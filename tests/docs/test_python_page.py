@@ -6,9 +6,9 @@ import re
 
 import numpy as np
 import pytest
-from PIL import Image
 
 import unmix_plugin
+from tests.commands.running import picture_size
 from tests.docs.pages import blocks_of, text_of
 
 
@@ -44,7 +44,7 @@ def test_the_examples_run_one_after_the_other(home):
     assert names["edited"].materials.names[2] == "wood"
     assert not np.allclose(names["picture"], names["rgb"], atol=0.05)
     np.testing.assert_allclose(np.load(home / "abundances.npy"), names["abundances"], atol=1e-6)
-    assert Image.open(home / "view.png").size == (width, height)
+    assert picture_size(home / "view.png") == (width, height)
     assert {path.name for path in home.glob("view.*")} == {"view.png", "view.hdr", "view.img"}
 
 
