@@ -80,7 +80,7 @@ def test_a_point_is_measured_by_the_view_nearest_to_the_camera(views, scene):
     index = 1
     camera = scene.cameras[scene.train_indices[index]]
     towards = camera.camera_to_world[0, :, 3] / camera.camera_to_world[0, :, 3].norm()
-    found = views.measurement(BALL * towards, camera)
+    found = views.measurement(BALL * towards, camera, None)
     assert found is not None
     assert found.view == scene.frames[scene.train_indices[index]].name
     coords, _ = camera.project((BALL * towards)[None], 0)
@@ -89,10 +89,27 @@ def test_a_point_is_measured_by_the_view_nearest_to_the_camera(views, scene):
 
 
 def test_a_point_inside_is_seen_by_nobody(views, scene):
-    assert views.measurement(torch.zeros(3), scene.cameras[scene.train_indices[0]]) is None
+    assert views.measurement(torch.zeros(3), scene.cameras[scene.train_indices[0]], None) is None
 
 
 def test_depths_of_few_views_are_kept(views, scene):
     for index in range(len(scene.train_indices)):
         views.error(ball_frame(scene.cameras[scene.train_indices[index]]))
     assert len(views._distances) == min(len(scene.train_indices), 4)
+
+
+def test_what_was_measured_is_compared_in_the_light_that_the_scene_is_shown_in(views, scene):
+    index = scene.train_indices[2]
+    camera, frame = scene.cameras[index], ball_frame(scene.cameras[index])
+    light = torch.tensor([0.2, 0.4, 0.6, 0.8, 1.0, 0.5])
+    endmembers = frame.materials.endmembers * light
+    materials = replace(frame.materials, endmembers=endmembers, light=light)
+    relit_frame = replace(frame, scene=replace(frame.scene, materials=materials))
+    errors, is_known, _ = views.error(relit_frame)
+    measured = torch.from_numpy(scene.cube(index))
+    expected = ((measured - 0.25).abs() * light).mean(dim=-1)
+    assert_close(errors[is_known], expected[is_known], atol=1e-6, rtol=0)
+    distance = camera.camera_to_world[0, :, 3].norm()
+    point = camera.camera_to_world[0, :, 3] / distance * BALL
+    plain, relit = (views.measurement(point, camera, shown) for shown in (None, light.double().numpy()))
+    assert_close(relit.spectrum, plain.spectrum * light)

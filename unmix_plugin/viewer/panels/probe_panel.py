@@ -89,10 +89,14 @@ class ProbePanel:
         if session.services.measured is None:
             return taken
         camera = camera_of(session.pose(), _PROBED_ROWS)
-        found = session.services.measured.measurement(taken.position, camera)
+        edit = session.view.edit
+        found = session.services.measured.measurement(
+            taken.position, camera, session.services.maker.light_of(edit)
+        )
         if found is None:
             return taken
-        return replace(taken, measured=found.spectrum.double().numpy(), measured_in=found.view)
+        view = f"{found.view}, before the edits" if edit.recipe.operations else found.view
+        return replace(taken, measured=found.spectrum.double().numpy(), measured_in=view)
 
     def _show_chosen(self) -> None:
         chosen = next((one for one in self._probes if _label(one) == self._chosen.value), None)

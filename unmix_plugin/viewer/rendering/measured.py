@@ -9,13 +9,15 @@ import threading
 from collections import OrderedDict
 from dataclasses import dataclass
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Float64
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION
+from unmix_plugin.trained.library_matches import relit
 from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.viewer.rendering.scene_source import SceneSource
 
@@ -64,7 +66,7 @@ class MeasuredViews:
         if len(seen):
             points = _end_points(frame)[seen]
             rows, columns, sees = self._pixels_of(points, index)
-            cube = torch.from_numpy(self._scene.cube(self._indices[index]))
+            cube = self._in_light(self._scene.cube(self._indices[index]), frame.scene.light_power)
             spectra = frame.materials.spectra(
                 frame.coefficients.flatten().map(lambda packed: packed[seen[sees]])
             ).cpu()
@@ -76,15 +78,32 @@ class MeasuredViews:
         name = self._scene.frames[self._indices[index]].name
         return errors.view(height, width).to(device), is_known.view(height, width).to(device), name
 
-    def measurement(self, point: Float[Tensor, "3"], camera: Cameras) -> Measurement | None:
-        """What the training view nearest to a camera measured of a point; None where no view tried sees it."""
+    def measurement(
+        self, point: Float[Tensor, "3"], camera: Cameras, light: Float64[np.ndarray, " B"] | None
+    ) -> Measurement | None:
+        """What the training view nearest to a camera measured of a point; None where no view tried sees it.
+
+        Args:
+            point: Model space.
+            camera: One camera.
+            light: In which the scene is shown, relative power; what was measured is relit to it. None if unknown.
+        """
         for index in self._by_nearness(camera)[:_VIEWS_TRIED].tolist():
             rows, columns, sees = self._pixels_of(point[None], index)
             if bool(sees[0]):
                 cube = self._scene.cube(self._indices[index])
-                spectrum = torch.from_numpy(cube[int(rows[0]), int(columns[0])].copy())
+                spectrum = self._in_light(cube[int(rows[0]), int(columns[0])].copy(), light)
                 return Measurement(self._scene.frames[self._indices[index]].name, spectrum)
         return None
+
+    def _in_light(
+        self, measured: Float32[np.ndarray, "*pixels B"], light: Float64[np.ndarray, " B"] | None
+    ) -> Float32[Tensor, "*pixels B"]:
+        """Radiance as it is in the light that the scene is shown in."""
+        recorded = self._source.record.summary.get("illuminant")
+        is_same = light is None or (recorded is not None and np.allclose(light, recorded, rtol=1e-4))
+        found = measured if is_same else relit(measured, recorded, light).astype(np.float32)
+        return torch.from_numpy(found)
 
     def _by_nearness(self, camera: Cameras) -> Tensor:
         """Training views by the angle between their axis and the camera's, and by their distance to it."""
