@@ -215,16 +215,6 @@ def test_nothing_is_written_into_a_run_that_is_only_looked_at(run_copy):
     assert contents(run_copy) == before
 
 
-def test_a_method_that_does_not_unmix_has_no_viewer_and_says_so(run_copy, monkeypatch):
-    monkeypatch.setattr("unmix_plugin.trained.open_run.TrainedScene", type("OtherScene", (), {}))
-    ended = run(view, "--run", run_copy, "--device", "cpu")
-    assert ended.status == 2
-    assert (
-        "the method unmix-nerf has no endmembers: this needs a run of a method that unmixes spectra"
-        in ended.err
-    )
-
-
 def test_a_run_is_shown_with_the_edits_and_the_light_asked_for(run_copy):
     recipe = run_copy / "recipe.yml"
     recipe.write_text("edits:\n  - rename: {endmember: endmember_1, name: clay}\n")
