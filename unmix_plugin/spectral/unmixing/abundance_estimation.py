@@ -54,7 +54,7 @@ def fcls(pixels: Float[Tensor, "N B"], endmembers: Float[Tensor, "K B"]) -> Floa
     spectra = torch.cat([endmembers.double(), torch.full_like(endmembers[:, :1], weight).double()], dim=1)
     augmented = torch.cat([pixels.double(), torch.full_like(pixels[:, :1], weight).double()], dim=1)
     shares = nnls(augmented, spectra)
-    # What is left of the penalty's softness, about 1e-6, goes into the scale.
+    # The penalty leaves sums about 1e-6 off 1.
     return (shares / shares.sum(dim=1, keepdim=True).clamp(min=1e-12)).to(pixels.dtype)
 
 
@@ -114,11 +114,11 @@ def _solve(loads: Float[Tensor, "N K"], gram: Float[Tensor, "K K"]) -> Float[Ten
         if len(open_pixels) == 0:
             break
         in_use[open_pixels, steepest.indices[rising]] = True
-        _settle(open_pixels, amounts, in_use, loads, gram)
+        _constrained_step(open_pixels, amounts, in_use, loads, gram)
     return amounts
 
 
-def _settle(
+def _constrained_step(
     pixels: Tensor, amounts: Float[Tensor, "N K"], in_use: Bool[Tensor, "N K"], loads: Tensor, gram: Tensor
 ) -> None:
     """Bring `pixels` to the best amounts of the endmembers in use, dropping those that would turn negative."""
@@ -126,9 +126,9 @@ def _settle(
         used = in_use[pixels]
         best = _unconstrained(loads[pixels], used, gram)
         negative = used & (best <= 0)
-        settled = ~negative.any(dim=1)
-        amounts[pixels[settled]] = best[settled]
-        pixels, used, best, negative = (value[~settled] for value in (pixels, used, best, negative))
+        is_feasible = ~negative.any(dim=1)
+        amounts[pixels[is_feasible]] = best[is_feasible]
+        pixels, used, best, negative = (value[~is_feasible] for value in (pixels, used, best, negative))
         if len(pixels) == 0:
             return
         start = amounts[pixels]
@@ -143,7 +143,7 @@ def _settle(
 def _unconstrained(loads: Tensor, used: Bool[Tensor, "N K"], gram: Tensor) -> Float[Tensor, "N K"]:
     """Least squares over the endmembers in use, 0 elsewhere."""
     mask = used.double()
-    # A trace on the diagonal settles linearly dependent endmembers; rows out of use become those of the identity.
+    # A trace on the diagonal lets dependent endmembers be solved for; unused rows become those of the identity.
     trace = 1e-13 * gram.diagonal().max().clamp(min=1e-300)
     diagonal = torch.diag_embed(torch.where(used, trace, gram.diagonal().max().clamp(min=1e-300)))
     system = gram * mask[:, :, None] * mask[:, None, :] + diagonal
