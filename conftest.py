@@ -1,6 +1,7 @@
 """What every test and every doctest runs under: one thread, no display, slow first calls allowed, numpy's own print."""
 
 import os
+import signal
 
 import matplotlib as mpl
 import numpy as np
@@ -11,6 +12,10 @@ from hypothesis import settings
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # for commands that tests start as processes of their own
 torch.set_num_threads(1)  # tensors in tests are tiny, and results should not depend on the machine
 mpl.use("Agg")
+# A shell that starts the tests in the background, or nohup, leaves signals ignored that tests send.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+if hasattr(signal, "SIGHUP"):
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 settings.register_profile("unmix", deadline=None, derandomize=True)  # a first call may compile a kernel
 settings.load_profile("unmix")
 

@@ -14,7 +14,7 @@ def looked_at(
     """Cells after samples in the middle of these ones, each with the number of its view, and a judgement."""
     cells = VisibleCells((SIDE, SIDE, SIDE))
     record(cells, *sights, seen=seen, num_rays=num_rays)
-    cells.judge()
+    cells.update()
     return cells
 
 
@@ -48,30 +48,30 @@ def test_samples_that_send_too_little_light_see_nothing():
     cells = VisibleCells((SIDE, SIDE, SIDE))
     record(cells, ((6, 6, 6), 0), ((6, 6, 6), 1), seen=False)
     record(cells, ((1, 1, 1), 0), ((1, 1, 1), 1))
-    cells.judge()
+    cells.update()
     assert cells.visible[1, 1, 1]
     assert not cells.visible[6, 6, 6]
 
 
-def test_fog_too_thin_for_any_sample_to_be_seen_is_not_put_out():
+def test_density_too_thin_for_any_sample_to_be_seen_stays():
     cells = looked_at(((6, 6, 6), 0), ((6, 6, 6), 1), seen=False)
     assert cells.visible.all()
 
 
-def test_nothing_is_judged_before_enough_rays_were_cast():
+def test_nothing_is_left_out_before_enough_rays_were_cast():
     cells = looked_at(((1, 1, 1), 0), ((1, 1, 1), 1), num_rays=ENOUGH_RAYS - 1)
     assert cells.visible.all()
     record(cells, ((6, 6, 6), 0), ((6, 6, 6), 1), num_rays=1)
-    cells.judge()
+    cells.update()
     assert cells.visible[1, 1, 1]
     assert cells.visible[6, 6, 6]
     assert not cells.visible[4, 1, 1]
 
 
-def test_only_what_was_seen_since_the_last_judgement_counts_and_the_open_cells_follow_a_surface():
+def test_only_what_was_seen_since_the_last_update_counts_and_the_open_cells_follow_a_surface():
     cells = looked_at(((3, 3, 3), 0), ((3, 3, 3), 1))
     record(cells, ((4, 3, 3), 0), ((4, 3, 3), 1))
-    cells.judge()
+    cells.update()
     assert cells.visible[5, 3, 3]
     assert not cells.visible[2, 3, 3]
 
@@ -86,7 +86,7 @@ def test_points_on_the_faces_of_the_box_belong_to_the_outermost_cells():
     cells = VisibleCells((SIDE, SIDE, SIDE))
     corners = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]).repeat(2, 1)
     cells.record(corners, torch.tensor([0, 0, 1, 1]), torch.ones(4, dtype=torch.bool), ENOUGH_RAYS)
-    cells.judge()
+    cells.update()
     assert cells.visible[0, 0, 0]
     assert cells.visible[-1, -1, -1]
     assert int(cells.visible.sum()) == 16
