@@ -25,11 +25,12 @@ import torch
 import tyro
 from torch import Tensor
 
-from unmix_plugin import rendering
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.field import UnmixField
 from unmix_plugin.model import UnmixModel
-from unmix_plugin.rendering import HashGridLayout, PackedSamples
+from unmix_plugin.rendering import compositing, hash_encoding, marching
+from unmix_plugin.rendering.hash_encoding import HashGridLayout
+from unmix_plugin.rendering.marching import PackedSamples
 from unmix_plugin.scenes.demo.scene import DEFAULT_SIZE, DEFAULT_VIEWS, make_demo_scene
 
 SPEED_UP = _common.Limit(8.0, unit=" x")
@@ -67,13 +68,13 @@ class Operators:
 
 IMPLEMENTATIONS = {
     "kernel": Operators(
-        rendering.march, rendering.hash_encode, rendering.volume_weights, rendering.accumulate
+        marching.march, hash_encoding.hash_encode, compositing.volume_weights, compositing.accumulate
     ),
     "twin": Operators(
-        rendering.march_twin,
-        rendering.hash_encode_twin,
-        rendering.volume_weights_twin,
-        rendering.accumulate_twin,
+        marching.march_twin,
+        hash_encoding.hash_encode_twin,
+        compositing.volume_weights_twin,
+        compositing.accumulate_twin,
     ),
 }
 
@@ -96,7 +97,7 @@ class TrainingState:
         self.device = t_near.device
         jitter = torch.rand(len(t_near), generator=generator).to(self.device)
         self.marched = (origins, directions, t_near, t_far, jitter, renderer.occupied, renderer.step)
-        self.samples = rendering.march(*self.marched)
+        self.samples = marching.march(*self.marched)
         rays = self.samples.ray_indices
         self.positions = origins[rays] + self.samples.t[:, None] * directions[rays]
         self.layout = field.layout

@@ -5,7 +5,7 @@ import torch
 from torch.testing import assert_close
 
 from tests.method_factory import BOX, CONFIG
-from unmix_plugin.field import UnmixField, UnmixFieldConfig, direction_features, finest_resolution
+from unmix_plugin.field import UnmixField, UnmixFieldConfig, direction_features
 
 
 def make_field(num_specular: int = 2, scale: str = "shared", temperature: float = 1.0) -> UnmixField:
@@ -85,6 +85,6 @@ def test_direction_features_are_orthogonal_over_the_sphere():
 
 def test_the_finest_level_follows_the_size_of_a_pixel():
     sharp, blurred = (
-        finest_resolution(UnmixFieldConfig(cells_per_pixel=2.0), BOX, size) for size in (0.01, 0.04)
+        UnmixFieldConfig(cells_per_pixel=2.0).cells_of_finest_level(BOX, size) for size in (0.01, 0.04)
     )
     assert (sharp, blurred) == (400, 100)

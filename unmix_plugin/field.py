@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Literal
 
 import torch
@@ -74,6 +75,11 @@ class UnmixFieldConfig(InstantiateConfig):
         }
         require("the field", rules)
 
+    def cells_of_finest_level(self, scene_box: SceneBox, pixel_size: float) -> int:
+        """Cells along the scene box's longest edge; `pixel_size` is as `UnmixField` takes it."""
+        cells = math.ceil(self.cells_per_pixel * float(scene_box.size.max()) / pixel_size)
+        return max(self.coarsest_resolution, min(cells, LARGEST_RESOLUTION))
+
 
 class CoefficientField(Field):
     """What the renderer asks of a field: densities by way of an encoding, and the coefficients of spectra."""
@@ -91,6 +97,10 @@ class CoefficientField(Field):
     @abstractmethod
     def abundances_of(self, features: Float[Tensor, "S G"]) -> Float[Tensor, "S K"]:
         """Abundances a of points with these geometry features, summing to 1."""
+
+    def get_density(self, positions: Float[Tensor, "S 3"]) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
+        """Density per scene unit and geometry features."""
+        return self.density_of(self.encode(positions))
 
 
 class UnmixField(CoefficientField):
@@ -118,27 +128,29 @@ class UnmixField(CoefficientField):
         """
         super().__init__()
         self.config = config
-        self.num_specular = num_specular
+        self.num_endmembers, self.num_specular = num_endmembers, num_specular
+        self.num_encoded = config.num_levels * config.features_per_level
         self.log_initial_density = math.log(initial_density)
         self.layout = HashGridLayout(
             config.num_levels,
             config.features_per_level,
             config.coarsest_resolution,
-            max(config.coarsest_resolution, finest_resolution(config, scene_box, pixel_size)),
+            config.cells_of_finest_level(scene_box, pixel_size),
             config.log2_rows_per_level,
         )
         self.register_buffer("aabb", scene_box.aabb.clone())
         table = torch.empty(self.layout.num_rows, config.features_per_level)
         self.table = nn.Parameter(nn.init.uniform_(table, -1e-4, 1e-4))
-        width, num_encoded = config.hidden_width, config.num_levels * config.features_per_level
-        num_features = config.num_features + 1
-        self.density_network = bias_free_network(num_encoded, width, num_features)
-        num_scales = 1 if config.scale == "shared" else num_endmembers
-        self.num_endmembers = num_endmembers
-        self.material_network = bias_free_network(num_features, width, num_endmembers + num_scales)
-        if num_specular:
+        self._make_networks()
+
+    def _make_networks(self) -> None:
+        width, num_features = self.config.hidden_width, self.config.num_features + 1
+        num_scales = 1 if self.config.scale == "shared" else self.num_endmembers
+        self.density_network = bias_free_network(self.num_encoded, width, num_features)
+        self.material_network = bias_free_network(num_features, width, self.num_endmembers + num_scales)
+        if self.num_specular:
             self.specular_network = bias_free_network(
-                num_features + NUM_DIRECTION_FEATURES, width, num_specular + 1
+                num_features + NUM_DIRECTION_FEATURES, width, self.num_specular + 1
             )
 
     def encode(
@@ -148,12 +160,8 @@ class UnmixField(CoefficientField):
         unit_positions = (positions - self.aabb[0]) / (self.aabb[1] - self.aabb[0])
         return hash_encode(unit_positions, self.table, self.layout, known)
 
-    def get_density(self, positions: Float[Tensor, "S 3"]) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
-        """Density per scene unit and geometry features."""
-        return self.density_of(self.encode(positions))
-
     def density_of(self, encoded: Float[Tensor, "S LF"]) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
-        """Density per scene unit and geometry features where the hash grid's encoding is `encoded`."""
+        """Density per scene unit and geometry features where the encoding is `encoded`."""
         features = self.density_network(encoded)
         return bounded_exp(features[:, 0] + self.log_initial_density), features
 
@@ -191,12 +199,6 @@ class UnmixField(CoefficientField):
         return factors[:, :1] * factors[:, 1:]
 
 
-def finest_resolution(config: UnmixFieldConfig, scene_box: SceneBox, pixel_size: float) -> int:
-    """Cells along the scene box's longest edge that give `cells_per_pixel`."""
-    cells = config.cells_per_pixel * float(scene_box.size.max()) / pixel_size
-    return min(math.ceil(cells), LARGEST_RESOLUTION)
-
-
 NUM_DIRECTION_FEATURES = 15
 
 
@@ -231,11 +233,10 @@ def bounded_exp(raw: Float[Tensor, "S"]) -> Float[Tensor, "S"]:
     return (raw + (raw.clamp(max=_LARGEST_LOG_DENSITY) - raw).detach()).exp()
 
 
-def bias_free_network(num_inputs: int, width: int, num_outputs: int) -> nn.Sequential:
-    """Two linear layers with a ReLU between them."""
+def bias_free_network(*widths: int) -> nn.Sequential:
+    """Linear layers from each width to the next, with a ReLU between them."""
     # Without biases, as in Mueller et al. 2022: torch copies a bias into the output first, a fifth of the layer's time.
-    return nn.Sequential(
-        nn.Linear(num_inputs, width, bias=False),
-        nn.ReLU(inplace=True),
-        nn.Linear(width, num_outputs, bias=False),
-    )
+    layers: list[nn.Module] = []
+    for num_inputs, num_outputs in pairwise(widths):
+        layers += [nn.Linear(num_inputs, num_outputs, bias=False), nn.ReLU(inplace=True)]
+    return nn.Sequential(*layers[:-1])

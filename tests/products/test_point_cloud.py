@@ -8,8 +8,8 @@ from tests.trained.camera_files.camera_scenes import FRAME
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.products.point_cloud import require_count, write_point_cloud
 from unmix_plugin.products.point_scores import require_point_scores
-from unmix_plugin.spectral import SpectraTable, write_spectra_csv
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.trained.surface import SeenSurface
 
 SCENE = ball_scene()

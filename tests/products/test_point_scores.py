@@ -7,7 +7,8 @@ import torch
 from tests.method_factory import WAVELENGTHS_NM, make_model
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.products.point_scores import require_point_scores
-from unmix_plugin.spectral import Bands, SpectraTable, write_spectra_csv
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 
 BANDS = Bands.of(WAVELENGTHS_NM)
 LIGHT = [0.2, 0.4, 0.6, 0.8, 1.0]

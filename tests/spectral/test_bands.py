@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.spectral import Bands
+from unmix_plugin.spectral.bands import Bands
 
 samplings = st.lists(st.floats(1, 3000), min_size=1, max_size=40, unique_by=lambda x: round(x, 2)).map(
     lambda values: Bands.of(sorted(values))

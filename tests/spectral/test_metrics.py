@@ -11,11 +11,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.spectral.mixtures import seeded, smooth_endmembers
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.spectral import (
+from unmix_plugin.spectral import metrics
+from unmix_plugin.spectral.metrics import (
     abundance_rmse,
     endmember_angle,
     match_endmembers,
-    metrics,
     psnr,
     rgb_psnr,
     rmse,

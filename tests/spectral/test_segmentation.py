@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 from tests.spectral.mixtures import seeded, smooth_endmembers
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.spectral import SegmentationTally, material_ids, material_scores
+from unmix_plugin.spectral.segmentation import SegmentationTally, material_ids, material_scores
 
 
 def labels(*values):

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.spectral import (
-    Bands,
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.colour.conversion import (
     band_composite_matrix,
     colour_mode,
     describe_colour,

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unmix_plugin.errors import RunError, SpectrumError
-from unmix_plugin.spectral import (
-    Bands,
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.library.spectra_csv import (
     SpectraTable,
     read_illuminant_csv,
     read_spectra_csv,

@@ -5,7 +5,7 @@ import torch
 from torch.testing import assert_close
 
 from unmix_plugin.errors import ConfigError, SpectrumError
-from unmix_plugin.spectral import Bands
+from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.maps.indices import NAMED_INDICES, available_indices, parse_index
 
 FULL = Bands.of(range(350, 2501, 10))

@@ -8,7 +8,8 @@ import torch
 from torch.testing import assert_close
 
 from unmix_plugin.errors import ConfigError, SpectrumError
-from unmix_plugin.spectral import Bands, SpectraTable, write_spectra_csv
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.spectral.maps.targets import parse_target
 
 BANDS = Bands.of([450, 500, 550, 600, 650])

@@ -5,7 +5,8 @@ from hypothesis import strategies as st
 
 from tests.spectral.mixtures import mixed_pixels, seeded, smooth_endmembers
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.spectral import drop_uninformative_pixels, initialise_endmembers, spectral_angle
+from unmix_plugin.spectral.metrics import spectral_angle
+from unmix_plugin.spectral.unmixing.endmembers import drop_uninformative_pixels, initialise_endmembers
 
 METHODS = ["kmeans", "vca", "nfindr", "minimum-volume", "pairs"]
 

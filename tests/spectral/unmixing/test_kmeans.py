@@ -6,7 +6,8 @@ from torch.testing import assert_close
 
 from tests.spectral.mixtures import seeded, smooth_endmembers
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.spectral import normalised_kmeans, scale_to_lit_pixels, spectral_angle
+from unmix_plugin.spectral.metrics import spectral_angle
+from unmix_plugin.spectral.unmixing.kmeans_normalised import normalised_kmeans, scale_to_lit_pixels
 
 
 def shaded_clusters(num_clusters, per_cluster=60, seed=0, noise=0.01):

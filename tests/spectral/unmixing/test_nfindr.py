@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 from tests.spectral.mixtures import mixed_pixels, seeded, smooth_endmembers
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.spectral import nfindr, simplex_volume
+from unmix_plugin.spectral.unmixing.nfindr_winter1999 import nfindr, simplex_volume
 
 
 def volume_in_plane(points):

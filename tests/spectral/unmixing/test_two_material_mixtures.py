@@ -10,8 +10,13 @@ from torch.testing import assert_close
 
 from tests.spectral.mixtures import seeded, smooth_endmembers
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.spectral import nnls, spectral_angle, two_material_endmembers, two_material_fits
-from unmix_plugin.spectral.unmixing.two_material_mixtures import distances_to_pairs
+from unmix_plugin.spectral.metrics import spectral_angle
+from unmix_plugin.spectral.unmixing.abundance_estimation import nnls
+from unmix_plugin.spectral.unmixing.two_material_mixtures import (
+    distances_to_pairs,
+    two_material_endmembers,
+    two_material_fits,
+)
 
 
 def surface_pixels(materials, seed=0, per_material=60, per_pair=30, noise=0.0):

@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 from tests.spectral.mixtures import mixed_pixels, seeded, smooth_endmembers
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.spectral import estimate_snr_db, vca
+from unmix_plugin.spectral.unmixing.vca_nascimento2005 import estimate_snr_db, vca
 
 HIGH_SNR_DB, LOW_SNR_DB = 80.0, 5.0
 
