@@ -12,16 +12,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from unmix_plugin.atomic_files import write_errors_as
 from unmix_plugin.formats.envi_header import (
     HeaderValue,
     beside,
-    header_bytes,
+    envi_rows,
     layout_entries,
     wavelength_entries,
 )
-from unmix_plugin.formats.files import write_file
-from unmix_plugin.formats.raw_rows import RowSink, raw_rows
+from unmix_plugin.formats.raw_rows import RowSink
 from unmix_plugin.spectral.bands import Bands
 
 _SHOWN_NM = (640.0, 550.0, 460.0)
@@ -48,8 +46,6 @@ def write_envi_cube(
         wavelengths: Centres of the bands, if they are bands of a spectrum.
         names: Of the bands; commas in them become `-`, as the format has no other way.
         description: What the numbers are, with their unit.
-    Returns:
-        The files.
     Raises:
         RunError: the disk is full or refuses.
         ValueError: another number of wavelengths or names than of bands.
@@ -67,33 +63,21 @@ def envi_cube_rows(
     names: Sequence[str] | None,
     description: str,
 ) -> Iterator[RowSink]:
-    """Context that gives a sink for the rows of a cube of `shape` (H, W, C); the rest is as in `write_envi_cube`.
-
-    The header is written last, and an old one is removed before its numbers are replaced: whenever both files are
-    there, they belong together.
-    """
+    """Context that gives a sink for the rows of a cube of `shape` (H, W, C); the rest is as in `write_envi_cube`."""
     for what, given in (("wavelengths", wavelengths), ("names", names)):
         if given is not None and len(given) != shape[2]:
             raise ValueError(f"{len(given)} {what} for {shape[2]} bands")
-    header_path, data_path = envi_cube_paths(path_without_suffix)
     height, width, num_bands = shape
-    kind = np.dtype("<f4")
     entries: dict[str, HeaderValue] = {
         "description": description,
         "file type": "ENVI Standard",
-        **layout_entries(width, height, num_bands, kind, "bip"),
-        **({} if wavelengths is None else wavelength_entries(wavelengths)),
-        **({} if names is None else {"band names": list(names)}),
-        **({} if wavelengths is None else _shown_bands(wavelengths)),
+        **layout_entries(width, height, num_bands, "bip"),
     }
-    with raw_rows(data_path, b"", shape, kind) as add:
+    if wavelengths is not None:
+        entries |= wavelength_entries(wavelengths)
+    if names is not None:
+        entries["band names"] = list(names)
+    if wavelengths is not None and all(map(wavelengths.contains, _SHOWN_NM)):
+        entries["default bands"] = [str(wavelengths.nearest(wavelength) + 1) for wavelength in _SHOWN_NM]
+    with envi_rows(envi_cube_paths(path_without_suffix), shape, entries) as add:
         yield add
-        with write_errors_as(header_path):
-            header_path.unlink(missing_ok=True)
-    write_file(header_path, header_bytes(entries))
-
-
-def _shown_bands(bands: Bands) -> dict[str, HeaderValue]:
-    if not all(bands.contains(wavelength) for wavelength in _SHOWN_NM):
-        return {}
-    return {"default bands": [str(bands.nearest(wavelength) + 1) for wavelength in _SHOWN_NM]}

@@ -11,10 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from unmix_plugin.atomic_files import write_errors_as
-from unmix_plugin.formats.envi_header import beside, header_bytes, layout_entries, wavelength_entries
-from unmix_plugin.formats.files import write_file
-from unmix_plugin.formats.raw_rows import raw_rows
+from unmix_plugin.formats.envi_header import beside, envi_rows, layout_entries, wavelength_entries
 from unmix_plugin.spectral.bands import Bands
 
 
@@ -30,36 +27,26 @@ def write_envi_library(
     names: Sequence[str],
     description: str = "spectra",
 ) -> list[Path]:
-    """Write spectra as NAME.hdr and NAME.sli, float32.
+    """Write spectra as NAME.hdr and NAME.sli, float32; commas in names become `-`, as the format has no other way.
 
     Args:
         path_without_suffix: Folder, which is made, and NAME.
-        spectra: Any numbers.
-        bands: Their wavelengths.
-        names: Of the spectra; commas in them become `-`, as the format has no other way.
+        spectra, bands, names: Any numbers, their wavelengths, and what each spectrum is called.
         description: What the numbers are, with their unit.
-    Returns:
-        The files.
     Raises:
         RunError: the disk is full or refuses.
         ValueError: another number of names than of spectra, or of wavelengths than of bands.
     """
     if spectra.shape != (len(names), len(bands)):
-        raise ValueError(
-            f"{len(names)} names and {len(bands)} wavelengths for spectra of shape {spectra.shape}"
-        )
-    header_path, data_path = envi_library_paths(path_without_suffix)
-    kind = np.dtype("<f4")
+        raise ValueError(f"{len(names)} names and {len(bands)} wavelengths for spectra of {spectra.shape}")
     entries = {
         "description": description,
         "file type": "ENVI Spectral Library",
-        **layout_entries(len(bands), len(names), 1, kind, "bsq"),
+        **layout_entries(len(bands), len(names), 1, "bsq"),
         **wavelength_entries(bands),
         "spectra names": list(names),
     }
-    with raw_rows(data_path, b"", spectra.shape, kind) as add:
+    paths = envi_library_paths(path_without_suffix)
+    with envi_rows(paths, spectra.shape, entries) as add:
         add(spectra)
-        with write_errors_as(header_path):
-            header_path.unlink(missing_ok=True)
-    write_file(header_path, header_bytes(entries))
-    return [header_path, data_path]
+    return paths

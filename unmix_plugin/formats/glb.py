@@ -43,8 +43,6 @@ def write_glb(
         faces: Indices of vertices.
         numbers: More of each vertex, (P,) float32, by a name that starts with `_`.
         extras: What else the file says of the mesh, as JSON has it.
-    Returns:
-        The file.
     Raises:
         RunError: the disk is full or refuses.
     """
@@ -57,17 +55,13 @@ def write_glb(
     for name, values in numbers.items():
         attributes[name] = builder.add(values, "SCALAR", _FLOAT, _VERTEX_BUFFER)
     indices = builder.add(faces.astype("<u4").ravel(), "SCALAR", _UNSIGNED_INT, _INDEX_BUFFER)
+    primitive = {"attributes": attributes, "indices": indices, "material": 0}
     content = {
         "asset": {"version": "2.0", "generator": f"unmix-nerf {__version__}"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "name": "surface"}],
-        "meshes": [
-            {
-                "primitives": [{"attributes": attributes, "indices": indices, "material": 0}],
-                "extras": dict(extras),
-            }
-        ],
+        "meshes": [{"primitives": [primitive], "extras": dict(extras)}],
         "materials": [{"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0}}],
         "accessors": builder.accessors,
         "bufferViews": builder.views,

@@ -32,22 +32,15 @@ def write_obj(
     palette: Float[np.ndarray, "M 3"],
     comments: Sequence[str] = (),
 ) -> list[Path]:
-    """Write a mesh as NAME.obj and NAME.mtl.
-
-    Numbers have nine significant digits, exact for float32.
+    """Write a mesh as NAME.obj and NAME.mtl, with nine significant digits, exact for float32.
 
     Args:
         path_without_suffix: Folder, which is made, and NAME.
-        positions: Of the vertices.
-        normals: Of the vertices, unit vectors.
+        positions, normals: Of the vertices; unit normals.
         srgb: Colours of the vertices in [0, 1], which most viewers show; others show the materials.
-        faces: Indices of vertices.
-        materials: Material of each face.
-        names: Of the materials; what is no letter or digit becomes `_`.
-        palette: sRGB of the materials.
+        faces, materials: Indices of vertices, and the material of each face.
+        names, palette: Of the materials; in names what is no letter or digit becomes `_`; sRGB.
         comments: First lines.
-    Returns:
-        The files.
     Raises:
         RunError: the disk is full or refuses.
     """
@@ -66,7 +59,5 @@ def write_obj(
         f"newmtl {name}\nKd {colour[0]:.6g} {colour[1]:.6g} {colour[2]:.6g}\nillum 1\n\n"
         for name, colour in zip(plain, palette.tolist(), strict=True)
     )
-    return [
-        write_file(library_path, library.encode()),
-        write_file(obj_path, text.getvalue().encode("utf-8")),
-    ][::-1]
+    write_file(library_path, library.encode())
+    return [write_file(obj_path, text.getvalue().encode("utf-8")), library_path]

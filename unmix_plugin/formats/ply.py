@@ -30,8 +30,6 @@ def write_ply(
             float64, uint8 or int32.
         faces: Indices of vertices.
         comments: Lines of the header.
-    Returns:
-        The file.
     Raises:
         RunError: the disk is full or refuses.
         KeyError: a property of another type.

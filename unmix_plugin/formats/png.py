@@ -18,9 +18,7 @@ if TYPE_CHECKING:
 def rgba_png_bytes(rgba: UInt8[np.ndarray, "H W C"], description: str = "") -> bytes:
     """sRGB colours, three or four channels; the fourth is opacity, by which colours are not multiplied.
 
-    Args:
-        rgba: Colours.
-        description: What is shown; written into the file as its `Description`.
+    `description` says what is shown; it is written into the file as its `Description`.
     """
     from PIL import Image
 
@@ -39,7 +37,7 @@ def indexed_png_bytes(
         ids: Indices.
         palette: sRGB in [0, 1], at most 256.
         transparent: An id that is not painted.
-        description: What is shown; written into the file as its `Description`.
+        description: As `rgba_png_bytes` takes it.
     """
     from PIL import Image
 

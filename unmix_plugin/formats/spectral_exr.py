@@ -16,12 +16,6 @@ from jaxtyping import Float32
 from unmix_plugin.formats.exr import write_exr
 from unmix_plugin.spectral.bands import Bands
 
-LAYOUT_VERSION = "1.0"
-"""Of the layout."""
-
-UNITS = "W.m^-2.sr^-1"
-"""What the layout has for emissive images; what 1 means depends on the sensor."""
-
 
 def channel_name(wavelength_nm: float) -> str:
     """Channel of a band.
@@ -49,8 +43,6 @@ def write_spectral_exr(
         rgb: Preview for viewers that know no spectra, linear light in sRGB primaries.
         alpha: Opacity, [0, 1]; spectra and preview are multiplied by it already, as OpenEXR wants it.
         comments: What the numbers are.
-    Returns:
-        The file.
     Raises:
         RunError: the disk is full or refuses.
         ValueError: another number of wavelengths than of bands.
@@ -62,7 +54,8 @@ def write_spectral_exr(
         channels.update({name: rgb[..., i] for i, name in enumerate("RGB")})
     if alpha is not None:
         channels["A"] = alpha
-    attributes = {"spectralLayoutVersion": LAYOUT_VERSION, "emissiveUnits": UNITS}
+    # The unit is the layout's for emissive images; what 1 stands for depends on the sensor.
+    attributes = {"spectralLayoutVersion": "1.0", "emissiveUnits": "W.m^-2.sr^-1"}
     if comments:
         attributes["comments"] = comments
     return write_exr(path, channels, attributes)

@@ -52,12 +52,10 @@ class GridPoints:
 
     def slice_points(self, index: int) -> Float[Tensor, "Y Z 3"]:
         """Points of the slice at `index` along x."""
-        axes = [
-            float(self.origin[axis]) + self.cell * torch.arange(count, dtype=torch.float64)
-            for axis, count in enumerate(self.shape)
-        ]
-        y, z = torch.meshgrid(axes[1], axes[2], indexing="ij")
-        return torch.stack([axes[0][index].expand_as(y), y, z], dim=-1).float()
+        _, num_y, num_z = self.shape
+        cells = torch.cartesian_prod(torch.tensor([index]), torch.arange(num_y), torch.arange(num_z))
+        points = torch.from_numpy(self.origin).double() + self.cell * cells
+        return points.float().view(num_y, num_z, 3)
 
 
 @torch.no_grad()
@@ -68,13 +66,9 @@ def sample_slice(
     flat = points.flatten(0, 1).to(scene.device)
     densities = torch.zeros(len(flat), device=scene.device)
     abundances = torch.zeros(len(flat), len(scene.materials.names), device=scene.device)
-    rendered = scene.renderer.is_occupied(flat).nonzero()[:, 0]
-    for chosen in rendered.split(_CHUNK):
-        found, features = scene.field.get_density(flat[chosen])
-        densities[chosen] = found
-        # Abundances don't depend on the direction that the interface asks for.
-        towards = torch.zeros_like(flat[chosen])
-        abundances[chosen] = scene.field.get_outputs(flat[chosen], towards, features)["abundances"]
+    for chosen in scene.renderer.is_occupied(flat).nonzero()[:, 0].split(_CHUNK):
+        densities[chosen], features = scene.field.get_density(flat[chosen])
+        abundances[chosen] = scene.field.abundances_of(features)
     shape = points.shape[:2]
     return densities.cpu().unflatten(0, shape).numpy(), abundances.cpu().unflatten(0, shape).numpy()
 

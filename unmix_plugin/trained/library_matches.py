@@ -72,12 +72,8 @@ def shown_matches(
 
 def match_json(match: LibraryMatch) -> dict[str, Any]:
     """A match as JSON has it."""
-    return {
-        "name": match.name,
-        "angle_rad": match.angle_rad,
-        "bands_compared": match.num_bands,
-        "source": match.source,
-    }
+    given = {"name": match.name, "angle_rad": match.angle_rad}
+    return {**given, "bands_compared": match.num_bands, "source": match.source}
 
 
 def _as_seen(

@@ -6,7 +6,6 @@ import copy
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -69,12 +68,11 @@ class ModelScene:
         Raises:
             ConfigError: there is none.
         """
-        for output in self.outputs:
-            if output.name == name:
-                return output
-        names = [output.name for output in self.outputs]
-        hint = did_you_mean(name, names, likeness=0.5, form=" ({})")
-        raise ConfigError(f"there is no output named {name!r}{hint}; known are {', '.join(names)}")
+        named = {output.name: output for output in self.outputs}
+        if name in named:
+            return named[name]
+        hint = did_you_mean(name, named, likeness=0.5, form=" ({})")
+        raise ConfigError(f"there is no output named {name!r}{hint}; known are {', '.join(named)}")
 
     def look(self, camera: Cameras, subpixels: int | None = None) -> ModelView:
         """Render all outputs of a view, one ray a pixel."""
@@ -100,13 +98,11 @@ class ModelScene:
         values = {
             name: tensor.detach().reshape(-1).double().cpu().numpy() for name, tensor in view.tensors.items()
         }
-        position = None
+        position = world = None
         if "ray_distance" in values:
-            rays = camera.to("cpu").generate_rays(
-                torch.zeros(1, dtype=torch.int64), torch.tensor([[column + 0.5, row + 0.5]])
-            )
+            rays = view.camera.to("cpu").image_rays(0)
             position = (rays.origins + values["ray_distance"][0] * rays.directions)[0].double().numpy()
-        world = None if position is None else self.frame.to_world(np.asarray(position)[None])[0]
+            world = self.frame.to_world(position[None])[0]
         return Probe(values, float(view.opacity.reshape(-1)[0]), position, world)
 
 
@@ -120,10 +116,19 @@ def model_scene(
     """
     if not model.outputs:
         raise ConfigError(f"{type(model).__name__} names no outputs that could be shown")
+    still = copy.deepcopy(model, frozen_parameters(model, averages)).eval()  # type: ignore[arg-type]
+    return ModelScene(still, world_frame(record), recorded_views(record), still.outputs)
+
+
+def frozen_parameters(model: Model, averages: Mapping[str, Tensor] | None) -> dict[int, nn.Parameter]:
+    """Copies of a model's parameters without gradients, by the parameters' ids, as `copy.deepcopy` takes them.
+
+    Args:
+        model: Stays as it is.
+        averages: Values to use instead of the parameters', by their names.
+    """
     values = dict(averages or {})
-    frozen = {
+    return {
         id(param): nn.Parameter(values.get(name, param).detach().clone(), requires_grad=False)
         for name, param in model.named_parameters()
     }
-    still = copy.deepcopy(model, frozen).eval()  # type: ignore[arg-type]
-    return ModelScene(still, world_frame(record), recorded_views(record), still.outputs)

@@ -6,13 +6,13 @@ import copy
 from collections.abc import Mapping
 from dataclasses import replace
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from unmix_plugin.engine.model import Model
 from unmix_plugin.engine.registry import find_method
 from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.model import UnmixModel
-from unmix_plugin.trained.model_scene import model_scene
+from unmix_plugin.trained.model_scene import frozen_parameters, model_scene
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.run_views import recorded_views
 from unmix_plugin.trained.trained_scene import TrainedScene
@@ -25,17 +25,12 @@ def unmix_scene(
     """The scene of a model as it is now; training that goes on does not change it.
 
     Args:
-        model: Stays as it is.
+        model, averages: As `frozen_parameters` takes them.
         record: Cameras and frame of its run.
-        averages: Values to use instead of the parameters', by their names.
     Raises:
         RunError: the record is damaged.
     """
-    values = dict(averages or {})
-    frozen = {
-        id(param): nn.Parameter(values.get(name, param).detach().clone(), requires_grad=False)
-        for name, param in model.named_parameters()
-    }
+    frozen = frozen_parameters(model, averages)
     materials = model.materials
     is_dictionary = materials.specular_spectra is model.specular_spectra
     materials = replace(

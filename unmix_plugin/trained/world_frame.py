@@ -37,13 +37,7 @@ def directions_to_world(
 def affine_to_world(
     frame: Normalisation, origin: Float[np.ndarray, "3"], cell: float
 ) -> Float64[np.ndarray, "4 4"]:
-    """Matrix from the indices of a grid in model space, as (i, j, k, 1), to world points.
-
-    Args:
-        frame: Of the run.
-        origin: Point of index (0, 0, 0), model space.
-        cell: Edge of a cell, model units.
-    """
+    """Matrix from indices of a model-space grid, as (i, j, k, 1), to world points; `origin` is that of (0, 0, 0)."""
     matrix = np.eye(4)
     matrix[:3, :3] = frame.rotation.T * (cell / frame.scale)
     matrix[:3, 3] = frame.to_world(np.asarray(origin, dtype=np.float64))
