@@ -72,10 +72,9 @@ def describe_colour(bands: Bands) -> str:
         return "true colour: CIE 1931 2 degree observer, flat spectrum shown as white"
     thirds = np.linspace(bands.edges_nm[0], bands.edges_nm[-1], 4)
     names = [
-        f"{name} {thirds[i]:.0f}-{thirds[i + 1]:.0f} nm"
-        for name, i in (("red", 2), ("green", 1), ("blue", 0))
+        f"{name} {thirds[i]:.0f}-{thirds[i + 1]:.0f} nm" for i, name in enumerate(("blue", "green", "red"))
     ]
-    return "false colour: " + ", ".join(names)
+    return "false colour: " + ", ".join(names[::-1])
 
 
 def rgb_matrix(bands: Bands, dtype: torch.dtype = torch.float32) -> Float[Tensor, "B 3"]:
@@ -96,12 +95,11 @@ def rgb_matrix(bands: Bands, dtype: torch.dtype = torch.float32) -> Float[Tensor
 def xyz_matrix(bands: Bands, dtype: torch.dtype = torch.float32) -> Float[Tensor, "B 3"]:
     """Matrix from spectra to CIE 1931 2 degree XYZ, on the CPU; flat 1 has Y = 1 and the chromaticity of illuminant E.
 
-    Relative to the covered range: a sensor that ends at 650 nm is normalised by what it sees of Y.
+    Relative to the covered range: a sensor that ends at 650 nm is normalised by what it sees of Y. The colour matching
+    functions are those of CIE 15:2018 at 1 nm, as colour-science gives them.
 
     Raises:
         SpectrumError: no band reaches into 360-830 nm, where the colour matching functions are.
-    Source:
-        CIE 15:2018, colour matching functions at 1 nm as colour-science gives them.
     """
     return torch.tensor(_xyz_weights(bands), dtype=dtype)
 
@@ -130,10 +128,9 @@ def band_composite_matrix(
 
 
 def linear_to_srgb(linear_rgb: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Encode linear light for a display; increasing everywhere, gradients finite, nothing clamped.
+    """Encode linear light for a display (IEC 61966-2-1:1999; below 0 the linear piece goes on).
 
-    Source:
-        IEC 61966-2-1:1999; below 0 the linear piece goes on.
+    Increasing everywhere, gradients finite, nothing clamped.
 
     >>> linear_to_srgb(torch.tensor([0.0, 0.2140, 1.0]))
     tensor([0.0000, 0.5000, 1.0000])
@@ -145,11 +142,7 @@ def linear_to_srgb(linear_rgb: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape
 
 
 def srgb_to_linear(srgb: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Decode sRGB values (1 = full scale) to linear light: the inverse of `linear_to_srgb`, gradients finite.
-
-    Source:
-        IEC 61966-2-1:1999.
-    """
+    """Decode sRGB values (1 = full scale) to linear light: the inverse of `linear_to_srgb`, gradients finite."""
     threshold = 0.04045
     power = ((srgb.clamp(min=threshold) + 0.055) / 1.055) ** 2.4
     return torch.where(srgb <= threshold, srgb / 12.92, power)

@@ -51,11 +51,7 @@ def lab_to_srgb(lab: Float[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*sha
 def xyz_to_lab(
     xyz: Float[np.ndarray, "*shape 3"], white: Float[np.ndarray, "3"]
 ) -> Float64[np.ndarray, "*shape 3"]:
-    """CIE 1976 L*a*b* of tristimulus values in the unit of `white`'s.
-
-    Source:
-        CIE 15:2018, section 8.2.1.
-    """
+    """CIE 1976 L*a*b* (CIE 15:2018, section 8.2.1) of tristimulus values in the unit of `white`'s."""
     ratio = np.asarray(xyz, dtype=np.float64) / white
     root = np.where(ratio > (6 / 29) ** 3, np.cbrt(ratio), ratio / (3 * (6 / 29) ** 2) + 4 / 29)
     x, y, z = np.moveaxis(root, -1, 0)

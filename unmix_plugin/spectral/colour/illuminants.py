@@ -76,11 +76,7 @@ def illuminant_power(
 
 
 def covered_bands(light: str | Path, bands: Bands) -> Bool[np.ndarray, " B"]:
-    """Bands at whose centres a light is known.
-
-    Raises:
-        SpectrumError: as `illuminant_power`, for the name and the file.
-    """
+    """Bands at whose centres a light is known; errors are those of `illuminant_power`."""
     source = _table(light)[0].centers_nm
     return (bands.centers_nm >= source[0] - TOLERANCE_NM) & (bands.centers_nm <= source[-1] + TOLERANCE_NM)
 
@@ -131,10 +127,6 @@ def _tables() -> dict[str, tuple[Bands, Float64[np.ndarray, " N"]]]:
 
 
 def _incandescent(wavelengths_nm: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
-    """CIE illuminant A, 100 at 560 nm.
-
-    Source:
-        CIE 15:2018, the black body that A is defined by; given there for 300-830 nm, and good beyond.
-    """
+    """CIE illuminant A, 100 at 560 nm: the black body of CIE 15:2018, given there for 300-830 nm, and good beyond."""
     radiation = np.expm1(1.435e7 / (2848.0 * 560.0)) / np.expm1(1.435e7 / (2848.0 * wavelengths_nm))
     return 100.0 * (560.0 / wavelengths_nm) ** 5 * radiation

@@ -47,8 +47,7 @@ def metameric_pairs(
     """All pairs that look alike in one of the lights and different in another, those that differ most first.
 
     Args:
-        reflectance: Of each surface.
-        lights: Relative power of each light, none of them invisible.
+        reflectance, lights: Of each surface; relative power of each light, none of them invisible.
         bands: Of both.
         alike: CIEDE2000 up to which two surfaces look alike.
         different: CIEDE2000 from which they look different.

@@ -7,7 +7,7 @@ strictly increasing; values finite and not negative. UTF-8, with or without a by
 from __future__ import annotations
 
 import csv
-import os
+import io
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.errors import RunError, SpectrumError
+from unmix_plugin.atomic_files import write_file
+from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands, require_nanometres
 
 TOLERANCE_NM = 1e-6
@@ -127,21 +128,14 @@ def write_spectra_csv(path: Path, table: SpectraTable) -> None:
     """Write a table with 9 significant digits, exact for float32; an older file is replaced in one step.
 
     Raises:
-        RunError: the file can't be written (no such folder, no permission, disk full).
+        RunError: the disk is full or refuses.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        try:
-            with temporary.open("w", newline="", encoding="utf-8") as file:
-                writer = csv.writer(file, lineterminator="\n")
-                writer.writerow(["wavelength", *table.names])
-                for wavelength_nm, values in zip(table.bands.centers_nm, table.spectra.T, strict=True):
-                    writer.writerow([f"{value:.9g}" for value in (wavelength_nm, *values)])
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
-    except OSError as error:
-        raise RunError(f"{path}: can't write spectra: {error.strerror or error}") from error
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["wavelength", *table.names])
+    for wavelength_nm, values in zip(table.bands.centers_nm, table.spectra.T, strict=True):
+        writer.writerow([f"{value:.9g}" for value in (wavelength_nm, *values)])
+    write_file(path, text.getvalue().encode())
 
 
 def _read_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
