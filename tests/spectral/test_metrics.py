@@ -17,7 +17,6 @@ from unmix_plugin.spectral.metrics import (
     endmember_angle,
     match_endmembers,
     psnr,
-    rgb_psnr,
     rmse,
     sam,
     spectral_angle,
@@ -38,7 +37,7 @@ def test_psnr_and_rmse_have_their_closed_forms():
     assert psnr(target + 0.1, target) == pytest.approx(20, abs=1e-5)
     assert psnr(target + 0.01, target) == pytest.approx(40, abs=1e-4)
     assert rmse(target + 0.1, target) == pytest.approx(0.1, rel=1e-6)
-    assert rgb_psnr(torch.full((2, 2, 3), 0.5), torch.full((2, 2, 3), 0.4)) == pytest.approx(20, abs=1e-5)
+    assert psnr(torch.full((2, 2, 3), 0.5), torch.full((2, 2, 3), 0.4)) == pytest.approx(20, abs=1e-5)
 
 
 def test_rmse_is_over_all_pixels_and_bands_not_a_mean_of_roots():

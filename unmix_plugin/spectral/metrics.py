@@ -30,10 +30,7 @@ def psnr(
     target_image: Float[Tensor, "H W B"],
     valid_mask: Bool[Tensor, "H W"] | None = None,
 ) -> float:
-    """Peak signal to noise ratio in dB over all pixels and bands, peak 1; infinite for equal images.
-
-    Args:
-        valid_mask: Pixels that count; None counts all.
+    """Peak signal to noise ratio in dB over all pixels and bands that count, peak 1; infinite for equal images.
 
     >>> psnr(torch.full((2, 2, 3), 0.6, dtype=torch.float64), torch.full((2, 2, 3), 0.5, dtype=torch.float64))
     20.0...
@@ -49,15 +46,6 @@ def rmse(
 ) -> float:
     """Root of the mean squared error over all pixels and bands; NaN if no pixel counts."""
     return _root_mean_square(_rows(pred_image, target_image, valid_mask))
-
-
-def rgb_psnr(
-    pred_srgb: Float[Tensor, "H W 3"],
-    target_srgb: Float[Tensor, "H W 3"],
-    valid_mask: Bool[Tensor, "H W"] | None = None,
-) -> float:
-    """`psnr` of display-encoded (sRGB) colours, over black where alpha is below 1."""
-    return psnr(pred_srgb, target_srgb, valid_mask)
 
 
 def ssim(
@@ -120,10 +108,8 @@ def sam(
 def spectral_angle(a: Float[Tensor, "*#rays B"], b: Float[Tensor, "*#rays B"]) -> Float[Tensor, "*#rays"]:
     """Angle between spectra, blind to brightness.
 
-    Args:
-        a, b: Spectra in any common unit, bands last; leading axes broadcast.
-    Returns:
-        Radians in [0, pi], precise for small angles too; gradients stay finite at parallel and at zero spectra.
+    Radians in [0, pi], precise for small angles too; gradients stay finite at parallel and at zero spectra.
+
     Source:
         Kruse et al. 1993, spectral angle mapper; in Kahan's form, 2 atan2(|u - v|, |u + v|) of the unit spectra, as
         arccos loses half the digits at 0 and has an infinite slope there.

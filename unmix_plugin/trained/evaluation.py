@@ -27,7 +27,6 @@ from unmix_plugin.spectral.metrics import (
     endmember_angle,
     match_endmembers,
     psnr,
-    rgb_psnr,
     rmse,
     sam,
     ssim,
@@ -149,7 +148,7 @@ class Evaluation:
             "rmse": rmse(spectra, view.spectra, valid),
             "ssim": ssim(spectra, view.spectra, valid) if _fits_window(spectra) else math.nan,
             "sam": sam(spectra, view.spectra, view.shows_matter),
-            "rgb_psnr": rgb_psnr(self._srgb(spectra), self._srgb(view.spectra), valid),
+            "rgb_psnr": psnr(self._srgb(spectra), self._srgb(view.spectra), valid),
             "abundance_rmse": self._abundance_rmse(view, predicted),
         }
         if self._tally is not None and view.labels is not None:
@@ -170,19 +169,11 @@ class Evaluation:
         scores, truth = self.segmentation(), self.truth
         angle = math.nan
         if truth.endmembers is not None:
-            flat = torch.ones(
-                len(truth.bands), dtype=torch.float64
-            )  # the light is in the true spectra already
+            flat = torch.ones(len(truth.bands))  # the light is in the true spectra already
             angle = endmember_angle(self.endmembers, truth.endmembers, flat)
-        return {
-            **means,
-            "miou": scores.miou,
-            "macro_f1": scores.macro_f1,
-            "accuracy": scores.accuracy,
-            "endmember_angle": angle,
-            "views": len(self.per_view),
-            "bands": len(truth.bands),
-        }
+        matched = {"miou": scores.miou, "macro_f1": scores.macro_f1, "accuracy": scores.accuracy}
+        counts = {"views": len(self.per_view), "bands": len(truth.bands)}
+        return {**means, **matched, "endmember_angle": angle, **counts}
 
     def _abundance_rmse(self, view: ViewTruth, predicted: RenderedView) -> float:
         if self.matching is None or view.abundances is None:

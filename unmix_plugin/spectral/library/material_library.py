@@ -60,7 +60,7 @@ class LibraryMatch:
 
     name: str
     angle_rad: float
-    """Spectral angle in radians; 0 for the same shape."""
+    """0 for the same shape."""
     num_bands: int
     """Bands that were compared."""
     source: str
@@ -75,9 +75,7 @@ class MaterialLibrary:
     def __post_init__(self) -> None:
         repeated = [name for name, count in Counter(self.names).items() if count > 1]
         if repeated:
-            raise SpectrumError(
-                f"materials of a library must have different names; found {repeated[0]!r} twice"
-            )
+            raise SpectrumError(f"materials of a library must differ in name; found {repeated[0]!r} twice")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -85,12 +83,7 @@ class MaterialLibrary:
         return tuple(material.name for material in self.materials)
 
     def extended(self, table: SpectraTable, source: str) -> MaterialLibrary:
-        """This library with one's own reflectances before its own; those of the same name are hidden.
-
-        Args:
-            table: Reflectances.
-            source: Where they are from.
-        """
+        """This library with the reflectances of a table before its own; those of the same name are hidden."""
         rows = zip(table.names, table.spectra, strict=True)
         own = tuple(LibraryMaterial(name, table.bands, row, source) for name, row in rows)
         others = tuple(material for material in self.materials if material.name not in table.names)
@@ -117,10 +110,8 @@ class MaterialLibrary:
     ) -> Float64[np.ndarray, " B"]:
         """Reflectance of a material at other wavelengths, by linear interpolation.
 
-        Args:
-            name: As `find` takes it.
-            bands: Where to have it.
-            beyond: Outside the measured range refuse, or hold the outermost value.
+        Outside the measured range (`beyond`) it is refused, or the outermost value is held.
+
         Raises:
             SpectrumError: as `find`; or bands outside the measured range that are not to be held.
         """
@@ -212,10 +203,7 @@ def library_with(paths: Iterable[Path]) -> MaterialLibrary:
 def continuum_removed(
     spectra: Float64[np.ndarray, "N B"], wavelengths_nm: Float64[np.ndarray, " B"]
 ) -> Float64[np.ndarray, "N B"]:
-    """Spectra divided by their continuum, the upper convex hull: at most 1, below it where something absorbs.
-
-    Source:
-        Clark and Roush 1984, Reflectance spectroscopy.
+    """Spectra over their continuum, the upper convex hull (Clark and Roush 1984): below 1 where something absorbs.
 
     >>> continuum_removed(np.array([[0.2, 0.2, 0.4]]), np.array([400.0, 500.0, 600.0])).round(3)
     array([[1.   , 0.667, 1.   ]])

@@ -19,14 +19,8 @@ from unmix_plugin.spectral.library.spectra_csv import SpectraTable
 
 _TYPES = {1: "u1", 2: "i2", 3: "i4", 4: "f4", 5: "f8", 12: "u2", 13: "u4", 14: "i8", 15: "u8"}
 _NM_PER_UNIT = {
-    "": 1.0,
-    "nm": 1.0,
-    "nanometers": 1.0,
-    "nanometer": 1.0,
-    "um": 1e3,
-    "micrometers": 1e3,
-    "micrometer": 1e3,
-    "microns": 1e3,
+    **dict.fromkeys(("", "nm", "nanometers", "nanometer"), 1.0),
+    **dict.fromkeys(("um", "micrometers", "micrometer", "microns"), 1e3),
 }
 _GREATEST_COUNT = 2**53
 _SMALLEST_SCALE = 1e-30
@@ -132,9 +126,8 @@ def _names(header: dict[str, str], count: int) -> tuple[str, ...]:
 
 
 def _numbers(header: dict[str, str], key: str, count: int) -> Float64[np.ndarray, " B"]:
-    words = header.get(key, "").split(",")
     try:
-        values = np.array([float(word) for word in words])
+        values = np.array([float(number) for number in header.get(key, "").split(",")])
     except ValueError:
         raise SpectrumError(f"'{key}' is missing or no list of numbers") from None
     if len(values) != count:

@@ -51,9 +51,8 @@ class Background:
                 f"all {len(counted)} pixels of the background are equal, so nothing stands out from it; choose views "
                 "that show more, or the spectral angle"
             )
-        loaded = covariance + LOADING * variance * torch.eye(len(mean)).to(covariance)
         identity = torch.eye(len(mean)).to(covariance)
-        factor = torch.linalg.cholesky(loaded)
+        factor = torch.linalg.cholesky(covariance + LOADING * variance * identity)
         return Background(mean, torch.linalg.solve_triangular(factor, identity, upper=False))
 
     def whiten(self, spectra: Float[Tensor, "*rays B"]) -> Float[Tensor, "*rays B"]:
@@ -71,9 +70,7 @@ def matched_filter(
 ) -> Float[Tensor, "*rays"]:
     """(x - m)^T S^-1 (t - m) / ((t - m)^T S^-1 (t - m)): 1 for the target t, 0 for the background's mean, float64.
 
-    Source:
-        Manolakis, Marden and Shaw 2003, Lincoln Laboratory Journal 14(1), in the normalisation of Eismann 2012,
-        Hyperspectral Remote Sensing.
+    Source: Manolakis, Marden and Shaw 2003, Lincoln Laboratory Journal 14(1), as normalised by Eismann 2012.
     """
     wanted = background.whiten(target)
     return background.whiten(spectra) @ (wanted / wanted.square().sum())

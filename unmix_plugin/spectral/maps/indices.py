@@ -31,38 +31,29 @@ class NamedIndex:
     """In the grammar of `index_formula`."""
     source: str
     """Who published it."""
-    usual_range: tuple[float, float]
+    usual_range: tuple[float, float] = (-1.0, 1.0)
     """Values that pictures spread their colours over."""
 
 
 NAMED_INDICES: dict[str, NamedIndex] = {
     "ndvi": NamedIndex(
-        "normalised difference vegetation index", "(r800-r670)/(r800+r670)", "Rouse et al. 1974", (-1.0, 1.0)
+        "normalised difference vegetation index", "(r800-r670)/(r800+r670)", "Rouse et al. 1974"
     ),
     "gndvi": NamedIndex(
         "green normalised difference vegetation index",
         "(r800-r550)/(r800+r550)",
         "Gitelson, Kaufman & Merzlyak 1996",
-        (-1.0, 1.0),
     ),
     "evi": NamedIndex(
-        "enhanced vegetation index",
-        "2.5*(r800-r670)/(r800+6*r670-7.5*r470+1)",
-        "Huete et al. 2002",
-        (-1.0, 1.0),
+        "enhanced vegetation index", "2.5*(r800-r670)/(r800+6*r670-7.5*r470+1)", "Huete et al. 2002"
     ),
-    "savi": NamedIndex(
-        "soil-adjusted vegetation index", "1.5*(r800-r670)/(r800+r670+0.5)", "Huete 1988", (-1.0, 1.0)
-    ),
+    "savi": NamedIndex("soil-adjusted vegetation index", "1.5*(r800-r670)/(r800+r670+0.5)", "Huete 1988"),
     "osavi": NamedIndex(
         "optimised soil-adjusted vegetation index",
         "(r800-r670)/(r800+r670+0.16)",
         "Rondeaux, Steven & Baret 1996",
-        (-1.0, 1.0),
     ),
-    "ndre": NamedIndex(
-        "normalised difference red edge", "(r790-r720)/(r790+r720)", "Barnes et al. 2000", (-1.0, 1.0)
-    ),
+    "ndre": NamedIndex("normalised difference red edge", "(r790-r720)/(r790+r720)", "Barnes et al. 2000"),
     "pri": NamedIndex(
         "photochemical reflectance index",
         "(r531-r570)/(r531+r570)",
@@ -100,23 +91,14 @@ NAMED_INDICES: dict[str, NamedIndex] = {
         (0.0, 10.0),
     ),
     "ndwi": NamedIndex(
-        "normalised difference water index (open water)",
-        "(r550-r800)/(r550+r800)",
-        "McFeeters 1996",
-        (-1.0, 1.0),
+        "normalised difference water index (open water)", "(r550-r800)/(r550+r800)", "McFeeters 1996"
     ),
     "ndwi-gao": NamedIndex(
-        "normalised difference water index (water in leaves)",
-        "(r860-r1240)/(r860+r1240)",
-        "Gao 1996",
-        (-1.0, 1.0),
+        "normalised difference water index (water in leaves)", "(r860-r1240)/(r860+r1240)", "Gao 1996"
     ),
-    "nbr": NamedIndex("normalised burn ratio", "(r830-r2215)/(r830+r2215)", "Key & Benson 2006", (-1.0, 1.0)),
+    "nbr": NamedIndex("normalised burn ratio", "(r830-r2215)/(r830+r2215)", "Key & Benson 2006"),
     "redness": NamedIndex(
-        "redness index of soils (iron oxides)",
-        "(r660-r560)/(r660+r560)",
-        "Escadafal & Huete 1991",
-        (-1.0, 1.0),
+        "redness index of soils (iron oxides)", "(r660-r560)/(r660+r560)", "Escadafal & Huete 1991"
     ),
     "iron-oxide": NamedIndex("iron oxide ratio, red over blue", "r660/r485", "Segal 1982", (0.0, 5.0)),
 }

@@ -20,9 +20,6 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.maps.indices import parse_index
 from unmix_plugin.spectral.maps.targets import parse_target
 
-MAP_KINDS = ("index", "target")
-"""What stands before the colon in the names of such outputs."""
-
 Score: TypeAlias = Callable[[Float[Tensor, "*rays B"]], Float[Tensor, "*rays"]]
 """From reflectances to numbers."""
 
@@ -45,7 +42,7 @@ def is_reflectance_map(name: str) -> bool:
     >>> is_reflectance_map("index:ndvi"), is_reflectance_map("band:650nm")
     (True, False)
     """
-    return name.partition(":")[0] in MAP_KINDS
+    return name.partition(":")[0] in ("index", "target")
 
 
 def parse_reflectance_map(name: str, bands: Bands) -> ReflectanceMap:

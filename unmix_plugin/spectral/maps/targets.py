@@ -43,16 +43,8 @@ _EXAMPLES = "paint.csv, ace:paint.csv, mf:paint.csv#gold or 'paint.csv#gold<0.1'
 _SIDES: dict[DetectionMethod, str] = {"angle": "<", "mf": ">", "ace": ">"}
 """On which side of a threshold a pixel is like the target."""
 
-_POSSIBLE: dict[DetectionMethod, tuple[float, float]] = {
-    "angle": (0.0, math.pi),
-    "mf": (-math.inf, math.inf),
-    "ace": (0.0, 1.0),
-}
-_USUAL: dict[DetectionMethod, tuple[float, float]] = {
-    "angle": (0.0, 0.5),
-    "mf": (0.0, 1.0),
-    "ace": (0.0, 1.0),
-}
+_POSSIBLE = {"angle": (0.0, math.pi), "mf": (-math.inf, math.inf), "ace": (0.0, 1.0)}
+_USUAL = {"angle": (0.0, 0.5), "mf": (0.0, 1.0), "ace": (0.0, 1.0)}
 _LABELS: dict[DetectionMethod, tuple[str, str]] = {
     "angle": ("spectral angle in radians to", "0 = the same but for brightness"),
     "mf": ("matched filter score of", "1 = like the target, 0 = like the background's mean"),
@@ -87,11 +79,6 @@ class Target:
         """What pictures show."""
         return _USUAL[self.method] if self.threshold is None else (0.0, 1.0)
 
-    @property
-    def needs_background(self) -> bool:
-        """Whether scores depend on what else there is."""
-        return self.method != "angle"
-
     def fit(self, background: Float[Tensor, "N B"]) -> TargetScore:
         """The score, judged against a sample of the scene's reflectances; the angle ignores it.
 
@@ -103,7 +90,7 @@ class Target:
             raise SpectrumError(
                 f"the target '{self.name}' has {len(self.reflectance)} bands, the background {background.shape[1]}"
             )
-        if not self.needs_background:
+        if self.method == "angle":
             return TargetScore(self, None)
         found = Background.fit(background)
         target = self.reflectance.to(found.mean)
@@ -151,7 +138,7 @@ def parse_target(text: str, bands: Bands) -> Target:
     if match is None:
         raise ConfigError(f"target:{text} must be target:[METHOD:]FILE.csv[#NAME][<VALUE], as in {_EXAMPLES}")
     prefix = match["method"] or ""
-    method = _method_of(prefix)
+    method = next((known for known in _SIDES if known == prefix), None)
     file = match["file"] if method or not prefix else f"{prefix}:{match['file']}"
     method = method or "angle"
     threshold = None if match["limit"] is None else _threshold(method, match["side"], float(match["limit"]))
@@ -160,10 +147,6 @@ def parse_target(text: str, bands: Bands) -> Target:
     reflectance = table.spectra[table.names.index(name)]
     _validate(reflectance, method, f"'{name}' ({file})")
     return Target(method, name, Path(file).name, torch.from_numpy(reflectance.copy()), threshold)
-
-
-def _method_of(prefix: str) -> DetectionMethod | None:
-    return next((method for method in _SIDES if method == prefix), None)
 
 
 def _threshold(method: DetectionMethod, side: str, limit: float) -> float:
