@@ -75,7 +75,9 @@ class MaterialLibrary:
     def __post_init__(self) -> None:
         repeated = [name for name, count in Counter(self.names).items() if count > 1]
         if repeated:
-            raise SpectrumError(f"materials of a library must differ in name; found {repeated[0]!r} twice")
+            raise SpectrumError(
+                f"materials of a library must have different names; found {repeated[0]!r} twice"
+            )
 
     @property
     def names(self) -> tuple[str, ...]:
