@@ -15,7 +15,7 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from unmix_plugin.errors import SceneError
-from unmix_plugin.spectral import spectral_angle
+from unmix_plugin.spectral.metrics import spectral_angle
 
 _LIT = 0.9
 """Value that the 99.9th percentile of the pixels' peaks is scaled to, so that few count as saturated."""

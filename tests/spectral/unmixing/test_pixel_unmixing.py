@@ -2,7 +2,8 @@ import torch
 from torch.testing import assert_close
 
 from tests.spectral.mixtures import seeded, smooth_endmembers
-from unmix_plugin.spectral import comparable_brightness, spectral_angle, unmix_pixels
+from unmix_plugin.spectral.metrics import spectral_angle
+from unmix_plugin.spectral.unmixing.pixel_unmixing import comparable_brightness, unmix_pixels
 
 
 def landscape(dark, seed=0):

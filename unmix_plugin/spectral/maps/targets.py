@@ -138,7 +138,7 @@ def parse_target(text: str, bands: Bands) -> Target:
     if match is None:
         raise ConfigError(f"target:{text} must be target:[METHOD:]FILE.csv[#NAME][<VALUE], as in {_EXAMPLES}")
     prefix = match["method"] or ""
-    named = next((method for method in _SIDES if method == prefix), None)
+    named = next((known for known in _SIDES if prefix == known), None)
     file = match["file"] if named or not prefix else f"{prefix}:{match['file']}"
     method: DetectionMethod = named or "angle"
     threshold = None if match["limit"] is None else _threshold(method, match["side"], float(match["limit"]))
