@@ -1,0 +1,105 @@
+"""README.md: every command on it runs as it stands, on a tiny scene; its links lead somewhere."""
+
+import json
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.commands.running import SMALL_METHOD, run
+from tests.docs.pages import ROOT, blocks_of, text_of
+from unmix_plugin.commands.demo_scene import write_demo_scene
+from unmix_plugin.commands.eval import evaluate
+from unmix_plugin.commands.export import export
+from unmix_plugin.commands.render import render
+from unmix_plugin.commands.train import train
+from unmix_plugin.scenes.demo.scene import make_demo_scene
+
+README = text_of("README.md")
+PAGES = ["README.md", "CHANGELOG.md", *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md")))]
+COMMANDS = {
+    "unmix-train": train,
+    "unmix-eval": evaluate,
+    "unmix-render": render,
+    "unmix-export": export,
+    "unmix-demo-scene": write_demo_scene,
+}
+SHORTER = {"--max-seconds 600": "--max-num-iterations 40", "--pixel 48,48": "--pixel 8,8"}
+SMALLER = {
+    "unmix-train unmix-nerf --data": shlex.join(SMALL_METHOD),
+    "unmix-train unmix-nerf --load-run": "--max-num-iterations 50",
+    "unmix-render --cameras orbit": "--frames 2 --size 16x16",
+    "unmix-export mesh": "--resolution 24 --density 0.05 --unseen keep",
+    "unmix-demo-scene": "--size 16 --bands 4 --views 4",
+}
+"""What makes a command that starts so take a moment."""
+
+
+def commands():
+    """Command lines of the blocks and of the table's examples in order; no viewer, which never ends."""
+    lines = [line for code in blocks_of("README.md", "") for line in code.splitlines()]
+    lines += re.findall(r"^\|.*\| `(unmix-[^`]*)` \|$", README, re.MULTILINE)
+    return [line for line in lines if line.startswith("unmix-") and not line.startswith("unmix-view")]
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder with the files that the examples name; its scene reaches into the near infrared."""
+    folder = tmp_path_factory.mktemp("readme")
+    make_demo_scene(folder / "my-scene", 16, 16, 8)
+    scene = json.loads((folder / "my-scene/transforms.json").read_text())
+    scene = {key: value for key, value in scene.items() if key not in ("illuminant_path", "endmembers_path")}
+    scene["wavelengths"] = np.linspace(400, 1000, 16).tolist()
+    (folder / "my-scene/transforms.json").write_text(json.dumps(scene))
+    (folder / "paint.csv").write_text("wavelength,paint\n300,0.2\n1100,0.6\n")
+    (folder / "responses.csv").write_text("wavelength,R,G\n500,0,1\n600,1,0\n700,0,0\n")
+    (recipe,) = blocks_of("README.md", "yaml")
+    (folder / "edits.yml").write_text(recipe)
+    return folder
+
+
+@pytest.mark.usefixtures("no_wait_for_the_disk")
+def test_every_command_runs(place, monkeypatch):
+    monkeypatch.chdir(place)
+    done = set()
+    for line in commands():
+        for long, short in SHORTER.items():
+            line = line.replace(long, short)
+        extra = " ".join(words for start, words in SMALLER.items() if line.startswith(start))
+        if line.startswith("unmix-train") and done & {"unmix-train"} and "--load-run" not in line:
+            extra += " --max-num-iterations 5"
+        command, *argv = shlex.split(f"{line} {extra}")
+        ended = run(COMMANDS[command], *argv)
+        assert ended.status == 0, f"{line}\n{ended.err}"
+        if command not in done and command == "unmix-train":
+            Path(ended.last_line.removeprefix("run: ")).rename(
+                "outputs/my-scene/unmix-nerf/2026-01-31_120000"
+            )
+        done.add(command)
+    assert done == set(COMMANDS)
+
+
+def test_the_readme_is_short():
+    assert len(README.splitlines()) < 250
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_lead_to_a_page_and_to_a_heading(page):
+    for target in re.findall(r"\]\(([^)\s]+)\)", text_of(page)):
+        if target.startswith("http"):
+            continue
+        name, _, anchor = target.partition("#")
+        path = (ROOT / page).parent / name if name else ROOT / page
+        assert path.exists(), f"{page} links to {target}"
+        if anchor:
+            headings = re.findall(r"^#+ (.*)$", path.read_text(encoding="utf-8"), re.MULTILINE)
+            anchors = {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+            assert anchor in anchors, f"{page} links to {target}"
+
+
+def test_the_index_lists_every_page():
+    listed = set(re.findall(r"\]\(([\w.-]+\.(?:md|ipynb))", text_of("docs/index.md")))
+    there = {path.name for path in (ROOT / "docs").iterdir() if path.suffix in (".md", ".ipynb")}
+    assert listed == there - {"index.md"}
