@@ -54,7 +54,7 @@ def make_model(
     model: UnmixModel = replace(CONFIG, **settings).setup(scene_box=BOX, metadata=metadata)
     with torch.no_grad():
         model.initialise(initial_data(), torch.Generator().manual_seed(seed))
-        model.field.table.normal_(std=0.5)
+        model.field.get_parameter("table").normal_(std=0.5)
     return model.eval()
 
 

@@ -382,8 +382,8 @@ def occupied_after_training(has_alpha: bool = True, visible_weight: float | str 
     renderer = replace(CONFIG.renderer, smallest_weight="auto", visible_weight=visible_weight)
     model = make_model(has_alpha=has_alpha, renderer=renderer).train()
     with torch.no_grad():
-        model.field.table.zero_()
-    model.field.log_initial_density = 4.7
+        model.field.get_parameter("table").zero_()
+    setattr(model.field, "log_initial_density", 4.7)  # noqa: B010
     g = torch.Generator().manual_seed(0)
     views = torch.arange(2000) % 2
     targets = torch.rand(2000, 3, generator=g) * 2 - 1
@@ -417,5 +417,6 @@ def test_outputs_and_losses_change_nothing_in_the_model():
     rays = make_rays(16)
     spectra = torch.rand(16, NUM_BANDS)
     batch = {"spectra": spectra, "alpha": torch.ones(16), "pixels": torch.arange(16)}
-    sum(model.get_loss_dict(model.get_outputs(rays), batch).values()).backward()
+    losses = model.get_loss_dict(model.get_outputs(rays), batch)
+    torch.stack(list(losses.values())).sum().backward()
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())

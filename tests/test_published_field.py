@@ -105,7 +105,7 @@ def test_a_scene_is_not_changed_by_what_becomes_of_its_model():
     camera = scene.views[0].camera
     before = scene.render(camera, ["spectral"])["spectral"]
     with torch.no_grad():
-        model.field.table.mul_(-2)
+        model.field.get_parameter("table").mul_(-2)
         model.endmembers.mul_(0.5)
         model.grid.occupied.zero_()
     assert torch.equal(scene.render(camera, ["spectral"])["spectral"], before)

@@ -164,5 +164,7 @@ def test_bands_light_and_notes_follow_and_the_run_stays(solid, camera):
     lit = load_edited_run(solid, "cpu", None, "A").materials_scene
     expected = seen_by(camera, solid)
     np.testing.assert_allclose(seen.bands.centers_nm, expected.bands.centers_nm)
+    assert seen.light_power is not None
+    assert lit.light_power is not None
     np.testing.assert_allclose(seen.light_power, lit.light_power @ expected.matrix, rtol=1e-5)
     assert seen.notes == (*lit.notes, expected.description, *expected.notes)

@@ -52,8 +52,8 @@ def test_average_metrics_are_the_mean_over_the_evaluation_views_that_have_them(
 
     monkeypatch.setattr(pipeline.model, "get_image_metrics_and_images", metrics)
     pipeline.train()
-    metrics, pictures = pipeline.get_average_eval_image_metrics_and_images()
-    assert metrics == {"psnr": 15.0, "miou": 0.5}
+    means, pictures = pipeline.get_average_eval_image_metrics_and_images()
+    assert means == {"psnr": 15.0, "miou": 0.5}
     assert set(pictures) == {"rgb"}
     assert seen == [False, False]
     assert pipeline.model.training

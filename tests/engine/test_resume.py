@@ -144,7 +144,12 @@ def test_a_second_ctrl_c_stops_within_the_step_and_names_the_last_checkpoint(sho
 
 def test_a_lost_terminal_may_say_so_twice(short_config: TrainerConfig):
     trainer = quiet_trainer(short_config)
-    call_after_step(trainer, 6, lambda: [os.kill(os.getpid(), signal.SIGHUP) for _ in range(2)])
+
+    def hang_up_twice() -> None:
+        for _ in range(2):
+            os.kill(os.getpid(), signal.SIGHUP)
+
+    call_after_step(trainer, 6, hang_up_twice)
     with pytest.raises(Interrupted) as caught:
         trainer.train()
     assert caught.value.step == 6

@@ -1,5 +1,7 @@
 """One output of a view as a file: the same numbers, and words where it can't be."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import spectral.io.envi as envi
@@ -22,7 +24,7 @@ def test_npy_holds_the_numbers_of_the_view(view, tmp_path):
 
 
 def test_envi_holds_the_same_with_wavelengths(view, tmp_path):
-    image = envi.open(save(view, "spectral", str(tmp_path / "some.cube.hdr")))
+    image: Any = envi.open(save(view, "spectral", str(tmp_path / "some.cube.hdr")))
     np.testing.assert_array_equal(np.array(image.open_memmap()), view["spectral"].numpy())
     np.testing.assert_allclose(image.bands.centers, view.scene.bands.centers_nm)
 

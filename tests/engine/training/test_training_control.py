@@ -120,7 +120,11 @@ def test_a_stop_ends_training_as_ctrl_c_does_and_it_can_go_on(short_config, is_p
 def test_a_guest_that_leaves_the_model_in_evaluation_mode_does_not_change_the_next_step(short_config):
     trainer = quiet_trainer(short_config)
     modes = []
-    call_after_step(trainer, 3, trainer.pipeline.eval)
+
+    def leave_in_evaluation_mode() -> None:
+        trainer.pipeline.eval()
+
+    call_after_step(trainer, 3, leave_in_evaluation_mode)
     for step in range(1, 13):
         call_after_step(trainer, step, lambda: modes.append(trainer.pipeline.model.training))
     trainer.pipeline.eval()  # a page that rendered before the first step

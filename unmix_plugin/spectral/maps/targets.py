@@ -138,9 +138,9 @@ def parse_target(text: str, bands: Bands) -> Target:
     if match is None:
         raise ConfigError(f"target:{text} must be target:[METHOD:]FILE.csv[#NAME][<VALUE], as in {_EXAMPLES}")
     prefix = match["method"] or ""
-    named = next((known for known in _SIDES if prefix == known), None)
+    named: DetectionMethod | None = next((known for known in _SIDES if known == prefix), None)
     file = match["file"] if named or not prefix else f"{prefix}:{match['file']}"
-    method: DetectionMethod = named or "angle"
+    method: DetectionMethod = "angle" if named is None else named
     threshold = None if match["limit"] is None else _threshold(method, match["side"], float(match["limit"]))
     table = _table(file, bands)
     name = _chosen(match["name"], table, file)
