@@ -1,11 +1,12 @@
 """What commands say while they work."""
 
 import io
-import time
+import threading
 
 import pytest
 from rich.console import Console
 
+from unmix_plugin.commands import reporting
 from unmix_plugin.commands.reporting import saying_when_kernels_compile
 from unmix_plugin.rendering.launching import warp
 
@@ -14,10 +15,10 @@ from unmix_plugin.rendering.launching import warp
 def test_compiling_is_said_only_when_a_kernel_is_not_in_the_cache(tmp_path, monkeypatch, compiles):
     (tmp_path / "wp_module_known").mkdir()
     monkeypatch.setattr(warp().config, "kernel_cache_dir", str(tmp_path))
-    out, until = io.StringIO(), time.monotonic() + 20
+    out, is_said = io.StringIO(), threading.Event()
+    monkeypatch.setattr(reporting, "say", lambda console, text: (console.print(text), is_said.set()))
     with saying_when_kernels_compile(Console(file=out)):
         if compiles:
             (tmp_path / "wp_module_new").mkdir()
-            while not out.getvalue() and time.monotonic() < until:
-                time.sleep(0.01)
+            assert is_said.wait(20)
     assert out.getvalue().count("compiling kernels") == compiles

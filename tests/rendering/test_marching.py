@@ -22,17 +22,26 @@ def make_rays(num_rays: int, seed: int = 0):
 @pytest.mark.parametrize("num_rays", [0, 1, 5, 900])
 @pytest.mark.parametrize("sides", [(8, 8, 8), (3, 5, 7), (1, 1, 1)])
 def test_kernel_and_twin_take_the_same_samples(num_rays, sides, device):
-    g = torch.Generator().manual_seed(3)
-    occupied = (torch.rand(sides, generator=g) < 0.3).to(torch.uint8).to(device)
-    o, d, t_near, t_far, jitter = (x.to(device) for x in make_rays(num_rays))
-    actual, expected = (f(o, d, t_near, t_far, jitter, occupied, 0.013) for f in (march, march_twin))
-    # A sample within rounding of a cell's face may fall to either side.
-    differing = (actual.packed_info[:, 1] - expected.packed_info[:, 1]).abs().sum().item()
-    assert differing <= max(2, len(expected)) * 1e-3
-    if differing == 0:
-        assert torch.equal(actual.packed_info, expected.packed_info)
-        assert torch.equal(actual.ray_indices, expected.ray_indices)
-        assert_close(actual.t, expected.t, rtol=0, atol=2e-6)
+    step, longest = 0.013, 3**0.5
+    occupied = torch.rand(sides, generator=torch.Generator().manual_seed(3)) < 0.3
+    o, d, t_near, t_far, jitter = rays = tuple(x.to(device) for x in make_rays(num_rays))
+    lattice = (t_near + jitter * step)[:, None] + torch.arange(int(longest / step) + 2, device=device) * step
+    taken = []
+    for function in (march, march_twin):
+        samples = function(*rays, occupied.to(device, torch.uint8), step)
+        ray, count = samples.ray_indices, samples.packed_info[:, 1]
+        indices = ((samples.t - lattice[ray, 0]) / step).round().long()
+        assert_close(samples.t, lattice[ray, indices], rtol=0, atol=2e-6)
+        assert torch.equal(ray, torch.arange(num_rays, device=device).repeat_interleave(count))
+        assert torch.equal(samples.packed_info[:, 0], count.cumsum(0) - count)
+        taken.append(
+            torch.zeros_like(lattice, dtype=torch.bool).index_put((ray, indices), torch.tensor(True))
+        )
+    # A sample within rounding of a cell's face or of the far end may fall to either side.
+    scaled = (o[:, None] + lattice[..., None] * d[:, None]) * torch.tensor(sides, device=device)
+    is_clear = ((scaled - scaled.round()).abs() > 1e-4).all(-1) & ((lattice - t_far[:, None]).abs() > 1e-5)
+    assert num_rays == 0 or is_clear.double().mean() > 0.99
+    assert torch.equal(taken[0][is_clear], taken[1][is_clear])
 
 
 def test_a_full_grid_is_sampled_at_every_step():

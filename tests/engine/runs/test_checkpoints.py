@@ -168,7 +168,7 @@ def test_twenty_real_kills_during_saving_leave_complete_checkpoints(tmp_path: Pa
 
 
 KILLING = """
-import os, random, signal, sys, time
+import os, random, signal, sys
 from pathlib import Path
 import torch
 from unmix_plugin.engine.runs.checkpoints import newest_complete_checkpoint, save_checkpoint
@@ -177,13 +177,16 @@ folder, chance = Path(sys.argv[1]), random.Random(1)
 save_checkpoint(folder, 1, {"a": torch.full((300_000,), 1.0)}, {})
 for _ in range(20):
     start = newest_complete_checkpoint(folder).step
+    saved, tell = os.pipe()
     child = os.fork()
     if child == 0:
         for step in range(start + 1, start + 10_000):
             save_checkpoint(folder, step, {"a": torch.full((300_000,), float(step))}, {})
+            os.write(tell, b".")
         os._exit(0)
-    time.sleep(chance.uniform(0.01, 0.08))
-    os.kill(child, signal.SIGKILL)
+    for _ in range(chance.randint(1, 4)):
+        os.read(saved, 1)
+    os.kill(child, signal.SIGKILL)  # in the middle of the next save
     os.waitpid(child, 0)
     found = newest_complete_checkpoint(folder)
     assert found.damaged == (), found.damaged

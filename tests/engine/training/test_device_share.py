@@ -3,9 +3,11 @@
 import math
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 
+from unmix_plugin.engine.training import device_share
 from unmix_plugin.engine.training.device_share import SHARE_BOUNDS, DeviceShare
 
 STEP_S = 0.004
@@ -18,29 +20,37 @@ def busy(seconds):
         pass
 
 
-def contest(share, seconds, cost=1.0):
-    """Part of the time that a guest that always wants more gets beside training."""
-    device = DeviceShare(share)
-    device.is_training = True
-    spent = {"guest": 0.0, "training": 0.0}
-    until = time.monotonic() + seconds
+@pytest.fixture
+def contest(monkeypatch):
+    """Part of the time that a guest that always wants more gets beside training, each step taking `STEP_S`."""
+    now = [0.0]
+    monkeypatch.setattr(device_share, "time", SimpleNamespace(perf_counter=lambda: now[0]))
 
-    def be_guest():
-        while time.monotonic() < until:
-            with device.guest_turn(cost):
-                started = time.perf_counter()
-                busy(STEP_S)
-                spent["guest"] += time.perf_counter() - started
+    def run(share, cost=1.0, steps=2500):
+        device, taken, is_over = DeviceShare(share), {"guest": 0, "training": 0}, threading.Event()
+        device.is_training = True
 
-    guest = threading.Thread(target=be_guest)
-    guest.start()
-    while time.monotonic() < until or guest.is_alive():
-        with device.training_turn():
-            started = time.perf_counter()
-            busy(STEP_S)
-            spent["training"] += time.perf_counter() - started
-    guest.join()
-    return spent["guest"] / (spent["guest"] + spent["training"])
+        def step(turn, who):
+            with turn:
+                now[0] += STEP_S
+                taken[who] += not is_over.is_set()
+
+        def be_guest():
+            while not is_over.is_set():
+                step(device.guest_turn(cost), "guest")
+
+        guest = threading.Thread(target=be_guest)
+        guest.start()
+        for _ in range(steps):
+            while device._num_waiting == 0:  # the guest is on its way to its next turn
+                time.sleep(0)
+            step(device.training_turn(), "training")
+        is_over.set()
+        device.is_training = False
+        guest.join(20)
+        return taken["guest"] / sum(taken.values())
+
+    return run
 
 
 def test_turns_never_overlap():
@@ -54,7 +64,7 @@ def test_turns_never_overlap():
             with turn():
                 inside += 1
                 most = max(most, inside)
-                time.sleep(0.0002)
+                time.sleep(0)  # lets the other thread run, which must not enter
                 inside -= 1
 
     guest = threading.Thread(target=take, args=(device.guest_turn,))
@@ -69,13 +79,14 @@ def test_turns_never_overlap():
 
 
 @pytest.mark.parametrize("share", [0.2, 0.5])
-def test_a_guest_that_always_wants_more_gets_its_share(share):
+def test_a_guest_that_always_wants_more_gets_its_share(contest, share):
     # What an idle guest has saved comes on top, hence a run long enough for it not to count much.
-    assert contest(share, 2.5) == pytest.approx(share, abs=0.1)
+    assert contest(share) == pytest.approx(share, abs=0.02)
 
 
-def test_work_that_may_wait_gets_less():
-    assert contest(0.4, 2.5, cost=4.0) < 0.3
+def test_work_that_may_wait_gets_less(contest):
+    # A guest's second costs four: 0.4 / 0.6 of training's are earned, a quarter of them taken.
+    assert contest(0.4, cost=4.0) == pytest.approx(1 / 7, abs=0.02)
 
 
 def test_without_training_a_guest_never_waits():

@@ -1,8 +1,8 @@
 """Training ends at whichever limit is reached first, and progress says how near that is."""
 
 import contextlib
-import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.runs.load_run import load_config
+from unmix_plugin.engine.training import limits as limits_module
 from unmix_plugin.engine.training.limits import Limits, TrainingClock
 from unmix_plugin.engine.training.trainer import Trainer
 
@@ -39,34 +40,49 @@ def test_progress_never_falls(limit: Limits, step: int, spent: float, more: int,
     assert limit.progress(step + more, spent + longer) >= limit.progress(step, spent)
 
 
-def test_the_clock_counts_only_while_it_runs():
+@pytest.fixture
+def fake_time(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """A clock that goes on by `tick` whenever it is read, and by hand."""
+    fake = SimpleNamespace(now=0.0, tick=0.0)
+
+    def read() -> float:
+        fake.now += fake.tick
+        return fake.now
+
+    monkeypatch.setattr(limits_module, "time", SimpleNamespace(perf_counter=read))
+    return fake
+
+
+def test_the_clock_counts_only_while_it_runs(fake_time):
     clock = TrainingClock(seconds=10.0)
-    time.sleep(0.03)
+    fake_time.now = 5.0
     assert clock.seconds == 10.0
     with clock.running():
-        time.sleep(0.03)
-    assert 10.03 <= clock.seconds < 10.5
+        fake_time.now += 3.0
+    assert clock.seconds == 13.0
     with contextlib.suppress(ValueError), clock.running():
-        time.sleep(0.01)
+        fake_time.now += 1.0
         raise ValueError
-    assert clock.seconds >= 10.04
+    assert clock.seconds == 14.0
 
 
-def test_a_limit_in_seconds_ends_training_in_time_with_the_schedule_run_out(short_config: TrainerConfig):
+def test_a_limit_in_seconds_ends_training_in_time_with_the_schedule_run_out(
+    short_config: TrainerConfig, fake_time
+):
+    fake_time.tick = 1 / 64
     trainer = Trainer(replace(short_config, max_num_iterations=None, max_seconds=0.5, steps_per_save=0))
     record = trainer.train()
-    assert 0.5 <= record.train_seconds < 1.5
+    assert (record.steps, record.train_seconds) == (32, 0.5)
     assert record.progress == 1.0
     assert record.learning_rates["fields"] < 0.2 * 0.2
-    assert record.steps > 12
-    resumed = Trainer(replace(load_config(trainer.run.path), max_seconds=0.8)).train()
-    assert 0.8 <= resumed.train_seconds < 1.8
-    assert resumed.steps > record.steps
+    resumed = Trainer(replace(load_config(trainer.run.path), max_seconds=0.75)).train()
+    assert (resumed.steps, resumed.train_seconds) == (48, 0.75)
 
 
 def test_seconds_of_evaluation_saving_and_warming_up_do_not_count(
-    short_config: TrainerConfig, monkeypatch: pytest.MonkeyPatch
+    short_config: TrainerConfig, monkeypatch: pytest.MonkeyPatch, fake_time
 ):
+    fake_time.tick = 1 / 64
     trainer = Trainer(
         replace(short_config, max_num_iterations=3, steps_per_eval_all_images=1, steps_per_save=1)
     )
@@ -74,15 +90,15 @@ def test_seconds_of_evaluation_saving_and_warming_up_do_not_count(
 
     def evaluate():
         slow["eval"] += 1
-        time.sleep(0.4)
+        fake_time.now += 400
         return {"psnr": 1.0}, {}
 
     def warm_up() -> None:
         slow["warm"] += 1
-        time.sleep(0.4)
+        fake_time.now += 400
 
     monkeypatch.setattr(trainer.pipeline, "get_average_eval_image_metrics_and_images", evaluate)
     monkeypatch.setattr(trainer.pipeline.model, "warm_up", warm_up)
     record = trainer.train()
     assert slow == {"eval": 3, "warm": 1}
-    assert record.train_seconds < 0.4
+    assert record.train_seconds == 3 / 64

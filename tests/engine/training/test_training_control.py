@@ -30,6 +30,20 @@ def wait_for(holds, timeout_s=20.0):
         time.sleep(0.002)
 
 
+def wait_for_rounds(control, number):
+    """Until the paused loop has looked that many times whether it may go on."""
+    seen, look = threading.Semaphore(0), control.wait_while_paused
+
+    def counted(*args):
+        seen.release()
+        return look(*args)
+
+    control.wait_while_paused = counted
+    for _ in range(number):
+        assert seen.acquire(timeout=20)
+    control.wait_while_paused = look
+
+
 @pytest.mark.parametrize("average_decay", [None, 0.9])
 def test_a_guest_on_the_device_changes_nothing_of_a_training(short_config, average_decay):
     config = replace(short_config, average_decay=average_decay)
@@ -65,7 +79,7 @@ def test_a_pause_stops_the_steps_and_the_clock_until_it_is_over(short_config):
     assert control.is_running
     assert not control.device.is_training
     seconds = trainer.clock.seconds
-    time.sleep(0.3)
+    wait_for_rounds(control, 3)
     assert (trainer.step, trainer.clock.seconds) == (5, seconds)
     control.resume()
     thread.join(20)
@@ -79,7 +93,7 @@ def test_a_paused_training_saves_when_asked_and_not_otherwise(short_config):
     call_after_step(trainer, 3, trainer.control.pause)
     thread = in_background(trainer.train)
     wait_for(lambda: trainer.control.is_paused and trainer.step == 3)
-    time.sleep(0.2)
+    wait_for_rounds(trainer.control, 3)
     assert checkpoint_steps(trainer.run.checkpoints) == []
     turns = trainer.control.device.training_turns
     trainer.control.request_save()
