@@ -24,11 +24,11 @@ def make_rays(num_rays: int, seed: int = 0):
 def test_kernel_and_twin_take_the_same_samples(num_rays, sides, device):
     step, longest = 0.013, 3**0.5
     occupied = torch.rand(sides, generator=torch.Generator().manual_seed(3)) < 0.3
-    o, d, t_near, t_far, jitter = rays = tuple(x.to(device) for x in make_rays(num_rays))
+    o, d, t_near, t_far, jitter = (x.to(device) for x in make_rays(num_rays))
     lattice = (t_near + jitter * step)[:, None] + torch.arange(int(longest / step) + 2, device=device) * step
     taken = []
     for function in (march, march_twin):
-        samples = function(*rays, occupied.to(device, torch.uint8), step)
+        samples = function(o, d, t_near, t_far, jitter, occupied.to(device, torch.uint8), step)
         ray, count = samples.ray_indices, samples.packed_info[:, 1]
         indices = ((samples.t - lattice[ray, 0]) / step).round().long()
         assert_close(samples.t, lattice[ray, indices], rtol=0, atol=2e-6)

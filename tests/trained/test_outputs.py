@@ -1,0 +1,155 @@
+"""Every output computes, has the shape that its kind promises, and says between which values its colours go."""
+
+import inspect
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from tests.engine.rgb_nerf_plugin import RgbNerf, RgbNerfConfig
+from tests.method_factory import CAMERA, NUM_BANDS, make_scene
+from tests.products.ball_model import RADIUS, ball_scene, cameras_around
+from tests.trained.camera_files.camera_scenes import BOX, FRAME, around, record
+from unmix_plugin.engine.outputs import Output
+from unmix_plugin.errors import ConfigError, SpectrumError
+from unmix_plugin.products.render.survey import needs_survey, take_survey
+from unmix_plugin.trained.material_view import MaterialView
+from unmix_plugin.trained.model_scene import model_scene
+from unmix_plugin.trained.outputs import FAMILIES, OUTPUTS, output_names
+from unmix_plugin.trained.protocol import RenderableScene, RenderedView
+
+SCENE = make_scene(light=[0.5, 0.7, 1.0, 0.9, 0.6])
+WITH_ARGUMENTS = ("band:500nm", "false-colour:650,550,450", "index:r600/r500")
+CHANNELS = {
+    "channels": (NUM_BANDS,),
+    "shares": (3,),
+    "srgb": (3,),
+    "linear": (3,),
+    "picture": (3,),
+    "vectors": (3,),
+    "grey": (),
+    "map": (),
+    "labels": (),
+}
+
+
+@pytest.fixture(scope="module")
+def view() -> MaterialView:
+    return SCENE.look(CAMERA)
+
+
+@pytest.mark.parametrize("name", [*OUTPUTS, *WITH_ARGUMENTS])
+def test_an_output_has_the_shape_and_the_values_that_it_promises(view, name):
+    output, values = SCENE.output(name), view[name]
+    assert output.name == name
+    assert values.shape == (CAMERA.height, CAMERA.width, *CHANNELS[output.kind])
+    assert (values.dtype == torch.uint8) == (output.kind == "labels")
+    assert not values.requires_grad
+    assert not values.isinf().any()
+    assert name.startswith("index:") or not values.isnan().any()
+    low, high = output.value_range or (-torch.inf, torch.inf)
+    known = values[~values.isnan()] if values.is_floating_point() else values
+    assert known.min() >= low - 1e-6
+    assert known.max() <= high + 1e-6
+
+
+@pytest.mark.parametrize("name", [*OUTPUTS, *WITH_ARGUMENTS])
+def test_maps_and_shares_have_a_range_or_get_one_from_the_views(name):
+    output = SCENE.output(name)
+    if output.kind not in ("map", "shares") or output.value_range is not None:
+        return
+    assert needs_survey([output])
+    assert name in take_survey(SCENE, SCENE.views, [output]).scales
+
+
+def test_an_example_stands_for_each_family():
+    assert [name.partition(":")[0] for name in output_names()] == [*OUTPUTS, *FAMILIES]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("abundance", "no output named 'abundance' .did you mean abundances .*; known are rgb, "),
+        ("bands:650", r"no output named 'bands:650' \(did you mean band "),
+        ("band", "the output band needs a wavelength, as in band:650nm"),
+        ("index:", "the output index needs to know which, as in index:ndvi"),
+        ("band:red", "'red' in the output band:red is not a wavelength in nm, such as 650nm"),
+        ("false-colour:650,550", "takes three wavelengths, as in false-colour:860,650,550"),
+        ("false-colour:650,550,blue", "'blue' in the output false-colour:650,550,blue is not a wavelength"),
+        ("index:nvdi", "no index 'nvdi'; nearest: .*ndvi"),
+    ],
+)
+def test_a_name_that_means_nothing_is_refused_with_what_could_be_meant(name, message):
+    with pytest.raises(ConfigError, match=message):
+        SCENE.output(name)
+
+
+@pytest.mark.parametrize("name", ["band:900nm", "false-colour:860,650,550", "index:ndvi"])
+def test_bands_that_are_not_there_are_refused_before_anything_is_rendered(monkeypatch, name):
+    monkeypatch.setattr(type(SCENE), "look", None)
+    with pytest.raises(SpectrumError, match="nm"):
+        SCENE.render(CAMERA, [name])
+
+
+def test_depth_distance_and_normals_are_those_of_the_world():
+    [camera] = cameras_around([(1.0, 2.0, 0.5)], side_px=41)
+    scene = replace(ball_scene(), frame=FRAME)
+    seen = scene.look(camera)
+    assert seen["ray_distance"][20, 20].item() == pytest.approx((3 - RADIUS) / FRAME.scale, abs=0.05)
+    assert_close(seen["depth"][20, 20], seen["ray_distance"][20, 20], rtol=1e-3, atol=0)
+    off_axis = torch.tensor(
+        np.hypot(8 / 65.6, 1.0)
+    )  # of the pixel 8 to the side, at 65.6 pixels of focal length
+    assert_close(seen["ray_distance"][20, 28] / seen["depth"][20, 28], off_axis.float(), rtol=1e-3, atol=0)
+    towards_camera = torch.tensor(np.array([1.0, 2.0, 0.5]) / np.sqrt(5.25) @ FRAME.rotation)
+    assert_close(seen["normals"][20, 20].double(), towards_camera, rtol=0, atol=0.05)
+    corner = [seen[name][0, 0] for name in ("depth", "ray_distance", "normals")]
+    assert all((values == 0).all() for values in corner)
+
+
+class Described(RgbNerf):
+    """A method without endmembers."""
+
+    outputs = (Output("rgb", "srgb", "colour", "sRGB on black, 0 to 1"),)
+
+
+def other_scene() -> RenderableScene:
+    model = Described(RgbNerfConfig(), scene_box=BOX, metadata={"grid_size": 6})
+    return model_scene(model, record(around(2), around(1)))
+
+
+@pytest.mark.parametrize("scene", [SCENE, other_scene()], ids=["materials", "model"])
+def test_scenes_of_both_kinds_keep_the_protocol(scene):
+    assert isinstance(scene, RenderableScene)
+    assert isinstance(scene.look(CAMERA), RenderedView)
+    for name in ("output", "look", "render", "probe"):
+        promised, kept = (inspect.signature(getattr(kind, name)) for kind in (RenderableScene, type(scene)))
+        assert list(kept.parameters) == list(promised.parameters), name
+    name = scene.outputs[0].name
+    assert torch.equal(scene.render(CAMERA, [name])[name], scene.look(CAMERA)[name])
+    with pytest.raises(ConfigError, match="no output named 'smell'"):
+        scene.render(CAMERA, ["smell"])
+    with pytest.raises(ConfigError, match="outside the image"):
+        scene.probe(CAMERA, CAMERA.width, 0)
+
+
+def test_the_scene_of_a_model_stays_as_it_was_while_training_goes_on():
+    model = Described(RgbNerfConfig(), scene_box=BOX, metadata={"grid_size": 6})
+    scene = model_scene(model, record(around(2), around(1)))
+    before = scene.render(CAMERA, ["rgb"])["rgb"]
+    with torch.no_grad():
+        for param in model.parameters():
+            param.add_(1.0)
+    assert torch.equal(scene.render(CAMERA, ["rgb"])["rgb"], before)
+    averages = {name: param.detach() - 1 for name, param in model.named_parameters()}
+    averaged = model_scene(model, record(around(2), around(1)), averages)
+    assert_close(averaged.render(CAMERA, ["rgb"])["rgb"], before)
+
+
+def test_a_model_that_names_no_outputs_is_refused():
+    model = RgbNerf(RgbNerfConfig(), scene_box=BOX, metadata={"grid_size": 6})
+    model.outputs = ()
+    with pytest.raises(ConfigError, match="RgbNerf names no outputs"):
+        model_scene(model, record(around(2), around(1)))
