@@ -32,7 +32,7 @@ Explain = Callable[[Tensor, Tensor], Tensor]
 """From pixels (N, B) and endmembers (K, B) to amounts (N, K)."""
 
 OURS = "pairs, NNLS"
-"""The row of `unmix_plugin.spectral.unmix_pixels`, with its defaults."""
+"""The row of `unmix_pixels`, with its defaults."""
 
 _RESTARTS = 5
 _LARGEST_SAMPLE = 20_000

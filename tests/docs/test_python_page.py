@@ -10,6 +10,7 @@ import pytest
 import unmix_plugin
 from tests.commands.running import picture_size
 from tests.docs.pages import blocks_of, text_of
+from unmix_plugin import read_recipe
 
 
 def test_the_public_names_are_those_that_the_page_lists():
@@ -46,6 +47,14 @@ def test_the_examples_run_one_after_the_other(home):
     np.testing.assert_allclose(np.load(home / "abundances.npy"), names["abundances"], atol=1e-6)
     assert picture_size(home / "view.png") == (width, height)
     assert {path.name for path in home.glob("view.*")} == {"view.png", "view.hdr", "view.img"}
+
+
+def test_the_example_of_editing_runs(home):
+    (code,) = blocks_of("docs/editing.md", "python")
+    names = {}
+    exec(compile(code, "docs/editing.md", "exec"), names)
+    assert read_recipe(home / "edits.yml") == names["recipe"]
+    assert names["views"]["rgb"].shape == (16, 16, 3)
 
 
 @pytest.mark.usefixtures("home")

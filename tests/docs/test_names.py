@@ -1,0 +1,47 @@
+"""Flags and dotted names that the pages mention are there."""
+
+import importlib
+import re
+
+import pytest
+
+from tests.commands.running import run
+from tests.docs.pages import ROOT, text_of
+from unmix_plugin.commands.demo_scene import write_demo_scene
+from unmix_plugin.commands.eval import evaluate
+from unmix_plugin.commands.export import PRODUCTS, export
+from unmix_plugin.commands.render import render
+from unmix_plugin.commands.train import train
+from unmix_plugin.commands.view import view
+
+PAGES = ["README.md", *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md")))]
+OF_OTHERS = {"--debug", "--constraint", "--help-all", "--pipeline", "--pipeline.model.resolution", "--seeds"}
+"""Taken before a command sees them, of pip, a beginning, of an example's method, of benchmarks."""
+
+
+@pytest.fixture(scope="module")
+def flags():
+    """Every flag of every command."""
+    asked = [(command, ["--help"]) for command in (evaluate, render, view, write_demo_scene)]
+    asked += [(train, [method, "--help-all"]) for method in ("unmix-nerf", "unmix-nerf-published")]
+    asked += [(export, [product.name, "--help"]) for product in PRODUCTS]
+    return {
+        flag for command, argv in asked for flag in re.findall(r"--[a-z0-9][\w.-]*", run(command, *argv).out)
+    }
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_flags_are_those_of_the_commands(page, flags):
+    named = {flag.rstrip(".-") for flag in re.findall(r"(?<![\w-])--[a-z0-9][\w.-]*", text_of(page))}
+    assert named - flags - OF_OTHERS == set()
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_dotted_names_of_the_package_are_there(page):
+    for name in set(re.findall(r"\bunmix_plugin(?:\.\w+)+", text_of(page))) - {"unmix_plugin.method_configs"}:
+        parts = name.split(".")
+        found = importlib.import_module("unmix_plugin")
+        for count, part in enumerate(parts[1:], start=2):
+            if not hasattr(found, part):
+                importlib.import_module(".".join(parts[:count]))
+            found = getattr(found, part)
