@@ -95,6 +95,20 @@ def test_a_colour_that_is_refused_again_and_again_is_one_notice(viewer, monkeypa
         assert [text for _, text in page.notices].count("that can't be") == 1
 
 
+def test_what_a_user_has_to_know_of_an_edit_is_said_once(viewer):
+    with opened(viewer) as page:
+        page.set("colour", (120, 110, 100))
+        page.wait_until(lambda: bool(page.notices))
+        recipe = page.controls[page.control("recipe")]
+        for label, value, written in (("brightness", 2.0, "scale"), ("light", "A", "illuminant: A")):
+            page.set(label, value)
+            page.wait_until(lambda written=written: written in recipe["value"])
+        show_layer(page, "depth")
+        assert [text for _, text in page.notices] == [
+            "the scene does not say what light it was recorded in: taken as flat (CIE illuminant E)"
+        ]
+
+
 def test_a_name_that_is_taken_is_refused_and_the_field_goes_back(viewer):
     with opened(viewer) as page:
         page.set("name", "endmember_1")

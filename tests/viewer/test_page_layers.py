@@ -10,7 +10,7 @@ from tests.viewer.pages import decoded, opened, serving, show_layer
 from tests.viewer.view_factory import source_of_model
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.maps.indices import available_indices
-from unmix_plugin.viewer.layers.painting import BACKGROUNDS
+from unmix_plugin.viewer.layers.layer_settings import BACKGROUNDS
 from unmix_plugin.viewer.rendering.edits import Edit
 
 
@@ -39,7 +39,8 @@ def test_small_pictures_and_labels_are_sent_without_loss_and_large_ones_compress
         assert page.last_picture.startswith(b"\x89PNG")
         materials = viewer.services.maker.edited(Edit()).materials
         known = {
-            tuple(row) for row in (viewer.services.aids().colours_of(materials) * 255).round().int().tolist()
+            tuple(row)
+            for row in (viewer.services.aids.for_layers().colours_of(materials) * 255).round().int().tolist()
         }
         background = round(255 * BACKGROUNDS["grey"])
         assert {tuple(row) for row in labels.reshape(-1, 3).astype(int).tolist()} <= known | {

@@ -47,23 +47,30 @@ def test_where_nothing_is_there_is_nothing_to_probe(source, camera):
         probe_through(scene, replace(camera, camera_to_world=away), 100.0, 100.0, 1)
 
 
+def test_contributions_of_the_endmembers_add_up_to_the_diffuse_spectrum(source, camera, taken):
+    row, column = camera.height // 2, camera.width // 2
+    with source.borrowed() as scene:
+        diffuse = scene.render(camera, ["diffuse"])["diffuse"][row, column]
+    np.testing.assert_allclose(taken.contributions.sum(axis=0), diffuse.numpy(), rtol=1e-5)
+
+
 def test_the_files_of_probes_hold_every_number(taken):
     measured = replace(taken, number=2, measured=taken.predicted * 2, measured_in="train_003")
     rows = list(csv.reader(io.StringIO(spectra_csv([taken, measured]).decode())))
     assert rows[0] == ["wavelength", "probe_1_predicted", "probe_2_predicted", "probe_2_measured"]
     values = np.array(rows[1:], dtype=float)
-    np.testing.assert_allclose(values[:, 0], taken.bands.centers_nm)
+    np.testing.assert_allclose(values[:, 0], taken.materials.bands.centers_nm)
     np.testing.assert_allclose(values[:, 3], 2 * taken.predicted, rtol=1e-7)
     rows = list(csv.reader(io.StringIO(abundances_csv([taken, measured]).decode())))
     assert rows[0][:6] == ["probe", "x", "y", "z", "material", "measured_in"]
-    assert rows[0][6:] == list(taken.names)
+    assert rows[0][6:] == list(taken.materials.names)
     assert rows[2][5] == "train_003"
     np.testing.assert_allclose([float(value) for value in rows[1][6:]], taken.abundances, atol=1e-5)
     np.testing.assert_allclose([float(value) for value in rows[1][1:4]], taken.point, rtol=1e-7)
 
 
 def test_names_with_commas_stay_one_field(taken):
-    odd = replace(taken, names=("a,b", 'c"d', "e"))
+    odd = replace(taken, materials=replace(taken.materials, names=("a,b", 'c"d', "e")))
     rows = list(csv.reader(io.StringIO(abundances_csv([odd]).decode())))
     assert rows[0][6:] == ["a,b", 'c"d', "e"]
 

@@ -22,7 +22,7 @@ from unmix_plugin.model import UnmixModel
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.trained.snapshot import unmix_scene
-from unmix_plugin.viewer.layers.layer_settings import LayerAids
+from unmix_plugin.viewer.layers.layer_aids import LayerAids
 from unmix_plugin.viewer.rendering.reference import render_reference
 from unmix_plugin.viewer.rendering.scene_source import SceneSource
 from unmix_plugin.viewer.rendering.view import Shown, View

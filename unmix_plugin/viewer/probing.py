@@ -17,8 +17,8 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 
@@ -30,14 +30,14 @@ class ProbedPoint:
     """From 1."""
     point: tuple[float, float, float]
     """Model space."""
-    bands: Bands
+    materials: Materials
+    """As they are shown."""
     predicted: Float64[np.ndarray, " B"]
     """Radiance, as rendered."""
     abundances: Float64[np.ndarray, " K"]
     """Shares, sum 1."""
-    names: tuple[str, ...]
-    endmembers: Float64[np.ndarray, "K B"]
-    """Of the materials as they are shown."""
+    contributions: Float64[np.ndarray, "K B"]
+    """Radiance that each endmember adds, as bright as it is there."""
     measured: Float64[np.ndarray, " B"] | None = None
     """Radiance in a training view that sees the point."""
     measured_in: str = ""
@@ -52,6 +52,11 @@ class ProbedPoint:
     def material(self) -> int:
         """The endmember of the largest share."""
         return int(self.abundances.argmax())
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return self.materials.names[self.material]
 
 
 def probe_through(
@@ -72,21 +77,20 @@ def probe_through(
     if found.opacity < OCCUPIED_ACCUMULATION or found.position is None:
         raise ConfigError("nothing is there to probe: less than half of the light ends on something")
     x, y, z = found.position.tolist()
-    materials = scene.materials
+    endmembers = scene.materials.endmembers.double().cpu().numpy()
     return ProbedPoint(
         number,
         (x, y, z),
-        materials.bands,
+        scene.materials,
         found.values["predicted"],
         found.values["abundances"],
-        materials.names,
-        materials.endmembers.double().cpu().numpy(),
+        found.values["scaled_abundances"][:, None] * endmembers,
     )
 
 
 def spectra_csv(probes: Sequence[ProbedPoint]) -> bytes:
     """One row a band: wavelength, and for each probe what was predicted and, where known, measured."""
-    header, columns = ["wavelength"], [probes[0].bands.centers_nm]
+    header, columns = ["wavelength"], [probes[0].materials.bands.centers_nm]
     for one in probes:
         header.append(f"probe_{one.number}_predicted")
         columns.append(one.predicted)
@@ -98,12 +102,12 @@ def spectra_csv(probes: Sequence[ProbedPoint]) -> bytes:
 
 def abundances_csv(probes: Sequence[ProbedPoint]) -> bytes:
     """One row a probe: number, position in model space, material, the training view measured in, abundances."""
-    header = ["probe", "x", "y", "z", "material", "measured_in", *probes[0].names]
+    header = ["probe", "x", "y", "z", "material", "measured_in", *probes[0].materials.names]
     rows = [
         [
             str(one.number),
             *(f"{value:.9g}" for value in one.point),
-            one.names[one.material],
+            one.name,
             one.measured_in,
             *(f"{value:.6g}" for value in one.abundances),
         ]

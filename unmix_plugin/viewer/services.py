@@ -11,33 +11,28 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from unmix_plugin.editing import Light, Recipe, sample_seen
+from unmix_plugin.editing import Light, Recipe
 from unmix_plugin.editing.light import relighting_factors
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.coefficients import Coefficients
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.colour.illuminants import illuminant_names
 from unmix_plugin.trained.run_views import RunView, recorded_views
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.failures import failures_said
-from unmix_plugin.viewer.layers.layer_settings import LayerAids
 from unmix_plugin.viewer.layers.output_layers import layers_of
 from unmix_plugin.viewer.recipe_editor import numbered
 from unmix_plugin.viewer.rendering.edits import Edit
 from unmix_plugin.viewer.rendering.frames import num_channels
 from unmix_plugin.viewer.rendering.measured import MeasuredViews
 from unmix_plugin.viewer.rendering.picture_maker import PictureMaker
-from unmix_plugin.viewer.rendering.reference import render_reference
 from unmix_plugin.viewer.rendering.render_loop import RenderLoop
+from unmix_plugin.viewer.rendering.scene_aids import SceneAids
 from unmix_plugin.viewer.rendering.scene_source import SceneSource
 from unmix_plugin.viewer.rendering.video_job import VideoQueue
 from unmix_plugin.viewer.scene_objects import Thumbnail
 from unmix_plugin.viewer.training_curve import TrainingCurve
-
-_REFERENCE_STEPS = 200
-"""Training steps after which the reference rays are rendered again."""
 
 _THUMBNAIL_HEIGHT = 96
 
@@ -67,8 +62,6 @@ class Services:
         self.num_train = len(source.record.train_cameras)
         self.scene: Scene | None = None
         """The scene, once it is read."""
-        self.measured: MeasuredViews | None = None
-        self.why_not_measured = "the scene is still being read"
         self.videos = VideoQueue()
         self.curve = TrainingCurve()
         self._read_scene = read_scene
@@ -79,16 +72,14 @@ class Services:
             channels = (
                 num_channels(scene.materials) if isinstance(scene, TrainedScene) else 4 * len(scene.outputs)
             )
-            self.maker = PictureMaker(source, self.aids, self._see, channels, self.layers)
-        self._seen: tuple[int, Coefficients] | None = None
+        self.aids = SceneAids(source, self.has_materials)
+        self.maker = PictureMaker(source, self.aids, channels, self.layers)
         self.loop = RenderLoop(self.maker)
         self.first_recipe = Recipe()
         """What every client sees the scene with at first; endmembers are meant by their numbers."""
         if recipe is not None:
             self.first_recipe = numbered(recipe, self.maker.edited(Edit()).materials.names)
             self.maker.edited(Edit(self.first_recipe))
-        self._reference_version = 0
-        self._aids: LayerAids | None = None
 
     @property
     def folder(self) -> Path:
@@ -103,9 +94,8 @@ class Services:
     @cached_property
     def usable_lights(self) -> tuple[str, ...]:
         """Names of the lights that the scene can be shown in."""
-        unedited = Edit()
-        bands, recorded = self.maker.edited(unedited).bands, self.maker.light_of(unedited)
-        return tuple(name for name in illuminant_names() if _is_usable(name, bands, recorded))
+        scene = self.maker.edited(Edit())
+        return tuple(name for name in illuminant_names() if _is_usable(name, scene.bands, scene.light_power))
 
     def start(self) -> None:
         """Begin to render, and to read the scene."""
@@ -125,35 +115,9 @@ class Services:
             # Not left behind: a thread in native code when the interpreter ends takes the process down with it.
             self._reader.join()
 
-    def aids(self) -> LayerAids | None:
-        """What layers of materials need, None without; its reference rays follow a training. Must not be called while
-        the scene is lent."""
-        if not self.has_materials:
-            return None
-        version = self.source.version
-        age = version - self._reference_version
-        is_stale = age >= _REFERENCE_STEPS or (age > 0 and not self.source.is_changing)
-        if self._aids is None or is_stale:
-            self._reference_version = version
-            self._aids = self._new_aids()
-        return self._aids
-
     def view_named(self, name: str) -> RunView | None:
         """A view of the scene by its name."""
         return next((view for view in self.views if view.name == name), None)
-
-    def _see(self, scene: TrainedScene) -> Coefficients:
-        """What the training cameras see of the unedited scene, not long ago."""
-        version = self.source.version
-        if self._seen is None or version - self._seen[0] >= _REFERENCE_STEPS:
-            self._seen = (version, sample_seen(scene))
-        return self._seen[1]
-
-    def _new_aids(self) -> LayerAids:
-        with self.source.borrowed_materials() as scene:
-            reference = render_reference(scene, self.source.record.train_cameras)
-        error_of = None if self.measured is None else self.measured.error
-        return LayerAids(reference, self.source.record.scene_box, error_of, self.why_not_measured)
 
     def _read(self) -> None:
         """Read the scene; without it the viewer only lacks what was measured."""
@@ -163,11 +127,10 @@ class Services:
             scene = self._read_scene()
             self.scene = scene
             if self.has_materials:
-                self.measured = MeasuredViews(scene, self.source)
-        self._reference_version = -_REFERENCE_STEPS
+                self.aids.set_measured(MeasuredViews(scene, self.source))
 
     def _note_missing(self, reason: str) -> None:
-        self.why_not_measured = f"the scene is not at hand: {reason}"
+        self.aids.set_measured(None, f"the scene is not at hand: {reason}")
 
 
 def _is_usable(light: str, bands: Bands, recorded: Float64[np.ndarray, " B"] | None) -> bool:

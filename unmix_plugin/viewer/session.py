@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.material_library import LibraryMatch, measured_library
 from unmix_plugin.viewer import html
 from unmix_plugin.viewer.failures import failures_said
@@ -100,6 +99,8 @@ class Session:
         self._object_owners: set[str] = set()
         self._warning: viser.NotificationHandle | None = None
         self._warning_said = (-math.inf, "")
+        self._note: viser.NotificationHandle | None = None
+        self._notes: tuple[str, ...] = ()
 
     def _first_settings(self) -> LayerSettings:
         if self.services.has_materials:
@@ -121,6 +122,8 @@ class Session:
         if self.is_closed:  # the client left while its panels were built
             self.services.loop.remove(self.view)
             return
+        if self.services.has_materials:
+            self._tell_notes(self.services.maker.edited(self.view.edit).notes)
         self.client.camera.on_update(self._moved)
         if self._returns and self.view.pose is not None:
             self.services.loop.move(self.view, self.view.pose)
@@ -156,14 +159,14 @@ class Session:
 
         return callback
 
-    def say(self, title: str, text: str, is_warning: bool = False) -> None:
+    def say(self, title: str, text: str, is_warning: bool = False) -> viser.NotificationHandle | None:
         """Show a notice. Of warnings there is one at a time, however many a control that is dragged brings about."""
         if self.is_closed:
-            return
+            return None
         if is_warning:
             before, self._warning_said = self._warning_said, (time.monotonic(), text)
             if before[1] == text and self._warning_said[0] - before[0] < _NOTICE_S:
-                return
+                return None
             if self._warning is not None:
                 self._warning.remove()
         notice = self.client.add_notification(
@@ -171,9 +174,19 @@ class Session:
         )
         if is_warning:
             self._warning = notice
+        return notice
 
     def _warn(self, text: str) -> None:
         self.say("not done", text, is_warning=True)
+
+    def _tell_notes(self, notes: tuple[str, ...]) -> None:
+        """Show what is new among the notes of the edit in force, in place of those shown before."""
+        new = [note for note in notes if note not in self._notes]
+        self._notes = notes
+        if new:
+            if self._note is not None:
+                self._note.remove()
+            self._note = self.say("edited", "; ".join(new))
 
     def restyle(self, settings: LayerSettings) -> None:
         """Show another layer, or the same otherwise."""
@@ -183,18 +196,11 @@ class Session:
         """The materials as this client sees them."""
         return self.services.maker.edited(self.view.edit).materials
 
-    def nearest_materials(
-        self, spectra: Float[np.ndarray, "N B"], bands: Bands, count: int = 3
-    ) -> list[list[LibraryMatch]]:
-        """Known materials that spectra resemble, seen in the light that this client sees them in."""
-        light = self.services.maker.light_of(self.view.edit)
-        return measured_library().nearest(spectra, bands, light, count)
-
-    def colours(self) -> list[tuple[float, ...]]:
-        """sRGB colours that stand for the materials as this client sees them."""
-        aids = self.services.aids()
+    def colours_of(self, materials: Materials) -> list[tuple[float, ...]]:
+        """sRGB colours that stand for materials."""
+        aids = self.services.aids.for_layers()
         assert aids is not None
-        return [tuple(row) for row in aids.colours_of(self.materials()).tolist()]
+        return [tuple(row) for row in aids.colours_of(materials).tolist()]
 
     def change_edit(self, edit: Edit) -> None:
         """Show the scene with other materials or light.
@@ -202,10 +208,11 @@ class Session:
         Raises:
             UnmixError: the edit does not fit the run; nothing has changed.
         """
-        self.services.maker.edited(edit)
+        notes = self.services.maker.edited(edit).notes
         self.services.loop.change_edit(self.view, edit)
         for tell in self.on_edit:
             tell()
+        self._tell_notes(notes)
 
     def show_objects(self, owner: str, has_some: bool) -> None:
         """Note whether a panel shows objects of the browser's own, which need depth to be hidden behind the picture."""
@@ -266,6 +273,14 @@ class Session:
         """What is wrong with the picture, in the panel until it is mended."""
         if self._status is not None and not self.is_closed and text:
             self._status.content = html.paragraph(text, is_warning=True)
+
+
+def nearest_materials(
+    spectra: Float[np.ndarray, "N B"], materials: Materials, count: int = 3
+) -> list[list[LibraryMatch]]:
+    """Known materials that spectra resemble, seen in the light of `materials`."""
+    light = None if materials.light is None else materials.light.cpu().double().numpy()
+    return measured_library().nearest(spectra, materials.bands, light, count)
 
 
 def likeness(match: LibraryMatch) -> str:

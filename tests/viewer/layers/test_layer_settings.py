@@ -8,8 +8,13 @@ from hypothesis import strategies as st
 
 from tests.viewer.view_factory import make_aids
 from unmix_plugin.spectral.maps.index_formula import MAX_LENGTH
-from unmix_plugin.viewer.layers.layer_settings import EXPOSURE_BOUNDS, GAMMA_BOUNDS, LayerSettings
-from unmix_plugin.viewer.layers.painting import BACKGROUNDS, COLOUR_MAPS
+from unmix_plugin.viewer.layers.layer_settings import (
+    BACKGROUNDS,
+    COLOUR_MAPS,
+    EXPOSURE_BOUNDS,
+    GAMMA_BOUNDS,
+    LayerSettings,
+)
 from unmix_plugin.viewer.layers.view_transforms import VIEW_TRANSFORMS
 
 names = st.sampled_from([entry.name for entry in fields(LayerSettings)])

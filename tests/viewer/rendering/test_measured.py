@@ -15,7 +15,10 @@ from unmix_plugin.spectral.coefficients import Coefficients
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.trained.trained_scene import TrainedScene
+from unmix_plugin.viewer.rendering.edits import Edit
 from unmix_plugin.viewer.rendering.measured import MeasuredViews
+from unmix_plugin.viewer.rendering.picture_maker import PictureMaker
+from unmix_plugin.viewer.rendering.scene_aids import SceneAids
 
 BALL = 0.5
 
@@ -80,7 +83,7 @@ def test_a_point_is_measured_by_the_view_nearest_to_the_camera(views, scene):
     index = 1
     camera = scene.cameras[scene.train_indices[index]]
     towards = camera.camera_to_world[0, :, 3] / camera.camera_to_world[0, :, 3].norm()
-    found = views.measurement(BALL * towards, camera, None)
+    found = views.measurement(BALL * towards, camera, None, ball_frame(camera).scene)
     assert found is not None
     assert found.view == scene.frames[scene.train_indices[index]].name
     coords, _ = camera.project((BALL * towards)[None], 0)
@@ -89,7 +92,8 @@ def test_a_point_is_measured_by_the_view_nearest_to_the_camera(views, scene):
 
 
 def test_a_point_inside_is_seen_by_nobody(views, scene):
-    assert views.measurement(torch.zeros(3), scene.cameras[scene.train_indices[0]], None) is None
+    camera = scene.cameras[scene.train_indices[0]]
+    assert views.measurement(torch.zeros(3), camera, None, ball_frame(camera).scene) is None
 
 
 def test_depths_of_few_views_are_kept(views, scene):
@@ -111,5 +115,20 @@ def test_what_was_measured_is_compared_in_the_light_that_the_scene_is_shown_in(v
     assert_close(errors[is_known], expected[is_known], atol=1e-6, rtol=0)
     distance = camera.camera_to_world[0, :, 3].norm()
     point = camera.camera_to_world[0, :, 3] / distance * BALL
-    plain, relit = (views.measurement(point, camera, shown) for shown in (None, light.double().numpy()))
+    plain, relit = (
+        views.measurement(point, camera, shown, frame.scene) for shown in (None, light.double().numpy())
+    )
     assert_close(relit.spectrum, plain.spectrum * light)
+
+
+def test_a_click_takes_one_device_turn_and_is_measured_in_it(views, scene, source, monkeypatch):
+    camera = scene.cameras[scene.train_indices[1]]
+    ball = replace(source, take=lambda: ball_frame(camera).scene)
+    maker = PictureMaker(ball, SceneAids(ball, has_materials=True), num_channels=8)
+    turns, turn = [], source.device.guest_turn
+    monkeypatch.setattr(source.device, "guest_turn", lambda cost: turns.append(cost) or turn(cost))
+    taken = maker.probe(Edit(), camera, (camera.width / 2, camera.height / 2), 1, views)
+    assert len(turns) == 1
+    assert taken.measured_in == scene.frames[scene.train_indices[1]].name
+    expected = scene.cube(scene.train_indices[1])[camera.height // 2, camera.width // 2]
+    np.testing.assert_allclose(taken.measured, expected)

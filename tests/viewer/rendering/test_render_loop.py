@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from tests.method_factory import make_model
-from tests.viewer.view_factory import Screen, make_aids, some_pose, source_of_model
-from unmix_plugin.editing import Light, Recipe, Remove, Scale, sample_seen
+from tests.viewer.view_factory import Screen, some_pose, source_of_model
+from unmix_plugin.editing import Light, Recipe, Remove, Scale
 from unmix_plugin.engine.training.training_control import TrainingControl
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings
@@ -22,6 +22,7 @@ from unmix_plugin.viewer.rendering.frames import FrameRender, num_channels
 from unmix_plugin.viewer.rendering.pacing import Speedometer
 from unmix_plugin.viewer.rendering.picture_maker import PictureMaker
 from unmix_plugin.viewer.rendering.render_loop import RenderLoop
+from unmix_plugin.viewer.rendering.scene_aids import SceneAids
 from unmix_plugin.viewer.rendering.view import Capture
 from unmix_plugin.viewer.view_cameras import camera_of
 
@@ -37,10 +38,9 @@ class FixedSpeed(Speedometer):
 
 def make_loop(source, slow_speed=None):
     """A loop that waits to be driven; with `slow_speed` it believes to be so slow that moving pictures are small."""
-    aids = make_aids(source)
     with source.borrowed() as scene:
-        seen, channels = sample_seen(scene), num_channels(scene.materials)
-    maker = PictureMaker(source, lambda: aids, lambda _: seen, channels)
+        channels = num_channels(scene.materials)
+    maker = PictureMaker(source, SceneAids(source, has_materials=True), channels)
     if slow_speed is not None:
         maker.speed = FixedSpeed(slow_speed)
     return RenderLoop(maker)

@@ -15,7 +15,8 @@ from unmix_plugin.spectral.coefficients import Coefficients
 from unmix_plugin.spectral.maps.indices import SpectralIndex, parse_index
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.material_view import MaterialView
-from unmix_plugin.viewer.layers.layer_settings import LayerAids, LayerSettings
+from unmix_plugin.viewer.layers.layer_aids import LayerAids
+from unmix_plugin.viewer.layers.layer_settings import LayerSettings
 from unmix_plugin.viewer.layers.painting import (
     ColourMapLegend,
     Legend,

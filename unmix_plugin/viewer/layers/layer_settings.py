@@ -1,35 +1,28 @@
-"""What a user has chosen to see, and what layers need to know of the run beside the view itself."""
+"""What a user has chosen to see."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from dataclasses import dataclass, replace
+from typing import Any
 
-import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
-
-from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.maps.indices import available_indices
-from unmix_plugin.spectral.materials import Materials
-from unmix_plugin.spectral.pca import PcaColours
-from unmix_plugin.trained.material_view import MaterialView
-from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.viewer.inputs import choice, number, text
-from unmix_plugin.viewer.layers.painting import BACKGROUNDS, COLOUR_MAPS
 from unmix_plugin.viewer.layers.view_transforms import VIEW_TRANSFORMS, ViewTransform
-from unmix_plugin.viewer.rendering.reference import Reference
+
+BACKGROUNDS = {"grey": 0.92, "white": 1.0, "black": 0.0}
+"""sRGB value of what shows nothing; grey is that of the figures."""
+
+COLOUR_MAPS = ("viridis", "magma", "inferno", "cividis", "turbo", "coolwarm", "gray")
+"""As matplotlib names them."""
 
 EXPOSURE_BOUNDS, GAMMA_BOUNDS = (-8.0, 8.0), (0.2, 5.0)
 _WAVELENGTH_BOUNDS = (1.0, 1e5)
 _VALUE_BOUNDS = (-1e6, 1e6)
 _LONGEST_INDEX = 1000
 """Letters that are kept: more than a formula may have, so that none becomes another one by being cut."""
-_MOST_REMEMBERED = 32
-_ValueT = TypeVar("_ValueT")
 
 
 @dataclass(frozen=True)
@@ -104,47 +97,3 @@ _CHECKS: dict[str, Callable[[Any, Any], Any]] = {
     "view_transform": lambda value, before: choice(value, VIEW_TRANSFORMS, before),
     "background": lambda value, before: choice(value, BACKGROUNDS, before),
 }
-
-ErrorOf = Callable[[MaterialView], tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"], str]]
-"""A view's error against the nearest training view, where it is known, and that view's name."""
-
-
-@dataclass(frozen=True)
-class LayerAids:
-    """What layers need to know of the run."""
-
-    reference: Reference
-    scene_box: SceneBox
-    error_of: ErrorOf | None = None
-    why_no_error: str = "the scene is not at hand"
-    _kept: dict[tuple[str, bytes], Any] = field(default_factory=dict, repr=False, compare=False)
-
-    def colours_of(self, materials: Materials) -> Float[Tensor, "K 3"]:
-        """sRGB colours that stand for the materials, as in all pictures of a run."""
-        return self._remembered(
-            "colours",
-            materials,
-            lambda: torch.as_tensor(endmember_colours(materials)).to(materials.endmembers),
-        )
-
-    def pca_of(self, materials: Materials) -> PcaColours:
-        """Principal components of what the reference rays show with the materials."""
-        return self._remembered("pca", materials, lambda: PcaColours.fit(self.reference.spectra(materials)))
-
-    def depth_range(self, frame: MaterialView) -> tuple[float, float]:
-        """Distances between which the scene box lies, world units."""
-        aabb, scale = self.scene_box.aabb.cpu(), frame.scene.frame.scale
-        middle, radius = aabb.mean(dim=0), float((aabb[1] - aabb[0]).norm()) / 2
-        distance = float((frame.camera.camera_to_world[0, :, 3].cpu() - middle).norm())
-        return (max(0.0, distance - radius) / scale, (distance + radius) / scale)
-
-    def _remembered(self, what: str, materials: Materials, make: Callable[[], _ValueT]) -> _ValueT:
-        """What `make` gives, remembered for the materials that clients look at."""
-        spectra = torch.cat([materials.endmembers, materials.specular_spectra])
-        key = (what, spectra.cpu().numpy().tobytes())
-        found = self._kept.get(key)  # looked up once: another thread may clear what is kept at any moment
-        if found is None:
-            if len(self._kept) >= _MOST_REMEMBERED:
-                self._kept.clear()
-            found = self._kept[key] = make()
-        return found

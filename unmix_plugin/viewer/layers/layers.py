@@ -22,7 +22,8 @@ from unmix_plugin.spectral.colour.conversion import band_composite_matrix, descr
 from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.viewer.layers.index_layer import paint_index
-from unmix_plugin.viewer.layers.layer_settings import LayerAids, LayerSettings
+from unmix_plugin.viewer.layers.layer_aids import LayerAids
+from unmix_plugin.viewer.layers.layer_settings import LayerSettings
 from unmix_plugin.viewer.layers.painting import (
     ColourMapLegend,
     Legend,

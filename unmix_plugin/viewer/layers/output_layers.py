@@ -16,7 +16,8 @@ from unmix_plugin.spectral.colour.conversion import srgb_to_linear
 from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.trained.protocol import RenderableScene, RenderedView
 from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.viewer.layers.layer_settings import LayerAids, LayerSettings
+from unmix_plugin.viewer.layers.layer_aids import LayerAids
+from unmix_plugin.viewer.layers.layer_settings import LayerSettings
 from unmix_plugin.viewer.layers.layers import LAYERS, Layer
 from unmix_plugin.viewer.layers.painting import (
     ColourMapLegend,

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -15,18 +15,10 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, srgb_to_linear
+from unmix_plugin.viewer.layers.layer_settings import BACKGROUNDS, COLOUR_MAPS, LayerSettings
 from unmix_plugin.viewer.layers.view_transforms import to_display
 
-if TYPE_CHECKING:
-    from unmix_plugin.viewer.layers.layer_settings import LayerSettings
-
 Picture: TypeAlias = Float[Tensor, "H W 3"]
-
-BACKGROUNDS = {"grey": 0.92, "white": 1.0, "black": 0.0}
-"""sRGB value of what shows nothing; grey is that of the figures."""
-
-COLOUR_MAPS = ("viridis", "magma", "inferno", "cividis", "turbo", "coolwarm", "gray")
-"""As matplotlib names them."""
 
 _LEVELS = 1024
 

@@ -16,7 +16,6 @@ from unmix_plugin.editing import (
     Retint,
     Scale,
     Swap,
-    assumption_of_light,
 )
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
@@ -34,8 +33,7 @@ from unmix_plugin.viewer.recipe_editor import (
     with_swap,
     with_visible,
 )
-from unmix_plugin.viewer.rendering.edits import Edit
-from unmix_plugin.viewer.session import Session, likeness
+from unmix_plugin.viewer.session import Session, likeness, nearest_materials
 from unmix_plugin.viewer.settling import Settling
 
 _OWN_LIGHT = "as recorded"
@@ -136,10 +134,6 @@ class MaterialsPanel:
         if name not in self._lights(self._recipe.recipe.illuminant):
             raise ConfigError(f"there is no light {name[:40]!r} to choose")
         self._recipe.change(with_light(self._recipe.recipe, None if name == _OWN_LIGHT else Light(name)))
-        scene = self._session.services.maker.edited(Edit())
-        assumed = assumption_of_light(scene, self._recipe.recipe)
-        if assumed is not None:
-            self._session.say("light", assumed)
 
     def _change_visibility(self, control: Any) -> None:
         hidden, _ = visibility(self._recipe.recipe)
@@ -167,11 +161,11 @@ class MaterialsPanel:
         """Show the materials as they are now."""
         materials = self._session.materials()
         self._show_names(materials.names)
-        colours, spectra = self._session.colours(), materials.endmembers.double().cpu().numpy()
+        colours, spectra = self._session.colours_of(materials), materials.endmembers.double().cpu().numpy()
         lines = zip(materials.names, spectra, colours, strict=True)
         self._chart.draw(materials.bands, [Line(name, row, colour) for name, row, colour in lines])
         self._listing.content = self._list(materials, colours)
-        self._show_chosen()
+        self._show_chosen(materials)
 
     def _show_names(self, names: tuple[str, ...]) -> None:
         """Let the menus have the names of the endmembers, each with the same one chosen as before."""
@@ -185,11 +179,12 @@ class MaterialsPanel:
         finally:
             self._is_showing = False
 
-    def _show_chosen(self) -> None:
+    def _show_chosen(self, materials: Materials | None = None) -> None:
         """Let the controls say what the recipe does to the endmember chosen."""
         self._is_showing = True
         try:
-            materials, index, recipe = self._session.materials(), self._index, self._recipe.recipe
+            materials = self._session.materials() if materials is None else materials
+            index, recipe = self._index, self._recipe.recipe
             hidden, isolated = visibility(recipe)
             self._is_visible.value = index not in hidden and (not isolated or index in isolated)
             self._is_alone.value = index in isolated
@@ -205,7 +200,7 @@ class MaterialsPanel:
             self._light.options = self._lights(recipe.illuminant)
             self._light.value = _OWN_LIGHT if recipe.illuminant is None else str(recipe.illuminant.light)
             spectrum = materials.endmembers[index : index + 1].double().cpu().numpy()
-            alike = self._session.nearest_materials(spectrum, materials.bands)[0]
+            alike = nearest_materials(spectrum, materials)[0]
             self._alike.content = html.table([("like", likeness(one)) for one in alike])
             self._recipe.show()
         finally:
@@ -231,7 +226,7 @@ class MaterialsPanel:
         """Every endmember with its colour, its nearest known material, and whether it is hidden."""
         hidden, isolated = visibility(self._recipe.recipe)
         spectra = materials.endmembers[:_LONGEST_LIST].double().cpu().numpy()
-        matches = self._session.nearest_materials(spectra, materials.bands, 1)
+        matches = nearest_materials(spectra, materials, 1)
         entries = []
         for index, (name, found) in enumerate(zip(materials.names, matches, strict=False)):
             is_gone = index in hidden or (isolated and index not in isolated)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from unmix_plugin.viewer.charts import Chart, Line
 from unmix_plugin.viewer.inputs import new_file, number
 from unmix_plugin.viewer.probing import ProbedPoint, abundances_csv, spectra_csv
 from unmix_plugin.viewer.scene_objects import add_probe
-from unmix_plugin.viewer.session import Session, likeness
+from unmix_plugin.viewer.session import Session, likeness, nearest_materials
 from unmix_plugin.viewer.view_cameras import camera_of
 
 if TYPE_CHECKING:
@@ -32,7 +31,7 @@ _COLOURS = (
     (0.0, 0.6, 0.6),
 )
 _SHOWN_SHARE = 0.08
-"""Endmembers of at least this share are drawn beside a probe's spectrum."""
+"""Endmembers of at least this share: what they add to a probe's spectrum is drawn beside it."""
 
 _PROBED_ROWS = 512
 _NONE = "none yet"
@@ -63,16 +62,16 @@ class ProbePanel:
         self._session.guarded(lambda: self._take(x, y))()
 
     def _take(self, x: Any, y: Any) -> None:
-        """ProbedPoint a point of the canvas, given in parts of its width and height."""
+        """Probe a point of the canvas, given in parts of its width and height."""
         if self._is_on.value is not True:
             return
         column, row = (number(value, 0.0, 1.0, fallback=0.5) for value in (x, y))
         session, services = self._session, self._session.services
         camera = camera_of(session.pose(), _PROBED_ROWS)
+        place = (column * camera.width, row * camera.height)
         taken = services.maker.probe(
-            session.view.edit, camera, column * camera.width, row * camera.height, self._taken + 1
+            session.view.edit, camera, place, self._taken + 1, services.aids.measured
         )
-        taken = self._with_measurement(taken)
         self._taken += 1
         self._probes.append(taken)
         while len(self._probes) > MOST_PROBES:
@@ -80,23 +79,7 @@ class ProbePanel:
         self._markers[taken.number] = add_probe(session.client, taken.number, taken.point, _marker(taken))
         session.show_objects("probe", True)
         self._chosen.options = tuple(_label(one) for one in self._probes)
-        self._chosen.value = _label(taken)
-        self._show(taken)
-
-    def _with_measurement(self, taken: ProbedPoint) -> ProbedPoint:
-        """With what a training view measured there, where the scene is at hand."""
-        session = self._session
-        if session.services.measured is None:
-            return taken
-        camera = camera_of(session.pose(), _PROBED_ROWS)
-        edit = session.view.edit
-        found = session.services.measured.measurement(
-            taken.position, camera, session.services.maker.light_of(edit)
-        )
-        if found is None:
-            return taken
-        view = f"{found.view}, before the edits" if edit.recipe.operations else found.view
-        return replace(taken, measured=found.spectrum.double().numpy(), measured_in=view)
+        self._chosen.value = _label(taken)  # which shows it
 
     def _show_chosen(self) -> None:
         chosen = next((one for one in self._probes if _label(one) == self._chosen.value), None)
@@ -105,14 +88,15 @@ class ProbePanel:
 
     def _show(self, shown: ProbedPoint) -> None:
         rows = [
-            ("material", shown.names[shown.material]),
+            ("material", shown.name),
             ("position", ", ".join(f"{value:.3f}" for value in shown.point)),
             ("measured in", shown.measured_in or "no training view at hand sees the point"),
-            *self._library_rows(shown),
+            *_library_rows(shown),
         ]
         self._text.content = html.table(rows)
-        colours = self._session.colours()
-        entries = zip(shown.names, shown.abundances.tolist(), colours, strict=True)
+        names, bands = shown.materials.names, shown.materials.bands
+        colours = self._session.colours_of(shown.materials)
+        entries = zip(names, shown.abundances.tolist(), colours, strict=True)
         self._bars.content = html.bars(sorted(entries, key=lambda entry: -entry[1])[:16])
         lines = [Line("predicted", shown.predicted, _colour(shown))]
         if shown.measured is not None:
@@ -120,17 +104,13 @@ class ProbePanel:
                 Line(f"measured, {shown.measured_in}", shown.measured, (0.35, 0.35, 0.35), is_dashed=True)
             )
         lines += [
-            Line(shown.names[index], shown.endmembers[index], colours[index], is_thin=True)
+            Line(names[index], shown.contributions[index], colours[index], is_thin=True)
             for index in np.flatnonzero(shown.abundances >= _SHOWN_SHARE)
         ]
-        self._chart.draw(shown.bands, lines)
+        self._chart.draw(bands, lines)
         self._comparison.draw(
-            shown.bands, [Line(f"probe {one.number}", one.predicted, _colour(one)) for one in self._probes]
+            bands, [Line(f"probe {one.number}", one.predicted, _colour(one)) for one in self._probes]
         )
-
-    def _library_rows(self, shown: ProbedPoint) -> list[tuple[str, str]]:
-        matches = self._session.nearest_materials(shown.predicted[None], shown.bands)[0]
-        return [("like" if rank == 0 else "", likeness(match)) for rank, match in enumerate(matches)]
 
     def _save(self) -> None:
         if not self._probes:
@@ -158,8 +138,13 @@ class ProbePanel:
         self._markers.pop(one.number).remove()
 
 
+def _library_rows(shown: ProbedPoint) -> list[tuple[str, str]]:
+    matches = nearest_materials(shown.predicted[None], shown.materials)[0]
+    return [("like" if rank == 0 else "", likeness(match)) for rank, match in enumerate(matches)]
+
+
 def _label(one: ProbedPoint) -> str:
-    return f"{one.number}: {one.names[one.material]}"
+    return f"{one.number}: {one.name}"
 
 
 def _colour(one: ProbedPoint) -> tuple[float, float, float]:

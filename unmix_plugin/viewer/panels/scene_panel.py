@@ -89,7 +89,7 @@ class ScenePanel:
 
     def _add_points(self) -> list[Any]:
         """Surface points in the colours that the materials have now."""
-        aids, materials = self._session.services.aids(), self._session.materials()
+        aids, materials = self._session.services.aids.for_layers(), self._session.materials()
         assert aids is not None
         spectra = aids.reference.spectra(materials)
         linear = (spectra @ rgb_matrix(materials.bands).to(spectra)).clamp(0, 1)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,7 @@ from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION
 from unmix_plugin.trained.library_matches import relit
 from unmix_plugin.trained.material_view import MaterialView
+from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.rendering.scene_source import SceneSource
 
 _TOLERANCE = 0.03
@@ -79,7 +81,11 @@ class MeasuredViews:
         return errors.view(height, width).to(device), is_known.view(height, width).to(device), name
 
     def measurement(
-        self, point: Float[Tensor, "3"], camera: Cameras, light: Float64[np.ndarray, " B"] | None
+        self,
+        point: Float[Tensor, "3"],
+        camera: Cameras,
+        light: Float64[np.ndarray, " B"] | None,
+        scene: TrainedScene,
     ) -> Measurement | None:
         """What the training view nearest to a camera measured of a point; None where no view tried sees it.
 
@@ -87,9 +93,10 @@ class MeasuredViews:
             point: Model space.
             camera: One camera.
             light: In which the scene is shown, relative power; what was measured is relit to it. None if unknown.
+            scene: The unedited scene, which is lent.
         """
         for index in self._by_nearness(camera)[:_VIEWS_TRIED].tolist():
-            rows, columns, sees = self._pixels_of(point[None], index)
+            rows, columns, sees = self._pixels_of(point[None], index, scene)
             if bool(sees[0]):
                 cube = self._scene.cube(self._indices[index])
                 spectrum = self._in_light(cube[int(rows[0]), int(columns[0])].copy(), light)
@@ -115,7 +122,7 @@ class MeasuredViews:
         return (offsets + angles).argsort()
 
     def _pixels_of(
-        self, points: Float[Tensor, "P 3"], index: int
+        self, points: Float[Tensor, "P 3"], index: int, lent: TrainedScene | None = None
     ) -> tuple[Tensor, Tensor, Bool[Tensor, "P"]]:
         """Row and column of each point in a training view, and whether that view sees it."""
         camera = self._cameras[index]
@@ -125,17 +132,17 @@ class MeasuredViews:
         inside &= (columns < camera.width) & (rows < camera.height)
         rows, columns = rows.clamp(0, camera.height - 1), columns.clamp(0, camera.width - 1)
         distance = (points.cpu() - camera.camera_to_world[0, :, 3]).norm(dim=-1)
-        rendered = self._distance_of(index)[rows, columns]
+        rendered = self._distance_of(index, lent)[rows, columns]
         return rows, columns, inside & ((distance - rendered).abs() < _TOLERANCE * distance)
 
-    def _distance_of(self, index: int) -> Float[Tensor, "H W"]:
+    def _distance_of(self, index: int, lent: TrainedScene | None) -> Float[Tensor, "H W"]:
         """Distances along the rays of a training view as rendered lately, infinite where nothing is."""
         step = self._source.version
         with self._lock:
             kept = self._distances.get(index)
         if kept is not None and step - kept[0] < _STEPS_KEPT:
             return kept[1]
-        with self._source.borrowed_materials() as scene:
+        with self._source.borrowed_materials() if lent is None else nullcontext(lent) as scene:
             seen = scene.look(self._cameras[index], subpixels=1).coefficients
         distance = seen.ray_distance.where(seen.is_occupied, torch.inf).cpu()
         with self._lock:

@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 
-import numpy as np
 import torch
-from jaxtyping import Float64
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.trained.open_run import require_materials
 from unmix_plugin.trained.protocol import RenderedView
 from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.viewer.layers.layer_settings import LayerAids, LayerSettings
+from unmix_plugin.viewer.layers.layer_settings import LayerSettings
 from unmix_plugin.viewer.layers.layers import LAYERS, Layer, layer_named
 from unmix_plugin.viewer.layers.painting import as_bytes
 from unmix_plugin.viewer.probing import ProbedPoint, probe_through
-from unmix_plugin.viewer.rendering.edits import Edit, See
+from unmix_plugin.viewer.rendering.edits import Edit
 from unmix_plugin.viewer.rendering.frames import FrameRender
+from unmix_plugin.viewer.rendering.measured import MeasuredViews
 from unmix_plugin.viewer.rendering.pacing import Speedometer, affordable_height, finer_height, moving_height
 from unmix_plugin.viewer.rendering.picture_depth import picture_depth
+from unmix_plugin.viewer.rendering.scene_aids import SceneAids
 from unmix_plugin.viewer.rendering.scene_source import SceneSource
 from unmix_plugin.viewer.rendering.view import Shown
 from unmix_plugin.viewer.view_cameras import ViewPose, camera_of
@@ -43,23 +44,20 @@ class PictureMaker:
     def __init__(
         self,
         source: SceneSource,
-        aids: Callable[[], LayerAids | None],
-        see: See,
+        aids: SceneAids,
         num_channels: int,
         layers: Mapping[str, Layer] = LAYERS,
     ) -> None:
         """
         Args:
             source: The model.
-            aids: What layers need, asked anew for each picture.
-            see: What cameras see of the model, asked while it is lent.
+            aids: What layers and edits need of it.
             num_channels: Numbers a pixel that a frame keeps.
             layers: What can be shown, by name.
         """
         self.speed = Speedometer()
         self.source = source
         self._aids = aids
-        self._see = see
         self._layers = layers
         self._largest_pixels = max(256, LARGEST_FRAME_BYTES // (4 * num_channels))
 
@@ -94,7 +92,7 @@ class PictureMaker:
             UnmixError: the edit does not fit the run.
         """
         with self.source.borrowed(cost) as scene, torch.no_grad():
-            shown = edit.apply(scene, self.source.version, self._see)
+            shown = edit.apply(scene, self.source.version, self._aids.see)
             started = time.perf_counter()
             rays = render.render_block(shown, num_rays)
             if shown.device.type == "cuda":
@@ -102,15 +100,32 @@ class PictureMaker:
             self.speed.add(rays, time.perf_counter() - started)
             return render.frame(shown) if render.rays_left == 0 else None
 
-    def probe(self, edit: Edit, camera: Cameras, column: float, row: float, number: int) -> ProbedPoint:
-        """What is seen through a point of a camera's picture.
+    def probe(
+        self,
+        edit: Edit,
+        camera: Cameras,
+        place: tuple[float, float],
+        number: int,
+        measured: MeasuredViews | None = None,
+    ) -> ProbedPoint:
+        """What is seen through a point of a camera's picture, and what a training view measured there.
 
+        Args:
+            edit: What is changed.
+            camera: One camera.
+            place: Column and row, pixels.
+            number: Of the probe.
+            measured: The training views, if they are at hand.
         Raises:
             UnmixError: nothing is there, or the edit does not fit the run.
         """
-        with self.source.borrowed() as scene:
-            shown = require_materials(edit.apply(scene, self.source.version, self._see), "of this run")
-            return probe_through(shown, camera, column, row, number)
+        with self._edited(edit) as (scene, shown):
+            taken = probe_through(shown, camera, *place, number)
+            found = measured and measured.measurement(taken.position, camera, shown.light_power, scene)
+        if found is None:
+            return taken
+        view = f"{found.view}, before the edits" if edit.recipe.operations else found.view
+        return replace(taken, measured=found.spectrum.double().numpy(), measured_in=view)
 
     def edited(self, edit: Edit) -> TrainedScene:
         """The scene after an edit.
@@ -118,16 +133,15 @@ class PictureMaker:
         Raises:
             UnmixError: the edit does not fit the run.
         """
-        with self.source.borrowed() as scene:
-            return require_materials(edit.apply(scene, self.source.version, self._see), "of this run")
+        with self._edited(edit) as (_, shown):
+            return shown
 
-    def light_of(self, edit: Edit) -> Float64[np.ndarray, " B"] | None:
-        """Relative power of the light after an edit; None where the scene's is unknown.
-
-        Raises:
-            UnmixError: the edit does not fit the run.
-        """
-        return self.edited(edit).light_power
+    @contextmanager
+    def _edited(self, edit: Edit) -> Iterator[tuple[TrainedScene, TrainedScene]]:
+        """Context with the scene before and after an edit, and the device."""
+        with self.source.borrowed_materials() as scene:
+            shown = edit.apply(scene, self.source.version, self._aids.see)
+            yield scene, require_materials(shown, "of this run")
 
     def with_materials_of(self, edit: Edit, frame: RenderedView) -> RenderedView:
         """What a frame would be with other materials on the same shapes.
@@ -143,7 +157,7 @@ class PictureMaker:
         Raises:
             UnmixError: the layer can't be shown.
         """
-        layer, aids = layer_named(settings.layer, self._layers), self._aids()
+        layer, aids = layer_named(settings.layer, self._layers), self._aids.for_layers()
         with torch.no_grad():
             picture, legend = layer.paint(frame, settings, aids)
         depth = picture_depth(frame) if with_depth and isinstance(frame, MaterialView) else None
