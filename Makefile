@@ -46,7 +46,7 @@ $(VENV)/.system-packages: scripts/install_system_packages.sh | $(BIN)/python
 	@touch $@
 
 test: $(VENV)/.installed-dev $(VENV)/.system-packages
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses 2
 
 # Deprecations that old releases warn of are no failures here, and old checkers of shapes are left out.
 test-minimum:
