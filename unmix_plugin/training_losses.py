@@ -97,8 +97,7 @@ def compare_pixels(
     Args:
         spectra, accumulation: Of rays, P for each pixel.
         batch: `spectra` (R, B) and `alpha` (R) of the pixels.
-        background: What lies behind both.
-        generator: Source of random greys.
+        background, generator: What lies behind both, and the source of random greys.
     """
     measured = batch["spectra"]
     opacities = pixel_mean(accumulation, len(measured))

@@ -47,7 +47,6 @@ def write_envi_cube(
         names: Of the bands; commas in them become `-`, as the format has no other way.
         description: What the numbers are, with their unit.
     Raises:
-        RunError: the disk is full or refuses.
         ValueError: another number of wavelengths or names than of bands.
     """
     with envi_cube_rows(path_without_suffix, cube.shape, wavelengths, names, description) as add:

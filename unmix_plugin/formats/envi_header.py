@@ -37,8 +37,6 @@ def envi_rows(
         paths: Header and numbers.
         shape: Of all rows.
         entries: Of the header.
-    Raises:
-        RunError: the disk is full or refuses.
     """
     header_path, data_path = paths
     with raw_rows(data_path, b"", shape, np.dtype("<f4")) as add:

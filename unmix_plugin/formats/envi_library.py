@@ -34,7 +34,6 @@ def write_envi_library(
         spectra, bands, names: Any numbers, their wavelengths, and what each spectrum is called.
         description: What the numbers are, with their unit.
     Raises:
-        RunError: the disk is full or refuses.
         ValueError: another number of names than of spectra, or of wavelengths than of bands.
     """
     if spectra.shape != (len(names), len(bands)):

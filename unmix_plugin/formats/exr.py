@@ -18,8 +18,6 @@ def write_exr(path: Path, channels: Mapping[str, np.ndarray], attributes: Mappin
 
     A dot in a channel's name parts layers. Readers get the channels in the order of their names.
 
-    Raises:
-        RunError: the disk is full or refuses.
     """
     import OpenEXR
 

@@ -43,8 +43,6 @@ def write_glb(
         faces: Indices of vertices.
         numbers: More of each vertex, (P,) float32, by a name that starts with `_`.
         extras: What else the file says of the mesh, as JSON has it.
-    Raises:
-        RunError: the disk is full or refuses.
     """
     builder = _Builder()
     attributes = {

@@ -17,7 +17,6 @@ def npy_rows(path: Path, shape: tuple[int, ...], dtype: type[np.generic]) -> Ite
     """Context that gives a sink for the rows of an array of this shape; at its end the file is there.
 
     Raises:
-        RunError: the disk is full or refuses.
         ValueError: the rows given don't add up to `shape`.
     """
     kind = np.dtype(dtype).newbyteorder("<")

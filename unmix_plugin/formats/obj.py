@@ -41,8 +41,6 @@ def write_obj(
         faces, materials: Indices of vertices, and the material of each face.
         names, palette: Of the materials; in names what is no letter or digit becomes `_`; sRGB.
         comments: First lines.
-    Raises:
-        RunError: the disk is full or refuses.
     """
     obj_path, library_path = obj_paths(path_without_suffix)
     plain = [f"material_{index}_{re.sub(r'[^0-9A-Za-z]+', '_', name)}" for index, name in enumerate(names)]

@@ -31,7 +31,6 @@ def write_ply(
         faces: Indices of vertices.
         comments: Lines of the header.
     Raises:
-        RunError: the disk is full or refuses.
         KeyError: a property of another type.
     """
     count = len(next(iter(vertices.values())))

@@ -26,7 +26,6 @@ def raw_rows(path: Path, header: bytes, shape: tuple[int, ...], dtype: np.dtype)
         shape: Of the whole image, (H, W, ...).
         dtype: Of the numbers on disk.
     Raises:
-        RunError: the disk is full or refuses.
         ValueError: the rows given don't add up to `shape`.
     """
     given = 0

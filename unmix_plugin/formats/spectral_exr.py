@@ -44,7 +44,6 @@ def write_spectral_exr(
         alpha: Opacity, [0, 1]; spectra and preview are multiplied by it already, as OpenEXR wants it.
         comments: What the numbers are.
     Raises:
-        RunError: the disk is full or refuses.
         ValueError: another number of wavelengths than of bands.
     """
     if spectra.shape[2] != len(bands):

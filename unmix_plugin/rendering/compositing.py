@@ -56,14 +56,17 @@ def accumulate_twin(
     return totals.index_add(0, ray_indices, weights[:, None] * values)
 
 
+def _launch(kernel: Any, packed_info: Int[Tensor, "R 2"], *arrays: Tensor) -> None:
+    launch(kernel, len(packed_info), [as_warp(array) for array in arrays], packed_info.device)
+
+
 class _VolumeWeights(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, optical_depths: Tensor, packed_info: Tensor) -> Tensor:
         from unmix_plugin.rendering._compositing_kernels import weights_kernel
 
         weights, transmittances = torch.empty_like(optical_depths), torch.empty_like(optical_depths)
-        arrays = [as_warp(x) for x in (optical_depths, packed_info, weights, transmittances)]
-        launch(weights_kernel, len(packed_info), arrays, optical_depths.device)
+        _launch(weights_kernel, packed_info, optical_depths, packed_info, weights, transmittances)
         ctx.save_for_backward(weights, transmittances, packed_info)
         return weights
 
@@ -74,8 +77,8 @@ class _VolumeWeights(torch.autograd.Function):
 
         weights, transmittances, packed_info = ctx.saved_tensors
         incoming, depth_gradients = gradients[0].contiguous(), torch.empty_like(weights)
-        arrays = [as_warp(x) for x in (weights, transmittances, packed_info, incoming, depth_gradients)]
-        launch(weights_gradient_kernel, len(packed_info), arrays, weights.device)
+        arrays = (weights, transmittances, packed_info, incoming, depth_gradients)
+        _launch(weights_gradient_kernel, packed_info, *arrays)
         return depth_gradients, None
 
 
@@ -85,8 +88,7 @@ class _Accumulate(torch.autograd.Function):
         from unmix_plugin.rendering._compositing_kernels import accumulate_kernel
 
         totals = values.new_empty(len(packed_info), values.shape[1])
-        arrays = [as_warp(x) for x in (weights, values, packed_info, totals)]
-        launch(accumulate_kernel, len(packed_info), arrays, weights.device)
+        _launch(accumulate_kernel, packed_info, weights, values, packed_info, totals)
         ctx.save_for_backward(weights, values, packed_info)
         return totals
 
@@ -98,8 +100,6 @@ class _Accumulate(torch.autograd.Function):
         weights, values, packed_info = ctx.saved_tensors
         incoming = gradients[0].contiguous()
         weight_gradients, value_gradients = torch.empty_like(weights), torch.empty_like(values)
-        arrays = [
-            as_warp(x) for x in (weights, values, packed_info, incoming, weight_gradients, value_gradients)
-        ]
-        launch(accumulate_gradient_kernel, len(packed_info), arrays, weights.device)
+        arrays = (weights, values, packed_info, incoming, weight_gradients, value_gradients)
+        _launch(accumulate_gradient_kernel, packed_info, *arrays)
         return weight_gradients, value_gradients, None

@@ -135,18 +135,15 @@ class _HashEncode(torch.autograd.Function):
             return known.view_as(known)
         num_samples, num_levels = len(positions), layout.num_levels
         encoded = positions.new_empty(num_samples, num_levels * ctx.width)
-        feature_vector = vector_type(ctx.width, table.dtype)
-        launch(
-            encode_kernel,
-            num_samples * num_levels,
-            [
-                as_warp(positions, vector_type(3, positions.dtype)),
-                as_warp(table, feature_vector),
-                as_warp(levels),
-                as_warp(encoded.view(num_samples, num_levels, ctx.width), feature_vector),
-            ],
-            positions.device,
-        )
+        point, features = vector_type(3, positions.dtype), vector_type(ctx.width, table.dtype)
+        rows = encoded.view(num_samples, num_levels, ctx.width)
+        arrays = [
+            as_warp(positions, point),
+            as_warp(table, features),
+            as_warp(levels),
+            as_warp(rows, features),
+        ]
+        launch(encode_kernel, num_samples * num_levels, arrays, positions.device)
         return encoded
 
     @staticmethod
@@ -161,25 +158,12 @@ class _HashEncode(torch.autograd.Function):
         table_gradient = position_gradient = None
         if ctx.needs_input_grad[1]:
             table_gradient = torch.zeros_like(table)
-            launch(
-                table_gradient_kernel,
-                num_samples * num_levels,
-                [as_warp(positions, point), incoming, as_warp(levels), as_warp(table_gradient, features)],
-                positions.device,
-                cpu_part=num_samples,
-            )
+            arrays = [as_warp(positions, point), incoming, as_warp(levels), as_warp(table_gradient, features)]
+            size = num_samples * num_levels
+            launch(table_gradient_kernel, size, arrays, positions.device, cpu_part=num_samples)
         if ctx.needs_input_grad[0]:
             position_gradient = torch.empty_like(positions)
-            launch(
-                position_gradient_kernel,
-                num_samples,
-                [
-                    as_warp(positions, point),
-                    as_warp(table, features),
-                    incoming,
-                    as_warp(levels),
-                    as_warp(position_gradient, point),
-                ],
-                positions.device,
-            )
+            arrays = [as_warp(positions, point), as_warp(table, features), incoming, as_warp(levels)]
+            arrays.append(as_warp(position_gradient, point))
+            launch(position_gradient_kernel, num_samples, arrays, positions.device)
         return position_gradient, table_gradient, None, None

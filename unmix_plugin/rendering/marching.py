@@ -70,9 +70,7 @@ def march(
     rays = [
         as_warp(origins.contiguous(), point),
         as_warp(directions.contiguous(), point),
-        as_warp(t_near.contiguous()),
-        as_warp(t_far.contiguous()),
-        as_warp(jitter.contiguous()),
+        *(as_warp(values.contiguous()) for values in (t_near, t_far, jitter)),
         step,
         as_warp(occupied.contiguous()),
     ]

@@ -37,11 +37,6 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("reachable_cells", _flat_indices(reachable), persistent=False)
         self.register_load_state_dict_post_hook(_find_reachable_cells)
 
-    @property
-    def occupied_fraction(self) -> float:
-        """Part of the box that rays are sampled in."""
-        return float(self.occupied.float().mean())
-
     @torch.no_grad()
     def update(
         self,
@@ -73,9 +68,7 @@ class OccupancyGrid(nn.Module):
         limit = min(threshold, float(known_peaks.mean())) if len(known_peaks) else threshold
         self.visibility.update()
         is_visible = self.visibility.visible.view(-1)[self.reachable_cells]
-        self.occupied.view(-1)[self.reachable_cells] = ((reachable_peaks > limit) & is_visible).to(
-            torch.uint8
-        )
+        self.occupied.view(-1)[self.reachable_cells] = ((reachable_peaks > limit) & is_visible).byte()
 
     def _choose_cells(self, num_cells: int | None, generator: torch.Generator) -> Int[Tensor, "N"]:
         reachable = self.reachable_cells

@@ -1,8 +1,8 @@
 """Which cells training rays have lately ended in: elsewhere nothing was learnt, and nothing is shown.
 
 Behind every surface lies space that no training ray reaches. What a field says there was never compared with a picture:
-from another side it is a grey floater. It costs time too, since it isn't empty. What one view alone
-sees isn't held by the others, and grows into shapes that fit a single picture.
+from another side it is a grey floater, and it costs time. What one view alone sees isn't held by the others, and grows
+into shapes that fit a single picture.
 
 So rays note where they end, and once enough of them were cast, cells stay visible if two views saw them or a neighbour
 of theirs. A surface that moves by a cell takes the open cells with it.
@@ -86,8 +86,8 @@ class VisibleCells(nn.Module):
 def _with_neighbours(cells: Bool[Tensor, "X Y Z"]) -> Bool[Tensor, "X Y Z"]:
     """And the cells that share a face, an edge or a corner with one of them."""
     for axis in range(3):
-        grown = cells.clone()
-        grown.narrow(axis, 1, cells.shape[axis] - 1).logical_or_(cells.narrow(axis, 0, cells.shape[axis] - 1))
-        grown.narrow(axis, 0, cells.shape[axis] - 1).logical_or_(cells.narrow(axis, 1, cells.shape[axis] - 1))
+        grown, count = cells.clone(), cells.shape[axis] - 1
+        for here, there in ((1, 0), (0, 1)):
+            grown.narrow(axis, here, count).logical_or_(cells.narrow(axis, there, count))
         cells = grown
     return cells

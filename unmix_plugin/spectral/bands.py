@@ -77,7 +77,7 @@ class Bands:
         """The B + 1 borders of the bands' intervals in nm, increasing."""
         centers = self.centers_nm
         if len(centers) == 1:
-            return np.array([centers[0] - LONE_BAND_WIDTH_NM / 2, centers[0] + LONE_BAND_WIDTH_NM / 2])
+            return centers + LONE_BAND_WIDTH_NM * np.array([-0.5, 0.5])
         inner = (centers[1:] + centers[:-1]) / 2
         return np.concatenate([[2 * centers[0] - inner[0]], inner, [2 * centers[-1] - inner[-1]]])
 

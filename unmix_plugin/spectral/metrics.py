@@ -54,10 +54,8 @@ def ssim(
     valid_mask: Bool[Tensor, "H W"] | None = None,
 ) -> float:
     """Structural similarity in [-1, 1], mean over bands: 7 x 7 uniform window, data range 1, sample covariance, windows
-    that reach beyond the image left out.
+    that reach beyond the image left out. Pixels whose windows do not count are made equal in both images first.
 
-    Args:
-        valid_mask: Pixels whose windows count. Pixels that do not are made equal in both images first.
     Raises:
         SpectrumError: an image smaller than the window.
     Source:
@@ -93,9 +91,7 @@ def sam(
 ) -> float:
     """Spectral angle mapper: mean angle in radians over the pixels that count; NaN if none does.
 
-    Args:
-        mask: Labelled or opaque pixels; None takes all. Pixels whose true spectrum is dark (root mean square over
-            bands at most 0.005) never count.
+    Pixels whose true spectrum is dark (root mean square over bands at most 0.005) never count.
     """
     total, count = 0.0, 0
     for pred, target, counts in _rows(pred_image, target_image, mask):
@@ -170,11 +166,7 @@ def abundance_rmse(
     """Root mean squared error of abundances over pixels and true materials; NaN where no pixel counts.
 
     A true material without a match is predicted as 0. A surplus predicted endmember has no column of its own: what it
-    takes is missing from the others.
-
-    Args:
-        matching: From `match_endmembers`, once a scene.
-        mask: Pixels that count; None takes those whose true abundances are not all zero.
+    takes is missing from the others. Without a mask, pixels count whose true abundances are not all zero.
     """
     if mask is None:
         mask = true_abundances.sum(dim=-1) > 0

@@ -73,22 +73,15 @@ class SegmentationTally:
     """Confusion counts of a scene, fed view by view; memory does not grow with views."""
 
     def __init__(self, num_pred: int, num_true: int) -> None:
-        """
-        Args:
-            num_pred: Number of predicted materials, K.
-            num_true: Number of true materials, M.
+        """Start with nothing counted, for K predicted and M true materials.
+
         Raises:
             SpectrumError: more than 255 of either, or none.
         """
         _require_countable(num_pred)
         _require_countable(num_true)
-        self._confusion: Int64[np.ndarray, "rows M"] = np.zeros((num_pred + 1, num_true), dtype=np.int64)
+        self.confusion: Int64[np.ndarray, "rows M"] = np.zeros((num_pred + 1, num_true), dtype=np.int64)
         """Pixels by predicted id and true label; the last row counts predictions of 255."""
-
-    @property
-    def confusion(self) -> Int64[np.ndarray, "rows M"]:
-        """Pixels by predicted id (the last row: 255) and true label; a copy."""
-        return self._confusion.copy()
 
     def add(self, pred_ids: UInt8[Tensor, "*pixels"], true_labels: UInt8[Tensor, "*pixels"]) -> None:
         """Count one view.
@@ -96,25 +89,24 @@ class SegmentationTally:
         Raises:
             SpectrumError: an id or label that is neither below the declared number nor 255.
         """
-        num_pred, num_true = self._confusion.shape[0] - 1, self._confusion.shape[1]
-        pred = pred_ids.detach().cpu().numpy().astype(np.int64).ravel()
-        true = true_labels.detach().cpu().numpy().astype(np.int64).ravel()
+        num_pred, num_true = self.confusion.shape[0] - 1, self.confusion.shape[1]
+        pred, true = (ids.detach().cpu().long().numpy().ravel() for ids in (pred_ids, true_labels))
         _require_known(pred, num_pred, "predicted ids")
         _require_known(true, num_true, "true labels")
         labelled = true != NOTHING_ID
         rows = np.where(pred == NOTHING_ID, num_pred, pred)[labelled]
-        cells = np.bincount(rows * num_true + true[labelled], minlength=self._confusion.size)
-        self._confusion += cells.reshape(self._confusion.shape)
+        cells = np.bincount(rows * num_true + true[labelled], minlength=self.confusion.size)
+        self.confusion += cells.reshape(self.confusion.shape)
 
     def scores(self) -> SegmentationScores:
         """Match once over everything counted so far, then score."""
         from scipy.optimize import linear_sum_assignment
 
-        present = np.flatnonzero(self._confusion.sum(axis=0))
+        present = np.flatnonzero(self.confusion.sum(axis=0))
         if len(present) == 0:
             return SegmentationScores(math.nan, math.nan, math.nan, {}, {})
-        hits = self._confusion[:-1, present].astype(np.float64)
-        num_true = self._confusion[:, present].sum(axis=0)
+        hits = self.confusion[:-1, present].astype(np.float64)
+        num_true = self.confusion[:, present].sum(axis=0)
         num_either = hits.sum(axis=1)[:, None] + num_true
         iou = hits / (num_either - hits)
         pred, column = linear_sum_assignment(iou, maximize=True)

@@ -28,9 +28,6 @@ _MOST_UNSEEN = 0.01
 _CENTER_DECIMALS = 3
 """Digits of a centre in nm: more would be noise of the integration, and the names of files' channels have to differ."""
 
-_SPAN = (0.005, 0.995)
-"""Parts of a response up to which the span of a channel reaches in messages."""
-
 
 @dataclass(frozen=True)
 class SensorBands:
@@ -97,8 +94,6 @@ class Sensor:
         count too; they get what the band has. A channel of which more than 1 % lies where there are no bands is left
         out.
 
-        Args:
-            bands: Of the spectra to be seen; their intervals say what is covered.
         Raises:
             SpectrumError: no channel is left.
         """
@@ -134,11 +129,11 @@ class Sensor:
         return integrals_up_to(wavelengths_nm.clip(table[0], table[-1]), self.responses.spectra, table)
 
     def _span(self, channel: int) -> str:
-        """From where to where a channel responds, for a message."""
+        """From where to where a channel responds, up to 0.5 % of it at both ends, for a message."""
         table = self.responses.bands.centers_nm
         wavelengths = np.linspace(table[0], table[-1], 2001)
         integral = self._responses_up_to(wavelengths)[channel]
-        low, high = np.interp(np.array(_SPAN) * integral[-1], integral, wavelengths)
+        low, high = np.interp(np.array([0.005, 0.995]) * integral[-1], integral, wavelengths)
         return f"{low:.0f}-{high:.0f} nm"
 
 

@@ -121,12 +121,7 @@ class Evaluation:
     def __init__(
         self, truth: SceneTruth, endmembers: Float[Tensor, "P B"], names: tuple[str, ...] | None = None
     ) -> None:
-        """
-        Args:
-            truth: Of the scene.
-            endmembers: Of the model.
-            names: Of the endmembers; None: `default_names`.
-        """
+        """Nothing counted yet; `endmembers` are the model's, their `names` None for `default_names`."""
         self.truth = truth
         self.names = default_names(len(endmembers)) if names is None else names
         self.endmembers = endmembers.detach().cpu().double()
@@ -142,11 +137,12 @@ class Evaluation:
         """Count one view; its figures."""
         valid = None if bool(view.valid.all()) else view.valid
         spectra = predicted.spectra
+        fits_window = min(spectra.shape[:2]) >= SSIM_WINDOW_PX
         figures = {
             "psnr": psnr(spectra, view.spectra, valid),
             "psnr_matter": psnr(spectra, view.spectra, view.shows_matter),
             "rmse": rmse(spectra, view.spectra, valid),
-            "ssim": ssim(spectra, view.spectra, valid) if _fits_window(spectra) else math.nan,
+            "ssim": ssim(spectra, view.spectra, valid) if fits_window else math.nan,
             "sam": sam(spectra, view.spectra, view.shows_matter),
             "rgb_psnr": psnr(self._srgb(spectra), self._srgb(view.spectra), valid),
             "abundance_rmse": self._abundance_rmse(view, predicted),
@@ -221,10 +217,9 @@ def finite_or_none(figures: dict[str, float]) -> dict[str, float | None]:
 
 def _num_materials(scene: Scene) -> int:
     """Materials that labels of evaluation views may name."""
-    if scene.material_names is not None:
-        return len(scene.material_names)
-    if scene.endmembers is not None:
-        return len(scene.endmembers)
+    for known in (scene.material_names, scene.endmembers):
+        if known is not None:
+            return len(known)
     greatest = -1
     for index in scene.eval_indices:
         labels = scene.labels(index)
@@ -236,10 +231,6 @@ def _num_materials(scene: Scene) -> int:
 def _tensor(array: np.ndarray | None) -> Tensor | None:
     """A copy: arrays of pictures may be read-only."""
     return None if array is None else torch.tensor(array)
-
-
-def _fits_window(image: Float[Tensor, "H W B"]) -> bool:
-    return min(image.shape[:2]) >= SSIM_WINDOW_PX
 
 
 def _mean(values: Iterable[float]) -> float:

@@ -34,8 +34,7 @@ def relit(
     """Radiance measured in one light as it is in another; 0 in bands that the first left dark.
 
     Args:
-        measured: Radiance.
-        recorded: Light that it was measured in, relative power; None for flat light.
+        measured, recorded: Radiance, and the light (relative power, None: flat) that it was measured in.
         light: The other one; None for the same.
     """
     if light is None:
@@ -83,10 +82,9 @@ def _as_seen(
     bands: Bands,
     light: Float64[np.ndarray, " B"] | None,
 ) -> Float64[np.ndarray, " B"]:
-    material = library.find(match.name)
-    known = np.interp(
-        bands.centers_nm, material.bands.centers_nm, material.reflectance, left=np.nan, right=np.nan
-    )
+    material, unknown = library.find(match.name), np.nan
+    centers = material.bands.centers_nm
+    known = np.interp(bands.centers_nm, centers, material.reflectance, left=unknown, right=unknown)
     lit = known if light is None else known * light
     shared = np.isfinite(lit)
     power = float(lit[shared] @ lit[shared])

@@ -5,6 +5,7 @@ Notation: `B` bands, `K` endmembers.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -60,10 +61,9 @@ def probe_point(scene: TrainedScene, point: tuple[float, float, float]) -> Probe
     place = scene.frame.to_model(world)
     inside = torch.from_numpy(place).float()[None].to(scene.device)
     if not bool(scene.scene_box.contains(inside).all()):
-        corners = scene.frame.to_world(
-            np.stack(np.meshgrid(*scene.scene_box.aabb.T.cpu().double().numpy()), -1)
-        )
-        least, greatest = corners.reshape(-1, 3).min(axis=0), corners.reshape(-1, 3).max(axis=0)
+        corners = np.stack(np.meshgrid(*scene.scene_box.aabb.T.cpu().double().numpy()), -1).reshape(-1, 3)
+        world_corners = scene.frame.to_world(corners)
+        least, greatest = world_corners.min(axis=0), world_corners.max(axis=0)
         raise ConfigError(
             f"the point {_text(world)} is outside the scene box, which lies between {_text(least)} and "
             f"{_text(greatest)} of the world"
@@ -96,9 +96,7 @@ def one_pixel(camera: Cameras, column: int, row: int) -> Cameras:
             f"columns are 0 to {camera.width - 1}, rows 0 to {camera.height - 1}"
         )
     corner = camera.center_px.new_tensor([float(column), float(row)])
-    return Cameras(
-        camera.camera_to_world, camera.focal_px, camera.center_px - corner, camera.distortion, 1, 1
-    )
+    return replace(camera, center_px=camera.center_px - corner, width=1, height=1)
 
 
 def _row(values: Tensor) -> Float64[np.ndarray, " n"]:

@@ -40,12 +40,8 @@ def recorded_views(record: SceneRecord) -> tuple[RunView, ...]:
 
 
 def find_view(numbered: Sequence[RunView], wanted: str, others: Sequence[RunView] = ()) -> RunView:
-    """A view by its name, or by its number from 0.
+    """A view by its name, or else by its number from 0 in `numbered`; `others` can be had by name only.
 
-    Args:
-        numbered: The views that numbers count.
-        wanted: Name or number; a name goes first.
-        others: Views that can be had by name only.
     Raises:
         ConfigError: there is none.
     """
@@ -69,14 +65,9 @@ def views_of(views: Sequence[RunView], choice: ViewChoice) -> list[RunView]:
 def cameras_of(views: Sequence[RunView], choice: ViewChoice) -> Cameras:
     """The cameras of the views chosen, as one; all views of a run have one size."""
     chosen = [view.camera for view in views_of(views, choice)]
-    return Cameras(
-        torch.cat([camera.camera_to_world for camera in chosen]),
-        torch.cat([camera.focal_px for camera in chosen]),
-        torch.cat([camera.center_px for camera in chosen]),
-        torch.cat([camera.distortion for camera in chosen]),
-        chosen[0].width,
-        chosen[0].height,
-    )
+    names = ("camera_to_world", "focal_px", "center_px", "distortion")
+    tensors = {name: torch.cat([getattr(camera, name) for camera in chosen]) for name in names}
+    return Cameras(**tensors, width=chosen[0].width, height=chosen[0].height)
 
 
 def _names(record: SceneRecord, split: str, count: int) -> list[str]:

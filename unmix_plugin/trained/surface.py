@@ -157,13 +157,7 @@ def _excess_px(
 def look_from_above(
     scene: TrainedScene, positions: Float[Tensor, "P 3"], normals: Float[Tensor, "P 3"]
 ) -> tuple[Float[Tensor, "P K"], Float[Tensor, "P B"]]:
-    """Abundances, summing to 1, and diffuse spectra of points as a camera straight above the surface sees them.
-
-    Args:
-        scene: What is looked at.
-        positions: On a surface.
-        normals: Unit vectors out of it.
-    """
+    """Abundances, summing to 1, and diffuse spectra of points of a surface with these unit normals, seen from above."""
     above = positions + scene.pixel_size * normals
     indices = torch.zeros(len(above), dtype=torch.int64)
     rays = RayBundle(above, -normals, indices).to(scene.device)

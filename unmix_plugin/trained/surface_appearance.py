@@ -63,11 +63,9 @@ class SurfaceLooks:
 
     def comments(self, what: str) -> list[str]:
         """What a file says of itself."""
-        lines = [
-            what,
-            f"coordinates: world of the scene's transforms.json; {describe_colour(self.materials.bands)}",
-        ]
-        return lines + [f"material {index}: {name}" for index, name in enumerate(self.materials.names)]
+        colours = describe_colour(self.materials.bands)
+        materials = [f"material {index}: {name}" for index, name in enumerate(self.materials.names)]
+        return [what, f"coordinates: world of the scene's transforms.json; {colours}", *materials]
 
 
 def property_names(names: tuple[str, ...]) -> list[str]:

@@ -55,13 +55,11 @@ def measured_reflectances() -> Iterator[Measured]:
     known = SDS_TCS.get("CIE 2024", SDS_TCS)  # colour-science below 0.4.7 has the fourteen of 1995 alone
     samples: dict[str, Any] = dict(zip(_CRI_NAMES, known.values(), strict=False))
     yield from _each("cri", samples, "test colour samples, CIE 13.3:1995 and CIE 2024")
-    extended = dict(SDS_VS["NIST CQS 9.0"].items())
-    for name, bands, values, source in _each("cqs", extended, "colour quality scale 9.0, NIST"):
+    for name, bands, values, source in _each("cqs", SDS_VS["NIST CQS 9.0"], "colour quality scale 9.0, NIST"):
         yield name, *_without_flat_ends(bands, values), source
     table = load_TCS_CIE2017(SpectralShape(380, 780, 5))
-    bands = Bands.of(np.asarray(table.wavelengths))
+    bands, source = Bands.of(np.asarray(table.wavelengths)), "test colour samples, CIE 224:2017"
     for index, values in enumerate(np.asarray(table.values, dtype=np.float64).T):
-        source = "test colour samples, CIE 224:2017"
         yield f"cie2017/{index + 1:02d}", *_without_flat_ends(bands, values), source
 
 

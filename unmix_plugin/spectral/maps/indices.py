@@ -119,10 +119,7 @@ class SpectralIndex:
     formula: Formula
 
     def __call__(self, reflectance: Float[Tensor, "*rays B"]) -> Float[Tensor, "*rays"]:
-        """The index of each spectrum, of the same type and on the same device; NaN where it is undefined.
-
-        Undefined is where any part of the formula is: 0/0 and other divisions by zero, the logarithm or root of a
-        negative number, overflow.
+        """The index of each spectrum; NaN where any part of the formula is undefined, as in 0/0, or overflows.
 
         Raises:
             SpectrumError: another number of bands than those the index was made for.

@@ -69,8 +69,7 @@ def seen_reflectance(
     """Reflectance of what is seen.
 
     Args:
-        spectra: Radiance on black.
-        opacity: By which it is multiplied, [0, 1].
+        spectra, opacity: Radiance on black, and the opacity in [0, 1] by which it is multiplied.
         light: Relative power of the scene's light; None: unknown, so that radiance is given back. NaN in bands that it
             leaves dark.
         smallest_opacity: NaN where there is less.

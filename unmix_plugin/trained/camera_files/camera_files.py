@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float64
 
 from unmix_plugin.errors import ConfigError, SceneError
@@ -35,11 +36,8 @@ from unmix_plugin.trained.run_views import RunView
 
 
 def read_camera_file(path: Path, frame: Normalisation) -> CameraFile:
-    """Read the cameras of a file.
+    """Read the cameras of a file; `frame` leads from world to model space.
 
-    Args:
-        path: The file.
-        frame: From world to model space.
     Raises:
         ConfigError: it is missing, empty, no camera file, from a newer version, or a camera in it is impossible.
     """
@@ -91,7 +89,8 @@ def _read_frames(path: Path, content: dict[str, Any], frame: Normalisation) -> C
     for index, (entry, name) in enumerate(zip(entries, names, strict=True)):
         pose = needed_pose(entry.get("transform_matrix"), f"frames[{index}]", path, "transform_matrix")
         if space == "world":
-            pose = _moved(pose, frame)
+            position = frame.to_model(pose[:, 3])
+            pose = np.concatenate([frame.rotation @ pose[:, :3], position[:, None]], axis=1)
         views.append(_frame_view(name, pose, {**content, **entry}, index, path))
     sizes = {(view.camera.width, view.camera.height) for view in views}
     if len(sizes) > 1:
@@ -114,10 +113,8 @@ def _frame_view(
             f"{path}: {where}: 'w' and 'h' are absent; expected the size of the picture in pixels"
         )
     width, height = check_size(lens.width, lens.height, f"{path}: {where}")
-    middle = (width / 2, height / 2)
-    centre = tuple(
-        half if value is None else value for value, half in zip(lens.center_px, middle, strict=True)
-    )
+    x, y = lens.center_px
+    centre = (width / 2 if x is None else x, height / 2 if y is None else y)
     return one_view(name, pose, lens.focal_at(width), centre, lens.distortion, (width, height))
 
 
@@ -137,25 +134,12 @@ def _names(entries: Sequence[dict[str, Any]], path: Path) -> list[str]:
     return numbers
 
 
-def _moved(pose: Float64[np.ndarray, "3 4"], frame: Normalisation) -> Float64[np.ndarray, "3 4"]:
-    """A pose of world space in model space."""
-    position = frame.to_model(pose[:, 3])
-    return np.concatenate([frame.rotation @ pose[:, :3], position[:, None]], axis=1)
-
-
 def _frame_entry(view: RunView, frame: Normalisation) -> dict[str, Any]:
     camera = view.camera
     pose = camera.camera_to_world[0].double().cpu().numpy()
     position = frame.to_world(pose[:, 3])
     pose = np.concatenate([frame.rotation.T @ pose[:, :3], position[:, None]], axis=1)
-    focal, center = camera.focal_px[0].tolist(), camera.center_px[0].tolist()
-    bending = dict(zip(("k1", "k2", "p1", "p2"), camera.distortion[0].tolist(), strict=True))
-    return {
-        "name": view.name,
-        "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]],
-        "fl_x": focal[0],
-        "fl_y": focal[1],
-        "cx": center[0],
-        "cy": center[1],
-        **bending,
-    }
+    lens = torch.cat([camera.focal_px, camera.center_px, camera.distortion], dim=1)[0].tolist()
+    keys = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
+    matrix = [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]]
+    return {"name": view.name, "transform_matrix": matrix, **dict(zip(keys, lens, strict=True))}

@@ -38,11 +38,7 @@ class CameraFile:
 
 
 def check_size(width: float | int, height: float | int, where: str) -> tuple[int, int]:
-    """Width and height of a picture in pixels.
-
-    Raises:
-        ConfigError: not whole, below 1, or above `GREATEST_SIDE_PX`.
-    """
+    """Width and height of a picture in pixels: whole numbers from 1 to `GREATEST_SIDE_PX`, or a ConfigError."""
     if not all(side == int(side) and 1 <= side <= GREATEST_SIDE_PX for side in (width, height)):
         raise ConfigError(
             f"{where}: {width:g} x {height:g} pixels; expected whole numbers from 1 to {GREATEST_SIDE_PX}"
@@ -51,11 +47,7 @@ def check_size(width: float | int, height: float | int, where: str) -> tuple[int
 
 
 def check_frames_per_second(value: float | int | None, where: str) -> float:
-    """Frames a second of a video.
-
-    Raises:
-        ConfigError: not above 0, or absurdly many.
-    """
+    """Frames a second of a video: above 0 and at most 1000, or a ConfigError."""
     if value is None or not 0 < value <= _GREATEST_FPS:
         raise ConfigError(
             f"{where}: {value} frames a second; expected a number above 0, at most {_GREATEST_FPS}"
@@ -104,11 +96,7 @@ def one_view(
 
 
 def camera_entries(content: dict[str, Any], key: str, path: Path) -> list[dict[str, Any]]:
-    """The objects in a list, one a camera.
-
-    Raises:
-        ConfigError: no list, an empty one, or one with something else in it.
-    """
+    """The objects in a list, one a camera; a ConfigError for anything else, and for an empty list."""
     entries = content[key]
     if not isinstance(entries, list):
         raise ConfigError(f"{path}: '{key}' is {describe(entries)}; expected a list with one object a camera")
@@ -121,11 +109,7 @@ def camera_entries(content: dict[str, Any], key: str, path: Path) -> list[dict[s
 
 
 def needed_number(values: dict[str, Any], key: str, where: Path | str) -> float:
-    """A finite number.
-
-    Raises:
-        ConfigError: it is absent or no number.
-    """
+    """A finite number; a ConfigError where it is absent or no number."""
     number = read_number(values.get(key))
     if number is None:
         found = describe(values[key]) if key in values else "absent"
@@ -138,9 +122,7 @@ def needed_pose(matrix: Any, where: str, path: Path, key: str) -> Float64[np.nda
 
     Args:
         matrix: 4 (or 3) rows of 4 numbers.
-        where: The camera, for messages.
-        path: The file, for messages.
-        key: Under which the matrix stands.
+        where, path, key: Camera, file and key of the matrix, for messages.
     Raises:
         ConfigError: no matrix, or not rigid.
     """
