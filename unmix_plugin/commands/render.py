@@ -36,8 +36,8 @@ class RenderOptions:
     view: tuple[str, ...] = ()
     """Only these of the cameras, by name or by number from 0."""
     outputs: tuple[str, ...] = ()
-    """spectral, rgb, linear_rgb, diffuse, specular, abundances, material_scores, segmentation, confidence, depth,
-    ray_distance, normals, accumulation, pca, band:650nm, false-colour:860,650,550; index:ndvi or
+    """spectral, rgb, linear_rgb, diffuse, specular, abundances, material_scores, probe_probabilities, segmentation,
+    confidence, depth, ray_distance, normals, accumulation, pca, band:650nm, false-colour:860,650,550; index:ndvi or
     index:(r800-r670)/(r800+r670), target:paint.csv or target:ace:paint.csv>0.5; or all (but those with a colon). None
     given: spectral rgb abundances segmentation depth for single views, rgb for a path."""
     formats: tuple[str, ...] = ()
