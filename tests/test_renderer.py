@@ -120,7 +120,7 @@ def test_points_are_asked_cell_by_cell_and_outside_the_box_is_nothing():
     ("settings", "message"),
     [
         ({"samples_per_pixel": 0.0}, "samples-per-pixel of 0.01 to 100"),
-        ({"grid_update_interval": 0}, "grid-update-interval of at least 1"),
+        ({"smallest_weight": 1.0}, r"smallest-weight in \[0, 1\) or auto"),
         ({"visible_weight": 0.0}, r"visible-weight in \(0, 1\] or auto"),
     ],
 )

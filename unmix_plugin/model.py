@@ -49,6 +49,14 @@ from unmix_plugin.training_losses import LossConfig, compare_pixels, pixel_mean,
 
 _FEWEST_RAYS, _MOST_RAYS = 64, 8192
 _PIXELS_TO_COUNT_BY = 20_000
+_GRID_INTERVAL = 16
+"""Steps between updates of the occupancy grid."""
+_PROBED_CELLS = 32_768
+"""Cells of the grid that an update probes."""
+_GRID_DECAY = 0.5
+"""Factor on the remembered density of a probed cell: lower forgets emptied space sooner."""
+_OCCUPIED_OPACITY = 0.03
+"""Opacity of one sample's interval from which a cell counts as occupied."""
 
 
 @dataclass(frozen=True)
@@ -323,16 +331,15 @@ class UnmixModel(Model):
 
     def _begin_step(self, step: int, progress: float) -> None:
         self._progress = progress
-        config = self.config.renderer
-        if step % config.grid_update_interval:
+        if step % _GRID_INTERVAL:
             return
         box = self.renderer.box
         seed = int(torch.randint(2**62, (1,), generator=self.generator, device=self._generator_device))
         self.grid.update(
             lambda points: self.field.get_density(points * box.size + box.aabb[0])[0],
-            threshold=-math.log1p(-config.grid_smallest_opacity) / self.step,
-            decay=config.grid_decay,
-            num_cells=config.grid_probed_cells,
+            threshold=-math.log1p(-_OCCUPIED_OPACITY) / self.step,
+            decay=_GRID_DECAY,
+            num_cells=_PROBED_CELLS,
             generator=torch.Generator().manual_seed(seed),
         )
 

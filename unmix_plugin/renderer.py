@@ -40,14 +40,6 @@ class RendererConfig:
     visible_weight: float | Auto = "auto"
     """Share of its ray's light from which a sample counts as seen. Cells that no two training views have lately seen
     are left out; 1 leaves none out. Auto is 0.05 where alpha is known, else 1."""
-    grid_update_interval: int = 16
-    """Steps between updates of the occupancy grid."""
-    grid_probed_cells: int = 32_768
-    """Cells of the grid that an update probes."""
-    grid_decay: float = 0.5
-    """Factor on the remembered density of a probed cell: lower forgets emptied space sooner."""
-    grid_smallest_opacity: float = 0.03
-    """Opacity of one sample's interval from which a cell counts as occupied."""
 
     def __post_init__(self) -> None:
         """Refuse impossible settings.
@@ -60,10 +52,6 @@ class RendererConfig:
             "smallest-weight in [0, 1) or auto": self.smallest_weight == "auto"
             or 0 <= self.smallest_weight < 1,
             "visible-weight in (0, 1] or auto": self.visible_weight == "auto" or 0 < self.visible_weight <= 1,
-            "grid-update-interval of at least 1": self.grid_update_interval >= 1,
-            "grid-probed-cells of at least 2": self.grid_probed_cells >= 2,
-            "grid-decay in [0, 1]": 0 <= self.grid_decay <= 1,
-            "grid-smallest-opacity in (0, 1)": 0 < self.grid_smallest_opacity < 1,
         }
         require("the renderer", rules)
 
