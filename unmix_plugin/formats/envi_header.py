@@ -1,7 +1,6 @@
 """The text beside an ENVI file: `key = value` lines after the word ENVI.
 
-Lists stand in braces and are parted by commas, for which there is no escape; so what would end a list or an element is
-replaced in names.
+Lists are in braces, separated by commas, and neither can be escaped: names have them replaced.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from unmix_plugin.formats.raw_rows import RowSink, raw_rows
 
 @contextmanager
 def npy_rows(path: Path, shape: tuple[int, ...], dtype: type[np.generic]) -> Iterator[RowSink]:
-    """Context that gives a sink for the rows of an array of this shape; at its end the file is there.
+    """Context that gives a sink for the rows of an array of this shape; the file appears at its end.
 
     Raises:
         ValueError: the rows given don't add up to `shape`.

@@ -1,4 +1,4 @@
-"""Wavefront OBJ with a material library beside it; colours of vertices stand after their positions.
+"""Wavefront OBJ with a material library beside it; colours of vertices follow their positions.
 
 Notation: `P` vertices, `F` faces, `M` materials.
 """

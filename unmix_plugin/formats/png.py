@@ -31,7 +31,7 @@ def indexed_png_bytes(
     transparent: int | None = None,
     description: str = "",
 ) -> bytes:
-    """Ids whose colours stand in the palette: readers get the ids or the colours, as they ask.
+    """Ids whose colours are in the palette: readers get either, as they ask.
 
     Args:
         ids: Indices.

@@ -53,7 +53,7 @@ def write_spectral_exr(
         channels.update({name: rgb[..., i] for i, name in enumerate("RGB")})
     if alpha is not None:
         channels["A"] = alpha
-    # The unit is the layout's for emissive images; what 1 stands for depends on the sensor.
+    # The unit is the layout's for emissive images; what 1 means depends on the sensor.
     attributes = {"spectralLayoutVersion": "1.0", "emissiveUnits": "W.m^-2.sr^-1"}
     if comments:
         attributes["comments"] = comments

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from unmix_plugin.scenes.scene import Normalisation
     from unmix_plugin.trained.density_grid import GridPoints
     from unmix_plugin.trained.surface import SeenSurface
-    from unmix_plugin.trained.surface_appearance import SurfaceLooks
+    from unmix_plugin.trained.surface_appearance import SurfaceAppearance
     from unmix_plugin.trained.trained_scene import TrainedScene
 
 MeshFormat = Literal["ply", "glb", "obj"]
@@ -146,7 +146,7 @@ def write_mesh(
     """
     from unmix_plugin.products.mesh_extraction import TriangleMesh
     from unmix_plugin.trained.surface import look_from_above
-    from unmix_plugin.trained.surface_appearance import SurfaceLooks
+    from unmix_plugin.trained.surface_appearance import SurfaceAppearance
     from unmix_plugin.trained.world_frame import directions_to_world
 
     if len(mesh.faces) == 0:
@@ -156,7 +156,7 @@ def write_mesh(
     normals = mesh.normals
     positions = torch.from_numpy(mesh.vertices).float()
     seen = look_from_above(scene, positions, torch.from_numpy(normals).float())
-    looks = SurfaceLooks(scene.materials, *seen)
+    looks = SurfaceAppearance(scene.materials, *seen)
     world = TriangleMesh(frame.to_world(mesh.vertices).astype(np.float32), mesh.faces)
     turned = directions_to_world(frame, normals).astype(np.float32)
     writers = {"ply": _write_ply, "obj": _write_obj, "glb": _write_glb}
@@ -167,7 +167,7 @@ _WHAT = "surface of an unmix-nerf run"
 
 
 def _write_ply(
-    path: Path, mesh: TriangleMesh, normals: Float32[np.ndarray, "V 3"], looks: SurfaceLooks
+    path: Path, mesh: TriangleMesh, normals: Float32[np.ndarray, "V 3"], looks: SurfaceAppearance
 ) -> list[Path]:
     vertices = {
         **{name: mesh.vertices[:, axis] for axis, name in enumerate("xyz")},
@@ -178,7 +178,7 @@ def _write_ply(
 
 
 def _write_obj(
-    path: Path, mesh: TriangleMesh, normals: Float32[np.ndarray, "V 3"], looks: SurfaceLooks
+    path: Path, mesh: TriangleMesh, normals: Float32[np.ndarray, "V 3"], looks: SurfaceAppearance
 ) -> list[Path]:
     materials = _majority(looks.material_ids.astype(np.int64)[mesh.faces])
     return write_obj(
@@ -195,7 +195,7 @@ def _write_obj(
 
 
 def _write_glb(
-    path: Path, mesh: TriangleMesh, normals: Float32[np.ndarray, "V 3"], looks: SurfaceLooks
+    path: Path, mesh: TriangleMesh, normals: Float32[np.ndarray, "V 3"], looks: SurfaceAppearance
 ) -> list[Path]:
     numbers = {"_MATERIAL": looks.material_ids.astype(np.float32)}
     for name, values in looks.properties().items():

@@ -102,7 +102,7 @@ def write_point_cloud(
         RunError: there is no point, or the disk is full or refuses.
         SpectrumError: too few points to judge a target against, or all are alike.
     """
-    from unmix_plugin.trained.surface_appearance import SurfaceLooks
+    from unmix_plugin.trained.surface_appearance import SurfaceAppearance
     from unmix_plugin.trained.world_frame import directions_to_world
 
     points = points.select(torch.from_numpy(~is_outlier(points.positions.numpy())))
@@ -115,7 +115,7 @@ def write_point_cloud(
     normals = plane_normals(positions, -points.directions.double().numpy(), chosen)
     kept = points.select(torch.from_numpy(chosen))
     diffuse = kept.diffuse(materials)
-    looks = SurfaceLooks(materials, kept.abundances, diffuse)
+    looks = SurfaceAppearance(materials, kept.abundances, diffuse)
     world = frame.to_world(positions[chosen]).astype(np.float32)
     turned = directions_to_world(frame, normals).astype(np.float32)
     vertices = {

@@ -1,4 +1,4 @@
-"""Samples along rays, only where an occupancy grid says that matter may be.
+"""Samples along rays, only in the occupied cells of an occupancy grid.
 
 Notation: `R` rays, `S` samples in all, stored packed: the samples of a ray are consecutive and `packed_info` holds
 (first sample, count) a ray. Points are in the unit cube that the grid fills, `t` in the unit of the ray parameter.
@@ -58,7 +58,7 @@ def march(
         origins, directions: Rays in unit-cube coordinates; directions need not have unit length.
         t_near, t_far: Where each ray enters and leaves the unit cube; t_far <= t_near marks a miss.
         jitter: Offset of each ray's lattice in steps, [0, 1).
-        occupied: Non-zero where matter may be; cell (x, y, z) is [x/X, (x+1)/X] and so on.
+        occupied: Non-zero in occupied cells; cell (x, y, z) is [x/X, (x+1)/X] and so on.
         step: Distance of neighbouring samples in the ray parameter, > 0.
     Raises:
         ValueError: step isn't positive.

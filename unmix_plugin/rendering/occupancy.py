@@ -1,4 +1,4 @@
-"""A grid over the scene box that remembers where matter may be, so that rays skip what is empty.
+"""A grid over the scene box that remembers which cells may be occupied, so that rays skip empty space.
 
 Each cell keeps an exponential moving maximum of the densities probed in it. The grid only says what is empty; what is
 visible is decided from the field's own densities, since a cell's maximum would hide what lies behind its empty part.
@@ -28,7 +28,7 @@ class OccupancyGrid(nn.Module):
     reachable_cells: Tensor
 
     def __init__(self, reachable: Bool[Tensor, "X Y Z"]) -> None:
-        """Start with every cell occupied that `reachable` allows; the others stay empty for ever."""
+        """Start with every cell occupied that `reachable` allows; the others always stay empty."""
         super().__init__()
         self.visibility = VisibleCells(reachable.shape)
         self.register_buffer("reachable", reachable.clone())

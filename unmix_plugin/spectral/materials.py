@@ -22,7 +22,7 @@ SegmentationMethod = Literal["abundances", "probe"]
 
 
 def default_names(count: int) -> tuple[str, ...]:
-    """Names of endmembers that nobody has named.
+    """Names of endmembers without names of their own.
 
     >>> default_names(2)
     ('endmember_0', 'endmember_1')
@@ -105,7 +105,7 @@ class Materials:
     def reflectance_of(
         self, spectra: Float[Tensor, "*rays B"], opacity: Float[Tensor, "*rays"]
     ) -> Float[Tensor, "*rays B"]:
-        """The same of spectra on black that are at hand already, on any device."""
+        """The same of spectra on black that were computed before, on any device."""
         return seen_reflectance(spectra, opacity, self.light, OCCUPIED_ACCUMULATION)
 
     def scores(self, coefficients: Coefficients) -> Float[Tensor, "*rays K"]:

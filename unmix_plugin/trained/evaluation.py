@@ -87,8 +87,8 @@ class ViewTruth:
     @property
     def shows_matter(self) -> Bool[Tensor, "H W"]:
         """Valid pixels that are labelled or opaque."""
-        matter = self.opacity > OPAQUE_ALPHA
-        return self.valid & (matter if self.labels is None else matter | (self.labels != NOTHING_ID))
+        opaque = self.opacity > OPAQUE_ALPHA
+        return self.valid & (opaque if self.labels is None else opaque | (self.labels != NOTHING_ID))
 
     def in_light(self, factors: Float[np.ndarray, " B"] | None) -> ViewTruth:
         """The view as the same sensor would have measured it in another light; itself where `factors` are None."""
@@ -175,8 +175,8 @@ class Evaluation:
         if self.matching is None or view.abundances is None:
             return math.nan
         counts = view.valid & (view.opacity >= HALF_COVERED) & (view.abundances.sum(dim=-1) > 0)
-        # Dividing by what is there, or by what should be there if less is seen, neither blames a partly covered pixel
-        # for its background nor forgives matter that is missing.
+        # Divided by the larger opacity, a partly covered pixel is not blamed for its background, nor is a surface that
+        # is missing forgiven.
         opacity = torch.maximum(predicted.accumulation, view.opacity).clamp(min=1e-6)
         return abundance_rmse(
             predicted.abundances / opacity[..., None], view.abundances, self.matching, counts

@@ -39,9 +39,8 @@ class Probe:
     @property
     def spectra(self) -> dict[str, Float64[np.ndarray, " B"]]:
         """`predicted` radiance on black, and its parts."""
-        return {
-            name: self.values[name] for name in ("predicted", "diffuse", "specular") if name in self.values
-        }
+        names = ("predicted", "diffuse", "specular")
+        return {name: self.values[name] for name in names if name in self.values}
 
     @property
     def abundances(self) -> Float64[np.ndarray, " K"]:

@@ -31,18 +31,10 @@ def unmix_scene(
         RunError: the record is damaged.
     """
     frozen = frozen_parameters(model, averages)
-    materials = model.materials
-    is_dictionary = materials.specular_spectra is model.specular_spectra
-    materials = replace(
-        materials,
-        endmembers=frozen[id(model.endmembers)],
-        specular_spectra=frozen[id(model.specular_spectra)] if is_dictionary else materials.specular_spectra,
-    )
-    renderer = replace(
-        model.renderer,
-        occupied=model.renderer.occupied.clone(),
-        reachable=model.renderer.reachable.clone(),
-    )
+    materials, renderer = model.materials, model.renderer
+    specular = frozen.get(id(materials.specular_spectra), materials.specular_spectra)
+    materials = replace(materials, endmembers=frozen[id(model.endmembers)], specular_spectra=specular)
+    renderer = replace(renderer, occupied=renderer.occupied.clone(), reachable=renderer.reachable.clone())
     return TrainedScene(
         copy.deepcopy(model.field, frozen).eval(),  # type: ignore[arg-type]
         renderer,

@@ -20,7 +20,7 @@ from unmix_plugin.trained.run_materials import endmember_colours
 
 
 @dataclass(frozen=True)
-class SurfaceLooks:
+class SurfaceAppearance:
     """Colour, material and abundances of points."""
 
     materials: Materials

@@ -1,7 +1,7 @@
 """Reflectances of real surfaces that colour-science carries, each over the range in which it was measured.
 
 The tables of `cqs` and `cie2017` go on beyond what was measured by repeating the outermost value; these flat ends are
-cut off here, so that nobody takes them for data.
+cut off here, so that they are not taken for data.
 """
 
 from __future__ import annotations

@@ -17,8 +17,8 @@ from unmix_plugin.errors import SpectrumError
 LOADING = 1e-3
 """Added to the covariance's diagonal, in mean variances of a band: a target may differ from how it is rendered by about
 3% of the background's standard deviation in each band. Rendered spectra are mixtures of a few and vary in no other
-direction, so that with much less the least difference makes the target unlike all that is there; with much more, alike
-materials are no longer told apart. Chosen on rendered views against the true reflectances of seven materials."""
+direction, so that with much less, the smallest difference makes the target unlike everything in view; with much more,
+similar materials can no longer be told apart. Chosen on rendered views against true reflectances of seven materials."""
 
 
 @dataclass(frozen=True)

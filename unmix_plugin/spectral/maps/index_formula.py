@@ -54,7 +54,7 @@ class Wavelength:
 class Operation:
     """A step that replaces the last `count` values on the stack by one."""
 
-    word: str
+    name: str
     count: int
 
 
@@ -65,7 +65,7 @@ class Formula:
     text: str
     """As it was written, without blanks around it."""
     steps: tuple[float | Wavelength | Operation, ...]
-    """Postfix program; a number stands for itself."""
+    """Postfix program; a number is pushed as it is."""
 
     @property
     def wavelengths_nm(self) -> tuple[float, ...]:
@@ -86,7 +86,7 @@ class Formula:
             if isinstance(step, Operation):
                 operands = stack[-step.count :]
                 del stack[-step.count :]
-                value = _OPERATIONS[step.word](*operands)
+                value = _OPERATIONS[step.name](*operands)
             elif isinstance(step, Wavelength):
                 value = at(step.nm)
             else:  # a number too large for the type is refused by PyTorch
@@ -213,7 +213,7 @@ class _Reader:
     def fail(self, problem: str, place: int | None = None) -> NoReturn:
         column = self.start if place is None else place
         found = "" if place is not None else f", found {self.token!r}" if self.token else ", found the end"
-        shown = " ".join(self.text.splitlines())  # one line, so that the caret stands below its column
+        shown = " ".join(self.text.splitlines())  # one line, so that the caret is below its column
         raise ConfigError(
             f"index formula, column {column + 1}: {problem}{found}\n  {shown}\n  {' ' * column}^\n"
             f"allowed are {ALLOWED}"

@@ -102,7 +102,7 @@ NAMED_INDICES: dict[str, NamedIndex] = {
     ),
     "iron-oxide": NamedIndex("iron oxide ratio, red over blue", "r660/r485", "Segal 1982", (0.0, 5.0)),
 }
-"""By the name that stands after `index:`, in the order in which they are listed."""
+"""By the name after `index:`, in the order in which they are listed."""
 
 
 @dataclass(frozen=True)

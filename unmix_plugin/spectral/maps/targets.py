@@ -126,7 +126,7 @@ class TargetScore:
 
 
 def parse_target(text: str, bands: Bands) -> Target:
-    """What stands after `target:` in the name of an output, `[METHOD:]FILE.csv[#NAME][<VALUE | >VALUE]`.
+    """The text after `target:` in the name of an output, `[METHOD:]FILE.csv[#NAME][<VALUE | >VALUE]`.
 
     Raises:
         ConfigError: text of another form, no such file, no or several spectra that could be meant, a threshold on the

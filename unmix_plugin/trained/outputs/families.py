@@ -94,4 +94,4 @@ FAMILIES: dict[str, OutputFamily] = {
         "map", "likeness to a target", "to know which", "target:paint.csv", _reflectance_map
     ),
 }
-"""By what stands before the colon."""
+"""By the part of the name before the colon."""
