@@ -18,7 +18,6 @@ from unmix_plugin.viewer.view_cameras import (
     pixel_rays,
     pose_of,
     quaternion,
-    resized,
     rotation_matrix,
     up_direction,
 )
@@ -112,15 +111,6 @@ def test_depth_along_the_axis_is_the_depth_of_a_projection():
     _, expected = camera.project(bundle.origins + distance[:, None] * bundle.directions, 0)
     depth = depth_along_axis(camera, distance.view(camera.height, camera.width))
     assert_close(depth.flatten(), expected, atol=1e-5, rtol=1e-5)
-
-
-def test_a_resized_camera_sees_the_same_corners():
-    camera = ring()[0]
-    larger = resized(camera, 64)
-    corners = [camera.generate_rays(torch.tensor([0]), torch.tensor([[0.0, 0.0]])).directions]
-    corners.append(larger.generate_rays(torch.tensor([0]), torch.tensor([[0.0, 0.0]])).directions)
-    assert_close(*corners)
-    assert (larger.width, larger.height) == (96, 64)
 
 
 def test_up_is_the_axis_of_the_world_that_the_cameras_hold_upright():

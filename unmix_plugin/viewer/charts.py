@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from unmix_plugin.figures.plotting import css_colour
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.viewer.html import css_colour
 
 if TYPE_CHECKING:
     import viser

@@ -7,6 +7,7 @@ from html import escape
 
 import numpy as np
 
+from unmix_plugin.figures.plotting import css_colour
 from unmix_plugin.viewer.layers.painting import ColourMapLegend, Legend, SwatchLegend, colour_table
 
 _NUM_STOPS = 17
@@ -50,16 +51,6 @@ def table(rows: Sequence[tuple[str, str]]) -> str:
         for name, value in rows
     )
     return f'<div style="{_BLOCK}"><table>{cells}</table></div>'
-
-
-def css_colour(srgb: Sequence[float]) -> str:
-    """An sRGB colour in [0, 1] as CSS writes it.
-
-    >>> css_colour((1.0, 0.5, 0.0))
-    '#ff8000'
-    """
-    red, green, blue = (int(np.clip(value, 0, 1) * 255 + 0.5) for value in srgb)
-    return f"#{red:02x}{green:02x}{blue:02x}"
 
 
 def _colour_bar(shown: ColourMapLegend) -> str:

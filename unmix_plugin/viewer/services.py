@@ -21,7 +21,7 @@ from unmix_plugin.spectral.colour.illuminants import illuminant_names
 from unmix_plugin.trained.run_views import RunView, recorded_views
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.failures import failures_said
-from unmix_plugin.viewer.layers.output_layers import layers_of
+from unmix_plugin.viewer.layers.layers import layers_of
 from unmix_plugin.viewer.recipe_editor import numbered
 from unmix_plugin.viewer.rendering.edits import Edit
 from unmix_plugin.viewer.rendering.frames import num_channels

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -97,18 +97,6 @@ def pose_of(camera: Cameras) -> ViewPose:
     fov = 2 * math.atan(camera.height / 2 / float(camera.focal_px[0, 1]))
     return checked_pose(
         quaternion(pose[:, :3] @ _OPENCV_TO_OPENGL), pose[:, 3], fov, camera.width / camera.height
-    )
-
-
-def resized(camera: Cameras, height: int) -> Cameras:
-    """The same view with `height` rows."""
-    factor = height / camera.height
-    return replace(
-        camera,
-        focal_px=camera.focal_px * factor,
-        center_px=camera.center_px * factor,
-        width=max(1, round(camera.width * factor)),
-        height=height,
     )
 
 

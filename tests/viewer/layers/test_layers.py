@@ -14,7 +14,7 @@ from unmix_plugin.spectral.coefficients import Coefficients
 from unmix_plugin.spectral.colour.conversion import band_composite_matrix, linear_to_srgb
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings
-from unmix_plugin.viewer.layers.layers import LAYERS, layer_named, paint_layer
+from unmix_plugin.viewer.layers.layers import LAYERS, paint_layer
 from unmix_plugin.viewer.layers.painting import (
     BACKGROUNDS,
     ColourMapLegend,
@@ -208,9 +208,9 @@ def test_an_error_is_painted_where_it_is_known(frame, aids):
     assert "train_007" in legend.label
 
 
-def test_an_unknown_layer_is_named_with_the_known_ones():
+def test_an_unknown_layer_is_named_with_the_known_ones(frame, aids):
     with pytest.raises(ConfigError, match="there is no layer named 'x-ray'; known: rgb, false-colour"):
-        layer_named("x-ray")
+        painted(frame, aids, "x-ray")
 
 
 def test_a_single_material_has_every_layer(tmp_path):

@@ -1,16 +1,12 @@
 """What can be shown: pure functions from a rendered view to a picture and its legend.
 
-A layer is one entry of `LAYERS`: its name, what users read, which controls it has, and the function that paints it.
+Titles, kinds and ranges are those of the registry of outputs; here is how materials are painted.
 
 Notation: pictures are (H, W, 3) sRGB in [0, 1]; what is transparent shows the background. `light` is linear RGB seen on
 black.
 """
 
 from __future__ import annotations
-
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -21,9 +17,15 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import band_composite_matrix, describe_colour, rgb_matrix
 from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.trained.material_view import MaterialView
+from unmix_plugin.trained.outputs.families import FAMILIES
+from unmix_plugin.trained.outputs.registry import OUTPUTS
+from unmix_plugin.trained.protocol import RenderableScene
+from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.layers.index_layer import paint_index
+from unmix_plugin.viewer.layers.layer import Layer, Painter, layer_named
 from unmix_plugin.viewer.layers.layer_aids import LayerAids
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings
+from unmix_plugin.viewer.layers.output_layers import PAINTED_KINDS, layer_of
 from unmix_plugin.viewer.layers.painting import (
     ColourMapLegend,
     Legend,
@@ -35,24 +37,6 @@ from unmix_plugin.viewer.layers.painting import (
     tone_mapped,
 )
 
-Painter = Callable[[Any, LayerSettings, Any], tuple[Picture, Legend]]
-"""From a rendered view, of the kind of scene that has the layer, and what layers need of the run."""
-
-
-@dataclass(frozen=True)
-class Layer:
-    """One thing that can be shown."""
-
-    name: str
-    """As in outputs of renders, where there is such an output."""
-    title: str
-    """What users read."""
-    paint: Painter
-    controls: frozenset[str]
-    """Which of `wavelength`, `false-colour`, `endmember`, `index`, `tone`, `scale` apply."""
-    is_labels: bool = False
-    """Whether each colour stands for something of its own, so that pictures must not be compressed with loss."""
-
 
 def paint_layer(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
     """The picture of the layer that `settings` name, and what its colours mean.
@@ -61,19 +45,7 @@ def paint_layer(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -
         ConfigError: there is no such layer, or it can't be shown here; the message says why.
     """
     with torch.no_grad():
-        return layer_named(settings.layer).paint(frame, settings, aids)
-
-
-def layer_named(name: str, layers: Mapping[str, Layer] | None = None) -> Layer:
-    """A layer by its name, of those given or of all of mixed materials.
-
-    Raises:
-        ConfigError: there is none.
-    """
-    known = LAYERS if layers is None else layers
-    if name not in known:
-        raise ConfigError(f"there is no layer named {name[:40]!r}; known: {', '.join(known)}")
-    return known[name]
+        return layer_named(settings.layer, LAYERS).paint(frame, settings, aids)
 
 
 def _paint_colour(diffuse: bool, specular: bool) -> Painter:
@@ -122,11 +94,6 @@ def _paint_abundance(frame: MaterialView, settings: LayerSettings, _: LayerAids)
     return _paint_seen(values, frame, settings, (0.0, 1.0), label)
 
 
-def _paint_confidence(frame: MaterialView, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
-    values = frame["confidence"]
-    return _paint_seen(values, frame, settings, (0.0, 1.0), "estimated probability of the material")
-
-
 def _paint_abundances(
     frame: MaterialView, settings: LayerSettings, aids: LayerAids
 ) -> tuple[Picture, Legend]:
@@ -161,12 +128,6 @@ def _paint_depth(frame: MaterialView, settings: LayerSettings, aids: LayerAids) 
     picture = paint_values(frame.depth, scale, settings.colour_map)
     legend = ColourMapLegend(settings.colour_map, *scale, "distance along the viewing axis, world units")
     return over_background(picture, frame.coefficients.accumulation, settings), legend
-
-
-def _paint_accumulation(frame: MaterialView, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
-    scale = settings.value_range or (0.0, 1.0)
-    picture = paint_values(frame.coefficients.accumulation, scale, settings.colour_map)
-    return picture, ColourMapLegend(settings.colour_map, *scale, "opacity")
 
 
 def _paint_error(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
@@ -210,25 +171,37 @@ def covered(bands: Bands, wavelength_nm: float) -> float:
     return min(max(low, wavelength_nm), high)
 
 
-_SCALE, _TONE = "scale", "tone"
+def _own(name: str, paint: Painter, *controls: str) -> Layer:
+    """A layer with a painter of its own; the rest is that of the output, or the family of outputs, of its name."""
+    output = OUTPUTS[name] if name in OUTPUTS else FAMILIES[name]
+    return Layer(name, output.title, paint, frozenset(controls), output.kind == "labels")
+
 
 LAYERS: dict[str, Layer] = {
     layer.name: layer
     for layer in (
-        Layer("rgb", "colour", _paint_colour(True, True), frozenset({_TONE})),
-        Layer("false-colour", "false colour", _paint_false_colour, frozenset({_TONE, "false-colour"})),
-        Layer("band", "one band", _paint_band, frozenset({_SCALE, "wavelength"})),
-        Layer("index", "spectral index", paint_index, frozenset({_SCALE, "index"})),
-        Layer("abundance", "abundance of one endmember", _paint_abundance, frozenset({_SCALE, "endmember"})),
-        Layer("abundances", "all abundances", _paint_abundances, frozenset()),
-        Layer("segmentation", "segmentation", _paint_segmentation, frozenset(), is_labels=True),
-        Layer("confidence", "segmentation confidence", _paint_confidence, frozenset({_SCALE})),
-        Layer("diffuse", "diffuse part", _paint_colour(True, False), frozenset({_TONE})),
-        Layer("specular", "specular part", _paint_colour(False, True), frozenset({_TONE})),
-        Layer("pca", "principal components", _paint_pca, frozenset()),
-        Layer("depth", "depth", _paint_depth, frozenset({_SCALE})),
-        Layer("accumulation", "opacity", _paint_accumulation, frozenset({_SCALE})),
-        Layer("error", "error against a training view", _paint_error, frozenset({_SCALE})),
+        _own("rgb", _paint_colour(True, True), "tone"),
+        _own("false-colour", _paint_false_colour, "tone", "false-colour"),
+        _own("band", _paint_band, "scale", "wavelength"),
+        _own("index", paint_index, "scale", "index"),
+        Layer("abundance", "abundance of one endmember", _paint_abundance, frozenset({"scale", "endmember"})),
+        _own("abundances", _paint_abundances),
+        _own("segmentation", _paint_segmentation),
+        layer_of(OUTPUTS["confidence"]),
+        _own("diffuse", _paint_colour(True, False), "tone"),
+        _own("specular", _paint_colour(False, True), "tone"),
+        _own("pca", _paint_pca),
+        _own("depth", _paint_depth, "scale"),
+        layer_of(OUTPUTS["accumulation"]),
+        Layer("error", "error against a training view", _paint_error, frozenset({"scale"})),
     )
 }
-"""All that can be shown, in the order in which it is offered."""
+"""All that can be shown of mixed materials, in the order in which it is offered."""
+
+
+def layers_of(scene: RenderableScene) -> dict[str, Layer]:
+    """All that can be shown of a scene, by name: what its materials allow, and its outputs that can be painted."""
+    if not isinstance(scene, TrainedScene):
+        return {output.name: layer_of(output) for output in scene.outputs if output.kind in PAINTED_KINDS}
+    others = (output for output in scene.outputs if output.kind in ("map", "vectors"))
+    return {**LAYERS, **{output.name: layer_of(output) for output in others if output.name not in LAYERS}}

@@ -14,11 +14,10 @@ from unmix_plugin.engine.outputs import Output, OutputKind
 from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION
 from unmix_plugin.spectral.colour.conversion import srgb_to_linear
 from unmix_plugin.spectral.segmentation import NOTHING_ID
-from unmix_plugin.trained.protocol import RenderableScene, RenderedView
-from unmix_plugin.trained.trained_scene import TrainedScene
+from unmix_plugin.trained.protocol import RenderedView
+from unmix_plugin.viewer.layers.layer import Layer
 from unmix_plugin.viewer.layers.layer_aids import LayerAids
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings
-from unmix_plugin.viewer.layers.layers import LAYERS, Layer
 from unmix_plugin.viewer.layers.painting import (
     ColourMapLegend,
     Legend,
@@ -34,17 +33,8 @@ from unmix_plugin.viewer.rendering.reference import percentile_range
 _Paint = Callable[[Tensor, RenderedView, LayerSettings, Output], tuple[Picture, Legend]]
 
 
-def layers_of(scene: RenderableScene) -> dict[str, Layer]:
-    """All that can be shown of a scene, by name: what its materials allow, and its outputs that can be painted."""
-    own, painters = {}, _PAINTERS
-    if isinstance(scene, TrainedScene):
-        own = LAYERS
-        painters = {kind: _PAINTERS[kind] for kind in ("map", "vectors")}  # its colours are among its own
-    others = (output for output in scene.outputs if output.name not in own and output.kind in painters)
-    return {**own, **{output.name: _layer(output) for output in others}}
-
-
-def _layer(output: Output) -> Layer:
+def layer_of(output: Output) -> Layer:
+    """The layer of an output of a kind that can be painted."""
     paint, controls = _PAINTERS[output.kind]
 
     def paint_output(
@@ -110,3 +100,6 @@ _PAINTERS: dict[OutputKind, tuple[_Paint, frozenset[str]]] = {
     "labels": (_paint_labels, frozenset()),
     "vectors": (_paint_vectors, frozenset()),
 }
+
+PAINTED_KINDS = frozenset(_PAINTERS)
+"""Kinds of outputs that can be painted without knowing more of them."""

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.maps.indices import available_indices
 from unmix_plugin.viewer.inputs import index_in, text
+from unmix_plugin.viewer.layers.layer import layer_named
 from unmix_plugin.viewer.layers.layer_settings import BACKGROUNDS, COLOUR_MAPS, EXPOSURE_BOUNDS, GAMMA_BOUNDS
-from unmix_plugin.viewer.layers.layers import covered, layer_named
+from unmix_plugin.viewer.layers.layers import covered
 from unmix_plugin.viewer.layers.view_transforms import VIEW_TRANSFORMS
 from unmix_plugin.viewer.session import Session
 from unmix_plugin.viewer.settling import Settling

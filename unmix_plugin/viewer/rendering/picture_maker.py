@@ -14,8 +14,9 @@ from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.trained.open_run import require_materials
 from unmix_plugin.trained.protocol import RenderedView
 from unmix_plugin.trained.trained_scene import TrainedScene
+from unmix_plugin.viewer.layers.layer import Layer, layer_named
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings
-from unmix_plugin.viewer.layers.layers import LAYERS, Layer, layer_named
+from unmix_plugin.viewer.layers.layers import LAYERS
 from unmix_plugin.viewer.layers.painting import as_bytes
 from unmix_plugin.viewer.probing import ProbedPoint, probe_through
 from unmix_plugin.viewer.rendering.edits import Edit

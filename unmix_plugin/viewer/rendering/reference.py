@@ -17,7 +17,6 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.spectral.coefficients import Coefficients
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.viewer.view_cameras import resized
 
 _NUM_CAMERAS = 6
 _NUM_RAYS = 6000
@@ -59,7 +58,7 @@ def render_reference(scene: TrainedScene, cameras: Cameras) -> Reference:
     height = max(1, min(cameras.height, int((_NUM_RAYS / len(chosen) / aspect) ** 0.5)))
     parts, points = [], []
     for index in chosen:
-        camera = resized(cameras[index], height)
+        camera = cameras[index].resized(max(1, round(aspect * height)), height)
         seen = scene.look(camera, subpixels=1).coefficients.flatten()
         rays = camera.to(scene.device).image_rays(0)
         ends = rays.origins + seen.ray_distance[:, None] * rays.directions
