@@ -22,7 +22,11 @@ from unmix_plugin.model import UnmixModel
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.trained.snapshot import unmix_scene
+from unmix_plugin.viewer.layers.layer import layer_named
 from unmix_plugin.viewer.layers.layer_aids import LayerAids
+from unmix_plugin.viewer.layers.layer_settings import LayerSettings
+from unmix_plugin.viewer.layers.layers import LAYERS
+from unmix_plugin.viewer.layers.painting import Legend, Picture
 from unmix_plugin.viewer.rendering.reference import render_reference
 from unmix_plugin.viewer.rendering.scene_source import SceneSource
 from unmix_plugin.viewer.rendering.view import Shown, View
@@ -82,6 +86,11 @@ def make_aids(source: SceneSource) -> LayerAids:
     """What layers need."""
     with source.borrowed() as scene:
         return LayerAids(render_reference(scene, source.record.train_cameras), source.record.scene_box)
+
+
+def paint_layer(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
+    """The picture of the layer that the settings name, and its legend."""
+    return layer_named(settings.layer, LAYERS).paint(frame, settings, aids)
 
 
 def some_pose(index: int = 0) -> ViewPose:

@@ -7,11 +7,10 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.viewer.view_factory import make_aids, make_frame, make_source
+from tests.viewer.view_factory import make_aids, make_frame, make_source, paint_layer
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.viewer.layers import index_layer
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings
-from unmix_plugin.viewer.layers.layers import paint_layer
 from unmix_plugin.viewer.layers.painting import ColourMapLegend, over_background, paint_values
 
 FORMULA = "(r650-r450)/(r650+r450)"

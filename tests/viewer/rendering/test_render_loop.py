@@ -252,6 +252,17 @@ def test_other_light_is_shown_without_rendering_and_other_shapes_with(loop, scre
     assert np.array_equal(finest(loop, screen).picture, before)
 
 
+def test_removed_materials_leave_no_faint_specks(loop, screen):
+    loop.change_edit(screen.view, Edit(Recipe((Remove((0,)),))))
+    loop.move(screen.view, some_pose())
+    shown = finest(loop, screen).picture
+    opacity = screen.view.frame.opacity.numpy()
+    is_trace = (opacity > 0.01) & (opacity < 0.25)
+    assert is_trace.any()
+    assert (shown[is_trace] == round(0.92 * 255)).all()
+    assert (shown[opacity > 0.3] != round(0.92 * 255)).any()
+
+
 def test_an_edit_that_does_not_fit_is_said(loop, screen):
     loop.move(screen.view, some_pose())
     finish(loop)

@@ -22,7 +22,7 @@ from unmix_plugin.trained.outputs.registry import OUTPUTS
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.layers.index_layer import paint_index
-from unmix_plugin.viewer.layers.layer import Layer, Painter, layer_named
+from unmix_plugin.viewer.layers.layer import Layer, Painter
 from unmix_plugin.viewer.layers.layer_aids import LayerAids
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings
 from unmix_plugin.viewer.layers.output_layers import PAINTED_KINDS, layer_of
@@ -36,16 +36,6 @@ from unmix_plugin.viewer.layers.painting import (
     paint_values,
     tone_mapped,
 )
-
-
-def paint_layer(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
-    """The picture of the layer that `settings` name, and what its colours mean.
-
-    Raises:
-        ConfigError: there is no such layer, or it can't be shown here; the message says why.
-    """
-    with torch.no_grad():
-        return layer_named(settings.layer, LAYERS).paint(frame, settings, aids)
 
 
 def _paint_colour(diffuse: bool, specular: bool) -> Painter:

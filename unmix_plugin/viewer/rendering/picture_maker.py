@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import torch
 
+from unmix_plugin.editing.edited_field import EditedField
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.trained.open_run import require_materials
@@ -34,6 +35,9 @@ RESTING_COST = 6.0
 
 REFRESH_S = 2.0
 """How long one picture of a client at rest should take while training."""
+
+_TRACE_OPACITY = 0.25
+"""Opacity under which a pixel counts as empty once materials are removed."""
 
 LARGEST_FRAME_BYTES = 1 << 26
 """Coefficients that are kept for one client."""
@@ -160,6 +164,16 @@ class PictureMaker:
         """
         layer, aids = layer_named(settings.layer, self._layers), self._aids.for_layers()
         with torch.no_grad():
+            frame = _without_traces(frame)
             picture, legend = layer.paint(frame, settings, aids)
         depth = picture_depth(frame) if with_depth and isinstance(frame, MaterialView) else None
         return Shown(as_bytes(picture), depth, legend, is_moving, layer.is_labels)
+
+
+def _without_traces(frame: RenderedView) -> RenderedView:
+    """A frame without the faint specks that removed materials leave where they were mixed with others."""
+    field = frame.scene.field if isinstance(frame, MaterialView) else None
+    if not isinstance(field, EditedField) or bool(field.is_kept.all()):
+        return frame
+    is_left = (frame.opacity >= _TRACE_OPACITY)[..., None]
+    return frame.map(lambda packed: packed * is_left)
