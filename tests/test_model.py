@@ -371,10 +371,10 @@ def test_given_endmembers_get_the_brightness_of_the_scene(tmp_path):
     data = {**initial_data(), "pixels": np.repeat(1.4 * shapes, 40, axis=0) * 0.999}
     with torch.no_grad():
         model.initialise(data, torch.Generator().manual_seed(0))
-    assert_close(model.endmembers.detach(), torch.from_numpy(1.4 * shapes), rtol=0.02, atol=0)
+    assert_close(model.endmembers.detach(), torch.from_numpy(1.4 / 0.75 * shapes), rtol=0.02, atol=0)
     for callback in model.get_training_callbacks():
         callback.func(1, 0.0)
-    assert_close(model.endmembers.detach(), torch.from_numpy(1.4 * shapes), rtol=0.02, atol=0)
+    assert_close(model.endmembers.detach(), torch.from_numpy(1.4 / 0.75 * shapes), rtol=0.02, atol=0)
 
 
 def occupied_after_training(has_alpha: bool = True, visible_weight: float | str = "auto") -> torch.Tensor:
