@@ -25,6 +25,7 @@ _MOST_STRICT = 1.5
 _CLEAR_MARGIN = 0.9
 """Nearly pure pixels, whose margin is larger, hardly err, and would hide what the others do."""
 _DECAY = 0.99
+_CACHE_BYTES = 1 << 26
 _SHARED_ERROR = 2.0
 """Variance of a margin's error in multiples of that of field against pixels: errors of both cancel in it."""
 
@@ -100,7 +101,8 @@ class MixtureCache:
     precision, so that a resumed training sees the same ones.
     """
 
-    def __init__(self, num_endmembers: int, device: torch.device, num_slots: int = 1 << 20) -> None:
+    def __init__(self, num_endmembers: int, device: torch.device, num_slots: int | None = None) -> None:
+        num_slots = min(1 << 20, _CACHE_BYTES // (2 * num_endmembers)) if num_slots is None else num_slots
         self._keys = torch.full((num_slots,), -1, dtype=torch.int64, device=device)
         self._values = torch.zeros(num_slots, num_endmembers, dtype=torch.float16, device=device)
 

@@ -6,7 +6,7 @@ Notation: `H x W` pixels, `B` bands, `K` endmembers.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -25,7 +25,7 @@ from unmix_plugin.trained.outputs.families import FAMILIES
 class MaterialOutput(Output):
     """An output with its function."""
 
-    compute: Callable[[MaterialView], Tensor] = lambda view: view.opacity
+    compute: Callable[[MaterialView], Tensor] = field(kw_only=True)
     """From a rendered view to (H, W, ...)."""
 
 
