@@ -58,26 +58,25 @@ class RecipeHistory:
 
     def undone(self) -> Recipe | None:
         """Go back by one; None at the beginning."""
-        if not self._past:
-            return None
-        self._last_change = (None, 0.0)
-        self._future.append(self.present)
-        self.present = self._past.pop()
-        return self.present
+        return self._step(self._past, self._future)
 
     def redone(self) -> Recipe | None:
         """Go forward again by one; None at the end."""
-        if not self._future:
+        return self._step(self._future, self._past)
+
+    def _step(self, source: list[Recipe], target: list[Recipe]) -> Recipe | None:
+        if not source:
             return None
         self._last_change = (None, 0.0)
-        self._past.append(self.present)
-        self.present = self._future.pop()
+        target.append(self.present)
+        self.present = source.pop()
         return self.present
 
 
 def with_change(recipe: Recipe, change: Replace | Retint | Scale | Rename | Gloss) -> Recipe:
     """The recipe with a change of one endmember, in place of an earlier one of the same kind."""
-    others = [one for one in recipe.operations if not (type(one) is type(change) and _same(one, change))]
+    kind, endmember = type(change), change.endmember
+    others = [one for one in recipe.operations if not _is_change(one, kind, endmember)]
     return _with_operations(recipe, [*others, change])
 
 
@@ -151,18 +150,11 @@ def numbered(recipe: Recipe, names: tuple[str, ...]) -> Recipe:
 
 def change_of(recipe: Recipe, kind: type[Operation], endmember: int) -> Operation | None:
     """The change of a kind that a recipe makes to an endmember by its number."""
-    return next(
-        (
-            one
-            for one in recipe.operations
-            if type(one) is kind and getattr(one, "endmember", None) == endmember
-        ),
-        None,
-    )
+    return next((one for one in recipe.operations if _is_change(one, kind, endmember)), None)
 
 
-def _same(one: Operation, other: Operation) -> bool:
-    return getattr(one, "endmember", None) == getattr(other, "endmember", None)
+def _is_change(one: Operation, kind: type[Operation], endmember: str | int | None) -> bool:
+    return type(one) is kind and getattr(one, "endmember", None) == endmember
 
 
 def _with_operations(recipe: Recipe, operations: Iterable[Operation]) -> Recipe:

@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from unmix_plugin.editing import Recipe
-from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.viewer import html
 from unmix_plugin.viewer.address import free_port, notices
 from unmix_plugin.viewer.failures import failures_said
@@ -22,7 +21,7 @@ from unmix_plugin.viewer.rendering.scene_source import SceneSource
 from unmix_plugin.viewer.services import SceneReader, Services
 from unmix_plugin.viewer.session import Session
 from unmix_plugin.viewer.token_prompt import TokenPrompts
-from unmix_plugin.viewer.view_cameras import pose_of, up_direction
+from unmix_plugin.viewer.view_cameras import point_ahead, pose_of, up_direction
 from unmix_plugin.viewer.web_server import (
     LABEL,
     address_of,
@@ -140,26 +139,17 @@ class Viewer:
                     return
 
     def _dress(self, server: viser.ViserServer) -> None:
-        """Looks, and where pages start to look from."""
+        """Set the theme, and where pages start to look from."""
         server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         server.gui.set_panel_label(LABEL)
         scene = self._services.source.record
         up = up_direction(scene.train_cameras)
         server.scene.set_up_direction(up)
         server.scene.world_axes.visible = False
-        self._place_camera(server, scene.eval_cameras if len(scene.eval_cameras) else scene.train_cameras, up)
-
-    def _place_camera(
-        self, server: viser.ViserServer, cameras: Cameras, up: tuple[float, float, float]
-    ) -> None:
-        camera = cameras[0]
-        pose = pose_of(camera)
-        middle = self._services.source.record.scene_box.aabb.mean(dim=0)
-        place, forward = camera.camera_to_world[0, :, 3], -camera.camera_to_world[0, :, 2]
-        reach = max(float((middle - place) @ forward), 0.1)
-        x, y, z = (place + reach * forward).tolist()
-        start = server.initial_camera
-        start.position, start.look_at, start.up, start.fov = pose.position, (x, y, z), up, pose.fov
+        camera = (scene.eval_cameras if len(scene.eval_cameras) else scene.train_cameras)[0]
+        pose, start = pose_of(camera), server.initial_camera
+        start.position, start.look_at = pose.position, point_ahead(camera, scene.scene_box)
+        start.up, start.fov = up, pose.fov
 
     def _connected(self, client: viser.ClientHandle) -> None:
         """Let a page in, ask it for the token, or turn it away."""

@@ -23,7 +23,7 @@ from unmix_plugin.viewer.recipe_editor import RecipeHistory
 from unmix_plugin.viewer.rendering.edits import Edit
 from unmix_plugin.viewer.rendering.view import DEFAULT_HEIGHT, HEIGHT_BOUNDS, Shown, View
 from unmix_plugin.viewer.services import Services
-from unmix_plugin.viewer.view_cameras import ViewPose, camera_of, checked_pose, pose_of
+from unmix_plugin.viewer.view_cameras import ViewPose, camera_of, checked_pose, point_ahead, pose_of
 
 if TYPE_CHECKING:
     import viser
@@ -223,21 +223,17 @@ class Session:
         """Where the client looks from now.
 
         Raises:
-            ConfigError: its camera is no camera.
+            ConfigError: its camera is invalid.
         """
         return pose_from(self.client.camera)
 
     def look_from(self, camera: Cameras) -> None:
         """Move the client's camera to one of ours."""
         pose = pose_of(camera)
-        middle = self.services.source.record.scene_box.aabb.mean(dim=0)
-        place = camera.camera_to_world[0, :, 3]
-        forward = -camera.camera_to_world[0, :, 2]
-        reach = max(float((middle - place) @ forward), 0.1)
         with self.client.atomic():
             self.client.camera.wxyz = pose.wxyz
             self.client.camera.position = pose.position
-            self.client.camera.look_at = tuple((place + reach * forward).tolist())
+            self.client.camera.look_at = point_ahead(camera, self.services.source.record.scene_box)
             self.client.camera.fov = pose.fov
 
     def _moved(self, camera: viser.CameraHandle) -> None:
@@ -283,8 +279,14 @@ def nearest_materials(
     return measured_library().nearest(spectra, materials.bands, light, count)
 
 
+def likeness_rows(spectrum: Float[np.ndarray, "B"], materials: Materials) -> list[tuple[str, str]]:
+    """Rows of a table of the known materials that a spectrum resembles."""
+    matches = nearest_materials(spectrum[None], materials)[0]
+    return [("like" if rank == 0 else "", likeness(match)) for rank, match in enumerate(matches)]
+
+
 def likeness(match: LibraryMatch) -> str:
-    """A known material and how far it is off; matches that say little are marked."""
+    """A known material and its spectral angle; matches that say little are marked."""
     remark = "" if match.angle_rad <= _ALIKE_RAD else ", not alike"
     return f"{match.name} ({match.angle_rad:.3f} rad{remark})"
 
@@ -298,7 +300,7 @@ def pose_from(camera: viser.CameraHandle) -> ViewPose:
     """The pose of a client's camera.
 
     Raises:
-        ConfigError: it is no camera, or its canvas has no size.
+        ConfigError: it is invalid, or its canvas has no size.
     """
     height, width = camera.image_height, camera.image_width
     has_size = isinstance(height, int) and isinstance(width, int) and height > 0 and width > 0

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
+from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.errors import ConfigError
 
 FOV_BOUNDS = (math.radians(1.0), math.radians(170.0))
@@ -53,7 +54,7 @@ def checked_pose(wxyz: Any, position: Any, fov: Any, aspect: Any) -> ViewPose:
         place = np.array([float(value) for value in position])
         angle, shape = float(fov), float(aspect)
     except (TypeError, ValueError) as error:
-        raise ConfigError(f"the browser sent a camera that is no camera: {error}") from error
+        raise ConfigError(f"the browser sent a camera of something other than numbers: {error}") from error
     numbers = np.concatenate([rotation, place, [angle, shape]])
     if len(rotation) != 4 or len(place) != 3 or not np.isfinite(numbers).all():
         raise ConfigError(f"the browser sent a camera with numbers that are missing or not finite: {numbers}")
@@ -133,30 +134,24 @@ def up_direction(cameras: Cameras) -> tuple[float, float, float]:
     return (float(up[0]), float(up[1]), float(up[2]))
 
 
+def point_ahead(camera: Cameras, box: SceneBox) -> tuple[float, float, float]:
+    """The point on the viewing axis that is nearest to the middle of the scene box, but in front of the camera."""
+    place, forward = camera.camera_to_world[0, :, 3], -camera.camera_to_world[0, :, 2]
+    reach = max(float((box.aabb.mean(dim=0) - place) @ forward), 0.1)
+    x, y, z = (place + reach * forward).tolist()
+    return x, y, z
+
+
 def rotation_matrix(wxyz: Sequence[float] | np.ndarray) -> Float64[np.ndarray, "3 3"]:
     """Rotation of a unit quaternion."""
-    w, x, y, z = wxyz
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_quat(np.roll(wxyz, -1)).as_matrix()
 
 
 def quaternion(rotation: Float[np.ndarray, "3 3"]) -> tuple[float, float, float, float]:
-    """Unit quaternion w, x, y, z of a rotation, by its largest component so that nothing small is divided by."""
-    r = np.asarray(rotation, dtype=np.float64)
-    products = np.array(
-        [
-            [r[0, 0] + r[1, 1] + r[2, 2], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
-            [0.0, r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]],
-            [0.0, 0.0, r[1, 1] - r[0, 0] - r[2, 2], r[1, 2] + r[2, 1]],
-            [0.0, 0.0, 0.0, r[2, 2] - r[0, 0] - r[1, 1]],
-        ]
-    )
-    products = products + np.triu(products, 1).T + np.eye(4)  # 4 q q^T
-    column = products[:, int(np.diag(products).argmax())]
-    w, x, y, z = (column / np.linalg.norm(column)).tolist()
+    """Unit quaternion w, x, y, z of a rotation."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat().tolist()
     return (w, x, y, z)

@@ -33,7 +33,7 @@ from unmix_plugin.viewer.recipe_editor import (
     with_swap,
     with_visible,
 )
-from unmix_plugin.viewer.session import Session, likeness, nearest_materials
+from unmix_plugin.viewer.session import Session, likeness, likeness_rows, nearest_materials
 from unmix_plugin.viewer.settling import Settling
 
 _OWN_LIGHT = "as recorded"
@@ -199,9 +199,8 @@ class MaterialsPanel:
                 self._name.value = materials.names[index]
             self._light.options = self._lights(recipe.illuminant)
             self._light.value = _OWN_LIGHT if recipe.illuminant is None else str(recipe.illuminant.light)
-            spectrum = materials.endmembers[index : index + 1].double().cpu().numpy()
-            alike = nearest_materials(spectrum, materials)[0]
-            self._alike.content = html.table([("like", likeness(one)) for one in alike])
+            spectrum = materials.endmembers[index].double().cpu().numpy()
+            self._alike.content = html.table(likeness_rows(spectrum, materials))
             self._recipe.show()
         finally:
             self._is_showing = False

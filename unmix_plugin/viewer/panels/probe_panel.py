@@ -13,7 +13,7 @@ from unmix_plugin.viewer.charts import Chart, Line
 from unmix_plugin.viewer.inputs import new_file, number
 from unmix_plugin.viewer.probing import ProbedPoint, abundances_csv, spectra_csv
 from unmix_plugin.viewer.scene_objects import add_probe
-from unmix_plugin.viewer.session import Session, likeness, nearest_materials
+from unmix_plugin.viewer.session import Session, likeness_rows
 from unmix_plugin.viewer.view_cameras import camera_of
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ class ProbePanel:
             ("material", shown.name),
             ("position", ", ".join(f"{value:.3f}" for value in shown.point)),
             ("measured in", shown.measured_in or "no training view at hand sees the point"),
-            *_library_rows(shown),
+            *likeness_rows(shown.predicted, shown.materials),
         ]
         self._text.content = html.table(rows)
         names, bands = shown.materials.names, shown.materials.bands
@@ -136,11 +136,6 @@ class ProbePanel:
     def _drop(self, one: ProbedPoint) -> None:
         self._probes.remove(one)
         self._markers.pop(one.number).remove()
-
-
-def _library_rows(shown: ProbedPoint) -> list[tuple[str, str]]:
-    matches = nearest_materials(shown.predicted[None], shown.materials)[0]
-    return [("like" if rank == 0 else "", likeness(match)) for rank, match in enumerate(matches)]
 
 
 def _label(one: ProbedPoint) -> str:
