@@ -74,10 +74,10 @@ def notices(options: ViewerOptions, port: int, environment: Mapping[str, str] | 
 def tunnel_command(port: int, environment: Mapping[str, str] | None = None) -> str:
     """The ssh command that makes the viewer of a remote machine reachable from where its user sits."""
     known = os.environ if environment is None else environment
-    words = known.get("SSH_CONNECTION", "").split()
-    server = words[2] if len(words) == 4 else socket.gethostname()
+    parts = known.get("SSH_CONNECTION", "").split()
+    server = parts[2] if len(parts) == 4 else socket.gethostname()
     user = known.get("USER") or known.get("LOGNAME")
-    port_flag = f" -p {words[3]}" if len(words) == 4 and words[3] != "22" else ""
+    port_flag = f" -p {parts[3]}" if len(parts) == 4 and parts[3] != "22" else ""
     return f"ssh -N -L {port}:127.0.0.1:{port}{port_flag} {f'{user}@' if user else ''}{server}"
 
 

@@ -1,4 +1,4 @@
-"""The border between the viewer's work and its clients: what goes wrong is said, and harms nothing else."""
+"""Errors on behalf of a client are shown to that client and affect nobody else."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ _LOG = logging.getLogger("unmix_plugin.viewer")
 
 @contextmanager
 def failures_said(what: str, say: Callable[[str], None]) -> Iterator[None]:
-    """Context that no error leaves.
+    """Context that lets no error out.
 
     Args:
-        what: Failed, if a defect of ours did; such errors are logged with their traceback.
-        say: Takes what a user can mend, or that there is a defect. An error of its own is logged.
+        what: What internal errors are reported as; they are logged with their traceback.
+        say: Shows a message to the user. Its own errors are logged.
     """
     try:
         yield
     except UnmixError as error:
         _say(what, say, str(error))
-    except Exception as error:  # noqa: BLE001 - a defect must not end the thread that serves everyone
+    except Exception as error:  # noqa: BLE001 - internal errors must not end the thread that serves everyone
         _LOG.exception(what)
         _say(what, say, f"{what}: {type(error).__name__}: {error}")
 
@@ -31,5 +31,5 @@ def failures_said(what: str, say: Callable[[str], None]) -> Iterator[None]:
 def _say(what: str, say: Callable[[str], None], message: str) -> None:
     try:
         say(message)
-    except Exception:  # noqa: BLE001 - whoever should be told has gone
+    except Exception:  # noqa: BLE001 - the page to tell has gone
         _LOG.warning("%s, and the client could not be told: %s", what, message)

@@ -1,7 +1,7 @@
-"""Recipes as a panel builds them: each change is an edit of the recipe, and can be undone.
+"""Recipes as panels build them: each change is an edit of the recipe, and can be undone.
 
-Endmembers are meant by their number, which no edit changes. A second change of the same kind to the same endmember
-takes the place of the first.
+Endmembers are given by their number, which no edit changes. A second change of the same kind to the same endmember
+replaces the first.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from unmix_plugin.editing import (
 _MOST_UNDONE = 200
 _MOST_OPERATIONS = 500
 _ONE_EDIT_S = 2.0
-"""Changes of the same thing that follow each other so quickly, as while a slider is dragged, are undone together."""
+"""Changes of the same thing in quicker succession, as while a slider is dragged, are undone together."""
 
 
 class RecipeHistory:
@@ -45,7 +45,7 @@ class RecipeHistory:
 
         Args:
             recipe: The new one.
-            subject: What the change is of; None for one that is always undone by itself.
+            subject: What is changed; None for a change that is undone by itself.
         """
         if recipe == self.present:
             return
@@ -118,7 +118,7 @@ def visibility(recipe: Recipe) -> tuple[frozenset[int], frozenset[int]]:
 
 
 def numbered(recipe: Recipe, names: tuple[str, ...]) -> Recipe:
-    """The same recipe with endmembers meant by their numbers; unknown names are left for whoever applies it to refuse.
+    """The same recipe with endmembers given by their numbers; unknown names stay, and are refused when it is applied.
 
     Args:
         recipe: As written by hand, perhaps.

@@ -1,4 +1,4 @@
-"""The life of a viewer: listening, letting clients in, keeping their sessions, and ending without leftovers."""
+"""The viewer's life cycle: listen, admit clients, keep their sessions, shut down cleanly."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Viewer:
             source: The model.
             options: Where to listen, and the token to ask for.
             read_scene: Reads the scene that the run was trained on.
-            say: Takes lines for the user's terminal.
+            say: Prints a line on the user's terminal.
             recipe: Edits that every page starts with.
         Raises:
             ConfigError: the recipe does not fit the run.
@@ -103,7 +103,7 @@ class Viewer:
             sessions = list(self._sessions.values())
             self._sessions.clear()
         for session in sessions:
-            session.tick()  # what has become of the training is the last that a page shows
+            session.tick()  # so that the page ends with the final state of the training
             session.close()
         if self._server is not None and sessions:
             send_what_is_queued(self._server)
@@ -152,7 +152,7 @@ class Viewer:
         start.up, start.fov = up, pose.fov
 
     def _connected(self, client: viser.ClientHandle) -> None:
-        """Let a page in, ask it for the token, or turn it away."""
+        """Admit a page, ask it for the token, or refuse it."""
         with failures_said("this page could not be served", lambda text: _warn(client, text)):
             reason = self._refusal(client)
             if not reason and self._gate.is_open:
@@ -210,7 +210,7 @@ class Viewer:
 
 @contextmanager
 def _interrupting_signals() -> Iterator[None]:
-    """Context in which SIGTERM and SIGHUP are as Ctrl-C; a signal that is ignored, as under nohup, stays so."""
+    """Context in which SIGTERM and SIGHUP act like Ctrl-C; signals that are ignored, as under nohup, stay ignored."""
     before = {}
     if threading.current_thread() is threading.main_thread():
         for name in ("SIGTERM", "SIGHUP"):

@@ -1,4 +1,4 @@
-"""What all clients of a viewer share: the model, the render loop, the scene's measurements, the folder for files."""
+"""What all clients of a viewer share: the scene, the render loop, what was measured, the folder for files."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Services:
         self.maker = PictureMaker(source, self.aids, channels, self.layers)
         self.loop = RenderLoop(self.maker)
         self.first_recipe = Recipe()
-        """What every client sees the scene with at first; endmembers are meant by their numbers."""
+        """Every client's first recipe; endmembers are given by their numbers."""
         if recipe is not None:
             self.first_recipe = numbered(recipe, self.maker.edited(Edit()).materials.names)
             self.maker.edited(Edit(self.first_recipe))

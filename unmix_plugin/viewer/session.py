@@ -1,4 +1,4 @@
-"""One client: its view, its panels, and what it is told. Nothing that a client does harms another one or the server."""
+"""One client: its view, panels and notices. Nothing that a client does affects another one or the server."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Panel:
 
 
 class Session:
-    """What the server keeps for a client, from its unlocking to its disconnection."""
+    """What the server keeps for a client from its admission to its disconnection."""
 
     def __init__(
         self,
@@ -140,17 +140,17 @@ class Session:
 
     @property
     def state(self) -> PageState:
-        """What the page shows, to be gone on with when it is loaded again."""
+        """What the page shows, to be restored when it is loaded again."""
         view = self.view
         return PageState(view.pose, view.settings, self.history, view.largest_height, view.subpixels)
 
     def tick(self) -> None:
-        """Renew what panels show of a run that goes on."""
+        """Update what panels show of a run in progress."""
         for tell in self.on_tick:
             self.guarded(tell)()
 
     def guarded(self, work: Callable[[], None]) -> Callable[..., None]:
-        """A callback for the browser's events: one at a time a client, and what goes wrong is said to the client."""
+        """A callback for the browser's events: one at a time for each client, with errors shown to it."""
 
         def callback(_event: Any = None) -> None:
             with self._lock, failures_said("that failed", self._warn):
@@ -160,7 +160,7 @@ class Session:
         return callback
 
     def say(self, title: str, text: str, is_warning: bool = False) -> viser.NotificationHandle | None:
-        """Show a notice. Of warnings there is one at a time, however many a control that is dragged brings about."""
+        """Show a notice. A warning replaces the one before, since a control that is dragged brings about many."""
         if self.is_closed:
             return None
         if is_warning:
@@ -266,7 +266,7 @@ class Session:
             self._status.content = html.paragraph(f"{width} x {height}, {speed / 1000:.0f} k rays/s{more}")
 
     def _report(self, text: str) -> None:
-        """What is wrong with the picture, in the panel until it is mended."""
+        """Show in the panel what is wrong with the picture, until it is right again."""
         if self._status is not None and not self.is_closed and text:
             self._status.content = html.paragraph(text, is_warning=True)
 

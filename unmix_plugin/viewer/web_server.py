@@ -104,14 +104,14 @@ def close_soon(client: viser.ClientHandle) -> None:
 
 
 def send_what_is_queued(server: viser.ViserServer) -> None:
-    """Give pages a moment to be sent what they were told, before a server is stopped."""
+    """Send pages what is queued for them, before a server is stopped."""
     server.flush()
     asyncio.run_coroutine_threadsafe(asyncio.sleep(_SENDING_S), server._event_loop).result()
 
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """viser prints a banner and a farewell of its own; ours say what is true of host and port."""
+    """Context without viser's own banner and farewell; ours name the real host and port."""
     with contextlib.redirect_stdout(io.StringIO()):
         yield
 

@@ -31,13 +31,13 @@ class LayerSettings:
 
     layer: str = "rgb"
     wavelength_nm: float = 550.0
-    """Of the layer `band`."""
+    """Shown by the layer `band`."""
     false_colour_nm: tuple[float, float, float] = (650.0, 550.0, 450.0)
     """Shown as red, green, blue by the layer `false-colour`."""
     endmember: int = 0
-    """Of the layer `abundance`."""
+    """Shown by the layer `abundance`."""
     index: str = ""
-    """Of the layer `index`: a name or a formula, as the output `index:` takes it; empty where none is chosen."""
+    """Shown by the layer `index`: a name or a formula, as the output `index:` takes it; empty where none is chosen."""
     colour_map: str = "viridis"
     value_range: tuple[float, float] | None = None
     """Values at the ends of the colour map; None for the layer's own."""

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.maps.indices import available_indices
+from unmix_plugin.viewer.debounce import Debounced
 from unmix_plugin.viewer.inputs import index_in, text
 from unmix_plugin.viewer.layers.layer import layer_named
 from unmix_plugin.viewer.layers.layer_settings import BACKGROUNDS, COLOUR_MAPS, EXPOSURE_BOUNDS, GAMMA_BOUNDS
 from unmix_plugin.viewer.layers.layers import covered
 from unmix_plugin.viewer.layers.view_transforms import VIEW_TRANSFORMS
 from unmix_plugin.viewer.session import Session
-from unmix_plugin.viewer.settling import Settling
 
 if TYPE_CHECKING:
     import viser
@@ -101,7 +101,7 @@ class LayerPanel:
 
         self._connect(known, "index", chosen, "index")
         self._of_control["index"].append(formula)
-        typed = Settling(lambda: self._change("index", chosen))
+        typed = Debounced(lambda: self._change("index", chosen))
         formula.on_update(self._session.guarded(typed.note))
         self._session.on_tick.append(typed.tick)
 

@@ -23,6 +23,7 @@ from unmix_plugin.spectral.library.material_library import measured_library
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.viewer import html
 from unmix_plugin.viewer.charts import Chart, Line
+from unmix_plugin.viewer.debounce import Debounced
 from unmix_plugin.viewer.inputs import index_in, number, text
 from unmix_plugin.viewer.panels.recipe_controls import RecipeControls
 from unmix_plugin.viewer.recipe_editor import (
@@ -34,7 +35,6 @@ from unmix_plugin.viewer.recipe_editor import (
     with_visible,
 )
 from unmix_plugin.viewer.session import Session, likeness, likeness_rows, nearest_materials
-from unmix_plugin.viewer.settling import Settling
 
 _OWN_LIGHT = "as recorded"
 _COMMON_LIGHTS = ("D65", "D50", "A", "E", "C", "FL2", "FL7", "FL11")
@@ -90,7 +90,7 @@ class MaterialsPanel:
             self._on(control, lambda make=make: self._change_endmember(make(self._index)))
         for control in (self._is_visible, self._is_alone):
             self._on(control, lambda control=control: self._change_visibility(control))
-        self._typed_name = Settling(self._rename)
+        self._typed_name = Debounced(self._rename)
         self._on(self._name, self._type_name)
         self._session.on_tick.append(self._typed_name.tick)
         replace_button.on_click(

@@ -30,7 +30,7 @@ class RecipeControls:
 
     @property
     def recipe(self) -> Recipe:
-        """The one in force; endmembers are meant by their numbers."""
+        """The one in force; endmembers are given by their numbers."""
         return self._history.present
 
     def change(self, recipe: Recipe, subject: Hashable = None) -> None:

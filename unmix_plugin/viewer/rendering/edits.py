@@ -1,4 +1,4 @@
-"""Recipes as the viewer applies them: to a scene that may still be in training, again and again, and cheaply."""
+"""Recipes as the viewer applies them: cheaply, and again as training changes the scene."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 _RENEWAL_S = 0.5
-"""An edited scene is made anew so long after the last time, where training changes what it was made from."""
+"""Seconds between two edited scenes while training changes the unedited one."""
 
 See = Callable[[TrainedScene], Coefficients]
 """What cameras see of a scene, for edits that depend on it."""

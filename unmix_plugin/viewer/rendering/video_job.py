@@ -47,7 +47,7 @@ class VideoJob:
     """A video asked for by one page; its callbacks are called in a thread of its own."""
 
     argv: list[str]
-    """Of `unmix-render`."""
+    """Arguments of `unmix-render`."""
     folder: Path
     """Where it writes."""
     progress: Callable[[float], None]
@@ -71,14 +71,14 @@ class VideoQueue:
         threading.Thread(target=self._run, args=(job,), name="unmix-viewer-video", daemon=True).start()
 
     def cancel(self, job: VideoJob) -> None:
-        """Do without a video, also one that is being rendered."""
+        """Drop a video, even one that is being rendered."""
         with self._lock:
             job.is_cancelled = True
             if self._running is not None and self._running[0] is job:
                 _end(self._running[1])
 
     def stop(self) -> None:
-        """Do without all videos."""
+        """Drop all videos."""
         with self._lock:
             self._is_stopping = True
             if self._running is not None:

@@ -54,15 +54,15 @@ class View:
     """Whether objects of the client's own are to be hidden behind what is seen."""
     pose: ViewPose | None = None
     frame: RenderedView | None = None
-    """Of the picture shown last."""
+    """The picture shown last."""
     frame_edit: Edit = Edit()
     """What `frame` was rendered with."""
     frame_version: int = -1
     """The model's version that `frame` shows."""
     moved_at: float | None = None
-    """When the first camera came that no picture has answered; None when all are."""
+    """When the first camera movement without a picture yet came; None if there is none."""
     restyled_at: float | None = None
-    """When the first change came that needs no rendering and no picture has answered."""
+    """The same for changes that need no rendering."""
     render: FrameRender | None = None
     """The finer picture under way."""
     render_version: int = -1
@@ -70,7 +70,7 @@ class View:
     """When a block was last rendered for it."""
     shown_at: float = 0.0
     is_stuck: bool = False
-    """Whether its last picture failed: nothing more is tried until something changes."""
+    """Whether its last picture failed; it is tried again once something changes."""
     has_reported: bool = False
     """Whether its client was told of a failure."""
 
@@ -89,6 +89,6 @@ class Capture:
     done: Callable[[RenderedView | None, str], None]
     """Takes the frame, or None and what went wrong; called in the render loop's thread."""
     progress: Callable[[float], None] = field(default=lambda _: None)
-    """Told the part rendered, now and then."""
+    """Takes the fraction rendered so far, now and then."""
     served_at: float = 0.0
     is_cancelled: bool = False

@@ -1,11 +1,11 @@
 """Text is taken when it is typed, not letter by letter."""
 
-from unmix_plugin.viewer.settling import WAIT_S, Settling
+from unmix_plugin.viewer.debounce import WAIT_S, Debounced
 
 
 def test_work_is_done_once_after_the_last_event():
     now, done = [0.0], []
-    field = Settling(lambda: done.append(now[0]), lambda: now[0])
+    field = Debounced(lambda: done.append(now[0]), lambda: now[0])
     for _ in range(5):
         field.note()
         now[0] += WAIT_S / 2
@@ -21,7 +21,7 @@ def test_work_is_done_once_after_the_last_event():
 
 def test_work_can_be_finished_at_once_and_only_if_there_is_some():
     done = []
-    field = Settling(lambda: done.append(1), lambda: 0.0)
+    field = Debounced(lambda: done.append(1), lambda: 0.0)
     field.finish()
     assert done == []
     field.note()

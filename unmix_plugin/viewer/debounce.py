@@ -1,4 +1,4 @@
-"""Text fields are read when they have been left alone for a moment: browsers send every letter."""
+"""Text fields are read once typing has paused: browsers send every letter."""
 
 from __future__ import annotations
 
@@ -7,18 +7,14 @@ import time
 from collections.abc import Callable
 
 WAIT_S = 0.4
-"""How long a field must be left alone."""
+"""How long typing must pause."""
 
 
-class Settling:
+class Debounced:
     """Work that waits until its events have stopped coming."""
 
     def __init__(self, work: Callable[[], None], clock: Callable[[], float] = time.monotonic) -> None:
-        """
-        Args:
-            work: What to do once, after the last event.
-            clock: Tells seconds.
-        """
+        """`work` is done once, after the last event; `clock` tells seconds."""
         self._work, self._clock = work, clock
         self._due_s: float | None = None
         self._lock = threading.Lock()
