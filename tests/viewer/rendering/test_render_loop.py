@@ -3,6 +3,7 @@
 The loop is driven by hand, piece by piece; its own thread is the subject of two tests at the end.
 """
 
+import threading
 import time
 from contextlib import contextmanager
 from dataclasses import replace
@@ -250,6 +251,27 @@ def test_other_light_is_shown_without_rendering_and_other_shapes_with(loop, scre
     assert rendered
     loop.change_edit(screen.view, Edit())
     assert np.array_equal(finest(loop, screen).picture, before)
+
+
+def test_pages_need_not_wait_for_a_picture_that_is_being_refined(source):
+    maker = PictureMaker(source, SceneAids(source, has_materials=True), num_channels=9)
+    render, blocks, ended = FrameRender(camera_of(some_pose(), 2048)), [], threading.Event()
+
+    def refine():
+        while not ended.is_set() and render.rays_left > 2048:
+            maker.advance(render, Edit(), 2048, cost=1.0)
+            blocks.append(render.rays_left)
+
+    thread = threading.Thread(target=refine)
+    thread.start()
+    try:
+        for _ in range(20):
+            before = len(blocks)
+            maker.edited(Edit())
+            assert len(blocks) - before <= 3
+    finally:
+        ended.set()
+        thread.join()
 
 
 def test_removed_materials_leave_no_faint_specks(loop, screen):

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 
 import torch
@@ -36,6 +37,9 @@ RESTING_COST = 6.0
 REFRESH_S = 2.0
 """How long one picture of a client at rest should take while training."""
 
+_LONGEST_WAIT_S = 1.0
+"""How long rendering waits for pages that ask for the device."""
+
 _TRACE_OPACITY = 0.25
 """Opacity under which a pixel counts as empty once materials are removed."""
 
@@ -63,6 +67,7 @@ class PictureMaker:
         self.speed = Speedometer()
         self.source = source
         self._aids = aids
+        self._queue, self._num_asking = threading.Condition(), 0
         self._layers = layers
         self._largest_pixels = max(256, LARGEST_FRAME_BYTES // (4 * num_channels))
 
@@ -96,6 +101,8 @@ class PictureMaker:
         Raises:
             UnmixError: the edit does not fit the run.
         """
+        with self._queue:
+            self._queue.wait_for(lambda: self._num_asking == 0, _LONGEST_WAIT_S)
         with self.source.borrowed(cost) as scene, torch.no_grad():
             shown = edit.apply(scene, self.source.version, self._aids.see)
             started = time.perf_counter()
@@ -141,10 +148,21 @@ class PictureMaker:
         with self._edited(edit) as (_, shown):
             return shown
 
+    def _ask(self, change: int) -> None:
+        """Note that a page waits for the device, or no longer: else the render loop would take turn after turn."""
+        with self._queue:
+            self._num_asking += change
+            self._queue.notify_all()
+
     @contextmanager
     def _edited(self, edit: Edit) -> Iterator[tuple[TrainedScene, TrainedScene]]:
         """Context with the scene before and after an edit, and the device."""
-        with self.source.borrowed_materials() as scene:
+        self._ask(1)
+        with ExitStack() as stack:
+            try:
+                scene = stack.enter_context(self.source.borrowed_materials())
+            finally:
+                self._ask(-1)
             shown = edit.apply(scene, self.source.version, self._aids.see)
             yield scene, require_materials(shown, "of this run")
 
