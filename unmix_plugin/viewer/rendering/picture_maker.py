@@ -190,7 +190,9 @@ class PictureMaker:
 
 def _without_traces(frame: RenderedView) -> RenderedView:
     """A frame without the faint specks that removed materials leave where they were mixed with others."""
-    field = frame.scene.field if isinstance(frame, MaterialView) else None
+    if not isinstance(frame, MaterialView):
+        return frame
+    field = frame.scene.field
     if not isinstance(field, EditedField) or bool(field.is_kept.all()):
         return frame
     is_left = (frame.opacity >= _TRACE_OPACITY)[..., None]
