@@ -22,6 +22,7 @@ from unmix_plugin.model import UnmixModel
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.trained.snapshot import unmix_scene
+from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.layers.layer import layer_named
 from unmix_plugin.viewer.layers.layer_aids import LayerAids
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings
@@ -79,12 +80,14 @@ def make_services(source: SceneSource) -> Services:
 def make_frame(source: SceneSource, camera: Cameras | None = None) -> MaterialView:
     """A rendered view."""
     with source.borrowed() as scene:
+        assert isinstance(scene, TrainedScene)
         return scene.look(source.record.train_cameras[0] if camera is None else camera, subpixels=1)
 
 
 def make_aids(source: SceneSource) -> LayerAids:
     """What layers need."""
     with source.borrowed() as scene:
+        assert isinstance(scene, TrainedScene)
         return LayerAids(render_reference(scene, source.record.train_cameras), source.record.scene_box)
 
 

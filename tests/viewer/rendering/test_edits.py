@@ -10,6 +10,7 @@ from tests.method_factory import make_model, scene_of
 from tests.viewer.view_factory import ring
 from unmix_plugin.editing import Gloss, Light, Recipe, Remove, Rename, Retint, Scale, Swap, sample_seen
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.rendering import edits
 from unmix_plugin.viewer.rendering.edits import Edit
 
@@ -31,6 +32,7 @@ def test_no_edit_is_the_scene_itself(scene):
 def test_an_edit_leaves_the_scene_alone(scene):
     before = scene.materials.endmembers.clone()
     edited = Edit(Recipe((Scale(0, 2.0), Rename(1, "clay")), Light("A"))).apply(scene, 0, unseen)
+    assert isinstance(edited, TrainedScene)
     assert_close(scene.materials.endmembers, before)
     assert edited.materials.names[1] == "clay"
     assert not torch.allclose(edited.materials.endmembers, before)
@@ -52,7 +54,9 @@ def test_an_edited_scene_follows_a_training_but_not_every_step(scene, monkeypatc
     assert edit.apply(scene, 2, unseen) is first
     monkeypatch.setattr(edits, "_RENEWAL_S", 0.0)
     trained = replace(scene, materials=replace(scene.materials, endmembers=torch.full((3, 5), 0.4)))
-    assert_close(edit.apply(trained, 3, unseen).materials.endmembers[0], torch.full((5,), 0.2))
+    renewed = edit.apply(trained, 3, unseen)
+    assert isinstance(renewed, TrainedScene)
+    assert_close(renewed.materials.endmembers[0], torch.full((5,), 0.2))
 
 
 def test_pictures_are_looked_at_only_for_edits_that_depend_on_them(scene):

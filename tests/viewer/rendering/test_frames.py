@@ -5,6 +5,8 @@ import torch
 from torch.testing import assert_close
 
 from tests.viewer.view_factory import make_frame, make_source
+from unmix_plugin.trained.material_view import MaterialView
+from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.rendering.frames import FrameRender, num_channels
 from unmix_plugin.viewer.view_cameras import camera_of, pose_of
 
@@ -16,12 +18,14 @@ def test_blocks_give_what_the_scene_gives_at_once(tmp_path, subpixels, block, sp
     source = make_source(tmp_path, specular=specular)
     camera = camera_of(pose_of(source.record.train_cameras[0]), 6)
     with source.borrowed() as scene:
+        assert isinstance(scene, TrainedScene)
         expected = scene.look(camera, subpixels).coefficients
         render = FrameRender(camera, subpixels)
         total = 0
         while render.rays_left:
             total += render.render_block(scene, block)
         frame = render.frame(scene)
+        assert isinstance(frame, MaterialView)
         assert num_channels(scene.materials) == expected.packed.shape[-1]
     assert total == render.num_rays == camera.width * camera.height * subpixels**2
     assert frame.coefficients.num_endmembers == expected.num_endmembers

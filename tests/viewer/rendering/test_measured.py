@@ -131,4 +131,5 @@ def test_a_click_takes_one_device_turn_and_is_measured_in_it(views, scene, sourc
     assert len(turns) == 1
     assert taken.measured_in == scene.frames[scene.train_indices[1]].name
     expected = scene.cube(scene.train_indices[1])[camera.height // 2, camera.width // 2]
+    assert taken.measured is not None
     np.testing.assert_allclose(taken.measured, expected)

@@ -17,6 +17,7 @@ from tests.viewer.view_factory import Screen, some_pose, source_of_model
 from unmix_plugin.editing import Light, Recipe, Remove, Scale
 from unmix_plugin.engine.training.training_control import TrainingControl
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings
 from unmix_plugin.viewer.rendering.edits import Edit
 from unmix_plugin.viewer.rendering.frames import FrameRender, num_channels
@@ -409,6 +410,6 @@ def test_when_training_ends_the_finest_picture_shows_its_last_step(tmp_path):
                     model.endmembers.mul_(0.5)
         version = source.version
         screen.wait_until(lambda: screen.view.frame_version == version and not screen.shown[-1].is_moving)
-        assert screen.view.frame is not None
+        assert isinstance(screen.view.frame, MaterialView)
         shown = screen.view.frame.materials.endmembers
         torch.testing.assert_close(shown, model.endmembers.detach())
