@@ -143,7 +143,7 @@ _FOUND: dict[str, EndmemberMethod | Literal["truth"]] = {
     "VCA": "vca",
     "N-FINDR": "nfindr",
     "minimum volume": "minimum-volume",
-    "pairs": "pairs",
+    "pairs": "pooled-pairs",
     "oracle": "truth",
 }
 METHODS: dict[str, PixelMethod] = {"k-means of raw spectra": PixelMethod("raw k-means", _by_distance)} | {

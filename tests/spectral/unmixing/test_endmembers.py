@@ -8,7 +8,7 @@ from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.metrics import spectral_angle
 from unmix_plugin.spectral.unmixing.endmembers import drop_uninformative_pixels, initialise_endmembers
 
-METHODS = ["kmeans", "vca", "nfindr", "minimum-volume", "pairs"]
+METHODS = ["kmeans", "vca", "nfindr", "minimum-volume", "pairs", "pooled-pairs"]
 
 
 def shaded_scene(num_endmembers, num_mixtures=200, seed=0):

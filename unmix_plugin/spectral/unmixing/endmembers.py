@@ -15,10 +15,11 @@ from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.unmixing.kmeans_normalised import normalised_kmeans, scale_to_lit_pixels
 from unmix_plugin.spectral.unmixing.minimum_volume import minimum_volume_simplex
 from unmix_plugin.spectral.unmixing.nfindr_winter1999 import nfindr
+from unmix_plugin.spectral.unmixing.pooled_pairs import pooled_pair_endmembers
 from unmix_plugin.spectral.unmixing.two_material_mixtures import two_material_endmembers
 from unmix_plugin.spectral.unmixing.vca_nascimento2005 import vca
 
-EndmemberMethod = Literal["kmeans", "vca", "nfindr", "minimum-volume", "pairs"]
+EndmemberMethod = Literal["kmeans", "vca", "nfindr", "minimum-volume", "pairs", "pooled-pairs"]
 
 _VCA_DRAWS = 5
 """Of which that of the largest simplex stays. The other methods restart by themselves, as often."""
@@ -81,7 +82,7 @@ def has_spectral_shape(pixels: Float[Tensor, "N B"]) -> Bool[Tensor, " N"]:
 def _shapes(
     usable: Float[Tensor, "N B"],
     num_endmembers: int,
-    method: Literal["vca", "nfindr", "minimum-volume", "pairs"],
+    method: Literal["vca", "nfindr", "minimum-volume", "pairs", "pooled-pairs"],
     generator: torch.Generator,
 ) -> Float[Tensor, "K B"]:
     """Endmembers of any brightness."""
@@ -90,6 +91,8 @@ def _shapes(
         return max(draws, key=_log_volume)
     if method == "minimum-volume":
         return minimum_volume_simplex(usable, num_endmembers, generator)
+    if method == "pooled-pairs":
+        return pooled_pair_endmembers(usable, num_endmembers, generator)
     if method == "pairs":
         return two_material_endmembers(usable, num_endmembers, generator)
     # On spectra of one brightness: otherwise the darkest pixels are the corners of the largest simplex.

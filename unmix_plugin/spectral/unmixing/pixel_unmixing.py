@@ -20,7 +20,7 @@ def unmix_pixels(
     pixels: Float[Tensor, "N B"],
     num_endmembers: int,
     generator: torch.Generator,
-    method: EndmemberMethod = "pairs",
+    method: EndmemberMethod = "pooled-pairs",
 ) -> tuple[Float[Tensor, "K B"], Float[Tensor, "N K"]]:
     """Endmembers of these pixels, and their abundances, at least 0 with sum 1; zeros for black pixels.
 

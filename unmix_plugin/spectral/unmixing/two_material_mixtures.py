@@ -10,8 +10,7 @@ grows the set one by one and swaps members while that helps, as in partitioning 
 1990).
 
 Notation: `N` pixels that judge, `B` bands, `M` candidates, `K` endmembers. All spectra have length 1, which removes
-shading; the distance of a pixel to a cone is then the sine of the angle between them. The shape of a dark pixel is
-mostly noise, so its distance counts by the root of its length.
+shading; the distance of a pixel to a cone is then the sine of the angle between them.
 """
 
 from __future__ import annotations
@@ -29,28 +28,14 @@ from unmix_plugin.spectral.unmixing.kmeans_normalised import normalised_kmeans
 MOST_ENDMEMBERS = 64
 """More are not searched for: time and memory grow with the square of the candidates."""
 
-_DRAWS = 5
-"""Sets of candidates that are searched one by one; the winners of all are candidates of the last search."""
-_NUM_CANDIDATES = 80
-_NUM_SEEDS = 10_000
-"""Pixels of which the candidates of a draw are the cluster means."""
-_ITERATIONS = 10
-_NUM_JUDGES = 1500
-
-_DARK = 0.3
-"""Length below which a distance counts less, as a share of that of bright pixels (95th percentile)."""
-_POWER = 1.2
-"""Of a distance in the cost: squared, highlights would choose; by itself, the variability of a common material would
-outweigh a rare one."""
+NUM_CANDIDATES = 80
+_NUM_JUDGES = 3000
 
 _DISTINCT = 4e-10
 """Squared distance above which unit spectra are distinct; k-means then finds at least as many shapes."""
 
-_SAME_MATERIAL = 0.995
-"""Cosine above which members of two sets are one material: an angle of 0.1 rad."""
-
 _LEAST_GAIN = 1e-7
-"""Least fall of the mean cost that counts: rounding errors must not swap for ever."""
+"""Least fall of the mean distance that counts: rounding errors must not swap for ever."""
 
 
 @dataclass(frozen=True)
@@ -80,19 +65,16 @@ def two_material_fits(
             f"mixtures of two are searched for 1 to {MOST_ENDMEMBERS} endmembers; {most_endmembers} were asked for; "
             "ask for fewer or take another method"
         )
-    num_candidates = max(1, min(_NUM_CANDIDATES, _count_shapes(pixels, _NUM_CANDIDATES)))
-    judges = _some(pixels, _NUM_JUDGES, generator).double()
-    pool, draws = [], []
-    for _ in range(_DRAWS if num_candidates == _NUM_CANDIDATES else 1):
-        candidates = _candidates(pixels, num_candidates, generator)
-        sets = _grown_sets(judges, candidates, most_endmembers)
-        pool.append(candidates[sorted({index for chosen in sets for index in chosen})])
-        draws.append([candidates[chosen] for chosen in sets])
-    candidates = torch.cat(pool)
-    fits = []
-    for chosen, *drawn in zip(_grown_sets(judges, candidates, most_endmembers), *draws, strict=False):
-        spectra = _averaged(candidates[chosen], drawn).to(pixels.dtype)
-        fits.append(TwoMaterialFit(spectra, mean_pair_distance(judges, spectra)))
+    num_candidates = max(1, min(NUM_CANDIDATES, count_shapes(pixels, NUM_CANDIDATES)))
+    candidates = normalised_kmeans(pixels, num_candidates, generator, restarts=1).endmembers
+    judges = pixels[torch.randperm(len(pixels), generator=generator)[:_NUM_JUDGES].to(pixels.device)]
+    candidates = normalize(candidates.double(), dim=1)
+    search = PairSearch(distances_to_pairs(normalize(judges.double(), dim=1), candidates))
+    fits, chosen = [], []
+    for _ in range(min(most_endmembers, num_candidates)):
+        chosen = search.improved(search.grown(chosen))
+        spectra = candidates[chosen].to(pixels.dtype)
+        fits.append(TwoMaterialFit(spectra, float(search.distances(chosen).mean())))
     return fits
 
 
@@ -145,48 +127,16 @@ def mean_pair_distance(pixels: Float[Tensor, "N B"], endmembers: Float[Tensor, "
     return float(torch.cat(nearest).mean()) if len(pixels) else 0.0
 
 
-def _some(pixels: Float[Tensor, "N B"], count: int, generator: torch.Generator) -> Float[Tensor, "n B"]:
-    return pixels[torch.randperm(len(pixels), generator=generator)[:count].to(pixels.device)]
+class PairSearch:
+    """Sets of candidates, judged by the mean distance of pixels to the nearest pair in the set."""
 
+    def __init__(self, pair_distances: Float[Tensor, "M M N"]) -> None:
+        self._pairs = pair_distances
+        every = torch.arange(len(pair_distances), device=pair_distances.device)
+        self._alone = pair_distances[every, every]
 
-def _candidates(pixels: Float[Tensor, "N B"], count: int, generator: torch.Generator) -> Float[Tensor, "M B"]:
-    """Mean shapes of clusters of some of the pixels; of all if those show fewer shapes."""
-    few = _some(pixels, _NUM_SEEDS, generator)
-    few = few if _count_shapes(few, count) == count else pixels
-    means = normalised_kmeans(few, count, generator, restarts=1, max_iterations=_ITERATIONS).endmembers
-    return normalize(means.double(), dim=1)
-
-
-def _grown_sets(judges: Float[Tensor, "N B"], candidates: Float[Tensor, "M B"], most: int) -> list[list[int]]:
-    """The best sets found of 1, 2, ... candidates."""
-    lengths = judges.norm(dim=1)
-    weights = (lengths / (_DARK * lengths.quantile(0.95))).clamp(max=1).sqrt()
-    search = _Search(distances_to_pairs(normalize(judges, dim=1), candidates).pow_(_POWER).mul_(weights))
-    sets: list[list[int]] = [[]]
-    for _ in range(min(most, len(candidates))):
-        sets.append(search.improved(search.grown(sets[-1])))
-    return sets[1:]
-
-
-def _averaged(members: Float[Tensor, "K B"], draws: list[Float[Tensor, "K B"]]) -> Float[Tensor, "K B"]:
-    """Mean shape of each member and of what is the same in other sets: chance decides less."""
-    means = members.clone()
-    for drawn in draws:
-        nearest = (members @ drawn.T).max(dim=1)
-        means += torch.where((nearest.values > _SAME_MATERIAL)[:, None], drawn[nearest.indices], 0.0)
-    return normalize(means, dim=1)
-
-
-class _Search:
-    """Sets of candidates, judged by the mean cost of pixels at the best pair in the set."""
-
-    def __init__(self, pair_costs: Float[Tensor, "M M N"]) -> None:
-        self._pairs = pair_costs
-        every = torch.arange(len(pair_costs), device=pair_costs.device)
-        self._alone = pair_costs[every, every]
-
-    def costs(self, chosen: list[int]) -> Float[Tensor, " N"]:
-        """Of each pixel at its best pair; infinite without any."""
+    def distances(self, chosen: list[int]) -> Float[Tensor, " N"]:
+        """Of each pixel to the nearest pair; infinite without any."""
         if not chosen:
             return torch.full_like(self._alone[0], torch.inf)
         return self._pairs[chosen][:, chosen].flatten(0, 1).amin(dim=0)
@@ -199,7 +149,7 @@ class _Search:
 
     def improved(self, chosen: list[int]) -> list[int]:
         """Each member swapped for the best candidate in its place, until no swap helps."""
-        cost = float(self.costs(chosen).mean())
+        cost = float(self.distances(chosen).mean())
         is_better = True
         while is_better:
             is_better = False
@@ -213,14 +163,14 @@ class _Search:
         return chosen
 
     def _costs_with_each(self, chosen: list[int]) -> Float[Tensor, " M"]:
-        """Mean cost if a candidate joined, for every candidate."""
+        """Mean distance if a candidate joined, for every candidate."""
         nearest = self._alone
         if chosen:
             nearest = torch.minimum(nearest, self._pairs[:, chosen].amin(dim=1))
-        return torch.minimum(nearest, self.costs(chosen)).mean(dim=1)
+        return torch.minimum(nearest, self.distances(chosen)).mean(dim=1)
 
 
-def _count_shapes(pixels: Float[Tensor, "N B"], enough: int) -> int:
+def count_shapes(pixels: Float[Tensor, "N B"], enough: int) -> int:
     """Number of distinct shapes; counting stops at `enough`."""
     left, count = normalize(pixels, dim=1), 0
     while count < enough and len(left) > 0:
