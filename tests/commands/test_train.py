@@ -108,7 +108,7 @@ def test_a_limit_given_alone_is_the_only_limit(words, iterations, seconds):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["unmix-nref", "--data", "demo"], "did you mean unmix-nerf?"),
+        (["unmix-nref", "--data", "demo"], "did you mean unmix-nerf or unmix-nerf-published?"),
         ([], "say which method to train first"),
         (["--data", "demo"], "say which method to train first"),
         (["unmix-nerf"], "give its folder with --data"),
