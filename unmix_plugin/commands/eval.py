@@ -62,7 +62,7 @@ def evaluate(argv: list[str]) -> None:
 
     from unmix_plugin.commands.eval_by_model import evaluate_by_model
     from unmix_plugin.commands.reporting import CommandConsole, working
-    from unmix_plugin.commands.run_choice import chosen_run
+    from unmix_plugin.commands.run_choice import chosen_run, spectral_scene
     from unmix_plugin.editing.edited_run import requested_recipe
     from unmix_plugin.engine.runs.load_run import load_pipeline
 
@@ -71,7 +71,7 @@ def evaluate(argv: list[str]) -> None:
     recipe = requested_recipe(options.edits, options.illuminant)
     with working(console, f"reading {path} and its scene"):
         loaded = load_pipeline(path, options.device, options.data)
-    if recipe is None and not _has_spectral_scene(loaded):
+    if recipe is None and spectral_scene(loaded.pipeline.datamanager) is None:
         evaluate_by_model(loaded, console)
         return
     subject = _subject(loaded, recipe, options)
@@ -118,18 +118,12 @@ def _subject(loaded: LoadedPipeline, recipe: Recipe | None, options: EvalOptions
     return _Subject(loaded, edited, factors, folder, recipe_to_yaml(recipe))
 
 
-def _has_spectral_scene(loaded: LoadedPipeline) -> bool:
-    from unmix_plugin.scenes.scene import Scene
-
-    return isinstance(getattr(loaded.pipeline.datamanager, "scene", None), Scene)
-
-
 def _scene_of(loaded: LoadedPipeline) -> Scene:
+    from unmix_plugin.commands.run_choice import spectral_scene
     from unmix_plugin.errors import ConfigError
-    from unmix_plugin.scenes.scene import Scene
 
-    scene = getattr(loaded.pipeline.datamanager, "scene", None)
-    if not isinstance(scene, Scene):
+    scene = spectral_scene(loaded.pipeline.datamanager)
+    if scene is None:
         raise ConfigError(
             f"{loaded.run.path} is a run of {loaded.config.method_name}, which has no spectral scene"
         )

@@ -135,10 +135,10 @@ def _scene_of(trainer: Trainer) -> Scene:
     Raises:
         ConfigError: its data manager has none.
     """
-    from unmix_plugin.scenes.scene import Scene
+    from unmix_plugin.commands.run_choice import spectral_scene
 
-    scene = getattr(trainer.pipeline.datamanager, "scene", None)
-    if not isinstance(scene, Scene):
+    scene = spectral_scene(trainer.pipeline.datamanager)
+    if scene is None:
         raise ConfigError(f"{trainer.config.method_name} has no spectral scene")
     return scene
 
