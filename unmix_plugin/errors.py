@@ -12,6 +12,10 @@ class UnmixError(Exception):
     """Base of every error whose cause a user can mend."""
 
 
+class CaptureError(UnmixError):
+    """Files of an instrument are missing, damaged, of an unknown kind, or contradict each other."""
+
+
 class SceneError(UnmixError):
     """The input scene is missing, malformed or contradicts itself."""
 

@@ -1,0 +1,1 @@
+"""Layouts of data sets: one file each, from a folder to a `Capture`."""

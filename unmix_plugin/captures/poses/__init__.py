@@ -1,0 +1,1 @@
+"""Poses of other programs, read or estimated, as a `PoseSet`."""

@@ -1,0 +1,129 @@
+"""A file of an instrument, opened but not read: what it says of itself, and its numbers by rows and bands.
+
+Notation: `H` rows, `W` columns, `B` bands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int, Shaped
+
+from unmix_plugin.errors import CaptureError
+
+BandIndex: TypeAlias = slice | Int[np.ndarray, " b"]
+"""Some bands: a slice, or their indices in any order."""
+ReadPart: TypeAlias = Callable[[slice, BandIndex], Shaped[np.ndarray, "h W b"]]
+"""Stored numbers of some rows and bands."""
+
+
+@dataclass(frozen=True)
+class BandTable:
+    """What a file says of its bands; None where it says nothing."""
+
+    wavelengths_nm: Float64[np.ndarray, " B"] | None = None
+    """Band centres in nm, in the order of the file."""
+    evidence: str = "the file gives no wavelengths"
+    """Where the wavelengths stand and in which unit, for people: `header field 'wavelength', Micrometers`."""
+    fwhm_nm: Float64[np.ndarray, " B"] | None = None
+    """Full width at half maximum of each band, nm."""
+    bad: Bool[np.ndarray, " B"] | None = None
+    """Bands that the file itself marks as bad."""
+
+
+@dataclass(frozen=True)
+class SpectralFile:
+    """One image of (H, W, B) numbers on disk."""
+
+    path: Path
+    """The file that was named: a header where there is one."""
+    reader: str
+    """Name of the reader: envi, tiff, exr, matlab, hdf5, npy, png, torch."""
+    shape: tuple[int, int, int]
+    """H, W, B."""
+    dtype: np.dtype
+    """Type of the stored numbers, in any byte order."""
+    read_part: ReadPart = field(repr=False)
+    """How `read` gets its numbers."""
+    bands: BandTable = BandTable()
+    interleave: str | None = None
+    """bsq, bil or bip where the format has a choice."""
+    scale: float | None = None
+    """Stored number that stands for 1, if the file says so."""
+    no_data: float | None = None
+    """Stored number that stands for no measurement."""
+    notes: tuple[str, ...] = ()
+    """What is odd about the file, one sentence each."""
+    metadata: dict[str, Any] = field(default_factory=dict)
+    """Other facts by name, as JSON-able values: exposure_s, gain, black_level, xmp, ..."""
+    sources: tuple[Path, ...] = ()
+    """Files that hold the numbers, where they are not `path` alone."""
+
+    def read(self, rows: slice = slice(None), bands: BandIndex = slice(None)) -> Shaped[np.ndarray, "h W b"]:
+        """Stored numbers of some rows and bands, in the machine's byte order.
+
+        Raises:
+            CaptureError: the file is cut short or can't be read.
+        """
+        values = self.read_part(rows, bands)
+        return np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("="))
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Every file that `read` depends on, `path` first."""
+        return (self.path, *(source for source in self.sources if source != self.path))
+
+
+def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
+    """Files of one view that hold some bands each, as one file with all of them, in the order given.
+
+    Args:
+        parts: At least one, all of one size.
+        path: What the whole is called in messages: the folder that holds them.
+    Raises:
+        CaptureError: their sizes differ.
+    """
+    first = parts[0]
+    for part in parts:
+        if part.shape[:2] != first.shape[:2]:
+            raise CaptureError(
+                f"{part.path} has {part.shape[0]} x {part.shape[1]} pixels; expected the "
+                f"{first.shape[0]} x {first.shape[1]} of {first.path}: the bands of one view have one size"
+            )
+    owner = np.concatenate([np.full(part.shape[2], index) for index, part in enumerate(parts)])
+    within = np.concatenate([np.arange(part.shape[2]) for part in parts])
+
+    def read_part(rows: slice, bands: BandIndex) -> np.ndarray:
+        wanted = np.arange(len(owner))[bands]
+        return np.concatenate([parts[owner[band]].read(rows, within[[band]]) for band in wanted], axis=-1)
+
+    return replace(
+        first,
+        path=path,
+        shape=(*first.shape[:2], len(owner)),
+        dtype=np.result_type(*(part.dtype for part in parts)),
+        read_part=read_part,
+        bands=_stack_tables([(part.bands, part.shape[2]) for part in parts]),
+        notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
+        sources=tuple(source for part in parts for source in part.files),
+    )
+
+
+def _stack_tables(tables: list[tuple[BandTable, int]]) -> BandTable:
+    """One table of several; a column that some table lacks is lacking, but bands without a mark are good."""
+
+    def join(columns: list[np.ndarray | None]) -> np.ndarray | None:
+        known = [column for column in columns if column is not None]
+        return np.concatenate(known) if len(known) == len(columns) else None
+
+    marks = [np.zeros(bands, bool) if table.bad is None else table.bad for table, bands in tables]
+    return BandTable(
+        join([table.wavelengths_nm for table, _ in tables]),
+        tables[0][0].evidence,
+        join([table.fwhm_nm for table, _ in tables]),
+        np.concatenate(marks) if any(table.bad is not None for table, _ in tables) else None,
+    )
