@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from unmix_plugin.commands import reporting
-from unmix_plugin.commands.reporting import saying_when_kernels_compile
+from unmix_plugin.commands.reporting import announce_kernel_compilation
 from unmix_plugin.rendering.launching import warp
 
 
@@ -17,7 +17,7 @@ def test_compiling_is_said_only_when_a_kernel_is_not_in_the_cache(tmp_path, monk
     monkeypatch.setattr(warp().config, "kernel_cache_dir", str(tmp_path))
     out, is_said = io.StringIO(), threading.Event()
     monkeypatch.setattr(reporting, "say", lambda console, text: (console.print(text), is_said.set()))
-    with saying_when_kernels_compile(Console(file=out)):
+    with announce_kernel_compilation(Console(file=out)):
         if compiles:
             (tmp_path / "wp_module_new").mkdir()
             assert is_said.wait(20)

@@ -10,7 +10,7 @@ from torch.testing import assert_close
 from tests.editing.scenes import CAMERAS, LIGHT, edited, lit_scene
 from unmix_plugin.editing import sample_seen
 from unmix_plugin.editing.material_state import MaterialState
-from unmix_plugin.editing.seen import Look, look_at
+from unmix_plugin.editing.seen import Appearance, appearance_of
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.spectral.coefficients import Coefficients
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
@@ -78,14 +78,14 @@ def test_highlights_count_in_the_mean_and_mixtures_hardly():
 
 
 def test_a_shaded_material_may_be_brighter_than_white_in_full_light_but_not_where_it_is_seen():
-    look = Look(np.linspace(0.2, 0.5, 100), np.zeros((100, 3)), np.ones(100))
-    assert look.greatest_reflectance == pytest.approx(1 / 0.485, rel=0.01)
-    assert Look(np.full(9, 2.0), np.zeros((9, 3)), np.ones(9)).greatest_reflectance == 1
+    appearance = Appearance(np.linspace(0.2, 0.5, 100), np.zeros((100, 3)), np.ones(100))
+    assert appearance.greatest_reflectance == pytest.approx(1 / 0.485, rel=0.01)
+    assert Appearance(np.full(9, 2.0), np.zeros((9, 3)), np.ones(9)).greatest_reflectance == 1
 
 
 def test_where_the_rest_of_the_pixels_is_too_bright_the_nearest_colour_is_taken():
-    look = Look(np.full(20, 0.5), np.full((20, 3), [0.3, 0.0, 0.0]), np.ones(20))
-    np.testing.assert_allclose(look.full_colour((0.2, 0.0, 0.5)), [0.0, 0.0, 2 * 0.21404], atol=1e-4)
+    appearance = Appearance(np.full(20, 0.5), np.full((20, 3), [0.3, 0.0, 0.0]), np.ones(20))
+    np.testing.assert_allclose(appearance.full_colour((0.2, 0.0, 0.5)), [0.0, 0.0, 2 * 0.21404], atol=1e-4)
 
 
 def test_a_colour_that_pictures_cannot_have_becomes_the_nearest_that_they_can():
@@ -100,14 +100,14 @@ def test_a_colour_that_pictures_cannot_have_becomes_the_nearest_that_they_can():
     )  # all that the bound allows
 
 
-def test_endmembers_that_are_hardly_seen_have_no_look():
+def test_endmembers_that_are_hardly_seen_have_no_appearance():
     materials = lit_scene().materials
-    looks = [
-        look_at(MaterialState.of(materials, None, seen_pixels([0.5] * count)), index)
+    appearances = [
+        appearance_of(MaterialState.of(materials, None, seen_pixels([0.5] * count)), index)
         for count, index in ((15, 0), (16, 0), (50, 2))
     ]
-    assert [look is None for look in looks] == [True, False, True]
-    assert look_at(MaterialState.of(materials, None, None), 0) is None
+    assert [appearance is None for appearance in appearances] == [True, False, True]
+    assert appearance_of(MaterialState.of(materials, None, None), 0) is None
 
 
 def test_what_is_seen_is_sampled_from_coarse_pictures_of_several_views():

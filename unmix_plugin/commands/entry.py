@@ -41,7 +41,7 @@ _MEMORY_ADVICE = (
 
 
 def run_command(command: Callable[[list[str]], object], arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run a command and leave the process with the exit code that its end deserves.
+    """Run a command and leave the process with the matching exit code.
 
     Every command understands `--debug`, which it never sees itself: errors then come with their traceback.
 

@@ -37,7 +37,7 @@ def working(console: Console, doing: str) -> Iterator[None]:
 
 
 @contextmanager
-def saying_when_kernels_compile(console: Console) -> Iterator[None]:
+def announce_kernel_compilation(console: Console) -> Iterator[None]:
     """Context that says so if the kernels it needs are not in Warp's cache, as happens once on a machine."""
     from unmix_plugin.rendering.launching import warp
 

@@ -47,14 +47,14 @@ def train(argv: list[str]) -> None:
 
 def _prepared(config: TrainerConfig, console: Console) -> Trainer:
     """The trainer, with everything read and compiled that training needs."""
-    from unmix_plugin.commands.reporting import say, saying_when_kernels_compile, working
+    from unmix_plugin.commands.reporting import announce_kernel_compilation, say, working
     from unmix_plugin.engine.training.trainer import Trainer
 
     with nullcontext() if config.data is None else working(console, f"reading {config.data}"):
         trainer = Trainer(config, console=console)
     if trainer.pipeline.reasons:
         say(console, trainer.pipeline.reasons)
-    with saying_when_kernels_compile(console):
+    with announce_kernel_compilation(console):
         trainer.pipeline.model.warm_up()
     data = trainer.pipeline.datamanager
     say(

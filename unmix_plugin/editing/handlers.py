@@ -25,7 +25,7 @@ from unmix_plugin.editing.operations import (
 )
 from unmix_plugin.editing.recipe import Recipe
 from unmix_plugin.editing.retint import LitReflectance, retinted
-from unmix_plugin.editing.seen import look_at
+from unmix_plugin.editing.seen import appearance_of
 from unmix_plugin.errors import ConfigError, SpectrumError, UnmixError
 from unmix_plugin.figures.plotting import css_colour
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, srgb_to_linear
@@ -103,7 +103,7 @@ def _library_of(spectrum: LibrarySpectrum | FileSpectrum) -> tuple[MaterialLibra
 def _retint(state: MaterialState, edit: Retint, where: str) -> None:
     index = state.index_of(edit.endmember)
     state.note(_RETINTED, index, where)
-    seen = look_at(state, index) if edit.match == "picture" else None
+    seen = appearance_of(state, index) if edit.match == "picture" else None
     is_lit = state.light > DARK_LIGHT * state.light.max()
     light = np.where(is_lit, state.light, 0.0)
     reflectance = np.where(is_lit, state.spectra[index] / np.where(is_lit, light, 1.0), 0.0)
@@ -116,10 +116,10 @@ def _retint(state: MaterialState, edit: Retint, where: str) -> None:
         reached = seen.mean_srgb(changed @ surface.to_linear_rgb)
     state.spectra[index] = changed * light
     what = state.names[index] if seen is None else f"pictures of {state.names[index]}"
-    _tell_nearest(state, f"{where}: {what}", edit.colour, reached)
+    _note_nearest(state, f"{where}: {what}", edit.colour, reached)
 
 
-def _tell_nearest(state: MaterialState, what: str, asked: Colour, reached: np.ndarray) -> None:
+def _note_nearest(state: MaterialState, what: str, asked: Colour, reached: np.ndarray) -> None:
     """Note if a colour visibly differs from the one asked for."""
     if np.abs(reached - asked).max() > _VISIBLE_DIFFERENCE:
         state.notes.append(
@@ -170,7 +170,7 @@ def _gloss(state: MaterialState, edit: Gloss, where: str) -> None:
         white = LitReflectance(state.bands, flat, flat)
         mirror = retinted(white, _linear(edit.colour))
         state.mirror_reflectances[edit.colour] = mirror
-        _tell_nearest(state, f"{where}: highlights", edit.colour, _srgb(mirror @ white.to_linear_rgb))
+        _note_nearest(state, f"{where}: highlights", edit.colour, _srgb(mirror @ white.to_linear_rgb))
     for index in chosen:
         state.gloss[index] *= edit.scale
         if edit.colour is not None:

@@ -45,6 +45,6 @@ class Recipe:
         return any(isinstance(one, Retint) and one.match == "picture" for one in self.operations)
 
     @property
-    def removes_matter(self) -> bool:
+    def removes_parts(self) -> bool:
         """Whether anything becomes transparent."""
         return any(isinstance(one, Remove | Isolate) for one in self.operations)

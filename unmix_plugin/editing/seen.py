@@ -44,7 +44,7 @@ def sample_seen(scene: TrainedScene) -> Coefficients:
 
 
 @dataclass(frozen=True)
-class Look:
+class Appearance:
     """An endmember as cameras see it."""
 
     strengths: Float64[np.ndarray, " N"]
@@ -76,7 +76,7 @@ class Look:
         return np.average(linear_to_srgb(torch.from_numpy(shown)).numpy(), axis=0, weights=self.weights)
 
 
-def look_at(state: MaterialState, index: int) -> Look | None:
+def appearance_of(state: MaterialState, index: int) -> Appearance | None:
     """How an endmember looks among the materials as they are now; None where too little of it is seen to tell."""
     seen = state.seen
     if seen is None:
@@ -89,7 +89,7 @@ def look_at(state: MaterialState, index: int) -> Look | None:
     others = np.where(np.arange(scaled.shape[1]) == index, 0.0, scaled)
     spectra = others @ state.spectra + specular @ state.specular_spectra
     shares = _rows(seen.abundances[..., index] / seen.accumulation, is_its)
-    return Look(
+    return Appearance(
         scaled[:, index],
         spectra @ rgb_matrix(state.bands, torch.float64).numpy(),
         shares**_PURITY_EXPONENT,

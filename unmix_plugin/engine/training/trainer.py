@@ -164,14 +164,14 @@ class Trainer:
         self.log.write(f"saved step {self.step}")
 
     def _loop(self, stop: StopSignals, display: ProgressDisplay) -> None:
-        said_paused = False
+        was_paused = False
         while not (
             self._is_at_limit or stop.requested or self.control.is_stop_requested or display.is_closed
         ):
-            if self.control.is_paused is not said_paused:
-                said_paused = not said_paused
-                display.message(f"{'paused' if said_paused else 'resumed'} at step {self.step}")
-            if not said_paused:
+            if self.control.is_paused is not was_paused:
+                was_paused = not was_paused
+                display.message(f"{'paused' if was_paused else 'resumed'} at step {self.step}")
+            if not was_paused:
                 with self.control.device.training_turn():
                     self._iterate(display)
             elif self.control.wait_while_paused():

@@ -43,7 +43,8 @@ def check_cube_headers(
         if found != size:
             faults.add(
                 where,
-                f"the cube has {in_words(found)} pixels (width x height); expected {in_words(size)}, {size_from}",
+                f"the cube has {describe_size(found)} pixels (width x height); "
+                f"expected {describe_size(size)}, {size_from}",
             )
             headers[-1] = None
         if header.shape[2] != bands:
@@ -103,7 +104,7 @@ def check_abundances(
     if size is not None and found != size:
         faults.add(
             where,
-            f"has {in_words(found)} pixels (width x height); expected {in_words(size)} as the cubes have",
+            f"has {describe_size(found)} pixels (width x height); expected {describe_size(size)} as the cubes have",
         )
     if num_materials is not None and header.shape[2] != num_materials:
         faults.add(
@@ -114,7 +115,7 @@ def check_abundances(
         faults.add(where, "has abundances outside [0, 1] or NaN; expected fractions")
 
 
-def in_words(size: Size) -> str:
+def describe_size(size: Size) -> str:
     """Width x height."""
     return f"{size[1]} x {size[0]}"
 
@@ -192,6 +193,6 @@ def _stated_size(entry: SceneEntry, faults: Faults) -> Size | None:
         elif found != stated:
             faults.add(
                 frame.where,
-                f"'w' and 'h' say {in_words(found)}; expected {in_words(stated)}, one size for all frames",
+                f"'w' and 'h' say {describe_size(found)}; expected {describe_size(stated)}, one size for all frames",
             )
     return stated

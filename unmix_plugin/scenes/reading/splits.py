@@ -43,7 +43,7 @@ def split_frames(
         return Split((), ())
     if method == "lists" or (method == "auto" and entry.split_lists):
         split = _by_lists(entry, faults)
-    elif method == "filename" or (method == "auto" and _names_tell(entry)):
+    elif method == "filename" or (method == "auto" and _have_split_names(entry)):
         split = _by_name(entry, faults)
     else:
         split = _by_interval(len(entry.frames), interval, faults)
@@ -107,7 +107,7 @@ def _name_split(paths: dict[str, str]) -> str | None:
     return None
 
 
-def _names_tell(entry: SceneEntry) -> bool:
+def _have_split_names(entry: SceneEntry) -> bool:
     names = [_name_split(frame.paths) for frame in entry.frames]
     return None not in names and "train" in names and len(set(names)) > 1
 
