@@ -1,0 +1,167 @@
+"""From stored numbers to values: dark frame, white reference, exposure, binning.
+
+    value = (stored - dark) / (white - dark) * reflectance of the panel * exposure of white / exposure of view
+
+with what is not given left out. Notation: `h x W` pixels of the file, `n x w` of the result; `b` kept bands of the
+file, `c` bands of the result.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64
+
+from unmix_plugin.captures.calibration.raster import Raster
+from unmix_plugin.captures.calibration.references import Reference
+from unmix_plugin.captures.spectral_file import SpectralFile
+
+SRGB = "sRGB"
+"""Value of `metadata['encoding']` of pictures for people."""
+
+
+@dataclass(frozen=True)
+class WhiteReference:
+    """A white panel and what is known of it."""
+
+    reference: Reference
+    reflectance: Float64[np.ndarray, " B"]
+    """Of the panel at every band of the file, above 0."""
+    exposure: float | None = None
+    """Exposure time times gain of its image, in the unit of the cubes'; None where a file is silent."""
+
+
+@dataclass(frozen=True)
+class CalibratedRows:
+    """Some rows of a view."""
+
+    values: Float32[np.ndarray, "n w c"]
+    """Reflectance or radiance, finite; 0 where pixels are missing."""
+    saturated: Bool[np.ndarray, "n w c"]
+    """At the detector's top before calibration."""
+    missing: Bool[np.ndarray, "n w"]
+    """Pixels without a measurement."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """How the files of one sensor are calibrated."""
+
+    raster: Raster
+    bands: np.ndarray
+    """Indices of the kept bands in the file, in the order of the result."""
+    bin_bands: int = 1
+    """Neighbouring kept bands that become one; what does not fill one at the end is left out."""
+    dark: Reference | None = None
+    white: WhiteReference | None = None
+    saturation: float | None = None
+    """Stored number of a saturated pixel; None where none is known."""
+    gain: float = 1.0
+    """Factor on all values, such as 1/255 of pictures."""
+
+    @property
+    def num_bands(self) -> int:
+        """Bands of the result."""
+        return len(self.bands) // self.bin_bands
+
+    def rows(self, file: SpectralFile, first: int, last: int) -> CalibratedRows:
+        """Rows `first` to `last` (excluded) of the result from a view's file.
+
+        Raises:
+            CaptureError: the file can't be read.
+        """
+        rows, columns = self.raster.file_rows(first, last), self.raster.columns
+        stored = file.read(rows, self.bands)[:, columns]
+        missing = find_missing(stored, file.no_data)
+        saturated = np.zeros(stored.shape, bool) if self.saturation is None else stored >= self.saturation
+        values = self._values(file, stored, rows)
+        sound = np.isfinite(values).all(axis=-1) & ~missing
+        values[~sound] = 0.0
+        saturated[~sound] = False
+        return CalibratedRows(
+            self._binned_bands(self.raster.averaged(values)).astype(np.float32, copy=False),
+            self._any_band(self.raster.any_in_square(saturated)),
+            self.raster.any_in_square(~sound),
+        )
+
+    def _values(self, file: SpectralFile, stored: np.ndarray, rows: slice) -> Float32[np.ndarray, "h W b"]:
+        columns, bands = self.raster.columns, self.bands
+        values = (
+            srgb_to_linear(stored) if file.metadata.get("encoding") == SRGB else stored.astype(np.float32)
+        )
+        factor = np.float32(self.gain * exposure_factor(file, self.white))
+        if self.dark is not None:
+            values -= self.dark.rows(rows, columns, bands)
+        if self.white is not None:
+            factor = factor * self.white_gain(rows)
+        values *= factor
+        return values
+
+    def white_gain(self, rows: slice) -> Float32[np.ndarray, "h W b"]:
+        """Factors from counts above dark to reflectance; NaN where the white is not above the dark."""
+        assert self.white is not None
+        columns, bands = self.raster.columns, self.bands
+        light = self.white.reference.rows(rows, columns, bands)
+        if self.dark is not None:
+            light = light - self.dark.rows(rows, columns, bands)
+        light = np.where(light > 0, light, np.float32(np.nan))
+        return self.white.reflectance[bands].astype(np.float32) / light
+
+    def _binned_bands(self, values: np.ndarray) -> np.ndarray:
+        if self.bin_bands == 1:
+            return values
+        used = values[..., : self.num_bands * self.bin_bands]
+        return used.reshape(*values.shape[:-1], self.num_bands, self.bin_bands).mean(axis=-1)
+
+    def _any_band(self, marks: np.ndarray) -> np.ndarray:
+        if self.bin_bands == 1:
+            return marks
+        used = marks[..., : self.num_bands * self.bin_bands]
+        return np.any(used.reshape(*marks.shape[:-1], self.num_bands, self.bin_bands), axis=-1)
+
+
+def find_missing(stored: np.ndarray, no_data: float | None) -> Bool[np.ndarray, "h W"]:
+    """Pixels without a measurement: no number in some band, or the file's no-data value.
+
+    A no-data value of 0 is also what a dark pixel may read in a band, so that all bands must have it.
+    """
+    missing = np.zeros(stored.shape[:2], bool)
+    if stored.dtype.kind == "f":
+        missing |= ~np.isfinite(stored).all(axis=-1)
+    if no_data is not None and np.isfinite(no_data):
+        same = stored == stored.dtype.type(no_data) if _is_in_range(no_data, stored.dtype) else None
+        if same is not None:
+            missing |= same.all(axis=-1) if no_data == 0 else same.any(axis=-1)
+    return missing
+
+
+def srgb_to_linear(stored: np.ndarray) -> Float32[np.ndarray, "*shape"]:
+    """Linear light in [0, 1] of integers that are encoded as sRGB (IEC 61966-2-1:1999)."""
+    top = np.iinfo(stored.dtype).max
+    levels = np.arange(top + 1) / top
+    linear = np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
+    return linear.astype(np.float32)[stored]
+
+
+def exposure_of(file: SpectralFile) -> float | None:
+    """Exposure time times gain, where the file has the time."""
+    exposure, gain = file.metadata.get("exposure_s"), file.metadata.get("gain", 1.0)
+    if not isinstance(exposure, int | float) or not isinstance(gain, int | float):
+        return None
+    return float(exposure * gain) if exposure > 0 and gain > 0 else None
+
+
+def exposure_factor(file: SpectralFile, white: WhiteReference | None) -> float:
+    """What a view's values are multiplied by, so that exposures do not matter; 1 where one is not known."""
+    exposure = exposure_of(file)
+    if exposure is None or white is None or white.exposure is None:
+        return 1.0
+    return white.exposure / exposure
+
+
+def _is_in_range(number: float, dtype: np.dtype) -> bool:
+    if dtype.kind == "f":
+        return True
+    limits = np.iinfo(dtype)
+    return limits.min <= number <= limits.max and number == int(number)

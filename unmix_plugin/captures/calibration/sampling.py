@@ -1,0 +1,115 @@
+"""A first, cheap pass over some rows of every view: where the detector ends, which bands are bad, how bright it is.
+
+Notation: `N` sampled pixels, `B` bands of the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64
+
+from unmix_plugin.captures.calibration.calibration import Calibration
+from unmix_plugin.captures.spectral_file import SpectralFile
+
+ROWS_A_VIEW = 12
+MOST_PIXELS = 20000
+"""Of all views together."""
+DETECTOR_BITS = (8, 10, 12, 14, 16)
+LEAST_AT_TOP = 10
+"""Values that must stand at the greatest one before it counts as the detector's end."""
+CROWDING = 20.0
+"""Values at the greatest one, against the mean number at each value a little below it."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Calibrated pixels of all views of a sensor, at all bands of its files."""
+
+    values: Float32[np.ndarray, "N B"]
+    saturated: Bool[np.ndarray, "N B"]
+
+
+def sampled_rows(height: int) -> list[int]:
+    """Rows spread evenly over an image.
+
+    >>> sampled_rows(4), len(sampled_rows(1000))
+    ([0, 1, 2, 3], 12)
+    """
+    count = min(height, ROWS_A_VIEW)
+    return [int((index + 0.5) * height / count) for index in range(count)]
+
+
+def find_saturation(files: Sequence[SpectralFile]) -> tuple[float | None, str]:
+    """The stored number at which a detector ends, from a plateau at the greatest one, and the evidence.
+
+    Files of floating-point numbers have none, as they were processed.
+    """
+    dtype = files[0].dtype
+    if dtype.kind not in "iu" or dtype.itemsize > 2:
+        return None, f"none: the files hold {dtype.name}"
+    low = int(np.iinfo(dtype).min)
+    counts = np.zeros(np.iinfo(dtype).max - low + 1, dtype=np.int64)
+    for file in files:
+        for row in sampled_rows(file.shape[0]):
+            stored = file.read(slice(row, row + 1)).ravel()
+            if file.no_data is not None:
+                stored = stored[stored != file.no_data]
+            counts += np.bincount(stored.astype(np.int64) - low, minlength=len(counts))
+    top = int(np.flatnonzero(counts)[-1]) if counts.any() else 0
+    below = counts[max(0, top - max(1, (top + low) // 50)) : top]
+    at_top, usual = int(counts[top]), float(below.mean()) if len(below) else 0.0
+    number, is_end = top + low, top + low in {2**bits - 1 for bits in DETECTOR_BITS}
+    if at_top >= LEAST_AT_TOP and (at_top > CROWDING * usual or is_end):
+        return float(number), f"{at_top} sampled values are {number}, none is greater"
+    limit = float(np.iinfo(dtype).max)
+    return limit, f"no plateau below the end of {dtype.name}; the greatest sampled value is {number}"
+
+
+def draw_sample(files: Sequence[SpectralFile], calibration: Calibration) -> Sample:
+    """Pixels on the sampled rows, evenly spaced along them.
+
+    Args:
+        files: Of the views of one sensor.
+        calibration: Without band binning; all bands that it keeps are sampled.
+    """
+    raster = calibration.raster
+    rows = sampled_rows(raster.height)
+    step = max(1, len(files) * len(rows) * raster.width // MOST_PIXELS)
+    values, saturated = [], []
+    for file, row in _places(files, rows):
+        part = calibration.rows(file, row, row + 1)
+        keep = np.zeros(raster.width, bool)
+        keep[row % step :: step] = True
+        keep &= ~part.missing[0]
+        values.append(part.values[0][keep])
+        saturated.append(part.saturated[0][keep])
+    return Sample(np.concatenate(values), np.concatenate(saturated))
+
+
+def noise_shares(values: Float32[np.ndarray, "N B"]) -> Float64[np.ndarray, " B"]:
+    """Noise of each band over its signal, from what the other bands can't explain; NaN with too few pixels.
+
+    The residual of a band's regression on all others has variance 1 / (C^-1)_bb, with C the matrix of their second
+    moments. Signal is the root mean square of the band.
+    Source:
+        Bioucas-Dias & Nascimento 2008, HySime, noise estimation.
+    """
+    count, bands = values.shape
+    if count < 4 * bands or bands < 8:
+        return np.full(bands, np.nan)
+    pixels = values.astype(np.float64)
+    size = np.sqrt((pixels**2).mean(axis=0))
+    size[size == 0] = 1.0
+    pixels = pixels / size
+    moments = pixels.T @ pixels / count
+    inverse = np.linalg.inv(moments + 1e-9 * np.eye(bands))
+    return np.sqrt(1.0 / np.diag(inverse))
+
+
+def _places(files: Sequence[SpectralFile], rows: list[int]) -> Iterator[tuple[SpectralFile, int]]:
+    for file in files:
+        for row in rows:
+            yield file, row

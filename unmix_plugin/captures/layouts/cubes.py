@@ -1,0 +1,131 @@
+"""Layout `cubes`: a folder with one spectral file a view, or one folder of band files a view.
+
+Files with the name of a cube and a suffix of a picture are its RGB picture. Where there are pictures alone, they are
+the views: three bands, gamma-encoded.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from dataclasses import replace
+from pathlib import Path
+
+from unmix_plugin.captures.capture import Capture, CaptureView
+from unmix_plugin.captures.layouts._opening import open_spectral_file
+from unmix_plugin.captures.layouts.registry import LayoutOptions
+from unmix_plugin.captures.spectral_file import BandTable, SpectralFile
+from unmix_plugin.errors import CaptureError
+
+CUBE_SUFFIXES = frozenset(
+    {".hdr", ".npy", ".npz", ".tif", ".tiff", ".exr", ".mat", ".h5", ".hdf5", ".nc", ".pt"}
+)
+PICTURE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
+REFERENCE_NAME = re.compile(
+    r"(white|dark|flat)[ _-]*(ref(erence)?|frame|field|current)?[ _-]*\d*", re.IGNORECASE
+)
+"""Names of files that hold no view."""
+
+
+def find_cubes(root: Path, options: LayoutOptions) -> Capture:
+    """The views of a folder; see the module.
+
+    Raises:
+        CaptureError: no file in it can be a view, one can't be opened, two views share a name, or the number of
+            wavelengths given is not the number of bands.
+    """
+    excluded = {path.resolve() for path in options.exclude}
+    files = [path for path in _visible_files(root) if path.resolve() not in excluded]
+    references = [path for path in files if REFERENCE_NAME.fullmatch(path.stem)]
+    files = [path for path in files if path not in references]
+    cubes = [path for path in files if path.suffix.lower() in CUBE_SUFFIXES]
+    pictures = {path.stem: path for path in files if path.suffix.lower() in PICTURE_SUFFIXES}
+    folders = [] if cubes else _band_folders(root, excluded)
+    found = cubes or folders or list(pictures.values())
+    if not found:
+        kinds = ", ".join(sorted(CUBE_SUFFIXES | PICTURE_SUFFIXES))
+        raise CaptureError(
+            f"{root} holds no cubes; expected one file a view ({kinds}), or one folder of band files a view"
+        )
+    _refuse_duplicates(found)
+    views = tuple(
+        CaptureView(
+            name=_name(path),
+            cube=_open(path, options),
+            picture=None if not (cubes or folders) else pictures.get(_name(path)),
+        )
+        for path in sorted(found, key=_name)
+    )
+    unused = [path for path in references if path.suffix.lower() in CUBE_SUFFIXES]
+    notes = tuple(
+        f"{path.name} was left out, as its name is that of a reference; use it with --white or --dark"
+        for path in unused
+    )
+    return Capture("cubes", root, views, notes=notes)
+
+
+def with_wavelengths(file: SpectralFile, options: LayoutOptions) -> SpectralFile:
+    """The file with the wavelengths that a user gives; unchanged where there are none.
+
+    Raises:
+        CaptureError: another number of them than of bands.
+    """
+    given = options.wavelengths_nm
+    if given is None:
+        return file
+    if len(given) != file.shape[2]:
+        raise CaptureError(
+            f"{file.path} has {file.shape[2]} bands, but --wavelengths gives {len(given)} numbers; give one a band"
+        )
+    bands = BandTable(given, "given with --wavelengths", None, file.bands.bad)
+    return replace(file, bands=bands)
+
+
+def _open(path: Path, options: LayoutOptions) -> SpectralFile:
+    file = with_wavelengths(open_spectral_file(path), options)
+    if (
+        path.suffix.lower() in PICTURE_SUFFIXES
+        and file.dtype.itemsize == 1
+        and "encoding" not in file.metadata
+    ):
+        file = replace(file, metadata={**file.metadata, "encoding": "sRGB"})
+    return file
+
+
+def _visible_files(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+
+
+def _band_folders(root: Path, excluded: set[Path]) -> list[Path]:
+    """Folders that hold more than one file, each a view of band files."""
+    return sorted(
+        path
+        for path in root.iterdir()
+        if path.is_dir()
+        and not path.name.startswith(".")
+        and path.resolve() not in excluded
+        and not REFERENCE_NAME.fullmatch(path.name)
+        and len([file for file in _visible_files(path) if _is_band(file)]) > 1
+    )
+
+
+def _is_band(path: Path) -> bool:
+    return path.suffix.lower() in CUBE_SUFFIXES | PICTURE_SUFFIXES
+
+
+def _name(path: Path) -> str:
+    """The stem, with only what is fit for any file system."""
+    stem = path.name if path.is_dir() else path.stem
+    return re.sub(r"[^\w.+-]+", "_", stem).strip(".") or "view"
+
+
+def _refuse_duplicates(paths: list[Path]) -> None:
+    owners: dict[str, list[Path]] = defaultdict(list)
+    for path in paths:
+        owners[_name(path).casefold()].append(path)
+    for same in owners.values():
+        if len(same) > 1:
+            raise CaptureError(
+                f"{same[0]} and {same[1]} would both be the view '{_name(same[0])}'; expected one file a view: rename "
+                "or move one of them"
+            )

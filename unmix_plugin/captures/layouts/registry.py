@@ -1,0 +1,50 @@
+"""The layouts by name. Each is a function from a folder to a `Capture`, imported when it is used."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+from jaxtyping import Float64
+
+from unmix_plugin.captures.capture import Capture
+from unmix_plugin.errors import CaptureError
+
+
+@dataclass(frozen=True)
+class LayoutOptions:
+    """What a user says about the files of a capture."""
+
+    wavelengths_nm: Float64[np.ndarray, " B"] | None = None
+    """Band centres in nm, in the order of the files; they replace what the files say."""
+    exclude: tuple[Path, ...] = ()
+    """Files in the folder that are no views, such as dark and white references."""
+
+
+FindViews: TypeAlias = Callable[[Path, LayoutOptions], Capture]
+"""Finds the views below a folder; raises CaptureError where there are none or they can't be opened."""
+
+_FUNCTIONS = {
+    "cubes": "cubes:find_cubes",
+}
+"""Module in this package, and the function in it."""
+
+LAYOUTS = tuple(_FUNCTIONS)
+
+
+def find_views(layout: str, root: Path, options: LayoutOptions) -> Capture:
+    """The views of a capture in one of `LAYOUTS`.
+
+    Raises:
+        CaptureError: there is no such folder, or the layout finds no views in it.
+    """
+    if not root.is_dir():
+        found = "is a file" if root.is_file() else "is not there"
+        raise CaptureError(f"{root} {found}; give the folder of the capture with --data")
+    module, function = _FUNCTIONS[layout].split(":")
+    find: FindViews = getattr(import_module(f"unmix_plugin.captures.layouts.{module}"), function)
+    return find(root, options)

@@ -1,0 +1,58 @@
+"""What a user asks of `unmix-process`. Imported for `--help` too, so nothing heavy is imported here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+MaskKind = Literal["files", "white", "black", "none"]
+
+
+@dataclass(frozen=True)
+class ProcessOptions:
+    """Turn what an instrument wrote into a scene to train on."""
+
+    layout: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="LAYOUT")]
+    """How the files of the capture are laid out."""
+    data: Path
+    """Folder of the capture."""
+    output_dir: Path
+    """Folder to write the scene to; it appears when the scene is complete."""
+    poses: str | None = None
+    """Where the cameras stood: a file or folder of another program (transforms.json, COLMAP, Metashape, ...), or
+    `estimate` to find them from the images; without it, the poses of the layout."""
+    wavelengths: str | None = None
+    """Band centres in nm for files that don't name them: a CSV file with a column `wavelength`, or a list such as
+    620,555,503."""
+    dark: Path | None = None
+    """Dark frame: an image taken with the shutter closed."""
+    white: Path | None = None
+    """White reference: an image of a white panel; cubes become reflectances."""
+    white_rectangle: Annotated[
+        tuple[str, int, int, int, int] | None, tyro.conf.arg(metavar="VIEW ROW COLUMN HEIGHT WIDTH")
+    ] = None
+    """The white reference is a panel in a view: its first row and column, height and width in pixels."""
+    white_reflectance: str = "1"
+    """Reflectance of the white panel: a number, or a CSV file (wavelength,reflectance)."""
+    mask: MaskKind | None = None
+    """What separates matter from background: pictures of the capture (files), a white or a black background, or
+    nothing; without it, the alpha channel of the capture's pictures where they have one."""
+    drop_bands: str | None = None
+    """Bands to leave out, as wavelengths and ranges in nm: 1350-1450,1900."""
+    max_noise: float = 0.5
+    """Bands whose noise is above this share of their signal are left out."""
+    crop: Annotated[tuple[int, int, int, int] | None, tyro.conf.arg(metavar="ROW COLUMN HEIGHT WIDTH")] = None
+    """Keep this rectangle of every view, in pixels of the files."""
+    bin_pixels: int = 1
+    """Average squares of this many pixels a side."""
+    bin_bands: int = 1
+    """Average this many neighbouring bands."""
+    saturation: float | None = None
+    """Stored number from which a pixel is saturated; without it, found from the values."""
+    scale: float | None = None
+    """Calibrated value that is written as 1; without it, found from the values."""
+    overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Replace a scene that this command made in the output folder."""

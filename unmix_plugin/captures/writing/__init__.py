@@ -1,0 +1,1 @@
+"""A scene folder as `scenes` reads it, with the record of how it was made."""
