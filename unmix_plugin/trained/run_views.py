@@ -63,11 +63,11 @@ def views_of(views: Sequence[RunView], choice: ViewChoice) -> list[RunView]:
 
 
 def cameras_of(views: Sequence[RunView], choice: ViewChoice) -> Cameras:
-    """The cameras of the views chosen, as one; all views of a run have one size."""
+    """The cameras of the views chosen, as one."""
     chosen = [view.camera for view in views_of(views, choice)]
     names = ("camera_to_world", "focal_px", "center_px", "distortion")
     tensors = {name: torch.cat([getattr(camera, name) for camera in chosen]) for name in names}
-    return Cameras(**tensors, width=chosen[0].width, height=chosen[0].height)
+    return Cameras.of_sizes(**tensors, sizes=[camera.size(0) for camera in chosen])
 
 
 def _names(record: SceneRecord, split: str, count: int) -> list[str]:

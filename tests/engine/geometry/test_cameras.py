@@ -149,3 +149,42 @@ def test_indexing_gives_cameras_in_the_order_asked_for(index, expected):
 def test_a_distorted_lens_is_told_from_a_pinhole():
     assert make_cameras(distortion=(0.0, 0.0, 0.0, 0.01)).is_distorted
     assert not make_cameras().is_distorted
+
+
+def cameras_of_two_sizes() -> Cameras:
+    cameras = make_cameras(3)
+    parts = (cameras.camera_to_world, cameras.focal_px, cameras.center_px, cameras.distortion)
+    return Cameras.of_sizes(*parts, sizes=[(64, 48), (16, 12), (64, 48)])
+
+
+def test_images_may_differ_in_size():
+    cameras = cameras_of_two_sizes()
+    assert (cameras.width, cameras.height) == (64, 48)
+    assert [cameras.size(index) for index in range(3)] == [(64, 48), (16, 12), (64, 48)]
+    assert [len(cameras.image_rays(index)) for index in range(3)] == [3072, 192, 3072]
+    small = cameras[1]
+    assert (small.width, small.height, small.sizes) == (16, 12, None)
+    assert cameras[[0, 2]].sizes is None
+    assert cameras[1:].sizes == ((16, 12), (64, 48))
+    assert len(cameras[3:]) == 0
+
+
+def test_sizes_survive_a_file_and_wrong_ones_are_refused():
+    written = cameras_of_two_sizes().to_json()
+    assert Cameras.from_json(json.loads(json.dumps(written))).sizes == ((64, 48), (16, 12), (64, 48))
+    assert "sizes" not in make_cameras().to_json()
+    for sizes in ([[64, 48]], [[64, 48], [16, 0], [64, 48]], [[64, 48], [16], [64, 48]]):
+        with pytest.raises(ValueError, match=r"pixels|sizes"):
+            Cameras.from_json({**written, "sizes": sizes})
+
+
+def test_cameras_brought_to_one_size_see_the_same_height_of_the_scene():
+    cameras = cameras_of_two_sizes()
+    alike = cameras.one_size()
+    assert [alike.size(index) for index in range(3)] == [(64, 48)] * 3
+    for x, y in ((0.0, 0.0), (16.0, 12.0), (5.5, 2.0)):
+        [before, after] = (
+            which.generate_rays(torch.tensor([1]), torch.tensor([point])).directions
+            for which, point in ((cameras, [x, y]), (alike, [4 * x, 4 * y]))
+        )
+        assert_close(after, before)

@@ -120,3 +120,16 @@ def test_a_file_without_cameras_is_refused(tmp_path):
     (tmp_path / "p.json").write_text(json.dumps({"frames": []}))
     with pytest.raises(ConfigError, match="'frames' is empty"):
         chosen(source=str(tmp_path / "p.json"))
+
+
+def test_views_of_several_sizes_are_rendered_as_large_as_the_largest():
+    views = [
+        replace(view, camera=view.camera.resized(*[(20, 15), (40, 30), (10, 10)][index % 3]))
+        for index, view in enumerate(SCENE.views)
+    ]
+    rig = replace(SCENE, views=tuple(views))
+    cameras = choose_cameras(rig, CameraRequest())
+    assert [view.camera.size(0) for view in cameras.views] == [(40, 30)] * 3
+    for source in ("orbit", "interpolate"):
+        path = choose_cameras(rig, CameraRequest(source=source, num_frames=2, downscale=2))
+        assert len({view.camera.size(0) for view in path.views}) == 1

@@ -1,6 +1,7 @@
 """The hull never cuts into foreground, and cuts away what views look through."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -257,3 +258,26 @@ def test_cells_that_too_few_views_see_are_carved_and_the_others_stay():
     assert kept[0].sum() > kept[1].sum() > kept[2].sum() > 0
     assert (kept[0] >= kept[1]).all()
     assert (kept[1] >= kept[2]).all()
+
+
+def test_views_of_two_sizes_carve_and_bound_the_same_ball():
+    poses, radius = ring_poses(8), 0.5
+    scales = [1 if index % 2 else 0.5 for index in range(8)]
+    whole = make_cameras(poses)
+    factors = torch.tensor(scales)[:, None]
+    sizes = [(int(SIDE * scale), int(SIDE * scale)) for scale in scales]
+    mixed = Cameras.of_sizes(
+        whole.camera_to_world, whole.focal_px * factors, whole.center_px * factors, whole.distortion, sizes
+    )
+    foreground = [
+        ball_alpha(pose, radius, side, side, FOCAL * scale) > 0
+        for pose, (side, _), scale in zip(poses, sizes, scales, strict=True)
+    ]
+    hull = carve_box(mixed, foreground, BOX, 32)
+    distances = np.linalg.norm(centres(BOX, 32), axis=-1)
+    assert hull[distances < radius].all()
+    assert not hull[distances > 1.0].any()
+    box = find_bounds(Path("scene"), mixed, foreground).aabb.numpy()
+    assert (box[0] < -radius + 0.05).all()
+    assert (box[1] > radius - 0.05).all()
+    assert np.abs(box).max() < 1.4  # pixels of the smaller views are wide

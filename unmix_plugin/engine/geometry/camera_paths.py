@@ -213,7 +213,7 @@ def _tour(
 
 def _with_lens(cameras: Cameras, poses: Float[np.ndarray, "F 3 4"]) -> Cameras:
     """Pinhole cameras at these poses, with the middle lens of `cameras`."""
-    count = len(poses)
+    cameras, count = cameras.one_size(), len(poses)
     middle = torch.tensor([[cameras.width / 2, cameras.height / 2]])
     return Cameras(
         torch.tensor(poses, dtype=torch.float32),

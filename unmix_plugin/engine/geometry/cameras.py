@@ -1,4 +1,4 @@
-"""Posed cameras, all of one image size: from pixels to rays and from points to pixels.
+"""Posed cameras: from pixels to rays and from points to pixels.
 
 Notation: `N` cameras, `R` rays, `P` points. Axes are OpenGL: +x right, +y up, a camera looks along -z. Pixel
 coordinates are x to the right and y down in pixels from the image's top left corner, so pixel centres lie at +0.5.
@@ -6,7 +6,8 @@ coordinates are x to the right and y down in pixels from the image's top left co
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -33,24 +34,40 @@ class Cameras:
     distortion: Float[Tensor, "N 4"]
     """k1, k2, p1, p2 of the OPENCV model; zeros are a pinhole."""
     width: int
-    """Columns of every image, pixels."""
+    """Columns of every image, pixels; of the largest image where sizes differ."""
     height: int
-    """Rows of every image, pixels."""
+    """Rows of every image, pixels; of the largest image where sizes differ."""
+    sizes: tuple[tuple[int, int], ...] | None = None
+    """Width and height of each image where they differ; None where all have one size."""
 
     def __len__(self) -> int:
         return self.camera_to_world.shape[0]
 
+    @staticmethod
+    def of_sizes(
+        camera_to_world: Float[Tensor, "N 3 4"],
+        focal_px: Float[Tensor, "N 2"],
+        center_px: Float[Tensor, "N 2"],
+        distortion: Float[Tensor, "N 4"],
+        sizes: Sequence[tuple[int, int]],
+    ) -> Cameras:
+        """Cameras whose images have these widths and heights, at least one."""
+        largest = max(sizes, key=lambda size: size[0] * size[1])
+        own = None if len(set(sizes)) == 1 else tuple(sizes)
+        return Cameras(camera_to_world, focal_px, center_px, distortion, *largest, own)
+
+    def size(self, index: int) -> tuple[int, int]:
+        """Width and height of one image in pixels."""
+        return (self.width, self.height) if self.sizes is None else self.sizes[index]
+
     def __getitem__(self, index: int | slice | list[int]) -> Cameras:
         """Some of the cameras, in the order asked for; an int gives a `Cameras` of one."""
         rows = [index] if isinstance(index, int) else index
-        return Cameras(
-            self.camera_to_world[rows],
-            self.focal_px[rows],
-            self.center_px[rows],
-            self.distortion[rows],
-            self.width,
-            self.height,
-        )
+        parts = (self.camera_to_world[rows], self.focal_px[rows], self.center_px[rows], self.distortion[rows])
+        if self.sizes is None:
+            return Cameras(*parts, self.width, self.height)
+        chosen = self.sizes[rows] if isinstance(rows, slice) else [self.sizes[row] for row in rows]
+        return Cameras.of_sizes(*parts, chosen) if chosen else Cameras(*parts, self.width, self.height)
 
     def to(self, device: torch.device | str) -> Cameras:
         """The same cameras on another device."""
@@ -61,16 +78,22 @@ class Cameras:
             self.distortion.to(device),
             self.width,
             self.height,
+            self.sizes,
         )
 
     def resized(self, width: int, height: int) -> Cameras:
         """The same cameras with another number of pixels: the vertical field of view stays, the horizontal follows."""
-        scale = height / self.height
-        old, new = (
-            self.center_px.new_tensor(size) / 2 for size in ((self.width, self.height), (width, height))
+        old = [self.size(index) for index in range(len(self))]
+        scale = self.focal_px.new_tensor([[height / rows] for _, rows in old]).reshape(-1, 1)
+        middle = self.center_px.new_tensor(old).reshape(-1, 2) / 2
+        center_px = (self.center_px - middle) * scale + self.center_px.new_tensor((width, height)) / 2
+        return Cameras(
+            self.camera_to_world, self.focal_px * scale, center_px, self.distortion, width, height
         )
-        center_px = (self.center_px - old) * scale + new
-        return replace(self, focal_px=self.focal_px * scale, center_px=center_px, width=width, height=height)
+
+    def one_size(self) -> Cameras:
+        """The same cameras with images as large as the largest, where sizes differ."""
+        return self if self.sizes is None else self.resized(self.width, self.height)
 
     def shrunk(self, num_pixels: int) -> Cameras:
         """The same cameras with about `num_pixels` pixels, or themselves where they have no more."""
@@ -110,13 +133,14 @@ class Cameras:
             subpixel_offset: Where in a pixel the ray passes, x, y in [0, 1].
         """
         device = self.camera_to_world.device
+        width, height = self.size(index)
         rows, columns = torch.meshgrid(
-            torch.arange(self.height, device=device, dtype=torch.float32),
-            torch.arange(self.width, device=device, dtype=torch.float32),
+            torch.arange(height, device=device, dtype=torch.float32),
+            torch.arange(width, device=device, dtype=torch.float32),
             indexing="ij",
         )
         pixel_coords = torch.stack([columns + subpixel_offset[0], rows + subpixel_offset[1]], dim=-1)
-        indices = torch.full((self.height * self.width,), index, dtype=torch.int64, device=device)
+        indices = torch.full((height * width,), index, dtype=torch.int64, device=device)
         return self.generate_rays(indices, pixel_coords.reshape(-1, 2))
 
     def project(
@@ -143,6 +167,7 @@ class Cameras:
         return {
             "width": self.width,
             "height": self.height,
+            **({} if self.sizes is None else {"sizes": [list(size) for size in self.sizes]}),
             "camera_to_world": self.camera_to_world.tolist(),
             "focal_px": self.focal_px.tolist(),
             "center_px": self.center_px.tolist(),
@@ -157,8 +182,14 @@ class Cameras:
             KeyError, TypeError, ValueError, RuntimeError: a part is missing, of another shape or out of its range.
         """
         count, width, height = len(values["camera_to_world"]), values["width"], values["height"]
-        if not all(type(edge) is int and 1 <= edge <= _LONGEST_EDGE_PX for edge in (width, height)):
-            raise ValueError(f"images of {width} x {height} pixels; edges have 1 to {_LONGEST_EDGE_PX}")
+        sizes = [tuple(size) for size in values.get("sizes", [])]
+        for size in ((width, height), *sizes):
+            if len(size) != 2 or not all(type(edge) is int and 1 <= edge <= _LONGEST_EDGE_PX for edge in size):
+                raise ValueError(
+                    f"an image of {' x '.join(map(str, size))} pixels; edges have 1 to {_LONGEST_EDGE_PX}"
+                )
+        if sizes and len(sizes) != count:
+            raise ValueError(f"{len(sizes)} image sizes for {count} cameras")
         cameras = Cameras(
             torch.tensor(values["camera_to_world"], dtype=torch.float32).reshape(count, 3, 4),
             torch.tensor(values["focal_px"], dtype=torch.float32).reshape(count, 2),
@@ -166,6 +197,7 @@ class Cameras:
             torch.tensor(values["distortion"], dtype=torch.float32).reshape(count, 4),
             width,
             height,
+            tuple(sizes) or None,
         )
         numbers = torch.cat(
             [part.flatten() for part in (cameras.camera_to_world, cameras.center_px, cameras.distortion)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -72,11 +73,7 @@ def choose_cameras(scene: RenderableScene, request: CameraRequest) -> RenderCame
     if request.frames_per_second is not None:
         frames_per_second = check_frames_per_second(request.frames_per_second, "--fps")
         chosen = replace(chosen, frames_per_second=frames_per_second)
-    width, height = _size(chosen.size, request)
-    if (width, height) == chosen.size:
-        return chosen
-    views = tuple(RunView(view.name, view.camera.resized(width, height)) for view in chosen.views)
-    return replace(chosen, views=views)
+    return replace(chosen, views=_resized(chosen.views, _size(chosen.size, request)))
 
 
 def _from_source(scene: RenderableScene, request: CameraRequest) -> RenderCameras:
@@ -85,7 +82,8 @@ def _from_source(scene: RenderableScene, request: CameraRequest) -> RenderCamera
         _check_frames(source, request.num_frames)
     if source in DATASET_CAMERAS:
         views = views_of(scene.views, "eval" if source == "dataset-eval" else "train")
-        return RenderCameras(tuple(views), False, None)
+        largest = max((view.camera.size(0) for view in views), key=math.prod)  # of a rig, the sharpest camera
+        return RenderCameras(_resized(views, largest), False, None)
     count = USUAL_FRAMES if request.num_frames is None else request.num_frames
     if source == "orbit":
         return _path("orbit", orbit(cameras_of(scene.views, "train"), scene.scene_box, count))
@@ -99,6 +97,14 @@ def _from_source(scene: RenderableScene, request: CameraRequest) -> RenderCamera
     found = read_camera_file(Path(source), scene.frame)
     is_path = found.frames_per_second is not None
     return RenderCameras(found.views, is_path, found.frames_per_second)
+
+
+def _resized(views: Sequence[RunView], size: tuple[int, int]) -> tuple[RunView, ...]:
+    """The views with pictures of this width and height."""
+    return tuple(
+        view if view.camera.size(0) == size else RunView(view.name, view.camera.resized(*size))
+        for view in views
+    )
 
 
 def _path(name: str, cameras: Cameras) -> RenderCameras:

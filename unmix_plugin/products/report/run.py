@@ -38,6 +38,7 @@ def scene_facts(
     scene, training = loaded.record, loaded.training
     summary, cameras = scene.summary, scene.train_cameras
     size = (scene.scene_box.size.cpu().double().numpy() / world_frame(scene).scale).tolist()
+    sizes = sorted({cameras.size(index) for index in range(len(cameras))}, reverse=True)
     known = [word for word in ("alpha", "labels", "abundances") if summary.get(f"has_{word}")]
     return [
         *(
@@ -48,7 +49,7 @@ def scene_facts(
         ("Scene", scene_name(loaded)),
         ("Bands", str(materials.bands)),
         ("Views", f"{len(scene.train_cameras)} training, {len(scene.eval_cameras)} evaluation"),
-        ("Image size", f"{cameras.width} x {cameras.height} pixels"),
+        ("Image size", ", ".join(f"{width} x {height}" for width, height in sizes) + " pixels"),
         ("Scene box", " x ".join(f"{edge:.3g}" for edge in size) + " world units"),
         ("Light", "recorded" if summary.get("illuminant") else "unknown, taken as flat"),
         ("Comes with", ", ".join(known) or "images alone"),

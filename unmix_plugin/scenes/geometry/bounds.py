@@ -50,7 +50,7 @@ SEEN_CELLS = 32
 """Cells along an edge when the region that cameras share is sought."""
 
 
-def find_bounds(root: Path, cameras: Cameras, foreground: list[Bool[np.ndarray, "H W"]] | None) -> SceneBox:
+def find_bounds(root: Path, cameras: Cameras, foreground: list[Bool[np.ndarray, "_ _"]] | None) -> SceneBox:
     """The box that the training views show.
 
     Args:
@@ -98,7 +98,7 @@ def focus_point(cameras: Cameras) -> Float64[np.ndarray, "3"] | None:
 def _cube_of_views(cameras: Cameras) -> tuple[Float64[np.ndarray, "3"], float]:
     poses = cameras.camera_to_world.double().numpy()
     positions, forward = poses[:, :, 3], -poses[:, :, 2]
-    sides = np.array([cameras.width, cameras.height], dtype=np.float64)
+    sides = np.array([cameras.size(index) for index in range(len(cameras))], dtype=np.float64)
     half_angles = (0.5 * sides / cameras.focal_px.double().numpy()).max(axis=-1)
     focus = focus_point(cameras)
     if focus is not None:
@@ -148,10 +148,10 @@ def _cell_centres(box: SceneBox, cells: int) -> Float[Tensor, "P 3"]:
 def _count_views(cameras: Cameras, box: SceneBox, cells: int) -> Int64[np.ndarray, "R R R"]:
     """How many cameras see the centre of each cell."""
     points = _cell_centres(box, cells)
-    limits = torch.tensor([cameras.width, cameras.height], dtype=torch.float32)
     count = torch.zeros(len(points), dtype=torch.int64)
     for index in range(len(cameras)):
         pixels, depths = cameras.project(points, index)
+        limits = torch.tensor(cameras.size(index), dtype=torch.float32)
         count += ((pixels >= 0.0) & (pixels <= limits)).all(dim=-1) & (depths > 0.0)
     return count.reshape(cells, cells, cells).numpy()
 

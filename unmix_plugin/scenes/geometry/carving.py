@@ -75,7 +75,7 @@ def foreground_mask(scene: Scene, index: int) -> Bool[np.ndarray, "H W"]:
 
 def carve_box(
     cameras: Cameras,
-    foreground: list[Bool[np.ndarray, "H W"]] | None,
+    foreground: list[Bool[np.ndarray, "_ _"]] | None,
     box: SceneBox,
     resolution: int,
     fewest_views: int = 1,
@@ -154,11 +154,11 @@ class _View:
         self._focal = cameras.focal_px[index].numpy()[:, None]
         self._center = cameras.center_px[index].numpy()[:, None]
         self._distortion = cameras.distortion[index] if cameras.is_distorted else None
-        self._columns, self._rows = cameras.width, cameras.height
+        self._columns, self._rows = cameras.size(index)
         self._low, self._high = self._ideal_bounds()
         self.covered = None
         if foreground is not None:
-            sums = np.zeros((cameras.height + 1, cameras.width + 1), dtype=np.int32)
+            sums = np.zeros((self._rows + 1, self._columns + 1), dtype=np.int32)
             np.cumsum(np.cumsum(foreground, axis=0, dtype=np.int32), axis=1, out=sums[1:, 1:])
             self.covered = sums.reshape(-1)
 

@@ -16,13 +16,16 @@ MIN_EXPLAINED = 0.999
 """Share of the foreground pixels whose rays must cross what is kept."""
 
 
-def foreground_rays(cameras: Cameras, foreground: list[Bool[np.ndarray, "H W"]]) -> RayBundle:
+def foreground_rays(cameras: Cameras, foreground: list[Bool[np.ndarray, "_ _"]]) -> RayBundle:
     """Rays through foreground pixels, evenly thinned out to at most `MAX_RAYS`."""
-    flat = np.flatnonzero(np.stack(foreground))
-    chosen = torch.from_numpy(flat[:: max(1, -(-len(flat) // MAX_RAYS))])
-    pixel = chosen % (cameras.height * cameras.width)
-    coords = torch.stack([pixel % cameras.width, pixel // cameras.width], dim=-1).float() + 0.5
-    return cameras.generate_rays(chosen // (cameras.height * cameras.width), coords)
+    flat = np.flatnonzero(np.concatenate([mask.reshape(-1) for mask in foreground]))
+    chosen = flat[:: max(1, -(-len(flat) // MAX_RAYS))]
+    starts = np.cumsum([0, *(mask.size for mask in foreground)])
+    views = np.searchsorted(starts, chosen, side="right") - 1
+    widths = np.array([mask.shape[1] for mask in foreground])[views]
+    rows, columns = np.divmod(chosen - starts[views], widths)
+    coords = torch.from_numpy(np.stack([columns, rows], axis=-1)).float() + 0.5
+    return cameras.generate_rays(torch.from_numpy(views), coords)
 
 
 def share_through(rays: RayBundle, box: SceneBox, hull: Bool[np.ndarray, "R R R"]) -> float:

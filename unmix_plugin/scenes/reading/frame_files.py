@@ -27,7 +27,7 @@ class CheckedFiles:
 
     size: Size
     """Of every image."""
-    foreground: tuple[Bool[np.ndarray, "H W"], ...] | None
+    foreground: tuple[Bool[np.ndarray, "_ _"], ...] | None
     """For each frame the pixels that may show something: not fully transparent, or not to be trusted. None where the
     scene has no alpha."""
     cube_hashes: dict[Path, str]

@@ -13,7 +13,7 @@ from unmix_plugin.scenes.reading.images import Size, UnreadableImageError, read_
 from unmix_plugin.scenes.reading.transforms_json import FrameEntry, SceneEntry
 from unmix_plugin.scenes.scene import UNLABELLED
 
-Pictures = list[Bool[np.ndarray, "H W"] | None]
+Pictures = list[Bool[np.ndarray, "_ _"] | None]
 """For each frame, None where it has no such picture."""
 
 

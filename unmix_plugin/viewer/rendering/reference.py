@@ -54,6 +54,7 @@ def render_reference(scene: TrainedScene, cameras: Cameras) -> Reference:
     """Reference rays through some of the cameras, spread over all."""
     step = max(1, len(cameras) // _NUM_CAMERAS)
     chosen = list(range(0, len(cameras), step))[:_NUM_CAMERAS]
+    cameras = cameras.one_size()
     aspect = cameras.width / cameras.height
     height = max(1, min(cameras.height, int((_NUM_RAYS / len(chosen) / aspect) ** 0.5)))
     parts, points = [], []
