@@ -87,9 +87,7 @@ class Cameras:
         scale = self.focal_px.new_tensor([[height / rows] for _, rows in old]).reshape(-1, 1)
         middle = self.center_px.new_tensor(old).reshape(-1, 2) / 2
         center_px = (self.center_px - middle) * scale + self.center_px.new_tensor((width, height)) / 2
-        return Cameras(
-            self.camera_to_world, self.focal_px * scale, center_px, self.distortion, width, height
-        )
+        return Cameras(self.camera_to_world, self.focal_px * scale, center_px, self.distortion, width, height)
 
     def one_size(self) -> Cameras:
         """The same cameras with images as large as the largest, where sizes differ."""
@@ -184,7 +182,9 @@ class Cameras:
         count, width, height = len(values["camera_to_world"]), values["width"], values["height"]
         sizes = [tuple(size) for size in values.get("sizes", [])]
         for size in ((width, height), *sizes):
-            if len(size) != 2 or not all(type(edge) is int and 1 <= edge <= _LONGEST_EDGE_PX for edge in size):
+            if len(size) != 2 or not all(
+                type(edge) is int and 1 <= edge <= _LONGEST_EDGE_PX for edge in size
+            ):
                 raise ValueError(
                     f"an image of {' x '.join(map(str, size))} pixels; edges have 1 to {_LONGEST_EDGE_PX}"
                 )
