@@ -1,0 +1,75 @@
+"""Band files as multispectral cameras write them, by Pillow: TIFF of 16 bits with XMP and EXIF."""
+
+from pathlib import Path
+
+import numpy as np
+import tifffile
+from PIL import Image
+from PIL.TiffImagePlugin import ImageFileDirectory_v2
+
+from unmix_plugin.captures.camera_tags import band_of, camera_tags
+from unmix_plugin.captures.spectral_file import BandTable, SpectralFile
+
+EXIF_CODES = {"ExposureTime": 33434, "FNumber": 33437, "ISOSpeedRatings": 34855, "ISOSpeed": 34867}
+FOCAL_PLANE_CODES = {"FocalLength": 37386, "FocalPlaneXResolution": 41486, "FocalPlaneYResolution": 41487}
+
+
+def xmp_packet(tags: dict[str, str | list[str]], as_attributes: bool = False) -> bytes:
+    """An XMP packet with tags called `Prefix:Name`."""
+    spaces = {tag.split(":")[0] for tag in tags} | {"Camera"}
+    declared = " ".join(f'xmlns:{space}="http://example.org/{space}/1.0/"' for space in sorted(spaces))
+    attributes, elements = "", ""
+    for tag, value in tags.items():
+        if isinstance(value, list):
+            items = "".join(f"<rdf:li>{item}</rdf:li>" for item in value)
+            elements += f"<{tag}><rdf:Seq>{items}</rdf:Seq></{tag}>\n"
+        elif as_attributes:
+            attributes += f' {tag}="{value}"'
+        else:
+            elements += f"<{tag}>{value}</{tag}>\n"
+    return (
+        '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>\n<x:xmpmeta xmlns:x="adobe:ns:meta/">'
+        '<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+        f'<rdf:Description rdf:about="" {declared}{attributes}>{elements}</rdf:Description>'
+        f"</rdf:RDF></x:xmpmeta>{' ' * 200}<?xpacket end='w'?>"
+    ).encode()
+
+
+def write_band_file(
+    path: Path,
+    pixels: np.ndarray,
+    xmp: dict[str, str | list[str]],
+    exif: dict[str, float] | None = None,
+    *,
+    make: str = "Maker",
+    black_level: list[int] | None = None,
+    orientation: int = 1,
+    as_attributes: bool = False,
+) -> Path:
+    """Write one band; exif by the names of `EXIF_CODES` and `FOCAL_PLANE_CODES`."""
+    directory = ImageFileDirectory_v2()
+    directory[271], directory[274] = make, orientation
+    directory[700] = xmp_packet(xmp, as_attributes)
+    if black_level is not None:
+        directory.tagtype[50714] = 3
+        directory[50714] = tuple(black_level)
+    codes = EXIF_CODES | FOCAL_PLANE_CODES
+    directory[34665] = {codes[name]: value for name, value in (exif or {}).items()}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels.astype(np.uint16)).save(path, format="TIFF", tiffinfo=directory)
+    return path
+
+
+def open_band_file(path: Path) -> SpectralFile:
+    """A band file as a reader gives it."""
+    with tifffile.TiffFile(path) as stream:
+        pixels, metadata = stream.pages.first.asarray()[..., None], camera_tags(stream.pages.first.tags)
+    return SpectralFile(
+        path,
+        "tiff",
+        pixels.shape,
+        pixels.dtype,
+        lambda rows, bands: pixels[rows][..., bands],
+        band_of(metadata["xmp"]) or BandTable(),
+        metadata=metadata,
+    )
