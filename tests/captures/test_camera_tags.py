@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from tests.captures.band_files import open_band_file, write_band_file, xmp_packet
-from unmix_plugin.captures.camera_tags import band_of, parse_xmp, tag_numbers, tag_text
+from unmix_plugin.captures.camera_tags import XmpTags, band_of, parse_xmp, tag_numbers, tag_text
 
 
 @pytest.mark.parametrize("as_attributes", [False, True])
@@ -21,7 +21,7 @@ def test_numbers_in_one_text_are_split():
 
 
 def test_the_first_tag_that_is_there_counts():
-    tags = {"DLS:Yaw": "", "Camera:Yaw": "3"}
+    tags: XmpTags = {"DLS:Yaw": "", "Camera:Yaw": "3"}
     assert tag_text(tags, "Camera:Pitch", "DLS:Yaw", "Camera:Yaw") == "3"
 
 
