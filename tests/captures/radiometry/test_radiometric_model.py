@@ -91,6 +91,9 @@ def test_some_rows_are_those_of_the_whole(tmp_path, pixels, tags):
     for rows in (slice(7, 19), slice(None, 4), slice(3, 30, 5)):
         part = model.apply(file.read(rows).astype(np.float64), rows)
         np.testing.assert_array_equal(part, whole[rows])
+        columns = slice(11, 40)
+        part = model.apply(file.read(rows)[:, columns].astype(np.float64), rows, columns)
+        np.testing.assert_allclose(part, whole[rows, columns], rtol=1e-6)
 
 
 def test_what_is_below_the_black_level_stays_below_0(tmp_path):

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int
 
-from unmix_plugin.captures.spectral_file import BandIndex, SpectralFile
+from unmix_plugin.captures.spectral_file import SpectralFile
 from unmix_plugin.errors import CaptureError
 
 FactorOf = Callable[[Int[np.ndarray, "h 1"], Int[np.ndarray, "1 W"]], Float64[np.ndarray, "h W"]]
@@ -49,19 +49,16 @@ class RadiometricModel:
         self,
         values: Float[np.ndarray, "h W b"],
         rows: slice = slice(None),
-        bands: BandIndex = slice(None),
+        columns: slice = slice(None),
     ) -> Float32[np.ndarray, "h W b"]:
         """Radiance of some rows; a little below 0 where noise goes below the black level.
 
         Args:
-            values: Stored numbers of all columns in these rows.
-            rows: Which rows of the file they are.
-            bands: Every band of the file is treated alike.
+            values: Stored numbers of these rows and columns; every band is treated alike.
+            rows, columns: Which ones of the file they are.
         """
-        height, width = values.shape[:2]
-        first = rows.start or 0
-        y = np.arange(first, first + height * (rows.step or 1), rows.step or 1)[:, None]
-        factor = self.factor_of(y, np.arange(width)[None, :])
+        y, x = _positions(rows, values.shape[0]), _positions(columns, values.shape[1])
+        factor = self.factor_of(y[:, None], x[None, :])
         return ((values - self.black_level) * factor[..., None]).astype(np.float32)
 
 
@@ -86,6 +83,11 @@ def radiometric_model(file: SpectralFile) -> RadiometricModel | None:
                 )
             return model
     return None
+
+
+def _positions(part: slice, count: int) -> Int[np.ndarray, " count"]:
+    first, step = part.start or 0, part.step or 1
+    return np.arange(first, first + count * step, step)
 
 
 def require_numbers(
