@@ -46,9 +46,9 @@ def read_model(file: SpectralFile, tags: XmpTags, exif: dict[str, Any]) -> Radio
     gain = f_number**2 / (a * exposure * iso + c)
 
     def factor_of(y: np.ndarray, x: np.ndarray) -> np.ndarray:
-        return gain / np.polynomial.polynomial.polyval2d(
-            *np.broadcast_arrays(x / width, y / height), vignetting
-        )
+        across = np.vander(x[0] / width, vignetting.shape[0], increasing=True)
+        down = np.vander(y[:, 0] / height, vignetting.shape[1], increasing=True)
+        return gain / (down @ vignetting.T @ across.T)
 
     saturated = SATURATED_10_BITS if int(exif.get("BitsPerSample", 16)) == 10 else SATURATED
     return RadiometricModel("Parrot Sequoia", "relative", b, saturated, factor_of)
