@@ -33,6 +33,8 @@ class BandTable:
     """Full width at half maximum of each band, nm."""
     bad: Bool[np.ndarray, " B"] | None = None
     """Bands that the file itself marks as bad."""
+    names: tuple[str, ...] | None = None
+    """What the file calls its bands."""
 
 
 @dataclass(frozen=True)
@@ -66,16 +68,57 @@ class SpectralFile:
     def read(self, rows: slice = slice(None), bands: BandIndex = slice(None)) -> Shaped[np.ndarray, "h W b"]:
         """Stored numbers of some rows and bands, in the machine's byte order.
 
+        Args:
+            rows: With a step of at least 1.
+            bands: A slice, or indices in any order; negative ones count from the last band.
         Raises:
             CaptureError: the file is cut short or can't be read.
+            IndexError: there is no such band.
         """
-        values = self.read_part(rows, bands)
+        height, width, num_bands = self.shape
+        rows, bands = slice(*rows.indices(height)), _plain_bands(bands, num_bands)
+        if rows.step < 1:
+            raise IndexError(f"rows are read from the top down; got the step {rows.step}")
+        wanted = (len(range(height)[rows]), width, len(np.arange(num_bands)[bands]))
+        if 0 in wanted:
+            return np.zeros(wanted, self.dtype.newbyteorder("="))
+        values = self._read_checked(rows, bands)
+        if values.shape != wanted:
+            raise CaptureError(f"{self.path}: reading gave an array of {values.shape}; expected {wanted}")
         return np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("="))
+
+    def _read_checked(self, rows: slice, bands: BandIndex) -> np.ndarray:
+        """What `read_part` gives; whatever it raises becomes an error of the file."""
+        try:
+            return self.read_part(rows, bands)
+        except CaptureError:
+            raise
+        except Exception as error:
+            raise unreadable(self.path, error) from error
 
     @property
     def files(self) -> tuple[Path, ...]:
         """Every file that `read` depends on, `path` first."""
         return (self.path, *(source for source in self.sources if source != self.path))
+
+
+def unreadable(path: Path, error: Exception) -> CaptureError:
+    """What to say where a library fails on a file."""
+    if isinstance(error, MemoryError):
+        return CaptureError(
+            f"{path}: too little memory to read it; close other programs, or cut the file in parts"
+        )
+    reason = " ".join(str(error).split())[:300] or "no reason given"
+    return CaptureError(
+        f"{path}: can't be read ({type(error).__name__}: {reason}); the file may be cut short or damaged, copy it again"
+    )
+
+
+def _plain_bands(bands: BandIndex, num_bands: int) -> BandIndex:
+    """The same bands as a slice with a positive step, or as indices from 0 up."""
+    if isinstance(bands, slice) and (bands.step is None or bands.step > 0):
+        return slice(*bands.indices(num_bands))
+    return np.arange(num_bands)[bands]
 
 
 def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
@@ -126,4 +169,9 @@ def _stack_tables(tables: list[tuple[BandTable, int]]) -> BandTable:
         tables[0][0].evidence,
         join([table.fwhm_nm for table, _ in tables]),
         np.concatenate(marks) if any(table.bad is not None for table, _ in tables) else None,
+        tuple(name for table, _ in tables for name in table.names or ()) if _all_named(tables) else None,
     )
+
+
+def _all_named(tables: list[tuple[BandTable, int]]) -> bool:
+    return all(table.names is not None for table, _ in tables)

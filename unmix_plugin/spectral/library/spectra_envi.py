@@ -15,6 +15,7 @@ from jaxtyping import Float64
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands, require_nanometres
+from unmix_plugin.spectral.library.envi_text import parse_envi_header
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable
 
 _TYPES = {1: "u1", 2: "i2", 3: "i4", 4: "f4", 5: "f8", 12: "u2", 13: "u4", 14: "i8", 15: "u8"}
@@ -61,21 +62,10 @@ def _read_header(path: Path) -> dict[str, str]:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise SpectrumError(f"no ENVI header: not text in UTF-8 ({error.reason})") from error
-    lines = iter(text.splitlines())
-    if next(lines, "").strip() != "ENVI":
-        raise SpectrumError("no ENVI header: its first line is not 'ENVI'")
-    header: dict[str, str] = {}
-    for line in lines:
-        key, equals, value = line.partition("=")
-        if not equals or line.lstrip().startswith(";"):
-            continue
-        parts = [value.strip()]
-        if parts[0].startswith("{"):
-            while "}" not in parts[-1] and (following := next(lines, None)) is not None:
-                parts.append("" if following.lstrip().startswith(";") else following)
-            parts = ["\n".join(parts).lstrip("{").partition("}")[0]]
-        header[" ".join(key.lower().split())] = parts[0].strip()
-    return header
+    try:
+        return parse_envi_header(text)
+    except ValueError as error:
+        raise SpectrumError(f"no ENVI header: {error}") from error
 
 
 def _read_values(header: dict[str, str], header_path: Path) -> Float64[np.ndarray, "K B"]:

@@ -1,0 +1,267 @@
+"""TIFF images: against what tifffile decodes as a whole, in every arrangement of bands."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+
+from tests.captures.readers.bands import centres_nm, widths_nm
+from unmix_plugin.captures.readers.opening import open_spectral_file
+from unmix_plugin.captures.readers.read_options import ReadOptions
+from unmix_plugin.errors import CaptureError
+
+CUBE = np.random.default_rng(0).integers(0, 60000, (70, 50, 6)).astype(np.uint16)
+PLANES = np.ascontiguousarray(CUBE.transpose(2, 0, 1))
+ARRANGEMENTS = {
+    "chunky": (CUBE, {"planarconfig": "contig"}),
+    "planar": (PLANES, {"planarconfig": "separate"}),
+    "pages": (PLANES, {"metadata": None}),
+}
+STORAGE = {
+    "one strip": {},
+    "strips": {"rowsperstrip": 16},
+    "tiles": {"tile": (32, 16)},
+    "deflated strips": {"rowsperstrip": 9, "compression": "zlib", "predictor": True},
+    "deflated tiles": {"tile": (16, 32), "compression": "zlib"},
+    "LZW": {"rowsperstrip": 16, "compression": "lzw"},
+    "big-endian": {"byteorder": ">", "rowsperstrip": 30},
+    "BigTIFF": {"bigtiff": True, "tile": (16, 16)},
+}
+
+
+def write(path: Path, arrangement: str, storage: str) -> Path:
+    image, options = ARRANGEMENTS[arrangement]
+    tifffile.imwrite(path, image, photometric="minisblack", **options, **STORAGE[storage])
+    return path
+
+
+@pytest.mark.parametrize("storage", STORAGE)
+@pytest.mark.parametrize("arrangement", ARRANGEMENTS)
+def test_rows_and_bands_are_those_of_the_image(tmp_path, arrangement, storage):
+    file = open_spectral_file(write(tmp_path / "cube.tif", arrangement, storage))
+    assert (file.reader, file.shape) == ("tiff", (70, 50, 6))
+    assert file.interleave == ("bip" if arrangement == "chunky" else "bsq")
+    np.testing.assert_array_equal(file.read(), CUBE)
+    np.testing.assert_array_equal(file.read(slice(13, 41), np.array([4, 0, 4])), CUBE[13:41][..., [4, 0, 4]])
+    np.testing.assert_array_equal(file.read(slice(5, 66, 7), slice(1, 3)), CUBE[5:66:7, :, 1:3])
+    assert file.read().dtype == np.uint16
+
+
+@pytest.mark.parametrize("dtype", ["u1", "i2", "u4", "f4", "f8"])
+def test_types_of_numbers(tmp_path, dtype):
+    image = CUBE.astype(dtype)
+    tifffile.imwrite(tmp_path / "a.tif", image, photometric="minisblack", planarconfig="contig")
+    file = open_spectral_file(tmp_path / "a.tif")
+    assert file.dtype == np.dtype(dtype)
+    np.testing.assert_array_equal(file.read(), image)
+
+
+def test_a_picture_written_by_pillow_has_one_band_or_three(tmp_path):
+    rgb = (CUBE[..., :3] // 256).astype(np.uint8)
+    Image.fromarray(rgb).save(tmp_path / "rgb.tif", compression="tiff_lzw")
+    Image.fromarray(CUBE[..., 0]).save(tmp_path / "grey.tif")
+    np.testing.assert_array_equal(open_spectral_file(tmp_path / "rgb.tif").read(), rgb)
+    np.testing.assert_array_equal(open_spectral_file(tmp_path / "grey.tif").read(), CUBE[..., :1])
+
+
+def test_stacks_of_imagej_with_one_entry_for_all_pages(tmp_path):
+    tifffile.imwrite(tmp_path / "a.tif", PLANES, imagej=True)
+    file = open_spectral_file(tmp_path / "a.tif")
+    np.testing.assert_array_equal(file.read(slice(3, 9), np.array([5, 1])), CUBE[3:9][..., [5, 1]])
+    tifffile.imwrite(tmp_path / "b.tif", PLANES, truncate=True)
+    np.testing.assert_array_equal(open_spectral_file(tmp_path / "b.tif").read(), CUBE)
+
+
+def test_rows_as_pages_are_recognised_by_the_number_of_wavelengths_or_said(tmp_path):
+    nm = [450.0, 500, 550, 600, 650, 700]
+    tifffile.imwrite(tmp_path / "a.tif", CUBE, photometric="minisblack", metadata={"wavelengths": nm})
+    with tifffile.TiffFile(tmp_path / "a.tif") as file:
+        assert len(file.pages) == 70
+    file = open_spectral_file(tmp_path / "a.tif")
+    np.testing.assert_array_equal(file.read(slice(10, 20), slice(2, 4)), CUBE[10:20, :, 2:4])
+    np.testing.assert_array_equal(centres_nm(file), nm)
+    tifffile.imwrite(tmp_path / "b.tif", CUBE, photometric="minisblack", compression="zlib")
+    assert "axis 2 is the shortest" in open_spectral_file(tmp_path / "b.tif").notes[0]
+    file = open_spectral_file(tmp_path / "b.tif", ReadOptions(axes="yxb"))
+    np.testing.assert_array_equal(file.read(slice(1, 70, 3), np.array([5, 2])), CUBE[1::3][..., [5, 2]])
+    file = open_spectral_file(tmp_path / "b.tif", ReadOptions(axes="xyb"))
+    np.testing.assert_array_equal(file.read(slice(3, 9)), CUBE.transpose(1, 0, 2)[3:9])
+
+
+GDAL = "<GDALMetadata>{}</GDALMetadata>"
+
+
+def items(name, values, more=""):
+    return "".join(f'<Item name="{name}" sample="{i}"{more}>{value}</Item>' for i, value in enumerate(values))
+
+
+@pytest.mark.parametrize(
+    ("text", "nm"),
+    [
+        (items("wavelength", [400, 410, 420, 430, 440, 450]), [400, 410, 420, 430, 440, 450]),
+        (
+            items("wavelength", [0.4, 0.5, 0.6, 0.7, 0.8, 0.9])
+            + items("wavelength_units", ["Micrometers"] * 6),
+            [400, 500, 600, 700, 800, 900],
+        ),
+        (
+            items("CENTRAL_WAVELENGTH_UM", [0.4, 0.5, 0.6, 0.7, 0.8, 0.9], ' domain="IMAGERY"'),
+            [400, 500, 600, 700, 800, 900],
+        ),
+        (
+            items(
+                "DESCRIPTION",
+                [f"B{i} ({nm} nm)" for i, nm in enumerate((443, 490, 560, 665, 705, 842))],
+                ' role="description"',
+            ),
+            [443, 490, 560, 665, 705, 842],
+        ),
+        (
+            "".join(f'<Item name="Band_{i + 1}">{400.5 + i} Nanometers</Item>' for i in range(6)),
+            [400.5, 401.5, 402.5, 403.5, 404.5, 405.5],
+        ),
+        ('<Item name="wavelength">{400, 410, 420, 430, 440, 450}</Item>', [400, 410, 420, 430, 440, 450]),
+    ],
+)
+def test_wavelengths_of_gdal(tmp_path, text, nm):
+    tag = (42112, "s", 0, GDAL.format(text), True)
+    tifffile.imwrite(
+        tmp_path / "a.tif", CUBE, photometric="minisblack", planarconfig="contig", extratags=[tag]
+    )
+    file = open_spectral_file(tmp_path / "a.tif")
+    np.testing.assert_allclose(centres_nm(file), nm)
+    assert file.notes == ()
+
+
+def test_scale_width_and_no_data_of_gdal(tmp_path):
+    text = items("OFFSET", [0] * 6, ' role="offset"') + items("SCALE", [0.0001] * 6, ' role="scale"')
+    text += items("wavelength", [400, 410, 420, 430, 440, 450]) + items("fwhm", [5, 5, 5, 5, 5, 6])
+    tags = [(42112, "s", 0, GDAL.format(text), True), (42113, "s", 0, "65535", True)]
+    tifffile.imwrite(
+        tmp_path / "a.tif", CUBE, photometric="minisblack", planarconfig="contig", extratags=tags
+    )
+    file = open_spectral_file(tmp_path / "a.tif")
+    assert file.scale == pytest.approx(10000)
+    assert file.no_data == 65535
+    np.testing.assert_array_equal(widths_nm(file), [5, 5, 5, 5, 5, 6])
+
+
+@pytest.mark.parametrize(
+    "description",
+    [
+        json.dumps({"wavelengths_nm": [400, 410, 420, 430, 440, 450]}),
+        json.dumps({"Wavelength": [0.4, 0.41, 0.42, 0.43, 0.44, 0.45], "wavelength_units": "um"}),
+        "camera: x\nwavelengths (nm): 400, 410, 420, 430, 440, 450\nshutter: 3",
+        "wavelength = {400, 410, 420, 430, 440, 450}",
+    ],
+)
+def test_wavelengths_of_the_description(tmp_path, description):
+    tifffile.imwrite(
+        tmp_path / "a.tif",
+        CUBE,
+        photometric="minisblack",
+        planarconfig="contig",
+        description=description,
+        metadata=None,
+    )
+    file = open_spectral_file(tmp_path / "a.tif")
+    np.testing.assert_allclose(centres_nm(file), [400, 410, 420, 430, 440, 450])
+    assert "image description" in file.bands.evidence
+
+
+def test_wavelengths_of_pages(tmp_path):
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        for nm, plane in zip((660, 550, 450), PLANES, strict=False):
+            file.write(plane, description=f"filter {nm} nm", metadata=None)
+    file = open_spectral_file(tmp_path / "a.tif")
+    np.testing.assert_array_equal(centres_nm(file), [660, 550, 450])
+    np.testing.assert_array_equal(file.read(), CUBE[..., :3])
+
+
+XMP = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/">
+<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description xmlns:Camera="http://pix4d.com/1.0">
+<Camera:BandName>Red edge</Camera:BandName><Camera:CentralWavelength>717</Camera:CentralWavelength>
+<Camera:WavelengthFWHM>10</Camera:WavelengthFWHM></rdf:Description></rdf:RDF></x:xmpmeta><?xpacket end="w"?>"""
+
+
+def test_the_band_of_a_multispectral_camera(tmp_path):
+    packet = XMP.encode()
+    tag = (700, "B", len(packet), packet, True)
+    tifffile.imwrite(tmp_path / "a.tif", PLANES[0], extratags=[tag, (274, "H", 1, 6, True)], metadata=None)
+    file = open_spectral_file(tmp_path / "a.tif")
+    assert file.shape == (70, 50, 1)  # the orientation is not followed
+    assert file.bands.names == ("Red edge",)
+    np.testing.assert_array_equal(centres_nm(file), [717])
+    np.testing.assert_array_equal(widths_nm(file), [10])
+    assert file.metadata["xmp"]["Camera:CentralWavelength"] == "717"
+    assert file.metadata["exif"]["Orientation"] == 6
+
+
+def test_previews_and_pages_of_other_sizes_are_left_out(tmp_path):
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        file.write(PLANES[0], metadata=None)
+        file.write(PLANES[0, ::2, ::2], subfiletype=1, metadata=None)
+        file.write(PLANES[1, :9], metadata=None)
+    file = open_spectral_file(tmp_path / "a.tif")
+    assert file.shape == (70, 50, 1)
+    assert "2 pages of other sizes" in file.notes[0]
+
+
+def test_several_colour_pages_are_refused(tmp_path):
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        for _ in range(2):
+            file.write(CUBE[..., :3], photometric="rgb", metadata=None)
+    with pytest.raises(CaptureError, match="2 pages of 3 numbers a pixel; expected one page with all bands"):
+        open_spectral_file(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize("storage", STORAGE)
+@pytest.mark.parametrize("arrangement", ARRANGEMENTS)
+def test_a_file_that_is_cut_short_is_refused(tmp_path, arrangement, storage):
+    path = write(tmp_path / "cube.tif", arrangement, storage)
+    for share in (0.9, 0.5, 0.1, 0.001):
+        data = path.read_bytes()
+        path.write_bytes(data[: int(len(data) * share)])
+        with pytest.raises(CaptureError, match=r"cube.tif: "):
+            open_spectral_file(path).read()
+
+
+def test_the_first_rows_of_a_compressed_file_are_read_without_the_rest(tmp_path):
+    path = write(tmp_path / "cube.tif", "chunky", "deflated strips")
+    file = open_spectral_file(path)
+    data = bytearray(path.read_bytes())
+    with tifffile.TiffFile(path) as opened:
+        page = opened.pages[0]
+        data[page.dataoffsets[2] : page.dataoffsets[2] + page.databytecounts[2]] = bytes(
+            page.databytecounts[2]
+        )
+    path.write_bytes(data)
+    np.testing.assert_array_equal(file.read(slice(0, 18)), CUBE[:18])
+    with pytest.raises(CaptureError, match="can't be read"):
+        file.read(slice(18, 19))
+
+
+def test_a_file_of_many_gigabytes_opens_at_once(tmp_path):
+    path = tmp_path / "big.tif"
+    tifffile.memmap(
+        path,
+        shape=(20000, 10000, 60),
+        dtype=np.uint16,
+        bigtiff=True,
+        photometric="minisblack",
+        planarconfig="contig",
+    )
+    file = open_spectral_file(path)
+    assert file.shape == (20000, 10000, 60)
+    assert file.read(slice(19999, 20000), slice(58, 60)).shape == (1, 10000, 2)
+
+
+def test_pointers_of_git_lfs_are_named(tmp_path):
+    (tmp_path / "a.tif").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")
+    with pytest.raises(
+        CaptureError, match="a pointer of Git LFS, not the file itself; fetch it with 'git lfs pull'"
+    ):
+        open_spectral_file(tmp_path / "a.tif")
