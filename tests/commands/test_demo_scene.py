@@ -60,3 +60,15 @@ def test_the_light_is_chosen_by_name(monkeypatch, capsys, tmp_path):
 def test_words_that_do_not_parse_exit_2(monkeypatch, capsys, words):
     assert run(monkeypatch, *words) == 2
     assert capsys.readouterr().err
+
+
+def test_raw_writes_a_capture_and_names_the_command_that_makes_a_scene_of_it(monkeypatch, capsys, tmp_path):
+    words = ["--raw", tmp_path / "capture", "--size", "16", "--bands", "8", "--views", "4"]
+    assert run(monkeypatch, *words) == 0
+    printed = capsys.readouterr().out
+    assert "4 raw views of 16 x 16 pixels and 8 bands, 3 of them bad" in printed
+    shown = ("view_000.hdr", "white.hdr", "dark.hdr", "poses-true.json", "truth")
+    assert all((tmp_path / "capture" / name).exists() for name in shown)
+    assert all(f"  {tmp_path / 'capture' / name}  " in printed for name in shown)
+    assert f"unmix-process cubes --data {tmp_path / 'capture'} --output-dir SCENE" in printed
+    assert not (tmp_path / "capture" / "transforms.json").exists()

@@ -1,14 +1,23 @@
-"""`unmix-demo-scene DIR`: write the built-in scene as a folder of any size."""
+"""`unmix-demo-scene DIR`: write the built-in scene as a folder of any size, or as an instrument would (`--raw`)."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from unmix_plugin.captures.demo.capture import (
+    POSES,
+    RAW_BANDS,
+    RAW_LAMP,
+    RAW_SIZE,
+    RAW_VIEWS,
+    make_demo_capture,
+)
 from unmix_plugin.commands.entry import run_command
 from unmix_plugin.scenes.demo.materials import LAMP
 from unmix_plugin.scenes.demo.scene import DEFAULT_BANDS, DEFAULT_SIZE, DEFAULT_VIEWS, make_demo_scene
@@ -21,41 +30,93 @@ class DemoSceneOptions:
 
     directory: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """Folder to write; made if it is not there."""
-    size: int = DEFAULT_SIZE
-    """Width and height of every image, pixels."""
-    bands: int = DEFAULT_BANDS
-    """Bands, evenly spaced over 400-700 nm."""
-    views: int = DEFAULT_VIEWS
-    """Images on a dome; every 4th is for evaluation."""
-    illuminant: str = LAMP
-    """What lights the scene: a CIE illuminant (D50, D65, A, E, FL2, ...) or a .csv file (wavelength,power)."""
+    raw: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Write what an instrument would have written instead: raw counts as ENVI cubes, a white reference, a dark frame,
+    and no poses; for unmix-process."""
+    size: int | None = None
+    """Width and height of every image, pixels; 96, or 400 with --raw."""
+    bands: int | None = None
+    """Bands, evenly spaced over 400-700 nm; 31."""
+    views: int | None = None
+    """Images on a dome, every 4th for evaluation; 32, or 40 with --raw."""
+    illuminant: str | None = None
+    """What lights the scene: a CIE illuminant (D50, D65, A, E, FL2, ...) or a .csv file (wavelength,power); D50, or A
+    with --raw."""
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Accept a folder that is not empty: a demo scene in it is replaced, other files stay."""
 
 
 def write_demo_scene(arguments: list[str]) -> None:
-    """Parse the arguments, write the scene, say what is where."""
+    """Parse the arguments, write the scene or the capture, say what is where."""
     options = tyro.cli(DemoSceneOptions, prog="unmix-demo-scene", args=arguments)
+    if options.raw:
+        _write_capture(options)
+    else:
+        _write_scene(options)
+
+
+def _write_scene(options: DemoSceneOptions) -> None:
+    folder = options.directory
+    size, bands, views = _numbers(options, (DEFAULT_SIZE, DEFAULT_BANDS, DEFAULT_VIEWS))
+    light = parse_light(options.illuminant or LAMP)
     started = time.perf_counter()
-    light = parse_light(options.illuminant)
-    make_demo_scene(options.directory, options.size, options.bands, options.views, options.overwrite, light)
+    make_demo_scene(folder, size, bands, views, options.overwrite, light)
     seconds = time.perf_counter() - started
-    evaluation = len(list((options.directory / "abundances").glob("eval_*")))
+    evaluation = len(list((folder / "abundances").glob("eval_*")))
     print(
-        f"{options.directory}: {options.views} views ({options.views - evaluation} to train on, {evaluation} for "
-        f"evaluation) of {options.size} x {options.size} pixels and {options.bands} bands, in {seconds:.1f} s"
+        f"{folder}: {views} views ({views - evaluation} to train on, {evaluation} for evaluation) of {size} x {size} "
+        f"pixels and {bands} bands, in {seconds:.1f} s"
     )
-    print(f"  {options.directory / 'transforms.json'}  cameras, wavelengths, splits")
-    for name, content in (
-        ("cubes", "radiance in [0, 1], float16 (H, W, B)"),
-        ("images", "sRGB with alpha"),
-        ("labels", "true material of each pixel, 255 where there is none"),
-        ("abundances", "true abundances of evaluation views, float16 (H, W, K)"),
-        ("endmembers.csv", "true reflectances"),
-        ("illuminant.csv", "the lamp's spectrum"),
-    ):
-        print(f"  {options.directory / name}  {content}")
-    print(f"train on it: unmix-train unmix-nerf --data {options.directory}")
+    _print_files(
+        folder,
+        (
+            ("transforms.json", "cameras, wavelengths, splits"),
+            ("cubes", "radiance in [0, 1], float16 (H, W, B)"),
+            ("images", "sRGB with alpha"),
+            ("labels", "true material of each pixel, 255 where there is none"),
+            ("abundances", "true abundances of evaluation views, float16 (H, W, K)"),
+            ("endmembers.csv", "true reflectances"),
+            ("illuminant.csv", "the lamp's spectrum"),
+        ),
+    )
+    print(f"train on it: unmix-train unmix-nerf --data {folder}")
+
+
+def _write_capture(options: DemoSceneOptions) -> None:
+    folder = options.directory
+    size, bands, views = _numbers(options, (RAW_SIZE, RAW_BANDS, RAW_VIEWS))
+    light = parse_light(options.illuminant or RAW_LAMP)
+    started = time.perf_counter()
+    make_demo_capture(folder, size, bands, views, options.overwrite, light)
+    seconds = time.perf_counter() - started
+    print(
+        f"{folder}: {views} raw views of {size} x {size} pixels and {bands} bands, 3 of them bad, in {seconds:.1f} s"
+    )
+    _print_files(
+        folder,
+        (
+            ("view_000.hdr", "and .raw, the first view: counts, uint16, ENVI bil"),
+            ("white.hdr", "white reference"),
+            ("dark.hdr", "dark frame"),
+            (POSES, "where the cameras stood, to compare with poses that were estimated"),
+            ("truth", "true materials of each pixel and their reflectances, the lamp's spectrum"),
+        ),
+    )
+    print(
+        f"make a scene of it: unmix-process cubes --data {folder} --output-dir SCENE --white {folder / 'white.hdr'} "
+        f"--dark {folder / 'dark.hdr'} --poses estimate"
+    )
+
+
+def _numbers(options: DemoSceneOptions, defaults: tuple[int, int, int]) -> tuple[int, ...]:
+    """Size, bands and views, as asked or else the defaults."""
+    asked = (options.size, options.bands, options.views)
+    return tuple(default if value is None else value for value, default in zip(asked, defaults, strict=True))
+
+
+def _print_files(folder: Path, files: Iterable[tuple[str, str]]) -> None:
+    for name, content in files:
+        print(f"  {folder / name}  {content}")
 
 
 def main() -> None:

@@ -12,9 +12,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +20,18 @@ import torch
 from jaxtyping import Float
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.errors import ConfigError, SceneError
+from unmix_plugin.errors import SceneError
+from unmix_plugin.scenes.demo.folders import check_bounds, staging_beside, staging_for
 from unmix_plugin.scenes.demo.materials import LAMP, MATERIALS, band_centers_nm, lamp_power, reflectances
 from unmix_plugin.scenes.demo.shading import ViewCoefficients, render_view
-from unmix_plugin.scenes.demo.views import demo_cameras, frame_name, label_image, radiance_cube
+from unmix_plugin.scenes.demo.views import (
+    demo_cameras,
+    frame_name,
+    label_image,
+    lens_entries,
+    radiance_cube,
+    transform_matrix,
+)
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
@@ -51,7 +56,7 @@ def demo_scene_path(cache_dir: Path | None = None) -> Path:
     if is_complete(target):
         return target
     try:
-        with _staging_beside(target) as staging:
+        with staging_beside(target) as staging:
             _write_scene(staging / "scene", DEFAULT_SIZE, DEFAULT_BANDS, DEFAULT_VIEWS)
             if target.exists() and not is_complete(target):
                 target.rename(staging / "incomplete")
@@ -86,22 +91,13 @@ def make_demo_scene(
         SpectrumError: an unknown light, or one that is not known at all bands.
         SceneError: the folder can't be written, or the disk is full.
     """
-    _check_bounds(size, bands, views)
-    if directory.exists() and not directory.is_dir():
-        raise ConfigError(f"{directory} is a file; give a folder for the demo scene")
-    if not overwrite and directory.is_dir() and any(directory.iterdir()):
-        raise ConfigError(
-            f"{directory} is not empty; choose another folder, or replace the scene with --overwrite"
-        )
-    try:
-        with _staging_beside(directory) as staging:
-            _write_scene(staging / "scene", size, bands, views, illuminant)
-            _move_files(staging / "scene", directory)
-    except OSError as error:  # NumPy's own has no strerror
-        raise SceneError(
-            f"can't write the demo scene to {directory}: {error.strerror or error}; make room there or choose another "
-            "folder"
-        ) from error
+    check_bounds(
+        "a demo scene",
+        {"size": (size, SIZE_BOUNDS), "bands": (bands, BANDS_BOUNDS), "views": (views, VIEWS_BOUNDS)},
+    )
+    with staging_for(directory, "the demo scene", overwrite) as staging:
+        _write_scene(staging / "scene", size, bands, views, illuminant)
+        _move_files(staging / "scene", directory)
 
 
 def is_complete(directory: Path) -> bool:
@@ -131,8 +127,7 @@ def _write_scene(folder: Path, size: int, bands: int, views: int, illuminant: st
         view = render_view(cameras, index)
         cube = radiance_cube(view, spectra, lamp)
         frames.append(_write_view(folder, frame_name(index), view, cube, to_rgb))
-        pose = cameras.camera_to_world[index].double().tolist()
-        frames[-1]["transform_matrix"] = [*pose, [0.0, 0.0, 0.0, 1.0]]
+        frames[-1]["transform_matrix"] = transform_matrix(cameras, index)
     content = _header(cameras, sampling) | _splits(views) | {"frames": frames}
     (folder / _TRANSFORMS).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
@@ -164,16 +159,8 @@ def _write_view(
 
 
 def _header(cameras: Cameras, bands: Bands) -> dict[str, Any]:
-    focal_px, center_px = float(cameras.focal_px[0, 0]), float(cameras.center_px[0, 0])
     return {
-        "camera_model": "OPENCV",
-        "w": cameras.width,
-        "h": cameras.height,
-        "fl_x": focal_px,
-        "fl_y": focal_px,
-        "cx": center_px,
-        "cy": center_px,
-        **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
+        **lens_entries(cameras),
         "wavelengths": bands.centers_nm.tolist(),
         "materials": list(MATERIALS),
         "illuminant_path": "illuminant.csv",
@@ -189,14 +176,6 @@ def _splits(views: int) -> dict[str, list[str]]:
     return {"train_filenames": train, "val_filenames": evaluation, "test_filenames": evaluation}
 
 
-@contextmanager
-def _staging_beside(directory: Path) -> Iterator[Path]:
-    """A temporary folder on the same disk, so that what is built there can be renamed into place."""
-    directory.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{directory.name}-", dir=directory.parent) as folder:
-        yield Path(folder)
-
-
 def _move_files(built: Path, directory: Path) -> None:
     """Put a scene into a folder in place of an older one, transforms.json last: a scene is whole or not there."""
     directory.mkdir(exist_ok=True)
@@ -209,16 +188,6 @@ def _move_files(built: Path, directory: Path) -> None:
         if path.is_file() and path.name != _TRANSFORMS:
             path.replace(directory / path.relative_to(built))
     (built / _TRANSFORMS).replace(directory / _TRANSFORMS)
-
-
-def _check_bounds(size: int, bands: int, views: int) -> None:
-    for name, value, (low, high) in (
-        ("size", size, SIZE_BOUNDS),
-        ("bands", bands, BANDS_BOUNDS),
-        ("views", views, VIEWS_BOUNDS),
-    ):
-        if not low <= value <= high:
-            raise ConfigError(f"--{name} of a demo scene must be {low} to {high}; found {value}")
 
 
 def _user_cache() -> Path:

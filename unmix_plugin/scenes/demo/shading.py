@@ -9,6 +9,7 @@ occlusion has a closed form.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -98,8 +99,14 @@ class Hits:
     specular: Float[np.ndarray, " R"]
 
 
-def render_view(cameras: Cameras, index: int, subpixels: int = SUBPIXELS) -> ViewCoefficients:
-    """Look at the scene through one camera with `subpixels`^2 rays a pixel."""
+def render_view(
+    cameras: Cameras, index: int, subpixels: int = SUBPIXELS, things: Sequence[Thing] = THINGS
+) -> ViewCoefficients:
+    """Look at the scene through one camera with `subpixels`^2 rays a pixel.
+
+    Args:
+        things: Those of `THINGS`, if need be with other surfaces.
+    """
     count = subpixels**2
     pixels = cameras.height * cameras.width
     coverage = np.zeros(pixels, dtype=np.float32)
@@ -108,7 +115,7 @@ def render_view(cameras: Cameras, index: int, subpixels: int = SUBPIXELS) -> Vie
     for i in range(count):
         offset = ((i % subpixels + 0.5) / subpixels, (i // subpixels + 0.5) / subpixels)
         rays = cameras.image_rays(index, offset)
-        hits = trace(rays.origins.numpy(), rays.directions.numpy(), lamp_point(i, count))
+        hits = trace(rays.origins.numpy(), rays.directions.numpy(), lamp_point(i, count), things)
         coverage += hits.is_hit
         abundances += hits.abundances
         diffuse += hits.diffuse
@@ -123,7 +130,10 @@ def render_view(cameras: Cameras, index: int, subpixels: int = SUBPIXELS) -> Vie
 
 
 def trace(
-    origins: Float[np.ndarray, "R 3"], directions: Float[np.ndarray, "R 3"], lamp: Float[np.ndarray, "3"]
+    origins: Float[np.ndarray, "R 3"],
+    directions: Float[np.ndarray, "R 3"],
+    lamp: Float[np.ndarray, "3"],
+    things: Sequence[Thing] = THINGS,
 ) -> Hits:
     """What each ray sees first, lit by one point of the lamp and by the sky. Directions have length 1."""
     distances, nearest = first_hits(_PLACEMENTS, origins, directions)
@@ -131,7 +141,7 @@ def trace(
     shape = (len(origins), len(MATERIALS))
     abundances, diffuse = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
     specular = np.zeros(len(origins), dtype=np.float32)
-    for i, thing in enumerate(THINGS):
+    for i, thing in enumerate(things):
         rows = np.flatnonzero(is_hit & (nearest == i))
         points = origins[rows] + distances[rows, None] * directions[rows]
         local_points = thing.placement.to_local(points)
@@ -180,7 +190,7 @@ def sky_light(
     """
     open_share = np.ones(len(points), dtype=np.float32)
     for other in THINGS:
-        for *center, radius in other.sky_blockers if other is not thing else ():
+        for *center, radius in other.sky_blockers if other.placement is not thing.placement else ():
             offsets = np.asarray(center, dtype=np.float32) - points
             lengths = np.sqrt(dot(offsets, offsets))
             cosines = dot(offsets, normals) / lengths

@@ -5,9 +5,11 @@ Notation: `B` bands, `K` materials, `H`, `W` rows and columns.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.scenes.demo.shading import ViewCoefficients
@@ -46,6 +48,26 @@ def demo_cameras(size: int, views: int) -> Cameras:
     )
 
 
+def lens_entries(cameras: Cameras) -> dict[str, Any]:
+    """What transforms.json says of the lens that all of the cameras have."""
+    focal_px, center_px = float(cameras.focal_px[0, 0]), float(cameras.center_px[0, 0])
+    return {
+        "camera_model": "OPENCV",
+        "w": cameras.width,
+        "h": cameras.height,
+        "fl_x": focal_px,
+        "fl_y": focal_px,
+        "cx": center_px,
+        "cy": center_px,
+        **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
+    }
+
+
+def transform_matrix(cameras: Cameras, index: int) -> list[list[float]]:
+    """Camera to world as the four rows that transforms.json has."""
+    return [*cameras.camera_to_world[index].double().tolist(), [0.0, 0.0, 0.0, 1.0]]
+
+
 def frame_name(index: int) -> str:
     """`train_000`, `train_001`, `eval_002`, ...: every 4th view is for evaluation."""
     return f"{'eval' if index % 4 == 2 else 'train'}_{index:03d}"
@@ -55,8 +77,12 @@ def radiance_cube(
     view: ViewCoefficients, spectra: Float[np.ndarray, "K B"], lamp: Float[np.ndarray, " B"]
 ) -> Float[np.ndarray, "H W B"]:
     """Spectral radiance of every pixel in [0, 1]: what exceeds 1 saturates, as in a sensor."""
-    reflected = view.diffuse @ spectra.astype(np.float32) + view.specular[..., None]
-    return (reflected * lamp.astype(np.float32)).clip(0, 1)
+    return (reflected(view, spectra) * lamp.astype(np.float32)).clip(0, 1)
+
+
+def reflected(view: ViewCoefficients, spectra: Float[np.ndarray, "K B"]) -> Float32[np.ndarray, "H W B"]:
+    """What every pixel reflects of the lamp, highlights included; 1 is a white matt panel in irradiance 1."""
+    return view.diffuse @ spectra.astype(np.float32) + view.specular[..., None]
 
 
 def label_image(view: ViewCoefficients) -> UInt8[np.ndarray, "H W"]:

@@ -1,0 +1,164 @@
+"""The demo scene as raw counts: what is written, and that calibration by hand gives the truth back."""
+
+import json
+from functools import partial
+
+import numpy as np
+import pytest
+
+from unmix_plugin.captures.demo import capture as demo_capture
+from unmix_plugin.captures.demo.capture import make_demo_capture
+from unmix_plugin.captures.demo.line_camera import (
+    FULL_WELL,
+    READ_NOISE,
+    WHITE_SHARE,
+    BadBands,
+    demo_line_camera,
+)
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.scenes.demo.materials import band_centers_nm, lamp_power, reflectances
+from unmix_plugin.scenes.demo.shading import render_view
+from unmix_plugin.scenes.demo.texture import speckled_things
+from unmix_plugin.scenes.demo.views import demo_cameras, label_image, reflected
+
+SIZE, BANDS, VIEWS = 48, 12, 5
+GOOD = [band for band in range(BANDS) if band not in BadBands.of(BANDS).all]
+
+
+@pytest.fixture(scope="module")
+def one_ray_a_pixel():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demo_capture, "render_view", partial(render_view, subpixels=1))
+        yield
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, one_ray_a_pixel):  # noqa: ARG001 - asked for its effect
+    path = tmp_path_factory.mktemp("capture") / "capture"
+    make_demo_capture(path, SIZE, BANDS, VIEWS)
+    return path
+
+
+@pytest.fixture(scope="module")
+def truth():
+    """The first view, rendered again."""
+    return render_view(demo_cameras(SIZE, VIEWS), 0, subpixels=1, things=speckled_things())
+
+
+def read_counts(path):
+    """A bil file, without any reader of ours."""
+    return np.fromfile(path, "<u2").reshape(-1, BANDS, SIZE).transpose(0, 2, 1).astype(float)
+
+
+def header_of(path):
+    lines = path.read_text().splitlines()[1:]
+    return dict(line.split(" = ", 1) for line in lines)
+
+
+def list_of(text):
+    return [float(value) for value in text.strip("{ }").split(",")]
+
+
+def test_the_folder_holds_views_references_true_poses_and_truth(folder):
+    names = [f"view_{index:03d}" for index in range(VIEWS)]
+    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert files == {
+        *(f"{name}{suffix}" for name in (*names, "white", "dark") for suffix in (".hdr", ".raw")),
+        *(f"truth/{name}.png" for name in names),
+        *("truth/endmembers.csv", "truth/illuminant.csv", "poses-true.json"),
+    }
+
+
+def test_headers_say_how_the_numbers_lie_and_which_bands_are_bad(folder):
+    for name, lines in (("view_003", SIZE), ("white", 100), ("dark", 100)):
+        header = header_of(folder / f"{name}.hdr")
+        assert (header["interleave"], header["data type"], header["byte order"]) == ("bil", "12", "0")
+        assert [int(header[key]) for key in ("lines", "samples", "bands")] == [lines, SIZE, BANDS]
+        assert header["wavelength units"] == "Nanometers"
+        np.testing.assert_allclose(list_of(header["wavelength"]), np.linspace(400, 700, BANDS))
+        np.testing.assert_allclose(list_of(header["fwhm"]), 300 / (BANDS - 1), atol=1e-3)
+        assert np.flatnonzero(np.array(list_of(header["bbl"])) == 0).tolist() == [0, 4]
+        assert (folder / f"{name}.raw").stat().st_size == 2 * lines * SIZE * BANDS
+
+
+def test_white_and_dark_turn_counts_into_the_true_reflectance(folder, truth):
+    dark, white = (read_counts(folder / f"{name}.raw").mean(axis=0) for name in ("dark", "white"))
+    counts = read_counts(folder / "view_000.raw")[..., GOOD]
+    found = (counts - dark[:, GOOD]) / (white - dark)[:, GOOD]
+    expected = reflected(truth, reflectances(band_centers_nm(BANDS)))[..., GOOD]
+    whole = counts < 65535
+    assert np.abs(found - expected)[whole].mean() < 0.005
+    assert np.abs(counts / 65535 - expected)[whole].mean() > 0.05, "the references matter"
+
+
+def test_dark_and_white_differ_from_column_to_column(folder):
+    dark, white = (read_counts(folder / f"{name}.raw")[..., GOOD] for name in ("dark", "white"))
+    for image in (dark, white):
+        columns = image.mean(axis=0)
+        assert (columns.std(axis=0) > 5 * image.std(axis=0).mean(axis=0) / 10).all(), "more than noise leaves"
+    edge, middle = white[:, [0, -1]].mean(), white[:, SIZE // 2 - 2 : SIZE // 2 + 2].mean()
+    assert edge < 0.85 * middle
+
+
+def test_bad_bands_are_dead_or_drowned_in_noise(folder):
+    white = read_counts(folder / "white.raw")
+    noise = white.std(axis=0).mean(axis=0) / white.mean(axis=(0, 1)).clip(1)
+    assert (white[..., 4] == 0).all()
+    assert (noise[[0, 8]] > 0.2).all()
+    assert (noise[GOOD] < 0.03).all()
+
+
+def test_noise_is_that_of_electrons_counted_and_read():
+    wavelengths = band_centers_nm(BANDS)
+    camera = demo_line_camera(8, wavelengths, lamp_power(wavelengths))
+    light = np.full((4000, 8, BANDS), 0.25, np.float32)
+    counts = camera.expose(light, np.random.default_rng(0)).astype(float)
+    electrons = 0.25 * camera.white_electrons
+    assert electrons.max() == pytest.approx(0.25 * WHITE_SHARE * FULL_WELL, rel=1e-5)
+    found = counts.std(axis=0) * FULL_WELL / 64000
+    np.testing.assert_allclose(found[:, GOOD], np.sqrt(electrons + READ_NOISE**2)[:, GOOD], rtol=0.06)
+
+
+def test_bright_highlights_are_cut_off_at_the_largest_count():
+    wavelengths = band_centers_nm(BANDS)
+    camera = demo_line_camera(8, wavelengths, lamp_power(wavelengths))
+    counts = camera.expose(np.full((2, 8, BANDS), 3.0, np.float32), np.random.default_rng(0))
+    assert (counts.max(axis=(0, 1))[GOOD] == 65535).any()
+
+
+def test_labels_and_poses_are_those_of_the_views(folder, truth):
+    from PIL import Image
+
+    assert (np.array(Image.open(folder / "truth/view_000.png")) == label_image(truth)).all()
+    poses = json.loads((folder / "poses-true.json").read_text())
+    assert [frame["file_path"] for frame in poses["frames"]] == [f"view_{i:03d}.hdr" for i in range(VIEWS)]
+    cameras = demo_cameras(SIZE, VIEWS)
+    assert (poses["w"], poses["h"], poses["fl_x"]) == (SIZE, SIZE, float(cameras.focal_px[0, 0]))
+    np.testing.assert_allclose(
+        [frame["transform_matrix"][:3] for frame in poses["frames"]], cameras.camera_to_world, atol=1e-7
+    )
+
+
+@pytest.mark.usefixtures("one_ray_a_pixel")
+def test_a_capture_written_again_has_the_same_bytes_and_no_view_of_the_older_one(folder, tmp_path):
+    make_demo_capture(tmp_path, 16, 8, 7)
+    (tmp_path / "view_of_mine.hdr").write_text("mine")
+    make_demo_capture(tmp_path, SIZE, BANDS, VIEWS, overwrite=True)
+    (tmp_path / "view_of_mine.hdr").unlink()
+    for path in tmp_path.rglob("*"):
+        if path.is_file():
+            assert path.read_bytes() == (folder / path.relative_to(tmp_path)).read_bytes(), path.name
+
+
+@pytest.mark.parametrize(("name", "value"), [("size", 8), ("bands", 7), ("views", 3)])
+def test_a_number_out_of_bounds_is_refused_before_anything_is_written(tmp_path, name, value):
+    with pytest.raises(ConfigError, match=rf"--{name} of a demo capture must be \d+ to \d+; found {value}"):
+        make_demo_capture(tmp_path / "capture", **{name: value})
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_with_something_in_it_is_refused_and_left_alone(tmp_path):
+    (tmp_path / "thesis.tex").write_text("years")
+    with pytest.raises(ConfigError, match="is not empty"):
+        make_demo_capture(tmp_path, 16, 8, 4)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]

@@ -1,0 +1,1 @@
+"""The built-in scene as an instrument would have written it."""

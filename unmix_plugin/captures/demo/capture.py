@@ -1,0 +1,169 @@
+"""The demo scene as an instrument would have written it: raw counts, white, dark, and no poses.
+
+A folder with one ENVI cube a view (`view_000.hdr` and `.raw`), `white` and `dark` the same, `poses-true.json` in the
+form of transforms.json, and `truth/` with labels and reflectances, for whoever compares. Writing it twice gives the
+same bytes.
+
+Notation: `B` bands, `K` materials, `H`, `W` rows and columns.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt16
+
+from unmix_plugin.captures.demo.line_camera import demo_line_camera
+from unmix_plugin.formats.envi_header import HeaderValue, beside, header_bytes, wavelength_entries
+from unmix_plugin.scenes.demo.folders import check_bounds, staging_for
+from unmix_plugin.scenes.demo.materials import MATERIALS, band_centers_nm, lamp_power, reflectances
+from unmix_plugin.scenes.demo.scene import SIZE_BOUNDS, VIEWS_BOUNDS
+from unmix_plugin.scenes.demo.shading import render_view
+from unmix_plugin.scenes.demo.texture import speckled_things
+from unmix_plugin.scenes.demo.views import (
+    demo_cameras,
+    label_image,
+    lens_entries,
+    reflected,
+    transform_matrix,
+)
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
+
+RAW_SIZE, RAW_BANDS, RAW_VIEWS = 400, 31, 40
+"""Defaults: as many views and pixels as structure from motion likes."""
+RAW_LAMP = "A"
+"""The lamp of the laboratory: a halogen lamp, which has little blue."""
+RAW_BANDS_BOUNDS = (8, 512)
+"""Fewer would leave too few beside the bad ones."""
+REFERENCE_LINES = 100
+"""Rows of the white and of the dark."""
+
+POSES = "poses-true.json"
+_UINT16 = 12
+"""What ENVI calls this type."""
+_OURS = re.compile(r"(view_\d{3,}|white|dark)\.(hdr|raw)|view_\d{3,}\.png")
+
+
+def view_name(index: int) -> str:
+    """`view_000`, `view_001`, ..."""
+    return f"view_{index:03d}"
+
+
+def make_demo_capture(
+    directory: Path,
+    size: int = RAW_SIZE,
+    bands: int = RAW_BANDS,
+    views: int = RAW_VIEWS,
+    overwrite: bool = False,
+    illuminant: str | Path = RAW_LAMP,
+) -> None:
+    """Write the demo capture. It is built beside the folder and moved in when complete.
+
+    Args:
+        directory: Made if absent, parents too.
+        overwrite: Whether a folder with something in it is accepted: an older capture there is replaced, other files
+            stay.
+        illuminant: The lamp: the name of a known light, or a CSV file (wavelength,power).
+    Raises:
+        ConfigError: a number out of bounds; a folder with something in it, or no folder at all.
+        SpectrumError: an unknown light, or one that is not known at all bands.
+        SceneError: the folder can't be written, or the disk is full.
+    """
+    numbers = {
+        "size": (size, SIZE_BOUNDS),
+        "bands": (bands, RAW_BANDS_BOUNDS),
+        "views": (views, VIEWS_BOUNDS),
+    }
+    check_bounds("a demo capture", numbers)
+    sampling = Bands.of(band_centers_nm(bands))
+    lamp = lamp_power(sampling.centers_nm, illuminant)
+    with staging_for(directory, "the demo capture", overwrite) as staging:
+        (staging / "truth").mkdir()
+        _write_truth(staging, sampling, lamp)
+        _write_images(staging, size, views, sampling, lamp)
+        _write_poses(staging / POSES, size, views)
+        _move_files(staging, directory)
+
+
+def _write_images(folder: Path, size: int, views: int, bands: Bands, lamp: np.ndarray) -> None:
+    """Dark, white, every view, and the labels of each."""
+    from PIL import Image
+
+    camera = demo_line_camera(size, bands.centers_nm, lamp)
+    generator = np.random.default_rng(1)
+    marked = camera.bad.marked
+    shape = (REFERENCE_LINES, size, len(bands))
+    for name, light in (("dark", np.zeros(shape, np.float32)), ("white", np.ones(shape, np.float32))):
+        write_counts(folder / name, camera.expose(light, generator), bands, marked, f"{name} reference")
+    cameras, things = demo_cameras(size, views), speckled_things()
+    spectra = reflectances(bands.centers_nm)
+    for index in range(views):
+        view, name = render_view(cameras, index, things=things), view_name(index)
+        counts = camera.expose(reflected(view, spectra), generator)
+        write_counts(folder / name, counts, bands, marked, "a view of the demo scene")
+        Image.fromarray(label_image(view)).save(folder / "truth" / f"{name}.png")
+
+
+def write_counts(
+    path_without_suffix: Path,
+    counts: UInt16[np.ndarray, "H W B"],
+    bands: Bands,
+    marked: tuple[int, ...],
+    what: str,
+) -> None:
+    """Write NAME.hdr and NAME.raw, band-interleaved by line.
+
+    Args:
+        marked: Bands that the header marks as bad.
+        what: Description of the image.
+    """
+    height, width, num_bands = counts.shape
+    entries: dict[str, HeaderValue] = {
+        "description": f"{what}, raw counts",
+        "file type": "ENVI Standard",
+        "samples": width,
+        "lines": height,
+        "bands": num_bands,
+        "header offset": 0,
+        "data type": _UINT16,
+        "interleave": "bil",
+        "byte order": 0,
+        **wavelength_entries(bands),
+        "bbl": [str(int(band not in marked)) for band in range(num_bands)],
+    }
+    beside(path_without_suffix, ".raw").write_bytes(counts.astype("<u2").transpose(0, 2, 1).tobytes())
+    beside(path_without_suffix, ".hdr").write_bytes(header_bytes(entries))
+
+
+def _write_truth(folder: Path, bands: Bands, lamp: np.ndarray) -> None:
+    truth = folder / "truth"
+    write_spectra_csv(
+        truth / "endmembers.csv", SpectraTable(bands, MATERIALS, reflectances(bands.centers_nm))
+    )
+    write_spectra_csv(truth / "illuminant.csv", SpectraTable(bands, ("power",), lamp[None]))
+
+
+def _write_poses(path: Path, size: int, views: int) -> None:
+    cameras = demo_cameras(size, views)
+    frames = [
+        {"file_path": f"{view_name(index)}.hdr", "transform_matrix": transform_matrix(cameras, index)}
+        for index in range(views)
+    ]
+    content = lens_entries(cameras) | {"frames": frames}
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def _move_files(built: Path, directory: Path) -> None:
+    """Put a capture into a folder in place of an older one."""
+    for folder in (directory, directory / "truth"):
+        folder.mkdir(exist_ok=True)
+        for stale in folder.iterdir():
+            if _OURS.fullmatch(stale.name):
+                stale.unlink()
+    for path in sorted(built.rglob("*")):
+        if path.is_file():
+            path.replace(directory / path.relative_to(built))
