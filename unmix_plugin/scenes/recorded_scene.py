@@ -19,6 +19,7 @@ class RecordedFrame:
     rotation: tuple[Numbers, Numbers, Numbers] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
     scale: float = 1.0
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)

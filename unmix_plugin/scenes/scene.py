@@ -1,12 +1,13 @@
 """A validated scene: posed spectral images, their truth if any, and the box of space they show.
 
-Notation: `N` frames, `B` bands, `K` materials, `H x W` pixels. World space is that of transforms.json, model space
-is the one that `Scene.normalisation` maps it to and in which `Scene.cameras` and `Scene.scene_box` are given.
+Notation: `N` frames, `B` bands, `K` materials, `H x W` pixels. World space is that of the source of the poses:
+that of transforms.json before its `applied_transform`, `applied_scale` and `offset`. Model space is the one that
+`Scene.normalisation` maps it to and in which `Scene.cameras` and `Scene.scene_box` are given.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,6 +17,7 @@ from jaxtyping import Bool, Float, Float32, Float64, Shaped, UInt8
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.engine.instantiate import Common, short
+from unmix_plugin.scenes.placement import Placement
 from unmix_plugin.scenes.reading.arrays import map_array
 from unmix_plugin.scenes.reading.cube_values import InvalidPixels, read_cube, read_invalid
 from unmix_plugin.scenes.reading.images import read_colour, read_labels, read_mask
@@ -62,7 +64,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Normalisation:
-    """Similarity from world to model space: p_model = scale * (rotation @ p_world + translation)."""
+    """Similarity from world to model space: p_model = scale * (rotation @ (p_world - offset) + translation)."""
 
     rotation: Float64[np.ndarray, "3 3"]
     """Orthonormal, determinant 1."""
@@ -70,14 +72,25 @@ class Normalisation:
     """World units, added after the rotation."""
     scale: float
     """Model units a world unit, > 0."""
+    offset: Float64[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    """Subtracted first, so that geo-referenced coordinates keep their digits; world units."""
 
     def to_model(self, points: Float[np.ndarray, "*points 3"]) -> Float64[np.ndarray, "*points 3"]:
         """World points in model space."""
-        return self.scale * (points @ self.rotation.T + self.translation)
+        return self.scale * ((points - self.offset) @ self.rotation.T + self.translation)
 
     def to_world(self, points: Float[np.ndarray, "*points 3"]) -> Float64[np.ndarray, "*points 3"]:
         """Model points in world space, the inverse of `to_model`."""
-        return (points / self.scale - self.translation) @ self.rotation
+        return (points / self.scale - self.translation) @ self.rotation + self.offset
+
+    def after(self, placement: Placement) -> Normalisation:
+        """From the source's world to model space, where this one starts from the space of transforms.json."""
+        return Normalisation(
+            self.rotation @ placement.rotation,
+            self.rotation @ placement.translation + self.translation / placement.scale,
+            self.scale * placement.scale,
+            placement.offset,
+        )
 
     def to_json(self) -> dict[str, Any]:
         """Numbers and lists; `from_json` gives back the same bits."""
@@ -85,6 +98,7 @@ class Normalisation:
             "rotation": self.rotation.tolist(),
             "translation": self.translation.tolist(),
             "scale": self.scale,
+            "offset": self.offset.tolist(),
         }
 
     @staticmethod
@@ -94,6 +108,7 @@ class Normalisation:
             np.array(values["rotation"], dtype=np.float64).reshape(3, 3),
             np.array(values["translation"], dtype=np.float64).reshape(3),
             float(values["scale"]),
+            np.array(values.get("offset", (0.0, 0.0, 0.0)), dtype=np.float64).reshape(3),
         )
 
 

@@ -10,6 +10,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float64, UInt8
 
+from unmix_plugin.errors import CaptureError
+
+SIDES_TOLERANCE = 0.02
+"""How much more one side of a picture may shrink than the other: sizes are rounded."""
+
 
 @dataclass(frozen=True)
 class Lens:
@@ -24,6 +29,26 @@ class Lens:
     distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """k1, k2, p1, p2 of the OPENCV model; zeros are a pinhole."""
 
+    def resized(self, width: int, height: int) -> Lens:
+        """The lens of the same picture at another size.
+
+        Raises:
+            CaptureError: the sides change by different factors, so that it was cropped or is another picture.
+        """
+        factors = width / self.width, height / self.height
+        if abs(factors[0] / factors[1] - 1.0) > SIDES_TOLERANCE:
+            raise CaptureError(
+                f"poses are for pictures of {self.width} x {self.height} px, the view has {width} x {height}; expected "
+                "the same shape: give poses of these pictures, uncropped"
+            )
+        return Lens(
+            width,
+            height,
+            (self.focal_px[0] * factors[0], self.focal_px[1] * factors[1]),
+            (self.center_px[0] * factors[0], self.center_px[1] * factors[1]),
+            self.distortion,
+        )
+
 
 @dataclass(frozen=True)
 class PosedCamera:
@@ -33,6 +58,8 @@ class PosedCamera:
     """Rotation (orthonormal, determinant 1) and position, OpenGL axes: +x right, +y up, looks along -z."""
     lens: Lens | None
     """None where the source gives none."""
+    other_names: tuple[str, ...] = ()
+    """More files of the same image that the source names, such as its cube."""
 
 
 @dataclass(frozen=True)
@@ -49,5 +76,7 @@ class PoseSet:
     """sRGB of the points."""
     offset: Float64[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
     """Add this to positions and points to get the source's coordinates."""
+    up: Float64[np.ndarray, "3"] | None = None
+    """Unit vector against gravity, where the source's coordinates tell it (geo-referenced, or +z by convention)."""
     notes: tuple[str, ...] = ()
     """What was changed or is odd: rotations made rigid, frames without files, ..."""

@@ -121,7 +121,7 @@ def _assemble(
         train_indices=split.train,
         eval_indices=split.evaluation,
         scene_box=scene_box,
-        normalisation=normalisation,
+        normalisation=normalisation.after(entry.placement),
         material_names=truth.material_names,
         illuminant=truth.illuminant,
         endmembers=truth.endmembers,
@@ -139,7 +139,8 @@ def _find_model_space(
 ) -> tuple[Normalisation, SceneBox]:
     """The box that the training views show, and how its longest edge becomes [-1, 1].
 
-    The box is found in a space centred on the training cameras, where coordinates are of order 1.
+    The similarity starts from the space of transforms.json. The box is found in a space centred on the training
+    cameras, where coordinates are of order 1.
     """
     cubes = list(checked.cube_hashes)
     positions = _world_poses(entry)[list(train), :, 3]

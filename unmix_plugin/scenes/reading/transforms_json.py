@@ -5,7 +5,7 @@ Nothing here opens a file other than transforms.json; a value of the wrong type 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from unmix_plugin.errors import SpectrumError
+from unmix_plugin.scenes.placement import Placement, read_placement
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.intrinsics import Intrinsics, read_intrinsics
 from unmix_plugin.scenes.reading.json_values import UnreadableJsonError, describe, read_json_file, read_number
@@ -52,6 +53,8 @@ class SceneEntry:
     endmembers_path: str | None
     split_lists: dict[str, tuple[str, ...]]
     frames: tuple[FrameEntry, ...]
+    placement: Placement = field(default_factory=Placement)
+    """How the poses were moved from where they come from."""
 
 
 def read_transforms(root: Path, faults: Faults) -> SceneEntry:
@@ -76,6 +79,7 @@ def read_transforms(root: Path, faults: Faults) -> SceneEntry:
         endmembers_path=_read_text(content, "endmembers_path", FILE_NAME, faults),
         split_lists=_read_split_lists(content, faults),
         frames=tuple(_read_frame(content, frame, i, faults) for i, frame in enumerate(frames)),
+        placement=read_placement(content, faults, FILE_NAME),
     )
 
 

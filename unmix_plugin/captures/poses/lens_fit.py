@@ -1,0 +1,127 @@
+"""Lenses of models that we do not have, replaced by the OPENCV lens that is nearest over the image.
+
+Notation: `P` points; ideal coordinates are x/z, y/z before the camera, +x right, +y down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+import numpy as np
+from jaxtyping import Float64
+
+from unmix_plugin.captures.poses.pose_set import Lens
+from unmix_plugin.errors import CaptureError
+
+Points = Float64[np.ndarray, "P 2"]
+Project: TypeAlias = Callable[[Points], Points]
+"""From ideal coordinates to pixels."""
+
+LARGEST_ERROR_PX = 0.5
+"""Of a fitted lens anywhere in the image; beyond, the images have to be undistorted."""
+_GRID = 21
+_STEP = 1e-6
+
+
+def project_opencv(
+    ideal: Points,
+    focal_px: tuple[float, float],
+    center_px: tuple[float, float],
+    radial: tuple[float, ...],
+    tangential: tuple[float, float] = (0.0, 0.0),
+) -> Points:
+    """Pixels of ideal points through a lens with radial terms of r^2, r^4, ... and OpenCV's p1, p2."""
+    x, y = ideal.T
+    squared = x**2 + y**2
+    factor = 1.0 + sum(k * squared ** (power + 1) for power, k in enumerate(radial))
+    p1, p2 = tangential
+    bent_x = x * factor + 2 * p1 * x * y + p2 * (squared + 2 * x**2)
+    bent_y = y * factor + 2 * p2 * x * y + p1 * (squared + 2 * y**2)
+    return np.column_stack([focal_px[0] * bent_x + center_px[0], focal_px[1] * bent_y + center_px[1]])
+
+
+def project_fisheye(
+    ideal: Points, focal_px: tuple[float, float], center_px: tuple[float, float], terms: tuple[float, ...]
+) -> Points:
+    """Pixels of ideal points through an equidistant lens with terms of theta^2, theta^4, ... (OPENCV_FISHEYE)."""
+    radius = np.linalg.norm(ideal, axis=1)
+    theta = np.arctan(radius)
+    bent = theta * (1.0 + sum(k * theta ** (2 * power + 2) for power, k in enumerate(terms)))
+    ratio = np.divide(bent, radius, out=np.ones_like(radius), where=radius > 1e-12)
+    return ideal * ratio[:, None] * np.array(focal_px) + np.array(center_px)
+
+
+def fit_lens(project: Project, start: Lens, model: str, where: str) -> tuple[Lens, str]:
+    """The lens with k1, k2, p1, p2 that is nearest to another model.
+
+    Args:
+        project: The other model.
+        start: Size of the image and a first guess of focal length and centre.
+        model: What the other model is called.
+        where: The file, for messages.
+    Returns:
+        The lens, and a sentence that says how far it is off.
+    Raises:
+        CaptureError: it is off by more than half a pixel somewhere in the image, or the model does not cover it.
+    """
+    from scipy.optimize import least_squares
+
+    pixels = _pixel_grid(start.width, start.height)
+    ideal = _invert(project, pixels, start)
+    advice = "undistort the images and export the poses with a pinhole or OPENCV lens"
+    if ideal is None:
+        raise CaptureError(
+            f"{where}: the lens model {model} can't be followed to the corners of the image; {advice}"
+        )
+
+    def errors(values: np.ndarray) -> np.ndarray:
+        return (_project(values, ideal) - pixels).ravel()
+
+    first = np.array([*start.focal_px, *start.center_px, *start.distortion])
+    scales = np.array([*start.focal_px, *start.focal_px, 0.1, 0.1, 0.01, 0.01])
+    found = least_squares(errors, first, x_scale=scales).x
+    worst = float(np.linalg.norm(errors(found).reshape(-1, 2), axis=1).max())
+    if worst > LARGEST_ERROR_PX:
+        raise CaptureError(
+            f"{where}: the lens model {model} differs from the nearest one with k1, k2, p1, p2 by up to "
+            f"{worst:.3g} px; expected at most {LARGEST_ERROR_PX} px: {advice}"
+        )
+    lens = Lens(start.width, start.height, _pair(found[:2]), _pair(found[2:4]), _four(found[4:]))
+    return lens, f"lens model {model} replaced by the nearest k1, k2, p1, p2; off by at most {worst:.2g} px"
+
+
+def _project(values: np.ndarray, ideal: Points) -> Points:
+    return project_opencv(ideal, _pair(values[:2]), _pair(values[2:4]), _pair(values[4:6]), _pair(values[6:]))
+
+
+def _pair(values: np.ndarray) -> tuple[float, float]:
+    return float(values[0]), float(values[1])
+
+
+def _four(values: np.ndarray) -> tuple[float, float, float, float]:
+    return (*_pair(values), *_pair(values[2:]))
+
+
+def _pixel_grid(width: int, height: int) -> Points:
+    columns, rows = np.meshgrid(np.linspace(0, width, _GRID), np.linspace(0, height, _GRID))
+    return np.column_stack([columns.ravel(), rows.ravel()])
+
+
+def _invert(project: Project, pixels: Points, start: Lens) -> Points | None:
+    """Ideal points that `project` maps to the pixels, by Newton's method; None if there are none."""
+    ideal = (pixels - np.array(start.center_px)) / np.array(start.focal_px)
+    with np.errstate(all="ignore"):
+        for _ in range(50):
+            missing = pixels - project(ideal)
+            if not np.isfinite(missing).all():
+                return None
+            along = [
+                (project(ideal + step) - project(ideal - step)) / (2 * _STEP) for step in _STEP * np.eye(2)
+            ]
+            jacobian = np.stack(along, axis=-1)
+            determinant = np.linalg.det(jacobian)
+            if not np.isfinite(determinant).all() or (determinant <= 0).any():
+                return None
+            ideal = ideal + np.linalg.solve(jacobian, missing[..., None])[..., 0]
+        return ideal if np.abs(pixels - project(ideal)).max() < 1e-3 else None

@@ -1,0 +1,102 @@
+"""How a scene was turned, moved and scaled from where its poses come from, as transforms.json records it.
+
+nerfstudio's keys `applied_transform` (3 x 4) and `applied_scale`, and `offset` for coordinates that are too large for
+float32: p_scene = applied_scale * applied_transform @ (p_source - offset, 1).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+from unmix_plugin.scenes.reading.faults import Faults
+from unmix_plugin.scenes.reading.json_values import describe, read_number
+
+TRANSFORM_KEY, SCALE_KEY, OFFSET_KEY = "applied_transform", "applied_scale", "offset"
+ROTATION_TOLERANCE = 1e-5
+"""Largest element of R^T R - 1 that passes as rounding of printed digits."""
+SCALE_RANGE = (1e-12, 1e12)
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Similarity from the source's world to the scene's.
+
+    p_scene = scale * (rotation @ (p_source - offset) + translation)
+    """
+
+    rotation: Float64[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
+    """Orthonormal, determinant 1."""
+    translation: Float64[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    """Units of the source, added after the rotation."""
+    scale: float = 1.0
+    """Units of the scene a unit of the source, > 0."""
+    offset: Float64[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    """Subtracted first, in units of the source."""
+
+    def to_scene(self, points: Float[np.ndarray, "*points 3"]) -> Float64[np.ndarray, "*points 3"]:
+        """Points of the source in the scene."""
+        return self.scale * ((points - self.offset) @ self.rotation.T + self.translation)
+
+    def to_source(self, points: Float[np.ndarray, "*points 3"]) -> Float64[np.ndarray, "*points 3"]:
+        """Points of the scene in the source, the inverse of `to_scene`."""
+        return (points / self.scale - self.translation) @ self.rotation + self.offset
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether it changes nothing."""
+        moves = self.translation.any() or self.offset.any()
+        return not moves and self.scale == 1.0 and np.array_equal(self.rotation, np.eye(3))
+
+    def to_json(self) -> dict[str, Any]:
+        """Keys of transforms.json; `read_placement` gives back the same value."""
+        return {
+            TRANSFORM_KEY: np.column_stack([self.rotation, self.translation]).tolist(),
+            SCALE_KEY: self.scale,
+            OFFSET_KEY: self.offset.tolist(),
+        }
+
+
+def read_placement(content: dict[str, Any], faults: Faults, where: str) -> Placement:
+    """What transforms.json records; the identity where it is silent, and with noted faults where it is wrong."""
+    transform = _numbers(content.get(TRANSFORM_KEY), (3, 4))
+    if content.get(TRANSFORM_KEY) is None:
+        transform = np.eye(3, 4)
+    elif transform is None or not _is_rotation(transform[:, :3]):
+        faults.add(
+            where,
+            f"'{TRANSFORM_KEY}' is {describe(content[TRANSFORM_KEY])}; expected 3 rows of 4 numbers, a rotation and a "
+            "translation; put scale into 'applied_scale', or drop the key",
+        )
+        transform = np.eye(3, 4)
+    scale = 1.0 if content.get(SCALE_KEY) is None else read_number(content[SCALE_KEY])
+    if scale is None or not SCALE_RANGE[0] <= scale <= SCALE_RANGE[1]:
+        faults.add(where, f"'{SCALE_KEY}' is {describe(content[SCALE_KEY])}; expected a number above 0")
+        scale = 1.0
+    offset = np.zeros(3) if content.get(OFFSET_KEY) is None else _numbers(content[OFFSET_KEY], (3,))
+    if offset is None:
+        faults.add(where, f"'{OFFSET_KEY}' is {describe(content[OFFSET_KEY])}; expected 3 finite numbers")
+        offset = np.zeros(3)
+    return Placement(transform[:, :3], transform[:, 3], scale, offset)
+
+
+def _is_rotation(matrix: Float64[np.ndarray, "3 3"]) -> bool:
+    with np.errstate(over="ignore", invalid="ignore"):
+        is_orthonormal = np.abs(matrix.T @ matrix - np.eye(3)).max() <= ROTATION_TOLERANCE
+    return bool(is_orthonormal) and float(np.linalg.det(matrix)) > 0
+
+
+def _numbers(value: Any, shape: tuple[int, ...]) -> np.ndarray | None:
+    """Lists of finite numbers as an array; of a 4 x 4 matrix the last row is left out. None if it is anything else."""
+    if isinstance(value, list) and shape == (3, 4) and len(value) == 4 and value[3] == [0, 0, 0, 1]:
+        value = value[:3]
+    if not isinstance(value, list) or len(value) != shape[0]:
+        return None
+    if len(shape) > 1:
+        rows = [_numbers(row, shape[1:]) for row in value]
+        return None if any(row is None for row in rows) else np.array(rows)
+    numbers = [read_number(number) for number in value]
+    return None if any(number is None for number in numbers) else np.array(numbers, dtype=np.float64)
