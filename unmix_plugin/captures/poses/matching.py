@@ -52,7 +52,8 @@ def match_poses(poses: PoseSet, views: Sequence[tuple[str, Sequence[str | Path]]
     if not found:
         raise CaptureError(
             f"no view has a pose: views are called {name_some(list(wanted)) or '(none)'}, the cameras of "
-            f"{poses.source} {name_some(list(owners))}; expected the same names, apart from folders and suffixes: rename one of them"
+            f"{poses.source} {name_some(list(owners))}; expected the same names, apart from folders and suffixes: "
+            "rename one of them"
         )
     unposed = tuple(name for name in wanted if name not in found)
     unused = tuple(name for name in owners if name not in set(found.values()))

@@ -1,0 +1,75 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.captures.poses.pose_factory import LENS, ring_set
+from unmix_plugin.captures.poses.alignment import align_poses, focus_of, moved, similarity_of
+from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
+from unmix_plugin.errors import CaptureError
+from unmix_plugin.scenes.placement import Placement
+
+SIMILARITY = Placement(
+    Rotation.from_euler("xyz", [0.3, -1.0, 2.0]).as_matrix(), np.array([1.0, 2.0, -3.0]), 2.5
+)
+
+
+def elsewhere(poses: PoseSet) -> PoseSet:
+    back = Placement(
+        SIMILARITY.rotation.T,
+        -SIMILARITY.scale * SIMILARITY.rotation.T @ SIMILARITY.translation,
+        1 / SIMILARITY.scale,
+    )
+    return replace(poses, cameras={name: moved(camera, back) for name, camera in poses.cameras.items()})
+
+
+def in_a_row() -> PoseSet:
+    cameras = {
+        str(x): PosedCamera(np.column_stack([np.eye(3), [x, 0.0, 5.0 + 0.1 * x]]), LENS) for x in range(4)
+    }
+    return PoseSet(cameras, "a row")
+
+
+@pytest.mark.parametrize("truth", [ring_set(), in_a_row()], ids=["ring", "row"])
+def test_the_similarity_between_two_worlds_is_found(truth):
+    alignment = align_poses(elsewhere(truth), truth)
+    np.testing.assert_allclose(alignment.similarity.rotation, SIMILARITY.rotation, atol=1e-6)
+    np.testing.assert_allclose(alignment.similarity.scale, SIMILARITY.scale, rtol=1e-6)
+    assert alignment.rms_px < 1e-4
+    assert alignment.rotation_errors_deg.max() < 1e-4
+    assert alignment.position_errors.max() < 1e-5
+
+
+def test_an_error_of_one_camera_is_told_in_its_pixels_and_degrees():
+    truth = ring_set(20)
+    name = "images/view_3.png"
+    pose = truth.cameras[name].camera_to_world
+    turned = pose[:, :3] @ Rotation.from_euler("y", 0.2, degrees=True).as_matrix()
+    wrong = replace(truth.cameras[name], camera_to_world=np.column_stack([turned, pose[:, 3]]))
+    estimated = elsewhere(replace(truth, cameras={**truth.cameras, name: wrong}))
+    alignment = align_poses(estimated, truth)
+    worst = int(np.argmax(alignment.errors_px))
+    assert alignment.names[worst] == name
+    shift = 500 * np.tan(np.radians(0.2))
+    np.testing.assert_allclose(alignment.errors_px[worst], shift, rtol=0.1)
+    np.testing.assert_allclose(alignment.rotation_errors_deg[worst], 0.2, rtol=0.1)
+
+
+def test_umeyama_does_not_mirror():
+    generator = np.random.default_rng(0)
+    source = generator.normal(size=(9, 3))
+    found = similarity_of(source, source * [1, 1, -1])
+    np.testing.assert_allclose(np.linalg.det(found.rotation), 1)
+
+
+def test_the_focus_is_where_the_cameras_look_and_none_where_they_look_in_parallel():
+    stacked = np.stack([camera.camera_to_world for camera in ring_set().cameras.values()])
+    np.testing.assert_allclose(focus_of(stacked), 0, atol=1e-9)
+    stacked = np.stack([camera.camera_to_world for camera in in_a_row().cameras.values()])
+    assert focus_of(stacked) is None
+
+
+def test_fewer_than_three_shared_cameras_are_refused():
+    with pytest.raises(CaptureError, match="2 cameras with lenses are in both"):
+        align_poses(ring_set(2), ring_set(6))

@@ -1,0 +1,148 @@
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.captures.poses.pose_factory import FLIP, LENS, assert_same_poses, ring
+from unmix_plugin.captures.poses.lens_fit import project_opencv
+from unmix_plugin.captures.poses.reading import read_poses
+from unmix_plugin.errors import CaptureError
+
+pycolmap = pytest.importorskip("pycolmap")
+OPENCV = (*LENS.focal_px, *LENS.center_px, *LENS.distortion)
+
+
+def make_model(model: str = "OPENCV", parameters: tuple[float, ...] = OPENCV):
+    """A reconstruction of COLMAP's own with the ring's cameras and two points."""
+    made = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(camera_id=7, model=model, width=640, height=480, params=list(parameters))
+    made.add_camera_with_trivial_rig(camera)
+    for number, (name, pose) in enumerate(ring().items(), start=1):
+        rotation = (pose[:, :3] @ FLIP).T
+        rigid = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ pose[:, 3])
+        image = pycolmap.Image(name=f"folder/{name} x.jpg", camera_id=7, image_id=number)
+        made.add_image_with_trivial_frame(image, rigid)
+    for place in ([0.5, 0.25, -1.0], [1.0, 2.0, 3.0]):
+        made.add_point3D(np.array(place), pycolmap.Track(), np.array([1, 2, 255], np.uint8))
+    return made
+
+
+def expected():
+    return {f"folder/{name} x.jpg": pose for name, pose in ring().items()}
+
+
+@pytest.mark.parametrize("kind", ["binary", "text"])
+def test_models_that_colmap_wrote_are_read_alike(tmp_path, kind):
+    folder = tmp_path / "sparse" / "0"
+    folder.mkdir(parents=True)
+    getattr(make_model(), f"write_{kind}")(folder)
+    for place in (tmp_path, folder, folder / ("images.bin" if kind == "binary" else "images.txt")):
+        found = read_poses(place)
+        assert_same_poses(found, expected())
+        assert {camera.lens for camera in found.cameras.values()} == {LENS}
+        np.testing.assert_allclose(sorted(found.points.tolist()), [[0.5, 0.25, -1.0], [1.0, 2.0, 3.0]])
+        np.testing.assert_array_equal(found.colours, [[1, 2, 255]] * 2)
+
+
+MODELS = {
+    "SIMPLE_PINHOLE": (500, 321, 239),
+    "PINHOLE": (500, 510, 321, 239),
+    "SIMPLE_RADIAL": (500, 321, 239, 0.05),
+    "RADIAL": (500, 321, 239, 0.05, -0.03),
+    "OPENCV": OPENCV,
+    "FULL_OPENCV": (500, 510, 321, 239, 0.01, -0.02, 0.001, -0.002, 0.01, 0.002, 0.003, -0.004),
+    "OPENCV_FISHEYE": (900, 900, 321, 239, 0.01, -0.02, 0.001, -0.002),
+    "RADIAL_FISHEYE": (900, 321, 239, 0.01, -0.02),
+    "SIMPLE_RADIAL_FISHEYE": (900, 321, 239, 0.01),
+}
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_lenses_see_what_colmaps_own_projection_sees(tmp_path, model):
+    made = make_model(model, MODELS[model])
+    made.write_binary(tmp_path)
+    found = read_poses(tmp_path)
+    lens = next(iter(found.cameras.values())).lens
+    ideal = np.random.default_rng(0).uniform([-0.3, -0.22], [0.3, 0.22], (50, 2))
+    wanted = made.cameras[7].img_from_cam(np.column_stack([ideal, np.ones(50)]))
+    mine = project_opencv(ideal, lens.focal_px, lens.center_px, lens.distortion[:2], lens.distortion[2:])
+    is_exact = not any("replaced by the nearest" in note for note in found.notes)
+    assert is_exact == (
+        model not in ("FULL_OPENCV", "OPENCV_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE")
+    )
+    np.testing.assert_allclose(mine, wanted, atol=1e-9 if is_exact else 0.5)
+
+
+def test_lenses_too_wide_for_the_model_are_refused(tmp_path):
+    make_model("OPENCV_FISHEYE", (250, 250, 320, 240, 0, 0, 0, 0)).write_binary(tmp_path)
+    with pytest.raises(CaptureError, match=r"OPENCV_FISHEYE.*undistort"):
+        read_poses(tmp_path)
+
+
+def test_models_that_are_not_representable_are_refused_by_name(tmp_path):
+    make_model("FOV", (500, 500, 320, 240, 0.5)).write_text(tmp_path)
+    with pytest.raises(CaptureError, match=r"FOV is not supported; expected one of .*image_undistorter"):
+        read_poses(tmp_path)
+
+
+def test_of_several_models_the_one_with_the_most_images_is_read(tmp_path):
+    for number in ("0", "1"):
+        (tmp_path / "sparse" / number).mkdir(parents=True)
+    make_model().write_binary(tmp_path / "sparse" / "1")
+    smaller = make_model()
+    for number in (1, 2):
+        smaller.deregister_frame(number)
+    smaller.write_binary(tmp_path / "sparse" / "0")
+    found = read_poses(tmp_path)
+    assert len(found.cameras) == 6
+    assert any("2 COLMAP models" in note for note in found.notes)
+
+
+def test_an_image_whose_camera_is_missing_is_refused(tmp_path):
+    make_model().write_text(tmp_path)
+    lines = (tmp_path / "cameras.txt").read_text().splitlines()
+    (tmp_path / "cameras.txt").write_text("\n".join(line for line in lines if line.startswith("#")))
+    with pytest.raises(CaptureError, match="has no camera 7"):
+        read_poses(tmp_path)
+
+
+def test_a_line_that_is_cut_short_is_named(tmp_path):
+    make_model().write_text(tmp_path)
+    path = tmp_path / "images.txt"
+    path.write_text(path.read_text()[:-40].rsplit(" ", 4)[0])
+    with pytest.raises(CaptureError, match=r"images.txt, line \d+: found .*expected number, quaternion"):
+        read_poses(tmp_path)
+
+
+def test_absurd_counts_are_refused_before_anything_is_allocated(tmp_path):
+    make_model().write_binary(tmp_path)
+    path = tmp_path / "points3D.bin"
+    path.write_bytes(struct.pack("<Q", 2**60) + path.read_bytes()[8:])
+    with pytest.raises(CaptureError, match=r"promises 1152921504606846976 points, but only"):
+        read_poses(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("model")
+    make_model().write_binary(folder)
+    return {name: (folder / name).read_bytes() for name in ("cameras.bin", "images.bin", "points3D.bin")}
+
+
+@given(st.sampled_from(["cameras.bin", "images.bin", "points3D.bin"]), st.data())
+def test_damaged_binaries_are_read_or_refused(written, tmp_path_factory, name, data):
+    folder = tmp_path_factory.mktemp("fuzz")
+    for other, content in written.items():
+        (folder / other).write_bytes(content)
+    content = bytearray(written[name])
+    for _ in range(data.draw(st.integers(0, 3))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    cut = data.draw(st.integers(0, len(content)))
+    (folder / name).write_bytes(bytes(content[:cut]))
+    try:
+        found = read_poses(folder)
+    except CaptureError:
+        return
+    assert all(np.isfinite(camera.camera_to_world).all() for camera in found.cameras.values())

@@ -1,0 +1,87 @@
+import json
+
+import numpy as np
+import pytest
+from plyfile import PlyData
+
+from tests.captures.poses.pose_factory import ring_set, transforms, write_json
+from tests.captures.poses.test_alignment import SIMILARITY, elsewhere, in_a_row
+from tests.scenes.scene_factory import make_scene, ring_poses
+from unmix_plugin.captures.poses.placement import place_poses, write_points
+from unmix_plugin.captures.poses.reading import read_poses
+from unmix_plugin.scenes import load_scene
+
+FAR = np.array([500_123.0, 5_400_321.0, 300.0])
+
+
+def test_a_ring_stands_upright_around_the_origin_whatever_its_world_was():
+    placed = place_poses(elsewhere(ring_set(12)))
+    stacked = np.stack([camera.camera_to_world for camera in placed.poses.cameras.values()])
+    np.testing.assert_allclose(np.linalg.norm(stacked[:, :, 3], axis=1), 1, atol=1e-9)
+    np.testing.assert_allclose(stacked[:, 2, 0], 0, atol=1e-9)  # horizontal axes lie flat
+    assert (stacked[:, 2, 1] > 0).all()
+    heights = [pose[2, 3] / 4 for pose in ring_poses(12)]
+    np.testing.assert_allclose(stacked[:, 2, 3], heights, atol=1e-9)
+
+
+def test_what_was_placed_returns_to_the_source():
+    poses = elsewhere(ring_set(points=np.ones((2, 3)), offset=FAR))
+    placed = place_poses(poses)
+    for name, camera in placed.poses.cameras.items():
+        back = placed.placement.to_source(camera.camera_to_world[:, 3])
+        np.testing.assert_allclose(back, poses.cameras[name].camera_to_world[:, 3] + FAR, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(
+        placed.placement.to_source(placed.poses.points), poses.points + FAR, rtol=0, atol=1e-8
+    )
+
+
+def test_a_known_up_axis_is_kept_and_cameras_in_parallel_have_their_points_in_the_middle():
+    points = np.array([[1.0, 2.0, -3.0], [2.0, 2.0, -3.0], [3.0, 2.0, -3.0]])
+    row = in_a_row()
+    placed = place_poses(ring_set(up=np.array([0.0, 0.0, 1.0])))
+    np.testing.assert_array_equal(placed.placement.rotation, np.eye(3))
+    assert "up is the source's" in placed.notes
+    placed = place_poses(type(row)(row.cameras, row.source, points))
+    np.testing.assert_allclose(placed.placement.to_source(np.zeros(3)), [2, 2, -3])
+    assert "up is the mean of the cameras' up vectors" in placed.notes
+
+
+def test_sparse_points_are_written_with_their_colours(tmp_path):
+    points, colours = np.arange(6.0).reshape(2, 3), np.array([[1, 2, 3], [4, 5, 255]], np.uint8)
+    assert write_points(tmp_path, ring_set()) is None
+    assert write_points(tmp_path, ring_set(points=points, colours=colours)) == "points.ply"
+    vertex = PlyData.read(tmp_path / "points.ply")["vertex"]
+    np.testing.assert_array_equal(np.stack([vertex[name] for name in "xyz"], 1), points)
+    np.testing.assert_array_equal(np.stack([vertex[name] for name in ("red", "green", "blue")], 1), colours)
+
+
+def test_written_placements_are_read_back_to_the_source(tmp_path):
+    poses = elsewhere(ring_set(offset=FAR))
+    placed = place_poses(poses)
+    stacked = {name: camera.camera_to_world for name, camera in placed.poses.cameras.items()}
+    found = read_poses(
+        write_json(tmp_path / "transforms.json", transforms(stacked, **placed.placement.to_json()))
+    )
+    for name, camera in poses.cameras.items():
+        mine = found.cameras[name].camera_to_world
+        np.testing.assert_allclose(mine[:, :3], camera.camera_to_world[:, :3], atol=1e-9)
+        np.testing.assert_allclose(
+            mine[:, 3] + found.offset, camera.camera_to_world[:, 3] + FAR, rtol=0, atol=1e-7
+        )
+
+
+@pytest.mark.parametrize("offset", [np.zeros(3), FAR])
+def test_a_scene_with_a_placement_has_the_sources_world(tmp_path, offset):
+    folder = make_scene(tmp_path / "scene")
+    plain = load_scene(folder.root)
+    folder.edit(lambda content: content.update({**SIMILARITY.to_json(), "offset": offset.tolist()}))
+    scene = load_scene(folder.root)
+    np.testing.assert_allclose(scene.cameras.camera_to_world, plain.cameras.camera_to_world)
+    corners = scene.scene_box.aabb.double().numpy()
+    expected = SIMILARITY.to_source(plain.normalisation.to_world(corners)) + offset
+    np.testing.assert_allclose(scene.normalisation.to_world(corners), expected, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(scene.normalisation.to_model(expected), corners, rtol=0, atol=1e-7)
+    recorded = json.loads(json.dumps(scene.normalisation.to_json()))
+    np.testing.assert_array_equal(
+        type(scene.normalisation).from_json(recorded).to_world(corners), scene.normalisation.to_world(corners)
+    )
