@@ -42,6 +42,8 @@ def test_models_that_colmap_wrote_are_read_alike(tmp_path, kind):
         found = read_poses(place)
         assert_same_poses(found, expected())
         assert {camera.lens for camera in found.cameras.values()} == {LENS}
+        assert found.points is not None
+        assert found.colours is not None
         np.testing.assert_allclose(sorted(found.points.tolist()), [[0.5, 0.25, -1.0], [1.0, 2.0, 3.0]])
         np.testing.assert_array_equal(found.colours, [[1, 2, 255]] * 2)
 
@@ -65,6 +67,7 @@ def test_lenses_see_what_colmaps_own_projection_sees(tmp_path, model):
     made.write_binary(tmp_path)
     found = read_poses(tmp_path)
     lens = next(iter(found.cameras.values())).lens
+    assert lens is not None
     ideal = np.random.default_rng(0).uniform([-0.3, -0.22], [0.3, 0.22], (50, 2))
     wanted = made.cameras[7].img_from_cam(np.column_stack([ideal, np.ones(50)]))
     mine = project_opencv(ideal, lens.focal_px, lens.center_px, lens.distortion[:2], lens.distortion[2:])

@@ -30,6 +30,8 @@ def test_what_was_placed_returns_to_the_source():
     for name, camera in placed.poses.cameras.items():
         back = placed.placement.to_source(camera.camera_to_world[:, 3])
         np.testing.assert_allclose(back, poses.cameras[name].camera_to_world[:, 3] + FAR, rtol=0, atol=1e-8)
+    assert placed.poses.points is not None
+    assert poses.points is not None
     np.testing.assert_allclose(
         placed.placement.to_source(placed.poses.points), poses.points + FAR, rtol=0, atol=1e-8
     )

@@ -84,9 +84,11 @@ def test_what_was_applied_is_undone_for_cameras_and_points(tmp_path):
     )
     found = read(tmp_path, content)
     assert_same_poses(found, ring())
+    assert found.points is not None
     np.testing.assert_allclose(found.points, points, atol=1e-12)
     assert found.colours is not None
     np.testing.assert_array_equal(found.colours[:, 0], red)
+    assert found.up is not None
     np.testing.assert_allclose(found.up, [0, 0, -1])
 
 
