@@ -65,7 +65,9 @@ def test_umeyama_does_not_mirror():
 
 def test_the_focus_is_where_the_cameras_look_and_none_where_they_look_in_parallel():
     stacked = np.stack([camera.camera_to_world for camera in ring_set().cameras.values()])
-    np.testing.assert_allclose(focus_of(stacked), 0, atol=1e-9)
+    focus = focus_of(stacked)
+    assert focus is not None
+    np.testing.assert_allclose(focus, 0, atol=1e-9)
     stacked = np.stack([camera.camera_to_world for camera in in_a_row().cameras.values()])
     assert focus_of(stacked) is None
 
