@@ -28,8 +28,6 @@ class WhiteReference:
     reference: Reference
     reflectance: Float64[np.ndarray, " B"]
     """Of the panel at every band of the file, above 0."""
-    exposure: float | None = None
-    """Exposure time times gain of its image, in the unit of the cubes'; None where a file is silent."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +56,10 @@ class Calibration:
     saturation: float | None = None
     """Stored number of a saturated pixel; None where none is known."""
     gain: float = 1.0
-    """Factor on all values, such as 1/255 of pictures."""
+    """Factor on all values, such as one over the scale factor of the files."""
+    exposure: float | None = None
+    """Exposure time times gain that values are brought to: that of the white reference, else of the first view; None
+    where the files are silent."""
 
     @property
     def num_bands(self) -> int:
@@ -90,7 +91,7 @@ class Calibration:
         values = (
             srgb_to_linear(stored) if file.metadata.get("encoding") == SRGB else stored.astype(np.float32)
         )
-        factor = np.float32(self.gain * exposure_factor(file, self.white))
+        factor = np.float32(self.gain * self.exposure_factor(file))
         if self.dark is not None:
             values -= self.dark.rows(rows, columns, bands)
         if self.white is not None:
@@ -107,6 +108,11 @@ class Calibration:
             light = light - self.dark.rows(rows, columns, bands)
         light = np.where(light > 0, light, np.float32(np.nan))
         return self.white.reflectance[bands].astype(np.float32) / light
+
+    def exposure_factor(self, file: SpectralFile) -> float:
+        """What a view's values are multiplied by, so that exposures do not matter; 1 where one is not known."""
+        exposure = exposure_of(file)
+        return 1.0 if exposure is None or self.exposure is None else self.exposure / exposure
 
     def _binned_bands(self, values: np.ndarray) -> np.ndarray:
         if self.bin_bands == 1:
@@ -150,14 +156,6 @@ def exposure_of(file: SpectralFile) -> float | None:
     if not isinstance(exposure, int | float) or not isinstance(gain, int | float):
         return None
     return float(exposure * gain) if exposure > 0 and gain > 0 else None
-
-
-def exposure_factor(file: SpectralFile, white: WhiteReference | None) -> float:
-    """What a view's values are multiplied by, so that exposures do not matter; 1 where one is not known."""
-    exposure = exposure_of(file)
-    if exposure is None or white is None or white.exposure is None:
-        return 1.0
-    return white.exposure / exposure
 
 
 def _is_in_range(number: float, dtype: np.dtype) -> bool:

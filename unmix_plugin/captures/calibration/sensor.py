@@ -1,0 +1,205 @@
+"""All decisions on one sensor, taken before a view is written: bands, references, saturation, scale, colours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from unmix_plugin.captures.calibration import white_panel
+from unmix_plugin.captures.calibration.band_choice import (
+    BandChoice,
+    drop_found,
+    repeated_wavelengths,
+    require_bands,
+)
+from unmix_plugin.captures.calibration.calibration import SRGB, Calibration, WhiteReference, exposure_of
+from unmix_plugin.captures.calibration.raster import Raster
+from unmix_plugin.captures.calibration.references import Reference, open_reference, panel_reference
+from unmix_plugin.captures.calibration.sampling import draw_sample, find_saturation
+from unmix_plugin.captures.capture import CaptureView
+from unmix_plugin.captures.options import ProcessOptions
+from unmix_plugin.captures.spectral_file import SpectralFile
+from unmix_plugin.captures.wavelengths import in_ranges
+from unmix_plugin.errors import CaptureError, ConfigError
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """How all views of one lens or camera are calibrated, and why."""
+
+    name: str
+    calibration: Calibration
+    bands: BandChoice
+    unit: str
+    """What values are: reflectance, relative radiance, ..."""
+    sample: Float32[np.ndarray, "N c"]
+    """Calibrated pixels of all views, on the bands of the scene."""
+    evidence: dict[str, Any]
+    """What was decided and from what, for the record."""
+    lamp: Float64[np.ndarray, " c"] | None = None
+    """Light on the white panel as the detector sees it, greatest value 1."""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def centers_nm(self) -> Float64[np.ndarray, " c"]:
+        """Bands of the scene."""
+        return self.bands.centers_nm(self.calibration.bin_bands)
+
+
+@dataclass(frozen=True)
+class References:
+    """Files of the references, opened."""
+
+    dark: SpectralFile | None = None
+    white: SpectralFile | None = None
+
+
+def prepare_sensor(
+    name: str, views: Sequence[CaptureView], options: ProcessOptions, references: References
+) -> Sensor:
+    """Look at some rows of every view and decide how they are calibrated.
+
+    Args:
+        name: Of the sensor; empty where there is one.
+        views: At least one; all have the same bands and size.
+        options: What the user asks.
+        references: Of this sensor.
+    Raises:
+        CaptureError: references don't fit, wavelengths are unknown, no band is left, or a file can't be read.
+        ConfigError: an option does not fit the files.
+    """
+    files = [view.cube for view in views]
+    choice, notes = _stated_bands(files[0], options), []
+    dark, white = _references(views, choice, options, references)
+    saturation, how = _saturation(files, options)
+    raster = Raster.of(files[0].shape[0], files[0].shape[1], options.crop, options.bin_pixels)
+    evidence: dict[str, Any] = {"saturation": {"stored": saturation, "evidence": how}}
+    lamp = None
+    if white is not None:
+        white_panel.refuse_saturated(white.reference, saturation)
+        signal = white_panel.panel_signal(white.reference, dark)
+        lamp = signal / white.reflectance
+        choice = choice.without(white_panel.too_dark(signal), "the white reference has no light there")
+    require_bands(choice, options.bin_bands, str(files[0].path))
+    exposure, said = _common_exposure(files, white)
+    notes += said
+    calibration = Calibration(raster, choice.kept, 1, dark, white, saturation, _gain(files[0]), exposure)
+    sample = draw_sample(files, calibration)
+    choice = drop_found(choice, sample, options.max_noise)
+    require_bands(choice, options.bin_bands, str(files[0].path))
+    still_kept = np.isin(calibration.bands, choice.kept)
+    calibration = replace(calibration, bands=choice.kept, bin_bands=options.bin_bands)
+    for what, reference in (("dark", dark), ("white", None if white is None else white.reference)):
+        if reference is not None:
+            evidence[what] = {"file": str(reference.file.path), "use": reference.how}
+    evidence |= _band_evidence(files[0], choice)
+    return Sensor(
+        name,
+        calibration,
+        choice,
+        _unit(files[0], white),
+        _binned(sample.values[:, still_kept], options.bin_bands),
+        evidence,
+        None if lamp is None else _lamp_of(lamp, choice, options.bin_bands),
+        tuple(notes),
+    )
+
+
+def _stated_bands(file: SpectralFile, options: ProcessOptions) -> BandChoice:
+    wavelengths = file.bands.wavelengths_nm
+    if wavelengths is None:
+        raise CaptureError(
+            f"{file.path}: the wavelengths of its {file.shape[2]} bands are unknown ({file.bands.evidence}); give them "
+            "with --wavelengths, as a list in nm or a CSV file"
+        )
+    choice = BandChoice(wavelengths, {})
+    choice = choice.without(repeated_wavelengths(wavelengths), "an earlier band has the same wavelength")
+    if file.bands.bad is not None:
+        choice = choice.without(file.bands.bad, "marked as bad in the file")
+    if options.drop_bands is not None:
+        choice = choice.without(in_ranges(options.drop_bands, wavelengths), "named in --drop-bands")
+    return choice
+
+
+def _references(
+    views: Sequence[CaptureView], choice: BandChoice, options: ProcessOptions, references: References
+) -> tuple[Reference | None, WhiteReference | None]:
+    cube = views[0].cube
+    dark = None if references.dark is None else open_reference(references.dark, "dark frame", cube)
+    if options.white_rectangle is not None:
+        panel = _panel(views, options.white_rectangle)
+    elif references.white is not None:
+        panel = open_reference(references.white, "white reference", cube)
+    else:
+        return dark, None
+    reflectance = white_panel.panel_reflectance(options.white_reflectance, choice.wavelengths_nm)
+    return dark, white_panel.white_reference(panel, dark, reflectance)
+
+
+def _panel(views: Sequence[CaptureView], rectangle: tuple[str, int, int, int, int]) -> Reference:
+    view = next((view for view in views if view.name == rectangle[0]), None)
+    if view is None:
+        names = ", ".join(view.name for view in views[:5])
+        raise ConfigError(f"--white-rectangle {rectangle[0]}: no view of this name; the first are {names}")
+    return panel_reference(view.cube, rectangle[1:], view.name)
+
+
+def _saturation(files: Sequence[SpectralFile], options: ProcessOptions) -> tuple[float | None, str]:
+    return find_saturation(files) if options.saturation is None else (options.saturation, "given with --saturation")
+
+
+def _common_exposure(
+    files: Sequence[SpectralFile], white: WhiteReference | None
+) -> tuple[float | None, list[str]]:
+    """The exposure that all values are brought to, and what to tell of it."""
+    found = [exposure_of(file) for file in files]
+    of_white = None if white is None else exposure_of(white.reference.file)
+    known = [exposure for exposure in found if exposure is not None]
+    if len(known) < len(found):
+        said = [] if not known else [f"{len(found) - len(known)} views have no exposure time: exposures are not compared"]
+        return None, said
+    common, source = (known[0], "the first view") if of_white is None else (of_white, "the white reference")
+    if all(exposure == common for exposure in known):
+        return common, []
+    low, high = min(known), max(known)
+    return common, [
+        f"views were exposed {low:g} to {high:g} s times gain: all are brought to {common:g}, as {source} has"
+    ]
+
+
+def _gain(file: SpectralFile) -> float:
+    return 1.0 if file.scale is None or file.metadata.get("encoding") == SRGB else 1.0 / file.scale
+
+
+def _unit(file: SpectralFile, white: WhiteReference | None) -> str:
+    if white is not None:
+        return "reflectance"
+    if file.metadata.get("encoding") == SRGB:
+        return "linear light of pictures in sRGB"
+    return "relative radiance" if file.scale is None else "values divided by the scale factor of the files"
+
+
+def _lamp_of(
+    lamp: Float64[np.ndarray, " B"], choice: BandChoice, binning: int
+) -> Float64[np.ndarray, " c"]:
+    kept = _binned(lamp[choice.kept][None].astype(np.float32), binning)[0].astype(np.float64)
+    return np.clip(kept, 0.0, None) / kept.max()
+
+
+def _binned(values: Float32[np.ndarray, "N b"], binning: int) -> Float32[np.ndarray, "N c"]:
+    count = values.shape[1] // binning
+    return values[:, : count * binning].reshape(len(values), count, binning).mean(axis=2)
+
+
+def _band_evidence(file: SpectralFile, choice: BandChoice) -> dict[str, Any]:
+    return {
+        "wavelengths": file.bands.evidence,
+        "dropped_bands": [
+            {"band": band, "wavelength_nm": float(choice.wavelengths_nm[band]), "reason": reason}
+            for band, reason in sorted(choice.dropped.items())
+        ],
+    }

@@ -1,0 +1,193 @@
+"""Everything that is decided before the first view is written."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+
+from unmix_plugin import __version__
+from unmix_plugin.captures.calibration.calibration import SRGB
+from unmix_plugin.captures.calibration.sampling import sampled_rows
+from unmix_plugin.captures.calibration.scale import choose_scale
+from unmix_plugin.captures.calibration.sensor import References, Sensor, prepare_sensor
+from unmix_plugin.captures.capture import Capture, CaptureView
+from unmix_plugin.captures.masks import Background, BackgroundRule, background_brightness, find_background
+from unmix_plugin.captures.options import MaskKind, ProcessOptions
+from unmix_plugin.captures.pictures import Colours
+from unmix_plugin.captures.view_masks import has_matter
+from unmix_plugin.captures.writing.sources import stamps
+from unmix_plugin.captures.writing.view_files import ViewRecipe
+from unmix_plugin.errors import CaptureError
+from unmix_plugin.spectral.bands import Bands
+
+BORDER_SHARE = 0.02
+"""Width of the border that a background is judged by, as a share of the view's."""
+MOST_BORDER_PIXELS = 20000
+BRIGHT_PERCENTILE = 99.0
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How every view is written, and why."""
+
+    capture: Capture
+    views: tuple[CaptureView, ...]
+    sensors: dict[str, Sensor]
+    recipes: dict[str, ViewRecipe]
+    """By sensor."""
+    scale: float
+    mask: MaskKind
+    decisions: dict[str, Any]
+    """With their evidence, as JSON-able values."""
+    notes: tuple[str, ...]
+    """What a user should know, one sentence each."""
+
+    def fingerprint(self, options: ProcessOptions) -> dict[str, Any]:
+        """What must be the same for views to be gone on with: options, decisions and input files."""
+        asked = {key: _plain(value) for key, value in asdict(options).items()}
+        files = [path for view in self.views for path in input_files(view)]
+        files += [path for path in (options.dark, options.white) if path is not None]
+        left_out = ("output_dir", "overwrite", "poses")
+        return {
+            "version": __version__,
+            "options": {key: value for key, value in asked.items() if key not in left_out},
+            "decisions": self.decisions,
+            "files": stamps(files),
+        }
+
+
+def make_plan(
+    capture: Capture, views: Sequence[CaptureView], options: ProcessOptions, references: References
+) -> Plan:
+    """Look at some rows of every view and decide.
+
+    Args:
+        views: Those of the capture that become frames.
+    Raises:
+        CaptureError: views don't fit each other or the references, or a file can't be read.
+        ConfigError: an option does not fit the files.
+    """
+    by_sensor: dict[str, list[CaptureView]] = defaultdict(list)
+    for view in views:
+        by_sensor[view.sensor].append(view)
+    for same in by_sensor.values():
+        _refuse_unlike(same)
+    sensors = {name: prepare_sensor(name, same, options, references) for name, same in by_sensor.items()}
+    scale, why = choose_scale(list(sensors.values()), options.scale)
+    mask = _choose_mask(views, options.mask)
+    recipes, evidence = {}, {}
+    for name, sensor in sensors.items():
+        recipes[name] = _recipe(sensor, by_sensor[name], scale, mask)
+        evidence[name or "all views"] = {
+            "unit": sensor.unit,
+            "bands": len(sensor.centers_nm),
+            "size": [recipes[name].calibration.raster.height, recipes[name].calibration.raster.width],
+            "colours": recipes[name].colours.description,
+            **sensor.evidence,
+            "background": None if recipes[name].background is None else asdict(recipes[name].background),
+        }
+    decisions = {
+        "scale": {"calibrated": scale, "evidence": why},
+        "mask": mask,
+        "sensors": evidence,
+    }
+    said = [note for sensor in sensors.values() for note in sensor.notes]
+    if any(view.cube.metadata.get("encoding") == SRGB for view in views):
+        said.append("pictures are taken as sRGB and brought to linear light; their bands overlap, unlike a spectral camera's")
+    said += [note for view in views[:1] for note in view.cube.notes]
+    return Plan(capture, tuple(views), sensors, recipes, scale, mask, decisions, (*capture.notes, *said))
+
+
+def input_files(view: CaptureView) -> list[Path]:
+    """Every file that a view is made of."""
+    more = [path for path in (view.picture, view.mask, view.labels) if path is not None]
+    return [*view.cube.files, *more]
+
+
+def _refuse_unlike(views: Sequence[CaptureView]) -> None:
+    """Refuse views of one sensor with other bands or another size than the first."""
+    first = views[0].cube
+    for view in views[1:]:
+        cube = view.cube
+        if cube.shape != first.shape:
+            found, expected = (" x ".join(map(str, file.shape)) for file in (cube, first))
+            raise CaptureError(
+                f"{cube.path} has {found} rows, columns and bands; expected {expected}, as {first.path} has: all views of "
+                "a camera are alike, so crop or remove this one"
+            )
+        wavelengths, expected_nm = cube.bands.wavelengths_nm, first.bands.wavelengths_nm
+        if (wavelengths is None) != (expected_nm is None):
+            raise CaptureError(
+                f"only one of {cube.path} and {first.path} gives wavelengths; give them for all with --wavelengths"
+            )
+        if wavelengths is not None and expected_nm is not None and not np.allclose(wavelengths, expected_nm, atol=0.1):
+            band = int(np.argmax(np.abs(wavelengths - expected_nm)))
+            raise CaptureError(
+                f"{cube.path} has {wavelengths[band]:g} nm at band {band}; expected {expected_nm[band]:g} nm, as "
+                f"{first.path} has: all views of a camera have the same bands"
+            )
+        if cube.dtype != first.dtype:
+            raise CaptureError(
+                f"{cube.path} holds {cube.dtype.name}; expected {first.dtype.name}, as {first.path} holds: convert "
+                "all views alike"
+            )
+
+
+def _choose_mask(views: Sequence[CaptureView], asked: MaskKind | None) -> MaskKind:
+    if asked not in (None, "files"):
+        return asked
+    found = [has_matter(view) for view in views]
+    if asked == "files" and not all(found):
+        missing = views[found.index(False)].name
+        raise CaptureError(
+            f"--mask files: view {missing} has no mask; expected a picture with an alpha channel, or masks/{missing}.png "
+            "that is white where matter is, for every view"
+        )
+    if asked is None:
+        found = [has_matter(view, alpha_only=True) for view in views]
+    return "files" if all(found) else "none"
+
+
+def _recipe(sensor: Sensor, views: Sequence[CaptureView], scale: float, mask: MaskKind) -> ViewRecipe:
+    sample = sensor.sample / np.float32(scale)
+    colours = Colours.of(Bands(sensor.centers_nm), sample)
+    rule = _background(sensor, views, scale, mask, sample) if mask in ("white", "black") else None
+    return ViewRecipe(sensor.calibration, scale, colours, rule, mask == "files")
+
+
+def _background(
+    sensor: Sensor,
+    views: Sequence[CaptureView],
+    scale: float,
+    kind: Background,
+    sample: Float32[np.ndarray, "N c"],
+) -> BackgroundRule:
+    raster = sensor.calibration.raster
+    width = max(1, round(BORDER_SHARE * raster.width))
+    columns = np.r_[0:width, raster.width - width : raster.width]
+    rows = sorted({0, raster.height - 1, *sampled_rows(raster.height)})
+    border = []
+    for view in views:
+        for row in rows:
+            part = sensor.calibration.rows(view.cube, row, row + 1)
+            is_edge = row in (0, raster.height - 1)
+            values, saturated = part.values[0], part.saturated[0]
+            seen = ~part.missing[0]
+            if not is_edge:
+                values, saturated, seen = values[columns], saturated[columns], seen[columns]
+            values = np.where(saturated, np.float32(scale), values)
+            border.append(values[seen])
+    pixels = np.clip(np.concatenate(border) / np.float32(scale), 0.0, 1.0)
+    pixels = pixels[:: max(1, len(pixels) // MOST_BORDER_PIXELS)]
+    everywhere = np.concatenate([background_brightness(kind, sample), background_brightness(kind, pixels)])
+    return find_background(kind, pixels, float(np.percentile(np.clip(everywhere, 0.0, 1.0), BRIGHT_PERCENTILE)))
+
+
+def _plain(value: Any) -> Any:
+    return str(value) if isinstance(value, Path) else value

@@ -1,0 +1,119 @@
+"""From a capture to a scene: look at it, decide, write view after view, and name the folder when all is there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from unmix_plugin.captures.calibration.sensor import References
+from unmix_plugin.captures.capture import Capture, CaptureView
+from unmix_plugin.captures.layouts.registry import LAYOUTS, LayoutOptions, find_views
+from unmix_plugin.captures.options import ProcessOptions
+from unmix_plugin.captures.plan import Plan, input_files, make_plan
+from unmix_plugin.captures.posing import ESTIMATE, PosedViews, given_poses, pose_views
+from unmix_plugin.captures.readers.opening import open_spectral_file
+from unmix_plugin.captures.spectral_file import SpectralFile
+from unmix_plugin.captures.wavelengths import parse_wavelengths
+from unmix_plugin.captures.writing.scene_files import write_scene_files
+from unmix_plugin.captures.writing.sources import hashes
+from unmix_plugin.captures.writing.view_files import ViewRecord, write_view
+from unmix_plugin.captures.writing.work_folder import WorkFolder, refuse_output
+from unmix_plugin.errors import CaptureError, ConfigError, did_you_mean
+
+Say = Callable[[str], None]
+"""Tells the user something, one line."""
+Follow = Callable[[str, Sequence[CaptureView]], Iterable[CaptureView]]
+"""Goes through views and shows how far it is."""
+
+
+def process_capture(options: ProcessOptions, say: Say, follow: Follow) -> list[str]:
+    """Make the scene that the options ask for.
+
+    A start that was interrupted is gone on with where inputs and options are the same.
+
+    Returns:
+        What is to be told at the end: what looks wrong, one sentence each.
+    Raises:
+        CaptureError: files are missing, damaged or don't fit each other.
+        ConfigError: an option is wrong or does not fit the files.
+        RunError: the folder can't be written.
+    """
+    _check(options)
+    refuse_output(options.output_dir, options.overwrite)
+    capture = _open_capture(options)
+    say(f"{capture.root}: {len(capture.views)} views of the layout {capture.layout}")
+    posed = None
+    if options.poses != ESTIMATE:
+        posed = pose_views(capture.views, given_poses(capture, options.poses))
+    views = capture.views if posed is None else posed.views
+    plan = make_plan(capture, views, options, _open_references(options))
+    for note in plan.notes:
+        say(f"note: {note}")
+    folder = WorkFolder(options.output_dir)
+    if folder.begin(plan.fingerprint(options)):
+        say(f"going on with {folder.path}")
+    records = _write_views(plan, folder, follow)
+    if posed is None:
+        posed = _estimate(plan, records, folder, say)
+    for note in posed.notes:
+        say(f"poses: {note}")
+    findings = write_scene_files(folder.path, plan, posed, records, options)
+    folder.finish(options.overwrite)
+    return findings
+
+
+def _check(options: ProcessOptions) -> None:
+    if options.layout not in LAYOUTS:
+        raise ConfigError(
+            f"'{options.layout}' is no layout; expected one of {', '.join(LAYOUTS)}"
+            + did_you_mean(options.layout, LAYOUTS, form="; {}")
+        )
+    if options.white is not None and options.white_rectangle is not None:
+        raise ConfigError("--white and --white-rectangle both name a white reference; give one of them")
+    if options.white_reflectance != "1" and options.white is None and options.white_rectangle is None:
+        raise ConfigError("--white-reflectance needs a white reference: --white or --white-rectangle")
+    for name, number in (("--bin-pixels", options.bin_pixels), ("--bin-bands", options.bin_bands)):
+        if number < 1:
+            raise ConfigError(f"{name} {number}: expected 1 or more")
+    if not options.max_noise > 0:
+        raise ConfigError(f"--max-noise {options.max_noise:g}: expected a share above 0")
+
+
+def _open_capture(options: ProcessOptions) -> Capture:
+    wavelengths = None if options.wavelengths is None else parse_wavelengths(options.wavelengths)
+    references = tuple(path for path in (options.dark, options.white) if path is not None)
+    capture = find_views(options.layout, options.data, LayoutOptions(wavelengths, references))
+    output = options.output_dir.resolve()
+    for view in capture.views:
+        if any(path.resolve().is_relative_to(output) for path in input_files(view)):
+            raise ConfigError(f"--output-dir {options.output_dir} holds files of the capture; give another folder")
+    return capture
+
+
+def _open_references(options: ProcessOptions) -> References:
+    return References(_open(options.dark, "--dark"), _open(options.white, "--white"))
+
+
+def _open(path: Path | None, flag: str) -> SpectralFile | None:
+    if path is None:
+        return None
+    if not path.exists():
+        raise CaptureError(f"{flag} {path}: no such file; give the image of the reference")
+    return open_spectral_file(path)
+
+
+def _write_views(plan: Plan, folder: WorkFolder, follow: Follow) -> dict[str, ViewRecord]:
+    records = {}
+    for view in follow("writing views", plan.views):
+        record = folder.done(view.name)
+        if record is None:
+            record = write_view(view, plan.recipes[view.sensor], folder.path)
+            record = replace(record, sources=hashes(input_files(view)))
+            folder.note(record)
+        records[view.name] = record
+    return records
+
+
+def _estimate(plan: Plan, records: dict[str, ViewRecord], folder: WorkFolder, say: Say) -> PosedViews:
+    raise CaptureError("--poses estimate is not available")

@@ -1,0 +1,99 @@
+"""What is written once all views are there: cameras, light, points, and the record of how the scene was made."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unmix_plugin import __version__
+from unmix_plugin.atomic_files import write_file
+from unmix_plugin.captures.options import ProcessOptions
+from unmix_plugin.captures.plan import Plan
+from unmix_plugin.captures.poses.placement import write_points
+from unmix_plugin.captures.posing import PosedViews
+from unmix_plugin.captures.writing.sources import hashes
+from unmix_plugin.captures.writing.transforms import WrittenView, transforms_json
+from unmix_plugin.captures.writing.view_files import FULL_SCALE, ViewRecord
+from unmix_plugin.captures.writing.work_folder import RECORD_NAME, SCENE_NAME
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
+
+ILLUMINANT_NAME, FLAT_LIGHT_NAME = "illuminant.csv", "flat-light.csv"
+
+
+def write_scene_files(
+    folder: Path, plan: Plan, posed: PosedViews, records: dict[str, ViewRecord], options: ProcessOptions
+) -> list[str]:
+    """Write transforms.json, light, points, contact sheet, report and record.
+
+    Returns:
+        What looks wrong, one sentence each.
+    Raises:
+        RunError: the folder can't be written.
+    """
+    keys: dict[str, Any] = dict(posed.keys)
+    points = write_points(folder, posed.poses)
+    if points is not None:
+        keys["ply_file_path"] = points
+    keys |= _write_light(folder, plan)
+    written = [
+        WrittenView(
+            paths=records[view.name].paths,
+            camera_to_world=posed.cameras[view.name].camera_to_world,
+            lens=plan.sensors[view.sensor].calibration.raster.lens(posed.lens(view.name)),
+            sensor=view.sensor,
+            wavelengths_nm=plan.sensors[view.sensor].centers_nm,
+            split=view.split,
+        )
+        for view in posed.views
+    ]
+    findings: list[str] = []
+    record = _record(plan, posed, records, options, findings)
+    _write_json(folder / RECORD_NAME, record)
+    _write_json(folder / SCENE_NAME, transforms_json(written, keys))
+    return findings
+
+
+def _write_light(folder: Path, plan: Plan) -> dict[str, str]:
+    """The light on the white panel, for people, and the flat one in which reflectances are seen; keys of the scene."""
+    sensor = next(iter(plan.sensors.values()))
+    if sensor.lamp is None or len(plan.sensors) > 1:
+        return {}
+    bands = Bands(sensor.centers_nm)
+    write_spectra_csv(folder / ILLUMINANT_NAME, SpectraTable(bands, ("power",), sensor.lamp[None]))
+    write_spectra_csv(folder / FLAT_LIGHT_NAME, SpectraTable(bands, ("power",), np.ones((1, len(bands)))))
+    return {"illuminant_path": FLAT_LIGHT_NAME}
+
+
+def _record(
+    plan: Plan,
+    posed: PosedViews,
+    records: dict[str, ViewRecord],
+    options: ProcessOptions,
+    findings: list[str],
+) -> dict[str, Any]:
+    references = [path for path in (options.dark, options.white) if path is not None]
+    views = [records[view.name].to_json() for view in posed.views]
+    return {
+        "made_by": f"unmix-process {__version__}",
+        "options": {key: str(value) if isinstance(value, Path) else value for key, value in asdict(options).items()},
+        "decisions": plan.decisions,
+        "stored": {"type": "uint16", "value_scale": FULL_SCALE, "calibrated_value_of_1": plan.scale},
+        "poses": {"source": posed.poses.source, "notes": list(posed.notes), **posed.keys},
+        "notes": list(plan.notes),
+        "what_looks_wrong": findings,
+        "totals": {
+            key: sum(view[key] for view in views)
+            for key in ("num_pixels", "saturated_pixels", "missing_pixels", "clipped_values", "negative_values")
+        },
+        "references": hashes(references),
+        "views": views,
+    }
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    write_file(path, (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode())

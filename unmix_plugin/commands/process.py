@@ -1,0 +1,45 @@
+"""`unmix-process LAYOUT --data PATH --output-dir DIR`: from what an instrument wrote to a scene to train on.
+
+`unmix-process inspect FILE...` says what files hold.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from unmix_plugin.commands.entry import run_command
+
+
+def process(arguments: list[str]) -> None:
+    """Parse the arguments, make the scene, say where it is.
+
+    Raises:
+        CaptureError: files are missing, damaged or don't fit each other.
+        ConfigError: an option is wrong or does not fit the files.
+        RunError: the folder can't be written.
+    """
+    if arguments[:1] == ["inspect"]:
+        from unmix_plugin.commands.process_inspect import inspect_command
+
+        sys.exit(inspect_command(arguments[1:]))
+    import tyro
+
+    from unmix_plugin.captures.options import ProcessOptions
+
+    options = tyro.cli(ProcessOptions, prog="unmix-process", args=arguments)
+
+    from unmix_plugin.captures.process import process_capture
+    from unmix_plugin.commands.reporting import CommandConsole, follow, say
+
+    console = CommandConsole()
+    findings = process_capture(
+        options, lambda text: say(console, text), lambda doing, views: follow(console, doing, views)
+    )
+    for finding in findings:
+        print(f"looks wrong: {finding}")
+    print(f"scene: {options.output_dir}")
+
+
+def main() -> None:
+    """Console script."""
+    run_command(process)
