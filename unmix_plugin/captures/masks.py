@@ -51,9 +51,7 @@ def background_brightness(kind: Background, values: Float32[np.ndarray, "*pixels
     return values.min(axis=-1) if kind == "white" else values.mean(axis=-1)
 
 
-def find_background(
-    kind: Background, border: Float32[np.ndarray, "N B"], brightest: float
-) -> BackgroundRule:
+def find_background(kind: Background, border: Float32[np.ndarray, "N B"], brightest: float) -> BackgroundRule:
     """The rule that fits pixels at the border of the views.
 
     Args:
@@ -69,10 +67,10 @@ def find_background(
     distance = max(DEVIATIONS * deviation, LEAST_DISTANCE * brightest)
     share = level / brightest if brightest > 0 else 0.0
     if (kind == "white" and share < LEAST_WHITE) or (kind == "black" and share > MOST_BLACK):
+        expected = f"more than {LEAST_WHITE:.0%}" if kind == "white" else f"less than {MOST_BLACK:.0%}"
         raise CaptureError(
-            f"--mask {kind}: the border of the views is at {share:.0%} of the brightest pixels; expected "
-            f"{'more than ' + format(LEAST_WHITE, '.0%') if kind == 'white' else 'less than ' + format(MOST_BLACK, '.0%')}"
-            " as the background should reach to the border: choose another --mask"
+            f"--mask {kind}: the border of the views is at {share:.0%} of the brightest pixels; expected {expected}, "
+            "as the background should reach to the border: choose another --mask"
         )
     threshold = level - distance if kind == "white" else level + distance
     return BackgroundRule(kind, threshold, level, deviation)
@@ -91,7 +89,10 @@ class CleanMask:
 def clean(matter: Bool[np.ndarray, "H W"]) -> CleanMask:
     """Remove specks, then fill holes, each connected by edges and smaller than `SMALL_SHARE` of the picture.
 
-    >>> mask = np.zeros((100, 100), bool); mask[20:80, 20:80] = True; mask[40, 40] = False; mask[5, 5] = True
+    >>> mask = np.zeros((100, 100), bool)
+    ... mask[20:80, 20:80] = True
+    ... mask[40, 40] = False
+    ... mask[5, 5] = True
     >>> done = clean(mask)
     >>> int(done.matter.sum()), done.specks, done.holes
     (3600, 1, 1)
@@ -105,7 +106,8 @@ def clean(matter: Bool[np.ndarray, "H W"]) -> CleanMask:
 def _without_small(mask: Bool[np.ndarray, "H W"], smallest: int) -> tuple[Bool[np.ndarray, "H W"], int]:
     from scipy import ndimage
 
-    parts, _ = ndimage.label(mask)
+    parts = np.empty(mask.shape, np.int32)
+    ndimage.label(mask, output=parts)
     sizes = np.bincount(parts.ravel())
     is_small = sizes < smallest
     is_small[0] = False

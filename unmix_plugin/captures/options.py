@@ -8,6 +8,9 @@ from typing import Annotated, Literal
 
 import tyro
 
+from unmix_plugin.captures.layouts.registry import LAYOUTS
+from unmix_plugin.captures.readers.read_options import Axes
+
 MaskKind = Literal["files", "white", "black", "none"]
 
 
@@ -15,7 +18,7 @@ MaskKind = Literal["files", "white", "black", "none"]
 class ProcessOptions:
     """Turn what an instrument wrote into a scene to train on."""
 
-    layout: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="LAYOUT")]
+    layout: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="{" + ",".join(LAYOUTS) + "}")]
     """How the files of the capture are laid out."""
     data: Path
     """Folder of the capture."""
@@ -27,6 +30,10 @@ class ProcessOptions:
     wavelengths: str | None = None
     """Band centres in nm for files that don't name them: a CSV file with a column `wavelength`, or a list such as
     620,555,503."""
+    dataset: str | None = None
+    """Data set to take from HDF5, NetCDF and MATLAB files that hold several."""
+    axes: Axes | None = None
+    """Order of the axes in files that don't fix it, the slowest first: y rows, x columns, b bands."""
     dark: Path | None = None
     """Dark frame: an image taken with the shutter closed."""
     white: Path | None = None

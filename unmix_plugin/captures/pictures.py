@@ -56,7 +56,7 @@ def detail(brightness: Float32[np.ndarray, "H W"], seen: Bool[np.ndarray, "H W"]
     fine, fine_inside = _residual(brightness, seen)
     height, width = (length // 2 * 2 for length in brightness.shape)
     halved = brightness[:height, :width].reshape(height // 2, 2, width // 2, 2).mean(axis=(1, 3))
-    inside = seen[:height, :width].reshape(height // 2, 2, width // 2, 2).all(axis=(1, 3))
+    inside = np.all(seen[:height, :width].reshape(height // 2, 2, width // 2, 2), axis=(1, 3))
     coarse, coarse_inside = _residual(halved, inside)
     if not fine_inside.any() or not coarse_inside.any():
         return 0.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -47,12 +47,14 @@ class Plan:
     """With their evidence, as JSON-able values."""
     notes: tuple[str, ...]
     """What a user should know, one sentence each."""
+    reference_files: tuple[Path, ...] = ()
+    """Of dark frame and white reference."""
 
     def fingerprint(self, options: ProcessOptions) -> dict[str, Any]:
         """What must be the same for views to be gone on with: options, decisions and input files."""
         asked = {key: _plain(value) for key, value in asdict(options).items()}
         files = [path for view in self.views for path in input_files(view)]
-        files += [path for path in (options.dark, options.white) if path is not None]
+        files += self.reference_files
         left_out = ("output_dir", "overwrite", "poses")
         return {
             "version": __version__,
@@ -99,9 +101,20 @@ def make_plan(
     }
     said = [note for sensor in sensors.values() for note in sensor.notes]
     if any(view.cube.metadata.get("encoding") == SRGB for view in views):
-        said.append("pictures are taken as sRGB and brought to linear light; their bands overlap, unlike a spectral camera's")
+        said.append("pictures are taken as sRGB and brought to linear light")
     said += [note for view in views[:1] for note in view.cube.notes]
-    return Plan(capture, tuple(views), sensors, recipes, scale, mask, decisions, (*capture.notes, *said))
+    opened = [file for file in (references.dark, references.white) if file is not None]
+    return Plan(
+        capture,
+        tuple(views),
+        sensors,
+        recipes,
+        scale,
+        mask,
+        decisions,
+        (*capture.notes, *said),
+        tuple(path for file in opened for path in file.files),
+    )
 
 
 def input_files(view: CaptureView) -> list[Path]:
@@ -118,15 +131,19 @@ def _refuse_unlike(views: Sequence[CaptureView]) -> None:
         if cube.shape != first.shape:
             found, expected = (" x ".join(map(str, file.shape)) for file in (cube, first))
             raise CaptureError(
-                f"{cube.path} has {found} rows, columns and bands; expected {expected}, as {first.path} has: all views of "
-                "a camera are alike, so crop or remove this one"
+                f"{cube.path} has {found} rows, columns and bands; expected {expected}, as {first.path} has: all views "
+                "of a camera are alike, so crop or remove this one"
             )
         wavelengths, expected_nm = cube.bands.wavelengths_nm, first.bands.wavelengths_nm
         if (wavelengths is None) != (expected_nm is None):
             raise CaptureError(
                 f"only one of {cube.path} and {first.path} gives wavelengths; give them for all with --wavelengths"
             )
-        if wavelengths is not None and expected_nm is not None and not np.allclose(wavelengths, expected_nm, atol=0.1):
+        if (
+            wavelengths is not None
+            and expected_nm is not None
+            and not np.allclose(wavelengths, expected_nm, atol=0.1)
+        ):
             band = int(np.argmax(np.abs(wavelengths - expected_nm)))
             raise CaptureError(
                 f"{cube.path} has {wavelengths[band]:g} nm at band {band}; expected {expected_nm[band]:g} nm, as "
@@ -146,8 +163,8 @@ def _choose_mask(views: Sequence[CaptureView], asked: MaskKind | None) -> MaskKi
     if asked == "files" and not all(found):
         missing = views[found.index(False)].name
         raise CaptureError(
-            f"--mask files: view {missing} has no mask; expected a picture with an alpha channel, or masks/{missing}.png "
-            "that is white where matter is, for every view"
+            f"--mask files: view {missing} has no mask; expected a picture with an alpha channel, or a mask that is "
+            "white where matter is, for every view"
         )
     if asked is None:
         found = [has_matter(view, alpha_only=True) for view in views]
@@ -186,7 +203,9 @@ def _background(
     pixels = np.clip(np.concatenate(border) / np.float32(scale), 0.0, 1.0)
     pixels = pixels[:: max(1, len(pixels) // MOST_BORDER_PIXELS)]
     everywhere = np.concatenate([background_brightness(kind, sample), background_brightness(kind, pixels)])
-    return find_background(kind, pixels, float(np.percentile(np.clip(everywhere, 0.0, 1.0), BRIGHT_PERCENTILE)))
+    return find_background(
+        kind, pixels, float(np.percentile(np.clip(everywhere, 0.0, 1.0), BRIGHT_PERCENTILE))
+    )
 
 
 def _plain(value: Any) -> Any:

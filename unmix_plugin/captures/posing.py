@@ -53,8 +53,8 @@ def given_poses(capture: Capture, where: str | None) -> PoseSet:
     if where is None:
         if capture.poses is None:
             raise CaptureError(
-                f"{capture.root}: the layout '{capture.layout}' has no poses; give --poses with transforms.json, a COLMAP "
-                f"model or another file, or '--poses {ESTIMATE}' to find them from the images"
+                f"{capture.root}: the layout '{capture.layout}' has no poses; give --poses with transforms.json, a "
+                f"COLMAP model or another file, or '--poses {ESTIMATE}' to find them from the images"
             )
         return capture.poses
     path = Path(where)

@@ -11,8 +11,9 @@ from unmix_plugin.captures.capture import Capture, CaptureView
 from unmix_plugin.captures.layouts.registry import LAYOUTS, LayoutOptions, find_views
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.plan import Plan, input_files, make_plan
-from unmix_plugin.captures.posing import ESTIMATE, PosedViews, given_poses, pose_views
+from unmix_plugin.captures.posing import given_poses, pose_views
 from unmix_plugin.captures.readers.opening import open_spectral_file
+from unmix_plugin.captures.readers.read_options import ReadOptions
 from unmix_plugin.captures.spectral_file import SpectralFile
 from unmix_plugin.captures.wavelengths import parse_wavelengths
 from unmix_plugin.captures.writing.scene_files import write_scene_files
@@ -43,19 +44,14 @@ def process_capture(options: ProcessOptions, say: Say, follow: Follow) -> list[s
     refuse_output(options.output_dir, options.overwrite)
     capture = _open_capture(options)
     say(f"{capture.root}: {len(capture.views)} views of the layout {capture.layout}")
-    posed = None
-    if options.poses != ESTIMATE:
-        posed = pose_views(capture.views, given_poses(capture, options.poses))
-    views = capture.views if posed is None else posed.views
-    plan = make_plan(capture, views, options, _open_references(options))
+    posed = pose_views(capture.views, given_poses(capture, options.poses))
+    plan = make_plan(capture, posed.views, options, _open_references(options))
     for note in plan.notes:
         say(f"note: {note}")
     folder = WorkFolder(options.output_dir)
     if folder.begin(plan.fingerprint(options)):
         say(f"going on with {folder.path}")
     records = _write_views(plan, folder, follow)
-    if posed is None:
-        posed = _estimate(plan, records, folder, say)
     for note in posed.notes:
         say(f"poses: {note}")
     findings = write_scene_files(folder.path, plan, posed, records, options)
@@ -83,24 +79,29 @@ def _check(options: ProcessOptions) -> None:
 def _open_capture(options: ProcessOptions) -> Capture:
     wavelengths = None if options.wavelengths is None else parse_wavelengths(options.wavelengths)
     references = tuple(path for path in (options.dark, options.white) if path is not None)
-    capture = find_views(options.layout, options.data, LayoutOptions(wavelengths, references))
+    capture = find_views(
+        options.layout, options.data, LayoutOptions(wavelengths, options.dataset, options.axes, references)
+    )
     output = options.output_dir.resolve()
     for view in capture.views:
         if any(path.resolve().is_relative_to(output) for path in input_files(view)):
-            raise ConfigError(f"--output-dir {options.output_dir} holds files of the capture; give another folder")
+            raise ConfigError(
+                f"--output-dir {options.output_dir} holds files of the capture; give another folder"
+            )
     return capture
 
 
 def _open_references(options: ProcessOptions) -> References:
-    return References(_open(options.dark, "--dark"), _open(options.white, "--white"))
+    read = ReadOptions(options.dataset, None, options.axes)
+    return References(_open(options.dark, "--dark", read), _open(options.white, "--white", read))
 
 
-def _open(path: Path | None, flag: str) -> SpectralFile | None:
+def _open(path: Path | None, flag: str, read: ReadOptions) -> SpectralFile | None:
     if path is None:
         return None
     if not path.exists():
         raise CaptureError(f"{flag} {path}: no such file; give the image of the reference")
-    return open_spectral_file(path)
+    return open_spectral_file(path, read)
 
 
 def _write_views(plan: Plan, folder: WorkFolder, follow: Follow) -> dict[str, ViewRecord]:
@@ -113,7 +114,3 @@ def _write_views(plan: Plan, folder: WorkFolder, follow: Follow) -> dict[str, Vi
             folder.note(record)
         records[view.name] = record
     return records
-
-
-def _estimate(plan: Plan, records: dict[str, ViewRecord], folder: WorkFolder, say: Say) -> PosedViews:
-    raise CaptureError("--poses estimate is not available")

@@ -1,11 +1,6 @@
-"""`unmix-process LAYOUT --data PATH --output-dir DIR`: from what an instrument wrote to a scene to train on.
-
-`unmix-process inspect FILE...` says what files hold.
-"""
+"""`unmix-process LAYOUT --data PATH --output-dir DIR`: from what an instrument wrote to a scene to train on."""
 
 from __future__ import annotations
-
-import sys
 
 from unmix_plugin.commands.entry import run_command
 
@@ -18,10 +13,6 @@ def process(arguments: list[str]) -> None:
         ConfigError: an option is wrong or does not fit the files.
         RunError: the folder can't be written.
     """
-    if arguments[:1] == ["inspect"]:
-        from unmix_plugin.commands.process_inspect import inspect_command
-
-        sys.exit(inspect_command(arguments[1:]))
     import tyro
 
     from unmix_plugin.captures.options import ProcessOptions

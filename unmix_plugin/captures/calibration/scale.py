@@ -25,7 +25,9 @@ def choose_scale(sensors: Sequence[Sensor], given: float | None) -> tuple[float,
     """
     if given is not None:
         if not (np.isfinite(given) and given > 0):
-            raise ConfigError(f"--scale {given:g}: expected a number above 0, the calibrated value written as 1")
+            raise ConfigError(
+                f"--scale {given:g}: expected a number above 0, the calibrated value written as 1"
+            )
         return given, "given with --scale"
     values = np.concatenate([sensor.sample.ravel() for sensor in sensors])
     bright = float(np.percentile(values, BRIGHT_PERCENTILE)) if len(values) else 0.0

@@ -149,7 +149,11 @@ def _panel(views: Sequence[CaptureView], rectangle: tuple[str, int, int, int, in
 
 
 def _saturation(files: Sequence[SpectralFile], options: ProcessOptions) -> tuple[float | None, str]:
-    return find_saturation(files) if options.saturation is None else (options.saturation, "given with --saturation")
+    return (
+        find_saturation(files)
+        if options.saturation is None
+        else (options.saturation, "given with --saturation")
+    )
 
 
 def _common_exposure(
@@ -160,7 +164,8 @@ def _common_exposure(
     of_white = None if white is None else exposure_of(white.reference.file)
     known = [exposure for exposure in found if exposure is not None]
     if len(known) < len(found):
-        said = [] if not known else [f"{len(found) - len(known)} views have no exposure time: exposures are not compared"]
+        missing = len(found) - len(known)
+        said = [f"{missing} views have no exposure time: exposures are not compared"] if known else []
         return None, said
     common, source = (known[0], "the first view") if of_white is None else (of_white, "the white reference")
     if all(exposure == common for exposure in known):
@@ -183,9 +188,7 @@ def _unit(file: SpectralFile, white: WhiteReference | None) -> str:
     return "relative radiance" if file.scale is None else "values divided by the scale factor of the files"
 
 
-def _lamp_of(
-    lamp: Float64[np.ndarray, " B"], choice: BandChoice, binning: int
-) -> Float64[np.ndarray, " c"]:
+def _lamp_of(lamp: Float64[np.ndarray, " B"], choice: BandChoice, binning: int) -> Float64[np.ndarray, " c"]:
     kept = _binned(lamp[choice.kept][None].astype(np.float32), binning)[0].astype(np.float64)
     return np.clip(kept, 0.0, None) / kept.max()
 

@@ -34,7 +34,9 @@ def panel_reflectance(text: str, wavelengths_nm: Float64[np.ndarray, " B"]) -> F
             ) from None
         table = read_spectra_csv(Path(text))
         if len(table.names) != 1:
-            raise SpectrumError(f"{text}: expected one column beside 'wavelength'; found {len(table.names)}") from None
+            raise SpectrumError(
+                f"{text}: expected one column beside 'wavelength'; found {len(table.names)}"
+            ) from None
         order = np.argsort(wavelengths_nm, kind="stable")
         distinct, back = np.unique(wavelengths_nm[order], return_inverse=True)
         values = np.empty(len(wavelengths_nm))

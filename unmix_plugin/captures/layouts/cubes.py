@@ -12,9 +12,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from unmix_plugin.captures.capture import Capture, CaptureView
-from unmix_plugin.captures.layouts._opening import open_spectral_file
 from unmix_plugin.captures.layouts.registry import LayoutOptions
-from unmix_plugin.captures.spectral_file import BandTable, SpectralFile
+from unmix_plugin.captures.readers.opening import open_spectral_file
+from unmix_plugin.captures.spectral_file import SpectralFile
 from unmix_plugin.errors import CaptureError
 
 CUBE_SUFFIXES = frozenset(
@@ -64,25 +64,8 @@ def find_cubes(root: Path, options: LayoutOptions) -> Capture:
     return Capture("cubes", root, views, notes=notes)
 
 
-def with_wavelengths(file: SpectralFile, options: LayoutOptions) -> SpectralFile:
-    """The file with the wavelengths that a user gives; unchanged where there are none.
-
-    Raises:
-        CaptureError: another number of them than of bands.
-    """
-    given = options.wavelengths_nm
-    if given is None:
-        return file
-    if len(given) != file.shape[2]:
-        raise CaptureError(
-            f"{file.path} has {file.shape[2]} bands, but --wavelengths gives {len(given)} numbers; give one a band"
-        )
-    bands = BandTable(given, "given with --wavelengths", None, file.bands.bad)
-    return replace(file, bands=bands)
-
-
 def _open(path: Path, options: LayoutOptions) -> SpectralFile:
-    file = with_wavelengths(open_spectral_file(path), options)
+    file = open_spectral_file(path, options.read)
     if (
         path.suffix.lower() in PICTURE_SUFFIXES
         and file.dtype.itemsize == 1

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from unmix_plugin.captures.capture import Capture
+from unmix_plugin.captures.readers.read_options import Axes, ReadOptions
 from unmix_plugin.errors import CaptureError
 
 
@@ -21,8 +22,17 @@ class LayoutOptions:
 
     wavelengths_nm: Float64[np.ndarray, " B"] | None = None
     """Band centres in nm, in the order of the files; they replace what the files say."""
+    dataset: str | None = None
+    """Data set to take from files that hold several."""
+    axes: Axes | None = None
+    """Order of the axes in files that don't fix it."""
     exclude: tuple[Path, ...] = ()
     """Files in the folder that are no views, such as dark and white references."""
+
+    @property
+    def read(self) -> ReadOptions:
+        """What the readers are told."""
+        return ReadOptions(self.dataset, self.wavelengths_nm, self.axes)
 
 
 FindViews: TypeAlias = Callable[[Path, LayoutOptions], Capture]

@@ -76,11 +76,12 @@ def _record(
     options: ProcessOptions,
     findings: list[str],
 ) -> dict[str, Any]:
-    references = [path for path in (options.dark, options.white) if path is not None]
     views = [records[view.name].to_json() for view in posed.views]
     return {
         "made_by": f"unmix-process {__version__}",
-        "options": {key: str(value) if isinstance(value, Path) else value for key, value in asdict(options).items()},
+        "options": {
+            key: str(value) if isinstance(value, Path) else value for key, value in asdict(options).items()
+        },
         "decisions": plan.decisions,
         "stored": {"type": "uint16", "value_scale": FULL_SCALE, "calibrated_value_of_1": plan.scale},
         "poses": {"source": posed.poses.source, "notes": list(posed.notes), **posed.keys},
@@ -88,9 +89,15 @@ def _record(
         "what_looks_wrong": findings,
         "totals": {
             key: sum(view[key] for view in views)
-            for key in ("num_pixels", "saturated_pixels", "missing_pixels", "clipped_values", "negative_values")
+            for key in (
+                "num_pixels",
+                "saturated_pixels",
+                "missing_pixels",
+                "clipped_values",
+                "negative_values",
+            )
         },
-        "references": hashes(references),
+        "references": hashes(plan.reference_files),
         "views": views,
     }
 

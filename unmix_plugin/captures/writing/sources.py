@@ -37,7 +37,9 @@ def hashes(paths: Iterable[Path]) -> list[dict[str, Any]]:
     for path in paths:
         for file in _files_of(path):
             with _reading(file):
-                found.append({"path": os.fspath(file), "bytes": file.stat().st_size, "sha256": sha256_of(file)})
+                found.append(
+                    {"path": os.fspath(file), "bytes": file.stat().st_size, "sha256": sha256_of(file)}
+                )
     return found
 
 

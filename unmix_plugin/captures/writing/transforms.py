@@ -37,7 +37,9 @@ def transforms_json(views: Sequence[WrittenView], extra: dict[str, Any]) -> dict
         views: At least one, in order.
         extra: More keys of the scene.
     """
-    shared = {key: value for key, value in _facts(views[0]).items() if all(_facts(v)[key] == value for v in views)}
+    shared = {
+        key: value for key, value in _facts(views[0]).items() if all(_facts(v)[key] == value for v in views)
+    }
     bands = np.unique(np.concatenate([view.wavelengths_nm for view in views]))
     frames = []
     for view in views:
@@ -74,4 +76,8 @@ def _split_lists(views: Sequence[WrittenView]) -> dict[str, list[str]]:
     train, evaluation = (
         [view.paths["file_path"] for view in views if view.split == split] for split in ("train", "eval")
     )
-    return {"train_filenames": train, "val_filenames": evaluation, "test_filenames": evaluation} if evaluation else {}
+    return (
+        {"train_filenames": train, "val_filenames": evaluation, "test_filenames": evaluation}
+        if evaluation
+        else {}
+    )

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt16
 
 from unmix_plugin.atomic_files import whole_file, write_errors_as, write_file
-from unmix_plugin.captures.calibration.calibration import Calibration, CalibratedRows
+from unmix_plugin.captures.calibration.calibration import CalibratedRows, Calibration
 from unmix_plugin.captures.capture import CaptureView
 from unmix_plugin.captures.masks import BackgroundRule, clean
 from unmix_plugin.captures.pictures import Colours, detail
@@ -103,8 +103,8 @@ def write_view(view: CaptureView, recipe: ViewRecipe, folder: Path) -> ViewRecor
     _write_picture(folder / paths["file_path"], tally, recipe)
     if tally.missing.any():
         paths["mask_path"] = f"masks/{view.name}.png"
-        pixels = np.where(tally.missing, 0, 255).astype(np.uint8)
-        write_file(folder / paths["mask_path"], rgba_png_bytes(pixels))
+        grey = np.where(tally.missing, 0, 255).astype(np.uint8)
+        write_file(folder / paths["mask_path"], rgba_png_bytes(np.dstack([grey] * 3)))
     return tally.record(view, paths)
 
 

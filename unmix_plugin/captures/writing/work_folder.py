@@ -98,7 +98,9 @@ def refuse_output(output: Path, overwrite: bool) -> None:
     if not (output / RECORD_NAME).is_file():
         raise ConfigError(f"{output} is not empty; give a new folder with --output-dir")
     if not overwrite:
-        raise ConfigError(f"{output} holds a scene already; choose another folder, or replace it with --overwrite")
+        raise ConfigError(
+            f"{output} holds a scene already; choose another folder, or replace it with --overwrite"
+        )
 
 
 def _json(value: Any) -> bytes:

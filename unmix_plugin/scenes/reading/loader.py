@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -45,6 +45,8 @@ def load_scene(root: Path, options: SceneOptions | None = None) -> Scene:
     faults = Faults(root)
     _check_options(options, faults)
     entry = read_transforms(root, faults)
+    if options.value_scale is None:
+        options = replace(options, value_scale=entry.value_scale)
     located = locate_files(root, entry, options, faults)
     truth = _read_truth(root, entry, options, faults)
     names = truth.material_names

@@ -51,6 +51,8 @@ class SceneEntry:
     materials: tuple[str, ...] | None
     illuminant_path: str | None
     endmembers_path: str | None
+    value_scale: float | None
+    """What cubes are divided by, where the options don't say."""
     split_lists: dict[str, tuple[str, ...]]
     frames: tuple[FrameEntry, ...]
     placement: Placement = field(default_factory=Placement)
@@ -77,6 +79,7 @@ def read_transforms(root: Path, faults: Faults) -> SceneEntry:
         materials=_read_materials(content, faults),
         illuminant_path=_read_text(content, "illuminant_path", FILE_NAME, faults),
         endmembers_path=_read_text(content, "endmembers_path", FILE_NAME, faults),
+        value_scale=_read_value_scale(content, faults),
         split_lists=_read_split_lists(content, faults),
         frames=tuple(_read_frame(content, frame, i, faults) for i, frame in enumerate(frames)),
         placement=read_placement(content, faults, FILE_NAME),
@@ -164,6 +167,17 @@ def _read_wavelengths(content: dict[str, Any], faults: Faults) -> Float64[np.nda
         faults.add(FILE_NAME, f"'wavelengths': {error}")
         return None
     return wavelengths
+
+
+def _read_value_scale(content: dict[str, Any], faults: Faults) -> float | None:
+    value = content.get("value_scale")
+    scale = read_number(value)
+    if value is not None and (scale is None or not 1e-30 <= scale <= 1e30):
+        faults.add(
+            FILE_NAME, f"'value_scale' is {describe(value)}; expected a positive number, what stands for 1"
+        )
+        return None
+    return scale
 
 
 def _read_materials(content: dict[str, Any], faults: Faults) -> tuple[str, ...] | None:
