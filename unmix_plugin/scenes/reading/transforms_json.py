@@ -51,12 +51,12 @@ class SceneEntry:
     materials: tuple[str, ...] | None
     illuminant_path: str | None
     endmembers_path: str | None
-    value_scale: float | None
-    """What cubes are divided by, where the options don't say."""
     split_lists: dict[str, tuple[str, ...]]
     frames: tuple[FrameEntry, ...]
     placement: Placement = field(default_factory=Placement)
     """How the poses were moved from where they come from."""
+    value_scale: float | None = None
+    """What cubes are divided by, where the options don't say."""
 
 
 def read_transforms(root: Path, faults: Faults) -> SceneEntry:

@@ -1,0 +1,40 @@
+"""The scale of a scene's cubes, from transforms.json or from the options."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.scenes.scene_factory import make_scene
+from unmix_plugin.errors import SceneError
+from unmix_plugin.scenes.reading.loader import load_scene
+from unmix_plugin.scenes.scene import SceneOptions
+
+
+def _with_scale(root: Path, scale: object) -> Path:
+    folder = make_scene(root)
+    for path in folder.root.rglob("cubes/*.npy"):
+        np.save(path, np.full(np.load(path).shape, 1000, np.uint16))
+    path = folder.root / "transforms.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "value_scale": scale}))
+    return folder.root
+
+
+def test_integers_are_divided_by_the_scale_of_the_scene(tmp_path: Path):
+    scene = load_scene(_with_scale(tmp_path, 4000))
+    assert scene.options.value_scale == 4000
+    np.testing.assert_allclose(scene.cube(0), 0.25)
+
+
+def test_the_option_goes_before_the_scale_of_the_scene(tmp_path: Path):
+    scene = load_scene(_with_scale(tmp_path, 4000), SceneOptions(value_scale=2000.0))
+    np.testing.assert_allclose(scene.cube(0), 0.5)
+
+
+@pytest.mark.parametrize("scale", [0, -1, "65535", 1e40])
+def test_a_scale_that_is_none_is_refused(tmp_path: Path, scale: object):
+    with pytest.raises(SceneError, match="'value_scale' is .*; expected a positive number"):
+        load_scene(_with_scale(tmp_path, scale))
