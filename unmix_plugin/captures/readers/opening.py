@@ -10,10 +10,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
+from unmix_plugin.captures.readers.band_folder import open_band_folder
 from unmix_plugin.captures.readers.envi import open_envi
+from unmix_plugin.captures.readers.exr import open_exr
 from unmix_plugin.captures.readers.file_kinds import file_kind
+from unmix_plugin.captures.readers.hdf5 import open_hdf5
+from unmix_plugin.captures.readers.matlab import open_matlab
+from unmix_plugin.captures.readers.netcdf3 import open_netcdf3
+from unmix_plugin.captures.readers.numpy_files import open_npy, open_npz
+from unmix_plugin.captures.readers.pictures import open_picture
 from unmix_plugin.captures.readers.read_options import ReadOptions
 from unmix_plugin.captures.readers.tiff import open_tiff
+from unmix_plugin.captures.readers.torch_files import open_torch
 from unmix_plugin.captures.spectral_file import SpectralFile, unreadable
 from unmix_plugin.errors import CaptureError
 
@@ -22,6 +30,17 @@ Reader: TypeAlias = Callable[[Path, ReadOptions], SpectralFile]
 _READERS: dict[str, Reader] = {
     "envi": open_envi,
     "tiff": open_tiff,
+    "exr": open_exr,
+    "npy": open_npy,
+    "npz": open_npz,
+    "matlab": open_matlab,
+    "hdf5": open_hdf5,
+    "netcdf": open_netcdf3,
+    "picture": open_picture,
+    "torch": open_torch,
+    "folder": lambda path, options: open_band_folder(
+        path, lambda band: _READERS[file_kind(band)](band, options)
+    ),
 }
 
 

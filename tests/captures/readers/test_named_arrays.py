@@ -1,0 +1,255 @@
+"""Files of named arrays (MATLAB, HDF5, NetCDF, npz, torch): against the libraries that wrote them."""
+
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+import torch
+
+from tests.captures.readers.bands import centres_nm, widths_nm
+from unmix_plugin.captures.readers.opening import open_spectral_file
+from unmix_plugin.captures.readers.read_options import ReadOptions
+from unmix_plugin.errors import CaptureError
+
+CUBE = np.random.default_rng(0).integers(0, 9000, (8, 9, 5)).astype(np.uint16)
+NM = np.array([450.0, 500, 550, 600, 650])
+
+
+def matlab73(path, arrays):
+    """As MATLAB writes them: axes in reverse order, behind 512 bytes of its own."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, array in arrays.items():
+            file[name] = np.asarray(array).T
+    with path.open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
+
+
+def hdf5(path, arrays):
+    with h5py.File(path, "w") as file:
+        for name, array in arrays.items():
+            file.create_dataset(name, data=array, chunks=True, compression="gzip")
+
+
+def netcdf3(path, arrays):
+    with scipy.io.netcdf_file(path, "w") as file:
+        for name, array in arrays.items():
+            names = tuple(f"{name}_{axis}" for axis in range(array.ndim))
+            for dimension, length in zip(names, array.shape, strict=True):
+                file.createDimension(dimension, length)
+            file.createVariable(name, array.dtype.newbyteorder("="), names)[:] = array
+
+
+def torch_legacy(path, arrays):
+    tensors = {name: torch.tensor(array) for name, array in arrays.items()}
+    torch.save(tensors, path, _use_new_zipfile_serialization=False)
+
+
+WRITERS = {
+    "v5.mat": lambda path, arrays: scipy.io.savemat(path, arrays),
+    "compressed.mat": lambda path, arrays: scipy.io.savemat(path, arrays, do_compression=True),
+    "v73.mat": matlab73,
+    "cube.h5": hdf5,
+    "cube.nc": netcdf3,
+    "cube.npz": lambda path, arrays: np.savez(path, **arrays),
+    "small.npz": lambda path, arrays: np.savez_compressed(path, **arrays),
+    "cube.pt": lambda path, arrays: torch.save({k: torch.tensor(v) for k, v in arrays.items()}, path),
+    "legacy.pt": torch_legacy,
+}
+PLAIN = CUBE.astype(np.int16)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("bands_at", [0, 1, 2])
+def test_the_image_and_its_wavelengths_are_found(tmp_path, name, bands_at):
+    stored = np.moveaxis(PLAIN, 2, bands_at)
+    arrays = {
+        "thumbnail": PLAIN[..., 0],
+        "cube": np.ascontiguousarray(stored),
+        "wavelengths": NM,
+        "fwhm": NM / 100,
+    }
+    WRITERS[name](tmp_path / name, arrays)
+    file = open_spectral_file(tmp_path / name)
+    assert (file.shape, file.dtype.newbyteorder("=")) == ((8, 9, 5), np.dtype("i2"))
+    np.testing.assert_array_equal(file.read(), PLAIN)
+    np.testing.assert_array_equal(
+        file.read(slice(2, 7, 2), np.array([4, 0, 4])), PLAIN[2:7:2][..., [4, 0, 4]]
+    )
+    np.testing.assert_array_equal(centres_nm(file), NM)
+    np.testing.assert_allclose(widths_nm(file), NM / 100)
+    assert "'wavelengths', no unit: 450 to 650 taken as nm" in file.bands.evidence
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_several_images_are_asked_about(tmp_path, name):
+    WRITERS[name](tmp_path / name, {"first": PLAIN, "second": PLAIN + 1})
+    with pytest.raises(CaptureError, match=r"2 data sets could be the image; name one.*first \(8, 9, 5\)"):
+        open_spectral_file(tmp_path / name)
+    file = open_spectral_file(tmp_path / name, ReadOptions(dataset="second"))
+    np.testing.assert_array_equal(file.read(), PLAIN + 1)
+    with pytest.raises(CaptureError, match="no data sets 'third'"):
+        open_spectral_file(tmp_path / name, ReadOptions(dataset="third"))
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_files_without_an_image_are_refused(tmp_path, name):
+    WRITERS[name](tmp_path / name, {"vector": NM, "table": PLAIN[..., 0]})
+    with pytest.raises(CaptureError, match="no data set has three axes; name one"):
+        open_spectral_file(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_files_that_are_cut_short_are_refused(tmp_path, name):
+    WRITERS[name](tmp_path / name, {"cube": PLAIN})
+    data = (tmp_path / name).read_bytes()
+    for share in (0.95, 0.6, 0.3, 0.05):
+        (tmp_path / name).write_bytes(data[: int(len(data) * share)])
+        with pytest.raises(CaptureError, match=name):
+            open_spectral_file(tmp_path / name).read()
+
+
+def test_lists_of_pixels_are_images_once_their_size_is_known(tmp_path):
+    listed = CUBE.transpose(2, 0, 1).reshape(5, -1, order="F")  # as MATLAB's reshape does it
+    scipy.io.savemat(tmp_path / "a.mat", {"Y": listed, "A": listed[:3]})
+    options = ReadOptions(dataset="Y", size=(8, 9))
+    file = open_spectral_file(tmp_path / "a.mat", options)
+    np.testing.assert_array_equal(file.read(slice(2, 5), slice(1, 4)), CUBE[2:5, :, 1:4])
+    with pytest.raises(CaptureError, match=r"Y \(5, 72\) is no list of 70 pixels"):
+        open_spectral_file(tmp_path / "a.mat", ReadOptions(dataset="Y", size=(7, 10)))
+    scipy.io.savemat(tmp_path / "b.mat", {"Y": listed, "nRow": 8, "nCol": 9, "nBand": 5})
+    np.testing.assert_array_equal(open_spectral_file(tmp_path / "b.mat").read(), CUBE)
+    scipy.io.savemat(tmp_path / "c.mat", {"Y": listed.T})
+    np.testing.assert_array_equal(
+        open_spectral_file(tmp_path / "c.mat", ReadOptions(size=(8, 9))).read(), CUBE
+    )
+
+
+def test_units_scale_and_groups_of_hdf5(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        image = file.create_dataset("site/reflectance", data=CUBE)
+        image.attrs["Scale_Factor"] = 10000.0
+        image.attrs["Data_Ignore_Value"] = -9999.0
+        file["site/metadata/wavelength"] = NM / 1000
+        file["site/metadata/wavelength"].attrs["Units"] = "micrometers"
+        file["site/metadata/bbl"] = np.array([1, 0, 1, 1, 1])
+        file["site/observations"] = np.zeros((8, 9, 10))
+    file = open_spectral_file(tmp_path / "a.h5")
+    np.testing.assert_allclose(centres_nm(file), NM)
+    assert (file.scale, file.no_data) == (10000, -9999)
+    assert file.bands.bad is not None
+    assert file.bands.bad.tolist() == [False, True, False, False, False]
+    assert file.metadata["dataset"] == "site/reflectance"
+
+
+def test_axes_by_the_names_of_netcdf4(tmp_path):
+    square = CUBE[:5, :5]
+    with h5py.File(tmp_path / "a.nc", "w") as opened:
+        file: Any = opened
+        for name, values in (("wavelength", NM), ("lat", np.arange(5.0)), ("lon", np.arange(5.0))):
+            file[name] = values
+            file[name].make_scale(name)
+        file["radiance"] = square.transpose(2, 0, 1)
+        for axis, name in enumerate(("wavelength", "lat", "lon")):
+            file["radiance"].dims[axis].attach_scale(file[name])
+        file["radiance"].attrs["scale_factor"] = 0.0001
+    file = open_spectral_file(tmp_path / "a.nc")
+    np.testing.assert_array_equal(file.read(), square)
+    assert file.scale == pytest.approx(10000)
+    assert file.notes == ()
+
+
+def test_attributes_with_wavelengths(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["cube"] = CUBE
+        file["cube"].attrs["wavelengths"] = NM
+    np.testing.assert_array_equal(centres_nm(open_spectral_file(tmp_path / "a.h5")), NM)
+
+
+def test_numbers_of_hdf5_outside_the_file_are_not_followed(tmp_path):
+    (tmp_path / "secret").write_bytes(bytes(range(60)))
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("cube", (3, 4, 5), "u1", external=[(str(tmp_path / "secret"), 0, 60)])
+    with pytest.raises(CaptureError, match="the numbers of cube lie in other files"):
+        open_spectral_file(tmp_path / "a.h5")
+
+
+@pytest.mark.parametrize("name", ["big.h5", "big.npy"])
+def test_files_of_terabytes_open_at_once(tmp_path, name):
+    shape = (10**5, 10**4, 500)
+    if name == "big.h5":
+        with h5py.File(tmp_path / name, "w") as file:
+            file.create_dataset("cube", shape, "u2", chunks=(1, 100, 500))
+    else:
+        header = np.lib.format.open_memmap(tmp_path / name, "w+", np.uint16, (1, 1, 1))
+        del header
+        with (tmp_path / name).open("r+b") as file:
+            np.lib.format.write_array_header_1_0(
+                file, {"descr": "<u2", "fortran_order": False, "shape": shape}
+            )
+            file.truncate(file.tell() + 10**5 * 10**4 * 500 * 2)
+    file = open_spectral_file(tmp_path / name)
+    assert file.shape == shape
+    assert file.read(slice(99_999, 10**5), slice(0, 2)).shape == (1, 10**4, 2)
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize("dtype", ["f2", ">f4", "u1", "f8"])
+def test_npy_arrays_are_mapped(tmp_path, order, dtype):
+    np.save(tmp_path / "a.npy", np.asarray(CUBE.astype(dtype), order=order))
+    file = open_spectral_file(tmp_path / "a.npy")
+    assert file.dtype == np.dtype(dtype)
+    np.testing.assert_array_equal(
+        file.read(slice(1, 3), np.array([3, 1])), CUBE.astype(dtype)[1:3][..., [3, 1]]
+    )
+    np.save(tmp_path / "b.npy", CUBE[..., 0])
+    np.testing.assert_array_equal(open_spectral_file(tmp_path / "b.npy").read(), CUBE[..., :1])
+
+
+def test_the_order_of_axes_can_be_said(tmp_path):
+    np.save(tmp_path / "a.npy", CUBE.transpose(2, 0, 1))
+    assert "axis 0 is the shortest" in open_spectral_file(tmp_path / "a.npy").notes[0]
+    file = open_spectral_file(tmp_path / "a.npy", ReadOptions(axes="byx"))
+    np.testing.assert_array_equal(file.read(), CUBE)
+    file = open_spectral_file(tmp_path / "a.npy", ReadOptions(wavelengths_nm=NM))
+    np.testing.assert_array_equal(file.read(), CUBE)
+    assert file.bands.evidence == "given by the user"
+    with pytest.raises(CaptureError, match="3 wavelengths were given for 5 rows x 8 columns x 9 bands"):
+        open_spectral_file(tmp_path / "a.npy", ReadOptions(wavelengths_nm=NM[:3]))
+
+
+@pytest.mark.parametrize("kind", ["npy", "npz", "pt", "legacy.pt"])
+def test_pickles_are_never_loaded(tmp_path, kind):
+    path = tmp_path / f"a.{kind}"
+    objects = np.array([[[print]]], dtype=object)
+    match kind:
+        case "npy":
+            np.save(path, objects, allow_pickle=True)
+        case "npz":
+            np.savez(path, cube=objects)
+        case _:
+            torch.save({"cube": print}, path, _use_new_zipfile_serialization=kind == "pt")
+    with pytest.raises(CaptureError, match=r"a\..*(objects|no data set)"):
+        open_spectral_file(path)
+
+
+def test_a_bare_tensor_is_an_image(tmp_path):
+    torch.save(torch.tensor(CUBE.astype("u1")), tmp_path / "a.pt")
+    file = open_spectral_file(tmp_path / "a.pt")
+    assert (file.reader, file.shape, file.dtype) == ("torch", (8, 9, 5), np.uint8)
+    np.testing.assert_array_equal(file.read(slice(0, 2)), CUBE.astype("u1")[:2])
+
+
+def test_members_that_promise_too_much_are_refused(tmp_path):
+    import io
+    import zipfile
+
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": "<u2", "fortran_order": False, "shape": (10**6, 10**6, 9)}
+    )
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("cube.npy", header.getvalue() + bytes(20))
+    with pytest.raises(CaptureError, match=r"cube\.npy holds 148 bytes; its header promises 18000000000000$"):
+        open_spectral_file(tmp_path / "a.npz")

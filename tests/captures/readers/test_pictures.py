@@ -1,0 +1,125 @@
+"""Pictures and folders of pictures: against Pillow and imagecodecs."""
+
+import imagecodecs
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+
+from tests.captures.readers.bands import centres_nm
+from unmix_plugin.captures.readers.opening import open_spectral_file
+from unmix_plugin.errors import CaptureError
+
+RGB = np.random.default_rng(0).integers(0, 255, (6, 9, 3)).astype(np.uint8)
+DEEP = np.random.default_rng(1).integers(0, 65535, (6, 9, 3)).astype(np.uint16)
+
+
+def test_colours_are_three_bands_of_unknown_wavelength(tmp_path):
+    Image.fromarray(RGB).save(tmp_path / "a.png")
+    Image.fromarray(RGB).save(tmp_path / "a.jpg", quality=100)
+    for name in ("a.png", "a.jpg"):
+        file = open_spectral_file(tmp_path / name)
+        with Image.open(tmp_path / name) as picture:
+            np.testing.assert_array_equal(
+                file.read(slice(1, 4), np.array([2, 0])), np.asarray(picture)[1:4][..., [2, 0]]
+            )
+        assert file.bands.names == ("red", "green", "blue")
+        assert file.bands.wavelengths_nm is None
+        assert file.metadata["encoding"] == "sRGB"
+
+
+def test_numbers_of_sixteen_bits_keep_them(tmp_path):
+    (tmp_path / "rgb.png").write_bytes(imagecodecs.png_encode(DEEP))
+    (tmp_path / "grey.png").write_bytes(imagecodecs.png_encode(DEEP[..., 0].copy()))
+    np.testing.assert_array_equal(open_spectral_file(tmp_path / "rgb.png").read(), DEEP)
+    np.testing.assert_array_equal(open_spectral_file(tmp_path / "grey.png").read(), DEEP[..., :1])
+
+
+def test_opacity_palettes_and_bits(tmp_path):
+    Image.fromarray(np.dstack([RGB, RGB[..., :1]])).save(tmp_path / "rgba.png")
+    file = open_spectral_file(tmp_path / "rgba.png")
+    np.testing.assert_array_equal(file.read(), RGB)
+    assert "opacity" in file.notes[0]
+    Image.fromarray(RGB).quantize(256).save(tmp_path / "palette.png")
+    with Image.open(tmp_path / "palette.png") as picture:
+        np.testing.assert_array_equal(
+            open_spectral_file(tmp_path / "palette.png").read(), picture.convert("RGB")
+        )
+    Image.fromarray(RGB[..., 0] > 99).save(tmp_path / "bits.png")
+    np.testing.assert_array_equal(
+        open_spectral_file(tmp_path / "bits.png").read()[..., 0] > 0, RGB[..., 0] > 99
+    )
+
+
+@pytest.mark.parametrize(
+    ("names", "nm"),
+    [
+        (["pot_ms_450nm", "pot_ms_500nm", "pot_ms_1000nm"], [450, 500, 1000]),
+        (["0450", "0500", "0550"], [450, 500, 550]),
+        (["view2_700", "view2_720.5", "view2_740"], [700, 720.5, 740]),
+        (["b 0.55um", "a 0.65um", "c 0.45um"], [550, 650, 450]),
+    ],
+)
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_a_folder_is_an_image_by_rising_wavelength(tmp_path, names, nm, suffix):
+    for value, name in enumerate(names):
+        plane = np.full((4, 5), value, np.uint16)
+        if suffix == ".png":
+            (tmp_path / f"{name}.png").write_bytes(imagecodecs.png_encode(plane))
+        else:
+            tifffile.imwrite(tmp_path / f"{name}.tif", plane)
+    Image.fromarray(RGB).save(tmp_path / "preview.jpg")
+    file = open_spectral_file(tmp_path)
+    np.testing.assert_allclose(centres_nm(file), np.sort(nm))
+    assert "names of files" in file.bands.evidence
+    np.testing.assert_array_equal(file.read()[0, 0], np.argsort(nm))
+    assert "1 picture of another kind" in file.notes[-1]
+
+
+def test_counted_files_keep_their_order_and_have_no_wavelengths(tmp_path):
+    for band in range(1, 12):
+        Image.fromarray(np.full((4, 5), band, np.uint8)).save(tmp_path / f"band_{band}.png")
+    file = open_spectral_file(tmp_path)
+    assert file.bands.wavelengths_nm is None
+    np.testing.assert_array_equal(file.read()[0, 0], np.arange(1, 12))
+
+
+def test_folders_that_are_no_image_are_refused(tmp_path):
+    with pytest.raises(CaptureError, match="no band files in this folder"):
+        open_spectral_file(tmp_path)
+    Image.fromarray(RGB).save(tmp_path / "a.png")
+    with pytest.raises(CaptureError, match="3 bands; expected one band a file"):
+        open_spectral_file(tmp_path)
+    Image.fromarray(RGB[..., 0]).save(tmp_path / "a.png")
+    Image.fromarray(RGB[:3, :, 0]).save(tmp_path / "b.png")
+    with pytest.raises(CaptureError, match=r"b.png has 3 x 9 pixels; expected the 6 x 9"):
+        open_spectral_file(tmp_path)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_pictures_that_are_cut_short_are_refused(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    Image.fromarray(RGB).save(path)
+    data = path.read_bytes()
+    for length in range(12, len(data) - 20, 9):
+        path.write_bytes(data[:length])
+        with pytest.raises(CaptureError, match=path.name):
+            open_spectral_file(path).read()
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "the file is empty"),
+        (b"hello world", "of no known kind: begins with b'hello wo'"),
+        (b"\x1f\x8b" + bytes(20), "compressed with gzip; unpack it first"),
+        (b"<!DOCTYPE html><html>", "a web page"),
+        (b"PK\x05\x06" + bytes(18), "no known kind"),
+    ],
+)
+def test_other_files_are_refused_with_the_reason(tmp_path, data, message):
+    (tmp_path / "a.raw").write_bytes(data)
+    with pytest.raises(CaptureError, match=message):
+        open_spectral_file(tmp_path / "a.raw")
+    with pytest.raises(CaptureError, match="no such file"):
+        open_spectral_file(tmp_path / "missing.tif")
