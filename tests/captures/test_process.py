@@ -21,7 +21,7 @@ from unmix_plugin.captures.writing.view_files import FULL_SCALE
 from unmix_plugin.scenes.reading.loader import load_scene
 
 
-@pytest.mark.parametrize("kind", ["envi"])
+@pytest.mark.parametrize("kind", ["envi", "npy"])
 def test_counts_become_reflectances_of_a_scene_that_loads(tmp_path: Path, kind):
     capture = make_capture(tmp_path / "capture", kind=kind)
     suffix = "hdr" if kind == "envi" else "npy"
@@ -104,3 +104,22 @@ def test_views_without_a_pose_are_left_out(tmp_path: Path):
         "view_02",
         "view_03",
     ]
+
+
+def test_pictures_become_linear_bands(tmp_path: Path):
+    from PIL import Image
+
+    root = tmp_path / "capture"
+    root.mkdir()
+    generator = np.random.default_rng(0)
+    pixels = generator.integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
+    for name in ("a", "b"):
+        Image.fromarray(pixels).save(root / f"{name}.png")
+    write_poses(root / "transforms.json", ["a", "b"])
+    process(root, tmp_path / "scene", wavelengths="620,555,503")
+
+    scene = load_scene(tmp_path / "scene")
+    np.testing.assert_allclose(scene.wavelengths_nm, [503.0, 555.0, 620.0])
+    encoded = pixels[..., ::-1] / 255.0
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    np.testing.assert_allclose(scene.cube(0), linear, atol=1e-4)

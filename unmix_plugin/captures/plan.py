@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from unmix_plugin import __version__
-from unmix_plugin.captures.calibration.calibration import SRGB
+from unmix_plugin.captures.calibration.linear import is_srgb
 from unmix_plugin.captures.calibration.sampling import sampled_rows
 from unmix_plugin.captures.calibration.scale import choose_scale
 from unmix_plugin.captures.calibration.sensor import References, Sensor, prepare_sensor
@@ -20,7 +20,7 @@ from unmix_plugin.captures.capture import Capture, CaptureView
 from unmix_plugin.captures.masks import Background, BackgroundRule, background_brightness, find_background
 from unmix_plugin.captures.options import MaskKind, ProcessOptions
 from unmix_plugin.captures.pictures import Colours
-from unmix_plugin.captures.view_masks import has_matter
+from unmix_plugin.captures.view_masks import has_opacity
 from unmix_plugin.captures.writing.sources import stamps
 from unmix_plugin.captures.writing.view_files import ViewRecipe
 from unmix_plugin.errors import CaptureError
@@ -100,7 +100,7 @@ def make_plan(
         "sensors": evidence,
     }
     said = [note for sensor in sensors.values() for note in sensor.notes]
-    if any(view.cube.metadata.get("encoding") == SRGB for view in views):
+    if any(is_srgb(view.cube) for view in views):
         said.append("pictures are taken as sRGB and brought to linear light")
     said += [note for view in views[:1] for note in view.cube.notes]
     opened = [file for file in (references.dark, references.white) if file is not None]
@@ -159,7 +159,7 @@ def _refuse_unlike(views: Sequence[CaptureView]) -> None:
 def _choose_mask(views: Sequence[CaptureView], asked: MaskKind | None) -> MaskKind:
     if asked not in (None, "files"):
         return asked
-    found = [has_matter(view) for view in views]
+    found = [has_opacity(view) for view in views]
     if asked == "files" and not all(found):
         missing = views[found.index(False)].name
         raise CaptureError(
@@ -167,7 +167,7 @@ def _choose_mask(views: Sequence[CaptureView], asked: MaskKind | None) -> MaskKi
             "white where matter is, for every view"
         )
     if asked is None:
-        found = [has_matter(view, alpha_only=True) for view in views]
+        found = [has_opacity(view, alpha_only=True) for view in views]
     return "files" if all(found) else "none"
 
 

@@ -1,4 +1,4 @@
-"""What pictures of a capture say of a view's pixels: which are matter, and which are to be ignored."""
+"""What pictures of a capture say of a view's pixels: how opaque they are, which are to be ignored, what they show."""
 
 from __future__ import annotations
 
@@ -6,14 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, UInt8
 
 from unmix_plugin.captures.calibration.raster import Raster
 from unmix_plugin.captures.capture import CaptureView
 from unmix_plugin.errors import CaptureError
 
 HALF = 127
-"""Opacity above which a pixel is matter."""
+"""Grey above which a mask is white."""
+OPAQUE = 255
 
 
 @dataclass(frozen=True)
@@ -22,57 +23,85 @@ class ViewMasks:
 
     valid: Bool[np.ndarray, "H W"]
     """Pixels that are not to be ignored."""
-    matter: Bool[np.ndarray, "H W"] | None
-    """Pixels that are not background; None where no file says so."""
+    opacity: UInt8[np.ndarray, "H W"] | None
+    """255 where matter covers a pixel; None where no file says so."""
 
 
-def has_matter(view: CaptureView, alpha_only: bool = False) -> bool:
-    """Whether a file says what is matter: the alpha channel of the picture, or a mask that is white there."""
-    return _alpha_of(view) is not None or (view.mask is not None and not alpha_only)
+def has_opacity(view: CaptureView, alpha_only: bool = False) -> bool:
+    """Whether a file says what is matter: an alpha channel, or a mask that is white there."""
+    has_alpha = view.alpha is not None or _alpha_picture(view) is not None
+    return has_alpha or (view.mask is not None and not alpha_only)
 
 
-def read_view_masks(view: CaptureView, raster: Raster, use_matter: bool) -> ViewMasks:
+def read_view_masks(view: CaptureView, raster: Raster, use_opacity: bool) -> ViewMasks:
     """The masks of a view.
 
     Args:
-        view: Its picture may have an alpha channel. Its mask is black where pixels are ignored, or, if matter is looked
-            for and there is no alpha channel, where background is.
-        raster: Of the scene; a square of pixels is valid, or matter, where all of it is.
-        use_matter: Whether to look for matter.
+        view: It may have an alpha channel. Its mask is black where pixels are ignored, or, if opacity is looked for and
+            there is no alpha channel, where background is.
+        raster: Of the scene; a square of pixels is valid where all of it is, and as opaque as its mean.
+        use_opacity: Whether to look for it.
     Raises:
         CaptureError: a file can't be read or has another size than the cube.
     """
-    valid, matter = np.ones((raster.height, raster.width), bool), None
-    alpha = _alpha_of(view) if use_matter else None
+    valid, opacity = np.ones((raster.height, raster.width), bool), None
+    alpha = _alpha(view) if use_opacity else None
     if alpha is not None:
-        matter = ~raster.any_in_square(_cut(_read(alpha, "RGBA", view)[..., 3] <= HALF, raster))
+        mean = raster.averaged(_cut(alpha, raster).astype(np.float32))
+        opacity = np.rint(mean).astype(np.uint8)
     if view.mask is not None:
-        kept = ~raster.any_in_square(_cut(_read(view.mask, "L", view) <= (HALF if use_matter else 0), raster))
-        valid, matter = (valid, kept) if use_matter and alpha is None else (kept, matter)
-    return ViewMasks(valid, matter)
+        mask = _cut(_read(view.mask, "L", view), raster)
+        if use_opacity and opacity is None:
+            opacity = np.where(raster.any_in_square(mask <= HALF), 0, OPAQUE).astype(np.uint8)
+        else:
+            valid = ~raster.any_in_square(mask == 0)
+    return ViewMasks(valid, opacity)
 
 
-def _alpha_of(view: CaptureView) -> Path | None:
+def read_labels(view: CaptureView, raster: Raster) -> UInt8[np.ndarray, "H W"] | None:
+    """True materials of a view; None if it has none, or if pixels are averaged.
+
+    Raises:
+        CaptureError: the file can't be read or has another size than the cube.
+    """
+    if view.labels is None or raster.binning > 1:
+        return None
+    return _cut(_read(view.labels, None, view), raster).astype(np.uint8)
+
+
+def _alpha(view: CaptureView) -> UInt8[np.ndarray, "H W"] | None:
+    if view.alpha is not None:
+        if view.alpha.shape[:2] != view.cube.shape[:2]:
+            raise CaptureError(
+                f"{view.alpha.path} has {view.alpha.shape[0]} x {view.alpha.shape[1]} pixels; expected those of the cube, "
+                f"{view.cube.shape[0]} x {view.cube.shape[1]}"
+            )
+        return np.rint(np.clip(view.alpha.read()[..., 0], 0.0, 1.0) * OPAQUE).astype(np.uint8)
+    picture = _alpha_picture(view)
+    return None if picture is None else _read(picture, "RGBA", view)[..., 3]
+
+
+def _alpha_picture(view: CaptureView) -> Path | None:
     """The picture with an alpha channel: the one beside the cube, or the view itself if it is one."""
-    picture = view.cube.path if view.cube.metadata.get("has_alpha") else view.picture
-    return picture if picture is not None and _has_alpha(picture) else None
+    from PIL import Image
+
+    picture = view.cube.path if view.cube.reader == "picture" else view.picture
+    if picture is None:
+        return None
+    try:
+        with Image.open(picture) as opened:
+            has_alpha = "A" in opened.getbands() or "transparency" in opened.info
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise CaptureError(f"{picture} can't be read as a picture ({error}); mend or remove it") from error
+    return picture if has_alpha else None
 
 
 def _cut(pixels: np.ndarray, raster: Raster) -> np.ndarray:
     return pixels[raster.file_rows(0, raster.height), raster.columns]
 
 
-def _has_alpha(path: Path) -> bool:
-    from PIL import Image
-
-    try:
-        with Image.open(path) as picture:
-            return "A" in picture.getbands() or "transparency" in picture.info
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise CaptureError(f"{path} can't be read as a picture ({error}); mend or remove it") from error
-
-
-def _read(path: Path, mode: str, view: CaptureView) -> np.ndarray:
+def _read(path: Path, mode: str | None, view: CaptureView) -> np.ndarray:
+    """A picture with the pixels of the cube, converted to a mode of Pillow or as it is."""
     from PIL import Image
 
     height, width, _ = view.cube.shape
@@ -83,6 +112,6 @@ def _read(path: Path, mode: str, view: CaptureView) -> np.ndarray:
                     f"{path} has {picture.size[0]} x {picture.size[1]} pixels (width x height); expected "
                     f"{width} x {height}, as the cube of view {view.name} has"
                 )
-            return np.asarray(picture.convert(mode))
+            return np.asarray(picture if mode is None else picture.convert(mode))
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise CaptureError(f"{path} can't be read as a picture ({error}); mend or remove it") from error

@@ -13,12 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
+from unmix_plugin.captures.calibration.linear import linear
 from unmix_plugin.captures.calibration.raster import Raster
 from unmix_plugin.captures.calibration.references import Reference
 from unmix_plugin.captures.spectral_file import SpectralFile
-
-SRGB = "sRGB"
-"""Value of `metadata['encoding']` of pictures for people."""
 
 
 @dataclass(frozen=True)
@@ -73,10 +71,11 @@ class Calibration:
             CaptureError: the file can't be read.
         """
         rows, columns = self.raster.file_rows(first, last), self.raster.columns
-        stored = file.read(rows, self.bands)[:, columns]
+        whole = file.read(rows, self.bands)
+        stored = whole[:, columns]
         missing = find_missing(stored, file.no_data)
         saturated = np.zeros(stored.shape, bool) if self.saturation is None else stored >= self.saturation
-        values = self._values(file, stored, rows)
+        values = self._values(file, whole, rows)
         sound = np.isfinite(values).all(axis=-1) & ~missing
         values[~sound] = 0.0
         saturated[~sound] = False
@@ -86,11 +85,9 @@ class Calibration:
             self.raster.any_in_square(~sound),
         )
 
-    def _values(self, file: SpectralFile, stored: np.ndarray, rows: slice) -> Float32[np.ndarray, "h W b"]:
+    def _values(self, file: SpectralFile, whole: np.ndarray, rows: slice) -> Float32[np.ndarray, "h W b"]:
         columns, bands = self.raster.columns, self.bands
-        values = (
-            srgb_to_linear(stored) if file.metadata.get("encoding") == SRGB else stored.astype(np.float32)
-        )
+        values = np.array(linear(file, whole, rows)[:, columns])
         factor = np.float32(self.gain * self.exposure_factor(file))
         if self.dark is not None:
             values -= self.dark.rows(rows, columns, bands)
@@ -140,14 +137,6 @@ def find_missing(stored: np.ndarray, no_data: float | None) -> Bool[np.ndarray, 
         if same is not None:
             missing |= same.all(axis=-1) if no_data == 0 else same.any(axis=-1)
     return missing
-
-
-def srgb_to_linear(stored: np.ndarray) -> Float32[np.ndarray, "*shape"]:
-    """Linear light in [0, 1] of integers that are encoded as sRGB (IEC 61966-2-1:1999)."""
-    top = np.iinfo(stored.dtype).max
-    levels = np.arange(top + 1) / top
-    linear = np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
-    return linear.astype(np.float32)[stored]
 
 
 def exposure_of(file: SpectralFile) -> float | None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from unmix_plugin.captures.calibration.linear import linear
 from unmix_plugin.captures.spectral_file import SpectralFile
 from unmix_plugin.errors import CaptureError, ConfigError
 
@@ -37,7 +38,7 @@ class Reference:
     def rows(self, rows: slice, columns: slice, bands: np.ndarray) -> Float32[np.ndarray, "h columns b"]:
         """Values at some rows and columns of the cubes; axes of length 1 where one value stands for all."""
         if self.is_per_pixel:
-            return self.file.read(rows, bands)[:, columns].astype(np.float32)
+            return linear(self.file, self.file.read(rows, bands), rows)[:, columns]
         mean = self.mean[:, :, bands]
         return mean if mean.shape[1] == 1 else mean[:, columns]
 
@@ -90,7 +91,8 @@ def panel_reference(cube: SpectralFile, rectangle: tuple[int, int, int, int], vi
             f"--white-rectangle {view} {top} {left} {height} {width} (row, column, height, width) leaves the view of "
             f"{rows} rows and {columns} columns"
         )
-    values = cube.read(slice(top, top + height))[:, left : left + width].astype(np.float64)
+    lines = slice(top, top + height)
+    values = linear(cube, cube.read(lines), lines)[:, left : left + width].astype(np.float64)
     mean = values.mean(axis=(0, 1), keepdims=True).astype(np.float32)
     how = f"mean of {height} x {width} pixels from row {top} and column {left} of view {view}"
     return Reference(cube, "white reference", mean, False, how)
@@ -102,11 +104,14 @@ def _column_means(file: SpectralFile) -> tuple[Float32[np.ndarray, "1 W B"], flo
     total = np.zeros((width, bands))
     step = max(1, BLOCK_VALUES // (width * bands))
     for first in range(0, height, step):
-        total += file.read(slice(first, min(first + step, height))).sum(axis=0, dtype=np.float64)
+        rows = slice(first, min(first + step, height))
+        total += linear(file, file.read(rows), rows).sum(axis=0, dtype=np.float64)
     mean = total / height
     judged = np.unique(np.linspace(0, bands - 1, 5).astype(int))
+    whole = slice(0, height)
     patterns = [
-        _pattern(file.read(bands=judged[[i]])[..., 0] - mean[:, band]) for i, band in enumerate(judged)
+        _pattern(linear(file, file.read(whole, judged[[index]]), whole)[..., 0] - mean[:, band])
+        for index, band in enumerate(judged)
     ]
     return mean[None].astype(np.float32), float(np.median(patterns))
 

@@ -12,12 +12,15 @@ from unmix_plugin.errors import CaptureError, ConfigError
 BRIGHT_PERCENTILE = 99.9
 MOST_ABOVE_ONE = 0.01
 """Share of reflectances above 1 that is still taken for highlights."""
+LEAST_BRIGHT = 0.05
+"""Bright values below this would lose digits if they were kept."""
 
 
 def choose_scale(sensors: Sequence[Sensor], given: float | None) -> tuple[float, str]:
     """The scale and why.
 
-    Reflectances keep their values unless many are above 1; other values are divided by a high percentile.
+    Reflectances, and values of files that say what stands for 1, are kept unless many are above 1 or all are small;
+    others are divided by a high percentile.
 
     Raises:
         CaptureError: nothing in the sampled pixels is above 0.
@@ -37,7 +40,7 @@ def choose_scale(sensors: Sequence[Sensor], given: float | None) -> tuple[float,
             "check the dark frame: is it as bright as the views?"
         )
     above = float((values > 1.0).mean())
-    if all(sensor.unit != "relative radiance" for sensor in sensors) and above <= MOST_ABOVE_ONE:
+    if all(sensor.is_absolute for sensor in sensors) and above <= MOST_ABOVE_ONE and bright >= LEAST_BRIGHT:
         return 1.0, f"values are kept ({sensors[0].unit}); {above:.2%} of the sampled ones are above 1"
     scale = float(f"{bright:.4g}")
     return scale, f"the {BRIGHT_PERCENTILE:g}th percentile of the sampled values"

@@ -16,12 +16,14 @@ from unmix_plugin.captures.calibration.band_choice import (
     repeated_wavelengths,
     require_bands,
 )
-from unmix_plugin.captures.calibration.calibration import SRGB, Calibration, WhiteReference, exposure_of
+from unmix_plugin.captures.calibration.calibration import Calibration, WhiteReference, exposure_of
+from unmix_plugin.captures.calibration.linear import is_srgb
 from unmix_plugin.captures.calibration.raster import Raster
 from unmix_plugin.captures.calibration.references import Reference, open_reference, panel_reference
 from unmix_plugin.captures.calibration.sampling import draw_sample, find_saturation
 from unmix_plugin.captures.capture import CaptureView
 from unmix_plugin.captures.options import ProcessOptions
+from unmix_plugin.captures.radiometry import radiometric_model
 from unmix_plugin.captures.spectral_file import SpectralFile
 from unmix_plugin.captures.wavelengths import in_ranges
 from unmix_plugin.errors import CaptureError, ConfigError
@@ -36,6 +38,8 @@ class Sensor:
     bands: BandChoice
     unit: str
     """What values are: reflectance, relative radiance, ..."""
+    is_absolute: bool
+    """Whether 1 means something: full reflectance, or what the files themselves take for 1."""
     sample: Float32[np.ndarray, "N c"]
     """Calibrated pixels of all views, on the bands of the scene."""
     evidence: dict[str, Any]
@@ -102,6 +106,7 @@ def prepare_sensor(
         calibration,
         choice,
         _unit(files[0], white),
+        white is not None or _has_one(files[0]),
         _binned(sample.values[:, still_kept], options.bin_bands),
         evidence,
         None if lamp is None else _lamp_of(lamp, choice, options.bin_bands),
@@ -149,17 +154,18 @@ def _panel(views: Sequence[CaptureView], rectangle: tuple[str, int, int, int, in
 
 
 def _saturation(files: Sequence[SpectralFile], options: ProcessOptions) -> tuple[float | None, str]:
-    return (
-        find_saturation(files)
-        if options.saturation is None
-        else (options.saturation, "given with --saturation")
-    )
+    if options.saturation is not None:
+        return options.saturation, "given with --saturation"
+    model = radiometric_model(files[0])
+    return find_saturation(files) if model is None else (model.saturated, f"known of {model.maker}")
 
 
 def _common_exposure(
     files: Sequence[SpectralFile], white: WhiteReference | None
 ) -> tuple[float | None, list[str]]:
     """The exposure that all values are brought to, and what to tell of it."""
+    if radiometric_model(files[0]) is not None:
+        return None, []  # it accounts for exposures already
     found = [exposure_of(file) for file in files]
     of_white = None if white is None else exposure_of(white.reference.file)
     known = [exposure for exposure in found if exposure is not None]
@@ -177,14 +183,23 @@ def _common_exposure(
 
 
 def _gain(file: SpectralFile) -> float:
-    return 1.0 if file.scale is None or file.metadata.get("encoding") == SRGB else 1.0 / file.scale
+    return 1.0 if file.scale is None or is_srgb(file) else 1.0 / file.scale
+
+
+def _has_one(file: SpectralFile) -> bool:
+    """Whether a file says which number stands for 1; floating-point numbers may have been brought to it already."""
+    is_float = file.dtype.kind == "f" and radiometric_model(file) is None
+    return is_srgb(file) or file.scale is not None or is_float
 
 
 def _unit(file: SpectralFile, white: WhiteReference | None) -> str:
     if white is not None:
         return "reflectance"
-    if file.metadata.get("encoding") == SRGB:
+    if is_srgb(file):
         return "linear light of pictures in sRGB"
+    model = radiometric_model(file)
+    if model is not None:
+        return model.description
     return "relative radiance" if file.scale is None else "values divided by the scale factor of the files"
 
 

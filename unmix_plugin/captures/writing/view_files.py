@@ -18,11 +18,13 @@ from unmix_plugin.captures.calibration.calibration import CalibratedRows, Calibr
 from unmix_plugin.captures.capture import CaptureView
 from unmix_plugin.captures.masks import BackgroundRule, clean
 from unmix_plugin.captures.pictures import Colours, detail
-from unmix_plugin.captures.view_masks import ViewMasks, read_view_masks
-from unmix_plugin.formats.png import rgba_png_bytes
+from unmix_plugin.captures.view_masks import HALF, OPAQUE, ViewMasks, read_labels, read_view_masks
+from unmix_plugin.formats.png import indexed_png_bytes, rgba_png_bytes
 
 FULL_SCALE = 65535
 """Stored number that stands for 1; saturated values have it too."""
+GREYS = np.arange(256)[:, None] / 255.0
+"""Palette of pictures of labels."""
 BLOCK_VALUES = 1 << 22
 """Values of a file that are calibrated together: 16 MiB as float32."""
 
@@ -72,8 +74,8 @@ class ViewRecipe:
     """Calibrated value that is written as 1."""
     colours: Colours
     background: BackgroundRule | None = None
-    use_mask_files: bool = False
-    """Whether pictures of the capture say what is matter."""
+    use_opacity: bool = False
+    """Whether files of the capture say what is matter."""
 
 
 def write_view(view: CaptureView, recipe: ViewRecipe, folder: Path) -> ViewRecord:
@@ -84,7 +86,7 @@ def write_view(view: CaptureView, recipe: ViewRecipe, folder: Path) -> ViewRecor
         RunError: the folder can't be written.
     """
     raster = recipe.calibration.raster
-    masks = read_view_masks(view, raster, recipe.use_mask_files)
+    masks = read_view_masks(view, raster, recipe.use_opacity)
     paths = {"file_path": f"images/{view.name}.png", "hyperspectral_file_path": f"cubes/{view.name}.npy"}
     tally = _Tally(raster.height, raster.width, recipe.calibration.num_bands, masks)
     path = folder / paths["hyperspectral_file_path"]
@@ -96,15 +98,19 @@ def write_view(view: CaptureView, recipe: ViewRecipe, folder: Path) -> ViewRecor
             for first, last in raster.blocks(file_bands, BLOCK_VALUES):
                 part = recipe.calibration.rows(view.cube, first, last)
                 file.write(_stored(tally.add(first, part, recipe), part).data)
-        matter = tally.finish_masks(recipe)
-        if not matter.all():
+        is_shown = tally.finish_masks(recipe) > 0
+        if not is_shown.all():
             with write_errors_as(path):
-                _blacken(temporary, start, matter, recipe.calibration.num_bands)
+                _blacken(temporary, start, is_shown, recipe.calibration.num_bands)
     _write_picture(folder / paths["file_path"], tally, recipe)
     if tally.missing.any():
         paths["mask_path"] = f"masks/{view.name}.png"
         grey = np.where(tally.missing, 0, 255).astype(np.uint8)
         write_file(folder / paths["mask_path"], rgba_png_bytes(np.dstack([grey] * 3)))
+    labels = read_labels(view, raster)
+    if labels is not None:
+        paths["seg_file_path"] = f"labels/{view.name}.png"
+        write_file(folder / paths["seg_file_path"], indexed_png_bytes(labels, np.repeat(GREYS, 3, axis=1)))
     return tally.record(view, paths)
 
 
@@ -115,8 +121,9 @@ class _Tally:
         self.rgb: Float32[np.ndarray, "H W 3"] = np.zeros((height, width, 3), np.float32)
         self.brightness: Float32[np.ndarray, "H W"] = np.zeros((height, width), np.float32)
         self.missing: Bool[np.ndarray, "H W"] = ~masks.valid
-        self.given_matter = masks.matter
-        self.matter: Bool[np.ndarray, "H W"] = np.ones((height, width), bool)
+        self.opacity: UInt8[np.ndarray, "H W"] = np.full((height, width), OPAQUE, np.uint8)
+        if masks.opacity is not None:
+            self.opacity = masks.opacity
         self.counts = np.zeros(3, dtype=np.int64)
         self.sum: Float64[np.ndarray, " B"] = np.zeros(bands)
         self.num_summed = 0
@@ -130,26 +137,25 @@ class _Tally:
         above = (values > 1.0) & ~part.saturated
         self.counts += (part.saturated.any(axis=-1).sum(), above.sum(), (values < 0).sum())
         if recipe.background is not None:
-            self.matter[rows] = recipe.background.matter(values)
-        elif self.given_matter is not None:
-            self.matter[rows] = self.given_matter[rows]
+            self.opacity[rows] = np.where(recipe.background.matter(values), OPAQUE, 0)
         self.rgb[rows] = recipe.colours.linear_rgb(values)
         self.brightness[rows] = values.mean(axis=-1)
-        counted = self.matter[rows] & ~self.missing[rows]
+        counted = (self.opacity[rows] > HALF) & ~self.missing[rows]
         self.sum += np.einsum("hwb,hw->b", values, counted.astype(np.float32), dtype=np.float64)
         self.num_summed += int(counted.sum())
         return values
 
-    def finish_masks(self, recipe: ViewRecipe) -> Bool[np.ndarray, "H W"]:
-        """Matter without specks and holes; pixels without a measurement count as matter, as nothing is known there."""
+    def finish_masks(self, recipe: ViewRecipe) -> UInt8[np.ndarray, "H W"]:
+        """Opacity without specks and holes; full for pixels without a measurement, as nothing is known there."""
         if recipe.background is not None:
-            done = clean(self.matter)
-            self.matter, self.specks, self.holes = done.matter, done.specks, done.holes
-        self.matter |= self.missing
-        return self.matter
+            done = clean(self.opacity > 0)
+            self.opacity = np.where(done.matter, OPAQUE, 0).astype(np.uint8)
+            self.specks, self.holes = done.specks, done.holes
+        self.opacity[self.missing] = OPAQUE
+        return self.opacity
 
     def record(self, view: CaptureView, paths: dict[str, str]) -> ViewRecord:
-        seen = self.matter & ~self.missing
+        seen = (self.opacity > HALF) & ~self.missing
         return ViewRecord(
             name=view.name,
             sensor=view.sensor,
@@ -159,7 +165,7 @@ class _Tally:
             clipped_values=int(self.counts[1]),
             negative_values=int(self.counts[2]),
             missing_pixels=int(self.missing.sum()),
-            matter_share=float(self.matter.mean()),
+            matter_share=float((self.opacity > HALF).mean()),
             specks=self.specks,
             holes=self.holes,
             brightness=float(np.median(self.brightness[seen])) if seen.any() else 0.0,
@@ -183,20 +189,20 @@ def _npy_header(shape: tuple[int, int, int]) -> bytes:
     return header.getvalue()
 
 
-def _blacken(path: Path, start: int, matter: Bool[np.ndarray, "H W"], bands: int) -> None:
+def _blacken(path: Path, start: int, is_shown: Bool[np.ndarray, "H W"], bands: int) -> None:
     """Set background to 0 in a cube that is written, row by row: cubes are as seen over black."""
-    row_bytes = matter.shape[1] * bands * 2
+    row_bytes = is_shown.shape[1] * bands * 2
     with path.open("r+b") as file:
-        for row in np.flatnonzero(~matter.all(axis=1)).tolist():
+        for row in np.flatnonzero(~is_shown.all(axis=1)).tolist():
             file.seek(start + row * row_bytes)
             values = np.frombuffer(file.read(row_bytes), "<u2").reshape(-1, bands).copy()
-            values[~matter[row]] = 0
+            values[~is_shown[row]] = 0
             file.seek(start + row * row_bytes)
             file.write(values.data)
 
 
 def _write_picture(path: Path, tally: _Tally, recipe: ViewRecipe) -> None:
     srgb = recipe.colours.srgb(tally.rgb)
-    if recipe.background is not None or recipe.use_mask_files:
-        srgb = np.dstack([srgb, np.where(tally.matter, 255, 0).astype(np.uint8)])
+    if recipe.background is not None or recipe.use_opacity:
+        srgb = np.dstack([srgb, tally.opacity])
     write_file(path, rgba_png_bytes(srgb))
