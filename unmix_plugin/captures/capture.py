@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from unmix_plugin.captures.poses.pose_set import PoseSet
+from unmix_plugin.captures.poses.pose_set import Lens, PoseSet
 from unmix_plugin.captures.spectral_file import SpectralFile
 
 
@@ -26,6 +26,12 @@ class CaptureView:
     """Black where pixels are ignored."""
     labels: Path | None = None
     """True materials, if known."""
+    alpha: SpectralFile | None = None
+    """Opacity in [0, 1], (H, W, 1), where it is no channel of the picture; the cube is multiplied by it."""
+    lens: Lens | None = None
+    """Intrinsics that the camera itself writes; poses may bring better ones."""
+    release: str = ""
+    """Name of the shutter release; views of one release were taken at one moment by the lenses of a rig."""
     split: Literal["train", "eval"] | None = None
     """What the layout says the view is for."""
 

@@ -73,8 +73,8 @@ def _alpha(view: CaptureView) -> UInt8[np.ndarray, "H W"] | None:
     if view.alpha is not None:
         if view.alpha.shape[:2] != view.cube.shape[:2]:
             raise CaptureError(
-                f"{view.alpha.path} has {view.alpha.shape[0]} x {view.alpha.shape[1]} pixels; expected those of the cube, "
-                f"{view.cube.shape[0]} x {view.cube.shape[1]}"
+                f"{view.alpha.path} has {view.alpha.shape[0]} x {view.alpha.shape[1]} pixels; expected "
+                f"{view.cube.shape[0]} x {view.cube.shape[1]}, as the cube has"
             )
         return np.rint(np.clip(view.alpha.read()[..., 0], 0.0, 1.0) * OPAQUE).astype(np.uint8)
     picture = _alpha_picture(view)

@@ -20,8 +20,9 @@ def parse_wavelengths(text: str) -> Float64[np.ndarray, " B"]:
     Raises:
         ConfigError: no such file, no numbers, or numbers that are no wavelengths in nm.
     """
-    path = Path(text)
-    words = _read_words(path) if path.suffix or path.is_file() else text.split(",")
+    words = text.split(",")
+    if not all(map(_is_number, words)):
+        words = _read_words(Path(text))
     try:
         values = np.array([float(word) for word in words])
     except ValueError as error:
@@ -71,13 +72,23 @@ def in_ranges(text: str, wavelengths_nm: Float64[np.ndarray, " B"]) -> Bool[np.n
     return named
 
 
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
 def _read_words(path: Path) -> list[str]:
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             rows = [[cell.strip() for cell in row] for row in csv.reader(file) if any(map(str.strip, row))]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         reason = getattr(error, "strerror", None) or error
-        raise ConfigError(f"--wavelengths {path}: can't be read as CSV ({reason})") from error
+        raise ConfigError(
+            f"--wavelengths {path}: neither a list of numbers, such as 620,555,503, nor a CSV file ({reason})"
+        ) from error
     if not rows:
         raise ConfigError(f"--wavelengths {path} is empty; expected a column 'wavelength'")
     heads = [cell.lower() for cell in rows[0]]

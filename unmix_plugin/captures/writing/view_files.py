@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt16
+from jaxtyping import Bool, Float32, Float64, UInt8, UInt16
 
 from unmix_plugin.atomic_files import whole_file, write_errors_as, write_file
 from unmix_plugin.captures.calibration.calibration import CalibratedRows, Calibration
