@@ -1,0 +1,87 @@
+"""Layout `nerfstudio`: RGB pictures with poses, each as a cube of three bands.
+
+The frames are those of transforms.json, or of Blender's transforms_train.json and its like, whose paths have no suffix. An
+alpha channel says what is matter. A picture has no wavelengths, only primaries; the user gives three numbers.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from unmix_plugin.captures.capture import Capture, CaptureView
+from unmix_plugin.captures.layouts.cubes import with_wavelengths
+from unmix_plugin.captures.layouts.frames import FoundFiles, make_capture, read_frames, require_names, view_names
+from unmix_plugin.captures.layouts.registry import LayoutOptions
+from unmix_plugin.captures.spectral_file import BandIndex, BandTable, SpectralFile
+from unmix_plugin.errors import CaptureError
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
+PRIMARIES_NM = (610, 550, 465)
+"""About where the red, green and blue of sRGB lie."""
+ADVICE = (
+    "RGB pictures have no wavelengths: --wavelengths "
+    f"{','.join(map(str, PRIMARIES_NM))} stands for the red, green and blue of a usual camera"
+)
+
+
+def find_nerfstudio(root: Path, options: LayoutOptions) -> Capture:
+    """The views of a scene; see the module.
+
+    Raises:
+        CaptureError: no frames, pictures are missing or can't be read, or a path leaves the folder.
+    """
+    listed = read_frames(root)
+    require_names(listed.frames, "file_path")
+    names = view_names([frame.name for frame in listed.frames], str(root))
+    found = FoundFiles(root)
+    pictures: list[Path] = []
+    masks: list[Path | None] = []
+    for frame in listed.frames:
+        has_suffix = PurePosixPath(frame.name).suffix in SUFFIXES
+        others = () if has_suffix else tuple(f"{frame.name}{suffix}" for suffix in SUFFIXES)
+        path = found.find(frame.where, frame.name, *others)
+        pictures += [] if path is None else [path]
+        text = frame.text("mask_path")
+        masks.append(found.find(frame.where, text) if text else None)
+    found.refuse_missing("copy them into the folder, or drop the frames")
+    views = tuple(
+        CaptureView(name, with_wavelengths(open_picture(path), options), picture=path, mask=mask, split=frame.split)
+        for frame, name, path, mask in zip(listed.frames, names, pictures, masks, strict=True)
+    )
+    return make_capture("nerfstudio", root, listed, views)
+
+
+def open_picture(path: Path) -> SpectralFile:
+    """The red, green and blue of a picture, gamma-encoded, as `metadata["encoding"]` says; its alpha is left out.
+
+    EXIF's orientation is ignored: poses refer to the stored raster.
+
+    Raises:
+        CaptureError: it can't be read.
+    """
+    from PIL import Image
+
+    def read_part(rows: slice, bands: BandIndex) -> np.ndarray:
+        with Image.open(path) as picture:
+            return np.asarray(picture.convert("RGB"))[rows][..., bands]
+
+    try:
+        with Image.open(path) as picture:
+            (width, height), orientation = picture.size, picture.getexif().get(0x0112, 1)
+            has_alpha = "A" in picture.getbands() or "transparency" in picture.info
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise CaptureError(f"{path} can't be read as a picture ({error}); copy it again") from error
+    notes = (f"EXIF's orientation {orientation} is ignored, as poses refer to the stored raster",) if orientation > 1 else ()
+    return SpectralFile(
+        path,
+        "png",
+        (height, width, 3),
+        np.dtype(np.uint8),
+        read_part,
+        BandTable(evidence=f"none: {ADVICE}"),
+        scale=255.0,
+        notes=notes,
+        metadata={"encoding": "sRGB", "has_alpha": has_alpha},
+    )

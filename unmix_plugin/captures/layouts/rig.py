@@ -1,0 +1,216 @@
+"""Layout `rig`: band files of a multispectral camera, one TIFF for each lens and release of the shutter.
+
+    IMG_0000_1.tif ... IMG_0000_5.tif                            MicaSense, in numbered folders
+    IMG_170101_101010_0000_GRE.TIF, RED, REG, NIR (and RGB.JPG)  Parrot Sequoia
+    DJI_20230101_0001_MS_G.TIF ... or DJI_0011.TIF ...           DJI
+
+Every file is a view, with the lens as its sensor. Files of one release share an identifier in their XMP, else their name up to
+the band. Pictures in colour are left out, as nothing says what their channels measure; so are thermal bands.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from unmix_plugin.captures.camera_tags import XmpTags, tag_text
+from unmix_plugin.captures.capture import Capture, CaptureView
+from unmix_plugin.captures.layouts.frames import view_names
+from unmix_plugin.captures.layouts.registry import LayoutOptions
+from unmix_plugin.captures.readers.opening import open_spectral_file
+from unmix_plugin.captures.rigs.lens_tags import lens_of
+from unmix_plugin.captures.spectral_file import BandTable, SpectralFile
+from unmix_plugin.errors import CaptureError
+
+TIFF_SUFFIXES = (".tif", ".tiff")
+COLOUR_SUFFIXES = (".jpg", ".jpeg")
+THERMAL_NM = 3000.0
+"""Bands from here on measure heat."""
+BAND_ENDING = re.compile(
+    r"(?:_MS)?[_-](\d|GRE|GREEN|RED|REG|REDEDGE|RE|NIR|BLUE|RGB|G|R|B|D|W)$", re.IGNORECASE
+)
+"""Of a file's stem."""
+DJI_NUMBER = re.compile(r"(DJI_\d+)(\d)$", re.IGNORECASE)
+"""Of a Phantom 4 Multispectral: the last digit is the band, 0 the colour picture."""
+UNIQUE_TAGS = ("MicaSense:CaptureId", "CaptureUUID", "CaptureId")
+
+
+@dataclass(frozen=True)
+class _BandFile:
+    """One file before it is a view."""
+
+    file: SpectralFile
+    base: str
+    """Name up to the band, with its folder."""
+    ending: str
+    """What tells the band in the name."""
+
+    @property
+    def tags(self) -> XmpTags:
+        return self.file.metadata.get("xmp") or {}
+
+
+def find_rig(root: Path, options: LayoutOptions) -> Capture:
+    """The views of a multispectral camera; see the module.
+
+    Raises:
+        CaptureError: no band files, one can't be read, two of one release are of the same lens, or files of one lens differ
+            in size or band.
+    """
+    excluded = {path.resolve() for path in options.exclude}
+    paths = [path for path in sorted(root.rglob("*")) if path.is_file() and path.resolve() not in excluded]
+    paths = [path for path in paths if not any(part.startswith(".") for part in path.relative_to(root).parts)]
+    opened = [_open(path, root) for path in paths if path.suffix.lower() in TIFF_SUFFIXES]
+    bands = [item for item in opened if item.file.shape[2] == 1 and not _is_thermal(item.file)]
+    if not bands:
+        raise CaptureError(
+            f"{root} holds no TIFF files of single bands; expected IMG_0000_1.tif, IMG_..._GRE.TIF or DJI_..._MS_G.TIF: give "
+            "the folder of the flight, or use the layout 'cubes' for other files"
+        )
+    sensors = _sensors(bands)
+    releases = _releases(bands)
+    names = view_names([str(item.file.path.relative_to(root)) for item in bands], str(root))
+    notes = [*_left_out(opened, paths), *_odd(bands, releases)]
+    views: list[CaptureView] = []
+    lens_notes: Counter[tuple[str, str]] = Counter()
+    for item, name, sensor, release in zip(bands, names, sensors, releases, strict=True):
+        lens, said = lens_of(item.file)
+        lens_notes.update((sensor, note) for note in said)
+        views.append(CaptureView(name, item.file, sensor, lens=lens, release=release))
+    _check_lenses(views)
+    notes += [f"lens {sensor}: {note} ({count} files)" for (sensor, note), count in lens_notes.items()]
+    views = _with_given_bands(views, options)
+    return Capture("rig", root, tuple(sorted(views, key=lambda view: view.name)), notes=tuple(notes))
+
+
+def _open(path: Path, root: Path) -> _BandFile:
+    file = open_spectral_file(path)
+    number = DJI_NUMBER.fullmatch(path.stem)
+    found = BAND_ENDING.search(path.stem)
+    base, ending = path.stem, ""
+    if number is not None:
+        base, ending = number[1], number[2]
+    elif found is not None:
+        base, ending = path.stem[: found.start()], found[1]
+    folder = path.parent.relative_to(root)
+    return _BandFile(file, str(folder / base) if folder.parts else base, ending.lower())
+
+
+def _is_thermal(file: SpectralFile) -> bool:
+    wavelengths = file.bands.wavelengths_nm
+    name = tag_text(file.metadata.get("xmp") or {}, "BandName") or ""
+    return name.upper() == "LWIR" or (wavelengths is not None and wavelengths.min() > THERMAL_NM)
+
+
+def _sensors(bands: Sequence[_BandFile]) -> list[str]:
+    """Names of the lenses: the band's, with the index in the rig where several lenses share it; else the file's ending."""
+    titles = [tag_text(item.tags, "BandName") or item.ending or "band" for item in bands]
+    slugs = [re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-") or "band" for title in titles]
+    indices = [tag_text(item.tags, "RigCameraIndex") or item.ending for item in bands]
+    owners: dict[str, set[str]] = defaultdict(set)
+    for slug, index in zip(slugs, indices, strict=True):
+        owners[slug].add(index)
+    return [
+        slug if len(owners[slug]) == 1 else f"{slug}-{index or '0'}"
+        for slug, index in zip(slugs, indices, strict=True)
+    ]
+
+
+def _releases(bands: Sequence[_BandFile]) -> list[str]:
+    """Names of the releases; the name up to the band of the first file of each.
+
+    Identifiers count where they join files; cameras that write another one into every file are grouped by name.
+    """
+    identifiers = [tag_text(item.tags, *UNIQUE_TAGS) or "" for item in bands]
+    shared = {identifier for identifier, count in Counter(identifiers).items() if identifier and count > 1}
+    titles: dict[str, str] = {}
+    releases: list[str] = []
+    for item, identifier in zip(bands, identifiers, strict=True):
+        key = identifier if identifier in shared else f"name {item.base}"
+        releases.append(titles.setdefault(key, item.base))
+    if len(set(titles.values())) < len(titles):  # one name, several identifiers: a folder of two flights
+        repeated = {title for title, count in Counter(titles.values()).items() if count > 1}
+        return [
+            f"{release} {identifier}" if release in repeated else release
+            for release, identifier in zip(releases, identifiers, strict=True)
+        ]
+    return releases
+
+
+def _check_lenses(views: Sequence[CaptureView]) -> None:
+    """Refuse a lens twice in one release, and files of one lens that differ.
+
+    Raises:
+        CaptureError: that is so.
+    """
+    first: dict[str, CaptureView] = {}
+    taken: dict[tuple[str, str], CaptureView] = {}
+    for view in views:
+        other = taken.setdefault((view.release, view.sensor), view)
+        if other is not view:
+            raise CaptureError(
+                f"{other.cube.path} and {view.cube.path} are both the lens {view.sensor} of the release {view.release}; "
+                "expected one file: remove the copy"
+            )
+        same = first.setdefault(view.sensor, view)
+        for what, expected, found in (
+            ("pixels", same.cube.shape[:2], view.cube.shape[:2]),
+            ("nm", _centre(same.cube), _centre(view.cube)),
+        ):
+            if expected != found:
+                raise CaptureError(
+                    f"{view.cube.path} has {found} {what}, {same.cube.path} of the same lens {view.sensor} {expected}; "
+                    "expected files of one camera with one setting: process different flights apart"
+                )
+
+
+def _centre(file: SpectralFile) -> float | None:
+    wavelengths = file.bands.wavelengths_nm
+    return None if wavelengths is None else float(wavelengths[0])
+
+
+def _with_given_bands(views: list[CaptureView], options: LayoutOptions) -> list[CaptureView]:
+    """Wavelengths of a user, one a lens in the order of their names.
+
+    Raises:
+        CaptureError: another number of them than of lenses.
+    """
+    given = options.wavelengths_nm
+    if given is None:
+        return views
+    sensors = sorted({view.sensor for view in views})
+    if len(given) != len(sensors):
+        raise CaptureError(
+            f"--wavelengths gives {len(given)} numbers for {len(sensors)} lenses ({', '.join(sensors)}); expected one a lens, in "
+            "this order"
+        )
+    tables = {
+        sensor: BandTable(np.array([wavelength]), "given with --wavelengths")
+        for sensor, wavelength in zip(sensors, given, strict=True)
+    }
+    return [replace(view, cube=replace(view.cube, bands=tables[view.sensor])) for view in views]
+
+
+def _left_out(opened: Iterable[_BandFile], paths: Iterable[Path]) -> list[str]:
+    files = [item.file for item in opened]
+    thermal = sum(file.shape[2] == 1 and _is_thermal(file) for file in files)
+    colour = sum(file.shape[2] > 1 for file in files) + sum(path.suffix.lower() in COLOUR_SUFFIXES for path in paths)
+    notes = [f"{thermal} thermal images are left out"] if thermal else []
+    notes += [f"{colour} colour pictures are left out: nothing says what their channels measure"] if colour else []
+    return notes
+
+
+def _odd(bands: Sequence[_BandFile], releases: Sequence[str]) -> list[str]:
+    turned = sum(int((item.file.metadata.get("exif") or {}).get("Orientation", 1)) > 1 for item in bands)
+    counts = Counter(releases)
+    incomplete = [release for release, count in counts.items() if count < max(counts.values())]
+    notes = [f"EXIF's orientation of {turned} files is ignored, as poses and lenses refer to the stored raster"] if turned else []
+    if incomplete:
+        shown = ", ".join(incomplete[:3])
+        notes.append(f"{len(incomplete)} of {len(counts)} releases lack a band: {shown}")
+    return notes

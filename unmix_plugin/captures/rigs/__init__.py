@@ -1,0 +1,1 @@
+"""Cameras of several lenses: the lens of each file, and poses of all lenses from those of some."""

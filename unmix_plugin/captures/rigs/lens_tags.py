@@ -1,0 +1,117 @@
+"""The lens that a multispectral camera writes into its files (tags of Pix4D's namespace, and DJI's).
+
+Their pixels have 0 at the centre of the first pixel, ours 0.5: principal points are moved by half a pixel.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from unmix_plugin.captures.camera_tags import XmpTags, tag_numbers, tag_text
+from unmix_plugin.captures.poses.lens_fit import Points, fit_lens, project_opencv
+from unmix_plugin.captures.poses.pose_set import Lens
+from unmix_plugin.captures.spectral_file import SpectralFile
+
+MM_OF_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
+"""Millimetres in EXIF's FocalPlaneResolutionUnit: inch, cm, mm, micrometre."""
+LONGEST_MM = 50.0
+"""Focal length without a unit from which it is in pixels; these cameras have about 5 mm."""
+HALF_PIXEL = 0.5
+
+
+def lens_of(file: SpectralFile) -> tuple[Lens | None, tuple[str, ...]]:
+    """The lens of a file, and what there is to say of it; no lens where its tags don't tell one.
+
+    Raises:
+        CaptureError: its model differs from k1, k2, p1, p2 by too much.
+    """
+    tags, exif = file.metadata.get("xmp") or {}, file.metadata.get("exif") or {}
+    if tag_numbers(tags, "DewarpData") is not None:
+        return _dji_lens(file, tags)
+    resolution = _resolution(exif)
+    centre_mm = tag_numbers(tags, "Camera:PrincipalPoint")
+    if resolution is None or centre_mm is None or len(centre_mm) != 2:
+        return None, ("no lens in the file's tags: principal point or focal plane resolution is absent",)
+    centre = (centre_mm[0] * resolution[0] + HALF_PIXEL, centre_mm[1] * resolution[1] + HALF_PIXEL)
+    fisheye = tag_numbers(tags, "FisheyePolynomial")
+    if fisheye is not None and (tag_text(tags, "Camera:ModelType") or "fisheye").lower() == "fisheye":
+        return _fisheye_lens(file, tags, fisheye, centre)
+    return _perspective_lens(file, tags, resolution, centre)
+
+
+def _resolution(exif: dict[str, Any]) -> tuple[float, float] | None:
+    """Pixels a millimetre along x and y."""
+    along = [exif.get(f"FocalPlane{axis}Resolution") for axis in "XY"]
+    unit = MM_OF_UNIT.get(int(exif.get("FocalPlaneResolutionUnit", 4)), 1.0)
+    across, down = along[0], along[1] or along[0]
+    return None if not across else (float(across) / unit, float(down) / unit)
+
+
+def _perspective_lens(
+    file: SpectralFile, tags: XmpTags, resolution: tuple[float, float], centre: tuple[float, float]
+) -> tuple[Lens | None, tuple[str, ...]]:
+    focal = tag_numbers(tags, "PerspectiveFocalLength")
+    if focal is None or focal[0] <= 0.0:
+        return None, ("no lens in the file's tags: PerspectiveFocalLength is absent",)
+    unit = tag_text(tags, "PerspectiveFocalLengthUnits") or ("mm" if focal[0] < LONGEST_MM else "px")
+    focal_px = (focal[0] * resolution[0], focal[0] * resolution[1]) if unit == "mm" else (focal[0], focal[0])
+    distortion = tag_numbers(tags, "PerspectiveDistortion") or []
+    k1, k2, k3, p1, p2 = distortion if len(distortion) == 5 else [0.0] * 5
+    return _lens(file, focal_px, centre, (k1, k2, k3), (p1, p2))
+
+
+def _dji_lens(file: SpectralFile, tags: XmpTags) -> tuple[Lens | None, tuple[str, ...]]:
+    """`DewarpData`: a date, a semicolon, then fx, fy, cx, cy, k1, k2, p1, p2, k3; cx, cy count from the optical centre."""
+    text = (tag_text(tags, "DewarpData") or "").rpartition(";")[2]
+    numbers = tag_numbers({"DewarpData": text}, "DewarpData") or []
+    middle = [(tag_numbers(tags, f"CalibratedOpticalCenter{axis}") or [math.nan])[0] for axis in "XY"]
+    if len(numbers) != 9 or not np.isfinite(middle).all():
+        return None, ("no lens in the file's tags: DewarpData or CalibratedOpticalCenter is incomplete",)
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = numbers
+    centre = (middle[0] + cx + HALF_PIXEL, middle[1] + cy + HALF_PIXEL)
+    return _lens(file, (fx, fy), centre, (k1, k2, k3), (p1, p2))
+
+
+def _lens(
+    file: SpectralFile,
+    focal_px: tuple[float, float],
+    centre: tuple[float, float],
+    radial: tuple[float, float, float],
+    tangential: tuple[float, float],
+) -> tuple[Lens, tuple[str, ...]]:
+    """A lens with k3, which is refitted if it is not 0."""
+    height, width = file.shape[:2]
+    start = Lens(width, height, focal_px, centre, (*radial[:2], *tangential))
+    if radial[2] == 0.0:
+        return start, ()
+
+    def project(ideal: Points) -> Points:
+        return project_opencv(ideal, focal_px, centre, radial, tangential)
+
+    lens, note = fit_lens(project, start, "with k3", str(file.path))
+    return lens, (note,)
+
+
+def _fisheye_lens(
+    file: SpectralFile, tags: XmpTags, polynomial: list[float], centre: tuple[float, float]
+) -> tuple[Lens | None, tuple[str, ...]]:
+    """Pix4D's fisheye: radius p0 + p1 t + p2 t^2 + p3 t^3 with t = 2/pi times the angle, then the matrix C, D; E, F."""
+    numbers = tag_numbers(tags, "FisheyeAffineMatrix")
+    if numbers is None or len(numbers) != 4:
+        return None, ("no lens in the file's tags: FisheyeAffineMatrix is absent",)
+    affine = np.array(numbers).reshape(2, 2)
+
+    def project(ideal: Points) -> Points:
+        radius = np.hypot(*ideal.T)
+        bent = np.polynomial.polynomial.polyval(2.0 / math.pi * np.arctan(radius), polynomial)
+        ratio = np.divide(bent, radius, out=np.full_like(radius, 2.0 / math.pi * polynomial[1]), where=radius > 1e-9)
+        return (ideal * ratio[:, None]) @ affine.T + np.array(centre)
+
+    height, width = file.shape[:2]
+    focal = 2.0 / math.pi * polynomial[1] * np.diag(affine)
+    start = Lens(width, height, (float(focal[0]), float(focal[1])), centre)
+    lens, note = fit_lens(project, start, "fisheye of Pix4D", str(file.path))
+    return lens, (note,)
