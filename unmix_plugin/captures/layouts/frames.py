@@ -66,8 +66,8 @@ def read_frames(root: Path) -> FrameList:
         files = {path: split for path, split in files.items() if path.is_file()}
     if not files:
         raise CaptureError(
-            f"{root} holds no transforms.json and no transforms_train.json; expected one of them with 'frames': give the "
-            "folder that holds it with --data, or name another layout"
+            f"{root} holds no transforms.json and no transforms_train.json; expected one of them with 'frames': "
+            "give the folder that holds it with --data, or name another layout"
         )
     top: dict[str, Any] = {}
     frames: dict[str, Frame] = {}
@@ -104,7 +104,9 @@ def _checked(listed: Any, path: Path) -> list[dict[str, Any]]:
 def _split_by_lists(frames: tuple[Frame, ...], top: dict[str, Any]) -> tuple[Frame, ...]:
     """Splits from `train_filenames` and the like: evaluation is test if there is any, else validation."""
     lists = {
-        name: {text.removeprefix("./") for text in top.get(f"{name}_filenames") or [] if isinstance(text, str)}
+        name: {
+            text.removeprefix("./") for text in top.get(f"{name}_filenames") or [] if isinstance(text, str)
+        }
         for name in ("train", "val", "test")
     }
     evaluation = lists["test"] or lists["val"]
@@ -190,11 +192,15 @@ def view_names(texts: Sequence[str], where: str) -> list[str]:
     for name, text in zip(names, texts, strict=True):
         other = seen.setdefault(name.casefold(), text)
         if other is not text:
-            raise CaptureError(f"{where}: {other} and {text} would both be the view '{name}'; rename one of them")
+            raise CaptureError(
+                f"{where}: {other} and {text} would both be the view '{name}'; rename one of them"
+            )
     return names
 
 
-def make_capture(layout: str, root: Path, listed: FrameList, views: Sequence[CaptureView], notes: Iterable[str] = ()) -> Capture:
+def make_capture(
+    layout: str, root: Path, listed: FrameList, views: Sequence[CaptureView], notes: Iterable[str] = ()
+) -> Capture:
     """Views with the poses of their frames, in the order of their names.
 
     Poses that can't be used are noted, as the user may give others.

@@ -1,7 +1,7 @@
 """Layout `nerfstudio`: RGB pictures with poses, each as a cube of three bands.
 
-The frames are those of transforms.json, or of Blender's transforms_train.json and its like, whose paths have no suffix. An
-alpha channel says what is matter. A picture has no wavelengths, only primaries; the user gives three numbers.
+The frames are those of transforms.json, or of Blender's transforms_train.json and its like, whose paths have no suffix.
+An alpha channel says what is matter. A picture has no wavelengths, only primaries; the user gives three numbers.
 """
 
 from __future__ import annotations
@@ -12,7 +12,13 @@ import numpy as np
 
 from unmix_plugin.captures.capture import Capture, CaptureView
 from unmix_plugin.captures.layouts.cubes import with_wavelengths
-from unmix_plugin.captures.layouts.frames import FoundFiles, make_capture, read_frames, require_names, view_names
+from unmix_plugin.captures.layouts.frames import (
+    FoundFiles,
+    make_capture,
+    read_frames,
+    require_names,
+    view_names,
+)
 from unmix_plugin.captures.layouts.registry import LayoutOptions
 from unmix_plugin.captures.spectral_file import BandIndex, BandTable, SpectralFile
 from unmix_plugin.errors import CaptureError
@@ -47,7 +53,9 @@ def find_nerfstudio(root: Path, options: LayoutOptions) -> Capture:
         masks.append(found.find(frame.where, text) if text else None)
     found.refuse_missing("copy them into the folder, or drop the frames")
     views = tuple(
-        CaptureView(name, with_wavelengths(open_picture(path), options), picture=path, mask=mask, split=frame.split)
+        CaptureView(
+            name, with_wavelengths(open_picture(path), options), picture=path, mask=mask, split=frame.split
+        )
         for frame, name, path, mask in zip(listed.frames, names, pictures, masks, strict=True)
     )
     return make_capture("nerfstudio", root, listed, views)
@@ -73,7 +81,11 @@ def open_picture(path: Path) -> SpectralFile:
             has_alpha = "A" in picture.getbands() or "transparency" in picture.info
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise CaptureError(f"{path} can't be read as a picture ({error}); copy it again") from error
-    notes = (f"EXIF's orientation {orientation} is ignored, as poses refer to the stored raster",) if orientation > 1 else ()
+    notes = (
+        (f"EXIF's orientation {orientation} is ignored, as poses refer to the stored raster",)
+        if orientation > 1
+        else ()
+    )
     return SpectralFile(
         path,
         "png",

@@ -17,7 +17,13 @@ import numpy as np
 
 from unmix_plugin.captures.capture import Capture, CaptureView
 from unmix_plugin.captures.layouts.cubes import with_wavelengths
-from unmix_plugin.captures.layouts.frames import FoundFiles, make_capture, read_frames, require_names, view_names
+from unmix_plugin.captures.layouts.frames import (
+    FoundFiles,
+    make_capture,
+    read_frames,
+    require_names,
+    view_names,
+)
 from unmix_plugin.captures.layouts.registry import LayoutOptions
 from unmix_plugin.captures.layouts.stokes_exr import open_intensity, open_opacity
 from unmix_plugin.captures.spectral_file import BandTable, SpectralFile, stack_bands
@@ -46,13 +52,17 @@ def find_nespof(root: Path, options: LayoutOptions) -> Capture:
         views.append(
             CaptureView(
                 name=name,
-                cube=with_wavelengths(stack_intensities(dict(zip(folders, files, strict=True)), root / text), options),
+                cube=with_wavelengths(
+                    stack_intensities(dict(zip(folders, files, strict=True)), root / text), options
+                ),
                 alpha=open_opacity(files[0]) if files[0] else None,
                 labels=_labels(root, text),
                 split=frame.split,
             )
         )
-    found.refuse_missing("expected one OpenEXR file for every view and wavelength: copy them, or drop the frames")
+    found.refuse_missing(
+        "expected one OpenEXR file for every view and wavelength: copy them, or drop the frames"
+    )
     return make_capture("nespof", root, listed, views)
 
 
@@ -73,7 +83,9 @@ def wavelength_entries(folder: Path, *, is_file: bool) -> dict[float, Path]:
             raise CaptureError(f"{other} and {path.name} are both {matched[1]} nm; remove one of them")
     if not entries:
         kind = "files such as 450.exr" if is_file else "folders such as 450, 460, ..."
-        raise CaptureError(f"{folder} holds no {kind}, named by a wavelength in nm; is this the right folder and layout?")
+        raise CaptureError(
+            f"{folder} holds no {kind}, named by a wavelength in nm; is this the right folder and layout?"
+        )
     return dict(sorted(entries.items()))
 
 

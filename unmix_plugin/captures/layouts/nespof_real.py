@@ -1,7 +1,7 @@
 """Layout `nespof-real`: captures of NeSpoF.
 
-    poses_bounds.npy       LLFF poses, one row a view, in the order of the names of views
-    exr/<view>/450.exr     Stokes components s0 to s3 of one wavelength, one folder a view
+poses_bounds.npy       LLFF poses, one row a view, in the order of the names of views
+exr/<view>/450.exr     Stokes components s0 to s3 of one wavelength, one folder a view
 """
 
 from __future__ import annotations
@@ -30,7 +30,9 @@ def find_nespof_real(root: Path, options: LayoutOptions) -> Capture:
     parent = root / "exr"
     folders = sorted(path for path in parent.iterdir() if path.is_dir()) if parent.is_dir() else []
     if not folders:
-        raise CaptureError(f"{root} holds no folder exr with one folder a view; expected exr/<view>/450.exr and so on")
+        raise CaptureError(
+            f"{root} holds no folder exr with one folder a view; expected exr/<view>/450.exr and so on"
+        )
     names = view_names([folder.name for folder in folders], str(parent))
     views: list[CaptureView] = []
     first: dict[float, Path] = {}
@@ -38,10 +40,10 @@ def find_nespof_real(root: Path, options: LayoutOptions) -> Capture:
         files = wavelength_entries(folder, is_file=True)
         first = first or files
         if list(files) != list(first):
-            lacks = sorted(set(first) ^ set(files))
+            differing = ", ".join(f"{wavelength:g}" for wavelength in sorted(set(first) ^ set(files)))
             raise CaptureError(
-                f"{folder} and {folders[0].name} have different wavelengths ({', '.join(f'{nm:g}' for nm in lacks)} nm in one "
-                "of them alone); expected one file a wavelength in every view"
+                f"{folder} and {folders[0].name} differ: {differing} nm in one of them alone; expected one file a "
+                "wavelength in every view"
             )
         cube = stack_intensities(dict(files), folder)
         views.append(CaptureView(name, with_wavelengths(cube, options)))
@@ -61,8 +63,10 @@ def _poses(root: Path, views: list[CaptureView]) -> tuple[PoseSet | None, tuple[
     poses = read_poses(path, {view.name: (view.cube.shape[1], view.cube.shape[0]) for view in views})
     if len(poses.cameras) != len(views):
         raise CaptureError(
-            f"{path} holds {len(poses.cameras)} poses, {root / 'exr'} {len(views)} views; expected as many: views are matched "
-            "to poses in the order of their names"
+            f"{path} holds {len(poses.cameras)} poses, {root / 'exr'} {len(views)} views; expected as many: views are "
+            "matched to poses in the order of their names"
         )
     cameras = [poses.cameras[name] for name in sorted(poses.cameras)]
-    return replace(poses, cameras={view.name: camera for view, camera in zip(views, cameras, strict=True)}), ()
+    return replace(
+        poses, cameras={view.name: camera for view, camera in zip(views, cameras, strict=True)}
+    ), ()

@@ -4,8 +4,8 @@
     IMG_170101_101010_0000_GRE.TIF, RED, REG, NIR (and RGB.JPG)  Parrot Sequoia
     DJI_20230101_0001_MS_G.TIF ... or DJI_0011.TIF ...           DJI
 
-Every file is a view, with the lens as its sensor. Files of one release share an identifier in their XMP, else their name up to
-the band. Pictures in colour are left out, as nothing says what their channels measure; so are thermal bands.
+Every file is a view, with the lens as its sensor. Files of one release share an identifier in their XMP, else their
+name up to the band. Pictures in colour are left out, as nothing says what their channels measure; so are thermal bands.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ def find_rig(root: Path, options: LayoutOptions) -> Capture:
     """The views of a multispectral camera; see the module.
 
     Raises:
-        CaptureError: no band files, one can't be read, two of one release are of the same lens, or files of one lens differ
-            in size or band.
+        CaptureError: no band files, one can't be read, two of one release are of the same lens, or files of one lens
+            differ in size or band.
     """
     excluded = {path.resolve() for path in options.exclude}
     paths = [path for path in sorted(root.rglob("*")) if path.is_file() and path.resolve() not in excluded]
@@ -69,8 +69,8 @@ def find_rig(root: Path, options: LayoutOptions) -> Capture:
     bands = [item for item in opened if item.file.shape[2] == 1 and not _is_thermal(item.file)]
     if not bands:
         raise CaptureError(
-            f"{root} holds no TIFF files of single bands; expected IMG_0000_1.tif, IMG_..._GRE.TIF or DJI_..._MS_G.TIF: give "
-            "the folder of the flight, or use the layout 'cubes' for other files"
+            f"{root} holds no TIFF files of single bands; expected IMG_0000_1.tif, IMG_..._GRE.TIF or "
+            "DJI_..._MS_G.TIF: give the folder of the flight, or use the layout 'cubes' for other files"
         )
     sensors = _sensors(bands)
     releases = _releases(bands)
@@ -108,7 +108,7 @@ def _is_thermal(file: SpectralFile) -> bool:
 
 
 def _sensors(bands: Sequence[_BandFile]) -> list[str]:
-    """Names of the lenses: the band's, with the index in the rig where several lenses share it; else the file's ending."""
+    """Names of the lenses: the band's, with the index in the rig where several share it; else the file's ending."""
     titles = [tag_text(item.tags, "BandName") or item.ending or "band" for item in bands]
     slugs = [re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-") or "band" for title in titles]
     indices = [tag_text(item.tags, "RigCameraIndex") or item.ending for item in bands]
@@ -154,8 +154,8 @@ def _check_lenses(views: Sequence[CaptureView]) -> None:
         other = taken.setdefault((view.release, view.sensor), view)
         if other is not view:
             raise CaptureError(
-                f"{other.cube.path} and {view.cube.path} are both the lens {view.sensor} of the release {view.release}; "
-                "expected one file: remove the copy"
+                f"{other.cube.path} and {view.cube.path} are both the lens {view.sensor} of the release "
+                f"{view.release}; expected one file: remove the copy"
             )
         same = first.setdefault(view.sensor, view)
         for what, expected, found in (
@@ -186,8 +186,8 @@ def _with_given_bands(views: list[CaptureView], options: LayoutOptions) -> list[
     sensors = sorted({view.sensor for view in views})
     if len(given) != len(sensors):
         raise CaptureError(
-            f"--wavelengths gives {len(given)} numbers for {len(sensors)} lenses ({', '.join(sensors)}); expected one a lens, in "
-            "this order"
+            f"--wavelengths gives {len(given)} numbers for {len(sensors)} lenses ({', '.join(sensors)}); expected one "
+            "a lens, in this order"
         )
     tables = {
         sensor: BandTable(np.array([wavelength]), "given with --wavelengths")
@@ -199,9 +199,13 @@ def _with_given_bands(views: list[CaptureView], options: LayoutOptions) -> list[
 def _left_out(opened: Iterable[_BandFile], paths: Iterable[Path]) -> list[str]:
     files = [item.file for item in opened]
     thermal = sum(file.shape[2] == 1 and _is_thermal(file) for file in files)
-    colour = sum(file.shape[2] > 1 for file in files) + sum(path.suffix.lower() in COLOUR_SUFFIXES for path in paths)
+    colour = sum(file.shape[2] > 1 for file in files) + sum(
+        path.suffix.lower() in COLOUR_SUFFIXES for path in paths
+    )
     notes = [f"{thermal} thermal images are left out"] if thermal else []
-    notes += [f"{colour} colour pictures are left out: nothing says what their channels measure"] if colour else []
+    notes += (
+        [f"{colour} colour pictures are left out: nothing says what their channels measure"] if colour else []
+    )
     return notes
 
 
@@ -209,7 +213,11 @@ def _odd(bands: Sequence[_BandFile], releases: Sequence[str]) -> list[str]:
     turned = sum(int((item.file.metadata.get("exif") or {}).get("Orientation", 1)) > 1 for item in bands)
     counts = Counter(releases)
     incomplete = [release for release, count in counts.items() if count < max(counts.values())]
-    notes = [f"EXIF's orientation of {turned} files is ignored, as poses and lenses refer to the stored raster"] if turned else []
+    notes = (
+        [f"EXIF's orientation of {turned} files is ignored, as poses and lenses refer to the stored raster"]
+        if turned
+        else []
+    )
     if incomplete:
         shown = ", ".join(incomplete[:3])
         notes.append(f"{len(incomplete)} of {len(counts)} releases lack a band: {shown}")

@@ -60,7 +60,9 @@ def opacity_channel(names: Sequence[str]) -> str | None:
     >>> opacity_channel(["s0", "s1", "s2", "s3", "w"])
     'w'
     """
-    named = [name for name in names if name.lower() in ("a", "alpha") or name.lower().endswith((".a", ".alpha"))]
+    named = [
+        name for name in names if name.lower() in ("a", "alpha") or name.lower().endswith((".a", ".alpha"))
+    ]
     if named:
         return named[0]
     return names[-1] if len(names) == 5 else None

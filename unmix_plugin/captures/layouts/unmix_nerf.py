@@ -1,8 +1,8 @@
 """Layouts `unmix-nerf` and `hs-nerf`: transforms.json of nerfstudio's form with `hyperspectral_file_path`.
 
-UnMix-NeRF names .npy cubes, wavelengths and labels, HS-NeRF .pt tensors of 8 bits without wavelengths. Splits are lists in
-the file, else the folder of a frame's file: `train` against `eval`, `val` or `test`. Paths with `val` whose files lie in
-`eval`, as UnMix-NeRF's converter leaves them, are followed there.
+UnMix-NeRF names .npy cubes, wavelengths and labels, HS-NeRF .pt tensors of 8 bits without wavelengths. Splits are
+lists in the file, else the folder of a frame's file: `train` against `eval`, `val` or `test`. Paths with `val` whose
+files lie in `eval`, as UnMix-NeRF's converter leaves them, are followed there.
 """
 
 from __future__ import annotations
@@ -79,7 +79,9 @@ def _find(layout: str, root: Path, options: LayoutOptions) -> Capture:
         )
         for frame, name, cube, split in zip(listed.frames, names, cubes, by_folder, strict=True)
     ]
-    notes = (f"{moved} paths name a folder 'val' whose files lie in 'eval'; they were followed",) if moved else ()
+    notes = (
+        (f"{moved} paths name a folder 'val' whose files lie in 'eval'; they were followed",) if moved else ()
+    )
     return make_capture(layout, root, listed, views, notes)
 
 
@@ -118,5 +120,7 @@ def _wavelengths(listed: FrameList) -> np.ndarray | None:
 
 def _splits_of_folders(frames: tuple[Frame, ...]) -> list[Split | None]:
     """Splits by the folder of each frame's file; None for all unless both training and evaluation are there."""
-    splits = [SPLIT_OF_FILE.get(PurePosixPath(frame.name).parent.name) for frame in frames]
-    return splits if None not in splits and len(set(splits)) == 2 else [None] * len(frames)
+    splits: list[Split | None] = [
+        SPLIT_OF_FILE.get(PurePosixPath(frame.name).parent.name) for frame in frames
+    ]
+    return splits if None not in splits and len(set(splits)) == 2 else [None for _ in frames]

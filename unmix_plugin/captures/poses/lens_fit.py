@@ -52,7 +52,9 @@ def project_fisheye(
     return ideal * ratio[:, None] * np.array(focal_px) + np.array(center_px)
 
 
-def fit_lens(project: Project, start: Lens, model: str, where: str) -> tuple[Lens, str]:
+def fit_lens(
+    project: Project, start: Lens, model: str, where: str, limit_px: float = LARGEST_ERROR_PX
+) -> tuple[Lens, str]:
     """The lens with k1, k2, p1, p2 that is nearest to another model.
 
     Args:
@@ -60,10 +62,11 @@ def fit_lens(project: Project, start: Lens, model: str, where: str) -> tuple[Len
         start: Size of the image and a first guess of focal length and centre.
         model: What the other model is called.
         where: The file, for messages.
+        limit_px: How far it may be off.
     Returns:
         The lens, and a sentence that says how far it is off.
     Raises:
-        CaptureError: it is off by more than half a pixel somewhere in the image, or the model does not cover it.
+        CaptureError: it is off by more than the limit somewhere in the image, or the model does not cover it.
     """
     from scipy.optimize import least_squares
 
@@ -82,10 +85,10 @@ def fit_lens(project: Project, start: Lens, model: str, where: str) -> tuple[Len
     scales = np.array([*start.focal_px, *start.focal_px, 0.1, 0.1, 0.01, 0.01])
     found = least_squares(errors, first, x_scale=scales).x
     worst = float(np.linalg.norm(errors(found).reshape(-1, 2), axis=1).max())
-    if worst > LARGEST_ERROR_PX:
+    if worst > limit_px:
         raise CaptureError(
             f"{where}: the lens model {model} differs from the nearest one with k1, k2, p1, p2 by up to "
-            f"{worst:.3g} px; expected at most {LARGEST_ERROR_PX} px: {advice}"
+            f"{worst:.3g} px; expected at most {limit_px:g} px: {advice}"
         )
     lens = Lens(start.width, start.height, _pair(found[:2]), _pair(found[2:4]), _four(found[4:]))
     return lens, f"lens model {model} replaced by the nearest k1, k2, p1, p2; off by at most {worst:.2g} px"

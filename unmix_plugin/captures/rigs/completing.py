@@ -1,8 +1,8 @@
 """Poses of all lenses of a rig from those of some.
 
-Where two lenses have poses in the same releases, their offset follows from these. Else the rotations that the files give
-(`RigRelatives`: Euler angles in degrees, x then y then z, from the axes of the lens to those of the reference lens, in
-axes +x right, +y down, +z forward) are used, and the lenses stand in one place.
+Where two lenses have poses in the same releases, their offset follows from these. Else the rotations that the files
+give are used, and the lenses stand in one place (`RigRelatives`: Euler angles in degrees, R = Rx Ry Rz, from the axes
+of the lens to those of the reference lens, with +x right, +y down, +z forward).
 """
 
 from __future__ import annotations
@@ -61,7 +61,11 @@ def _say(sensor: str, kind: str, count: int) -> str:
     text = f"{count} views of lens {sensor} "
     if kind == "nothing":
         return text + "have no pose, and nothing says how the lens stands to others: left out"
-    known = "its offset in other releases" if kind == "poses" else "the rig's rotations in the files, at the same place"
+    known = (
+        "its offset in other releases"
+        if kind == "poses"
+        else "the rig's rotations in the files, at the same place"
+    )
     return text + f"got the pose of another lens of their release and {known}"
 
 
@@ -100,7 +104,11 @@ def _measured_offsets(
     """Offsets between lenses with poses in one release: mean rotation, median place."""
     found: dict[tuple[str, str], list[Pose]] = defaultdict(list)
     for members in releases.values():
-        poses = {view.sensor: _square(cameras[view.name].camera_to_world) for view in members if view.name in cameras}
+        poses = {
+            view.sensor: _square(cameras[view.name].camera_to_world)
+            for view in members
+            if view.name in cameras
+        }
         for first, base in poses.items():
             for second, other in poses.items():
                 if first != second:

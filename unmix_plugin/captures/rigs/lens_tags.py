@@ -6,6 +6,7 @@ Their pixels have 0 at the centre of the first pixel, ours 0.5: principal points
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,12 +15,16 @@ from unmix_plugin.captures.camera_tags import XmpTags, tag_numbers, tag_text
 from unmix_plugin.captures.poses.lens_fit import Points, fit_lens, project_opencv
 from unmix_plugin.captures.poses.pose_set import Lens
 from unmix_plugin.captures.spectral_file import SpectralFile
+from unmix_plugin.errors import CaptureError
 
 MM_OF_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 """Millimetres in EXIF's FocalPlaneResolutionUnit: inch, cm, mm, micrometre."""
+TAGS = "lens in the XMP"
 LONGEST_MM = 50.0
 """Focal length without a unit from which it is in pixels; these cameras have about 5 mm."""
 HALF_PIXEL = 0.5
+LIMIT_PX = 10.0
+"""By how much the lens with k1, k2, p1, p2 may differ from the camera's; poses usually bring a better one."""
 
 
 def lens_of(file: SpectralFile) -> tuple[Lens | None, tuple[str, ...]]:
@@ -44,10 +49,10 @@ def lens_of(file: SpectralFile) -> tuple[Lens | None, tuple[str, ...]]:
 
 def _resolution(exif: dict[str, Any]) -> tuple[float, float] | None:
     """Pixels a millimetre along x and y."""
-    along = [exif.get(f"FocalPlane{axis}Resolution") for axis in "XY"]
     unit = MM_OF_UNIT.get(int(exif.get("FocalPlaneResolutionUnit", 4)), 1.0)
-    across, down = along[0], along[1] or along[0]
-    return None if not across else (float(across) / unit, float(down) / unit)
+    across = float(exif.get("FocalPlaneXResolution", 0.0)) / unit
+    down = float(exif.get("FocalPlaneYResolution", 0.0)) / unit
+    return (across, down or across) if across > 0.0 else None
 
 
 def _perspective_lens(
@@ -64,7 +69,7 @@ def _perspective_lens(
 
 
 def _dji_lens(file: SpectralFile, tags: XmpTags) -> tuple[Lens | None, tuple[str, ...]]:
-    """`DewarpData`: a date, a semicolon, then fx, fy, cx, cy, k1, k2, p1, p2, k3; cx, cy count from the optical centre."""
+    """`DewarpData`: a date; fx, fy, cx, cy, k1, k2, p1, p2, k3, where cx, cy count from the optical centre."""
     text = (tag_text(tags, "DewarpData") or "").rpartition(";")[2]
     numbers = tag_numbers({"DewarpData": text}, "DewarpData") or []
     middle = [(tag_numbers(tags, f"CalibratedOpticalCenter{axis}") or [math.nan])[0] for axis in "XY"]
@@ -84,15 +89,30 @@ def _lens(
 ) -> tuple[Lens, tuple[str, ...]]:
     """A lens with k3, which is refitted if it is not 0."""
     height, width = file.shape[:2]
-    start = Lens(width, height, focal_px, centre, (*radial[:2], *tangential))
     if radial[2] == 0.0:
-        return start, ()
+        return Lens(width, height, focal_px, centre, (*radial[:2], *tangential)), ()
+    try:
+        lens, note = _fit_radial((width, height), focal_px, centre, radial, tangential)
+    except CaptureError as error:
+        raise CaptureError(f"{file.path}, {error}") from error
+    return lens, (note,)
+
+
+@lru_cache
+def _fit_radial(
+    size: tuple[int, int],
+    focal_px: tuple[float, float],
+    centre: tuple[float, float],
+    radial: tuple[float, float, float],
+    tangential: tuple[float, float],
+) -> tuple[Lens, str]:
+    """The lens nearest to one with k3; all files of a lens have the same."""
 
     def project(ideal: Points) -> Points:
         return project_opencv(ideal, focal_px, centre, radial, tangential)
 
-    lens, note = fit_lens(project, start, "with k3", str(file.path))
-    return lens, (note,)
+    start = Lens(*size, focal_px, centre, (*radial[:2], *tangential))
+    return fit_lens(project, start, "with k3", TAGS, LIMIT_PX)
 
 
 def _fisheye_lens(
@@ -102,16 +122,32 @@ def _fisheye_lens(
     numbers = tag_numbers(tags, "FisheyeAffineMatrix")
     if numbers is None or len(numbers) != 4:
         return None, ("no lens in the file's tags: FisheyeAffineMatrix is absent",)
-    affine = np.array(numbers).reshape(2, 2)
+    height, width = file.shape[:2]
+    try:
+        lens, note = _fit_fisheye((width, height), tuple(polynomial), tuple(numbers), centre)
+    except CaptureError as error:
+        raise CaptureError(f"{file.path}, {error}") from error
+    return lens, (note,)
+
+
+@lru_cache
+def _fit_fisheye(
+    size: tuple[int, int],
+    polynomial: tuple[float, ...],
+    matrix: tuple[float, ...],
+    centre: tuple[float, float],
+) -> tuple[Lens, str]:
+    """The lens nearest to a fisheye; all files of a lens have the same."""
+    affine = np.array(matrix).reshape(2, 2)
 
     def project(ideal: Points) -> Points:
         radius = np.hypot(*ideal.T)
         bent = np.polynomial.polynomial.polyval(2.0 / math.pi * np.arctan(radius), polynomial)
-        ratio = np.divide(bent, radius, out=np.full_like(radius, 2.0 / math.pi * polynomial[1]), where=radius > 1e-9)
+        ratio = np.divide(
+            bent, radius, out=np.full_like(radius, 2.0 / math.pi * polynomial[1]), where=radius > 1e-9
+        )
         return (ideal * ratio[:, None]) @ affine.T + np.array(centre)
 
-    height, width = file.shape[:2]
     focal = 2.0 / math.pi * polynomial[1] * np.diag(affine)
-    start = Lens(width, height, (float(focal[0]), float(focal[1])), centre)
-    lens, note = fit_lens(project, start, "fisheye of Pix4D", str(file.path))
-    return lens, (note,)
+    start = Lens(*size, (float(focal[0]), float(focal[1])), centre)
+    return fit_lens(project, start, "fisheye of Pix4D", TAGS, LIMIT_PX)

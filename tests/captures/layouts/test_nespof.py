@@ -1,0 +1,192 @@
+import json
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.captures.layouts.data_sets import PLAIN, intensity, pose, stokes, write_exr, write_nespof
+from unmix_plugin.captures.layouts.nespof import find_nespof
+from unmix_plugin.captures.layouts.nespof_real import find_nespof_real
+from unmix_plugin.captures.layouts.registry import LayoutOptions
+from unmix_plugin.captures.layouts.stokes_exr import open_intensity, open_opacity
+from unmix_plugin.errors import CaptureError
+
+
+def test_views_have_the_first_stokes_component_of_all_wavelengths(tmp_path):
+    write_nespof(tmp_path)
+    capture = find_nespof(tmp_path, PLAIN)
+    assert [view.name for view in capture.views] == ["r_0", "r_1", "r_2", "r_3", "r_4"]
+    for index, view in enumerate(capture.views):
+        expected = np.stack([intensity(index, wavelength) for wavelength in (450, 460, 470)], axis=-1)
+        np.testing.assert_array_equal(view.cube.read(), expected)
+        assert view.cube.bands.wavelengths_nm is not None
+        assert view.cube.bands.wavelengths_nm.tolist() == [450.0, 460.0, 470.0]
+
+
+def test_rows_and_bands_are_read_alone(tmp_path):
+    write_nespof(tmp_path)
+    cube = find_nespof(tmp_path, PLAIN).views[2].cube
+    np.testing.assert_array_equal(cube.read(slice(1, 4), np.array([2, 0])), cube.read()[1:4][..., [2, 0]])
+
+
+def test_opacity_is_the_last_channel(tmp_path):
+    write_nespof(tmp_path)
+    alpha = find_nespof(tmp_path, PLAIN).views[0].alpha
+    assert alpha is not None
+    np.testing.assert_allclose(alpha.read()[..., 0], np.linspace(0, 1, 35).reshape(5, 7), atol=1e-6)
+
+
+def test_a_scene_without_alpha_has_no_opacity(tmp_path):
+    write_nespof(tmp_path, alpha=False)
+    assert find_nespof(tmp_path, PLAIN).views[0].alpha is None
+
+
+def test_splits_are_those_of_the_files_and_repeated_frames_are_left_out(tmp_path):
+    write_nespof(tmp_path)
+    capture = find_nespof(tmp_path, PLAIN)
+    assert [view.split for view in capture.views] == ["eval", "train", "train", "train", "train"]
+    assert any("5 frames of transforms_test.json are listed before" in note for note in capture.notes)
+
+
+def test_poses_and_field_of_view_belong_to_the_views(tmp_path):
+    write_nespof(tmp_path)
+    poses = find_nespof(tmp_path, PLAIN).poses
+    assert poses is not None
+    for index in range(5):
+        camera = poses.cameras[f"r_{index}"]
+        np.testing.assert_allclose(camera.camera_to_world, pose(index)[:3], atol=1e-6)
+        assert camera.lens is not None
+        assert (camera.lens.width, camera.lens.height) == (7, 5)
+        assert camera.lens.focal_px[0] == pytest.approx(0.5 * 7 / np.tan(0.4))
+
+
+def test_labels_lie_in_seg(tmp_path):
+    write_nespof(tmp_path)
+    (tmp_path / "seg" / "train").mkdir(parents=True)
+    Image.fromarray(np.zeros((5, 7), np.uint8)).save(tmp_path / "seg" / "train" / "r_3.png")
+    labels = [view.labels for view in find_nespof(tmp_path, PLAIN).views]
+    assert [path is not None for path in labels] == [False, False, False, True, False]
+
+
+def test_views_of_one_name_in_two_splits_keep_their_folder(tmp_path):
+    write_nespof(tmp_path, wavelengths=(450,))
+    for name, split in (("transforms_train.json", "train"), ("transforms_val.json", "val")):
+        content = json.loads((tmp_path / name).read_text())
+        frame = {**content["frames"][0], "file_path": f"./{split}/same"}
+        (tmp_path / name).write_text(json.dumps({**content, "frames": [*content["frames"], frame]}))
+        write_exr(tmp_path / "450" / split / "same.exr", stokes(intensity(9, 450)))
+    names = [view.name for view in find_nespof(tmp_path, PLAIN).views]
+    assert "train_same" in names
+    assert "val_same" in names
+
+
+def test_given_wavelengths_replace_the_names_of_folders(tmp_path):
+    write_nespof(tmp_path)
+    options = LayoutOptions(wavelengths_nm=np.array([500.0, 510.0, 520.0]))
+    wavelengths = find_nespof(tmp_path, options).views[0].cube.bands.wavelengths_nm
+    assert wavelengths is not None
+    assert wavelengths.tolist() == [500.0, 510.0, 520.0]
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float16])
+def test_raw_files_of_mitsuba_have_the_intensity_in_the_fifth_channel(tmp_path, kind):
+    names = [f"ch{index:02d}" for index in range(16)]
+    write_exr(tmp_path / "a.exr", {name: np.full((3, 4), float(i)) for i, name in enumerate(names)}, kind)
+    assert (open_intensity(tmp_path / "a.exr").read() == 4.0).all()
+    assert open_opacity(tmp_path / "a.exr") is None
+
+
+def test_channels_are_known_by_name_wherever_they_stand(tmp_path):
+    write_exr(tmp_path / "a.exr", {"A": np.full((3, 4), 0.5), **stokes(np.full((3, 4), 2.0))})
+    assert (open_intensity(tmp_path / "a.exr").read() == 2.0).all()
+    alpha = open_opacity(tmp_path / "a.exr")
+    assert alpha is not None
+    assert (alpha.read() == 0.5).all()
+
+
+def test_other_channels_are_refused(tmp_path):
+    write_exr(tmp_path / "a.exr", {"R": np.zeros((3, 4)), "G": np.zeros((3, 4))})
+    with pytest.raises(CaptureError, match="has the channels G, R; expected s0 to s3"):
+        open_intensity(tmp_path / "a.exr")
+
+
+def test_missing_files_are_counted_and_named(tmp_path):
+    write_nespof(tmp_path)
+    shutil.rmtree(tmp_path / "460" / "train")
+    with pytest.raises(CaptureError, match=r"lacks 4 files .*460/train/r_1.exr, .* and 1 more"):
+        find_nespof(tmp_path, PLAIN)
+
+
+def test_a_truncated_file_is_refused(tmp_path):
+    write_nespof(tmp_path)
+    path = tmp_path / "450" / "val" / "r_0.exr"
+    path.write_bytes(path.read_bytes()[:20])
+    with pytest.raises(CaptureError, match=r"r_0.exr can't be read as OpenEXR"):
+        find_nespof(tmp_path, PLAIN)
+
+
+def test_files_of_different_sizes_are_refused(tmp_path):
+    write_nespof(tmp_path)
+    write_exr(tmp_path / "460" / "val" / "r_0.exr", stokes(np.zeros((5, 8))))
+    with pytest.raises(CaptureError, match="the bands of one view have one size"):
+        find_nespof(tmp_path, PLAIN)
+
+
+def test_a_path_that_leaves_the_folder_is_refused(tmp_path):
+    write_nespof(tmp_path / "scene")
+    path = tmp_path / "scene" / "transforms_val.json"
+    path.write_text(path.read_text().replace("./val/r_0", "../../r_0"))
+    with pytest.raises(CaptureError, match="leaves the folder"):
+        find_nespof(tmp_path / "scene", PLAIN)
+
+
+@pytest.mark.parametrize("name", ["transforms_train.json", "450"])
+def test_a_folder_of_another_kind_is_refused(tmp_path, name):
+    write_nespof(tmp_path, wavelengths=(450,))
+    for path in [*tmp_path.glob("transforms_*.json")] if name.endswith("json") else [tmp_path / name]:
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    with pytest.raises(CaptureError, match="holds no"):
+        find_nespof(tmp_path, PLAIN)
+
+
+def write_real(root, views=("v10", "v2"), wavelengths=(450, 460), poses=True):
+    for index, view in enumerate(views):
+        for wavelength in wavelengths:
+            write_exr(root / "exr" / view / f"{wavelength}.exr", stokes(intensity(index, wavelength)))
+    if poses:
+        rows = []
+        for index in range(len(views)):
+            right, up, back, place = np.array(pose(index))[:3].T
+            matrix = np.column_stack([-up, right, back, place, [5.0, 7.0, 9.0]])
+            rows.append([*matrix.ravel(), 0.5, 4.0])
+        np.save(root / "poses_bounds.npy", np.array(rows))
+
+
+def test_real_captures_have_one_folder_a_view(tmp_path):
+    write_real(tmp_path, poses=False)
+    capture = find_nespof_real(tmp_path, PLAIN)
+    assert [view.name for view in capture.views] == ["v10", "v2"]
+    expected = np.stack([intensity(1, 450), intensity(1, 460)], axis=-1)
+    np.testing.assert_array_equal(capture.views[1].cube.read(), expected)
+    assert capture.poses is None
+    assert any("poses_bounds.npy is not there" in note for note in capture.notes)
+
+
+def test_views_of_different_wavelengths_are_refused(tmp_path):
+    write_real(tmp_path, poses=False)
+    (tmp_path / "exr" / "v2" / "460.exr").unlink()
+    with pytest.raises(CaptureError, match="460 nm in one of them alone"):
+        find_nespof_real(tmp_path, PLAIN)
+
+
+def test_one_wavelength_twice_is_refused(tmp_path):
+    write_real(tmp_path, poses=False)
+    write_exr(tmp_path / "exr" / "v2" / "450nm.exr", stokes(intensity(1, 450)))
+    with pytest.raises(CaptureError, match="are both 450 nm"):
+        find_nespof_real(tmp_path, PLAIN)
+
+
+def test_a_folder_without_exr_is_refused(tmp_path):
+    with pytest.raises(CaptureError, match="holds no folder exr"):
+        find_nespof_real(tmp_path, PLAIN)
