@@ -10,7 +10,9 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Literal, TypeAlias
 
 from unmix_plugin.captures.capture import Capture, CaptureView
+from unmix_plugin.captures.layouts.registry import LayoutOptions
 from unmix_plugin.captures.poses.reading import read_poses
+from unmix_plugin.captures.spectral_file import BandTable, SpectralFile
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.scenes.reading.json_values import UnreadableJsonError, describe, read_json_file
 
@@ -218,6 +220,22 @@ def make_capture(
     except CaptureError as error:
         said.append(f"the poses of the capture can't be used: {error}")
     return Capture(layout, root, tuple(sorted(views, key=lambda view: view.name)), poses, tuple(said))
+
+
+def with_wavelengths(file: SpectralFile, options: LayoutOptions) -> SpectralFile:
+    """The file with the wavelengths that a user gives; unchanged where there are none.
+
+    Raises:
+        CaptureError: another number of them than of bands.
+    """
+    given = options.wavelengths_nm
+    if given is None:
+        return file
+    if len(given) != file.shape[2]:
+        raise CaptureError(
+            f"{file.path} has {file.shape[2]} bands, --wavelengths gives {len(given)} numbers; expected one a band"
+        )
+    return replace(file, bands=BandTable(given, "given with --wavelengths"))
 
 
 def require_names(frames: Iterable[Frame], key: str) -> None:

@@ -6,12 +6,10 @@ An alpha channel says what is matter. A picture has no wavelengths, only primari
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
-import numpy as np
-
 from unmix_plugin.captures.capture import Capture, CaptureView
-from unmix_plugin.captures.layouts.cubes import with_wavelengths
 from unmix_plugin.captures.layouts.frames import (
     FoundFiles,
     make_capture,
@@ -20,8 +18,8 @@ from unmix_plugin.captures.layouts.frames import (
     view_names,
 )
 from unmix_plugin.captures.layouts.registry import LayoutOptions
-from unmix_plugin.captures.spectral_file import BandIndex, BandTable, SpectralFile
-from unmix_plugin.errors import CaptureError
+from unmix_plugin.captures.readers.opening import open_spectral_file
+from unmix_plugin.captures.spectral_file import SpectralFile
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 PRIMARIES_NM = (610, 550, 465)
@@ -53,47 +51,18 @@ def find_nerfstudio(root: Path, options: LayoutOptions) -> Capture:
         masks.append(found.find(frame.where, text) if text else None)
     found.refuse_missing("copy them into the folder, or drop the frames")
     views = tuple(
-        CaptureView(
-            name, with_wavelengths(open_picture(path), options), picture=path, mask=mask, split=frame.split
-        )
+        CaptureView(name, _open(path, options), picture=path, mask=mask, split=frame.split)
         for frame, name, path, mask in zip(listed.frames, names, pictures, masks, strict=True)
     )
     return make_capture("nerfstudio", root, listed, views)
 
 
-def open_picture(path: Path) -> SpectralFile:
-    """The red, green and blue of a picture, gamma-encoded, as `metadata["encoding"]` says; its alpha is left out.
+def _open(path: Path, options: LayoutOptions) -> SpectralFile:
+    """The red, green and blue of a picture.
 
     EXIF's orientation is ignored: poses refer to the stored raster.
-
-    Raises:
-        CaptureError: it can't be read.
     """
-    from PIL import Image
-
-    def read_part(rows: slice, bands: BandIndex) -> np.ndarray:
-        with Image.open(path) as picture:
-            return np.asarray(picture.convert("RGB"))[rows][..., bands]
-
-    try:
-        with Image.open(path) as picture:
-            (width, height), orientation = picture.size, picture.getexif().get(0x0112, 1)
-            has_alpha = "A" in picture.getbands() or "transparency" in picture.info
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise CaptureError(f"{path} can't be read as a picture ({error}); copy it again") from error
-    notes = (
-        (f"EXIF's orientation {orientation} is ignored, as poses refer to the stored raster",)
-        if orientation > 1
-        else ()
-    )
-    return SpectralFile(
-        path,
-        "png",
-        (height, width, 3),
-        np.dtype(np.uint8),
-        read_part,
-        BandTable(evidence=f"none: {ADVICE}"),
-        scale=255.0,
-        notes=notes,
-        metadata={"encoding": "sRGB", "has_alpha": has_alpha},
-    )
+    file = open_spectral_file(path, options.read)
+    if file.bands.wavelengths_nm is not None:
+        return file
+    return replace(file, bands=replace(file.bands, evidence=f"none: {ADVICE}"))

@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 
 from unmix_plugin.captures.capture import Capture, CaptureView
-from unmix_plugin.captures.layouts.cubes import with_wavelengths
 from unmix_plugin.captures.layouts.frames import (
     FoundFiles,
     make_capture,
     read_frames,
     require_names,
     view_names,
+    with_wavelengths,
 )
 from unmix_plugin.captures.layouts.registry import LayoutOptions
 from unmix_plugin.captures.layouts.stokes_exr import open_intensity, open_opacity

@@ -40,6 +40,12 @@ FindViews: TypeAlias = Callable[[Path, LayoutOptions], Capture]
 
 _FUNCTIONS = {
     "cubes": "cubes:find_cubes",
+    "nespof": "nespof:find_nespof",
+    "nespof-real": "nespof_real:find_nespof_real",
+    "hs-nerf": "unmix_nerf:find_hs_nerf",
+    "unmix-nerf": "unmix_nerf:find_unmix_nerf",
+    "nerfstudio": "nerfstudio:find_nerfstudio",
+    "rig": "rig:find_rig",
 }
 """Module in this package, and the function in it."""
 

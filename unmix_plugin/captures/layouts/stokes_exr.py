@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from unmix_plugin.captures.spectral_file import BandIndex, SpectralFile
+from unmix_plugin.captures.readers.opening import open_spectral_file
+from unmix_plugin.captures.readers.read_options import ReadOptions
+from unmix_plugin.captures.spectral_file import SpectralFile
 from unmix_plugin.errors import CaptureError
 
 RAW_CHANNELS, RAW_INTENSITY = 16, 4
@@ -24,20 +23,20 @@ def open_intensity(path: Path) -> SpectralFile:
     Raises:
         CaptureError: the file can't be read, or which channel is s0 can't be told.
     """
-    names, size = _header(path)
+    names = _channels(path)
     channel = intensity_channel(names)
     if channel is None:
         raise CaptureError(
             f"{path} has the channels {', '.join(names)}; expected s0 to s3 and maybe alpha, or Mitsuba's 16 channels"
         )
-    return _channel_file(path, channel, size)
+    return open_spectral_file(path, ReadOptions(channel))
 
 
 def open_opacity(path: Path) -> SpectralFile | None:
     """The alpha channel, (H, W, 1), in [0, 1]; None where there is none."""
-    names, size = _header(path)
+    names = _channels(path)
     channel = opacity_channel(names)
-    return None if channel is None else _channel_file(path, channel, size)
+    return None if channel is None else open_spectral_file(path, ReadOptions(channel))
 
 
 def intensity_channel(names: Sequence[str]) -> str | None:
@@ -68,33 +67,11 @@ def opacity_channel(names: Sequence[str]) -> str | None:
     return names[-1] if len(names) == 5 else None
 
 
-def _header(path: Path) -> tuple[list[str], tuple[int, int]]:
-    """Names of the channels in the order of the file, and rows and columns."""
-    file = _open(path)
-    header = file.header()
-    window = header["dataWindow"]
-    return list(header["channels"]), (window.max.y - window.min.y + 1, window.max.x - window.min.x + 1)
-
-
-def _open(path: Path) -> Any:
+def _channels(path: Path) -> list[str]:
+    """Names of the channels in the order of the file."""
     import OpenEXR
 
     try:
-        return OpenEXR.InputFile(str(path))
+        return list(OpenEXR.InputFile(str(path)).header()["channels"])
     except (OSError, RuntimeError, ValueError, TypeError) as error:
         raise CaptureError(f"{path} can't be read as OpenEXR ({error}); copy it again") from error
-
-
-def _channel_file(path: Path, channel: str, size: tuple[int, int]) -> SpectralFile:
-    def read_part(rows: slice, bands: BandIndex) -> np.ndarray:
-        import Imath
-
-        first, last, step = rows.indices(size[0])
-        file = _open(path)
-        top = file.header()["dataWindow"].min.y
-        kind = Imath.PixelType(Imath.PixelType.FLOAT)
-        packed = file.channel(channel, kind, top + first, top + max(last, first + 1) - 1)
-        values = np.frombuffer(packed, np.float32).reshape(-1, size[1])
-        return values[: max(0, last - first) : step, :, None][..., bands]
-
-    return SpectralFile(path, "exr", (*size, 1), np.dtype(np.float32), read_part)

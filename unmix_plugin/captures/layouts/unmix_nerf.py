@@ -13,7 +13,6 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from unmix_plugin.captures.capture import Capture, CaptureView
-from unmix_plugin.captures.layouts.cubes import with_wavelengths
 from unmix_plugin.captures.layouts.frames import (
     SPLIT_OF_FILE,
     FoundFiles,
@@ -71,7 +70,7 @@ def _find(layout: str, root: Path, options: LayoutOptions) -> Capture:
     views = [
         CaptureView(
             name=name,
-            cube=with_wavelengths(_open(cube, wavelengths), options),
+            cube=_open(cube, wavelengths, options),
             picture=_optional(found, frame, "file_path"),
             mask=_optional(found, frame, "mask_path"),
             labels=_optional(found, frame, "seg_file_path"),
@@ -101,9 +100,9 @@ def _optional(found: FoundFiles, frame: Frame, key: str) -> Path | None:
     return found.look(frame.where, text, in_eval(text)) if text else None
 
 
-def _open(path: Path, wavelengths: np.ndarray | None) -> SpectralFile:
+def _open(path: Path, wavelengths: np.ndarray | None, options: LayoutOptions) -> SpectralFile:
     """A cube; numbers of 8 bits stand for fractions of 255."""
-    file = open_spectral_file(path)
+    file = open_spectral_file(path, options.read)
     if file.dtype == np.uint8 and file.scale is None:
         file = replace(file, scale=SCALE_8_BITS)
     if wavelengths is not None and len(wavelengths) == file.shape[2] and file.bands.wavelengths_nm is None:

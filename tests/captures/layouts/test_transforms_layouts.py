@@ -1,0 +1,281 @@
+"""Layouts with a transforms.json: unmix-nerf, hs-nerf, nerfstudio."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from tests.captures.layouts.data_sets import PLAIN, pose, write_json
+from unmix_plugin.captures.layouts.nerfstudio import find_nerfstudio
+from unmix_plugin.captures.layouts.registry import LAYOUTS, LayoutOptions, find_views
+from unmix_plugin.captures.layouts.unmix_nerf import find_hs_nerf, find_unmix_nerf
+from unmix_plugin.errors import CaptureError
+
+LENS = {"fl_x": 9.0, "fl_y": 9.0, "cx": 4.0, "cy": 3.0, "w": 8, "h": 6}
+
+
+def cube(index: int) -> np.ndarray:
+    return np.random.default_rng(index).random((6, 8, 4)).astype(np.float32)
+
+
+def write_picture(path, mode="RGB"):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pixels = np.random.default_rng(5).integers(0, 256, (6, 8, len(mode)), dtype=np.uint8)
+    Image.fromarray(pixels, mode).save(path)
+    return pixels
+
+
+def write_unmix(root, written="eval", named="val", **top):
+    """Three training views, and two for evaluation whose paths name one folder and whose files may lie in another."""
+    frames = []
+    for index in range(5):
+        folder, real = ("train", "train") if index < 3 else (named, written)
+        name = f"frame_{index:05d}"
+        (root / real).mkdir(parents=True, exist_ok=True)
+        np.save(root / real / f"{name}.npy", cube(index))
+        write_picture(root / real / f"{name}.png")
+        Image.fromarray(np.full((6, 8), index, np.uint8)).save(root / real / f"{name}_seg.png")
+        frames.append(
+            {
+                "file_path": f"./{folder}/{name}.png",
+                "hyperspectral_file_path": f"{folder}/{name}.npy",
+                "seg_file_path": f"{folder}/{name}_seg.png",
+                "transform_matrix": pose(index),
+            }
+        )
+    write_json(
+        root / "transforms.json", LENS | {"wavelengths": [450, 500, 550, 600]} | top | {"frames": frames}
+    )
+
+
+def edit(root, change):
+    path = root / "transforms.json"
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+@pytest.mark.parametrize("written", ["eval", "val"])
+def test_cubes_pictures_and_labels_are_found_where_the_converter_left_them(tmp_path, written):
+    write_unmix(tmp_path, written)
+    capture = find_unmix_nerf(tmp_path, PLAIN)
+    for index, view in enumerate(capture.views):
+        np.testing.assert_array_equal(view.cube.read(), cube(index))
+        assert view.picture is not None
+        assert view.labels is not None
+        assert (np.asarray(Image.open(view.labels)) == index).all()
+    told = any("2 paths name a folder 'val' whose files lie in 'eval'" in note for note in capture.notes)
+    assert told == (written == "eval")
+
+
+def test_folders_say_the_split(tmp_path):
+    write_unmix(tmp_path)
+    assert [view.split for view in find_unmix_nerf(tmp_path, PLAIN).views] == ["train"] * 3 + ["eval"] * 2
+
+
+def test_lists_go_before_folders(tmp_path):
+    lists = {
+        "train_filenames": [f"./train/frame_0000{k}.png" for k in (0, 1)],
+        "test_filenames": ["train/frame_00002.npy"],
+    }
+    write_unmix(tmp_path, **lists)
+    splits = [view.split for view in find_unmix_nerf(tmp_path, PLAIN).views]
+    assert splits[:3] == ["train", "train", "eval"]
+
+
+def test_one_folder_for_all_says_nothing(tmp_path):
+    write_unmix(tmp_path, written="train", named="train")
+    assert {view.split for view in find_unmix_nerf(tmp_path, PLAIN).views} == {None}
+
+
+def test_wavelengths_are_those_of_the_file_unless_given(tmp_path):
+    write_unmix(tmp_path)
+    bands = find_unmix_nerf(tmp_path, PLAIN).views[0].cube.bands
+    assert bands.wavelengths_nm is not None
+    assert bands.wavelengths_nm.tolist() == [450.0, 500.0, 550.0, 600.0]
+    assert "transforms.json" in bands.evidence
+    given = LayoutOptions(wavelengths_nm=np.array([400.0, 410.0, 420.0, 430.0]))
+    bands = find_unmix_nerf(tmp_path, given).views[0].cube.bands
+    assert bands.wavelengths_nm is not None
+    assert bands.wavelengths_nm.tolist() == [400.0, 410.0, 420.0, 430.0]
+
+
+@pytest.mark.parametrize("stated", [None, [450, 500], ["blue", "green", "red", "nir"]])
+def test_wavelengths_are_never_made_up(tmp_path, stated):
+    write_unmix(tmp_path, wavelengths=stated)
+    assert find_unmix_nerf(tmp_path, PLAIN).views[0].cube.bands.wavelengths_nm is None
+
+
+def test_poses_come_by_the_names_of_views(tmp_path):
+    write_unmix(tmp_path)
+    poses = find_unmix_nerf(tmp_path, PLAIN).poses
+    assert poses is not None
+    assert sorted(poses.cameras) == [f"frame_0000{index}" for index in range(5)]
+    np.testing.assert_allclose(poses.cameras["frame_00004"].camera_to_world, pose(4)[:3], atol=1e-6)
+    lens = poses.cameras["frame_00004"].lens
+    assert lens is not None
+    assert lens.focal_px == (9.0, 9.0)
+
+
+def test_corrupt_poses_are_told_and_others_may_be_given(tmp_path):
+    write_unmix(tmp_path)
+    edit(tmp_path, lambda content: content["frames"][1].update(transform_matrix=np.zeros((4, 4)).tolist()))
+    capture = find_unmix_nerf(tmp_path, PLAIN)
+    assert capture.poses is None
+    assert len(capture.views) == 5
+    assert any("poses of the capture can't be used" in note for note in capture.notes)
+
+
+def test_a_missing_picture_is_no_fault(tmp_path):
+    write_unmix(tmp_path)
+    (tmp_path / "train" / "frame_00001.png").unlink()
+    views = find_unmix_nerf(tmp_path, PLAIN).views
+    assert [view.picture is None for view in views] == [False, True, False, False, False]
+
+
+def test_missing_cubes_are_counted_and_another_layout_named(tmp_path):
+    write_unmix(tmp_path)
+    for index in range(3):
+        (tmp_path / "train" / f"frame_0000{index}.npy").unlink()
+    with pytest.raises(CaptureError, match=r"lacks 3 files .*train/frame_00000.npy.*nerfstudio"):
+        find_unmix_nerf(tmp_path, PLAIN)
+
+
+@pytest.mark.parametrize("text", ["../outside.npy", "/etc/passwd", "link.npy"])
+def test_paths_that_leave_the_folder_are_refused(tmp_path, text):
+    root = tmp_path / "scene"
+    write_unmix(root)
+    np.save(tmp_path / "outside.npy", cube(0))
+    (root / "link.npy").symlink_to(tmp_path / "outside.npy")
+    edit(root, lambda content: content["frames"][0].update(hyperspectral_file_path=text))
+    with pytest.raises(CaptureError, match=r"frames\[0\].*leaves the folder"):
+        find_unmix_nerf(root, PLAIN)
+
+
+def test_a_frame_without_a_cube_is_refused(tmp_path):
+    write_unmix(tmp_path)
+    edit(tmp_path, lambda content: content["frames"][2].pop("hyperspectral_file_path"))
+    with pytest.raises(CaptureError, match=r"frames\[2\] has no 'hyperspectral_file_path'"):
+        find_unmix_nerf(tmp_path, PLAIN)
+
+
+def test_views_that_would_share_a_name_are_refused(tmp_path):
+    write_unmix(tmp_path)
+    (tmp_path / "train" / "frame 00000.npy").write_bytes(
+        (tmp_path / "train" / "frame_00000.npy").read_bytes()
+    )
+    edit(
+        tmp_path, lambda content: content["frames"][1].update(hyperspectral_file_path="train/frame 00000.npy")
+    )
+    with pytest.raises(CaptureError, match="would both be the view 'frame_00000'"):
+        find_unmix_nerf(tmp_path, PLAIN)
+
+
+@pytest.mark.parametrize("content", ["{", '{"frames": 3}', '{"frames": [3]}', '{"no": "frames"}', ""])
+def test_a_damaged_list_of_frames_is_refused(tmp_path, content):
+    (tmp_path / "transforms.json").write_text(content)
+    with pytest.raises(CaptureError, match=r"transforms.json"):
+        find_unmix_nerf(tmp_path, PLAIN)
+
+
+def write_hs(root, kind=torch.uint8):
+    frames = []
+    for index in range(3):
+        (root / "plant" / "torch").mkdir(parents=True, exist_ok=True)
+        values = torch.from_numpy(cube(index))
+        tensor = (values * 255).to(kind) if kind == torch.uint8 else values.to(kind)
+        torch.save(tensor, root / "plant" / "torch" / f"frame_{index:05d}.pt")
+        write_picture(root / "images" / f"frame_{index:05d}.jpg")
+        frames.append(
+            {
+                "file_path": f"images/frame_{index:05d}.jpg",
+                "hyperspectral_file_path": f"plant/torch/frame_{index:05d}.pt",
+                "transform_matrix": pose(index),
+            }
+        )
+    write_json(root / "transforms.json", LENS | {"frames": frames})
+
+
+@pytest.mark.parametrize(("kind", "scale"), [(torch.uint8, 255.0), (torch.float32, None)])
+def test_tensors_of_8_bits_are_fractions_of_255(tmp_path, kind, scale):
+    write_hs(tmp_path, kind)
+    capture = find_hs_nerf(tmp_path, PLAIN)
+    assert capture.layout == "hs-nerf"
+    for index, view in enumerate(capture.views):
+        assert view.cube.scale == scale
+        np.testing.assert_allclose(view.cube.read() / (scale or 1.0), cube(index), atol=1.01 / 255)
+        assert view.cube.bands.wavelengths_nm is None
+        assert view.picture is not None
+        assert view.picture.name == f"frame_{index:05d}.jpg"
+
+
+def test_given_wavelengths_must_be_one_a_band(tmp_path):
+    write_hs(tmp_path)
+    with pytest.raises(CaptureError, match=r"frame_00000.pt.* 3 "):
+        find_hs_nerf(tmp_path, LayoutOptions(wavelengths_nm=np.array([450.0, 500.0, 550.0])))
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA"])
+def test_pictures_are_cubes_of_three_bands(tmp_path, mode):
+    pixels = write_picture(tmp_path / "images" / "a.png", mode)
+    write_picture(tmp_path / "images" / "b.png", mode)
+    Image.fromarray(np.full((6, 8), 255, np.uint8)).save(tmp_path / "mask.png")
+    frames = [{"file_path": f"images/{name}.png", "transform_matrix": pose(k)} for k, name in enumerate("ab")]
+    frames[1]["mask_path"] = "mask.png"
+    write_json(tmp_path / "transforms.json", LENS | {"frames": frames})
+    first, second = find_nerfstudio(tmp_path, PLAIN).views
+    np.testing.assert_array_equal(first.cube.read(), pixels[..., :3])
+    assert first.cube.metadata["encoding"] == "sRGB"
+    assert first.picture == first.cube.path
+    assert first.mask is None
+    assert second.mask is not None
+    assert first.cube.bands.wavelengths_nm is None
+    assert "--wavelengths 610,550,465" in first.cube.bands.evidence
+
+
+def test_given_primaries_are_taken(tmp_path):
+    write_picture(tmp_path / "a.png")
+    write_json(
+        tmp_path / "transforms.json", LENS | {"frames": [{"file_path": "a.png", "transform_matrix": pose(0)}]}
+    )
+    options = LayoutOptions(wavelengths_nm=np.array([610.0, 550.0, 465.0]))
+    bands = find_nerfstudio(tmp_path, options).views[0].cube.bands
+    assert bands.wavelengths_nm is not None
+    assert bands.wavelengths_nm.tolist() == [610.0, 550.0, 465.0]
+
+
+def test_pictures_of_blender_have_no_suffix_and_a_file_for_each_split(tmp_path):
+    for index, split in enumerate(("train", "val", "test")):
+        write_picture(tmp_path / split / "r_0.png", "RGBA")
+        frame = {"file_path": f"./{split}/r_0", "transform_matrix": pose(index)}
+        write_json(tmp_path / f"transforms_{split}.json", {"camera_angle_x": 0.7, "frames": [frame]})
+    capture = find_nerfstudio(tmp_path, PLAIN)
+    assert [(view.name, view.split) for view in capture.views] == [
+        ("test_r_0", "eval"),
+        ("train_r_0", "train"),
+        ("val_r_0", "eval"),
+    ]
+    assert capture.poses is not None
+    np.testing.assert_allclose(capture.poses.cameras["test_r_0"].camera_to_world, pose(2)[:3], atol=1e-6)
+
+
+def test_a_turned_picture_stays_as_it_is_stored(tmp_path):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / "a.jpg", exif=exif)
+    write_json(
+        tmp_path / "transforms.json", LENS | {"frames": [{"file_path": "a.jpg", "transform_matrix": pose(0)}]}
+    )
+    assert find_nerfstudio(tmp_path, PLAIN).views[0].cube.shape == (6, 8, 3)
+
+
+def test_every_layout_is_registered():
+    assert set(LAYOUTS) >= {"nespof", "nespof-real", "hs-nerf", "unmix-nerf", "nerfstudio", "rig", "cubes"}
+
+
+@pytest.mark.parametrize("layout", ["nespof", "nespof-real", "hs-nerf", "unmix-nerf", "nerfstudio", "rig"])
+def test_an_empty_folder_is_refused_by_every_layout(tmp_path, layout):
+    with pytest.raises(CaptureError, match=r"holds no"):
+        find_views(layout, tmp_path, PLAIN)
