@@ -80,7 +80,7 @@ def test_lists_go_before_folders(tmp_path):
         "train_filenames": [f"./train/frame_0000{k}.png" for k in (0, 1)],
         "test_filenames": ["train/frame_00002.npy"],
     }
-    write_unmix(tmp_path, **lists)
+    write_unmix(tmp_path, "eval", "val", **lists)
     splits = [view.split for view in find_unmix_nerf(tmp_path, PLAIN).views]
     assert splits[:3] == ["train", "train", "eval"]
 
