@@ -43,27 +43,43 @@ class AbundanceGuide(nn.Module):
         return margin_error(self.margin_variance)
 
     def start(
-        self, pixels: Float[Tensor, "N B"], endmembers: Float[Tensor, "K B"], relative_penalty: float
+        self,
+        pixels: Float[Tensor, "N b"],
+        endmembers: Float[Tensor, "K B"],
+        relative_penalty: float,
+        seen: Float[Tensor, "K b"],
     ) -> None:
-        """Unmix with these endmembers from now on; the rest as `mixing_penalty` takes it."""
+        """Unmix with these endmembers, `seen` as the pixels are, from now on; the rest as `mixing_penalty` takes it."""
         self.endmembers.copy_(endmembers)
-        self.penalty.fill_(mixing_penalty(pixels, endmembers, relative_penalty))
+        self.penalty.fill_(mixing_penalty(pixels, seen, relative_penalty))
 
-    def error(self, abundances: Float[Tensor, "R K"], batch: dict[str, Tensor]) -> Float[Tensor, ""]:
-        """Mean squared distance of composited abundances to what the pixels of a batch are made of."""
+    def error(
+        self, abundances: Float[Tensor, "R K"], batch: dict[str, Tensor], endmembers: Float[Tensor, "K b"]
+    ) -> Float[Tensor, ""]:
+        """Mean squared distance of composited abundances to what the pixels of a batch are made of.
+
+        Args:
+            endmembers: The guide's, as the sensor of these pixels sees them.
+        """
         is_informative = has_spectral_shape(batch["spectra"])
-        return abundance_error(abundances, self._mixtures(batch), batch["alpha"], is_informative)
+        mixtures = self._mixtures(batch, endmembers)
+        return abundance_error(abundances, mixtures, batch["alpha"], is_informative)
 
-    def observe(self, abundances: Float[Tensor, "R K"], batch: dict[str, Tensor]) -> None:
+    def observe(
+        self, abundances: Float[Tensor, "R K"], batch: dict[str, Tensor], endmembers: Float[Tensor, "K b"]
+    ) -> None:
         """Follow how far margins of composited abundances are from those of the measured spectra."""
         few = {name: values[:_OBSERVED_PIXELS] for name, values in batch.items()}
         counts = has_spectral_shape(few["spectra"]) & (few["alpha"] > _OPAQUE_ALPHA)
         found = margin_variance(
-            self.margin_variance, abundances[:_OBSERVED_PIXELS].detach(), self._mixtures(few), counts
+            self.margin_variance,
+            abundances[:_OBSERVED_PIXELS].detach(),
+            self._mixtures(few, endmembers),
+            counts,
         )
         self.margin_variance.copy_(found)
 
-    def _mixtures(self, batch: dict[str, Tensor]) -> Float[Tensor, "R K"]:
+    def _mixtures(self, batch: dict[str, Tensor], endmembers: Float[Tensor, "K b"]) -> Float[Tensor, "R K"]:
         if self._cache is None:
             self._cache = MixtureCache(len(self.endmembers), self.endmembers.device)
-        return self._cache.mixtures(batch["pixels"], batch["spectra"], self.endmembers, self.penalty)
+        return self._cache.mixtures(batch["pixels"], batch["spectra"], endmembers, self.penalty)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.alpha_preset import Auto, choose, preset_for
@@ -24,15 +24,20 @@ from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.instantiate import Target
 from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.engine.training.seeding import step_generator
-from unmix_plugin.errors import ConfigError, SceneError, require
+from unmix_plugin.errors import SceneError, require
 from unmix_plugin.scenes.geometry.carving import carve
 from unmix_plugin.scenes.geometry.pose_check import check_scene_poses
 from unmix_plugin.scenes.identity import scene_identity
-from unmix_plugin.scenes.pixel_store import PixelStore
+from unmix_plugin.scenes.pixel_table import DrawnPixels, PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
+from unmix_plugin.scenes.reading.sensors import lonely_sensors
 from unmix_plugin.scenes.recorded_scene import check_recorded_scene
 from unmix_plugin.scenes.scene import Scene, SceneOptions
+from unmix_plugin.sensor_batches import join_parts
+from unmix_plugin.spectral.unmixing.partial_bands import typical_spectrum
 
+_MOST_SENSOR_SUBPIXELS = 4
+"""Along an edge of a coarse sensor's pixel, in multiples of the finest sensor's."""
 DEMO = Path("demo")
 """`--data demo` stands for the built-in scene."""
 
@@ -109,20 +114,25 @@ class HyperspectralDataManager(DataManager):
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
         """Random valid pixels of the training views; the draw depends on (seed, step) only."""
         generator = step_generator(self.seed, step)
-        chosen = self._pixels.draw(self._pixels_for(self._num_rays), generator)
-        return self._batch(self._device_cameras, self._pixels, chosen, generator)
+        parts = []
+        for drawn in self._pixels.draw(self._pixels_for(self._num_rays), generator):
+            measured = {"spectra": drawn.spectra, "alpha": drawn.alpha, "pixels": drawn.numbers}
+            parts.append((drawn.sensor, self._rays_through(drawn, generator), measured))
+        return join_parts(parts) if self.scene.is_rig else parts[0][1:]
 
     def eval_image(self, index: int) -> tuple[Cameras, dict[str, Tensor]]:
         """Camera and whole image of one evaluation view."""
         view = self.scene.eval_indices[index]
-        alpha = self.scene.alpha(view)
+        alpha, valid = self.scene.alpha(view), self.scene.valid_mask(view)
         arrays = {
             "spectra": self.scene.cube(view),
-            "alpha": np.ones(self._image_shape, np.float32) if alpha is None else alpha,
-            "valid": self.scene.valid_mask(view),
+            "alpha": np.ones(valid.shape, np.float32) if alpha is None else alpha,
+            "valid": valid,
             "labels": self.scene.labels(view),
             "abundances": self.scene.abundances(view),
         }
+        if self.scene.is_rig:
+            arrays["sensor"] = np.array(self.scene.frames[view].sensor)
         batch = {
             name: torch.tensor(array, device=self.device)
             for name, array in arrays.items()
@@ -132,7 +142,7 @@ class HyperspectralDataManager(DataManager):
 
     def get_train_rays_per_batch(self) -> int:
         """Rays of the next training batch."""
-        return self._pixels_for(self._num_rays) * self._subpixels**2
+        return round(self._pixels_for(self._num_rays) * self._rays_a_pixel)
 
     def set_train_rays_per_batch(self, num_rays: int) -> None:
         """Let the next training batches have `num_rays` rays, but whole pixels and at least one."""
@@ -154,16 +164,30 @@ class HyperspectralDataManager(DataManager):
             "illuminant": None if illuminant is None else illuminant.tolist(),
             "has_alpha": self.scene.has_alpha,
             "grid_resolution": self._grid_resolution,
-            "pixel_size": self._pixel_size(),
+            "pixel_size": min(self._pixel_sizes.values()),
             "subpixels": self.options.subpixels,
+            **({"sensors": [sensor.to_json() for sensor in self.scene.sensors]} if self.scene.is_rig else {}),
         }
 
     def initial_data(self) -> Mapping[str, np.ndarray]:
-        """`pixels`: spectra pooled over all training views; `reachable`: where something may be."""
-        return {
-            "pixels": self._pixels.sample_opaque(self.options.max_initial_pixels, self.seed),
+        """`pixels`: spectra pooled over all training views; `reachable`: where something may be.
+
+        Of a rig, pixels of the sensor with most channels, and of those the one with most pixels; `sensor`, which that
+        is; and `typical`, a spectrum on all bands that fits the mean of each sensor's pixels.
+        """
+        most, seed, sensors = self.options.max_initial_pixels, self.seed, self.scene.sensors
+        shares = self._pixels.shares
+        chosen = max(shares, key=lambda sensor: (sensors[sensor].num_channels, shares[sensor]))
+        found = {
+            "pixels": self._pixels.sample_opaque(chosen, most, seed),
             "reachable": carve(self.scene, self._grid_resolution),
         }
+        if not self.scene.is_rig:
+            return found
+        pixels = [torch.from_numpy(self._pixels.sample_opaque(sensor, most, seed)) for sensor in shares]
+        means = [seen.mean(dim=0) if len(seen) else seen.new_zeros(seen.shape[1]) for seen in pixels]
+        matrices = [torch.from_numpy(sensors[sensor].matrix).float() for sensor in shares]
+        return {**found, "sensor": np.array(chosen), "typical": typical_spectrum(means, matrices).numpy()}
 
     def summary(self) -> dict[str, Any]:
         """The scene's own record: files, splits, normalisation, truth, hashes."""
@@ -176,21 +200,37 @@ class HyperspectralDataManager(DataManager):
         check_recorded_scene(summary)
 
     def warnings(self) -> list[str]:
-        """Poses that seem to follow another convention."""
-        warning = check_scene_poses(self.scene)
-        return [] if warning is None else [warning]
+        """Poses that seem to follow another convention, and sensors that share no band with another."""
+        scene = self.scene
+        found = [check_scene_poses(scene)]
+        alone = lonely_sensors(scene.sensors, {scene.frames[view].sensor for view in scene.train_indices})
+        if alone:
+            found.append(
+                f"no other sensor shares a band with {', '.join(alone)}: only their poses hold their spectra together"
+            )
+        return [warning for warning in found if warning is not None]
 
     def identity(self, summary: Mapping[str, Any]) -> dict[str, Any]:
         """Views, cameras, bands and the hashes of what was measured."""
         return scene_identity(summary)
 
     @cached_property
-    def _pixels(self) -> _DrawnPixels:
+    def _pixels(self) -> PixelTable:
         """Read when training asks: evaluation needs none of it."""
-        return _DrawnPixels(self.scene, self.device, self.scene.train_indices)
+        return PixelTable(self.scene, self.device, self.scene.train_indices)
 
     def _pixels_for(self, num_rays: int) -> int:
-        return max(1, num_rays // self._subpixels**2)
+        return max(1, int(num_rays // self._rays_a_pixel))
+
+    @property
+    def _rays_a_pixel(self) -> float | int:
+        """In the mean over the pixels of all sensors."""
+        if not self.scene.is_rig:
+            return self._subpixels**2
+        shares = self._pixels.shares.items()
+        return sum(
+            share * (self._subpixels * self._sensor_subpixels[sensor]) ** 2 for sensor, share in shares
+        )
 
     def _choose_subpixels(self, step: int, progress: float) -> None:
         until = choose(self.options.single_ray_until, self._preset.single_ray_until)
@@ -200,28 +240,30 @@ class HyperspectralDataManager(DataManager):
     def _grid_resolution(self) -> int:
         return choose(self.options.grid_resolution, self._preset.grid_resolution)
 
-    def _pixel_size(self) -> float:
-        """Edge of a pixel where it looks at the middle of the scene box, median over the training views."""
+    @cached_property
+    def _pixel_sizes(self) -> dict[int, float]:
+        """Of each sensor, the edge of a pixel where it looks at the middle of the scene box, median over its views."""
         centre = self.scene_box.aabb.mean(dim=0)
         distances = (self.train_cameras.camera_to_world[:, :, 3] - centre).norm(dim=-1)
-        return float((distances / self.train_cameras.focal_px.mean(dim=-1)).median())
+        edges = distances / self.train_cameras.focal_px.mean(dim=-1)
+        sensors = torch.tensor([self.scene.frames[view].sensor for view in self.scene.train_indices])
+        return {sensor: float(edges[sensors == sensor].median()) for sensor in set(sensors.tolist())}
 
     @property
-    def _image_shape(self) -> tuple[int, int]:
-        return self.scene.cameras.height, self.scene.cameras.width
+    def _sensor_subpixels(self) -> dict[int, int]:
+        """Of each sensor, by how many times more rays its pixels are wide: as many as fine pixels lie along an edge."""
+        finest = min(self._pixel_sizes.values())
+        return {
+            sensor: min(max(1, round(size / finest)), _MOST_SENSOR_SUBPIXELS)
+            for sensor, size in self._pixel_sizes.items()
+        }
 
-    def _batch(
-        self, cameras: Cameras, pixels: _DrawnPixels, chosen: Int[Tensor, "R"], generator: torch.Generator
-    ) -> tuple[RayBundle, dict[str, Tensor]]:
-        height, width = self._image_shape
-        within = chosen % (height * width)
-        corners = torch.stack([within % width, within // width], dim=-1)
-        offsets = _scattered_offsets(len(chosen), self._subpixels, generator).to(corners.device)
-        points = (corners[:, None] + offsets).flatten(0, 1)
-        views = (chosen // (height * width)).repeat_interleave(offsets.shape[1])
-        bundle = cameras.generate_rays(views, points)
-        found = {"spectra": pixels.store.spectra(chosen), "alpha": pixels.store.alpha[chosen]}
-        return bundle, {**found, "pixels": chosen}
+    def _rays_through(self, pixels: DrawnPixels, generator: torch.Generator) -> RayBundle:
+        """Rays scattered over pixels of one sensor."""
+        edge = self._subpixels * self._sensor_subpixels[pixels.sensor]
+        offsets = _scattered_offsets(len(pixels.cameras), edge, generator).to(pixels.corners.device)
+        points = (pixels.corners[:, None] + offsets).flatten(0, 1)
+        return self._device_cameras.generate_rays(pixels.cameras.repeat_interleave(edge**2), points)
 
 
 def _scattered_offsets(num_pixels: int, subpixels: int, generator: torch.Generator) -> Float[Tensor, "R P 2"]:
@@ -229,31 +271,6 @@ def _scattered_offsets(num_pixels: int, subpixels: int, generator: torch.Generat
     cells = torch.arange(subpixels)
     grid = torch.stack(torch.meshgrid(cells, cells, indexing="xy"), dim=-1).reshape(1, -1, 2)
     return (grid + torch.rand(num_pixels, subpixels**2, 2, generator=generator)) / subpixels
-
-
-class _DrawnPixels:
-    """The pixels of some views, drawn evenly from the valid ones."""
-
-    def __init__(self, scene: Scene, device: torch.device, views: tuple[int, ...]) -> None:
-        self.store = PixelStore(scene, device, views)
-        valid = self.store.valid
-        self._valid = None if bool(valid.all()) else valid.nonzero()[:, 0]
-        if self._valid is not None and len(self._valid) == 0:
-            raise ConfigError("no valid pixel is left in the training views: masks leave out every one")
-
-    def draw(self, count: int, generator: torch.Generator) -> Int[Tensor, "R"]:
-        """Indices of random valid pixels."""
-        pool = len(self.store) if self._valid is None else len(self._valid)
-        drawn = torch.randint(pool, (count,), generator=generator)
-        chosen = drawn if self._valid is None else self._valid[drawn]
-        return chosen.to(self.store.alpha.device)
-
-    def sample_opaque(self, count: int, seed: int) -> Float[np.ndarray, "pixels B"]:
-        """Spectra of at most `count` random valid pixels that are opaque."""
-        pool = torch.arange(len(self.store)) if self._valid is None else self._valid
-        opaque = pool[(self.store.alpha.cpu()[pool] > 0.99)]
-        chosen = opaque[torch.randperm(len(opaque), generator=step_generator(seed, 0))[:count]]
-        return self.store.spectra(chosen.to(self.store.alpha.device)).cpu().numpy()
 
 
 def _load(folder: Path, options: SceneOptions) -> Scene:

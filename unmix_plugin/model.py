@@ -34,7 +34,10 @@ from unmix_plugin.errors import ConfigError, require
 from unmix_plugin.field import CoefficientField, UnmixFieldConfig
 from unmix_plugin.renderer import RendererConfig, VolumeRenderer
 from unmix_plugin.rendering.occupancy import OccupancyGrid
+from unmix_plugin.sensor_batches import SensorPart, mean_over_parts, split_parts
+from unmix_plugin.sensor_views import SensorViews
 from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.coefficients import Coefficients
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.materials import Materials, SegmentationMethod
 from unmix_plugin.spectral.metrics import psnr
@@ -45,6 +48,7 @@ from unmix_plugin.spectral.unmixing.endmembers import (
 )
 from unmix_plugin.spectral.unmixing.given_endmembers import given_endmembers
 from unmix_plugin.spectral.unmixing.num_materials import propose_num_materials
+from unmix_plugin.spectral.unmixing.partial_bands import distinct_spectra, fill_bands
 from unmix_plugin.training_losses import LossConfig, compare_pixels, pixel_mean, spectral_losses
 
 _FEWEST_RAYS, _MOST_RAYS = 64, 8192
@@ -165,6 +169,7 @@ class UnmixModel(Model):
         self.register_buffer("every_band", torch.eye(len(self.bands)), persistent=False)
         self.register_buffer("endmember_bound", torch.ones(()))
         self.guide = AbundanceGuide(*shape)
+        self.seen_by = SensorViews(metadata.get("sensors", ()), self.rgb_weights)
         self._progress = 0.0
 
     def initialise(self, initial_data: Mapping[str, np.ndarray], generator: torch.Generator) -> None:
@@ -177,10 +182,11 @@ class UnmixModel(Model):
         light = self.metadata["illuminant"]
         lamp = torch.ones(len(self.bands)) if light is None else torch.tensor(light, dtype=torch.float32)
         pixels = torch.from_numpy(initial_data["pixels"])
-        endmembers = self._first_endmembers(pixels, lamp, generator)
+        endmembers = self._first_endmembers(initial_data, lamp, generator)
         self.endmembers.copy_(endmembers)
         self.endmember_bound.fill_(max(1.0, float(endmembers.max())))
-        self.guide.start(pixels, endmembers, self.config.losses.mixing_penalty)
+        seen = self.seen_by.project(endmembers, initial_data.get("sensor"))
+        self.guide.start(pixels, endmembers, self.config.losses.mixing_penalty, seen)
         for row in range(len(self.specular_spectra)):
             spectrum = lamp if row == 0 else endmembers[(row - 1) % len(endmembers)]
             self.specular_spectra[row] = spectrum
@@ -224,13 +230,19 @@ class UnmixModel(Model):
         )
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
-        """`spectral` (R, B) on black, `abundances` (R, K), `accumulation` (R), `spread` and `num_samples`, one number
-        each, and of the samples that carry weight `positions`, `weights` and `views` (S)."""
+        """`spectral` (R, B) on black (of a rig `coefficients`, from which `_parts` makes what its sensors see),
+        `abundances` (R, K), `accumulation` (R), `spread` and `num_samples`, one number each, and of the samples that
+        carry weight `positions`, `weights` and `views` (S)."""
         generator = self.generator if self.training else None
         rendered = self.renderer.render(self.field, ray_bundle, generator)
         coefficients = rendered.coefficients
+        seen = (
+            {"coefficients": coefficients.packed}
+            if self.seen_by
+            else {"spectral": self.materials.spectra(coefficients)}
+        )
         return {
-            "spectral": self.materials.spectra(coefficients),
+            **seen,
             "accumulation": coefficients.accumulation,
             "abundances": coefficients.abundances,
             "spread": rendered.spread,
@@ -247,19 +259,38 @@ class UnmixModel(Model):
         metrics_dict: dict[str, Tensor] | None = None,
     ) -> dict[str, Tensor]:
         """Weighted losses by name; those of no weight are left out. See training_losses.py."""
-        config, measured = self.config.losses, batch["spectra"]
+        config = self.config.losses
         weights = {name: x for name, x in config.weights(self.preset, self._progress).items() if x > 0}
+        losses = mean_over_parts(
+            self._parts(outputs, batch), lambda part: self._pixel_losses(part, set(weights))
+        )
+        if "spread" in weights:
+            losses["spread"] = outputs["spread"]
+        return {name: weights[name] * losses[name] for name in weights if name in losses}
+
+    def _pixel_losses(self, part: SensorPart, wanted: set[str]) -> dict[str, Tensor]:
+        """Losses that compare rendered with measured pixels, not yet weighted."""
+        config, outputs, batch = self.config.losses, part.outputs, part.batch
+        measured = batch["spectra"]
         background = choose(config.background, self.preset.background)
         pixels = compare_pixels(
             outputs["spectral"], outputs["accumulation"], batch, background, self.generator
         )
-        losses = spectral_losses(pixels, measured, self.rgb_weights, set(weights))
-        if "spread" in weights:
-            losses["spread"] = outputs["spread"]
-        if "abundances" in weights:
+        losses = spectral_losses(pixels, measured, self.seen_by.rgb_weights(part.sensor), wanted)
+        if "abundances" in wanted and self.seen_by.tells_materials(part.sensor, self.num_endmembers):
             abundances = pixel_mean(outputs["abundances"], len(measured))
-            losses["abundances"] = self.guide.error(abundances, batch)
-        return {name: weights[name] * losses[name] for name in weights}
+            endmembers = self.seen_by.project(self.guide.endmembers, part.sensor)
+            losses["abundances"] = self.guide.error(abundances, batch, endmembers)
+        return losses
+
+    def _parts(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> list[SensorPart]:
+        """A batch by sensor, each part with the `spectral` (R, b) that its sensor sees."""
+        parts = split_parts(outputs, batch, self.seen_by.num_channels)
+        for part in parts:
+            if part.sensor is not None:
+                seen = Coefficients(part.outputs["coefficients"], self.num_endmembers)
+                part.outputs["spectral"] = self.materials.through(seen, self.seen_by.matrix(part.sensor).T)
+        return parts
 
     def observe(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> None:
         """Note which cells the views see, and how far margins of abundances are from those of measured spectra."""
@@ -268,14 +299,24 @@ class UnmixModel(Model):
         if threshold < 1:
             is_seen = outputs["weights"] > threshold
             self.grid.visibility.record(outputs["positions"], outputs["views"], is_seen, num_rays)
-        if self.config.losses.abundances > 0:
-            self.guide.observe(pixel_mean(outputs["abundances"], len(batch["spectra"])), batch)
+        if self.config.losses.abundances == 0:
+            return
+        for part in split_parts(outputs, batch, self.seen_by.num_channels):
+            if self.seen_by.tells_materials(part.sensor, self.num_endmembers):
+                abundances = pixel_mean(part.outputs["abundances"], len(part.batch["spectra"]))
+                endmembers = self.seen_by.project(self.guide.endmembers, part.sensor)
+                self.guide.observe(abundances, part.batch, endmembers)
 
     def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """`psnr` of the batch in dB, on black."""
-        spectra = pixel_mean(outputs["spectral"], len(batch["spectra"]))
-        error = (spectra.detach().clamp(0, 1) - batch["spectra"]).square().mean()
-        return {"psnr": -10 * torch.log10(error.clamp(min=1e-12))}
+
+        def error(part: SensorPart) -> dict[str, Tensor]:
+            measured = part.batch["spectra"]
+            spectra = pixel_mean(part.outputs["spectral"], len(measured))
+            return {"psnr": (spectra.detach().clamp(0, 1) - measured).square().mean()}
+
+        errors = mean_over_parts(self._parts(outputs, batch), error)
+        return {"psnr": -10 * torch.log10(errors["psnr"].clamp(min=1e-12))}
 
     @torch.no_grad()
     def get_outputs_for_camera(
@@ -297,10 +338,10 @@ class UnmixModel(Model):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """PSNR of the view's valid pixels in dB, and its predicted sRGB picture."""
-        return {"psnr": psnr(outputs["spectral"], batch["spectra"], batch.get("valid"))}, {
-            "rgb": outputs["rgb"]
-        }
+        """PSNR of the view's valid pixels in dB as its sensor sees them, and its predicted sRGB picture."""
+        sensor = int(batch["sensor"]) if "sensor" in batch else None
+        seen = self.seen_by.project(outputs["spectral"], sensor)
+        return {"psnr": psnr(seen, batch["spectra"], batch.get("valid"))}, {"rgb": outputs["rgb"]}
 
     def get_training_callbacks(self) -> list[TrainingCallback]:
         """Keep the occupancy grid up to date, and spectra within their bounds."""
@@ -371,12 +412,21 @@ class UnmixModel(Model):
         return self.config.num_specular_spectra
 
     def _first_endmembers(
-        self, pixels: Float[Tensor, "N B"], lamp: Float[Tensor, "B"], generator: torch.Generator
+        self, initial_data: Mapping[str, np.ndarray], lamp: Float[Tensor, "B"], generator: torch.Generator
     ) -> Float[Tensor, "K B"]:
-        config = self.config
-        if config.endmember_file is None:
-            assert config.endmember_init != "file"
-            return initialise_endmembers(pixels, self.num_endmembers, config.endmember_init, generator)
-        return given_endmembers(
-            config.endmember_file, self.num_endmembers, self.bands, lamp, pixels, generator
-        )
+        config, count = self.config, self.num_endmembers
+        pixels, sensor = torch.from_numpy(initial_data["pixels"]), initial_data.get("sensor")
+        if config.endmember_file is not None:
+            everywhere = pixels if sensor is None else self._on_all_bands(pixels, initial_data)
+            return given_endmembers(config.endmember_file, count, self.bands, lamp, everywhere, generator)
+        assert config.endmember_init != "file"
+        if not self.seen_by.tells_materials(sensor, count):
+            return distinct_spectra(torch.from_numpy(initial_data["typical"]), count)
+        seen = initialise_endmembers(pixels, count, config.endmember_init, generator)
+        return seen if sensor is None else self._on_all_bands(seen, initial_data)
+
+    def _on_all_bands(
+        self, seen: Float[Tensor, "N b"], initial_data: Mapping[str, np.ndarray]
+    ) -> Float[Tensor, "N B"]:
+        matrix = self.seen_by.matrix(initial_data["sensor"]).cpu()
+        return fill_bands(seen, matrix, torch.from_numpy(initial_data["typical"]))

@@ -8,6 +8,7 @@ from typing import Any
 from unmix_plugin.scenes.reading.transforms_json import FILE_NAME
 
 _COMPARED = ("wavelengths_nm", "frames", "train_indices", "eval_indices", "cameras", "normalisation")
+_OF_RIGS = ("sensors", "frame_sensors")
 
 
 def scene_identity(summary: Mapping[str, Any]) -> dict[str, Any]:
@@ -18,4 +19,5 @@ def scene_identity(summary: Mapping[str, Any]) -> dict[str, Any]:
     """
     hashes = dict(summary.get("input_hashes") or {})
     hashes.pop(FILE_NAME, None)
-    return {**{key: summary.get(key) for key in _COMPARED}, "files": hashes}
+    rig = {key: summary[key] for key in _OF_RIGS if key in summary}
+    return {**{key: summary.get(key) for key in _COMPARED}, **rig, "files": hashes}

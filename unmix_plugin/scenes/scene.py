@@ -21,6 +21,7 @@ from unmix_plugin.scenes.placement import Placement
 from unmix_plugin.scenes.reading.arrays import map_array
 from unmix_plugin.scenes.reading.cube_values import InvalidPixels, read_cube, read_invalid
 from unmix_plugin.scenes.reading.images import read_colour, read_labels, read_mask
+from unmix_plugin.spectral.scene_sensor import SceneSensor
 
 UNLABELLED = 255
 """Label of a pixel whose material is unknown."""
@@ -60,6 +61,8 @@ class Frame:
     """Black where pixels are ignored."""
     abundance_path: Path | None
     """(H, W, K) .npy file of true abundances."""
+    sensor: int = 0
+    """Which of the scene's sensors took it."""
 
 
 @dataclass(frozen=True)
@@ -120,6 +123,8 @@ class Scene:
     """Scene folder."""
     wavelengths_nm: Float64[np.ndarray, " B"]
     """Band centres in nm, strictly increasing."""
+    sensors: tuple[SceneSensor, ...]
+    """What takes the frames; each frame of a sensor has the same bands and size."""
     frames: tuple[Frame, ...]
     """All views, in the order of transforms.json."""
     cameras: Cameras
@@ -151,8 +156,17 @@ class Scene:
     options: SceneOptions
     """How the scene was read."""
 
-    def cube(self, index: int, part: tuple[slice, ...] = ()) -> Float32[np.ndarray, "H W B"]:
-        """Spectra of a view in [0, 1].
+    @property
+    def is_rig(self) -> bool:
+        """Whether frames differ in bands or size, or don't have the scene's bands in their order."""
+        return len(self.sensors) > 1 or not self.sensors[0].sees_all_bands
+
+    def sensor_of(self, index: int) -> SceneSensor:
+        """What took a view."""
+        return self.sensors[self.frames[index].sensor]
+
+    def cube(self, index: int, part: tuple[slice, ...] = ()) -> Float32[np.ndarray, "H W b"]:
+        """Spectra of a view in [0, 1], as its sensor sees them.
 
         Values above 1 after the division by `value_scale` are clipped to 1, as a saturated sensor does. Unless
         `invalid_pixels` is `refuse`, spectra of invalid pixels are 0 (see `valid_mask`).
@@ -164,7 +178,7 @@ class Scene:
         """NumPy's code of a cube's numbers, such as f2 or u2, in any byte order."""
         return map_array(self.frames[index].cube_path).dtype.str[1:]
 
-    def stored_cube(self, index: int) -> Shaped[np.ndarray, "H W B"]:
+    def stored_cube(self, index: int) -> Shaped[np.ndarray, "H W b"]:
         """A cube as it is stored, before any division, in the machine's byte order."""
         stored = map_array(self.frames[index].cube_path)
         return np.array(stored, dtype=stored.dtype.newbyteorder("="), order="C")
@@ -178,24 +192,24 @@ class Scene:
         path = self.frames[index].image_path
         if not self.has_alpha or path is None:
             return None
-        return read_colour(path, self._size)[..., 3].astype(np.float32) / np.float32(255.0)
+        return read_colour(path, self._size(index))[..., 3].astype(np.float32) / np.float32(255.0)
 
     def srgb(self, index: int) -> Float32[np.ndarray, "H W 3"] | None:
         """sRGB picture of a view in [0, 1], as stored (gamma-encoded); None if it has none."""
         path = self.frames[index].image_path
         if path is None:
             return None
-        return read_colour(path, self._size)[..., :3].astype(np.float32) / np.float32(255.0)
+        return read_colour(path, self._size(index))[..., :3].astype(np.float32) / np.float32(255.0)
 
     def labels(self, index: int) -> UInt8[np.ndarray, "H W"] | None:
         """Material index of each pixel, 255 = unlabelled; None if the view has no labels."""
         path = self.frames[index].label_path
-        return None if path is None else read_labels(path, self._size)
+        return None if path is None else read_labels(path, self._size(index))
 
     def valid_mask(self, index: int) -> Bool[np.ndarray, "H W"]:
         """True where a pixel counts: not black in the view's mask and not invalid (see `SceneOptions`)."""
         path = self.frames[index].mask_path
-        valid = np.ones(self._size, bool) if path is None else read_mask(path, self._size)
+        valid = np.ones(self._size(index), bool) if path is None else read_mask(path, self._size(index))
         if self.options.invalid_pixels != "refuse":
             path, options = self.frames[index].cube_path, self.options
             valid = valid & ~read_invalid(path, options.value_scale, options.invalid_pixels)
@@ -220,6 +234,7 @@ class Scene:
             "material_names": None if self.material_names is None else list(self.material_names),
             "illuminant": None if self.illuminant is None else self.illuminant.tolist(),
             "endmembers": None if self.endmembers is None else self.endmembers.tolist(),
+            **self._rig_summary(),
             "has_alpha": self.has_alpha,
             "has_labels": self.has_labels,
             "has_abundances": self.has_abundances,
@@ -228,6 +243,15 @@ class Scene:
             "options": asdict(self.options),
         }
 
-    @property
-    def _size(self) -> tuple[int, int]:
-        return self.cameras.height, self.cameras.width
+    def _rig_summary(self) -> dict[str, Any]:
+        """Nothing for the scenes of one ordinary camera, so that their records stay as they are."""
+        if not self.is_rig:
+            return {}
+        return {
+            "sensors": [sensor.to_json() for sensor in self.sensors],
+            "frame_sensors": [frame.sensor for frame in self.frames],
+        }
+
+    def _size(self, index: int) -> tuple[int, int]:
+        width, height = self.cameras.size(index)
+        return height, width

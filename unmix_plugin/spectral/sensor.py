@@ -58,6 +58,8 @@ class Sensor:
     name: str
     responses: SpectraTable
     """A row for each channel; sorted by centre, in whatever order they were given."""
+    column_names: tuple[str, ...] = ()
+    """Of the channels as they were given."""
 
     def __post_init__(self) -> None:
         """Sort the channels.
@@ -80,6 +82,7 @@ class Sensor:
                     f"{centers[one]:g} nm; bands are known by their wavelengths, so leave one of the columns out"
                 )
         names = tuple(table.names[index] for index in order)
+        object.__setattr__(self, "column_names", table.names)
         object.__setattr__(self, "responses", SpectraTable(table.bands, names, table.spectra[order]))
 
     @cached_property

@@ -55,13 +55,20 @@ ReadView = Callable[[int, tuple[slice, ...]], Float32[np.ndarray, "H W B"]]
 
 def check_scene_poses(scene: Scene) -> str | None:
     """A warning if the training views agree much better under another convention than the one expected."""
-    train = list(scene.train_indices)
+    sensors = [scene.frames[index].sensor for index in scene.train_indices]
+    train = [scene.train_indices[row] for row in commonest(sensors)]
     poses = scene.cameras.camera_to_world[train].double().numpy()
     rotations = scene.normalisation.rotation.T @ poses[:, :, :3]
     positions = scene.normalisation.to_world(poses[:, :, 3])
     world = np.concatenate([rotations, positions[:, :, None]], axis=-1)
     lenses = scene.cameras[train]
     return describe(compare_conventions(world, lenses, lambda view, part: scene.cube(train[view], part)))
+
+
+def commonest(sensors: list[int]) -> list[int]:
+    """Which views to compare, given the sensor of each: those of the sensor with most, since bands must agree."""
+    most = max(sensors, key=sensors.count)
+    return [row for row, sensor in enumerate(sensors) if sensor == most]
 
 
 def compare_conventions(poses: Poses, lenses: Cameras, read_view: ReadView) -> dict[str, float]:

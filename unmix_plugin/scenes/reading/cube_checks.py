@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+
+import numpy as np
 
 from unmix_plugin.scenes.reading.arrays import ArrayHeader, UnreadableArrayError, map_array, read_array_header
 from unmix_plugin.scenes.reading.cube_values import (
@@ -13,7 +16,7 @@ from unmix_plugin.scenes.reading.cube_values import (
     propose_scale,
 )
 from unmix_plugin.scenes.reading.faults import Faults
-from unmix_plugin.scenes.reading.transforms_json import SceneEntry
+from unmix_plugin.scenes.reading.transforms_json import FrameEntry, SceneEntry
 from unmix_plugin.scenes.scene import SceneOptions
 
 Size = tuple[int, int]
@@ -21,35 +24,43 @@ Size = tuple[int, int]
 
 
 def check_cube_headers(
-    entry: SceneEntry, located: tuple[dict[str, Path], ...], faults: Faults
-) -> tuple[Size | None, list[ArrayHeader | None]]:
-    """Check shapes and types; returns the size of all images, None if nothing tells it, and the sound headers."""
-    bands = None if entry.wavelengths_nm is None else len(entry.wavelengths_nm)
-    bands_from = "as 'wavelengths' lists"
-    size, size_from = _stated_size(entry, faults), "as 'w' and 'h' say"
+    entry: SceneEntry,
+    located: tuple[dict[str, Path], ...],
+    operators: Sequence[np.ndarray | None],
+    faults: Faults,
+) -> tuple[list[Size | None], list[ArrayHeader | None]]:
+    """Check shapes and types against sizes and sensors.
+
+    Args:
+        operators: Of each frame, (channels, B); None where unknown.
+    Returns:
+        Sizes of the frames' images, None where nothing tells one, and the sound headers.
+    """
+    shared: tuple[Size, str] | None = None
+    bands: tuple[int, str] | None = None
+    sizes: list[Size | None] = []
     headers: list[ArrayHeader | None] = []
-    for frame, paths in zip(entry.frames, located, strict=True):
+    for frame, paths, operator in zip(entry.frames, located, operators, strict=True):
         path = paths.get("hyperspectral_file_path")
         where = frame.name_of("hyperspectral_file_path")
         header = None if path is None else read_header(path, "(H, W, B)", where, faults)
+        expected = _stated_size(frame) or shared
         headers.append(header)
-        if header is None:
-            continue
-        found = header.shape[0], header.shape[1]
-        if size is None:
-            size, size_from = found, f"as {where} has"
-        if bands is None:
-            bands, bands_from = header.shape[2], f"as {where} has"
-        if found != size:
-            faults.add(
-                where,
-                f"the cube has {describe_size(found)} pixels (width x height); "
-                f"expected {describe_size(size)}, {size_from}",
-            )
-            headers[-1] = None
-        if header.shape[2] != bands:
-            faults.add(where, f"the cube has {header.shape[2]} bands; expected {bands}, {bands_from}")
-    return size, headers
+        if header is not None:
+            found = header.shape[0], header.shape[1]
+            if expected is None:
+                expected = shared = found, f"as {where} has"
+            if found != expected[0]:
+                message = f"expected {describe_size(expected[0])}, {expected[1]}"
+                faults.add(where, f"the cube has {describe_size(found)} pixels (width x height); {message}")
+                headers[-1] = None
+            wanted = bands if operator is None else (len(operator), _bands_from(frame))
+            if wanted is None:
+                wanted = bands = header.shape[2], f"as {where} has"
+            if header.shape[2] != wanted[0]:
+                faults.add(where, f"the cube has {header.shape[2]} bands; expected {wanted[0]}, {wanted[1]}")
+        sizes.append(None if expected is None else expected[0])
+    return sizes, headers
 
 
 def check_cube_values(
@@ -181,18 +192,14 @@ def _note_scales(measured: list[tuple[str, CubeValues]], options: SceneOptions, 
         )
 
 
-def _stated_size(entry: SceneEntry, faults: Faults) -> Size | None:
-    stated: Size | None = None
-    for frame in entry.frames:
-        lens = frame.intrinsics
-        if lens is None or lens.width is None or lens.height is None:
-            continue
-        found = (lens.height, lens.width)
-        if stated is None:
-            stated = found
-        elif found != stated:
-            faults.add(
-                frame.where,
-                f"'w' and 'h' say {describe_size(found)}; expected {describe_size(stated)}, one size for all frames",
-            )
-    return stated
+def _stated_size(frame: FrameEntry) -> tuple[Size, str] | None:
+    lens = frame.intrinsics
+    if lens is None or lens.width is None or lens.height is None:
+        return None
+    return (lens.height, lens.width), "as 'w' and 'h' say"
+
+
+def _bands_from(frame: FrameEntry) -> str:
+    if "responses_path" in frame.paths:
+        return "as its responses have"
+    return "as 'wavelengths' lists" if frame.sensor.bands is None else "as its 'bands' list"

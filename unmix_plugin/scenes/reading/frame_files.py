@@ -17,16 +17,21 @@ from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.images import Size
 from unmix_plugin.scenes.reading.picture_checks import check_colours, check_labels, check_masks
 from unmix_plugin.scenes.reading.scene_paths import resolve_path
+from unmix_plugin.scenes.reading.sensors import group_by_sensor, read_operators
 from unmix_plugin.scenes.reading.transforms_json import SceneEntry
 from unmix_plugin.scenes.scene import SceneOptions
+from unmix_plugin.spectral.scene_sensor import SceneSensor
 
 
 @dataclass(frozen=True)
 class CheckedFiles:
     """What the checks found on their way through the files."""
 
-    size: Size
-    """Of every image."""
+    sizes: list[Size]
+    """Of each frame's images."""
+    sensors: tuple[SceneSensor, ...]
+    sensor_indices: tuple[int, ...]
+    """Which sensor took each frame."""
     foreground: tuple[Bool[np.ndarray, "_ _"], ...] | None
     """For each frame the pixels that may show something: not fully transparent, or not to be trusted. None where the
     scene has no alpha."""
@@ -64,28 +69,34 @@ def check_files(
     faults: Faults,
 ) -> CheckedFiles | None:
     """Read and check all files of all frames; None with noted faults if no cube is sound."""
-    size, headers = check_cube_headers(entry, located, faults)
+    entries = [
+        (frame.where, frame.sensor, paths.get("responses_path"))
+        for frame, paths in zip(entry.frames, located, strict=True)
+    ]
+    operators = read_operators(entries, entry.wavelengths_nm, faults)
+    sizes, headers = check_cube_headers(entry, located, operators, faults)
     values = check_cube_values(entry, located, headers, options, faults)
-    seen = check_colours(entry, located, size, faults)
-    masks = check_masks(entry, located, size, faults)
-    check_labels(entry, located, size, num_materials, faults)
-    for frame, paths in zip(entry.frames, located, strict=True):
+    seen = check_colours(entry, located, sizes, faults)
+    masks = check_masks(entry, located, sizes, faults)
+    check_labels(entry, located, sizes, num_materials, faults)
+    for frame, paths, size in zip(entry.frames, located, sizes, strict=True):
         if "abundance_file_path" in paths:
             where = frame.name_of("abundance_file_path")
             check_abundances(paths["abundance_file_path"], size, num_materials, where, faults)
-    if size is None or any(cube is None for cube in values):
-        return None
     cubes = [cube for cube in values if cube is not None]
+    known_sizes = [size for size in sizes if size is not None]
+    known_operators = [operator for operator in operators if operator is not None]
+    if len(cubes) != len(values) or len(known_operators) != len(operators) or not cubes:
+        return None
     foreground = None
     if seen is not None:
-        everything = np.ones(size, bool)
         foreground = tuple(
-            (everything if shown is None else shown)
+            (np.ones(size, bool) if shown is None else shown)
             | (False if cube.invalid is None else cube.invalid)
             | (False if mask is None else ~mask)
-            for shown, cube, mask in zip(seen, cubes, masks, strict=True)
+            for shown, cube, mask, size in zip(seen, cubes, masks, known_sizes, strict=True)
         )
     paths = [paths["hyperspectral_file_path"] for paths in located]
-    return CheckedFiles(
-        size, foreground, {path: cube.sha256 for path, cube in zip(paths, cubes, strict=True)}
-    )
+    sensors, indices = group_by_sensor(entries, known_operators, known_sizes, faults)
+    hashes = {path: cube.sha256 for path, cube in zip(paths, cubes, strict=True)}
+    return CheckedFiles(known_sizes, sensors, indices, foreground, hashes)

@@ -13,12 +13,13 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.geometry.bounds import find_bounds
-from unmix_plugin.scenes.geometry.pose_check import compare_conventions, describe
+from unmix_plugin.scenes.geometry.pose_check import commonest, compare_conventions, describe
 from unmix_plugin.scenes.reading.cube_values import read_cube
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.frame_files import CheckedFiles, check_files, locate_files
 from unmix_plugin.scenes.reading.images import Size
 from unmix_plugin.scenes.reading.scene_paths import resolve_path, sha256_of
+from unmix_plugin.scenes.reading.sensors import check_coverage
 from unmix_plugin.scenes.reading.spectra_files import read_endmembers, read_illuminant
 from unmix_plugin.scenes.reading.splits import Split, split_frames
 from unmix_plugin.scenes.reading.transforms_json import FILE_NAME, SceneEntry, read_transforms
@@ -26,7 +27,7 @@ from unmix_plugin.scenes.scene import Frame, Normalisation, Scene, SceneOptions
 
 SCALE_RANGE = (1e-30, 1e30)
 """Of `value_scale`: what float32 can divide by."""
-MEASURED_KEYS = ("hyperspectral_file_path", "file_path", "mask_path")
+MEASURED_KEYS = ("hyperspectral_file_path", "file_path", "mask_path", "responses_path")
 """Files of a frame that a training reads; the others are the truth, for evaluation only."""
 
 
@@ -52,6 +53,9 @@ def load_scene(root: Path, options: SceneOptions | None = None) -> Scene:
     names = truth.material_names
     checked = check_files(entry, located, None if names is None else len(names), options, faults)
     split = split_frames(entry, options.eval_split, options.eval_interval, faults)
+    if checked is not None and split.train and entry.wavelengths_nm is not None:
+        used = {checked.sensor_indices[index] for index in split.train}
+        check_coverage(checked.sensors, used, entry.wavelengths_nm, faults)
     faults.raise_if_any()
     assert checked is not None
     return _assemble(root, entry, located, checked, truth, split, options)
@@ -118,8 +122,9 @@ def _assemble(
     return Scene(
         root=root,
         wavelengths_nm=entry.wavelengths_nm,
-        frames=_name_frames(entry, located),
-        cameras=_make_cameras(entry, checked.size, normalisation),
+        sensors=checked.sensors,
+        frames=_name_frames(entry, located, checked.sensor_indices),
+        cameras=_make_cameras(entry, checked.sizes, normalisation),
         train_indices=split.train,
         eval_indices=split.evaluation,
         scene_box=scene_box,
@@ -149,17 +154,18 @@ def _find_model_space(
     middle = positions.mean(axis=0)
     radius = float(np.linalg.norm(positions - middle, axis=-1).max())
     first = Normalisation(np.eye(3), -middle, 1.0 / radius if radius > 0.0 else 1.0)
-    cameras = _make_cameras(entry, checked.size, first)[list(train)]
+    cameras = _make_cameras(entry, checked.sizes, first)[list(train)]
     foreground = None if checked.foreground is None else [checked.foreground[index] for index in train]
     try:
         low, high = find_bounds(root, cameras, foreground).aabb.double().numpy()
     except SceneError as error:
         scale, invalid = options.value_scale, options.invalid_pixels
+        alike = commonest([checked.sensor_indices[index] for index in train])
         hint = describe(
             compare_conventions(
-                _world_poses(entry)[list(train)],
-                cameras,
-                lambda view, part: read_cube(cubes[train[view]], scale, invalid, part),
+                _world_poses(entry)[[train[row] for row in alike]],
+                cameras[alike],
+                lambda view, part: read_cube(cubes[train[alike[view]]], scale, invalid, part),
             )
         )
         raise SceneError(f"{error}\n{hint}" if hint else str(error)) from error
@@ -176,29 +182,32 @@ def _world_poses(entry: SceneEntry) -> Float64[np.ndarray, "N 3 4"]:
     return np.stack(poses)
 
 
-def _make_cameras(entry: SceneEntry, size: Size, normalisation: Normalisation) -> Cameras:
-    height, width = size
+def _make_cameras(entry: SceneEntry, sizes: list[Size], normalisation: Normalisation) -> Cameras:
     lenses = [frame.intrinsics for frame in entry.frames if frame.intrinsics is not None]
     assert len(lenses) == len(entry.frames)
     poses = _world_poses(entry)
     rotations = normalisation.rotation @ poses[:, :, :3]
     positions = normalisation.to_model(poses[:, :, 3])
-    middle = (0.5 * width, 0.5 * height)
     centers = [
-        [middle[axis] if value is None else value for axis, value in enumerate(lens.center_px)]
-        for lens in lenses
+        [
+            0.5 * side if value is None else value
+            for value, side in zip(lens.center_px, size[::-1], strict=True)
+        ]
+        for lens, size in zip(lenses, sizes, strict=True)
     ]
-    return Cameras(
+    focal_px = [lens.focal_at(width) for lens, (_, width) in zip(lenses, sizes, strict=True)]
+    return Cameras.of_sizes(
         camera_to_world=torch.from_numpy(np.concatenate([rotations, positions[:, :, None]], axis=-1)).float(),
-        focal_px=torch.tensor([lens.focal_at(width) for lens in lenses], dtype=torch.float32),
+        focal_px=torch.tensor(focal_px, dtype=torch.float32),
         center_px=torch.tensor(centers, dtype=torch.float32),
         distortion=torch.tensor([lens.distortion for lens in lenses], dtype=torch.float32),
-        width=width,
-        height=height,
+        sizes=[(width, height) for height, width in sizes],
     )
 
 
-def _name_frames(entry: SceneEntry, located: tuple[dict[str, Path], ...]) -> tuple[Frame, ...]:
+def _name_frames(
+    entry: SceneEntry, located: tuple[dict[str, Path], ...], sensors: tuple[int, ...]
+) -> tuple[Frame, ...]:
     """Frames with the shortest names that differ: the stem of the cube, its folder before it, or its whole path."""
     paths = [PurePosixPath(frame.paths["hyperspectral_file_path"]).with_suffix("") for frame in entry.frames]
     candidates = (
@@ -216,8 +225,9 @@ def _name_frames(entry: SceneEntry, located: tuple[dict[str, Path], ...]) -> tup
             label_path=files.get("seg_file_path"),
             mask_path=files.get("mask_path"),
             abundance_path=files.get("abundance_file_path"),
+            sensor=sensor,
         )
-        for name, files in zip(names, located, strict=True)
+        for name, files, sensor in zip(names, located, sensors, strict=True)
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ Pictures = list[Bool[np.ndarray, "_ _"] | None]
 
 
 def check_colours(
-    entry: SceneEntry, located: tuple[dict[str, Path], ...], size: Size | None, faults: Faults
+    entry: SceneEntry, located: tuple[dict[str, Path], ...], sizes: Sequence[Size | None], faults: Faults
 ) -> Pictures | None:
     """Check all pictures; returns where each is not fully transparent, or None if the scene has no alpha.
 
@@ -27,7 +27,7 @@ def check_colours(
     seen: Pictures = []
     is_readable = []
     example = None
-    for frame, paths in zip(entry.frames, located, strict=True):
+    for frame, paths, size in zip(entry.frames, located, sizes, strict=True):
         noted = faults.noted
         pixels = _read(frame, paths, "file_path", read_colour, size, faults)
         is_readable.append(faults.noted == noted and ("file_path" in paths) == ("file_path" in frame.paths))
@@ -45,11 +45,11 @@ def check_colours(
 
 
 def check_masks(
-    entry: SceneEntry, located: tuple[dict[str, Path], ...], size: Size | None, faults: Faults
+    entry: SceneEntry, located: tuple[dict[str, Path], ...], sizes: Sequence[Size | None], faults: Faults
 ) -> Pictures:
     """Check all masks; returns which pixels they keep."""
     masks: Pictures = []
-    for frame, paths in zip(entry.frames, located, strict=True):
+    for frame, paths, size in zip(entry.frames, located, sizes, strict=True):
         masks.append(_read(frame, paths, "mask_path", read_mask, size, faults))
         if masks[-1] is not None and not masks[-1].any():
             faults.add(
@@ -62,12 +62,12 @@ def check_masks(
 def check_labels(
     entry: SceneEntry,
     located: tuple[dict[str, Path], ...],
-    size: Size | None,
+    sizes: Sequence[Size | None],
     num_materials: int | None,
     faults: Faults,
 ) -> None:
     """Check the true materials of all frames."""
-    for frame, paths in zip(entry.frames, located, strict=True):
+    for frame, paths, size in zip(entry.frames, located, sizes, strict=True):
         labels = _read(frame, paths, "seg_file_path", read_labels, size, faults)
         greatest = 0 if labels is None else int(labels.max(where=labels != UNLABELLED, initial=0))
         if num_materials is not None and greatest >= num_materials:

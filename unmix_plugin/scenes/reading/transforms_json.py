@@ -18,11 +18,19 @@ from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.intrinsics import Intrinsics, read_intrinsics
 from unmix_plugin.scenes.reading.json_values import UnreadableJsonError, describe, read_json_file, read_number
 from unmix_plugin.scenes.reading.poses import read_pose
+from unmix_plugin.scenes.reading.sensors import SensorEntry, read_sensor_entry
 from unmix_plugin.spectral.bands import require_nanometres
 
 FILE_NAME = "transforms.json"
 SPLIT_KEYS = ("train_filenames", "val_filenames", "test_filenames")
-FILE_KEYS = ("file_path", "hyperspectral_file_path", "seg_file_path", "mask_path", "abundance_file_path")
+FILE_KEYS = (
+    "file_path",
+    "hyperspectral_file_path",
+    "seg_file_path",
+    "mask_path",
+    "abundance_file_path",
+    "responses_path",
+)
 
 
 @dataclass(frozen=True)
@@ -37,6 +45,8 @@ class FrameEntry:
     """Camera to world, rotation orthonormal."""
     intrinsics: Intrinsics | None
     """Lens of this frame."""
+    sensor: SensorEntry = SensorEntry()
+    """What it was taken with."""
 
     def name_of(self, key: str) -> str:
         """One of its files, for messages."""
@@ -125,6 +135,7 @@ def _read_frame(content: dict[str, Any], frame: Any, index: int, faults: Faults)
         paths={key: path for key, path in paths.items() if path is not None},
         pose=read_pose(frame.get("transform_matrix"), where, faults),
         intrinsics=read_intrinsics(content, frame, where, faults),
+        sensor=read_sensor_entry(frame, where, faults),
     )
 
 

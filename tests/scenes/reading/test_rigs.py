@@ -1,0 +1,108 @@
+"""Scenes whose frames differ in bands and size."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tests.scenes.rig_factory import RESPONSES, halve, make_rig
+from tests.scenes.scene_factory import fault_of, make_scene, set_frame
+from unmix_plugin.scenes import load_scene
+from unmix_plugin.scenes.identity import scene_identity
+from unmix_plugin.scenes.recorded_scene import check_recorded_scene
+from unmix_plugin.spectral.scene_sensor import SceneSensor
+
+
+def test_frames_have_the_size_and_bands_of_their_sensor(tmp_path):
+    scene = load_scene(make_rig(tmp_path / "rig").root)
+    assert scene.is_rig
+    assert [frame.sensor for frame in scene.frames] == [0, 0, 0, 1, 1, 2]
+    assert [sensor.name for sensor in scene.sensors] == ["4-bands-20x16", "small", "2-bands-20x16"]
+    assert [sensor.bands for sensor in scene.sensors] == [(0, 1, 2, 3), (2, 0), None]
+    assert [scene.cube(index).shape for index in (0, 3, 5)] == [(16, 20, 4), (8, 10, 2), (16, 20, 2)]
+    for index in (0, 3, 5):
+        alpha, labels, abundances = scene.alpha(index), scene.labels(index), scene.abundances(index)
+        assert alpha is not None
+        assert labels is not None
+        assert abundances is not None
+        assert alpha.shape == labels.shape == abundances.shape[:2] == scene.valid_mask(index).shape
+        assert alpha.shape == scene.cube(index).shape[:2]
+    assert [scene.cameras.size(index) for index in (0, 3)] == [(20, 16), (10, 8)]
+
+
+def test_channels_of_responses_are_weighted_means_in_the_order_of_the_columns(tmp_path):
+    matrix = load_scene(make_rig(tmp_path / "rig").root).sensors[2].matrix
+    np.testing.assert_allclose(matrix.sum(axis=1), 1.0)
+    red, blue = matrix  # of bands at 450, 520, 600 and 680 nm
+    assert red.argmax() == 2
+    assert blue.argmax() == 1
+    assert red[3] == blue[3] == 0 < blue[0]
+
+
+def test_one_ordinary_camera_is_no_rig_and_leaves_no_trace_in_records(tmp_path):
+    scene = load_scene(make_scene(tmp_path / "scene").root)
+    assert not scene.is_rig
+    assert not {"sensors", "frame_sensors"} & scene.summary().keys()
+
+
+def test_frames_of_two_sizes_and_equal_bands_are_two_sensors(tmp_path):
+    folder = make_scene(tmp_path / "scene")
+    halve(folder, 2)
+    scene = load_scene(folder.root)
+    assert [frame.sensor for frame in scene.frames] == [0, 0, 1, 0, 0, 0]
+    assert all(sensor.sees_all_bands for sensor in scene.sensors)
+    assert scene.is_rig
+
+
+def test_a_record_of_a_rig_keeps_its_sensors_and_other_bands_are_another_scene(tmp_path):
+    folder = make_rig(tmp_path / "rig")
+    first = json.loads(json.dumps(load_scene(folder.root).summary()))
+    check_recorded_scene(first)
+    again = [SceneSensor.from_json(values, 4) for values in first["sensors"]]
+    for sensor, other in zip(load_scene(folder.root).sensors, again, strict=True):
+        assert sensor.name == other.name
+        np.testing.assert_array_equal(sensor.matrix, other.matrix)
+    for index in (3, 4):
+        folder.edit(set_frame(index, bands=[0, 2]))
+    assert scene_identity(load_scene(folder.root).summary()) != scene_identity(first)
+
+
+def test_responses_are_among_the_files_that_make_a_scene_the_same(tmp_path):
+    folder = make_rig(tmp_path / "rig")
+    assert "colours.csv" in load_scene(folder.root).input_hashes
+
+
+@pytest.mark.parametrize(
+    ("frame", "values", "message"),
+    [
+        (3, {"bands": []}, "'bands' is a list of 0; expected indices into 'wavelengths'"),
+        (3, {"bands": "all"}, "'bands' is \"all\"; expected indices into 'wavelengths'"),
+        (3, {"bands": [0, True]}, "'bands' is a list of 2; expected indices into 'wavelengths'"),
+        (3, {"bands": [1, 1]}, "'bands' repeats 1; expected each band once"),
+        (3, {"bands": [1, 4]}, "'bands' has 4; expected 0 to 3, indices into 'wavelengths'"),
+        (3, {"bands": [0, 1, 2]}, "the cube has 2 bands; expected 3, as its 'bands' list"),
+        (3, {"responses_path": "colours.csv"}, "has 'bands' and 'responses_path'"),
+        (5, {"responses_path": "none.csv"}, "'none.csv' is missing"),
+        (3, {"sensor": 3}, "'sensor' is 3; expected a name"),
+        (2, {"sensor": "small"}, "has 10 x 8 pixels, others of sensor 'small' 20 x 16; name it otherwise"),
+        (4, {"bands": [2, 1]}, "has other bands than others of sensor 'small'; name it otherwise"),
+    ],
+)
+def test_what_is_wrong_with_a_sensor_is_said(tmp_path, frame, values, message):
+    assert message in fault_of(make_rig(tmp_path / "rig").edit(set_frame(frame, **values)))
+
+
+def test_responses_beyond_the_bands_are_refused(tmp_path):
+    folder = make_rig(tmp_path / "rig")
+    (folder.root / "colours.csv").write_text(RESPONSES + "900,1,0\n", encoding="utf-8")
+    fault = fault_of(folder)
+    assert "left out red" in fault
+    assert "'wavelengths' must cover all channels" in fault
+
+
+def test_bands_that_no_training_frame_sees_are_refused(tmp_path):
+    folder = make_rig(tmp_path / "rig")
+    for index in (1, 2):
+        folder.edit_cube(index, lambda cube: cube[..., :3]).edit(set_frame(index, bands=[0, 1, 2]))
+    folder.edit(lambda content: content.update(train_filenames=["images/view_1.png", "images/view_2.png"]))
+    assert "no training frame sees the bands at 680 nm" in fault_of(folder)

@@ -1,0 +1,124 @@
+"""The pixels of one sensor in memory, as small as they were stored.
+
+Cubes of 8 or 16 bits stay as they are in their files and become float32 when pixels are drawn: half or a quarter of the
+memory for the same numbers. Cubes of other types are kept as float32.
+
+Notation: `b` channels of the sensor, `R` drawn pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from unmix_plugin.scenes.scene import Scene
+
+COMPACT_TYPES = ("f2", "u1", "i1", "i2", "u2")
+"""Of NumPy, at most half as large as float32."""
+
+
+@dataclass(frozen=True)
+class DrawnPixels:
+    """Pixels of one sensor."""
+
+    sensor: int
+    """Which of the scene's."""
+    numbers: Int[Tensor, " R"]
+    """Of the pixels in the table, each its own."""
+    cameras: Int[Tensor, " R"]
+    """Which of the table's views each is of."""
+    corners: Int[Tensor, "R 2"]
+    """Column and row."""
+    spectra: Float[Tensor, "R b"]
+    """What the sensor measured, [0, 1]."""
+    alpha: Float[Tensor, " R"]
+    """Opacity in [0, 1]; 1 where the scene has no alpha."""
+
+
+class PixelBlock:
+    """All pixels of some views of one sensor, view after view, row after row. Nothing is read before `read`."""
+
+    alpha: Float[Tensor, " pixels"]
+    valid: Bool[Tensor, " pixels"]
+    """Pixels that count, on the CPU."""
+
+    def __init__(self, scene: Scene, views: tuple[int, ...], cameras: tuple[int, ...]) -> None:
+        """
+        Args:
+            views: Frames of the scene, all of one sensor.
+            cameras: Which view of the table each is.
+        """
+        self.sensor = scene.frames[views[0]].sensor
+        self._scene, self._views, self._cameras = scene, views, cameras
+        self._width, self._height = scene.cameras.size(views[0])
+        types = {scene.stored_type(view) for view in views}
+        kind = types.pop() if len(types) == 1 else "f4"
+        self._is_compact = kind in COMPACT_TYPES
+        self._is_unsigned = kind == "u2"  # PyTorch can't index these, but the same bits as int16
+        self._kept = np.dtype("i2" if self._is_unsigned else kind if self._is_compact else "f4")
+        self._num_channels = scene.sensors[self.sensor].num_channels
+
+    def __len__(self) -> int:
+        return len(self._views) * self._width * self._height
+
+    @property
+    def value_bytes(self) -> int:
+        """Bytes of a number."""
+        return self._kept.itemsize
+
+    @property
+    def num_bytes(self) -> int:
+        """Memory that the pixels take."""
+        return len(self) * (self._num_channels * self.value_bytes + 5)
+
+    @property
+    def description(self) -> str:
+        """What makes it so large."""
+        return (
+            f"{len(self._views)} views x {self._height} x {self._width} pixels x {self._num_channels} bands x "
+            f"{self.value_bytes} bytes"
+        )
+
+    def read(self, device: torch.device) -> None:
+        """Read the pixels to a device."""
+        scene, num_pixels = self._scene, self._width * self._height
+        shape = (len(self._views), num_pixels)
+        blank = torch.from_numpy(np.empty(0, self._kept))
+        values = torch.empty(*shape, self._num_channels, dtype=blank.dtype, device=device)
+        alpha, valid = torch.ones(shape, device=device), torch.empty(shape, dtype=torch.bool)
+        for row, view in enumerate(self._views):
+            cube = scene.stored_cube(view) if self._is_compact else scene.cube(view)
+            values[row] = torch.from_numpy(cube.reshape(num_pixels, -1).view(self._kept))
+            valid[row] = torch.from_numpy(scene.valid_mask(view)).flatten()
+            opacity = scene.alpha(view)
+            if opacity is not None:
+                alpha[row] = torch.from_numpy(opacity).flatten()
+        self._values, self.alpha, self.valid = values.flatten(0, 1), alpha.flatten(), valid.flatten()
+        self._camera_of = torch.tensor(self._cameras, device=device)
+
+    def spectra(self, pixels: Int[Tensor, " R"]) -> Float[Tensor, "R b"]:
+        """Spectra of some pixels in [0, 1], the numbers of `Scene.cube`; only of valid ones."""
+        values = self._values[pixels]
+        if not self._is_compact:
+            return values
+        if self._is_unsigned:
+            values = values.to(torch.int32) & 0xFFFF
+        values, scale = values.float(), self._scene.options.value_scale
+        return (values if scale is None else values / scale).clamp(0.0, 1.0)
+
+    def take(self, pixels: Int[Tensor, " R"], first: int) -> DrawnPixels:
+        """Some pixels by their index in the block, on any device; `first` is the number of the block's first."""
+        pixels = pixels.to(self.alpha.device)
+        within = pixels % (self._width * self._height)
+        return DrawnPixels(
+            self.sensor,
+            pixels + first,
+            self._camera_of[pixels // (self._width * self._height)],
+            torch.stack([within % self._width, within // self._width], dim=-1),
+            self.spectra(pixels),
+            self.alpha[pixels],
+        )

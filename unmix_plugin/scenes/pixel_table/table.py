@@ -1,0 +1,79 @@
+"""All pixels of some views, drawn evenly from the valid ones: of each sensor a block, one after the other."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from itertools import accumulate
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from unmix_plugin.engine.training.seeding import step_generator
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.scenes.pixel_table import memory
+from unmix_plugin.scenes.pixel_table.block import DrawnPixels, PixelBlock
+from unmix_plugin.scenes.scene import Scene
+
+OPAQUE_ALPHA = 0.99
+
+
+class PixelTable:
+    """What training draws from; a draw is a function of its generator alone."""
+
+    def __init__(self, scene: Scene, device: torch.device, views: tuple[int, ...]) -> None:
+        """Read the pixels.
+
+        Raises:
+            ConfigError: they don't fit in the memory of the device (nothing was read), or none is valid.
+        """
+        cameras_of: dict[int, list[int]] = {}
+        for camera, view in enumerate(views):
+            cameras_of.setdefault(scene.frames[view].sensor, []).append(camera)
+        self._blocks = tuple(
+            PixelBlock(scene, tuple(views[camera] for camera in cameras), tuple(cameras))
+            for _, cameras in sorted(cameras_of.items())
+        )
+        memory.require_memory(self._blocks, device)
+        for block in self._blocks:
+            block.read(device)
+        self._firsts = list(accumulate((len(block) for block in self._blocks), initial=0))
+        valid = torch.cat([block.valid for block in self._blocks])
+        self._valid = None if bool(valid.all()) else valid.nonzero()[:, 0]
+        if self._valid is not None and len(self._valid) == 0:
+            raise ConfigError("no valid pixel is left in the training views: masks leave out every one")
+
+    def __len__(self) -> int:
+        return self._firsts[-1]
+
+    @cached_property
+    def shares(self) -> dict[int, float]:
+        """Of each sensor the share of the valid pixels."""
+        counts = {block.sensor: int(block.valid.sum()) for block in self._blocks}
+        return {sensor: count / sum(counts.values()) for sensor, count in counts.items()}
+
+    def draw(self, count: int, generator: torch.Generator) -> tuple[DrawnPixels, ...]:
+        """Random valid pixels, in one group for each sensor that some of them are of."""
+        pool = len(self) if self._valid is None else len(self._valid)
+        drawn = torch.randint(pool, (count,), generator=generator)
+        chosen = drawn if self._valid is None else self._valid[drawn]
+        if len(self._blocks) == 1:
+            return (self._blocks[0].take(chosen, 0),)
+        chosen = chosen.sort().values
+        bounds = torch.searchsorted(chosen, torch.tensor(self._firsts)).tolist()
+        return tuple(
+            block.take(chosen[start:end] - first, first)
+            for block, first, start, end in zip(self._blocks, self._firsts, bounds, bounds[1:], strict=False)
+            if end > start
+        )
+
+    def sample_opaque(self, sensor: int, count: int, seed: int) -> Float[np.ndarray, "pixels b"]:
+        """Spectra of at most `count` random valid pixels of a sensor that are opaque."""
+        block = next(block for block in self._blocks if block.sensor == sensor)
+        pool: Int[Tensor, " pool"] = (
+            torch.arange(len(block)) if self._valid is None else block.valid.nonzero()[:, 0]
+        )
+        opaque = pool[block.alpha.cpu()[pool] > OPAQUE_ALPHA]
+        chosen = opaque[torch.randperm(len(opaque), generator=step_generator(seed, 0))[:count]]
+        return block.spectra(chosen.to(block.alpha.device)).cpu().numpy()

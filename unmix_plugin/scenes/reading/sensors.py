@@ -1,0 +1,166 @@
+"""Which sensor took a frame: its bands or responses in transforms.json, and frames grouped by sensor.
+
+Notation: `B` bands of the scene, `b` channels of a frame's cube.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from unmix_plugin.errors import SpectrumError
+from unmix_plugin.scenes.reading.faults import Faults
+from unmix_plugin.scenes.reading.images import Size
+from unmix_plugin.scenes.reading.json_values import describe
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.scene_sensor import SceneSensor
+from unmix_plugin.spectral.sensor import read_sensor
+
+
+@dataclass(frozen=True)
+class SensorEntry:
+    """What a frame says of its sensor; None where it is silent."""
+
+    name: str | None = None
+    bands: tuple[int, ...] | None = None
+    """Bands of the scene, one a channel, in the order of the channels."""
+
+
+def read_sensor_entry(frame: dict[str, Any], where: str, faults: Faults) -> SensorEntry:
+    """The keys `sensor` and `bands` of a frame; whether the bands exist is asked later."""
+    name, bands = frame.get("sensor"), frame.get("bands")
+    if name is not None and (not isinstance(name, str) or not name.strip()):
+        faults.add(where, f"'sensor' is {describe(name)}; expected a name")
+        name = None
+    if bands is None:
+        return SensorEntry(name)
+    if frame.get("responses_path") is not None:
+        faults.add(where, "has 'bands' and 'responses_path'; a sensor has one of them, drop the other")
+    if not isinstance(bands, list) or not bands or not all(type(band) is int for band in bands):
+        faults.add(where, f"'bands' is {describe(bands)}; expected indices into 'wavelengths', one a channel")
+        return SensorEntry(name)
+    repeated = sorted({band for band in bands if bands.count(band) > 1})
+    if repeated:
+        faults.add(where, f"'bands' repeats {', '.join(map(str, repeated))}; expected each band once")
+    return SensorEntry(name, tuple(bands))
+
+
+def read_operators(
+    entries: list[tuple[str, SensorEntry, Path | None]],
+    wavelengths_nm: Float64[np.ndarray, " B"] | None,
+    faults: Faults,
+) -> list[Float64[np.ndarray, "_ _"] | None]:
+    """The operator of each frame, as `SceneSensor.matrix`; None where it can't be told.
+
+    Args:
+        entries: For each frame how messages call it, its entry and its table of responses.
+        wavelengths_nm: Of the scene; None where they are faulty.
+    """
+    if wavelengths_nm is None:
+        return [None] * len(entries)
+    tables: dict[Path, Float64[np.ndarray, "_ _"] | None] = {}
+    operators: list[Float64[np.ndarray, "_ _"] | None] = []
+    for where, entry, path in entries:
+        if path is not None:
+            if path not in tables:
+                tables[path] = _read_responses(path, Bands(wavelengths_nm), where, faults)
+            operators.append(tables[path])
+        else:
+            operators.append(_rows_of(entry.bands, len(wavelengths_nm), where, faults))
+    return operators
+
+
+def group_by_sensor(
+    entries: list[tuple[str, SensorEntry, Path | None]],
+    operators: list[Float64[np.ndarray, "_ _"]],
+    sizes: list[Size],
+    faults: Faults,
+) -> tuple[tuple[SceneSensor, ...], tuple[int, ...]]:
+    """The sensors in the order in which they appear, and the index of each frame's.
+
+    Frames without a name are of one sensor if their bands and sizes are the same.
+    """
+    known: dict[str | tuple[bytes, Size], tuple[int, bytes, Size]] = {}
+    sensors: list[SceneSensor] = []
+    indices = []
+    for (where, entry, _), matrix, size in zip(entries, operators, sizes, strict=True):
+        key = (matrix.tobytes(), size) if entry.name is None else entry.name
+        if key not in known:
+            known[key] = (len(sensors), matrix.tobytes(), size)
+            sensors.append(SceneSensor(entry.name or _new_name(matrix, size, sensors), matrix))
+        index, first_matrix, first_size = known[key]
+        if first_size != size:
+            found, expected = (f"{wide} x {high}" for high, wide in (size, first_size))
+            faults.add(
+                where, f"has {found} pixels, others of sensor {entry.name!r} {expected}; name it otherwise"
+            )
+        elif first_matrix != matrix.tobytes():
+            faults.add(where, f"has other bands than others of sensor {entry.name!r}; name it otherwise")
+        indices.append(index)
+    return tuple(sensors), tuple(indices)
+
+
+def check_coverage(
+    sensors: tuple[SceneSensor, ...],
+    train_sensors: set[int],
+    wavelengths_nm: Float64[np.ndarray, " B"],
+    faults: Faults,
+) -> None:
+    """Refuse bands of the scene that no training frame sees: nothing could be learnt of them."""
+    seen = np.any([sensors[index].seen_bands for index in sorted(train_sensors)], axis=0)
+    if not seen.all():
+        missing = ", ".join(f"{nm:g}" for nm in wavelengths_nm[~seen])
+        faults.add("'wavelengths'", f"no training frame sees the bands at {missing} nm; leave them out")
+
+
+def lonely_sensors(sensors: tuple[SceneSensor, ...], train_sensors: set[int]) -> list[str]:
+    """Names of sensors of the training frames whose bands no other sensor of them sees."""
+    used = sorted(train_sensors)
+    return [
+        sensors[index].name
+        for index in used
+        if len(used) > 1
+        and not any(
+            (sensors[index].seen_bands & sensors[other].seen_bands).any() for other in used if other != index
+        )
+    ]
+
+
+def _rows_of(
+    bands: tuple[int, ...] | None, num_bands: int, where: str, faults: Faults
+) -> Float64[np.ndarray, "_ _"] | None:
+    if bands is None:
+        return np.eye(num_bands)
+    if not all(0 <= band < num_bands for band in bands):
+        found = next(band for band in bands if not 0 <= band < num_bands)
+        faults.add(where, f"'bands' has {found}; expected 0 to {num_bands - 1}, indices into 'wavelengths'")
+        return None
+    return np.eye(num_bands)[list(bands)]
+
+
+def _read_responses(
+    path: Path, bands: Bands, where: str, faults: Faults
+) -> Float64[np.ndarray, "_ _"] | None:
+    """Channels in the order of the table's columns; one that reaches beyond the bands is a fault."""
+    try:
+        sensor = read_sensor(path)
+        seen = sensor.seen_by(bands)
+    except SpectrumError as error:
+        faults.add(where, str(error))
+        return None
+    if seen.notes:
+        faults.add(where, f"{path}: " + "; ".join(seen.notes) + "; 'wavelengths' must cover all channels")
+        return None
+    columns = [seen.names.index(name) for name in sensor.column_names]
+    return np.ascontiguousarray(seen.matrix.T[columns])
+
+
+def _new_name(matrix: Float64[np.ndarray, "_ _"], size: Size, sensors: list[SceneSensor]) -> str:
+    """Such as `12-bands-24x24`, with a number behind it where another sensor has that name."""
+    name = f"{len(matrix)}-band{'s' * (len(matrix) > 1)}-{size[1]}x{size[0]}"
+    names = {sensor.name for sensor in sensors}
+    return next(n for n in (name, *(f"{name}-{i}" for i in range(2, len(sensors) + 3))) if n not in names)

@@ -1,0 +1,72 @@
+"""What the sensors of a rig see of spectra on all bands, on the model's device.
+
+Notation: `B` bands of the scene, `b` channels of a sensor, `K` endmembers. A sensor None is a scene's only, ordinary
+camera, which sees spectra as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, SupportsInt
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from unmix_plugin.spectral.scene_sensor import SceneSensor
+
+_FEWEST_CHANNELS = 3
+"""Of a sensor whose spectra tell materials apart."""
+
+
+class SensorViews(nn.Module):
+    """Operators of a scene's sensors; false where it has one ordinary camera."""
+
+    def __init__(self, sensors: Sequence[Mapping[str, Any]], rgb_weights: Float[Tensor, "B 3"]) -> None:
+        """
+        Args:
+            sensors: As `SceneSensor.to_json` gives them.
+            rgb_weights: From a spectrum on all bands to linear sRGB.
+        """
+        super().__init__()
+        self._names = [f"matrix_{index}" for index in range(len(sensors))]
+        for index, values in enumerate(sensors):
+            sensor = SceneSensor.from_json(values, len(rgb_weights))
+            matrix = torch.from_numpy(sensor.matrix).float()
+            colours = rgb_weights if sensor.sees_all_bands else _false_colours(len(matrix))
+            self.register_buffer(f"matrix_{index}", matrix, persistent=False)
+            self.register_buffer(f"colours_{index}", colours.clone(), persistent=False)
+        self.register_buffer("plain_colours", rgb_weights.clone(), persistent=False)
+
+    def __bool__(self) -> bool:
+        return bool(self._names)
+
+    def matrix(self, sensor: SupportsInt) -> Float[Tensor, "b B"]:
+        """Operator of a sensor."""
+        return self.get_buffer(self._names[int(sensor)])
+
+    def num_channels(self, sensor: int) -> int:
+        """b."""
+        return len(self.matrix(sensor))
+
+    def project(
+        self, spectra: Float[Tensor, "*rows B"], sensor: SupportsInt | None
+    ) -> Float[Tensor, "*rows b"]:
+        """Spectra as a sensor sees them."""
+        return spectra if sensor is None else spectra @ self.matrix(sensor).T.to(spectra)
+
+    def rgb_weights(self, sensor: int | None) -> Float[Tensor, "b 3"]:
+        """From channels to colours: sRGB where all bands are seen, else false colours."""
+        return self.get_buffer("plain_colours" if sensor is None else f"colours_{sensor}")
+
+    def tells_materials(self, sensor: SupportsInt | None, num_endmembers: int) -> bool:
+        """Whether a pixel alone can be unmixed: it has as many channels as there are endmembers, and at least 3."""
+        return sensor is None or self.num_channels(int(sensor)) >= max(num_endmembers, _FEWEST_CHANNELS)
+
+
+def _false_colours(num_channels: int) -> Float[Tensor, "b 3"]:
+    """Each colour the mean of a third of the channels, or of the nearest one."""
+    middles = (torch.arange(3) + 0.5) / 3 * num_channels - 0.5
+    distances = (torch.arange(num_channels)[:, None] - middles).abs()
+    near = distances <= distances.min(dim=0).values.clamp(min=num_channels / 6)
+    return near / near.sum(dim=0)
