@@ -159,7 +159,7 @@ class Scene:
     @property
     def is_rig(self) -> bool:
         """Whether frames differ in bands or size, or don't have the scene's bands in their order."""
-        return len(self.sensors) > 1 or not self.sensors[0].sees_all_bands
+        return [sensor.sees_all_bands for sensor in self.sensors] != [True]
 
     def sensor_of(self, index: int) -> SceneSensor:
         """What took a view."""

@@ -47,7 +47,7 @@ class SceneSensor:
     @property
     def seen_bands(self) -> Bool[np.ndarray, " B"]:
         """Bands that some channel responds to."""
-        return (self.matrix > 0).any(axis=0)
+        return np.any(self.matrix > 0, axis=0)
 
     def to_json(self) -> dict[str, Any]:
         """Name, and bands or responses; `from_json` gives back the same bits."""
