@@ -19,6 +19,7 @@ import safetensors.torch
 import torch
 from PIL import Image
 
+from tests.fuzz.capture_samples import ENVI_DATA, SAMPLES, read_capture
 from tests.fuzz.mutation import Mutator, mutate_bytes, mutate_json, mutate_png
 from tests.scenes.scene_factory import look_at
 from unmix_plugin.datamanager import HyperspectralDataManager
@@ -33,7 +34,7 @@ from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.runs.scene_record import read_scene_record
 from unmix_plugin.engine.training.training_state import TrainingRecord
 from unmix_plugin.engine.training.writers import _keep_until
-from unmix_plugin.errors import ConfigError, RunError, SceneError, SpectrumError
+from unmix_plugin.errors import CaptureError, ConfigError, RunError, SceneError, SpectrumError
 from unmix_plugin.scenes.reading.arrays import UnreadableArrayError, read_array_header
 from unmix_plugin.scenes.reading.cube_values import measure_cube
 from unmix_plugin.scenes.reading.faults import Faults
@@ -407,6 +408,11 @@ def _read_recipe(path: Path) -> None:
     assert recipe_from_yaml(written, folder=path.parent) == recipe
 
 
+def _capture(file_name: str) -> Reader:
+    beside = (("cube", ENVI_DATA),) if file_name == "cube.hdr" else ()
+    return Reader(SAMPLES[file_name](), file_name, read_capture, (CaptureError,), companions=beside)
+
+
 READERS: dict[str, Callable[[], Reader]] = {
     "transforms.json": _transforms,
     "cube (.npy)": _cube,
@@ -423,5 +429,6 @@ READERS: dict[str, Callable[[], Reader]] = {
     "checkpoint tensors": _checkpoint_tensors,
     "run metrics": _metrics,
     "recipe": _recipe,
+    **{f"capture {file_name}": partial(_capture, file_name) for file_name in SAMPLES},
 }
 """By name, for messages and tables."""

@@ -124,6 +124,8 @@ def _plain_bands(bands: BandIndex, num_bands: int) -> BandIndex:
 def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
     """Files of one view that hold some bands each, as one file with all of them, in the order given.
 
+    A scale, a no-data value and metadata are those that all parts share.
+
     Args:
         parts: At least one, all of one size.
         path: What the whole is called in messages: the folder that holds them.
@@ -151,6 +153,9 @@ def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
         dtype=np.result_type(*(part.dtype for part in parts)),
         read_part=read_part,
         bands=_stack_tables([(part.bands, part.shape[2]) for part in parts]),
+        scale=_common([part.scale for part in parts]),
+        no_data=_common([part.no_data for part in parts]),
+        metadata=_stack_metadata(parts),
         notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
         sources=tuple(source for part in parts for source in part.files),
     )
@@ -171,6 +176,19 @@ def _stack_tables(tables: list[tuple[BandTable, int]]) -> BandTable:
         np.concatenate(marks) if any(table.bad is not None for table, _ in tables) else None,
         tuple(name for table, _ in tables for name in table.names or ()) if _all_named(tables) else None,
     )
+
+
+def _common(values: list[float | None]) -> float | None:
+    """The value that all share; None if they differ."""
+    return values[0] if len({repr(value) for value in values}) == 1 else None
+
+
+def _stack_metadata(parts: list[SpectralFile]) -> dict[str, Any]:
+    """Entries that are the same in all parts; if any differ, `parts` lists what each part has of its own."""
+    first = parts[0].metadata
+    same = {key for key in first if all(repr(part.metadata.get(key)) == repr(first[key]) for part in parts)}
+    own = [{key: value for key, value in part.metadata.items() if key not in same} for part in parts]
+    return {key: first[key] for key in same} | ({"parts": own} if any(own) else {})
 
 
 def _all_named(tables: list[tuple[BandTable, int]]) -> bool:

@@ -97,3 +97,13 @@ def test_files_that_are_cut_short_are_refused(tmp_path):
         (tmp_path / "b.exr").write_bytes(data[:length])
         with pytest.raises(CaptureError, match=r"b\.exr"):
             open_spectral_file(tmp_path / "b.exr").read()
+
+
+def test_damaged_numbers_are_reported_in_the_error_alone(tmp_path, capsys):
+    write(tmp_path / "a.exr", ["S0.450,0nm", "S0.460,0nm"])
+    data = bytearray((tmp_path / "a.exr").read_bytes())
+    data[-200:-190] = bytes(10)  # the head of the only chunk
+    (tmp_path / "a.exr").write_bytes(data)
+    with pytest.raises(CaptureError, match=r"a\.exr: damaged: "):
+        open_spectral_file(tmp_path / "a.exr").read()
+    assert capsys.readouterr().out == ""

@@ -5,7 +5,9 @@ Notation: `H` rows, `W` columns, `B` bands.
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,7 @@ from unmix_plugin.errors import CaptureError
 
 _HEADER_BYTES = 2**20
 _ALPHA = ("A", "alpha")
+_OF_ALL_FILES = ("pixelAspectRatio", "screenWindowWidth")
 _COLOURS = ("R", "G", "B")
 _LAYERS = ("S0", "T", "")
 """Which of several layers is taken: radiance, reflectance, any other."""
@@ -102,17 +105,27 @@ def _choose(path: Path, channels: Sequence[ExrChannel], wanted: str | None) -> _
 
 
 def _header(path: Path) -> dict[str, Any]:
-    import OpenEXR
-
-    return OpenEXR.File(str(path), separate_channels=True, header_only=True).header()
+    return _opened(path, header_only=True).header()
 
 
 def _load(path: Path, names: tuple[str, ...]) -> np.ndarray:
     """Channels (B, H, W), each in its own piece of memory."""
+    found = _opened(path).channels()
+    return np.stack([found[name].pixels for name in names])
+
+
+def _opened(path: Path, **options: bool) -> Any:
+    """What the OpenEXR library reads; it prints what is damaged and goes on without it."""
     import OpenEXR
 
-    found = OpenEXR.File(str(path), separate_channels=True).channels()
-    return np.stack([found[name].pixels for name in names])
+    printed = io.StringIO()
+    with redirect_stdout(printed):
+        file = OpenEXR.File(str(path), separate_channels=True, **options)
+    if printed.getvalue():
+        raise CaptureError(
+            f"{path}: damaged: {printed.getvalue().rpartition(' - ')[2].strip()}; copy the file again"
+        )
+    return file
 
 
 def _window_notes(header: dict[str, Any]) -> tuple[str, ...]:
@@ -123,4 +136,8 @@ def _window_notes(header: dict[str, Any]) -> tuple[str, ...]:
 
 def _attributes(header: dict[str, Any]) -> dict[str, Any]:
     """Attributes that are text or numbers."""
-    return {name: value for name, value in header.items() if isinstance(value, str | int | float)}
+    return {
+        name: value
+        for name, value in header.items()
+        if isinstance(value, str | int | float) and name not in _OF_ALL_FILES
+    }

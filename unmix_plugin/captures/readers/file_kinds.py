@@ -22,7 +22,7 @@ _BEGINNINGS = {
     b"\x89PNG\r\n\x1a\n": "picture",
     b"\xff\xd8\xff": "picture",
 }
-_SUFFIXES = {".hdr": "envi", ".mat": "matlab", ".pt": "torch", ".pth": "torch"}
+_SUFFIXES = {".hdr": "envi", ".pt": "torch", ".pth": "torch"}
 """Kinds that their first bytes don't tell, or that are refused with a better reason by their reader."""
 _LFS_POINTER = b"version https://git-lfs"
 _REFUSED = {

@@ -47,6 +47,8 @@ def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
     metadata: dict[str, Any] = {"xmp": xmp} if xmp else {}
     if num_bands == 3 and dtype.itemsize == 1 and bands.wavelengths_nm is None:
         metadata["encoding"] = "sRGB"
+    if alpha:
+        metadata["has_alpha"] = True
     return SpectralFile(
         path=path,
         reader="picture",

@@ -12,6 +12,7 @@ from unmix_plugin.captures.spectral_file import BandTable
 
 _PLAUSIBLE_NM = (100.0, 30_000.0)
 """Range of cameras, from the far ultraviolet to the thermal infrared."""
+_UNUSABLE = "the file gives no wavelengths that can be used, see the notes"
 _ASK = "give the wavelengths yourself"
 
 
@@ -35,6 +36,7 @@ def check_bands(stated: StatedBands, num_bands: int) -> tuple[BandTable, tuple[s
     names = _fitting("names of bands", stated.names, num_bands, notes)
     centres, evidence, factor = None, BandTable.evidence, None
     if stated.centres is not None:
+        evidence = _UNUSABLE
         numbers = _numbers(f"{stated.where}: wavelengths", stated.centres, num_bands, notes)
         if numbers is not None:
             centres, evidence, factor = _in_nm(numbers, stated, notes)
@@ -76,7 +78,7 @@ def _in_nm(
         notes.append(f"{stated.where}: {low:g} to {high:g} can't be in {unit}; {_ASK}")
     else:
         return values * factor, evidence, factor
-    return None, BandTable.evidence, None
+    return None, _UNUSABLE, None
 
 
 def _is_plausible(low_nm: float, high_nm: float) -> bool:

@@ -77,7 +77,7 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
         scale=scale,
         no_data=no_data,
         notes=stack.notes + axis_notes + band_notes + scale_notes + tuple(messages[:3]),
-        metadata={name: value for name, value in tags.items() if value},
+        metadata={name: value for name, value in tags.items() if value} | _exposure(tags),
     )
 
 
@@ -147,6 +147,17 @@ def _with_camera_tags(table: BandTable, xmp: dict[str, Any], num_bands: int) -> 
     return (
         replace(found, names=table.names, bad=table.bad) if len(found.wavelengths_nm) == num_bands else table
     )
+
+
+def _exposure(tags: dict[str, Any]) -> dict[str, float]:
+    """Time and gain out of EXIF, unless XMP may hold a calibration that has them in it already."""
+    time_s, iso = (
+        tags["exif"].get("ExposureTime"),
+        tags["exif"].get("ISOSpeedRatings", tags["exif"].get("ISOSpeed")),
+    )
+    if tags["xmp"] or not isinstance(time_s, int | float):
+        return {}
+    return {"exposure_s": float(time_s), **({"gain": iso / 100} if isinstance(iso, int | float) else {})}
 
 
 def _interleave(page: TiffPage, axes: Axes, is_stack: bool) -> str | None:

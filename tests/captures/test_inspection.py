@@ -1,0 +1,110 @@
+"""`unmix-process inspect` and what it is made of."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tests.captures.readers.envi_factory import header_text, write_envi
+from unmix_plugin.captures.inspection import FACTS, inspect_file
+from unmix_plugin.captures.readers.read_options import ReadOptions
+from unmix_plugin.commands.process_inspect import inspect_command
+from unmix_plugin.errors import CaptureError, ConfigError
+
+CUBE = np.random.default_rng(0).integers(0, 9000, (4, 6, 3)).astype("<u2")
+BANDS = "wavelength units = nm\nwavelength = {450, 550, 650.5}\nfwhm = {5, 5, 6}\nbbl = {1, 0, 1}\nsensor type = X"
+
+
+@pytest.fixture
+def header(tmp_path):
+    return write_envi(tmp_path / "cube.hdr", CUBE, "bil", BANDS + "\ndata ignore value = nan")
+
+
+@pytest.fixture
+def poses(tmp_path):
+    placed = [np.eye(4) + np.eye(4, k=3) * distance for distance in range(3)]
+    frames = [{"file_path": f"{i}.png", "transform_matrix": pose.tolist()} for i, pose in enumerate(placed)]
+    (tmp_path / "transforms.json").write_text(
+        json.dumps({"camera_angle_x": 0.7, "w": 6, "h": 4, "frames": frames})
+    )
+    return tmp_path / "transforms.json"
+
+
+def test_facts_of_an_image(header):
+    facts = inspect_file(header)
+    assert set(facts) == {"file", *FACTS}
+    expected = {
+        "file": str(header),
+        "reader": "envi",
+        "shape": [4, 6, 3],
+        "dtype": "uint16",
+        "interleave": "bil",
+        "wavelengths_nm": [450, 550, 650.5],
+        "wavelength_evidence": "header field 'wavelength', nm",
+        "fwhm_nm": [5, 5, 6],
+        "bad_bands": [1],
+        "scale": None,
+        "no_data": "nan",
+        "poses": None,
+    }
+    assert {key: facts[key] for key in expected} == expected
+    assert facts["metadata"]["header"]["sensor type"] == "X"
+
+
+def test_facts_of_poses(poses):
+    facts = inspect_file(poses)
+    assert set(facts) == {"file", *FACTS}
+    assert (facts["poses"], facts["shape"]) == (3, None)
+
+
+def test_numbers_that_are_not_there_are_found_out(tmp_path):
+    header = tmp_path / "cube.hdr"
+    header.write_text(header_text(CUBE, "bsq", {}))
+    with pytest.raises(CaptureError, match="no file of numbers"):
+        inspect_file(header)
+    np.savez_compressed(tmp_path / "a.npz", cube=CUBE)
+    data = bytearray((tmp_path / "a.npz").read_bytes())
+    data[len(data) // 2] ^= 255
+    (tmp_path / "a.npz").write_bytes(data)
+    with pytest.raises(CaptureError, match=r"a\.npz"):
+        inspect_file(tmp_path / "a.npz")
+
+
+def test_a_list_of_pixels_needs_its_size(tmp_path):
+    np.savez(tmp_path / "a.npz", Y=CUBE.reshape(-1, 3))
+    assert inspect_file(tmp_path / "a.npz", ReadOptions(dataset="Y", size=(4, 6)))["shape"] == [4, 6, 3]
+
+
+def test_one_json_object_a_file_and_status_2_if_one_is_refused(header, poses, tmp_path, capsys):
+    assert inspect_command([str(header), str(poses), "--json"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [json.loads(line)["file"] for line in lines] == [str(header), str(poses)]
+    assert inspect_command(["--json", str(tmp_path / "missing.hdr"), str(header)]) == 2
+    refused, good = map(json.loads, capsys.readouterr().out.splitlines())
+    assert refused == {
+        "file": str(tmp_path / "missing.hdr"),
+        "error": f"{tmp_path / 'missing.hdr'}: no such file",
+    }
+    assert good["reader"] == "envi"
+
+
+def test_options_reach_the_reader(tmp_path, capsys):
+    np.savez(tmp_path / "a.npz", first=CUBE, second=CUBE[:2])
+    assert inspect_command(["--json", str(tmp_path / "a.npz"), "--dataset", "second", "--axes", "bxy"]) == 0
+    assert json.loads(capsys.readouterr().out)["shape"] == [3, 6, 2]
+
+
+def test_the_table_for_people(header, poses, tmp_path, capsys):
+    (tmp_path / "a.raw").write_bytes(b"nothing known")
+    assert inspect_command([str(header), str(poses), str(tmp_path / "a.raw")]) == 2
+    out = " ".join(capsys.readouterr().out.split())
+    assert "4 rows x 6 columns x 3 bands, uint16, bil, read as envi" in out
+    assert "450 to 650.5 nm, FWHM 5 to 6 nm (header field 'wavelength', nm)" in out
+    assert "bad bands 1" in out
+    assert "3 cameras" in out
+    assert "of no known kind" in out
+
+
+def test_no_file_is_an_error():
+    with pytest.raises(ConfigError, match="no file is named"):
+        inspect_command([])

@@ -1,0 +1,125 @@
+"""`unmix-process inspect FILE...`: what files hold, and why one can't be read."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from unmix_plugin.captures.readers.read_options import Axes, ReadOptions
+from unmix_plugin.commands.entry import DONE, USER_ERROR
+from unmix_plugin.errors import CaptureError, ConfigError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+@dataclass(frozen=True)
+class InspectOptions:
+    """Say what files of instruments hold: size, type, bands, wavelengths with their evidence, poses.
+
+    Nothing but headers and one row of each image is read. Exit status 2 if a file is refused.
+    """
+
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE...")]
+    """Images, folders with one file a band, or poses."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """One JSON object a file, a line each."""
+    dataset: str | None = None
+    """Variable, data set, layer or channel to take from files that hold several."""
+    axes: Axes | None = None
+    """Order of the axes of arrays, the slowest first: y rows, x columns, b bands."""
+    size: tuple[int, int] | None = None
+    """Rows and columns of an image that is stored as a matrix of bands and pixels, column after column."""
+
+
+def inspect_command(arguments: list[str]) -> int:
+    """Parse the arguments and print what each file holds.
+
+    Returns:
+        Exit status: 0, or 2 if a file was refused.
+    Raises:
+        ConfigError: no file is named.
+    """
+    options = tyro.cli(InspectOptions, prog="unmix-process inspect", args=arguments)
+    if not options.files:
+        raise ConfigError("no file is named; expected unmix-process inspect FILE...")
+    reading = ReadOptions(dataset=options.dataset, axes=options.axes, size=options.size)
+    reports = [_report(path, reading) for path in options.files]
+    if options.json:
+        for report in reports:
+            print(json.dumps(report))
+    else:
+        _print_tables(reports)
+    return USER_ERROR if any("error" in report for report in reports) else DONE
+
+
+def _report(path: Path, options: ReadOptions) -> dict[str, Any]:
+    from unmix_plugin.captures.inspection import inspect_file
+
+    try:
+        return inspect_file(path, options)
+    except CaptureError as error:
+        return {"file": str(path), "error": str(error)}
+
+
+def _print_tables(reports: Sequence[dict[str, Any]]) -> None:
+    from unmix_plugin.commands.reporting import CommandConsole
+
+    console = CommandConsole()
+    for report in reports:
+        console.print(_table(report), markup=False, highlight=False)
+
+
+def _table(report: dict[str, Any]) -> Table:
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=Text(report["file"], style="bold"), title_justify="left", show_header=False, box=None)
+    for name, text in _rows(report):
+        table.add_row(name, Text(text))
+    return table
+
+
+def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
+    """Facts worth a line."""
+    if "error" in report:
+        return [("refused", report["error"])]
+    rows: list[tuple[str, str]] = []
+    if report["shape"] is not None:
+        rows = _image_rows(report)
+    if report.get("poses") is not None:
+        rows.append(("poses", f"{report['poses']} cameras ({report['metadata'].get('source', '')})"))
+    rows += [("note", note) for note in report["notes"]]
+    others = [name for name in report["metadata"] if name not in ("axes", "source")]
+    return rows + ([("also holds", ", ".join(others))] if others else [])
+
+
+def _image_rows(report: dict[str, Any]) -> list[tuple[str, str]]:
+    height, width, num_bands = report["shape"]
+    size = f"{height} rows x {width} columns x {num_bands} band{'s' if num_bands != 1 else ''}"
+    interleave = f", {report['interleave']}" if report["interleave"] else ""
+    rows = [("image", f"{size}, {report['dtype']}{interleave}, read as {report['reader']}")]
+    rows.append(("wavelengths", _wavelength_text(report)))
+    named = report["band_names"]
+    if named and report["wavelengths_nm"] is None:
+        rows.append(("bands", ", ".join(named[:8]) + (", ..." if len(named) > 8 else "")))
+    for key, what in (("bad_bands", "bad bands"), ("scale", "stored for 1"), ("no_data", "no data")):
+        if report[key] not in (None, []):
+            rows.append((what, str(report[key]).strip("[]")))
+    return rows
+
+
+def _wavelength_text(report: dict[str, Any]) -> str:
+    found = report["wavelengths_nm"]
+    if found is None:
+        return f"unknown: {report['wavelength_evidence']}"
+    span = f"{found[0]:g} nm" if len(found) == 1 else f"{found[0]:g} to {found[-1]:g} nm"
+    widths = report["fwhm_nm"]
+    ends = sorted({f"{width:g}" for width in (min(widths), max(widths))}, key=float) if widths else []
+    width = f", FWHM {' to '.join(ends)} nm" if ends else ""
+    return f"{span}{width} ({report['wavelength_evidence']})"
