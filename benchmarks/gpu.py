@@ -1,0 +1,141 @@
+"""Does everything work on a CUDA GPU, and how fast is it there?
+
+    python benchmarks/gpu.py
+
+One command of at most nine minutes. Where PyTorch finds a GPU it runs every test that uses one, times each operator
+beside its PyTorch twin, trains still-life for 20 s and the built-in scene at 512 x 512 pixels for 30 s, evaluates both,
+and measures a frame of 512 x 512 pixels as the viewer shows it. Elsewhere it says why not and writes nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
+
+import _common
+import _machine
+import tyro
+
+TESTS = ("tests/gpu", "tests/rendering", "tests/test_model.py", "tests/engine/test_second_method.py")
+SIDE = 512
+FRAME_RATE = _common.Limit(30, unit=" frames/s")
+SAMPLES_PER_SECOND = _common.Limit(10e6, unit=" samples/s")
+STILL_LIFE = _common.Limit(37, unit=" dB")
+LARGE_SCENE = _common.Limit(33, unit=" dB")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Tests, operators, trainings and viewer frames on a CUDA GPU."""
+
+    scenes: Path = _common.REPOSITORY.parent / "shared" / "scenes"
+    """Folder that holds still-life; without it that scene is left out."""
+    results: Path | None = None
+    """Folder for gpu.json and the table; None: beside the benchmarks."""
+    rehearse: bool = False
+    """Do it all on the CPU, small, to see that it would work; figures mean nothing and nothing is written."""
+
+    @property
+    def device(self) -> Literal["cpu", "cuda"]:
+        """Where to compute."""
+        return "cpu" if self.rehearse else "cuda"
+
+
+def main(options: Options) -> None:
+    """Measure and publish, or say why not."""
+    from unmix_plugin.engine.devices import resolve_device
+    from unmix_plugin.errors import ConfigError
+
+    try:
+        resolve_device(options.device)
+    except ConfigError as error:
+        print(f"nothing measured: {error}")
+        return
+    figures, measured = [run_tests()], {}
+    with TemporaryDirectory(prefix="unmix-gpu-") as folder:
+        work = Path(folder)
+        for figure, name, values in (time_operators(work, options), *train_scenes(work, options)):
+            figures.append(figure)
+            measured[name] = values
+        figures.append(frame_rate(Path(measured["large scene"]["run"]), options.device))
+    report = _common.Report(
+        "gpu",
+        "Tests, operators, trainings and viewer frames on a CUDA GPU",
+        {"device": options.device, "large scene": f"built-in, {SIDE} x {SIDE} pixels"},
+        _machine.describe_machine(options.device),
+        figures,
+        measured,
+        (),
+    )
+    _common.publish(report, _common.results_folder(options.results, options.rehearse))
+
+
+def run_tests() -> _common.Figure:
+    """Every test that computes on CUDA."""
+    words = [sys.executable, "-m", "pytest", "-q", "-k", "cuda or gpu or CUDA", *TESTS]
+    ended = subprocess.run(words, cwd=_common.REPOSITORY, capture_output=True, text=True, check=False)
+    print(ended.stdout[-4000:])
+    return _common.required(
+        "tests that use the GPU", "pass", ended.returncode == 0, ended.stdout.splitlines()[-1]
+    )
+
+
+def time_operators(work: Path, options: Options) -> tuple[_common.Figure, str, Any]:
+    """Rendering operators beside their twins, by the benchmark made for it."""
+    script = Path(__file__).with_name("operators.py")
+    words = [sys.executable, script, "--device", options.device, "--results", work]
+    subprocess.run([*words, *["--quick"] * options.rehearse], check=True)
+    (written,) = work.glob("operators*.json")
+    found = json.loads(written.read_text())["measured"]
+    slowest = min(values["samples_per_second"]["kernel"] for values in found["operators"].values())
+    return SAMPLES_PER_SECOND.judge("slowest operator", slowest), "operators", found
+
+
+def train_scenes(work: Path, options: Options) -> list[tuple[_common.Figure, str, Any]]:
+    """PSNR of evaluation views after some seconds of training with the defaults."""
+    from unmix_plugin.scenes.demo.scene import make_demo_scene
+
+    scenes, side = options.scenes, 32 if options.rehearse else SIDE
+    make_demo_scene(work / "large", side)
+    asked = [("large scene", work / "large", 30, 6, LARGE_SCENE)]
+    if (scenes / "still-life").is_dir():
+        asked.insert(0, ("still-life", scenes / "still-life", 20, 7, STILL_LIFE))
+    found = []
+    for name, data, seconds, materials, limit in asked:
+        values = train(data, work, 3 if options.rehearse else seconds, materials, options)
+        found.append((limit.judge(f"{name}: PSNR after {seconds} s", values["psnr"]), name, values))
+    return found
+
+
+def train(data: Path, work: Path, seconds: int, materials: int, options: Options) -> dict[str, Any]:
+    """Train and evaluate by the commands; the metrics, and where the run is."""
+    device = ("--device", options.device)
+    words = ["unmix-nerf", "--data", data, "--output-dir", work / "runs", "--max-seconds", seconds, *device]
+    words += ["--endmembers", materials, "--viewer.no-enabled"]
+    run = _common.run_command([_common.console_script("unmix-train"), *map(str, words)]).run
+    _common.run_command([_common.console_script("unmix-eval"), "--run", str(run), *device])
+    return {**json.loads((run / "eval" / "metrics.json").read_text()), "run": str(run)}
+
+
+def frame_rate(run: Path, device: str) -> _common.Figure:
+    """Pictures a second of one view of a run, with their copy to the host."""
+    from unmix_plugin import open_run
+
+    scene = open_run(run, device=device)
+    camera, seconds = scene.views[0].camera.resized(SIDE, SIDE), []
+    for _ in range(30):
+        started = time.perf_counter()
+        scene.look(camera, subpixels=1)["rgb"].cpu()
+        seconds.append(time.perf_counter() - started)
+    return FRAME_RATE.judge(f"viewer at {SIDE} x {SIDE}", 1 / median(seconds[5:]))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

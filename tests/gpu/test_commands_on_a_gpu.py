@@ -1,0 +1,133 @@
+"""Every command computes on a GPU what it computes on the CPU: on a stand-in that any machine has, and on CUDA.
+
+What fails here is a tensor left on the wrong device, a generator of the other device, or an implicit copy to the host.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.commands.running import SMALL_METHOD, Ended, run
+from tests.gpu.stand_in import StandInTensor, stand_in_gpu
+from unmix_plugin.commands.eval import evaluate
+from unmix_plugin.commands.export import PRODUCTS, export
+from unmix_plugin.commands.render import render
+from unmix_plugin.commands.train import train
+from unmix_plugin.scenes.demo.scene import make_demo_scene
+
+DEVICES = ["standin", "cuda"] if torch.cuda.is_available() else ["standin"]
+STEPS = 33
+"""Enough for updates of the occupancy grid, more rays a pixel, and the specular part."""
+SMALL = {
+    "mesh": ["--resolution", 12],
+    "point-cloud": ["--num-points", 100],
+    "report": ["--max-views", 1],
+    "spectrum": ["--view", "eval_002", "--pixel", "8,8"],
+    "volume": ["--resolution", 8],
+}
+
+
+@contextmanager
+def gpu(name: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Context in which commands compute on a GPU, whatever they are told."""
+    if name == "cuda":
+        where = torch.device("cuda", 0)
+        _use(where, monkeypatch)
+        yield
+        return
+    with stand_in_gpu(monkeypatch) as where:
+        _use(where, monkeypatch)
+        yield
+
+
+def _use(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in ("training.trainer", "runs.load_run"):
+        monkeypatch.setattr(f"unmix_plugin.engine.{module}.resolve_device", lambda _: device)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("gpu") / "scene"
+    make_demo_scene(folder, 16, 8, 8)
+    return folder
+
+
+def trained(scene: Path, folder: Path, method: str = "unmix-nerf") -> Path:
+    given = ["--data", scene, "--output-dir", folder, "--max-num-iterations", STEPS]
+    opaque = ["--pipeline.model.initial-opacity", 0.6]
+    return Path(succeed(run(train, method, *given, *opaque, *SMALL_METHOD)).removeprefix("run: "))
+
+
+def succeed(ended: Ended) -> str:
+    assert ended.status == 0, ended.err
+    return ended.last_line
+
+
+@pytest.fixture(scope="module")
+def cpu_run(scene, tmp_path_factory) -> Path:
+    return trained(scene, tmp_path_factory.mktemp("cpu"))
+
+
+@pytest.fixture(params=DEVICES)
+def on_gpu(request, monkeypatch):
+    with gpu(request.param, monkeypatch):
+        yield request.param
+
+
+def test_a_tensor_on_the_cpu_is_refused_beside_one_on_the_gpu(monkeypatch):
+    with stand_in_gpu(monkeypatch) as device:
+        here = torch.ones(3, device=device)
+        assert isinstance(here + 1.0, StandInTensor)
+        with pytest.raises(RuntimeError, match="one device"):
+            here.add(torch.ones(3))
+        with pytest.raises(RuntimeError, match="generator"):
+            torch.rand(3, device=device, generator=torch.Generator())
+        with pytest.raises(RuntimeError, match="numpy"):
+            here.numpy()
+
+
+@pytest.mark.usefixtures("on_gpu")
+def test_training_on_a_gpu_gives_what_the_cpu_gives(scene, cpu_run, tmp_path):
+    there = trained(scene, tmp_path)
+    for folder in (cpu_run, there):
+        succeed(run(evaluate, "--run", folder))
+    here, found = (json.loads((folder / "eval" / "metrics.json").read_text()) for folder in (cpu_run, there))
+    assert found["psnr"] == pytest.approx(here["psnr"], abs=0.5)
+
+
+@pytest.mark.usefixtures("on_gpu")
+@pytest.mark.parametrize("product", [product.name for product in PRODUCTS])
+def test_every_product_is_exported_from_a_gpu(cpu_run, tmp_path, product):
+    words = [product, "--run", cpu_run, "--output", tmp_path / "out", *SMALL.get(product, [])]
+    succeed(run(export, *words))
+
+
+@pytest.mark.usefixtures("on_gpu")
+@pytest.mark.parametrize("method", ["unmix-nerf-published"])
+def test_other_methods_train_on_a_gpu(scene, tmp_path, method):
+    trained(scene, tmp_path, method)
+
+
+@pytest.mark.usefixtures("on_gpu")
+def test_every_output_is_rendered_on_a_gpu(cpu_run, tmp_path):
+    outputs = (
+        "spectral rgb diffuse specular abundances segmentation material_scores confidence depth accumulation"
+    )
+    outputs += " pca band:600nm false-colour:650,550,450 normals"
+    words = ["--run", cpu_run, "--view", 0, "--output", tmp_path / "out"]
+    succeed(run(render, *words, "--outputs", *outputs.split()))
+
+
+@pytest.mark.usefixtures("on_gpu")
+def test_edited_materials_are_rendered_in_another_light_on_a_gpu(cpu_run, tmp_path):
+    recipe = tmp_path / "edits.yml"
+    edits = "retint: {endmember: 0, colour: '#3366cc'}", "remove: [1]", "gloss: {endmember: 2, scale: 2}"
+    recipe.write_text("edits:\n" + "".join(f"  - {edit}\n" for edit in edits))
+    words = ["--run", cpu_run, "--view", 0, "--output", tmp_path / "out"]
+    succeed(run(render, *words, "--outputs", "rgb", "--edits", recipe, "--illuminant", "A"))

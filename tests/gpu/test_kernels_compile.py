@@ -1,0 +1,30 @@
+"""Every kernel compiles for CUDA, also on machines without a GPU: Warp brings NVIDIA's compiler along."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.method_factory import CAMERA, make_model
+from unmix_plugin.rendering import _compositing_kernels, _hash_kernels, _marching_kernels
+from unmix_plugin.rendering.launching import warp
+
+
+@pytest.fixture(scope="module")
+def _specialised() -> None:
+    """Generic kernels exist for the types that they were launched with."""
+    model = make_model()
+    model.warm_up()
+    field, bundle = model.field, CAMERA.image_rays(0)
+    model.renderer.normals(field, bundle, bundle.origins.new_full((len(bundle),), 4.0))
+
+
+@pytest.mark.parametrize("module", [_marching_kernels, _hash_kernels, _compositing_kernels])
+@pytest.mark.usefixtures("_specialised")
+def test_kernels_compile_to_code_for_a_gpu(module, tmp_path):
+    warp().compile_aot_module(module, arch=80, module_dir=tmp_path, use_ptx=True)
+    (compiled,) = tmp_path.glob("*.ptx")
+    text = compiled.read_text()
+    launched = [kernel for kernel in vars(module).values() if isinstance(kernel, warp().Kernel)]
+    assert launched
+    for kernel in launched:
+        assert f".entry {kernel.key}" in text
