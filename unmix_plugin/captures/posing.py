@@ -12,6 +12,7 @@ from unmix_plugin.captures.poses.matching import match_poses
 from unmix_plugin.captures.poses.placement import place_poses
 from unmix_plugin.captures.poses.pose_set import Lens, PosedCamera, PoseSet
 from unmix_plugin.captures.poses.reading import read_poses
+from unmix_plugin.captures.rigs.completing import complete_rigs
 from unmix_plugin.errors import CaptureError
 
 ESTIMATE = "estimate"
@@ -52,9 +53,10 @@ def given_poses(capture: Capture, where: str | None) -> PoseSet:
     """
     if where is None:
         if capture.poses is None:
+            why = "".join(f" ({note})" for note in capture.notes if "poses" in note)
             raise CaptureError(
-                f"{capture.root}: the layout '{capture.layout}' has no poses; give --poses with transforms.json, a "
-                f"COLMAP model or another file, or '--poses {ESTIMATE}' to find them from the images"
+                f"{capture.root}: the layout '{capture.layout}' has no poses{why}; give --poses with transforms.json, "
+                f"a COLMAP model or another file, or '--poses {ESTIMATE}' to find them from the images"
             )
         return capture.poses
     path = Path(where)
@@ -65,20 +67,21 @@ def given_poses(capture: Capture, where: str | None) -> PoseSet:
 
 
 def pose_views(views: Sequence[CaptureView], poses: PoseSet) -> PosedViews:
-    """Give each view its camera; views without one are left out.
+    """Give each view its camera, lenses of a rig that of others of their release; views without one are left out.
 
     Raises:
         CaptureError: fewer than two views have a camera, or a lens does not fit its view.
     """
     matches = match_poses(poses, [(view.name, _files_of(view)) for view in views])
-    posed = tuple(view for view in views if view.name in matches.cameras)
+    cameras, completed = complete_rigs(views, matches.cameras)
+    posed = tuple(view for view in views if view.name in cameras)
     if len(posed) < LEAST_VIEWS:
         raise CaptureError(
             f"{poses.source}: {len(posed)} of {len(views)} views has a pose; a scene needs {LEAST_VIEWS} or more. "
             + " ".join(matches.notes)
         )
     fitted = {
-        view.name: replace(matches.cameras[view.name], lens=fit_lens(matches.cameras[view.name].lens, view))
+        view.name: replace(cameras[view.name], lens=fit_lens(cameras[view.name].lens or view.lens, view))
         for view in posed
     }
     placed = place_poses(replace(poses, cameras=fitted))
@@ -87,7 +90,7 @@ def pose_views(views: Sequence[CaptureView], poses: PoseSet) -> PosedViews:
         placed.poses.cameras,
         placed.poses,
         placed.placement.to_json(),
-        (*poses.notes, *matches.notes, *placed.notes),
+        (*poses.notes, *matches.notes, *completed, *placed.notes),
     )
 
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from unmix_plugin.captures.camera_tags import XmpTags, tag_text
 from unmix_plugin.captures.capture import Capture, CaptureView
-from unmix_plugin.captures.layouts.frames import view_names
+from unmix_plugin.captures.layouts.frames import Split, view_names
 from unmix_plugin.captures.layouts.registry import LayoutOptions
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.rigs.lens_tags import lens_of
@@ -37,6 +37,8 @@ BAND_ENDING = re.compile(
 """Of a file's stem."""
 DJI_NUMBER = re.compile(r"(DJI_\d+)(\d)$", re.IGNORECASE)
 """Of a Phantom 4 Multispectral: the last digit is the band, 0 the colour picture."""
+EVAL_INTERVAL = 8
+"""Every so many releases, one is for evaluation."""
 UNIQUE_TAGS = ("MicaSense:CaptureId", "CaptureUUID", "CaptureId")
 
 
@@ -74,6 +76,7 @@ def find_rig(root: Path, options: LayoutOptions) -> Capture:
         )
     sensors = _sensors(bands)
     releases = _releases(bands)
+    splits = _splits(releases)
     names = view_names([str(item.file.path.relative_to(root)) for item in bands], str(root))
     notes = [*_left_out(opened, paths), *_odd(bands, releases)]
     views: list[CaptureView] = []
@@ -81,7 +84,7 @@ def find_rig(root: Path, options: LayoutOptions) -> Capture:
     for item, name, sensor, release in zip(bands, names, sensors, releases, strict=True):
         lens, said = lens_of(item.file)
         lens_notes.update((sensor, note) for note in said)
-        views.append(CaptureView(name, item.file, sensor, lens=lens, release=release))
+        views.append(CaptureView(name, item.file, sensor, lens=lens, release=release, split=splits[release]))
     _check_lenses(views)
     notes += [f"lens {sensor}: {note} ({count} files)" for (sensor, note), count in lens_notes.items()]
     views = _with_given_bands(views, options)
@@ -104,7 +107,7 @@ def _open(path: Path, root: Path) -> _BandFile:
 def _is_thermal(file: SpectralFile) -> bool:
     wavelengths = file.bands.wavelengths_nm
     name = tag_text(file.metadata.get("xmp") or {}, "BandName") or ""
-    return name.upper() == "LWIR" or (wavelengths is not None and wavelengths.min() > THERMAL_NM)
+    return name.upper() == "LWIR" or (wavelengths is not None and float(wavelengths.min()) > THERMAL_NM)
 
 
 def _sensors(bands: Sequence[_BandFile]) -> list[str]:
@@ -140,6 +143,14 @@ def _releases(bands: Sequence[_BandFile]) -> list[str]:
             for release, identifier in zip(releases, identifiers, strict=True)
         ]
     return releases
+
+
+def _splits(releases: Iterable[str]) -> dict[str, Split]:
+    """Every eighth release is for evaluation, with all its lenses."""
+    return {
+        release: "eval" if index % EVAL_INTERVAL == 0 else "train"
+        for index, release in enumerate(sorted(set(releases)))
+    }
 
 
 def _check_lenses(views: Sequence[CaptureView]) -> None:

@@ -8,9 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float64
 
 from unmix_plugin import __version__
 from unmix_plugin.atomic_files import write_file
+from unmix_plugin.captures.calibration.calibration import Calibration
+from unmix_plugin.captures.capture import CaptureView
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.plan import Plan
 from unmix_plugin.captures.poses.placement import write_points
@@ -48,6 +51,8 @@ def write_scene_files(
             sensor=view.sensor,
             wavelengths_nm=plan.sensors[view.sensor].centers_nm,
             split=view.split,
+            release=view.release,
+            fwhm_nm=_widths(view, plan.sensors[view.sensor].calibration),
         )
         for view in posed.views
     ]
@@ -56,6 +61,12 @@ def write_scene_files(
     _write_json(folder / RECORD_NAME, record)
     _write_json(folder / SCENE_NAME, transforms_json(written, keys))
     return findings
+
+
+def _widths(view: CaptureView, calibration: Calibration) -> Float64[np.ndarray, " B"] | None:
+    """Widths of a view's bands as the file tells them; None where it doesn't or bands are averaged."""
+    widths = view.cube.bands.fwhm_nm
+    return None if widths is None or calibration.bin_bands > 1 else widths[calibration.bands]
 
 
 def _write_light(folder: Path, plan: Plan) -> dict[str, str]:

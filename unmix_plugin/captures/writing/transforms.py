@@ -25,31 +25,35 @@ class WrittenView:
     sensor: str
     wavelengths_nm: Float64[np.ndarray, " B"]
     split: Literal["train", "eval"] | None
+    release: str = ""
+    """Of the shutter; frames of one were taken at one moment."""
+    fwhm_nm: Float64[np.ndarray, " B"] | None = None
+    """Widths of the bands, where the files tell them."""
 
 
 def transforms_json(views: Sequence[WrittenView], extra: dict[str, Any]) -> dict[str, Any]:
     """The content of the file.
 
-    What all views share stands above the frames. Views of different sensors have their own lens, size, bands and the
-    name of their sensor.
+    What all views share stands above the frames. Views of different sensors have their own lens and size, `bands` as
+    indices into the `wavelengths` of the scene, and the name of their sensor.
 
     Args:
         views: At least one, in order.
         extra: More keys of the scene.
     """
-    shared = {
-        key: value for key, value in _facts(views[0]).items() if all(_facts(v)[key] == value for v in views)
-    }
     bands = np.unique(np.concatenate([view.wavelengths_nm for view in views]))
+    facts = [_facts(view, bands) for view in views]
+    shared = {key: value for key, value in facts[0].items() if all(own.get(key) == value for own in facts)}
     frames = []
-    for view in views:
-        own = {key: value for key, value in _facts(view).items() if key not in shared}
+    for view, known in zip(views, facts, strict=True):
+        own = {key: value for key, value in known.items() if key not in shared}
         pose = [*view.camera_to_world.tolist(), [0.0, 0.0, 0.0, 1.0]]
         frames.append({**view.paths, **own, "transform_matrix": pose})
     return {
         "camera_model": "OPENCV",
         **shared,
         "wavelengths": bands.tolist(),
+        **_widths(views, bands),
         "value_scale": FULL_SCALE,
         **extra,
         **_split_lists(views),
@@ -57,7 +61,18 @@ def transforms_json(views: Sequence[WrittenView], extra: dict[str, Any]) -> dict
     }
 
 
-def _facts(view: WrittenView) -> dict[str, Any]:
+def _widths(views: Sequence[WrittenView], bands: Float64[np.ndarray, " B"]) -> dict[str, Any]:
+    """Widths of all bands, if all are known."""
+    known = {
+        float(band): float(width)
+        for view in views
+        if view.fwhm_nm is not None
+        for band, width in zip(view.wavelengths_nm, view.fwhm_nm, strict=True)
+    }
+    return {"fwhm": [known[band] for band in bands.tolist()]} if len(known) == len(bands) else {}
+
+
+def _facts(view: WrittenView, bands: Float64[np.ndarray, " B"]) -> dict[str, Any]:
     lens = view.lens
     facts: dict[str, Any] = {"w": lens.width, "h": lens.height}
     facts |= dict(zip(("fl_x", "fl_y"), map(float, lens.focal_px), strict=True))
@@ -65,7 +80,10 @@ def _facts(view: WrittenView) -> dict[str, Any]:
     facts |= dict(zip(("k1", "k2", "p1", "p2"), map(float, lens.distortion), strict=True))
     if view.sensor:
         facts["sensor"] = view.sensor
-    facts["wavelengths"] = view.wavelengths_nm.tolist()
+    if view.release:
+        facts["capture"] = view.release
+    if len(view.wavelengths_nm) < len(bands):
+        facts["bands"] = np.searchsorted(bands, view.wavelengths_nm).tolist()
     return facts
 
 

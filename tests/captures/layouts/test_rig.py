@@ -1,0 +1,265 @@
+import json
+
+import numpy as np
+import pytest
+
+from tests.captures.band_files import write_band_file
+from tests.captures.layouts.data_sets import PLAIN
+from tests.captures.layouts.rig_flight import (
+    HEIGHT,
+    LENSES,
+    WIDTH,
+    image,
+    lens_pose,
+    rays,
+    stored,
+    write_flight,
+    write_poses,
+)
+from unmix_plugin.captures.layouts.registry import LayoutOptions
+from unmix_plugin.captures.layouts.rig import find_rig
+from unmix_plugin.captures.options import ProcessOptions
+from unmix_plugin.captures.process import process_capture
+from unmix_plugin.captures.radiometry import radiometric_model
+from unmix_plugin.errors import CaptureError
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    root = tmp_path_factory.mktemp("flight")
+    write_flight(root)
+    (root / "IMG_170101_101000_0000_RGB.JPG").write_bytes(b"a picture in colour")
+    return root
+
+
+@pytest.fixture(scope="module")
+def scene(flight, tmp_path_factory):
+    """The scene that the command makes from the poses of the green lens alone."""
+    folder = tmp_path_factory.mktemp("scenes")
+    write_poses(folder / "poses.json")
+    return _process(flight, folder / "scene", folder / "poses.json")
+
+
+def _process(root, output, poses):
+    options = ProcessOptions(layout="rig", data=root, output_dir=output, poses=str(poses), mask="none")
+    process_capture(options, lambda _: None, lambda _, views: views)
+    return output
+
+
+def _view(capture, index, ending):
+    return next(view for view in capture.views if view.name.endswith(f"_{index:04d}_{ending}"))
+
+
+def test_every_file_is_a_view_of_its_lens_and_release(flight):
+    capture = find_rig(flight, PLAIN)
+    assert len(capture.views) == 40
+    assert {view.sensor for view in capture.views} == {"green", "red", "rededge", "nir"}
+    assert len({view.release for view in capture.views}) == 10
+    for index in range(10):
+        of_release = {_view(capture, index, lens.ending).release for lens in LENSES}
+        assert len(of_release) == 1
+
+
+def test_bands_come_from_the_tags(flight):
+    capture = find_rig(flight, PLAIN)
+    for lens in LENSES:
+        bands = _view(capture, 3, lens.ending).cube.bands
+        assert bands.wavelengths_nm is not None
+        assert bands.fwhm_nm is not None
+        assert (bands.wavelengths_nm[0], bands.fwhm_nm[0]) == (lens.centre_nm, lens.width_nm)
+
+
+def test_what_is_left_out_or_ignored_is_said(flight):
+    notes = " ".join(find_rig(flight, PLAIN).notes)
+    assert "1 colour pictures are left out" in notes
+    assert "EXIF's orientation of 40 files is ignored" in notes
+
+
+def test_the_stored_raster_is_not_turned(flight):
+    view = _view(find_rig(flight, PLAIN), 2, "RED")
+    np.testing.assert_array_equal(view.cube.read()[..., 0], stored(image(2, LENSES[1]), LENSES[1]))
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=lambda lens: lens.ending)
+def test_radiance_is_that_of_the_ground_within_1_percent(flight, lens):
+    view = _view(find_rig(flight, PLAIN), 4, lens.ending)
+    model = radiometric_model(view.cube)
+    assert model is not None
+    found = model.apply(view.cube.read().astype(np.float64))[..., 0]
+    np.testing.assert_allclose(found, image(4, lens), rtol=0.001)
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=lambda lens: lens.ending)
+def test_every_lens_has_its_own_intrinsics(flight, lens):
+    found = _view(find_rig(flight, PLAIN), 0, lens.ending).lens
+    assert found is not None
+    x, y = (rays(lens)[..., :2] / -rays(lens)[..., 2:]).transpose(2, 0, 1)
+    y = -y
+    k1, k2, p1, p2 = found.distortion
+    square = x**2 + y**2
+    bent_x = x * (1 + k1 * square + k2 * square**2) + 2 * p1 * x * y + p2 * (square + 2 * x**2)
+    bent_y = y * (1 + k1 * square + k2 * square**2) + 2 * p2 * x * y + p1 * (square + 2 * y**2)
+    columns, rows = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    assert np.abs(found.focal_px[0] * bent_x + found.center_px[0] - columns).max() < 0.01
+    assert np.abs(found.focal_px[1] * bent_y + found.center_px[1] - rows).max() < 0.01
+
+
+def _frames(scene):
+    content = json.loads((scene / "transforms.json").read_text())
+    return content, {frame["hyperspectral_file_path"]: frame for frame in content["frames"]}
+
+
+def test_frames_have_their_band_lens_and_release(scene):
+    content, frames = _frames(scene)
+    assert content["wavelengths"] == [550.0, 660.0, 735.0, 790.0]
+    assert content["fwhm"] == [40.0, 40.0, 10.0, 40.0]
+    assert len(frames) == 40
+    for band, lens in enumerate(LENSES):
+        frame = next(frame for path, frame in frames.items() if path.endswith(f"_0004_{lens.ending}.npy"))
+        assert frame["bands"] == [band]
+        assert frame["sensor"] == lens.name.lower()
+        assert frame["fl_x"] == pytest.approx(lens.focal_mm * 20.0, abs=0.01)
+        assert frame["capture"].endswith("_0004")
+
+
+def test_releases_stay_together_when_views_are_split(scene):
+    content, _ = _frames(scene)
+    evaluation = content["test_filenames"]
+    assert len(evaluation) == 8
+    assert {path.rpartition("_")[0].rpartition("_")[2] for path in evaluation} == {"0000", "0008"}
+    assert len(content["train_filenames"]) == 32
+
+
+def test_all_lenses_are_posed_by_the_rig(scene):
+    content, frames = _frames(scene)
+    scale = content.get("applied_scale", 1.0)
+    poses = {path: np.array(frame["transform_matrix"]) for path, frame in frames.items()}
+    base = next(pose for path, pose in poses.items() if path.endswith("_0006_GRE.npy"))
+    for lens in LENSES:
+        pose = next(pose for path, pose in poses.items() if path.endswith(f"_0006_{lens.ending}.npy"))
+        expected = np.linalg.inv(lens_pose(6, LENSES[0])) @ lens_pose(6, lens, at_its_place=False)
+        found = np.linalg.inv(base) @ pose
+        np.testing.assert_allclose(found[:3, :3], expected[:3, :3], atol=1e-6)
+        np.testing.assert_allclose(found[:3, 3] / scale, expected[:3, 3], atol=1e-6)
+
+
+def test_offsets_follow_from_releases_in_which_all_lenses_have_poses(flight, tmp_path):
+    write_poses(tmp_path / "some.json", LENSES, releases=3)
+    frames = json.loads((tmp_path / "some.json").read_text())["frames"]
+    write_poses(tmp_path / "all.json")
+    frames += json.loads((tmp_path / "all.json").read_text())["frames"][3:]
+    (tmp_path / "poses.json").write_text(json.dumps({"frames": frames}))
+    content, found = _frames(_process(flight, tmp_path / "scene", tmp_path / "poses.json"))
+    scale = content.get("applied_scale", 1.0)
+    poses = {path: np.array(frame["transform_matrix"]) for path, frame in found.items()}
+    base = next(pose for path, pose in poses.items() if path.endswith("_0007_GRE.npy"))
+    for lens in LENSES:
+        pose = next(pose for path, pose in poses.items() if path.endswith(f"_0007_{lens.ending}.npy"))
+        place = (np.linalg.inv(base) @ pose)[:3, 3] / scale
+        np.testing.assert_allclose(place, lens.place, atol=1e-6)
+
+
+def test_the_scene_holds_the_radiance_of_the_ground(scene):
+    record = json.loads((scene / "process.json").read_text())
+    one = record["stored"]["calibrated_value_of_1"]
+    for lens in LENSES:
+        path = next((scene / "cubes").glob(f"*_0005_{lens.ending}.npy"))
+        found = np.load(path)[..., 0] / 65535 * one
+        expected = np.minimum(image(5, lens), one)
+        np.testing.assert_allclose(found, expected, rtol=0.01)
+
+
+def test_files_are_grouped_by_name_where_they_share_no_identifier(tmp_path):
+    for release in range(2):
+        for band in (1, 2):
+            write_band_file(
+                tmp_path / f"IMG_{release:04d}_{band}.tif",
+                np.full((4, 5), 9),
+                {
+                    "Camera:CentralWavelength": str(400 + 100 * band),
+                    "MicaSense:CaptureId": f"{release}{band}",
+                },
+            )
+    capture = find_rig(tmp_path, PLAIN)
+    assert [(view.name, view.release, view.sensor) for view in capture.views] == [
+        ("IMG_0000_1", "IMG_0000", "1"),
+        ("IMG_0000_2", "IMG_0000", "2"),
+        ("IMG_0001_1", "IMG_0001", "1"),
+        ("IMG_0001_2", "IMG_0001", "2"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("names", "releases"),
+    [
+        (("DJI_0011.TIF", "DJI_0012.TIF", "DJI_0021.TIF"), ["DJI_001", "DJI_001", "DJI_002"]),
+        (("DJI_2023_0001_MS_G.TIF", "DJI_2023_0001_MS_NIR.TIF"), ["DJI_2023_0001", "DJI_2023_0001"]),
+        (("a/IMG_0000_1.tif", "b/IMG_0000_1.tif"), ["a/IMG_0000", "b/IMG_0000"]),
+    ],
+)
+def test_names_of_makers_tell_releases(tmp_path, names, releases):
+    for name in names:
+        write_band_file(tmp_path / name, np.full((4, 5), 9), {"Camera:CentralWavelength": "500"})
+    try:
+        views = find_rig(tmp_path, PLAIN).views
+    except CaptureError as error:
+        pytest.fail(str(error))
+    assert [view.release for view in views] == releases
+
+
+def test_lenses_of_one_band_name_are_told_apart(tmp_path):
+    for index in (0, 5):
+        tags = {"Camera:BandName": "Red", "Camera:RigCameraIndex": str(index)}
+        tags |= {"Camera:CentralWavelength": str(650 + index), "Camera:CaptureUUID": "A"}
+        write_band_file(tmp_path / f"IMG_0000_{index}.tif", np.full((4, 5), 9), tags)
+    assert [view.sensor for view in find_rig(tmp_path, PLAIN).views] == ["red-0", "red-5"]
+
+
+def test_thermal_bands_and_missing_bands_are_said(tmp_path):
+    for release, bands in (("0000", (1, 2, 6)), ("0001", (1,))):
+        for band in bands:
+            tags = {"Camera:BandName": "LWIR" if band == 6 else f"B{band}"}
+            tags["Camera:CentralWavelength"] = "11000" if band == 6 else str(500 + band)
+            write_band_file(tmp_path / f"IMG_{release}_{band}.tif", np.full((4, 5), 9), tags)
+    capture = find_rig(tmp_path, PLAIN)
+    assert [view.name for view in capture.views] == ["IMG_0000_1", "IMG_0000_2", "IMG_0001_1"]
+    notes = " ".join(capture.notes)
+    assert "1 thermal images are left out" in notes
+    assert "1 of 2 releases lack a band: IMG_0001" in notes
+
+
+def test_given_wavelengths_are_one_a_lens(tmp_path):
+    for band in (1, 2):
+        write_band_file(tmp_path / f"IMG_0000_{band}.tif", np.full((4, 5), 9), {})
+    views = find_rig(tmp_path, LayoutOptions(wavelengths_nm=np.array([500.0, 600.0]))).views
+    assert [view.cube.bands.wavelengths_nm for view in views] == [500.0, 600.0]
+    with pytest.raises(CaptureError, match=r"gives 3 numbers for 2 lenses \(1, 2\)"):
+        find_rig(tmp_path, LayoutOptions(wavelengths_nm=np.array([500.0, 600.0, 700.0])))
+
+
+def test_a_lens_twice_in_one_release_is_refused(tmp_path):
+    for name in ("IMG_0000_1.tif", "copy/IMG_0000_1.tif"):
+        tags = {"Camera:CentralWavelength": "500", "Camera:BandName": "Blue", "MicaSense:CaptureId": "same"}
+        write_band_file(tmp_path / name, np.full((4, 5), 9), tags)
+    with pytest.raises(CaptureError, match="are both the lens blue"):
+        find_rig(tmp_path, PLAIN)
+
+
+@pytest.mark.parametrize(
+    ("size", "centre", "message"), [((4, 6), 500, "pixels"), ((4, 5), 510, "nm, .* of the same lens")]
+)
+def test_files_of_one_lens_that_differ_are_refused(tmp_path, size, centre, message):
+    tags = {"Camera:BandName": "Blue", "Camera:CentralWavelength": "500"}
+    write_band_file(tmp_path / "IMG_0000_1.tif", np.full((4, 5), 9), tags)
+    write_band_file(
+        tmp_path / "IMG_0001_1.tif", np.full(size, 9), tags | {"Camera:CentralWavelength": str(centre)}
+    )
+    with pytest.raises(CaptureError, match=message):
+        find_rig(tmp_path, PLAIN)
+
+
+def test_a_truncated_file_is_refused(flight, tmp_path):
+    whole = next(flight.glob("*_GRE.TIF")).read_bytes()
+    (tmp_path / "IMG_0000_1.tif").write_bytes(whole[: len(whole) // 3])
+    with pytest.raises(CaptureError, match=r"IMG_0000_1.tif"):
+        find_rig(tmp_path, PLAIN).views[0].cube.read()
