@@ -1,5 +1,6 @@
 """Band files as multispectral cameras write them, by Pillow: TIFF of 16 bits with XMP and EXIF."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ EXIF_CODES = {"ExposureTime": 33434, "FNumber": 33437, "ISOSpeedRatings": 34855,
 FOCAL_PLANE_CODES = {"FocalLength": 37386, "FocalPlaneXResolution": 41486, "FocalPlaneYResolution": 41487}
 
 
-def xmp_packet(tags: dict[str, str | list[str]], as_attributes: bool = False) -> bytes:
+def xmp_packet(tags: Mapping[str, str | list[str]], as_attributes: bool = False) -> bytes:
     """An XMP packet with tags called `Prefix:Name`."""
     spaces = {tag.split(":")[0] for tag in tags} | {"Camera"}
     declared = " ".join(f'xmlns:{space}="http://example.org/{space}/1.0/"' for space in sorted(spaces))
@@ -38,7 +39,7 @@ def xmp_packet(tags: dict[str, str | list[str]], as_attributes: bool = False) ->
 def write_band_file(
     path: Path,
     pixels: np.ndarray,
-    xmp: dict[str, str | list[str]],
+    xmp: Mapping[str, str | list[str]],
     exif: dict[str, float] | None = None,
     *,
     make: str = "Maker",
