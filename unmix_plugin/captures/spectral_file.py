@@ -186,7 +186,7 @@ def _common(values: list[float | None]) -> float | None:
 def _stack_metadata(parts: list[SpectralFile]) -> dict[str, Any]:
     """Entries that are the same in all parts; if any differ, `parts` lists what each part has of its own."""
     first = parts[0].metadata
-    same = {key for key in first if all(repr(part.metadata.get(key)) == repr(first[key]) for part in parts)}
+    same = [key for key in first if all(repr(part.metadata.get(key)) == repr(first[key]) for part in parts)]
     own = [{key: value for key, value in part.metadata.items() if key not in same} for part in parts]
     return {key: first[key] for key in same} | ({"parts": own} if any(own) else {})
 
