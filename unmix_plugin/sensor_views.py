@@ -33,7 +33,8 @@ class SensorViews(nn.Module):
         for index, values in enumerate(sensors):
             sensor = SceneSensor.from_json(values, len(rgb_weights))
             matrix = torch.from_numpy(sensor.matrix).float()
-            colours = rgb_weights if sensor.sees_all_bands else _false_colours(len(matrix))
+            false_colours = torch.from_numpy(sensor.false_colours).float()
+            colours = rgb_weights if sensor.sees_all_bands else false_colours
             self.register_buffer(f"matrix_{index}", matrix, persistent=False)
             self.register_buffer(f"colours_{index}", colours.clone(), persistent=False)
         self.register_buffer("plain_colours", rgb_weights.clone(), persistent=False)
@@ -62,11 +63,3 @@ class SensorViews(nn.Module):
     def tells_materials(self, sensor: SupportsInt | None, num_endmembers: int) -> bool:
         """Whether a pixel alone can be unmixed: it has as many channels as there are endmembers, and at least 3."""
         return sensor is None or self.num_channels(int(sensor)) >= max(num_endmembers, _FEWEST_CHANNELS)
-
-
-def _false_colours(num_channels: int) -> Float[Tensor, "b 3"]:
-    """Each colour the mean of a third of the channels, or of the nearest one."""
-    middles = (torch.arange(3) + 0.5) / 3 * num_channels - 0.5
-    distances = (torch.arange(num_channels)[:, None] - middles).abs()
-    near = distances <= distances.min(dim=0).values.clamp(min=num_channels / 6)
-    return near / near.sum(dim=0)

@@ -3,14 +3,17 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import SceneOptions
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.metrics import abundance_rmse, psnr, sam
+from unmix_plugin.spectral.scene_sensor import SceneSensor
 from unmix_plugin.trained.evaluation import (
     VIEW_FIGURES,
     Evaluation,
@@ -238,3 +241,23 @@ def test_psnr_of_matter_is_unknown_where_nothing_is(scene, view):
     assert math.isnan(
         evaluated(scene, empty, perfect(view, SHUFFLED), SHUFFLED).per_view["void"]["psnr_matter"]
     )
+
+
+def test_a_view_is_measured_as_its_sensor_sees_it():
+    sensor = SceneSensor("pair", np.array([[0.5, 0.5, 0, 0, 0], [0, 0, 0, 1.0, 0]]))
+    spectra = torch.rand(10, 12, 5, generator=torch.Generator().manual_seed(4))
+    measured = torch.stack([spectra[..., :2].mean(dim=-1), spectra[..., 3]], dim=-1)
+    valid = torch.ones(10, 12, dtype=torch.bool)
+    evaluation = Evaluation(SceneTruth(Bands.of([450, 500, 550, 600, 650]), 0), torch.rand(3, 5))
+    flat = torch.zeros(10, 12)
+    predicted = RenderedView(spectra, flat, torch.zeros(10, 12, 3), flat.byte(), torch.zeros(10, 12, 3))
+    figures = evaluation.add(ViewTruth("a", measured, valid, sensor=sensor), predicted)
+    assert figures["psnr"] > 100
+    assert math.isnan(figures["rgb_psnr"])
+    other = evaluation.add(ViewTruth("b", measured + 0.1, valid, sensor=sensor), predicted)
+    assert other["psnr"] == pytest.approx(20, abs=0.01)
+    assert evaluation.per_sensor() == {}
+    evaluation.sensors.update(a="one", b="other")
+    assert evaluation.per_sensor()["other"]["psnr"] == other["psnr"]
+    relit = ViewTruth("a", measured, valid, sensor=sensor).in_light(np.array([1.0, 3.0, 0, 0.5, 0]))
+    assert_close(relit.spectra, (measured * torch.tensor([2.0, 0.5])).clamp(max=1))

@@ -135,7 +135,7 @@ def _evaluate_views(subject: _Subject, console: Console) -> tuple[Evaluation, in
     from unmix_plugin.commands.reporting import follow
     from unmix_plugin.formats.files import write_file
     from unmix_plugin.products.evaluation_pictures import draw_colour, draw_matched_abundances, material_look
-    from unmix_plugin.trained.evaluation import Evaluation, scene_truth, view_truth
+    from unmix_plugin.trained.evaluation import Evaluation, scene_truth, subpixels_for, view_truth
     from unmix_plugin.trained.view_rendering import render_view
 
     scene, folder, factors = _scene_of(subject.loaded), subject.folder, subject.light_factors
@@ -145,7 +145,10 @@ def _evaluate_views(subject: _Subject, console: Console) -> tuple[Evaluation, in
     ids: dict[int, np.ndarray] = {}
     for index in follow(console, "evaluating views", scene.eval_indices):
         truth = view_truth(scene, index).in_light(factors)
-        predicted = render_view(subject.scene, scene.cameras[index])
+        rays = subpixels_for(scene, index, subject.scene.subpixels, subject.scene.pixel_size)
+        predicted = render_view(subject.scene, scene.cameras[index], rays)
+        if scene.is_rig:
+            evaluation.sensors[truth.name] = scene.sensor_of(index).name
         psnr_db = evaluation.add(truth, predicted)["psnr"]
         name = f"{truth.name}.png"
         write_file(folder / "rgb" / name, draw_colour(truth, predicted, evaluation.truth.bands, psnr_db))
@@ -189,6 +192,8 @@ def _write_metrics(subject: _Subject, evaluation: Evaluation) -> dict[str, Any]:
     figures = {name: values[name] for name in DEFINITIONS}
     per_view = [{"name": name, **finite_or_none(found)} for name, found in evaluation.per_view.items()]
     content = {**figures, "per_view": per_view, "definitions": DEFINITIONS}
+    per_sensor = {name: finite_or_none(found) for name, found in evaluation.per_sensor().items()}
+    content |= {"per_sensor": per_sensor} if per_sensor else {}
     content |= {} if subject.edits is None else {"edits": subject.edits}
     text = json.dumps(content, indent=1, allow_nan=False) + "\n"
     write_file(subject.folder / "metrics.json", text.encode())

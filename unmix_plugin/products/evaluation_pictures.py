@@ -28,10 +28,10 @@ from unmix_plugin.figures.plotting import RIGHT, WRONG, Colour
 from unmix_plugin.products.abundances import SHARE_SCALE, share_panels
 from unmix_plugin.products.segmentation import paint_ids
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.conversion import describe_colour, linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.colour.conversion import describe_colour, linear_to_srgb
 from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.trained.evaluation import Evaluation, ViewTruth
-from unmix_plugin.trained.view_rendering import RenderedView, as_numpy, picture
+from unmix_plugin.trained.view_rendering import RenderedView, as_numpy, coloured_picture
 
 _ERROR_SCALE = ColourScale("magma", 0.0, 0.2, "error of sRGB")
 _COLUMNS = 7
@@ -79,17 +79,17 @@ def material_look(evaluation: Evaluation) -> MaterialLook:
 
 
 def draw_colour(view: ViewTruth, predicted: RenderedView, bands: Bands, psnr_db: float) -> bytes:
-    """True colour, predicted colour, and their difference."""
-    error = np.abs(_srgb_on_black(predicted.spectra, bands) - _srgb_on_black(view.spectra, bands)).mean(
-        axis=-1
-    )
+    """True colour, predicted colour, and their difference; in false colours for sensors without all bands."""
+    weights, spectra = view.colour_weights(bands), view.seen(predicted.spectra)
+    error = np.abs(_srgb_on_black(spectra, weights) - _srgb_on_black(view.spectra, weights)).mean(axis=-1)
     seen = np.maximum(as_numpy(view.opacity), as_numpy(predicted.accumulation))
     panels = [
-        TitledPicture(picture(view.spectra, view.opacity, bands), "true"),
-        TitledPicture(picture(predicted.spectra, predicted.accumulation, bands), "predicted"),
+        TitledPicture(coloured_picture(view.spectra, view.opacity, weights), "true"),
+        TitledPicture(coloured_picture(spectra, predicted.accumulation, weights), "predicted"),
         TitledPicture(over_neutral(paint(error, _ERROR_SCALE), (seen > 0.01).astype(np.float64)), "error"),
     ]
-    heading = f"{view.name}: {describe_colour(bands).split(':')[0]}, spectral PSNR {psnr_db:.1f} dB"
+    colours = describe_colour(bands).split(":")[0] if view.sensor is None else f"seen by {view.sensor.name}"
+    heading = f"{view.name}: {colours}, spectral PSNR {psnr_db:.1f} dB"
     return draw_panels([panels], heading, _ERROR_SCALE)
 
 
@@ -146,6 +146,6 @@ def draw_matched_abundances(
     return draw_panels(rows, f"{heading}, true above predicted (matched by spectral angle)", SHARE_SCALE)
 
 
-def _srgb_on_black(spectra: Float[Tensor, "H W B"], bands: Bands) -> np.ndarray:
-    linear = spectra.double().clamp(0, 1) @ rgb_matrix(bands).double()
+def _srgb_on_black(spectra: Float[Tensor, "H W b"], weights: Float[Tensor, "b 3"]) -> np.ndarray:
+    linear = spectra.double().clamp(0, 1) @ weights
     return linear_to_srgb(linear.clamp(0, 1)).numpy()

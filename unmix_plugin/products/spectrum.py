@@ -111,6 +111,9 @@ class Spectrum(Product):
         if scene is None or view.name not in names:
             job.say("the scene folder was not found: no measured spectrum; give it with --data")
             return None
+        if not scene.sensor_of(names.index(view.name)).sees_all_bands:
+            job.say(f"{view.name} was taken by a sensor without all bands: no measured spectrum")
+            return None
         recorded, light = job.loaded.record.summary.get("illuminant"), job.scene.light_power
         return relit(scene.cube(names.index(view.name))[pixel[1], pixel[0]], recorded, light)
 

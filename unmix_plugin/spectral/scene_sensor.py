@@ -49,6 +49,17 @@ class SceneSensor:
         """Bands that some channel responds to."""
         return np.any(self.matrix > 0, axis=0)
 
+    @cached_property
+    def false_colours(self) -> Float64[np.ndarray, "b 3"]:
+        """From channels to red, green and blue, long waves red: each the mean of a third of the channels, or the
+        nearest one."""
+        centers = self.matrix @ np.arange(self.matrix.shape[1])
+        order = np.argsort(np.argsort(centers, kind="stable"), kind="stable")
+        middles = (np.array([2, 1, 0]) + 0.5) / 3 * len(centers) - 0.5
+        distances = np.abs(order[:, None] - middles)
+        near = distances <= np.maximum(distances.min(axis=0), len(centers) / 6)
+        return near / near.sum(axis=0)
+
     def to_json(self) -> dict[str, Any]:
         """Name, and bands or responses; `from_json` gives back the same bits."""
         if self.bands is not None:

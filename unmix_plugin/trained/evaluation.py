@@ -9,7 +9,7 @@ Notation: `H x W` pixels, `B` bands, `K` true materials, `P` predicted endmember
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,6 +31,7 @@ from unmix_plugin.spectral.metrics import (
     sam,
     ssim,
 )
+from unmix_plugin.spectral.scene_sensor import SceneSensor
 from unmix_plugin.spectral.segmentation import NOTHING_ID, SegmentationScores, SegmentationTally
 from unmix_plugin.trained.view_rendering import RenderedView
 
@@ -39,6 +40,9 @@ OPAQUE_ALPHA = 0.99
 
 HALF_COVERED = 0.5
 """Opacity from which a pixel's abundances count."""
+
+MOST_SENSOR_SUBPIXELS = 4
+"""How many times finer than others the pixels of a coarse sensor are rendered, along an edge."""
 
 VIEW_FIGURES = ("psnr", "psnr_matter", "rmse", "ssim", "sam", "rgb_psnr", "abundance_rmse")
 """Figures of every view, as far as there is truth for them."""
@@ -50,7 +54,8 @@ DEFINITIONS = {
     "ssim": "mean over bands, 7 x 7 uniform window, data range 1",
     "sam": "mean spectral angle in radians over labelled or opaque pixels whose true spectrum is not dark "
     "(root mean square over bands above 0.005)",
-    "rgb_psnr": "dB, the same cubes as sRGB (false colour where the bands are not those of the eye)",
+    "rgb_psnr": "dB, the same cubes as sRGB (false colour where the bands are not those of the eye); only of "
+    "views with all bands",
     "miou": "mean intersection over union of the true materials; predicted ids matched to labels once a scene "
     "(Hungarian), unlabelled pixels ignored",
     "macro_f1": "mean F1 of the true materials, same matching",
@@ -78,6 +83,20 @@ class ViewTruth:
     labels: UInt8[Tensor, "H W"] | None = None
     """True material, 255 where unlabelled."""
     abundances: Float[Tensor, "H W K"] | None = None
+    sensor: SceneSensor | None = None
+    """What measured the spectra; None where it sees the scene's bands as they are."""
+
+    def seen(self, spectra: Float[Tensor, "*pixels B"]) -> Float[Tensor, "*pixels b"]:
+        """Spectra on the scene's bands as the view's sensor sees them."""
+        if self.sensor is None:
+            return spectra
+        return spectra @ torch.from_numpy(self.sensor.matrix).to(spectra).T
+
+    def colour_weights(self, bands: Bands) -> Float[Tensor, "b 3"]:
+        """From the view's spectra to linear sRGB, or to false colours where its sensor lacks bands."""
+        if self.sensor is None:
+            return rgb_matrix(bands, torch.float64)
+        return torch.from_numpy(self.sensor.false_colours)
 
     @property
     def opacity(self) -> Float[Tensor, "H W"]:
@@ -94,7 +113,8 @@ class ViewTruth:
         """The view as the same sensor would have measured it in another light; itself where `factors` are None."""
         if factors is None:
             return self
-        return replace(self, spectra=(self.spectra * torch.from_numpy(factors).to(self.spectra)).clamp(0, 1))
+        own = self.seen(torch.from_numpy(factors))
+        return replace(self, spectra=(self.spectra * own.to(self.spectra)).clamp(0, 1))
 
 
 @dataclass(frozen=True)
@@ -131,12 +151,14 @@ class Evaluation:
         """Predicted and true endmembers, paired by spectral angle; None without true ones."""
         self.per_view: dict[str, dict[str, float]] = {}
         """`VIEW_FIGURES` of each view; NaN where it has no truth."""
+        self.sensors: dict[str, str] = {}
+        """Name of the sensor of each view of a rig."""
         self._tally = SegmentationTally(len(endmembers), truth.num_materials) if truth.num_materials else None
 
     def add(self, view: ViewTruth, predicted: RenderedView) -> dict[str, float]:
         """Count one view; its figures."""
         valid = None if bool(view.valid.all()) else view.valid
-        spectra = predicted.spectra
+        spectra = view.seen(predicted.spectra)
         fits_window = min(spectra.shape[:2]) >= SSIM_WINDOW_PX
         figures = {
             "psnr": psnr(spectra, view.spectra, valid),
@@ -144,7 +166,9 @@ class Evaluation:
             "rmse": rmse(spectra, view.spectra, valid),
             "ssim": ssim(spectra, view.spectra, valid) if fits_window else math.nan,
             "sam": sam(spectra, view.spectra, view.shows_matter),
-            "rgb_psnr": psnr(self._srgb(spectra), self._srgb(view.spectra), valid),
+            "rgb_psnr": psnr(self._srgb(spectra), self._srgb(view.spectra), valid)
+            if view.sensor is None
+            else math.nan,
             "abundance_rmse": self._abundance_rmse(view, predicted),
         }
         if self._tally is not None and view.labels is not None:
@@ -159,9 +183,16 @@ class Evaluation:
             return SegmentationScores(math.nan, math.nan, math.nan, {}, {})
         return self._tally.scores()
 
+    def per_sensor(self) -> dict[str, dict[str, float]]:
+        """Means of `VIEW_FIGURES` over the views of each sensor, by its name; empty unless the scene is a rig."""
+        return {
+            sensor: _means([self.per_view[view] for view, own in self.sensors.items() if own == sensor])
+            for sensor in dict.fromkeys(self.sensors.values())
+        }
+
     def figures(self) -> dict[str, float]:
         """The scene's figures; NaN where there is no truth."""
-        means = {name: _mean(view[name] for view in self.per_view.values()) for name in VIEW_FIGURES}
+        means = _means(self.per_view.values())
         scores, truth = self.segmentation(), self.truth
         angle = math.nan
         if truth.endmembers is not None:
@@ -200,6 +231,7 @@ def scene_truth(scene: Scene) -> SceneTruth:
 
 def view_truth(scene: Scene, index: int) -> ViewTruth:
     """What was measured of one view of a scene."""
+    sensor = scene.sensor_of(index)
     return ViewTruth(
         name=scene.frames[index].name,
         spectra=torch.from_numpy(scene.cube(index)),
@@ -207,7 +239,21 @@ def view_truth(scene: Scene, index: int) -> ViewTruth:
         alpha=_tensor(scene.alpha(index)),
         labels=_tensor(scene.labels(index)),
         abundances=_tensor(scene.abundances(index)),
+        sensor=None if sensor.sees_all_bands else sensor,
     )
+
+
+def subpixels_for(scene: Scene, index: int, subpixels: int, pixel_size: float) -> int:
+    """Rays along the edge of a pixel with which to render a view, so that coarse sensors' pixels are means too.
+
+    Args:
+        subpixels, pixel_size: Rays along the edge of a pixel of this size, in the middle of the scene.
+    """
+    if not scene.is_rig:
+        return subpixels
+    distance = scene.cameras.camera_to_world[index, :, 3] - scene.scene_box.aabb.mean(dim=0)
+    edge = float(distance.norm() / scene.cameras.focal_px[index].mean())
+    return subpixels * min(max(1, round(edge / pixel_size)), MOST_SENSOR_SUBPIXELS)
 
 
 def finite_or_none(figures: dict[str, float]) -> dict[str, float | None]:
@@ -231,6 +277,10 @@ def _num_materials(scene: Scene) -> int:
 def _tensor(array: np.ndarray | None) -> Tensor | None:
     """A copy: arrays of pictures may be read-only."""
     return None if array is None else torch.tensor(array)
+
+
+def _means(views: Collection[dict[str, float]]) -> dict[str, float]:
+    return {name: _mean(view[name] for view in views) for name in VIEW_FIGURES}
 
 
 def _mean(values: Iterable[float]) -> float:

@@ -38,16 +38,23 @@ class RenderedView:
         return self.abundances / self.accumulation.clamp(min=1e-6)[..., None]
 
 
-def render_view(scene: TrainedScene, camera: Cameras) -> RenderedView:
-    """Render all that is written about a view."""
+def render_view(scene: TrainedScene, camera: Cameras, subpixels: int | None = None) -> RenderedView:
+    """Render all that is written about a view; `subpixels` squared rays a pixel, None for as many as in training."""
     names = ("spectral", "accumulation", "abundances", "segmentation", "material_scores")
-    outputs = scene.render(camera, names)
+    outputs = scene.render(camera, names, subpixels)
     return RenderedView(*(outputs[name].detach().cpu() for name in names))
 
 
 def picture(spectra: Float[Tensor, "H W B"], opacity: Float[Tensor, "H W"], bands: Bands) -> Picture:
     """Spectra seen on black as an sRGB picture over neutral grey."""
-    linear = spectra.double().clamp(min=0) @ rgb_matrix(bands).double()
+    return coloured_picture(spectra, opacity, rgb_matrix(bands))
+
+
+def coloured_picture(
+    spectra: Float[Tensor, "H W b"], opacity: Float[Tensor, "H W"], weights: Float[Tensor, "b 3"]
+) -> Picture:
+    """The same with other weights of the channels in red, green and blue."""
+    linear = spectra.double().clamp(min=0) @ weights.double()
     return premultiplied_over_neutral(linear.clamp(0, 1).numpy(), as_numpy(opacity))
 
 

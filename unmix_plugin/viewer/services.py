@@ -25,7 +25,7 @@ from unmix_plugin.viewer.layers.layers import layers_of
 from unmix_plugin.viewer.recipe_editor import numbered
 from unmix_plugin.viewer.rendering.edits import Edit
 from unmix_plugin.viewer.rendering.frames import num_channels
-from unmix_plugin.viewer.rendering.measured import MeasuredViews
+from unmix_plugin.viewer.rendering.measured import MeasuredViews, usable_views
 from unmix_plugin.viewer.rendering.picture_maker import PictureMaker
 from unmix_plugin.viewer.rendering.render_loop import RenderLoop
 from unmix_plugin.viewer.rendering.scene_aids import SceneAids
@@ -126,8 +126,10 @@ class Services:
         with failures_said("the scene could not be read", self._note_missing):
             scene = self._read_scene()
             self.scene = scene
-            if self.has_materials:
+            if self.has_materials and usable_views(scene):
                 self.aids.set_measured(MeasuredViews(scene, self.source))
+            elif self.has_materials:
+                self.aids.set_measured(None, "no training view has all bands")
 
     def _note_missing(self, reason: str) -> None:
         self.aids.set_measured(None, f"the scene is not at hand: {reason}")
@@ -153,5 +155,8 @@ def thumbnail(scene: Scene, name: str) -> Thumbnail | None:
     cube = scene.cube(index)
     step = max(1, cube.shape[0] // _THUMBNAIL_HEIGHT)
     spectra = torch.from_numpy(np.ascontiguousarray(cube[::step, ::step]))
-    linear = (spectra @ rgb_matrix(Bands.of(scene.wavelengths_nm))).clamp(0, 1)
+    sensor = scene.sensor_of(index)
+    false_colours = torch.from_numpy(sensor.false_colours).to(spectra)
+    weights = rgb_matrix(Bands.of(scene.wavelengths_nm)) if sensor.sees_all_bands else false_colours
+    linear = (spectra @ weights).clamp(0, 1)
     return (linear_to_srgb(linear) * 255 + 0.5).to(torch.uint8).numpy()

@@ -75,6 +75,8 @@ class Report(Product):
         indices = {} if scene is None else {frame.name: index for index, frame in enumerate(scene.frames)}
         for view in job.follow("rendering views", chosen):
             truth = None if scene is None else view_truth(scene, indices[view.name])
+            if truth is not None and truth.sensor is not None:
+                truth = None  # of a rig, only views with all bands are put beside the prediction
             views.add(view.name, job.render(view), truth)
         return views
 

@@ -43,14 +43,19 @@ class Measurement:
     """Radiance, [0, 1]."""
 
 
+def usable_views(scene: Scene) -> list[int]:
+    """Training views whose spectra can be put beside those of the model."""
+    return [index for index in scene.train_indices if scene.sensor_of(index).sees_all_bands]
+
+
 class MeasuredViews:
-    """The training views of a scene that is at hand."""
+    """The training views of a scene that is at hand, of a rig those with all bands."""
 
     def __init__(self, scene: Scene, source: SceneSource) -> None:
         self._scene = scene
         self._source = source
-        self._indices = scene.train_indices
-        self._cameras = scene.cameras[list(scene.train_indices)]
+        self._indices = usable_views(scene)
+        self._cameras = scene.cameras[self._indices]
         self._distances: OrderedDict[int, tuple[int, Tensor]] = OrderedDict()
         self._lock = threading.Lock()
 
