@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from unmix_plugin.captures.poses.colmap import find_models, read_colmap
+from unmix_plugin.captures.poses.llff import FILE_NAME as LLFF_FILE
+from unmix_plugin.captures.poses.llff import read_llff
+from unmix_plugin.captures.poses.metashape import read_metashape
+from unmix_plugin.captures.poses.micmac import find_orientations, read_micmac
+from unmix_plugin.captures.poses.opensfm import is_reconstruction, read_opensfm
 from unmix_plugin.captures.poses.pose_set import PoseSet
 from unmix_plugin.captures.poses.sizes import PictureSizes, Size
 from unmix_plugin.captures.poses.transforms_json import has_frames, read_transforms
+from unmix_plugin.captures.poses.xml_text import load_xml
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.scenes.reading.json_values import UnreadableJsonError, describe, read_json_file
 
-KNOWN = "transforms.json, a COLMAP model (.bin or .txt)"
+KNOWN = (
+    "transforms.json, a COLMAP model (.bin or .txt), Metashape's cameras as XML, OpenSfM's reconstruction.json, "
+    "MicMac's Orientation-*.xml or LLFF's poses_bounds.npy"
+)
 SPLIT_FILES = tuple(f"transforms_{split}.json" for split in ("train", "val", "eval", "test"))
 
 
@@ -40,35 +49,53 @@ def _read_file(path: Path, given: Mapping[str, Size]) -> PoseSet:
         return read_colmap(path.parent)
     if start[:1] in (b"{", b"["):
         return _read_json(path, given)
-    raise CaptureError(f"{path} holds no poses that we know; expected {KNOWN}")
+    if start[:1] == b"<":
+        return _read_xml(path)
+    if start.startswith(b"\x93NUMPY"):
+        return read_llff(path)
+    hint = ": export the cameras as XML" if path.suffix in (".psx", ".psz") else ""
+    raise CaptureError(f"{path} holds no poses that we know; expected {KNOWN}{hint}")
 
 
 def _read_json(path: Path, given: Mapping[str, Size]) -> PoseSet:
     content = _load_json(path)
     if has_frames(content):
         return read_transforms({path: content}, PictureSizes(given, path.parent))
+    if is_reconstruction(content):
+        return read_opensfm(path, content)
     raise CaptureError(
-        f"{path} holds {describe(content)} without poses; expected 'frames' with 'transform_matrix' (transforms.json)"
+        f"{path} holds {describe(content)} without poses; expected 'frames' with 'transform_matrix' "
+        "(transforms.json) or 'shots' (OpenSfM)"
+    )
+
+
+def _read_xml(path: Path) -> PoseSet:
+    root = load_xml(path)
+    if root.tag == "document" or root.find("chunk") is not None:
+        return read_metashape(path, root)
+    if root.tag in ("ExportAPERO", "OrientationConique"):
+        return read_micmac(find_orientations(path.parent) or [path])
+    raise CaptureError(
+        f"{path} is XML with the root <{root.tag}>; expected Metashape's <document> or MicMac's <ExportAPERO>"
     )
 
 
 def _read_folder(folder: Path, given: Mapping[str, Size]) -> PoseSet:
     """The poses of a folder; where several programs left some, those of the first kind, and the others are named."""
-    found: list[tuple[str, Any]] = []
+    found: list[tuple[str, Callable[[], PoseSet]]] = []
     if (folder / "transforms.json").is_file():
         found.append(("transforms.json", lambda: _read_json(folder / "transforms.json", given)))
     splits = [folder / name for name in SPLIT_FILES if (folder / name).is_file()]
     if splits:
-        sizes = PictureSizes(given, folder)
-        found.append(
-            (
-                ", ".join(path.name for path in splits),
-                lambda: read_transforms({path: _load_json(path) for path in splits}, sizes),
-            )
-        )
-    models = find_models(folder)
-    if models:
+        found.append((", ".join(path.name for path in splits), lambda: _read_splits(folder, splits, given)))
+    if models := find_models(folder):
         found.append(("a COLMAP model", lambda: _greatest_model(models)))
+    plain = [name for name in ("reconstruction.json", LLFF_FILE) if (folder / name).is_file()]
+    found += [(name, lambda name=name: _read_file(folder / name, given)) for name in plain]
+    if orientations := find_orientations(folder):
+        found.append(("MicMac's orientations", lambda: read_micmac(orientations)))
+    elif sheets := _documents(folder):
+        found.append((sheets[0].name, lambda: _read_xml(sheets[0])))
     if not found:
         raise CaptureError(f"{folder} holds no poses that we know; expected {KNOWN}")
     (name, read), *others = found
@@ -77,6 +104,15 @@ def _read_folder(folder: Path, given: Mapping[str, Size]) -> PoseSet:
         return poses
     ignored = " and ".join(other for other, _ in others)
     return replace(poses, notes=(*poses.notes, f"{folder} has {ignored} too; {name} was read"))
+
+
+def _read_splits(folder: Path, paths: list[Path], given: Mapping[str, Size]) -> PoseSet:
+    return read_transforms({path: _load_json(path) for path in paths}, PictureSizes(given, folder))
+
+
+def _documents(folder: Path) -> list[Path]:
+    """XML files that may be Metashape's."""
+    return [path for path in sorted(folder.glob("*.xml")) if b"<document" in _first_bytes(path)]
 
 
 def _greatest_model(models: list[Path]) -> PoseSet:

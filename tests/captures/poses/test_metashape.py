@@ -1,0 +1,139 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.captures.poses.pose_factory import FLIP, assert_same_poses, ring
+from unmix_plugin.captures.poses.lens_fit import project_opencv
+from unmix_plugin.captures.poses.reading import read_poses
+from unmix_plugin.errors import CaptureError
+
+SENSOR = """<sensor id="0" label="lens" type="{kind}"><resolution width="640" height="480"/>
+<property name="pixel_width" value="0.004"/><property name="pixel_height" value="0.005"/>
+<property name="focal_length" value="2"/>{calibration}</sensor>"""
+CALIBRATION = """<calibration type="{kind}" class="adjusted"><resolution width="640" height="480"/>
+<f>500</f><cx>3</cx><cy>-4</cy>{terms}</calibration>"""
+
+
+def text_of(matrix):
+    return " ".join(repr(float(value)) for value in np.asarray(matrix).ravel())
+
+
+def document(poses, component="", chunk="", terms="", kind="frame", calibration=CALIBRATION, extra=""):
+    """What Metashape writes for cameras at these poses of the chunk, all in a group."""
+    cameras = "".join(
+        f'<camera id="{index}" sensor_id="0" component_id="0" label="{name}"><transform>'
+        f"{text_of(np.vstack([np.column_stack([pose[:, :3] @ FLIP, pose[:, 3]]), [0, 0, 0, 1]]))}"
+        "</transform></camera>"
+        for index, (name, pose) in enumerate(poses.items())
+    )
+    sensor = SENSOR.format(kind=kind, calibration=calibration.format(kind=kind, terms=terms))
+    return (
+        f'<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"><chunk label="c" enabled="true">{chunk}'
+        f'<sensors>{sensor}</sensors><components><component id="0">{component}</component></components>'
+        f'<cameras><group id="0">{cameras}</group>{extra}</cameras></chunk></document>'
+    )
+
+
+def read(tmp_path, *args, **options):
+    path = tmp_path / "cameras.xml"
+    path.write_text(document(*args, **options), encoding="utf-8")
+    return read_poses(path)
+
+
+def lens_of(found):
+    lens = next(iter(found.cameras.values())).lens
+    assert lens is not None
+    return lens
+
+
+def test_cameras_of_groups_are_read_in_the_chunks_own_coordinates(tmp_path):
+    found = read(tmp_path, ring())
+    assert_same_poses(found, ring())
+    lens = lens_of(found)
+    assert (lens.focal_px, lens.center_px, lens.distortion) == ((500, 500), (323, 236), (0, 0, 0, 0))
+    assert found.up is None
+
+
+@pytest.mark.parametrize("place", ["component", "chunk"])
+def test_the_similarity_leads_to_geocentric_coordinates_with_an_offset(tmp_path, place):
+    rotation, scale = Rotation.from_euler("xyz", [0.5, 1.0, -2.0]).as_matrix(), 12.35
+    middle = np.array([-2499366.43, -4256836.52, 4029217.97])
+    element = (
+        f"<transform><rotation>{text_of(rotation)}</rotation><translation>{text_of(middle)}</translation>"
+        f"<scale>{scale}</scale></transform>"
+    )
+    found = read(tmp_path, ring(), **{place: element})
+    world = {
+        name: np.column_stack([rotation @ pose[:, :3], scale * rotation @ pose[:, 3] + middle])
+        for name, pose in ring().items()
+    }
+    assert_same_poses(found, world, atol=1e-8)
+    assert np.abs(next(iter(found.cameras.values())).camera_to_world).max() < 100
+    assert found.up is not None
+    np.testing.assert_allclose(found.up, middle / np.linalg.norm(middle), atol=1e-4)
+
+
+def test_metashapes_p1_and_b1_are_ours_in_its_own_order(tmp_path):
+    found = read(tmp_path, ring(), terms="<k1>0.1</k1><p1>0.01</p1><p2>0.02</p2><b1>2</b1>")
+    lens = lens_of(found)
+    x, y, squared = 0.3, -0.2, 0.13
+    bent_x = x * (1 + 0.1 * squared) + 0.01 * (squared + 2 * x**2) + 2 * 0.02 * x * y
+    bent_y = y * (1 + 0.1 * squared) + 0.02 * (squared + 2 * y**2) + 2 * 0.01 * x * y
+    mine = project_opencv(
+        np.array([[x, y]]), lens.focal_px, lens.center_px, lens.distortion[:2], lens.distortion[2:]
+    )
+    np.testing.assert_allclose(mine, [[323 + bent_x * 502, 236 + bent_y * 500]])
+
+
+def test_skew_and_higher_terms_are_fitted_and_their_effect_said(tmp_path):
+    found = read(tmp_path, ring(), terms="<b2>0.3</b2><k3>0.01</k3>")
+    assert any("replaced by the nearest" in note and "px" in note for note in found.notes)
+    assert lens_of(found).distortion != (0, 0, 0, 0)
+    with pytest.raises(CaptureError, match=r"sensor lens: .*by up to [\d.]+ px"):
+        read(tmp_path, ring(), terms="<b2>80</b2>")
+
+
+def test_a_sensor_without_calibration_has_its_nominal_focal_length(tmp_path):
+    found = read(tmp_path, ring(), calibration="")
+    assert lens_of(found).focal_px == (500, 400)
+    assert any("not calibrated" in note for note in found.notes)
+
+
+def test_cameras_that_are_disabled_or_not_aligned_are_left_out_and_named(tmp_path):
+    extra = (
+        '<camera id="90" sensor_id="0" label="loose"/>'
+        '<camera id="91" sensor_id="0" label="off" enabled="false"><transform>1</transform></camera>'
+    )
+    found = read(tmp_path, ring(), extra=extra)
+    assert_same_poses(found, ring())
+    assert "1 cameras have no transform: loose" in found.notes
+    assert "1 cameras are disabled: left out" in found.notes
+    with pytest.raises(CaptureError, match="none of 2 cameras is enabled and has a transform"):
+        read(tmp_path, {}, extra=extra)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda text: text[:400], "not valid XML"),
+        (lambda text: text.replace("<document", "<!DOCTYPE d><document", 1), "DOCTYPE"),
+        (lambda text: text.replace("<transform>", "<transform>nan "), "expected 16 finite numbers"),
+        (
+            lambda text: text.replace('type="frame"', 'type="spherical"'),
+            "spherical; expected frame or fisheye",
+        ),
+        (lambda text: text.replace('width="640"', 'width="-1"'), "has no resolution"),
+        (lambda text: text.replace("<f>500", "<f>0"), "focal length 0"),
+        (
+            lambda text: (
+                text.replace("<document", "<kml").replace("</document", "</kml").replace("chunk", "c")
+            ),
+            "<kml>",
+        ),
+    ],
+)
+def test_damaged_documents_are_refused(tmp_path, spoil, message):
+    path = tmp_path / "cameras.xml"
+    path.write_text(spoil(document(ring())), encoding="utf-8")
+    with pytest.raises(CaptureError, match=message):
+        read_poses(path)
