@@ -8,6 +8,7 @@ import pytest
 from tests.captures.readers.envi_factory import header_text, write_envi
 from unmix_plugin.captures.inspection import FACTS, inspect_file
 from unmix_plugin.captures.readers.read_options import ReadOptions
+from unmix_plugin.commands.process import process
 from unmix_plugin.commands.process_inspect import inspect_command
 from unmix_plugin.errors import CaptureError, ConfigError
 
@@ -86,6 +87,14 @@ def test_one_json_object_a_file_and_status_2_if_one_is_refused(header, poses, tm
         "error": f"{tmp_path / 'missing.hdr'}: no such file",
     }
     assert good["reader"] == "envi"
+
+
+def test_the_command_of_captures_passes_it_on(header, tmp_path, capsys):
+    process(["inspect", "--json", str(header)])
+    assert json.loads(capsys.readouterr().out)["shape"] == [4, 6, 3]
+    with pytest.raises(SystemExit) as left:
+        process(["inspect", "--json", str(tmp_path / "missing.hdr")])
+    assert left.value.code == 2
 
 
 def test_options_reach_the_reader(tmp_path, capsys):

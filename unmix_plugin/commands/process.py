@@ -1,4 +1,7 @@
-"""`unmix-process LAYOUT --data PATH --output-dir DIR`: from what an instrument wrote to a scene to train on."""
+"""`unmix-process LAYOUT --data PATH --output-dir DIR`: from what an instrument wrote to a scene to train on.
+
+`unmix-process inspect FILE...` says what files hold.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,14 @@ def process(arguments: list[str]) -> None:
         CaptureError: files are missing, damaged or don't fit each other.
         ConfigError: an option is wrong or does not fit the files.
         RunError: the folder can't be written.
+        SystemExit: files were to be inspected, and one was refused.
     """
+    if arguments[:1] == ["inspect"]:
+        from unmix_plugin.commands.process_inspect import inspect_command
+
+        if status := inspect_command(arguments[1:]):
+            raise SystemExit(status)
+        return
     import tyro
 
     from unmix_plugin.captures.options import ProcessOptions

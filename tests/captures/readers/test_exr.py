@@ -74,6 +74,13 @@ def test_one_of_several_layers_is_taken_or_named(tmp_path):
         open_spectral_file(tmp_path / "a.exr", ReadOptions(dataset="S3"))
 
 
+def test_channels_of_two_wavelengths_are_left_out(tmp_path):
+    write(tmp_path / "a.exr", ["T.380,000000nm.410,000000nm", "T.380,000000nm", "T.410,000000nm"])
+    file = open_spectral_file(tmp_path / "a.exr")
+    np.testing.assert_array_equal(centres_nm(file), [380, 410])
+    assert (file.notes, file.metadata["other_channels"]) == ((), ["T.380,000000nm.410,000000nm"])
+
+
 def test_channels_without_wavelengths_are_bands_without_them(tmp_path):
     channels = write(tmp_path / "a.exr", ["s0", "s1", "A"])
     file = open_spectral_file(tmp_path / "a.exr")

@@ -210,6 +210,23 @@ def test_previews_and_pages_of_other_sizes_are_left_out(tmp_path):
     assert "2 pages of other sizes" in file.notes[0]
 
 
+def test_opacity_is_noted(tmp_path):
+    image = CUBE[..., :4].copy()
+    tifffile.imwrite(tmp_path / "a.tif", image, photometric="rgb", extrasamples=["unassalpha"])
+    file = open_spectral_file(tmp_path / "a.tif")
+    np.testing.assert_array_equal(file.read(), image)
+    assert "marked as opacity" in file.notes[0]
+
+
+def test_time_and_gain_of_exif(tmp_path):
+    with Image.new("I;16", (5, 4)) as picture:
+        exif = Image.Exif()
+        exif[0x8769] = {0x829A: 0.25, 0x8827: 200}
+        picture.save(tmp_path / "a.tif", exif=exif)
+    metadata = open_spectral_file(tmp_path / "a.tif").metadata
+    assert (metadata["exposure_s"], metadata["gain"]) == (0.25, 2)
+
+
 def test_several_colour_pages_are_refused(tmp_path):
     with tifffile.TiffWriter(tmp_path / "a.tif") as file:
         for _ in range(2):

@@ -111,7 +111,9 @@ def _plain(name: str) -> SpectralChannel | None:
 
 
 def _checked(name: str, layer: str | None, nm: float) -> SpectralChannel | None:
-    """None for what no camera records: a plain number that counts, for one."""
+    """None for what no camera records: a plain number that counts, or light that comes back at another wavelength."""
+    if layer and (_LENGTH.fullmatch(layer) or _FREQUENCY.fullmatch(layer)):
+        return None
     return SpectralChannel(name, layer or "", round(nm, 6), None) if 100.0 <= nm <= 30_000.0 else None
 
 

@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     from tifffile import TiffFile, TiffPage
 
 
+_OPACITY = (1, 2)
+"""Kinds of extra numbers of a pixel. Programs give it to fourth bands that are none, so that nothing is dropped."""
+
+
 @dataclass(frozen=True)
 class _Stack:
     """The pages of a file that make its image."""
@@ -103,6 +107,8 @@ def _find_stack(path: Path, file: TiffFile) -> _Stack:
         if end > size:
             raise CaptureError(f"{path}: cut short: {num_pages} pages reach to byte {end} of {size}")
         return _Stack(like[:1], (num_pages, height, width), dtype, unlisted.dataoffset, notes)
+    if any(extra in _OPACITY for extra in first.extrasamples):
+        notes = (*notes, "a number of each pixel is marked as opacity; it is kept as a band")
     if num_listed == 1:
         return _Stack(like, (height, width, planes * samples), dtype, None, notes)
     if planes * samples > 1:
