@@ -15,6 +15,8 @@ from unmix_plugin.captures.calibration.calibration import Calibration
 from unmix_plugin.captures.spectral_file import SpectralFile
 
 ROWS_A_VIEW = 12
+MOST_ALIKE = 4
+"""Views that are looked at for bands with one value only."""
 MOST_PIXELS = 20000
 """Of all views together."""
 DETECTOR_BITS = (8, 10, 12, 14, 16)
@@ -42,22 +44,30 @@ def sampled_rows(height: int) -> list[int]:
     return [int((index + 0.5) * height / count) for index in range(count)]
 
 
-def find_saturation(files: Sequence[SpectralFile]) -> tuple[float | None, str]:
+def find_saturation(files: Sequence[SpectralFile], bands: np.ndarray) -> tuple[float | None, str]:
     """The stored number at which a detector ends, from a plateau at the greatest one, and the evidence.
 
     Files of floating-point numbers have none, as they were processed.
+
+    Args:
+        files: Of the views of one sensor.
+        bands: Indices of bands that may be of use; those with one value in all sampled pixels are left out here.
     """
     dtype = files[0].dtype
     if dtype.kind not in "iu" or dtype.itemsize > 2:
         return None, f"none: the files hold {dtype.name}"
     low = int(np.iinfo(dtype).min)
     counts = np.zeros(np.iinfo(dtype).max - low + 1, dtype=np.int64)
-    for file in files:
-        for row in sampled_rows(file.shape[0]):
-            stored = file.read(slice(row, row + 1)).ravel()
-            if file.no_data is not None:
-                stored = stored[stored != file.no_data]
-            counts += np.bincount(stored.astype(np.int64) - low, minlength=len(counts))
+    rows = sampled_rows(files[0].shape[0])
+    parts = [file.read(slice(row, row + 1), bands)[0] for file, row in _places(files[:MOST_ALIKE], rows)]
+    bands = bands[np.ptp(np.concatenate(parts), axis=0) > 0]
+    if not len(bands):
+        return None, "none: every band has one value only"
+    for file, row in _places(files, rows):
+        stored = file.read(slice(row, row + 1), bands).ravel()
+        if file.no_data is not None:
+            stored = stored[stored != file.no_data]
+        counts += np.bincount(stored.astype(np.int64) - low, minlength=len(counts))
     top = int(np.flatnonzero(counts)[-1]) if counts.any() else 0
     below = counts[max(0, top - max(1, (top + low) // 50)) : top]
     at_top, usual = int(counts[top]), float(below.mean()) if len(below) else 0.0

@@ -79,7 +79,7 @@ def prepare_sensor(
     files = [view.cube for view in views]
     choice, notes = _stated_bands(files[0], options), []
     dark, white = _references(views, choice, options, references)
-    saturation, how = _saturation(files, options)
+    saturation, how = _saturation(files, choice, options)
     raster = Raster.of(files[0].shape[0], files[0].shape[1], options.crop, options.bin_pixels)
     evidence: dict[str, Any] = {"saturation": {"stored": saturation, "evidence": how}}
     lamp = None
@@ -153,11 +153,15 @@ def _panel(views: Sequence[CaptureView], rectangle: tuple[str, int, int, int, in
     return panel_reference(view.cube, rectangle[1:], view.name)
 
 
-def _saturation(files: Sequence[SpectralFile], options: ProcessOptions) -> tuple[float | None, str]:
+def _saturation(
+    files: Sequence[SpectralFile], choice: BandChoice, options: ProcessOptions
+) -> tuple[float | None, str]:
     if options.saturation is not None:
         return options.saturation, "given with --saturation"
     model = radiometric_model(files[0])
-    return find_saturation(files) if model is None else (model.saturated, f"known of {model.maker}")
+    return (
+        find_saturation(files, choice.kept) if model is None else (model.saturated, f"known of {model.maker}")
+    )
 
 
 def _common_exposure(

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,10 @@ from unmix_plugin import __version__
 from unmix_plugin.atomic_files import write_file
 from unmix_plugin.captures.calibration.calibration import Calibration
 from unmix_plugin.captures.capture import CaptureView
+from unmix_plugin.captures.calibration.sensor import Sensor
+from unmix_plugin.captures.checks.report import Checked, check_views, report_text
+from unmix_plugin.captures.checks.seen_view import SeenView
+from unmix_plugin.captures.contact_sheet import Spectra, contact_sheet
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.plan import Plan
 from unmix_plugin.captures.poses.placement import write_points
@@ -26,6 +32,9 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 
 ILLUMINANT_NAME, FLAT_LIGHT_NAME = "illuminant.csv", "flat-light.csv"
+SHEET_NAME, REPORT_NAME = "contact-sheet.png", "report.txt"
+REFERENCES = {"dark": "dark frame", "white": "white reference"}
+"""Entries of a sensor's evidence."""
 
 
 def write_scene_files(
@@ -56,11 +65,104 @@ def write_scene_files(
         )
         for view in posed.views
     ]
-    findings: list[str] = []
-    record = _record(plan, posed, records, options, findings)
+    seen = _seen_views(folder, posed, records, written)
+    checked = check_views(seen, posed.poses.points)
+    done = _what_was_done(plan, posed, records)
+    title = f"{plan.capture.root}: {len(written)} views, {_sizes(plan)}"
+    write_file(folder / REPORT_NAME, report_text(title, checked, done).encode())
+    sheet = contact_sheet(
+        seen, _spectra(plan, posed, records), posed.poses.points, posed.poses.colours, title
+    )
+    write_file(folder / SHEET_NAME, sheet)
+    record = _record(plan, posed, records, options, checked)
     _write_json(folder / RECORD_NAME, record)
     _write_json(folder / SCENE_NAME, transforms_json(written, keys))
-    return findings
+    return list(checked.findings)
+
+
+def _seen_views(
+    folder: Path, posed: PosedViews, records: dict[str, ViewRecord], written: Sequence[WrittenView]
+) -> list[SeenView]:
+    return [
+        SeenView(
+            records[view.name],
+            replace(posed.cameras[view.name], lens=frame.lens),
+            folder / frame.paths["file_path"],
+        )
+        for view, frame in zip(posed.views, written, strict=True)
+    ]
+
+
+def _spectra(plan: Plan, posed: PosedViews, records: dict[str, ViewRecord]) -> list[Spectra]:
+    return [
+        Spectra(
+            name,
+            sensor.centers_nm,
+            np.array([records[view.name].mean_spectrum for view in posed.views if view.sensor == name]),
+            sensor.bands.wavelengths_nm[sorted(sensor.bands.dropped)],
+        )
+        for name, sensor in plan.sensors.items()
+    ]
+
+
+def _sizes(plan: Plan) -> str:
+    """Pixels and bands of each sensor."""
+    found = [
+        f"{name + ': ' if name else ''}{raster.height} x {raster.width} pixels, {Bands(sensor.centers_nm)}"
+        for name, sensor in plan.sensors.items()
+        for raster in [sensor.calibration.raster]
+    ]
+    return "; ".join(found)
+
+
+def _what_was_done(plan: Plan, posed: PosedViews, records: dict[str, ViewRecord]) -> list[str]:
+    """Decisions and totals, one sentence each."""
+    lines = []
+    for name, sensor in plan.sensors.items():
+        where = f"{name}: " if name else ""
+        facts = sensor.evidence
+        lines.append(f"{where}values are {sensor.unit}; wavelengths from {facts['wavelengths']}")
+        lines += [f"{where}{what}: {facts[key]['use']}" for key, what in REFERENCES.items() if key in facts]
+        lines.append(
+            f"{where}saturated from {facts['saturation']['stored']} ({facts['saturation']['evidence']})"
+        )
+        lines += [f"{where}{count} bands left out: {reason}" for reason, count in _reasons(sensor).items()]
+    scale = plan.decisions["scale"]
+    lines.append(
+        f"{scale['calibrated']:g} is written as 1: {scale['evidence']}; full scale of the cubes is {FULL_SCALE}"
+    )
+    views = [records[view.name] for view in posed.views]
+    lines.append(
+        f"{_sum(views, 'saturated_pixels')} pixels with saturated bands, which are written as 1; "
+        f"{_sum(views, 'clipped_values')} values above 1, written as 1 too; {_sum(views, 'negative_values')} below 0, "
+        f"written as 0; {_sum(views, 'missing_pixels')} pixels masked, as nothing was measured there"
+    )
+    lines.append(_masks_in_words(plan, views))
+    return [*lines, *posed.notes, *plan.notes]
+
+
+def _reasons(sensor: Sensor) -> Counter[str]:
+    return Counter(
+        "noisy" if reason.startswith("noise") else reason for reason in sensor.bands.dropped.values()
+    )
+
+
+def _sum(views: Sequence[ViewRecord], what: str) -> int:
+    return sum(getattr(view, what) for view in views)
+
+
+def _masks_in_words(plan: Plan, views: Sequence[ViewRecord]) -> str:
+    if plan.mask == "none":
+        return "no mask of matter"
+    share = np.mean([view.matter_share for view in views])
+    if plan.mask == "files":
+        return f"masks from files; {share:.0%} of the pixels are matter"
+    rules = [recipe.background for recipe in plan.recipes.values() if recipe.background is not None]
+    levels = ", ".join(f"{rule.level:.3f} (threshold {rule.threshold:.3f})" for rule in rules)
+    return (
+        f"{plan.mask} background at {levels}; {share:.0%} of the pixels are matter; {_sum(views, 'specks')} specks "
+        f"removed, {_sum(views, 'holes')} holes filled"
+    )
 
 
 def _widths(view: CaptureView, calibration: Calibration) -> Float64[np.ndarray, " B"] | None:
@@ -85,7 +187,7 @@ def _record(
     posed: PosedViews,
     records: dict[str, ViewRecord],
     options: ProcessOptions,
-    findings: list[str],
+    checked: Checked,
 ) -> dict[str, Any]:
     views = [records[view.name].to_json() for view in posed.views]
     return {
@@ -97,7 +199,8 @@ def _record(
         "stored": {"type": "uint16", "value_scale": FULL_SCALE, "calibrated_value_of_1": plan.scale},
         "poses": {"source": posed.poses.source, "notes": list(posed.notes), **posed.keys},
         "notes": list(plan.notes),
-        "what_looks_wrong": findings,
+        "what_looks_wrong": list(checked.findings),
+        "measured": list(checked.measured),
         "totals": {
             key: sum(view[key] for view in views)
             for key in (

@@ -39,7 +39,7 @@ class ViewRecord:
     """Files by the keys of transforms.json, relative to the scene."""
     num_pixels: int
     saturated_pixels: int
-    """With at least one band at the detector's top; such bands are written as 1."""
+    """Of matter, with at least one band at the detector's top; such bands are written as 1."""
     clipped_values: int
     """Values above the scale that are not saturated; written as 1 too."""
     negative_values: int
@@ -124,7 +124,8 @@ class _Tally:
         self.opacity: UInt8[np.ndarray, "H W"] = np.full((height, width), OPAQUE, np.uint8)
         if masks.opacity is not None:
             self.opacity = masks.opacity
-        self.counts = np.zeros(3, dtype=np.int64)
+        self.saturated: Bool[np.ndarray, "H W"] = np.zeros((height, width), bool)
+        self.counts = np.zeros(2, dtype=np.int64)
         self.sum: Float64[np.ndarray, " B"] = np.zeros(bands)
         self.num_summed = 0
         self.specks, self.holes = 0, 0
@@ -135,7 +136,8 @@ class _Tally:
         values = part.values * np.float32(1.0 / recipe.scale)
         self.missing[rows] |= part.missing
         above = (values > 1.0) & ~part.saturated
-        self.counts += (part.saturated.any(axis=-1).sum(), above.sum(), (values < 0).sum())
+        self.counts += (above.sum(), (values < 0).sum())
+        self.saturated[rows] = part.saturated.any(axis=-1)
         if recipe.background is not None:
             self.opacity[rows] = np.where(recipe.background.matter(values), OPAQUE, 0)
         self.rgb[rows] = recipe.colours.linear_rgb(values)
@@ -161,9 +163,9 @@ class _Tally:
             sensor=view.sensor,
             paths=paths,
             num_pixels=seen.size,
-            saturated_pixels=int(self.counts[0]),
-            clipped_values=int(self.counts[1]),
-            negative_values=int(self.counts[2]),
+            saturated_pixels=int((self.saturated & seen).sum()),
+            clipped_values=int(self.counts[0]),
+            negative_values=int(self.counts[1]),
             missing_pixels=int(self.missing.sum()),
             matter_share=float((self.opacity > HALF).mean()),
             specks=self.specks,
