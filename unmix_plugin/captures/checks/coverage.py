@@ -48,8 +48,8 @@ def ring(views: Sequence[SeenView]) -> tuple[list[str], str]:
     findings = []
     if height < NARROW_DEG and around > WIDE_RING_DEG:
         findings.append(
-            f"a narrow ring: all cameras stand within {height:.0f} degrees of elevation, so that what is seen from above "
-            "or below is a guess; add a second ring 25 degrees higher"
+            f"a narrow ring: all cameras stand within {height:.0f} degrees of elevation, so that what is seen from "
+            "above or below is a guess; add a second ring 25 degrees higher"
         )
     if around > WIDE_RING_DEG and gap > GAP_DEG:
         findings.append(f"no camera looks from {gap:.0f} degrees of the circle around the object")

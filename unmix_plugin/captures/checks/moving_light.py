@@ -73,8 +73,8 @@ def moving_light(
             "whether light moves with the camera is not measured: it takes sparse points and near views",
         )
     said = (
-        f"the brightness of sparse points has a slope of {found.slope:.2f} +- {found.error:.2f} along the movement of the "
-        f"camera ({found.pairs} pairs of views; 0 is fixed light)"
+        f"the brightness of sparse points has a slope of {found.slope:.2f} +- {found.error:.2f} along the movement of "
+        f"the camera ({found.pairs} pairs of views; 0 is fixed light)"
     )
     if not found.moves:
         return [], said

@@ -66,7 +66,7 @@ def write_scene_files(
         for view in posed.views
     ]
     seen = _seen_views(folder, posed, records, written)
-    checked = check_views(seen, posed.poses.points)
+    checked = check_views(_of_greatest_sensor(seen), posed.poses.points)
     done = _what_was_done(plan, posed, records)
     title = f"{plan.capture.root}: {len(written)} views, {_sizes(plan)}"
     write_file(folder / REPORT_NAME, report_text(title, checked, done).encode())
@@ -91,6 +91,12 @@ def _seen_views(
         )
         for view, frame in zip(posed.views, written, strict=True)
     ]
+
+
+def _of_greatest_sensor(views: Sequence[SeenView]) -> list[SeenView]:
+    """Views of the sensor that took the most: those of different ones can't be compared."""
+    (sensor, _), *_ = Counter(view.record.sensor for view in views).most_common(1)
+    return [view for view in views if view.record.sensor == sensor]
 
 
 def _spectra(plan: Plan, posed: PosedViews, records: dict[str, ViewRecord]) -> list[Spectra]:
