@@ -16,7 +16,6 @@ from unmix_plugin import __version__
 from unmix_plugin.atomic_files import write_file
 from unmix_plugin.captures.calibration.calibration import Calibration
 from unmix_plugin.captures.capture import CaptureView
-from unmix_plugin.captures.calibration.sensor import Sensor
 from unmix_plugin.captures.checks.report import Checked, check_views, report_text
 from unmix_plugin.captures.checks.seen_view import SeenView
 from unmix_plugin.captures.contact_sheet import Spectra, contact_sheet
@@ -24,6 +23,7 @@ from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.plan import Plan
 from unmix_plugin.captures.poses.placement import write_points
 from unmix_plugin.captures.posing import PosedViews
+from unmix_plugin.captures.writing.decisions_in_words import sizes_in_words, what_was_done
 from unmix_plugin.captures.writing.sources import hashes
 from unmix_plugin.captures.writing.transforms import WrittenView, transforms_json
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, ViewRecord
@@ -33,8 +33,6 @@ from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectr
 
 ILLUMINANT_NAME, FLAT_LIGHT_NAME = "illuminant.csv", "flat-light.csv"
 SHEET_NAME, REPORT_NAME = "contact-sheet.png", "report.txt"
-REFERENCES = {"dark": "dark frame", "white": "white reference"}
-"""Entries of a sensor's evidence."""
 
 
 def write_scene_files(
@@ -67,8 +65,8 @@ def write_scene_files(
     ]
     seen = _seen_views(folder, posed, records, written)
     checked = check_views(_of_greatest_sensor(seen), posed.poses.points)
-    done = _what_was_done(plan, posed, records)
-    title = f"{plan.capture.root}: {len(written)} views, {_sizes(plan)}"
+    done = what_was_done(plan, posed, records)
+    title = f"{plan.capture.root}: {len(written)} views, {sizes_in_words(plan)}"
     write_file(folder / REPORT_NAME, report_text(title, checked, done).encode())
     sheet = contact_sheet(
         seen, _spectra(plan, posed, records), posed.poses.points, posed.poses.colours, title
@@ -109,66 +107,6 @@ def _spectra(plan: Plan, posed: PosedViews, records: dict[str, ViewRecord]) -> l
         )
         for name, sensor in plan.sensors.items()
     ]
-
-
-def _sizes(plan: Plan) -> str:
-    """Pixels and bands of each sensor."""
-    found = [
-        f"{name + ': ' if name else ''}{raster.height} x {raster.width} pixels, {Bands(sensor.centers_nm)}"
-        for name, sensor in plan.sensors.items()
-        for raster in [sensor.calibration.raster]
-    ]
-    return "; ".join(found)
-
-
-def _what_was_done(plan: Plan, posed: PosedViews, records: dict[str, ViewRecord]) -> list[str]:
-    """Decisions and totals, one sentence each."""
-    lines = []
-    for name, sensor in plan.sensors.items():
-        where = f"{name}: " if name else ""
-        facts = sensor.evidence
-        lines.append(f"{where}values are {sensor.unit}; wavelengths from {facts['wavelengths']}")
-        lines += [f"{where}{what}: {facts[key]['use']}" for key, what in REFERENCES.items() if key in facts]
-        lines.append(
-            f"{where}saturated from {facts['saturation']['stored']} ({facts['saturation']['evidence']})"
-        )
-        lines += [f"{where}{count} bands left out: {reason}" for reason, count in _reasons(sensor).items()]
-    scale = plan.decisions["scale"]
-    lines.append(
-        f"{scale['calibrated']:g} is written as 1: {scale['evidence']}; full scale of the cubes is {FULL_SCALE}"
-    )
-    views = [records[view.name] for view in posed.views]
-    lines.append(
-        f"{_sum(views, 'saturated_pixels')} pixels with saturated bands, which are written as 1; "
-        f"{_sum(views, 'clipped_values')} values above 1, written as 1 too; {_sum(views, 'negative_values')} below 0, "
-        f"written as 0; {_sum(views, 'missing_pixels')} pixels masked, as nothing was measured there"
-    )
-    lines.append(_masks_in_words(plan, views))
-    return [*lines, *posed.notes, *plan.notes]
-
-
-def _reasons(sensor: Sensor) -> Counter[str]:
-    return Counter(
-        "noisy" if reason.startswith("noise") else reason for reason in sensor.bands.dropped.values()
-    )
-
-
-def _sum(views: Sequence[ViewRecord], what: str) -> int:
-    return sum(getattr(view, what) for view in views)
-
-
-def _masks_in_words(plan: Plan, views: Sequence[ViewRecord]) -> str:
-    if plan.mask == "none":
-        return "no mask of matter"
-    share = np.mean([view.matter_share for view in views])
-    if plan.mask == "files":
-        return f"masks from files; {share:.0%} of the pixels are matter"
-    rules = [recipe.background for recipe in plan.recipes.values() if recipe.background is not None]
-    levels = ", ".join(f"{rule.level:.3f} (threshold {rule.threshold:.3f})" for rule in rules)
-    return (
-        f"{plan.mask} background at {levels}; {share:.0%} of the pixels are matter; {_sum(views, 'specks')} specks "
-        f"removed, {_sum(views, 'holes')} holes filled"
-    )
 
 
 def _widths(view: CaptureView, calibration: Calibration) -> Float64[np.ndarray, " B"] | None:

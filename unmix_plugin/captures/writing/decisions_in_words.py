@@ -1,0 +1,77 @@
+"""What was decided and done, in sentences for the report."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from unmix_plugin.captures.calibration.sensor import Sensor
+from unmix_plugin.captures.plan import Plan
+from unmix_plugin.captures.posing import PosedViews
+from unmix_plugin.captures.writing.view_files import FULL_SCALE, ViewRecord
+from unmix_plugin.spectral.bands import Bands
+
+REFERENCES = {"dark": "dark frame", "white": "white reference"}
+"""Entries of a sensor's evidence."""
+
+
+def sizes_in_words(plan: Plan) -> str:
+    """Pixels and bands of each sensor."""
+    found = [
+        f"{name + ': ' if name else ''}{raster.height} x {raster.width} pixels, {Bands(sensor.centers_nm)}"
+        for name, sensor in plan.sensors.items()
+        for raster in [sensor.calibration.raster]
+    ]
+    return "; ".join(found)
+
+
+def what_was_done(plan: Plan, posed: PosedViews, records: dict[str, ViewRecord]) -> list[str]:
+    """Decisions and totals, one sentence each."""
+    lines = []
+    for name, sensor in plan.sensors.items():
+        where = f"{name}: " if name else ""
+        facts = sensor.evidence
+        lines.append(f"{where}values are {sensor.unit}; wavelengths from {facts['wavelengths']}")
+        lines += [f"{where}{what}: {facts[key]['use']}" for key, what in REFERENCES.items() if key in facts]
+        lines.append(
+            f"{where}saturated from {facts['saturation']['stored']} ({facts['saturation']['evidence']})"
+        )
+        lines += [f"{where}{count} bands left out: {reason}" for reason, count in _reasons(sensor).items()]
+    scale = plan.decisions["scale"]
+    lines.append(
+        f"{scale['calibrated']:g} is written as 1: {scale['evidence']}; full scale of the cubes is {FULL_SCALE}"
+    )
+    views = [records[view.name] for view in posed.views]
+    lines.append(
+        f"{_sum(views, 'saturated_pixels')} pixels with saturated bands, which are written as 1; "
+        f"{_sum(views, 'clipped_values')} values above 1, written as 1 too; {_sum(views, 'negative_values')} below 0, "
+        f"written as 0; {_sum(views, 'missing_pixels')} pixels masked, as nothing was measured there"
+    )
+    lines.append(_masks_in_words(plan, views))
+    return [*lines, *posed.notes, *plan.notes]
+
+
+def _reasons(sensor: Sensor) -> Counter[str]:
+    return Counter(
+        "noisy" if reason.startswith("noise") else reason for reason in sensor.bands.dropped.values()
+    )
+
+
+def _sum(views: Sequence[ViewRecord], what: str) -> int:
+    return sum(getattr(view, what) for view in views)
+
+
+def _masks_in_words(plan: Plan, views: Sequence[ViewRecord]) -> str:
+    if plan.mask == "none":
+        return "no mask of matter"
+    share = np.mean([view.matter_share for view in views])
+    if plan.mask == "files":
+        return f"masks from files; {share:.0%} of the pixels are matter"
+    rules = [recipe.background for recipe in plan.recipes.values() if recipe.background is not None]
+    levels = ", ".join(f"{rule.level:.3f} (threshold {rule.threshold:.3f})" for rule in rules)
+    return (
+        f"{plan.mask} background at {levels}; {share:.0%} of the pixels are matter; {_sum(views, 'specks')} specks "
+        f"removed, {_sum(views, 'holes')} holes filled"
+    )
