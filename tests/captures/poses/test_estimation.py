@@ -1,0 +1,86 @@
+import importlib.util
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from tests.scenes.scene_factory import look_at
+from unmix_plugin.captures.poses import estimation
+from unmix_plugin.captures.poses.alignment import align_poses
+from unmix_plugin.captures.poses.estimation import estimate_poses
+from unmix_plugin.captures.poses.pose_set import Lens, PosedCamera, PoseSet
+from unmix_plugin.errors import CaptureError
+
+pytest.importorskip("pycolmap")
+LENS = Lens(256, 192, (300.0, 300.0), (128.0, 96.0))
+TEXTURE = 400
+
+
+def corner_of_a_room(pose: np.ndarray, textures: np.ndarray) -> np.ndarray:
+    """What a camera sees of three walls, x = 0, y = 0 and z = 0, with a texture each."""
+    x, y = np.meshgrid(np.arange(LENS.width) + 0.5, np.arange(LENS.height) + 0.5)
+    local = np.stack([(x - 128) / 300, -(y - 96) / 300, -np.ones_like(x)], -1)
+    directions = local @ pose[:3, :3].T
+    distances = np.where(directions < 0, -pose[:3, 3] / np.minimum(directions, -1e-9), np.inf)
+    wall = distances.argmin(-1)
+    points = pose[:3, 3] + distances.min(-1)[..., None] * directions
+    seen = np.zeros(wall.shape)
+    for axis in range(3):
+        along = [index for index in range(3) if index != axis]
+        place = np.moveaxis(points[..., along], -1, 0) * TEXTURE / 4
+        seen[wall == axis] = map_coordinates(textures[axis], place, order=1, mode="wrap")[wall == axis]
+    return seen
+
+
+@pytest.fixture(scope="module")
+def room():
+    """Pictures of the corner, and where they were taken from."""
+    generator = np.random.default_rng(0)
+    noise = generator.normal(size=(3, TEXTURE, TEXTURE))
+    textures = np.stack([gaussian_filter(part, 1.5) + 2 * gaussian_filter(part, 4) for part in noise])
+    cameras, pictures = {}, {}
+    for index, angle in enumerate(np.radians(np.linspace(15, 75, 8))):
+        height = 1.6 + 0.4 * (index % 2)
+        pose = look_at(np.array([3 * np.cos(angle), 3 * np.sin(angle), height]), np.array([0.4, 0.4, 0.4]))
+        cameras[f"view {index}"] = PosedCamera(pose[:3], LENS)
+        seen = corner_of_a_room(pose, textures)
+        pictures[f"view {index}"] = np.clip(128 + 60 * seen / seen.std(), 0, 255).astype(np.uint8)
+    return pictures, PoseSet(cameras, "the truth")
+
+
+def test_poses_of_a_textured_scene_are_found_to_a_part_of_a_pixel(room, tmp_path):
+    pictures, truth = room
+    found = estimate_poses(pictures, tmp_path, threads=1)
+    assert list(found.cameras) == sorted(pictures)
+    assert found.points is not None
+    assert len(found.points) > 100
+    assert any("registered 8 of 8 views with a mean reprojection error of 0." in note for note in found.notes)
+    assert align_poses(replace(found, points=None), truth).rms_px < 0.5
+    assert (tmp_path / "colmap.log").stat().st_size > 0
+    lens = found.cameras["view 0"].lens
+    assert lens is not None
+    np.testing.assert_allclose(lens.focal_px, LENS.focal_px, rtol=0.05)
+
+
+def test_pictures_without_texture_are_refused_with_what_to_do(room, tmp_path):
+    blank = {name: np.full_like(picture, 128) for name, picture in room[0].items()}
+    with pytest.raises(CaptureError, match=r"only 0 of 8 views could be estimated.*more views"):
+        estimate_poses(blank, tmp_path, threads=1)
+
+
+def test_two_views_are_too_few(room, tmp_path):
+    with pytest.raises(CaptureError, match="2 views; expected at least 3"):
+        estimate_poses(dict(list(room[0].items())[:2]), tmp_path)
+
+
+def test_a_crash_of_colmap_is_told_with_its_log(room, tmp_path, monkeypatch):
+    monkeypatch.setattr(estimation.sys, "executable", "/bin/false")
+    with pytest.raises(CaptureError, match=r"COLMAP stopped with status 1 .*colmap\.log"):
+        estimate_poses(room[0], tmp_path)
+
+
+def test_without_pycolmap_the_extra_is_named(room, tmp_path, monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", {}.get)
+    with pytest.raises(CaptureError, match=r"pip install 'unmix-nerf\[sfm\]'"):
+        estimate_poses(room[0], tmp_path)
