@@ -74,6 +74,7 @@ def pose_views(views: Sequence[CaptureView], poses: PoseSet) -> PosedViews:
     """
     matches = match_poses(poses, [(view.name, _files_of(view)) for view in views])
     cameras, completed = complete_rigs(views, matches.cameras)
+    matched = [note for note in matches.notes if not (completed and "without pose" in note)]
     posed = tuple(view for view in views if view.name in cameras)
     if len(posed) < LEAST_VIEWS:
         raise CaptureError(
@@ -90,7 +91,7 @@ def pose_views(views: Sequence[CaptureView], poses: PoseSet) -> PosedViews:
         placed.poses.cameras,
         placed.poses,
         placed.placement.to_json(),
-        (*poses.notes, *matches.notes, *completed, *placed.notes),
+        (*poses.notes, *matched, *completed, *placed.notes),
     )
 
 

@@ -49,7 +49,7 @@ def complete_rigs(
                 continue
             base, offset = _offset_to(view, posed, offsets)
             if base is None or offset is None:
-                how[(view.sensor, "nothing")] += 1
+                how[(view.sensor, "unknown" if posed else "unposed")] += 1
                 continue
             pose = _square(cameras[base.name].camera_to_world) @ offset
             completed[view.name] = PosedCamera(pose[:3], view.lens)
@@ -58,15 +58,15 @@ def complete_rigs(
 
 
 def _say(sensor: str, kind: str, count: int) -> str:
-    text = f"{count} views of lens {sensor} "
-    if kind == "nothing":
-        return text + "have no pose, and nothing says how the lens stands to others: left out"
-    known = (
-        "its offset in other releases"
-        if kind == "poses"
-        else "the rig's rotations in the files, at the same place"
+    return (
+        f"{count} views of lens {sensor} "
+        + {
+            "unposed": "are left out: no lens of their release has a pose",
+            "unknown": "are left out: they have no pose, and nothing says how the lens stands to others of the rig",
+            "poses": "got the pose of another lens of their release, moved as in other releases",
+            "files": "got the pose of another lens of their release, turned as the files say, at the same place",
+        }[kind]
     )
-    return text + f"got the pose of another lens of their release and {known}"
 
 
 def _offset_to(
