@@ -41,7 +41,8 @@ class ProcessOptions:
     white_rectangle: Annotated[
         tuple[str, int, int, int, int] | None, tyro.conf.arg(metavar="VIEW ROW COLUMN HEIGHT WIDTH")
     ] = None
-    """The white reference is a panel in a view: its first row and column, height and width in pixels."""
+    """The white reference is a panel in a view, or in the views of a release of a rig: its first row and column, height
+    and width in pixels."""
     white_reflectance: str = "1"
     """Reflectance of the white panel: a number, or a CSV file (wavelength,reflectance)."""
     mask: MaskKind | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +80,10 @@ def make_plan(
         by_sensor[view.sensor].append(view)
     for same in by_sensor.values():
         _refuse_unlike(same)
-    sensors = {name: prepare_sensor(name, same, options, references) for name, same in by_sensor.items()}
+    sensors = {
+        name: prepare_sensor(name, same, options, replace(references, views=_of_sensor(capture, name)))
+        for name, same in by_sensor.items()
+    }
     scale, why = choose_scale(list(sensors.values()), options.scale)
     mask = _choose_mask(views, options.mask)
     recipes, evidence = {}, {}
@@ -115,6 +118,10 @@ def make_plan(
         (*capture.notes, *said),
         tuple(path for file in opened for path in file.files),
     )
+
+
+def _of_sensor(capture: Capture, name: str) -> tuple[CaptureView, ...]:
+    return tuple(view for view in capture.views if view.sensor == name)
 
 
 def input_files(view: CaptureView) -> list[Path]:

@@ -160,6 +160,19 @@ def write_flight(root: Path, releases: int = 10) -> None:
             )
 
 
+PANEL_LIGHT = {"GRE": 0.5, "RED": 0.4, "REG": 0.7, "NIR": 0.62}
+"""Radiance of a grey panel that fills the images of one release."""
+
+
+def write_panel(root: Path) -> str:
+    """Files of a release that shows the panel, before the flight; gives its name."""
+    for lens in LENSES:
+        light = np.full((HEIGHT, WIDTH), PANEL_LIGHT[lens.ending])
+        path = root / f"IMG_170101_100000_9999_{lens.ending}.TIF"
+        write_band_file(path, stored(light, lens), tags(9999, lens), EXIF | {"ExposureTime": lens.exposure_s})
+    return "IMG_170101_100000_9999"
+
+
 def write_poses(path: Path, lenses: tuple[LensOfRig, ...] = LENSES[:1], releases: int = 10) -> None:
     """True poses of some lenses, with their lens, as nerfstudio writes them."""
     frames = [

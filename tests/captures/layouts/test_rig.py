@@ -8,12 +8,14 @@ from tests.captures.layouts.data_sets import PLAIN
 from tests.captures.layouts.rig_flight import (
     HEIGHT,
     LENSES,
+    PANEL_LIGHT,
     WIDTH,
     image,
     lens_pose,
     rays,
     stored,
     write_flight,
+    write_panel,
     write_poses,
 )
 from unmix_plugin.captures.layouts.registry import LayoutOptions
@@ -40,8 +42,8 @@ def scene(flight, tmp_path_factory):
     return _process(flight, folder / "scene", folder / "poses.json")
 
 
-def _process(root, output, poses):
-    options = ProcessOptions(layout="rig", data=root, output_dir=output, poses=str(poses), mask="none")
+def _process(root, output, poses, **given):
+    options = ProcessOptions("rig", data=root, output_dir=output, poses=str(poses), mask="none", **given)
     process_capture(options, lambda _: None, lambda _, views: views)
     return output
 
@@ -166,6 +168,20 @@ def test_the_scene_holds_the_radiance_of_the_ground(scene):
         path = next((scene / "cubes").glob(f"*_0005_{lens.ending}.npy"))
         found = np.load(path)[..., 0] / 65535 * one
         expected = np.minimum(image(5, lens), one)
+        np.testing.assert_allclose(found, expected, rtol=0.01)
+
+
+def test_a_panel_before_the_flight_makes_reflectances(tmp_path):
+    write_flight(tmp_path / "flight", releases=3)
+    panel = write_panel(tmp_path / "flight")
+    write_poses(tmp_path / "poses.json", releases=3)
+    options = {"white_rectangle": (panel, 10, 12, 20, 30), "white_reflectance": "0.5"}
+    scene = _process(tmp_path / "flight", tmp_path / "scene", tmp_path / "poses.json", **options)
+    one = json.loads((scene / "process.json").read_text())["stored"]["calibrated_value_of_1"]
+    assert not list((scene / "cubes").glob("*_9999_*"))
+    for lens in LENSES:
+        found = np.load(next((scene / "cubes").glob(f"*_0001_{lens.ending}.npy")))[..., 0] / 65535 * one
+        expected = np.minimum(0.5 * image(1, lens) / PANEL_LIGHT[lens.ending], one)
         np.testing.assert_allclose(found, expected, rtol=0.01)
 
 

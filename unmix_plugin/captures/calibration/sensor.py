@@ -60,6 +60,8 @@ class References:
 
     dark: SpectralFile | None = None
     white: SpectralFile | None = None
+    views: tuple[CaptureView, ...] = ()
+    """All views of the sensor, with those that have no pose: one may show a panel."""
 
 
 def prepare_sensor(
@@ -100,7 +102,7 @@ def prepare_sensor(
     for what, reference in (("dark", dark), ("white", None if white is None else white.reference)):
         if reference is not None:
             evidence[what] = {"file": str(reference.file.path), "use": reference.how}
-    evidence |= _band_evidence(files[0], choice)
+    evidence |= _band_evidence(files[0], choice) | _light_evidence(views)
     return Sensor(
         name,
         calibration,
@@ -136,7 +138,7 @@ def _references(
     cube = views[0].cube
     dark = None if references.dark is None else open_reference(references.dark, "dark frame", cube)
     if options.white_rectangle is not None:
-        panel = _panel(views, options.white_rectangle)
+        panel = _panel(references.views or views, options.white_rectangle)
     elif references.white is not None:
         panel = open_reference(references.white, "white reference", cube)
     else:
@@ -146,7 +148,7 @@ def _references(
 
 
 def _panel(views: Sequence[CaptureView], rectangle: tuple[str, int, int, int, int]) -> Reference:
-    view = next((view for view in views if view.name == rectangle[0]), None)
+    view = next((view for view in views if rectangle[0] in (view.name, view.release)), None)
     if view is None:
         names = ", ".join(view.name for view in views[:5])
         raise ConfigError(f"--white-rectangle {rectangle[0]}: no view of this name; the first are {names}")
@@ -215,6 +217,15 @@ def _lamp_of(lamp: Float64[np.ndarray, " B"], choice: BandChoice, binning: int) 
 def _binned(values: Float32[np.ndarray, "N b"], binning: int) -> Float32[np.ndarray, "N c"]:
     count = values.shape[1] // binning
     return values[:, : count * binning].reshape(len(values), count, binning).mean(axis=2)
+
+
+def _light_evidence(views: Sequence[CaptureView]) -> dict[str, Any]:
+    """What sunshine sensors measured, by view."""
+    models = {view.name: radiometric_model(view.cube) for view in views}
+    light = {
+        name: model.irradiance for name, model in models.items() if model and model.irradiance is not None
+    }
+    return {"irradiance": light} if light else {}
 
 
 def _band_evidence(file: SpectralFile, choice: BandChoice) -> dict[str, Any]:
