@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import tifffile
 from PIL import Image
+from PIL.TiffImagePlugin import IFDRational, ImageFileDirectory_v2
 
 from tests.captures.readers.bands import centres_nm, widths_nm
 from unmix_plugin.captures.readers.opening import open_spectral_file
@@ -219,10 +220,9 @@ def test_opacity_is_noted(tmp_path):
 
 
 def test_time_and_gain_of_exif(tmp_path):
-    with Image.new("I;16", (5, 4)) as picture:
-        exif = Image.Exif()
-        exif[0x8769] = {0x829A: 0.25, 0x8827: 200}
-        picture.save(tmp_path / "a.tif", exif=exif)
+    tags = ImageFileDirectory_v2()
+    tags[0x8769] = {0x829A: IFDRational(1, 4), 0x8827: 200}
+    Image.new("I;16", (5, 4)).save(tmp_path / "a.tif", tiffinfo=tags)
     metadata = open_spectral_file(tmp_path / "a.tif").metadata
     assert (metadata["exposure_s"], metadata["gain"]) == (0.25, 2)
 
