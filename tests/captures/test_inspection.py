@@ -58,6 +58,15 @@ def test_facts_of_poses(poses):
     assert (facts["poses"], facts["shape"]) == (3, None)
 
 
+def test_poses_in_an_array(tmp_path):
+    rows = np.zeros((5, 17))
+    for distance, row in enumerate(rows):
+        row[:15] = np.hstack([np.eye(3), [[distance], [0], [0]], [[480], [640], [500]]]).reshape(-1)
+        row[15:] = 1, 9
+    np.save(tmp_path / "poses_bounds.npy", rows)
+    assert inspect_file(tmp_path / "poses_bounds.npy")["poses"] == 5
+
+
 def test_numbers_that_are_not_there_are_found_out(tmp_path):
     header = tmp_path / "cube.hdr"
     header.write_text(header_text(CUBE, "bsq", {}))

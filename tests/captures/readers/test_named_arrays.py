@@ -171,6 +171,7 @@ def test_numbers_of_hdf5_outside_the_file_are_not_followed(tmp_path):
     (tmp_path / "secret").write_bytes(bytes(range(60)))
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file.create_dataset("cube", (3, 4, 5), "u1", external=[(str(tmp_path / "secret"), 0, 60)])
+        file.create_dataset("wavelength", (5,), "u1", external=[(str(tmp_path / "secret"), 0, 5)])
     with pytest.raises(CaptureError, match="the numbers of cube lie in other files"):
         open_spectral_file(tmp_path / "a.h5")
 

@@ -59,4 +59,4 @@ def image_shape(shape: tuple[int, ...], axes: Axes) -> tuple[int, int, int]:
 
 def take_part(stored: np.ndarray, axes: Axes, rows: slice, bands: BandIndex) -> np.ndarray:
     """A copy (h, W, b) of some rows and bands of a stored array."""
-    return np.array(stored.transpose([axes.index(axis) for axis in "yxb"])[rows][:, :, bands])
+    return np.array(stored.transpose([axes.index(axis) for axis in "yxb"])[rows][:, :, bands], order="C")

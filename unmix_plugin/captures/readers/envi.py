@@ -72,7 +72,9 @@ def _read_part(data_path: Path, layout: EnviLayout, rows: slice, bands: BandInde
     stored = np.memmap(
         data_path, layout.dtype, "r", layout.offset, tuple(lengths[axis] for axis in layout.axes)
     )
-    return np.array(stored.transpose([layout.axes.index(axis) for axis in "yxb"])[rows][:, :, bands])
+    return np.array(
+        stored.transpose([layout.axes.index(axis) for axis in "yxb"])[rows][:, :, bands], order="C"
+    )
 
 
 def _check_size(header_path: Path, data_path: Path, layout: EnviLayout) -> tuple[str, ...]:

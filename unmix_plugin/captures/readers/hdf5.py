@@ -5,6 +5,7 @@ A file is opened for each part that is read and closed again, so that many can b
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,7 @@ def open_hdf5(path: Path, options: ReadOptions) -> SpectralFile:
     with import_extra("h5py").File(path, "r") as file:
         arrays: list[FoundArray] = []
         file.visititems(lambda name, item: arrays.extend(_found(path, name, item, is_matlab)))
-        root = dict(file.attrs)
+        root = _attributes(file)
     arrays = [_with_attributes(array, root) for array in arrays]
     opened = image_of_arrays(path, "matlab" if is_matlab else "hdf5", arrays, options)
     _refuse_other_files(path, opened.metadata.get("dataset") or arrays[0].name)
@@ -41,6 +42,8 @@ def _found(path: Path, name: str, item: Any, is_matlab: bool) -> list[FoundArray
     if not hasattr(item, "shape") or item.shape is None or "#refs#" in name:
         return []
     shape = tuple(item.shape[::-1] if is_matlab else item.shape)
+    if len(shape) != 3 and (item.external or item.is_virtual):
+        return []
 
     def whole() -> np.ndarray:
         return _whole(path, name).T if is_matlab else _whole(path, name)
@@ -51,7 +54,7 @@ def _found(path: Path, name: str, item: Any, is_matlab: bool) -> list[FoundArray
     is_cube = len(shape) == 3
     return [
         FoundArray(
-            name, shape, item.dtype, whole, take if is_cube else None, dict(item.attrs), _dimensions(item)
+            name, shape, item.dtype, whole, take if is_cube else None, _attributes(item), _dimensions(item)
         )
     ]
 
@@ -59,6 +62,15 @@ def _found(path: Path, name: str, item: Any, is_matlab: bool) -> list[FoundArray
 def _with_attributes(array: FoundArray, root: dict[str, Any]) -> FoundArray:
     """Attributes of the file hold for its images where these have none of that name."""
     return replace(array, attributes={**root, **array.attributes}) if len(array.shape) == 3 else array
+
+
+def _attributes(item: Any) -> dict[str, Any]:
+    """Attributes that h5py can read; files of other programs hold types that it has no word for."""
+    attributes = {}
+    for name in item.attrs:
+        with suppress(OSError, TypeError, ValueError, RuntimeError):
+            attributes[name] = item.attrs[name]
+    return attributes
 
 
 def _dimensions(item: Any) -> tuple[str, ...] | None:

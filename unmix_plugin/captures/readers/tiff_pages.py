@@ -62,7 +62,7 @@ def read_page(path: Path, page: TiffPage, dtype: np.dtype, rows: slice, bands: B
         stored = np.memmap(path, dtype, "r", page.dataoffsets[0], (planes, height, width, samples))
         image = stored[:, rows]
         chosen = image[0][..., bands] if planes == 1 else np.moveaxis(image[..., 0][bands], 0, -1)
-        return np.array(chosen)
+        return np.array(chosen, order="C")
     indices = np.arange(planes * samples)[bands]
     wanted_planes = sorted(set(indices.tolist())) if planes > 1 else [0]
     block = _decode(path, page, rows, wanted_planes)
