@@ -8,10 +8,11 @@ from pathlib import Path
 
 from unmix_plugin.captures.calibration.sensor import References
 from unmix_plugin.captures.capture import Capture, CaptureView
+from unmix_plugin.captures.estimating import estimated_poses
 from unmix_plugin.captures.layouts.registry import LAYOUTS, LayoutOptions, find_views
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.plan import Plan, input_files, make_plan
-from unmix_plugin.captures.posing import given_poses, pose_views
+from unmix_plugin.captures.posing import ESTIMATE, given_poses, pose_views
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.readers.read_options import ReadOptions
 from unmix_plugin.captures.spectral_file import SpectralFile
@@ -44,14 +45,20 @@ def process_capture(options: ProcessOptions, say: Say, follow: Follow) -> list[s
     refuse_output(options.output_dir, options.overwrite)
     capture = _open_capture(options)
     say(f"{capture.root}: {len(capture.views)} views of the layout {capture.layout}")
-    posed = pose_views(capture.views, given_poses(capture, options.poses))
-    plan = make_plan(capture, posed.views, options, _open_references(options))
+    posed = None
+    if options.poses != ESTIMATE:
+        posed = pose_views(capture.views, given_poses(capture, options.poses))
+    views = capture.views if posed is None else posed.views
+    plan = make_plan(capture, views, options, _open_references(options))
     for note in plan.notes:
         say(f"note: {note}")
     folder = WorkFolder(options.output_dir)
     if folder.begin(plan.fingerprint(options)):
         say(f"going on with {folder.path}")
     records = _write_views(plan, folder, follow)
+    if posed is None:
+        say("estimating poses ...")
+        posed = pose_views(plan.views, estimated_poses(plan, records, folder.path, folder.poses))
     for note in posed.notes:
         say(f"poses: {note}")
     findings = write_scene_files(folder.path, plan, posed, records, options)

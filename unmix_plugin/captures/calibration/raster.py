@@ -92,3 +92,14 @@ class Raster:
             focal_px=(lens.focal_px[0] / n, lens.focal_px[1] / n),
             center_px=((lens.center_px[0] - self.left) / n, (lens.center_px[1] - self.top) / n),
         )
+
+    def lens_of_file(self, lens: Lens, height: int, width: int) -> Lens:
+        """The inverse of `lens`: intrinsics of the whole image, of this size, from those of the result."""
+        n = self.binning
+        return replace(
+            lens,
+            width=width,
+            height=height,
+            focal_px=(lens.focal_px[0] * n, lens.focal_px[1] * n),
+            center_px=(lens.center_px[0] * n + self.left, lens.center_px[1] * n + self.top),
+        )

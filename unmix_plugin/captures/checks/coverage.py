@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.captures.checks.seen_view import SeenView
+from unmix_plugin.captures.checks.seen_view import SeenView, angles_between
 from unmix_plugin.captures.poses.alignment import focus_of
 
 FEW_VIEWS = 15
@@ -66,13 +66,12 @@ def overlap(views: Sequence[SeenView]) -> tuple[list[str], str]:
     focus = focus_of(poses)
     if focus is None or len(views) < 2:
         return [], "overlap is not judged"
-    axes = np.stack([view.axis for view in views])
+    between = angles_between(views)
     shares = np.zeros(len(views))
     nearest = np.zeros(len(views))
     for index, view in enumerate(views):
         points = _points_seen(view, focus)
-        angles = np.degrees(np.arccos(np.clip(axes @ axes[index], -1.0, 1.0)))
-        angles[index] = np.inf
+        angles = np.where(np.arange(len(views)) == index, np.inf, between[index])
         nearest[index] = angles.min()
         near = np.argsort(angles)[: min(6, len(views) - 1)]
         near = near[angles[near] <= FAR_NEIGHBOUR_DEG]

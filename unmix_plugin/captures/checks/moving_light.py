@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 
-from unmix_plugin.captures.checks.seen_view import SeenView
+from unmix_plugin.captures.checks.seen_view import SeenView, angles_between, log_ratio
 
 ANGLES_DEG = (4.0, 25.0)
 """Between the views of a pair."""
@@ -86,26 +86,17 @@ def moving_light(
 
 
 def _pairs(views: Sequence[SeenView]) -> list[tuple[int, int]]:
-    axes = np.stack([view.axis for view in views])
-    angles = np.degrees(np.arccos(np.clip(axes @ axes.T, -1.0, 1.0)))
+    angles = angles_between(views)
     low, high = ANGLES_DEG
     first, second = np.nonzero((angles >= low) & (angles <= high))
     pairs = list(zip(first.tolist(), second.tolist(), strict=True))
     return pairs[:: max(1, len(pairs) // MOST_PAIRS)]
 
 
-def _on_near_side(view: SeenView, points: Float64[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
-    """Points nearer to the camera than the middle of all: those behind it are hidden by what is in front of them."""
-    distances = np.linalg.norm(points - view.position, axis=1)
-    return distances < np.linalg.norm(np.median(points, axis=0) - view.position)
-
-
 def _slope(first: SeenView, second: SeenView, points: Float64[np.ndarray, "P 3"]) -> float | None:
     """Slope of log brightness along the direction in which the camera moves, per radius and radian."""
-    points = points[_on_near_side(first, points) & _on_near_side(second, points)]
-    before, after = first.pixels_of(points), second.pixels_of(points)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.log(second.brightness_at(after)) - np.log(first.brightness_at(before))
+    points = points[first.has_before_it(points) & second.has_before_it(points)]
+    before, ratio = first.pixels_of(points), log_ratio(first, second, points)
     rotation = first.camera.camera_to_world[:, :3]
     turned = (second.position - first.position) @ rotation
     direction = np.array([turned[0], -turned[1]])

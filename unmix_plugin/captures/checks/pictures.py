@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.captures.checks.seen_view import SeenView
+from unmix_plugin.captures.checks.seen_view import SeenView, angles_between, log_ratio
 
 BLURRED = 0.6
 """Detail of a view against the median of all, below which it is blurred."""
@@ -16,6 +16,8 @@ JUMP = 0.15
 """Logarithm of a gain against the others that counts as a jump."""
 JUMP_DEVIATIONS = 4.0
 LEAST_POINTS = 50
+NEIGHBOURS = 6
+"""Views that one is compared with: the nearest."""
 SATURATED_SHARE = 0.01
 MISSING_SHARE = 0.05
 
@@ -39,23 +41,16 @@ def blur(views: Sequence[SeenView]) -> tuple[list[str], str]:
 
 
 def exposure(views: Sequence[SeenView], points: Float64[np.ndarray, "P 3"] | None) -> tuple[list[str], str]:
-    """Views whose sparse points are brighter or darker than the same points in the other views."""
+    """Views whose sparse points are brighter or darker than the same points in the views nearest to them."""
     if points is None or len(points) < LEAST_POINTS or len(views) < LEAST_VIEWS:
         return (
             [],
             "exposure is not compared: it takes sparse points, which come with estimated poses and COLMAP",
         )
-    with np.errstate(divide="ignore", invalid="ignore"):
-        light = np.log(np.stack([view.brightness_at(view.pixels_of(points)) for view in views]))
-    light[~np.isfinite(light)] = np.nan
-    enough = np.isfinite(light).sum(axis=0) >= LEAST_VIEWS
-    relative = light[:, enough] - np.nanmedian(light[:, enough], axis=0)
-    counted = np.isfinite(relative).sum(axis=1)
-    if (counted < LEAST_POINTS).any():
+    gains = _gains(views, points)
+    if np.isnan(gains).any():
         return [], "exposure is not compared: too few sparse points are seen in every view"
-    gains = np.nanmedian(relative, axis=1)
-    gains -= np.median(gains)
-    usual = 1.4826 * float(np.median(np.abs(gains)))
+    usual = 1.4826 * float(np.median(np.abs(gains - np.median(gains))))
     limit = max(JUMP, JUMP_DEVIATIONS * usual)
     jumps = [
         f"{view.name} ({np.exp(gain):.2f} times as bright)"
@@ -69,6 +64,24 @@ def exposure(views: Sequence[SeenView], points: Float64[np.ndarray, "P 3"] | Non
         findings,
         f"sparse points vary by {np.expm1(usual):.0%} in brightness from view to view (robust deviation)",
     )
+
+
+def _gains(views: Sequence[SeenView], points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, " N"]:
+    """Logarithm of how much brighter a view is than the views around it; NaN where too few points tell."""
+    angles = angles_between(views) + 360.0 * np.eye(len(views))
+    before = [view.has_before_it(points) for view in views]
+    gains = np.full(len(views), np.nan)
+    for index, view in enumerate(views):
+        ratios = []
+        for other in np.argsort(angles[index])[:NEIGHBOURS]:
+            shared = points[before[index] & before[other]]
+            found = log_ratio(views[other], view, shared)
+            found = found[np.isfinite(found)]
+            if len(found) >= LEAST_POINTS // 2:
+                ratios.append(float(np.median(found)))
+        if len(ratios) >= 2:
+            gains[index] = np.median(ratios)
+    return gains
 
 
 def pixels(views: Sequence[SeenView]) -> list[str]:

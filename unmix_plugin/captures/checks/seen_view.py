@@ -1,10 +1,11 @@
 """A written view as the checks look at it: its camera, its picture, what was measured while it was written.
 
-Notation: `H x W` pixels, `P` points.
+Notation: `H x W` pixels, `N` views, `P` points.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -61,6 +62,11 @@ class SeenView:
         found[~self._inside(found)] = np.nan
         return found
 
+    def has_before_it(self, points: Float64[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
+        """Points nearer to the camera than the middle of all: those behind it are mostly hidden."""
+        distances = np.linalg.norm(points - self.position, axis=1)
+        return distances < np.linalg.norm(np.median(points, axis=0) - self.position)
+
     def brightness_at(self, pixels: Float64[np.ndarray, "P 2"]) -> Float64[np.ndarray, " P"]:
         """Luminance at pixels of `pixels_of`; NaN where it is."""
         found = np.full(len(pixels), np.nan)
@@ -74,3 +80,19 @@ class SeenView:
         width, height = self.camera.lens.width, self.camera.lens.height
         x, y = pixels.T
         return (x >= 0) & (x < width) & (y >= 0) & (y < height)  # false for NaN
+
+
+def log_ratio(
+    first: SeenView, second: SeenView, points: Float64[np.ndarray, "P 3"]
+) -> Float64[np.ndarray, " P"]:
+    """Logarithm of how much brighter points are in the second view than in the first; not finite where unseen."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.log(second.brightness_at(second.pixels_of(points))) - np.log(
+            first.brightness_at(first.pixels_of(points))
+        )
+
+
+def angles_between(views: Sequence[SeenView]) -> Float64[np.ndarray, "N N"]:
+    """Angles between optical axes, degrees."""
+    axes = np.stack([view.axis for view in views])
+    return np.degrees(np.arccos(np.clip(axes @ axes.T, -1.0, 1.0)))

@@ -24,6 +24,8 @@ class WorkFolder:
         self.output = output
         self.path = output.with_name(f"{output.name}.unfinished")
         """Where files are written until the scene is complete."""
+        self.poses = self.path / "poses"
+        """Where files of the estimation of poses lie while it runs, or after it failed."""
 
     def begin(self, plan: dict[str, Any]) -> bool:
         """Make the folder, or go on in the one that an interrupted start left.
@@ -72,6 +74,7 @@ class WorkFolder:
         """
         with write_errors_as(self.output):
             shutil.rmtree(self.path / _VIEWS)
+            shutil.rmtree(self.poses, ignore_errors=True)
             (self.path / PLAN_NAME).unlink()
             old = self.output.with_name(f"{self.output.name}.old")
             if overwrite and self.output.exists():
