@@ -173,6 +173,24 @@ def test_real_captures_have_one_folder_a_view(tmp_path):
     assert any("poses_bounds.npy is not there" in note for note in capture.notes)
 
 
+def test_poses_go_with_views_in_the_order_of_names(tmp_path):
+    write_real(tmp_path, views=("v10", "v2", "v1"))
+    poses = find_nespof_real(tmp_path, PLAIN).poses
+    assert poses is not None
+    for index, name in enumerate(("v1", "v10", "v2")):
+        np.testing.assert_allclose(poses.cameras[name].camera_to_world, pose(index)[:3], atol=1e-12)
+        lens = poses.cameras[name].lens
+        assert lens is not None
+        assert (lens.height, lens.width, lens.focal_px) == (5, 7, (9.0, 9.0))
+
+
+def test_more_poses_than_views_are_refused(tmp_path):
+    write_real(tmp_path)
+    shutil.rmtree(tmp_path / "exr" / "v2")
+    with pytest.raises(CaptureError, match=r"holds 2 poses, .* 1 views"):
+        find_nespof_real(tmp_path, PLAIN)
+
+
 def test_views_of_different_wavelengths_are_refused(tmp_path):
     write_real(tmp_path, poses=False)
     (tmp_path / "exr" / "v2" / "460.exr").unlink()

@@ -47,15 +47,14 @@ def find_nespof(root: Path, options: LayoutOptions) -> Capture:
     for frame, name in zip(listed.frames, names, strict=True):
         text = frame.name.removesuffix(".exr")
         files = [found.find(frame.where, f"{folder.name}/{text}.exr") for folder in folders.values()]
-        if None in files:
+        there = [file for file in files if file is not None]
+        if len(there) < len(files):
             continue
         views.append(
             CaptureView(
                 name=name,
-                cube=with_wavelengths(
-                    stack_intensities(dict(zip(folders, files, strict=True)), root / text), options
-                ),
-                alpha=open_opacity(files[0]) if files[0] else None,
+                cube=with_wavelengths(stack_intensities(dict(zip(folders, there, strict=True))), options),
+                alpha=open_opacity(there[0]),
                 labels=_labels(root, text),
                 split=frame.split,
             )
@@ -89,15 +88,16 @@ def wavelength_entries(folder: Path, *, is_file: bool) -> dict[float, Path]:
     return dict(sorted(entries.items()))
 
 
-def stack_intensities(files: dict[float, Path | None], path: Path) -> SpectralFile:
+def stack_intensities(files: dict[float, Path]) -> SpectralFile:
     """Files of one view by their wavelength, as one cube.
 
     Raises:
         CaptureError: one can't be read, or their sizes differ.
     """
-    cube = stack_bands([open_intensity(file) for file in files.values() if file is not None], path)
+    parts = [open_intensity(file) for file in files.values()]
     evidence = "names of the folders or files, nm"
-    return replace(cube, bands=BandTable(np.array(list(files), dtype=np.float64), evidence))
+    bands = BandTable(np.array(list(files), dtype=np.float64), evidence)
+    return replace(stack_bands(parts, parts[0].path), bands=bands)
 
 
 def _labels(root: Path, text: str) -> Path | None:

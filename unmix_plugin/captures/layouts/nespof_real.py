@@ -44,7 +44,7 @@ def find_nespof_real(root: Path, options: LayoutOptions) -> Capture:
                 f"{folder} and {folders[0].name} differ: {differing} nm in one of them alone; expected one file a "
                 "wavelength in every view"
             )
-        cube = stack_intensities(dict(files), folder)
+        cube = stack_intensities(files)
         views.append(CaptureView(name, with_wavelengths(cube, options)))
     poses, notes = _poses(root, views)
     return Capture("nespof-real", root, tuple(views), poses, notes)
@@ -65,7 +65,7 @@ def _poses(root: Path, views: list[CaptureView]) -> tuple[PoseSet | None, tuple[
             f"{path} holds {len(poses.cameras)} poses, {root / 'exr'} {len(views)} views; expected as many: views are "
             "matched to poses in the order of their names"
         )
-    cameras = [poses.cameras[name] for name in sorted(poses.cameras)]
+    cameras = poses.cameras.values()  # in the order of the file
     return replace(
         poses, cameras={view.name: camera for view, camera in zip(views, cameras, strict=True)}
     ), ()
