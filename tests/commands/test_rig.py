@@ -54,3 +54,5 @@ def test_every_band_is_rendered_and_exported_from_every_view(rig_run, tmp_path):
         words = ["--view", "view_4", "--pixel", "5,4"] if product == "spectrum" else []
         ended = run(export, product, "--run", rig_run, *words)
         assert ended.status == 0, (product, ended.err)
+    [cube] = Path(rig_run).glob("exports/cubes/view_4.hdr")
+    assert "samples = 20" in cube.read_text()

@@ -25,7 +25,7 @@ from unmix_plugin.products.product import Job, Product
 from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.pca import PcaColours
-from unmix_plugin.trained.run_views import ViewChoice
+from unmix_plugin.trained.run_views import ViewChoice, resized_views
 from unmix_plugin.trained.view_rendering import RenderedView, as_numpy
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class Pca(Product):
 
     def write(self, job: Job) -> list[Path]:
         """Find the components of all views, then paint each."""
-        views, scene = job.views(self.views), job.scene
+        views, scene = resized_views(job.views(self.views)), job.scene
         job.claim([*(pca_path(job.folder, view.name) for view in views), components_path(job.folder)])
         seen = [survey_view(scene, view.camera, self.of) for view in job.follow("finding components", views)]
         components = find_components(seen, self.of)

@@ -13,7 +13,7 @@ import tyro
 
 from unmix_plugin.engine.configs import DeviceName
 from unmix_plugin.formats.files import refuse_to_overwrite
-from unmix_plugin.trained.run_views import RunView, ViewChoice, views_of
+from unmix_plugin.trained.run_views import RunView, ViewChoice, resized_views, views_of
 
 if TYPE_CHECKING:
     from unmix_plugin.scenes.scene import Normalisation
@@ -80,7 +80,7 @@ class ViewProduct(Product):
 
     def write(self, job: Job) -> list[Path]:
         """Render the views, one after the other, and write each."""
-        views = job.views(self.views)
+        views = resized_views(job.views(self.views))
         job.claim([path for view in views for path in self.paths(job.folder, view.name)])
         return [
             path

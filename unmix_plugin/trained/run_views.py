@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import torch
@@ -68,6 +69,15 @@ def cameras_of(views: Sequence[RunView], choice: ViewChoice) -> Cameras:
     names = ("camera_to_world", "focal_px", "center_px", "distortion")
     tensors = {name: torch.cat([getattr(camera, name) for camera in chosen]) for name in names}
     return Cameras.of_sizes(**tensors, sizes=[camera.size(0) for camera in chosen])
+
+
+def resized_views(views: Sequence[RunView], size: tuple[int, int] | None = None) -> tuple[RunView, ...]:
+    """The views with pictures of this width and height; None: as large as the largest, which is a rig's sharpest."""
+    chosen = max((view.camera.size(0) for view in views), key=math.prod) if size is None else size
+    return tuple(
+        view if view.camera.size(0) == chosen else replace(view, camera=view.camera.resized(*chosen))
+        for view in views
+    )
 
 
 def _names(record: SceneRecord, split: str, count: int) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +12,7 @@ from unmix_plugin.errors import ConfigError, did_you_mean
 from unmix_plugin.trained.camera_files.camera_files import read_camera_file
 from unmix_plugin.trained.camera_files.camera_json import check_frames_per_second, check_size
 from unmix_plugin.trained.protocol import RenderableScene
-from unmix_plugin.trained.run_views import RunView, cameras_of, find_view, views_of
+from unmix_plugin.trained.run_views import RunView, cameras_of, find_view, resized_views, views_of
 
 DATASET_CAMERAS = ("dataset-eval", "dataset-train")
 PATH_CAMERAS = ("orbit", "interpolate")
@@ -73,7 +72,7 @@ def choose_cameras(scene: RenderableScene, request: CameraRequest) -> RenderCame
     if request.frames_per_second is not None:
         frames_per_second = check_frames_per_second(request.frames_per_second, "--fps")
         chosen = replace(chosen, frames_per_second=frames_per_second)
-    return replace(chosen, views=_resized(chosen.views, _size(chosen.size, request)))
+    return replace(chosen, views=resized_views(chosen.views, _size(chosen.size, request)))
 
 
 def _from_source(scene: RenderableScene, request: CameraRequest) -> RenderCameras:
@@ -82,8 +81,7 @@ def _from_source(scene: RenderableScene, request: CameraRequest) -> RenderCamera
         _check_frames(source, request.num_frames)
     if source in DATASET_CAMERAS:
         views = views_of(scene.views, "eval" if source == "dataset-eval" else "train")
-        largest = max((view.camera.size(0) for view in views), key=math.prod)  # of a rig, the sharpest camera
-        return RenderCameras(_resized(views, largest), False, None)
+        return RenderCameras(resized_views(views), False, None)
     count = USUAL_FRAMES if request.num_frames is None else request.num_frames
     if source == "orbit":
         return _path("orbit", orbit(cameras_of(scene.views, "train"), scene.scene_box, count))
@@ -97,14 +95,6 @@ def _from_source(scene: RenderableScene, request: CameraRequest) -> RenderCamera
     found = read_camera_file(Path(source), scene.frame)
     is_path = found.frames_per_second is not None
     return RenderCameras(found.views, is_path, found.frames_per_second)
-
-
-def _resized(views: Sequence[RunView], size: tuple[int, int]) -> tuple[RunView, ...]:
-    """The views with pictures of this width and height."""
-    return tuple(
-        view if view.camera.size(0) == size else RunView(view.name, view.camera.resized(*size))
-        for view in views
-    )
 
 
 def _path(name: str, cameras: Cameras) -> RenderCameras:
