@@ -91,7 +91,8 @@ def enlarged(data: Path) -> np.ndarray:
     found = []
     for index in scene.eval_indices:
         cube = scene.cube(index)
-        large = zoom(binned(cube, FACTOR), (FACTOR, FACTOR, 1), order=3, mode="nearest", grid_mode=True)
+        size = (FACTOR, FACTOR, 1)
+        large = np.asarray(zoom(binned(cube, FACTOR), size, order=3, mode="nearest", grid_mode=True))
         found.append(psnr_of_bands(large, cube))
     return np.mean(found, axis=0)
 
