@@ -62,6 +62,8 @@ class AbundanceGuide(nn.Module):
             endmembers: The guide's, as the sensor of these pixels sees them.
         """
         is_informative = has_spectral_shape(batch["spectra"])
+        if "alpha_trust" in batch:
+            is_informative &= batch["alpha_trust"] > 0
         mixtures = self._mixtures(batch, endmembers)
         return abundance_error(abundances, mixtures, batch["alpha"], is_informative)
 
@@ -71,6 +73,8 @@ class AbundanceGuide(nn.Module):
         """Follow how far margins of composited abundances are from those of the measured spectra."""
         few = {name: values[:_OBSERVED_PIXELS] for name, values in batch.items()}
         counts = has_spectral_shape(few["spectra"]) & (few["alpha"] > _OPAQUE_ALPHA)
+        if "alpha_trust" in few:
+            counts &= few["alpha_trust"] > 0
         found = margin_variance(
             self.margin_variance,
             abundances[:_OBSERVED_PIXELS].detach(),

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from unmix_plugin.alpha_preset import Auto, choose, preset_for
@@ -25,7 +25,9 @@ from unmix_plugin.engine.instantiate import Target
 from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.engine.training.seeding import step_generator
 from unmix_plugin.errors import SceneError, require
+from unmix_plugin.scenes.alpha_evidence import AlphaEvidence
 from unmix_plugin.scenes.geometry.carving import carve
+from unmix_plugin.scenes.geometry.lighting import light_moves
 from unmix_plugin.scenes.geometry.pose_check import check_scene_poses
 from unmix_plugin.scenes.identity import scene_identity
 from unmix_plugin.scenes.pixel_table import DrawnPixels, PixelTable
@@ -38,6 +40,8 @@ from unmix_plugin.spectral.unmixing.partial_bands import typical_spectrum
 
 _MOST_SENSOR_SUBPIXELS = 4
 """Along an edge of a coarse sensor's pixel, in multiples of the finest sensor's."""
+_MANY_PIXELS = 4_000_000
+"""Pixels of all training views beyond which one ray a pixel is enough."""
 DEMO = Path("demo")
 """`--data demo` stands for the built-in scene."""
 
@@ -51,8 +55,9 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
     """Rays of the first training step; the model adapts the number to its budget of samples."""
     scene: SceneOptions = SceneOptions()
     """How the files are read and split."""
-    subpixels: int = 2
-    """Rays cast through a pixel, along each of its edges; their mean is the pixel, in training and in rendering."""
+    subpixels: int | Auto = "auto"
+    """Rays cast through a pixel, along each of its edges; their mean is the pixel, in training and in rendering. Auto is
+    2, but 1 where the training views have more than 4 million pixels: then more pixels teach more than exact ones."""
     single_ray_until: float | Auto = "auto"
     """Part of the training in which one ray a pixel has to do: coarse shape needs many pixels, not exact ones. Auto is
     0.4 where alpha is known, else 0.8."""
@@ -70,7 +75,7 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
         """
         super().__post_init__()
         rules = {
-            "subpixels of 1 to 8": 1 <= self.subpixels <= 8,
+            "subpixels of 1 to 8 or auto": self.subpixels == "auto" or 1 <= self.subpixels <= 8,
             "single-ray-until in [0, 1] or auto": self.single_ray_until == "auto"
             or 0 <= self.single_ray_until <= 1,
             "grid-resolution of 8 to 512 or auto": self.grid_resolution == "auto"
@@ -83,8 +88,8 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
 class HyperspectralDataManager(DataManager):
     """Serves pixels of the training views, drawn evenly from all valid ones.
 
-    A training batch has R P rays, `spectra` (R, B), `alpha` (R) and `pixels` (R), the
-    number of each; an image batch has `spectra` (H, W, B),
+    A training batch has R P rays, `spectra` (R, B), `alpha` (R), `alpha_trust` (R, see `spectral.evidence`) and
+    `pixels` (R), the number of each; an image batch has `spectra` (H, W, B),
     `alpha` (H, W), `valid` (H, W) and, where the scene has them, `labels` (H, W) and `abundances` (H, W, K).
     """
 
@@ -116,7 +121,12 @@ class HyperspectralDataManager(DataManager):
         generator = step_generator(self.seed, step)
         parts = []
         for drawn in self._pixels.draw(self._pixels_for(self._num_rays), generator):
-            measured = {"spectra": drawn.spectra, "alpha": drawn.alpha, "pixels": drawn.numbers}
+            measured = {
+                "spectra": drawn.spectra,
+                "alpha": drawn.alpha,
+                "alpha_trust": self._evidence.trust(drawn),
+                "pixels": drawn.numbers,
+            }
             parts.append((drawn.sensor, self._rays_through(drawn, generator), measured))
         return join_parts(parts) if self.scene.is_rig else parts[0][1:]
 
@@ -165,22 +175,30 @@ class HyperspectralDataManager(DataManager):
             "has_alpha": self.scene.has_alpha,
             "grid_resolution": self._grid_resolution,
             "pixel_size": min(self._pixel_sizes.values()),
-            "subpixels": self.options.subpixels,
+            "subpixels": self._final_subpixels,
             **({"sensors": [sensor.to_json() for sensor in self.scene.sensors]} if self.scene.is_rig else {}),
         }
 
     def initial_data(self) -> Mapping[str, np.ndarray]:
-        """`pixels`: spectra pooled over all training views; `reachable`: where something may be.
+        """`pixels`: spectra pooled over all training views; `reachable`: where something may be; `light_moves`: whether
+        the light moves with the camera, as far as pictures with alpha tell.
 
         Of a rig, pixels of the sensor with most channels, and of those the one with most pixels; `sensor`, which that
         is; and `typical`, a spectrum on all bands that fits the mean of each sensor's pixels.
         """
+        return self._initial_data
+
+    @cached_property
+    def _initial_data(self) -> Mapping[str, np.ndarray]:
         most, seed, sensors = self.options.max_initial_pixels, self.seed, self.scene.sensors
         shares = self._pixels.shares
         chosen = max(shares, key=lambda sensor: (sensors[sensor].num_channels, shares[sensor]))
+        foreground = self._evidence.foreground() if self.scene.has_alpha else None
+        reachable = carve(self.scene, self._grid_resolution, foreground)
         found = {
             "pixels": self._pixels.sample_opaque(chosen, most, seed),
-            "reachable": carve(self.scene, self._grid_resolution),
+            "reachable": reachable,
+            "light_moves": np.array(self.scene.has_alpha and self._light_moves(reachable)),
         }
         if not self.scene.is_rig:
             return found
@@ -219,6 +237,10 @@ class HyperspectralDataManager(DataManager):
         """Read when training asks: evaluation needs none of it."""
         return PixelTable(self.scene, self.device, self.scene.train_indices)
 
+    @cached_property
+    def _evidence(self) -> AlphaEvidence:
+        return AlphaEvidence(self._pixels, self.scene.has_alpha)
+
     def _pixels_for(self, num_rays: int) -> int:
         return max(1, int(num_rays // self._rays_a_pixel))
 
@@ -234,7 +256,13 @@ class HyperspectralDataManager(DataManager):
 
     def _choose_subpixels(self, step: int, progress: float) -> None:
         until = choose(self.options.single_ray_until, self._preset.single_ray_until)
-        self._subpixels = 1 if progress < until else self.options.subpixels
+        self._subpixels = 1 if progress < until else self._final_subpixels
+
+    @property
+    def _final_subpixels(self) -> int:
+        sizes = [self.train_cameras.size(index) for index in range(len(self.train_cameras))]
+        is_large = sum(width * height for width, height in sizes) > _MANY_PIXELS
+        return choose(self.options.subpixels, 1 if is_large else 2)
 
     @property
     def _grid_resolution(self) -> int:
@@ -257,6 +285,11 @@ class HyperspectralDataManager(DataManager):
             sensor: min(max(1, round(size / finest)), _MOST_SENSOR_SUBPIXELS)
             for sensor, size in self._pixel_sizes.items()
         }
+
+    def _light_moves(self, reachable: Bool[np.ndarray, "R R R"]) -> bool:
+        """Judged by the views of the sensor that took most."""
+        views, seen = self._evidence.log_brightness()
+        return light_moves(self.train_cameras[views], seen, reachable, self.scene_box)
 
     def _rays_through(self, pixels: DrawnPixels, generator: torch.Generator) -> RayBundle:
         """Rays scattered over pixels of one sensor."""

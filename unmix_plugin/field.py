@@ -116,6 +116,8 @@ class UnmixField(CoefficientField):
         num_specular: int,
         initial_density: float,
         pixel_size: float,
+        exposure: float = 1.0,
+        lit_by_camera: bool = False,
     ) -> None:
         """
         Args:
@@ -125,9 +127,13 @@ class UnmixField(CoefficientField):
             num_specular: J; 0 leaves the view-dependent part out.
             initial_density: Density of the untrained field, per scene unit.
             pixel_size: Edge of a pixel in the middle of the scene, scene units.
+            exposure: How dark the scene is: the view-dependent part starts so many times darker.
+            lit_by_camera: Whether the light moves with the camera, so that scales depend on the direction of view.
         """
         super().__init__()
         self.config = config
+        self.lit_by_camera = lit_by_camera
+        self.specular_bias = config.specular_bias - math.log(exposure)
         self.num_endmembers, self.num_specular = num_endmembers, num_specular
         self.num_encoded = config.num_levels * config.features_per_level
         self.log_initial_density = math.log(initial_density)
@@ -148,10 +154,11 @@ class UnmixField(CoefficientField):
         num_scales = 1 if self.config.scale == "shared" else self.num_endmembers
         self.density_network = bias_free_network(self.num_encoded, width, num_features)
         self.material_network = bias_free_network(num_features, width, self.num_endmembers + num_scales)
+        seen = num_features + NUM_DIRECTION_FEATURES
         if self.num_specular:
-            self.specular_network = bias_free_network(
-                num_features + NUM_DIRECTION_FEATURES, width, self.num_specular + 1
-            )
+            self.specular_network = bias_free_network(seen, width, self.num_specular + 1)
+        if self.lit_by_camera:
+            self.shading_network = bias_free_network(num_features, width, NUM_DIRECTION_FEATURES)
 
     def encode(
         self, positions: Float[Tensor, "S 3"], known: Float[Tensor, "S LF"] | None = None
@@ -172,7 +179,7 @@ class UnmixField(CoefficientField):
         features: Float[Tensor, "S G"],
     ) -> dict[str, Tensor]:
         """`abundances` (S, K), `scaled_abundances` S a (S, K) and `specular_coefficients` h u (S, J)."""
-        abundances, scales = self._material(features)
+        abundances, scales = self._material(features, directions)
         return {
             "abundances": abundances,
             "scaled_abundances": scales * abundances,
@@ -183,11 +190,18 @@ class UnmixField(CoefficientField):
         """Abundances a of points with these geometry features, summing to 1."""
         return self._material(features)[0]
 
-    def _material(self, features: Float[Tensor, "S G"]) -> tuple[Float[Tensor, "S K"], Float[Tensor, "S C"]]:
-        """Abundances and scales; C is 1 or K."""
+    def _material(
+        self, features: Float[Tensor, "S G"], directions: Float[Tensor, "S 3"] | None = None
+    ) -> tuple[Float[Tensor, "S K"], Float[Tensor, "S C"]]:
+        """Abundances and scales; C is 1 or K. Only scales depend on directions, and only in a moving light."""
         material = self.material_network(features)
         abundances = torch.softmax(material[:, : self.num_endmembers] / self.config.temperature, dim=-1)
-        return abundances, torch.sigmoid(material[:, self.num_endmembers :])
+        scales = material[:, self.num_endmembers :]
+        if self.lit_by_camera and directions is not None:
+            # A sum over harmonics rather than a network of both: that took textures for shading.
+            changes = self.shading_network(features) * direction_features(directions)
+            scales = scales + changes.sum(dim=-1, keepdim=True)
+        return abundances, torch.sigmoid(scales)
 
     def _specular(
         self, directions: Float[Tensor, "S 3"], features: Float[Tensor, "S G"]
@@ -195,7 +209,7 @@ class UnmixField(CoefficientField):
         if self.num_specular == 0:
             return features.new_zeros(len(features), 0)
         seen = torch.cat([features, direction_features(directions)], dim=-1)
-        factors = torch.sigmoid(self.specular_network(seen) + self.config.specular_bias / 2)
+        factors = torch.sigmoid(self.specular_network(seen) + self.specular_bias / 2)
         return factors[:, :1] * factors[:, 1:]
 
 

@@ -39,6 +39,7 @@ from unmix_plugin.sensor_views import SensorViews
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.coefficients import Coefficients
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.evidence import exposure_of
 from unmix_plugin.spectral.materials import Materials, SegmentationMethod
 from unmix_plugin.spectral.metrics import psnr
 from unmix_plugin.spectral.unmixing.endmembers import (
@@ -82,6 +83,10 @@ class UnmixModelConfig(ModelConfig):
     come the endmembers', as light that they send on has. Auto is 1 where alpha is known, else all."""
     train_endmembers: bool = True
     """Whether endmembers change while training; else they stay the first guess, or the spectra from a file."""
+    light: Annotated[Literal["fixed", "camera"] | Auto, Common, short("light")] = "auto"
+    """Where the light stands: fixed in the scene, or moving with the camera, as where an object is turned before camera
+    and lamp; then the brightness of a point depends on the direction of view, what it is made of never does. Auto
+    judges by the brightness of the hull's surface; without alpha it is fixed."""
     segmentation: SegmentationMethod = "abundances"
     """Material of a ray: its largest abundance, or the endmember of smallest angle to its spectrum as published."""
     samples_per_step: int = 30_000
@@ -124,12 +129,26 @@ class UnmixModelConfig(ModelConfig):
         Raises:
             SpectrumError: no pixel is neither dark nor saturated.
         """
-        if self.num_endmembers != "auto":
-            return self, ""
-        pixels = drop_uninformative_pixels(torch.from_numpy(initial_data()["pixels"]))
-        kept = torch.randperm(len(pixels), generator=generator)[:_PIXELS_TO_COUNT_BY]
-        count = propose_num_materials(pixels[kept], generator)
-        return replace(self, num_endmembers=count.number), count.evidence()
+        found, reasons = self, []
+        if self.num_endmembers == "auto":
+            pixels = drop_uninformative_pixels(torch.from_numpy(initial_data()["pixels"]))
+            kept = torch.randperm(len(pixels), generator=generator)[:_PIXELS_TO_COUNT_BY]
+            count = propose_num_materials(pixels[kept], generator)
+            found = replace(found, num_endmembers=count.number)
+            reasons.append(count.evidence())
+        if self.losses.exposure == "auto":
+            exposure = round(exposure_of(torch.from_numpy(initial_data()["pixels"])), 3)
+            found = replace(found, losses=replace(self.losses, exposure=exposure))
+            if exposure > 1:
+                reasons.append(
+                    f"the scene is dark: training compares spectra multiplied by {exposure:.3g} (exposure)"
+                )
+        if self.light == "auto":
+            moves = bool(initial_data().get("light_moves", False))
+            found = replace(found, light="camera" if moves else "fixed")
+            if moves:
+                reasons.append("the light moves with the camera: brightness depends on the direction of view")
+        return found, "\n".join(reasons)
 
 
 class UnmixModel(Model):
@@ -162,8 +181,10 @@ class UnmixModel(Model):
             scene_box=self.scene_box,
             num_endmembers=self.num_endmembers,
             num_specular=len(self.bands) if config.specular == "full" else num_dictionary,
-            initial_density=-math.log1p(-opacity) / self.step,
+            initial_density=-math.log1p(-opacity) / (self.step * self._coarseness(0.0)),
             pixel_size=metadata["pixel_size"],
+            exposure=choose(config.losses.exposure, 1.0),
+            lit_by_camera=config.light == "camera",
         )
         self.register_buffer("rgb_weights", rgb_matrix(self.bands), persistent=False)
         self.register_buffer("every_band", torch.eye(len(self.bands)), persistent=False)
@@ -234,7 +255,8 @@ class UnmixModel(Model):
         `abundances` (R, K), `accumulation` (R), `spread` and `num_samples`, one number each, and of the samples that
         carry weight `positions`, `weights` and `views` (S)."""
         generator = self.generator if self.training else None
-        rendered = self.renderer.render(self.field, ray_bundle, generator)
+        renderer = replace(self.renderer, step=self._training_step) if self.training else self.renderer
+        rendered = renderer.render(self.field, ray_bundle, generator)
         coefficients = rendered.coefficients
         seen = (
             {"coefficients": coefficients.packed}
@@ -274,9 +296,16 @@ class UnmixModel(Model):
         measured = batch["spectra"]
         background = choose(config.background, self.preset.background)
         pixels = compare_pixels(
-            outputs["spectral"], outputs["accumulation"], batch, background, self.generator
+            outputs["spectral"],
+            outputs["accumulation"],
+            batch,
+            background,
+            self.generator,
+            choose(config.exposure, 1.0),
+            config.outlier,
         )
-        losses = spectral_losses(pixels, measured, self.seen_by.rgb_weights(part.sensor), wanted)
+        exposed = choose(config.exposure, 1.0) * measured
+        losses = spectral_losses(pixels, exposed, self.seen_by.rgb_weights(part.sensor), wanted)
         if "abundances" in wanted and self.seen_by.tells_materials(part.sensor, self.num_endmembers):
             abundances = pixel_mean(outputs["abundances"], len(measured))
             endmembers = self.seen_by.project(self.guide.endmembers, part.sensor)
@@ -370,6 +399,16 @@ class UnmixModel(Model):
             parameters = [value for group in self.get_param_groups().values() for value in group]
             torch.autograd.grad(spectra.sum(), parameters, allow_unused=True)
 
+    @property
+    def _training_step(self) -> float:
+        """Distance of samples in the present training step."""
+        return self.step * self._coarseness(self._progress)
+
+    def _coarseness(self, progress: float) -> float:
+        """How many times farther apart samples are in training than in the end: large images begin coarsely."""
+        samples = float(self.scene_box.size.max()) / self.step
+        return self.config.renderer.coarseness(samples, progress)
+
     def _begin_step(self, step: int, progress: float) -> None:
         self._progress = progress
         if step % _GRID_INTERVAL:
@@ -378,7 +417,7 @@ class UnmixModel(Model):
         seed = int(torch.randint(2**62, (1,), generator=self.generator, device=self._generator_device))
         self.grid.update(
             lambda points: self.field.get_density(points * box.size + box.aabb[0])[0],
-            threshold=-math.log1p(-_OCCUPIED_OPACITY) / self.step,
+            threshold=-math.log1p(-_OCCUPIED_OPACITY) / self._training_step,
             decay=_GRID_DECAY,
             num_cells=_PROBED_CELLS,
             generator=torch.Generator().manual_seed(seed),

@@ -34,6 +34,11 @@ class RendererConfig:
 
     samples_per_pixel: float = 1.5
     """Samples of a ray along the length of a pixel's edge where it meets the middle of the scene box."""
+    coarse_samples: int = 256
+    """Samples along the longest edge of the scene box at the start of training, if there are more in the end: what is
+    coarse must be found first, by many rays of few samples."""
+    coarse_until: float = 0.5
+    """Part of the training in which samples move together to the distance they have in the end."""
     smallest_weight: float | Auto = "auto"
     """Samples that contribute less than this share of their ray's light are left out. Auto is 0.004 where alpha is
     known, else 0.001."""
@@ -49,11 +54,26 @@ class RendererConfig:
         """
         rules = {
             "samples-per-pixel of 0.01 to 100": 0.01 <= self.samples_per_pixel <= 100,
+            "coarse-samples of at least 1": self.coarse_samples >= 1,
+            "coarse-until in [0, 1]": 0 <= self.coarse_until <= 1,
             "smallest-weight in [0, 1) or auto": self.smallest_weight == "auto"
             or 0 <= self.smallest_weight < 1,
             "visible-weight in (0, 1] or auto": self.visible_weight == "auto" or 0 < self.visible_weight <= 1,
         }
         require("the renderer", rules)
+
+    def coarseness(self, samples: float, progress: float) -> float:
+        """Factor on the distance of samples when that part of the training is over.
+
+        Args:
+            samples: Along the longest edge of the scene box in the end.
+            progress: In [0, 1].
+
+        >>> RendererConfig(coarse_samples=100, coarse_until=0.5).coarseness(400.0, 0.25)
+        2.0
+        """
+        left = 0.0 if progress >= self.coarse_until else 1.0 - progress / self.coarse_until
+        return max(samples / self.coarse_samples, 1.0) ** left
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ Notation: `R` pixels, `P` rays through each, `B` bands, `K` endmembers.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,7 +15,8 @@ from torch import Tensor
 
 from unmix_plugin.alpha_preset import AlphaPreset, Auto, choose
 from unmix_plugin.errors import require
-from unmix_plugin.spectral.losses import forgive_saturation, over_background, solid_evidence, srgb_error
+from unmix_plugin.spectral.evidence import is_blown_out
+from unmix_plugin.spectral.losses import bounded_square, forgive_saturation, over_background, solid_evidence, srgb_error
 
 Background = Literal["random", "black", "white", "last"]
 
@@ -45,6 +47,13 @@ class LossConfig:
     abundances_final_factor: float = 0.1
     """Factor on that weight at the end of training, reached exponentially: once materials are found, what is left of
     their disagreement with single pixels holds spectra back."""
+    exposure: float | Auto = "auto"
+    """Factor on spectra, rendered and measured, before they are compared: errors of dark scenes count as much as those
+    of bright ones. Auto makes the median opaque pixel as bright as 0.2, but darkens nothing."""
+    outlier: float = 1.0
+    """Error of an exposed value from which on it counts in proportion and no longer squared. It matters in dark scenes
+    only: a blown-out pixel would else outweigh all others. What a saturated value misses is unknown anyway, so for
+    such pixels the bound is divided by the exposure."""
     mixing_penalty: float = 2.0
     """By how much a further material must improve the fit of such a spectrum, in multiples of the mean angle that
     mixtures of two leave unexplained where that is 0.02 rad; less where it is less, more where it is more."""
@@ -58,6 +67,8 @@ class LossConfig:
         weights = (self.spectral, self.rgb, self.opacity, self.spread, self.abundances, self.mixing_penalty)
         rules = {
             "weights of at least 0": all(weight == "auto" or weight >= 0 for weight in weights),
+            "an exposure above 0 or auto": self.exposure == "auto" or self.exposure > 0,
+            "outlier above 0": self.outlier > 0,
             "spread-until in (0, 1]": 0 < self.spread_until <= 1,
             "abundances-final-factor in (0, 1]": 0 < self.abundances_final_factor <= 1,
         }
@@ -83,6 +94,8 @@ class PixelComparison:
     target: Float[Tensor, "R B"]
     opacities: Float[Tensor, "R"]
     """Rendered."""
+    outliers: Float[Tensor, "R 1"]
+    """Error of a pixel's values from which on it is no longer squared."""
 
 
 def compare_pixels(
@@ -91,13 +104,17 @@ def compare_pixels(
     batch: dict[str, Tensor],
     background: Background,
     generator: torch.Generator | None,
+    exposure: float = 1.0,
+    outlier: float = math.inf,
 ) -> PixelComparison:
     """Lay rendered and measured pixels over one background; saturated pixels can't be exceeded.
 
     Args:
         spectra, accumulation: Of rays, P for each pixel.
-        batch: `spectra` (R, B) and `alpha` (R) of the pixels.
-        background, generator: What lies behind both, and the source of random greys.
+        batch: `spectra` (R, B), `alpha` (R) and, unless all is to be trusted, `alpha_trust` (R) of the pixels.
+        background, generator: What lies behind both, and the source of random greys. It is black where alpha is not
+            to be trusted: then only light counts.
+        exposure, outlier: As `LossConfig` has them.
     """
     measured = batch["spectra"]
     opacities = pixel_mean(accumulation, len(measured))
@@ -107,9 +124,12 @@ def compare_pixels(
         grey = torch.rand(grey.shape, generator=generator, device=device).to(grey)
     elif background == "white":
         grey = grey + 1
-    target = over_background(measured, batch["alpha"], grey)
-    predicted = over_background(pixel_mean(spectra, len(measured)), opacities, grey)
-    return PixelComparison(forgive_saturation(predicted, target, measured), target, opacities)
+    if "alpha_trust" in batch:
+        grey = grey * batch["alpha_trust"][:, None]
+    target = over_background(exposure * measured, batch["alpha"], grey)
+    predicted = over_background(exposure * pixel_mean(spectra, len(measured)), opacities, grey)
+    outliers = torch.where(is_blown_out(measured), outlier / exposure, outlier)[:, None]
+    return PixelComparison(forgive_saturation(predicted, target, measured), target, opacities, outliers)
 
 
 def spectral_losses(
@@ -119,9 +139,9 @@ def spectral_losses(
     wanted: set[str],
 ) -> dict[str, Tensor]:
     """Those of `spectral`, `rgb` and `opacity` that are wanted, not yet weighted."""
-    losses = {"spectral": (pixels.predicted - pixels.target).square().mean()}
+    losses = {"spectral": bounded_square(pixels.predicted - pixels.target, pixels.outliers).mean()}
     if "rgb" in wanted:
-        losses["rgb"] = srgb_error(pixels.predicted, pixels.target, rgb_weights)
+        losses["rgb"] = srgb_error(pixels.predicted, pixels.target, rgb_weights, pixels.outliers)
     if "opacity" in wanted:
         losses["opacity"] = (solid_evidence(measured) * (1 - pixels.opacities).square()).mean()
     return losses

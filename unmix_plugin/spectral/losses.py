@@ -29,6 +29,15 @@ def forgive_saturation(
     return torch.where((measured >= 1) & (pred_spectra > target_spectra), target_spectra, pred_spectra)
 
 
+def bounded_square(errors: Float[Tensor, "R C"], outliers: Float[Tensor, "R 1"]) -> Float[Tensor, "R C"]:
+    """Squared errors up to a pixel's `outliers`; beyond, they grow in proportion, with the slope that they have there.
+
+    Source: Huber, Ann. Math. Stat. 35(1), 1964.
+    """
+    size = errors.abs()
+    return torch.where(size <= outliers, errors.square(), outliers * (2 * size - outliers))
+
+
 _SURELY_LIT = 0.05
 """Root mean square over bands from which a pixel surely shows something."""
 
@@ -45,11 +54,12 @@ def srgb_error(
     pred_spectra: Float[Tensor, "R B"],
     target_spectra: Float[Tensor, "R B"],
     rgb_weights: Float[Tensor, "B 3"],
+    outliers: Float[Tensor, "R 1"],
 ) -> Float[Tensor, ""]:
-    """Mean squared difference of the sRGB colours of two sets of spectra.
+    """Mean squared difference of the sRGB colours of two sets of spectra, bounded as `bounded_square` does.
 
     Against the colours of the measured spectra, not of a picture file: another colour pipeline than ours there would
     contradict the spectra.
     """
     colours = linear_to_srgb(torch.stack([pred_spectra, target_spectra]) @ rgb_weights)
-    return (colours[0] - colours[1]).square().mean()
+    return bounded_square(colours[0] - colours[1], outliers).mean()

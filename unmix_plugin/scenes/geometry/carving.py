@@ -1,8 +1,9 @@
 """Which cells of space may be occupied, judged by the training views alone and before any training.
 
 A cell stays if enough training cameras see it and, where pictures have alpha, no training view looks through it: a view
-looks through a cell if the cell's whole footprint, widened by a margin, lies in the image on pixels of alpha 0. The
-footprint is the bounding rectangle of the cell's projection, rounded outwards, so the hull is never too small.
+looks through a cell if the cell's whole footprint, widened by a margin, lies in the image on background. The footprint
+is the bounding rectangle of the cell's projection, rounded outwards, so the hull is never too small. Masks may err:
+where the hull leaves matter unexplained, two views must look through a cell, or three.
 
 What one or two views see is not held by the others, and what grows there fits single images only: with alpha half of
 the views must see a cell, unless that leaves pixels unexplained, without alpha a tenth.
@@ -18,10 +19,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Int64
+from scipy.ndimage import binary_opening
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.camera_distortion import distort, undistort
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.scenes.geometry.foreground_rays import MIN_EXPLAINED, foreground_rays, share_through
 from unmix_plugin.scenes.scene import Scene
@@ -30,6 +33,8 @@ PIXEL_MARGIN = 1.0
 """Pixels around a footprint that must be empty too: alpha is quantised and poses are not exact."""
 NEAR_DEPTH = 0.05
 """Depth in front of a camera, as a share of the box's longest half edge, below which it sees nothing."""
+WITNESS_CELLS = 64
+"""Cells along an edge of the hull that decides how many views must agree."""
 COARSEST_CELLS = 16
 """Cells along an edge of the coarsest grid; finer ones look only inside what the coarser left."""
 BORDER_POINTS = 65
@@ -39,16 +44,21 @@ FAIR_SHARE = 0.5
 FAIR_SHARE_OPEN = 0.1
 """The same without alpha, where nothing tells what it leaves unexplained: only what hardly any view sees is carved,
 since walls would be continued there into the void beside a room."""
+WITNESSES = (1, 2, 3)
+"""Views that must look through a cell to carve it; more only where fewer leave foreground unexplained."""
 BLOCK_CELLS = 1 << 15
 """Cells projected together; keeps temporaries within the processor's cache."""
 
 
-def carve(scene: Scene, resolution: int) -> Bool[np.ndarray, "R R R"]:
+def carve(
+    scene: Scene, resolution: int, foreground: list[Bool[np.ndarray, "H W"]] | None = None
+) -> Bool[np.ndarray, "R R R"]:
     """Cells of the scene box that may be occupied.
 
     Args:
         scene: With alpha its hull is carved; without, what hardly any training camera sees.
         resolution: Cells along each edge of the box.
+        foreground: For each training view True on pixels that may show something; None takes them from alpha.
     Returns:
         True where something may be.
     """
@@ -57,13 +67,36 @@ def carve(scene: Scene, resolution: int) -> Bool[np.ndarray, "R R R"]:
     if not scene.has_alpha:
         fewest_views = max(1, math.ceil(FAIR_SHARE_OPEN * len(indices)))
         return carve_box(cameras, None, box, resolution, fewest_views)
-    foreground = [foreground_mask(scene, index) for index in indices]
-    fair = carve_box(
-        cameras, foreground, box, resolution, fewest_views=max(1, math.ceil(FAIR_SHARE * len(indices)))
-    )
-    if share_through(foreground_rays(cameras, foreground), box, fair) >= MIN_EXPLAINED:
-        return fair
-    return carve_box(cameras, foreground, box, resolution)
+    if foreground is None:
+        foreground = [foreground_mask(scene, index) for index in indices]
+    fair = max(1, math.ceil(FAIR_SHARE * len(indices)))
+    rays = foreground_rays(cameras, [_without_specks(mask) for mask in foreground])
+    witnesses = needed_witnesses(cameras, foreground, box, rays)
+    kept = carve_box(cameras, foreground, box, resolution, fair, witnesses)
+    if share_through(rays, box, kept) >= MIN_EXPLAINED:
+        return kept
+    return carve_box(cameras, foreground, box, resolution, witnesses=witnesses)
+
+
+def needed_witnesses(
+    cameras: Cameras, foreground: list[Bool[np.ndarray, "H W"]], box: SceneBox, rays: RayBundle
+) -> int:
+    """Views that must agree that a cell is empty, so that the hull explains what single views show.
+
+    A hole in one mask carves away what all other views see; where masks are good, one view is enough.
+    """
+    shares: list[float] = []
+    for witnesses in WITNESSES:
+        hull = carve_box(cameras, foreground, box, WITNESS_CELLS, witnesses=witnesses)
+        shares.append(share_through(rays, box, hull))
+        if shares[-1] >= MIN_EXPLAINED:
+            return witnesses
+    return WITNESSES[int(np.argmax(shares))]
+
+
+def _without_specks(foreground: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """Foreground that has neighbours: single pixels in the air need no hull behind them."""
+    return binary_opening(foreground, np.ones((2, 2), dtype=bool))
 
 
 def foreground_mask(scene: Scene, index: int) -> Bool[np.ndarray, "H W"]:
@@ -79,6 +112,7 @@ def carve_box(
     box: SceneBox,
     resolution: int,
     fewest_views: int = 1,
+    witnesses: int = 1,
 ) -> Bool[np.ndarray, "R R R"]:
     """Cells of a box that may be occupied, by the given views.
 
@@ -88,6 +122,7 @@ def carve_box(
         box: What is divided into cells.
         resolution: Cells along each edge, >= 1.
         fewest_views: Views that must see a cell for it to stay.
+        witnesses: Views that must look through a cell for it to go.
     """
     if resolution < 1:
         raise ValueError(f"resolution must be at least 1; got {resolution}")
@@ -103,7 +138,9 @@ def carve_box(
         candidates = np.flatnonzero(kept)
         for first in range(0, len(candidates), BLOCK_CELLS):
             block = candidates[first : first + BLOCK_CELLS]
-            kept.reshape(-1)[block] = _may_be_occupied(block, cells, views, box, near, fewest_views)
+            kept.reshape(-1)[block] = _may_be_occupied(
+                block, cells, views, box, near, fewest_views, witnesses
+            )
     return kept
 
 
@@ -114,12 +151,14 @@ def _may_be_occupied(
     box: SceneBox,
     near: float,
     fewest_views: int,
+    witnesses: int,
 ) -> Bool[np.ndarray, " M"]:
     low, size = box.aabb[0].numpy(), box.size.numpy()
     index = np.stack(np.unravel_index(flat_cells, (cells, cells, cells))).astype(np.float32)
     centres = low[:, None] + (index + np.float32(0.5)) * (size / np.float32(cells))[:, None]
     half = size * np.float32(0.5 / cells)
     seen_by = np.zeros(len(flat_cells), dtype=np.int64)
+    looked_through = np.zeros(len(flat_cells), dtype=np.int64)
     alive = np.arange(len(flat_cells))
     for view in views:
         # With alpha every cell left is looked at by every view; without, only those too few have seen yet.
@@ -127,7 +166,8 @@ def _may_be_occupied(
         footprint = view.footprint(centres.take(looked_at, axis=1), half)
         seen_by[looked_at] += view.sees(footprint, near)
         if view.covered is not None:
-            alive = alive[~view.looks_through(footprint)]
+            looked_through[alive] += view.looks_through(footprint)
+            alive = alive[looked_through[alive] < witnesses]
     result = np.zeros(len(flat_cells), dtype=bool)
     result[alive] = seen_by[alive] >= fewest_views
     return result

@@ -8,6 +8,7 @@ Notation: `b` channels of the sensor, `R` drawn pixels.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,7 +54,7 @@ class PixelBlock:
             cameras: Which view of the table each is.
         """
         self.sensor = scene.frames[views[0]].sensor
-        self._scene, self._views, self._cameras = scene, views, cameras
+        self._scene, self._views, self.cameras = scene, views, cameras
         self._width, self._height = scene.cameras.size(views[0])
         types = {scene.stored_type(view) for view in views}
         kind = types.pop() if len(types) == 1 else "f4"
@@ -98,7 +99,7 @@ class PixelBlock:
             if opacity is not None:
                 alpha[row] = torch.from_numpy(opacity).flatten()
         self._values, self.alpha, self.valid = values.flatten(0, 1), alpha.flatten(), valid.flatten()
-        self._camera_of = torch.tensor(self._cameras, device=device)
+        self._camera_of = torch.tensor(self.cameras, device=device)
 
     def spectra(self, pixels: Int[Tensor, " R"]) -> Float[Tensor, "R b"]:
         """Spectra of some pixels in [0, 1], the numbers of `Scene.cube`; only of valid ones."""
@@ -109,6 +110,15 @@ class PixelBlock:
             values = values.to(torch.int32) & 0xFFFF
         values, scale = values.float(), self._scene.options.value_scale
         return (values if scale is None else values / scale).clamp(0.0, 1.0)
+
+    def images(self) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        """Of each view spectra (H, W, b), alpha and which pixels are valid (H, W); on the CPU."""
+        shape = (self._height, self._width)
+        for first in range(0, len(self), self._width * self._height):
+            pixels = torch.arange(first, first + self._width * self._height)
+            chosen = pixels.to(self.alpha.device)
+            spectra = self.spectra(chosen).cpu().unflatten(0, shape)
+            yield spectra, self.alpha[chosen].cpu().view(shape), self.valid[pixels].view(shape)
 
     def take(self, pixels: Int[Tensor, " R"], first: int) -> DrawnPixels:
         """Some pixels by their index in the block, on any device; `first` is the number of the block's first."""

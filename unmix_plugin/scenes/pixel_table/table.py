@@ -31,15 +31,15 @@ class PixelTable:
         cameras_of: dict[int, list[int]] = {}
         for camera, view in enumerate(views):
             cameras_of.setdefault(scene.frames[view].sensor, []).append(camera)
-        self._blocks = tuple(
+        self.blocks = tuple(
             PixelBlock(scene, tuple(views[camera] for camera in cameras), tuple(cameras))
             for _, cameras in sorted(cameras_of.items())
         )
-        memory.require_memory(self._blocks, device)
-        for block in self._blocks:
+        memory.require_memory(self.blocks, device)
+        for block in self.blocks:
             block.read(device)
-        self._firsts = list(accumulate((len(block) for block in self._blocks), initial=0))
-        valid = torch.cat([block.valid for block in self._blocks])
+        self._firsts = list(accumulate((len(block) for block in self.blocks), initial=0))
+        valid = torch.cat([block.valid for block in self.blocks])
         self._valid = None if bool(valid.all()) else valid.nonzero()[:, 0]
         if self._valid is not None and len(self._valid) == 0:
             raise ConfigError("no valid pixel is left in the training views: masks leave out every one")
@@ -50,7 +50,7 @@ class PixelTable:
     @cached_property
     def shares(self) -> dict[int, float]:
         """Of each sensor the share of the valid pixels."""
-        counts = {block.sensor: int(block.valid.sum()) for block in self._blocks}
+        counts = {block.sensor: int(block.valid.sum()) for block in self.blocks}
         return {sensor: count / sum(counts.values()) for sensor, count in counts.items()}
 
     def draw(self, count: int, generator: torch.Generator) -> tuple[DrawnPixels, ...]:
@@ -58,19 +58,19 @@ class PixelTable:
         pool = len(self) if self._valid is None else len(self._valid)
         drawn = torch.randint(pool, (count,), generator=generator)
         chosen = drawn if self._valid is None else self._valid[drawn]
-        if len(self._blocks) == 1:
-            return (self._blocks[0].take(chosen, 0),)
+        if len(self.blocks) == 1:
+            return (self.blocks[0].take(chosen, 0),)
         chosen = chosen.sort().values
         bounds = torch.searchsorted(chosen, torch.tensor(self._firsts)).tolist()
         return tuple(
             block.take(chosen[start:end] - first, first)
-            for block, first, start, end in zip(self._blocks, self._firsts, bounds, bounds[1:], strict=False)
+            for block, first, start, end in zip(self.blocks, self._firsts, bounds, bounds[1:], strict=False)
             if end > start
         )
 
     def sample_opaque(self, sensor: int, count: int, seed: int) -> Float[np.ndarray, "pixels b"]:
         """Spectra of at most `count` random valid pixels of a sensor that are opaque."""
-        block = next(block for block in self._blocks if block.sensor == sensor)
+        block = next(block for block in self.blocks if block.sensor == sensor)
         pool: Int[Tensor, " pool"] = (
             torch.arange(len(block)) if self._valid is None else block.valid.nonzero()[:, 0]
         )

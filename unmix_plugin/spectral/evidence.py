@@ -1,0 +1,95 @@
+"""What a measured pixel is evidence of: how bright it is, and whether there is anything at all.
+
+Alpha is evidence, not law: masks err by a pixel along edges, have holes and specks. Light is evidence too. Where the
+two contradict each other, alpha is not believed, and only light counts.
+
+Notation: `R` pixels, `B` bands; spectra are on black, premultiplied by alpha. The brightness of a pixel is the root mean
+square of its spectrum.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+_TRANSPARENT = 0.5 / 255
+"""Largest alpha of a pixel that shows nothing."""
+BLOWN_OUT = 0.9
+"""Value from which on a band counts as saturated."""
+_SIGMAS = 6.0
+"""Standard deviations of the background's noise above its median that still count as background."""
+_SIGMA_OF_MAD = 1.4826
+_DARK_SHARE = 0.5
+"""The background must be darker than this share of the median brightness of what is not background."""
+_FAINTEST_SURPLUS = 0.02
+"""Brightness beyond what alpha allows that contradicts it: alpha is rounded, and edges are filtered."""
+_PLAIN_BRIGHTNESS = 0.2
+"""Median brightness of opaque pixels from which on a scene counts as well exposed."""
+_LARGEST_EXPOSURE = 100.0
+
+
+def brightness(spectra: Float[Tensor, "R B"]) -> Float[Tensor, "R"]:
+    """Root mean square over bands."""
+    return spectra.square().mean(dim=-1).sqrt()
+
+
+def is_blown_out(spectra: Float[Tensor, "*pixels B"]) -> Bool[Tensor, "*pixels"]:
+    """Pixels with a band near the sensor's full scale of 1: the light was at least that strong.
+
+    From 0.9 on, since cameras, filters and codecs end a little below full scale.
+    """
+    return (spectra > BLOWN_OUT).any(dim=-1)
+
+
+def background_level(spectra: Float[Tensor, "R B"], alpha: Float[Tensor, "R"]) -> float | None:
+    """Brightness up to which a pixel can't be told from the background.
+
+    0 where the background is black; None where it is unknown, or as bright as what stands before it.
+    """
+    seen, is_background = brightness(spectra), alpha <= _TRANSPARENT
+    background, matter = seen[is_background], seen[~is_background]
+    if len(background) == 0 or len(matter) == 0:
+        return None
+    median = background.median()
+    deviation = _SIGMA_OF_MAD * (background - median).abs().median()
+    level = float(median + _SIGMAS * deviation)
+    return level if level < _DARK_SHARE * float(matter.median()) else None
+
+
+def alpha_trust(
+    spectra: Float[Tensor, "R B"], alpha: Float[Tensor, "R"], background: float | None
+) -> Float[Tensor, "R"]:
+    """How far alpha is to be believed, 0 or 1.
+
+    Not where a pixel sends more light than its alpha lets through, nor where alpha says that something is there and
+    the light can't be told from the background's.
+
+    Args:
+        spectra, alpha: Of the pixels.
+        background: As `background_level` gives it.
+    """
+    if background is None:
+        return torch.ones_like(alpha)
+    seen = brightness(spectra)
+    is_surplus = seen > background + alpha + _FAINTEST_SURPLUS
+    is_nothing = (seen <= background) & (alpha > _TRANSPARENT)
+    return (~(is_surplus | is_nothing)).to(alpha)
+
+
+def may_show_matter(
+    spectra: Float[Tensor, "R B"], alpha: Float[Tensor, "R"], background: float | None
+) -> Bool[Tensor, "R"]:
+    """Pixels that may show something: by alpha where it is trusted, else by their light. Arguments as above."""
+    is_trusted = alpha_trust(spectra, alpha, background) > 0
+    return torch.where(is_trusted, alpha > 0, brightness(spectra) > (background or 0.0))
+
+
+def exposure_of(pixels: Float[Tensor, "R B"]) -> float:
+    """Factor that makes dark spectra as bright as those of a well exposed scene, at least 1.
+
+    Args:
+        pixels: Of the whole scene, opaque ones.
+    """
+    median = float(brightness(pixels).median()) if len(pixels) else _PLAIN_BRIGHTNESS
+    return min(max(_PLAIN_BRIGHTNESS / max(median, 1e-9), 1.0), _LARGEST_EXPOSURE)
