@@ -1,12 +1,14 @@
 """What batches hold and which randomness they depend on."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from torch.testing import assert_close
 
 from tests.scenes.scene_factory import make_scene
@@ -192,3 +194,29 @@ def test_a_run_does_not_go_on_with_cubes_that_were_changed(tmp_path):
     manager = make(folder.edit_cube(0, lambda cube: cube * np.float16(0.5)).root)
     with pytest.raises(RunError, match=r"files\.cubes/view_0\.npy differ; name the right one with --data"):
         check_same_scene(record, manager, RunFolder(tmp_path / "run"))
+
+
+def test_views_of_many_pixels_are_seen_by_one_ray_a_pixel(scene_folder, monkeypatch):
+    assert make(scene_folder).metadata()["subpixels"] == 2
+    monkeypatch.setattr("unmix_plugin.datamanager._MANY_PIXELS", 1000)
+    assert make(scene_folder).metadata()["subpixels"] == 1
+    assert make(scene_folder, subpixels=3).metadata()["subpixels"] == 3
+
+
+def test_light_outside_a_mask_counts_as_evidence(scene_folder, tmp_path):
+    """A hole in one mask, through which the cube still shows matter, is neither believed nor carved."""
+    folder = tmp_path / "holed"
+    shutil.copytree(scene_folder, folder)
+    frame = make(folder).scene.frames[make(folder).scene.train_indices[0]]
+    assert frame.image_path is not None
+    picture = np.array(Image.open(frame.image_path))
+    holed = np.zeros_like(picture[..., 3], dtype=bool)
+    holed[4:12, 4:12] = True
+    holed &= picture[..., 3] == 255
+    picture[holed, 3] = 0
+    Image.fromarray(picture).save(frame.image_path)
+    true, spoilt = make(scene_folder), make(folder)
+    assert holed.sum() > 20
+    np.testing.assert_array_equal(true.initial_data()["reachable"], spoilt.initial_data()["reachable"])
+    trust = torch.cat([spoilt.next_train(step)[1]["alpha_trust"] for step in range(20)])
+    assert 0.005 < float((trust == 0).double().mean()) < 0.1

@@ -8,12 +8,14 @@ from tests.method_factory import BOX, CONFIG
 from unmix_plugin.field import UnmixField, UnmixFieldConfig, direction_features
 
 
-def make_field(num_specular: int = 2, scale: str = "shared", temperature: float = 1.0) -> UnmixField:
+def make_field(
+    num_specular: int = 2, scale: str = "shared", temperature: float = 1.0, **settings
+) -> UnmixField:
     from dataclasses import replace
 
     torch.manual_seed(0)
     config = replace(CONFIG.field, scale=scale, temperature=temperature)
-    field = UnmixField(config, BOX, 3, num_specular, initial_density=2.0, pixel_size=0.087)
+    field = UnmixField(config, BOX, 3, num_specular, initial_density=2.0, pixel_size=0.087, **settings)
     torch.nn.init.normal_(field.table)
     torch.nn.init.normal_(field.material_network[-1].weight)  # pyright: ignore[reportArgumentType]
     return field
@@ -59,6 +61,25 @@ def test_only_the_specular_part_depends_on_direction():
     assert_close(up["scaled_abundances"], down["scaled_abundances"])
     assert (up["specular_coefficients"] - down["specular_coefficients"]).abs().max() > 1e-3
     assert ((up["specular_coefficients"] > 0) & (up["specular_coefficients"] < 1)).all()
+
+
+def test_where_the_light_moves_shading_depends_on_direction_and_abundances_do_not():
+    field = make_field(lit_by_camera=True)
+    positions = torch.rand(20, 3) * 2 - 1
+    _, features = field.get_density(positions)
+    up, down = (
+        field.get_outputs(positions, torch.tensor([[0.0, 0.0, z]]).repeat(20, 1), features) for z in (1, -1)
+    )
+    assert_close(up["abundances"], down["abundances"])
+    assert_close(up["abundances"], field.abundances_of(features))
+    assert (up["scaled_abundances"] - down["scaled_abundances"]).abs().max() > 1e-3
+
+
+def test_the_view_dependent_part_of_a_dark_scene_starts_as_much_darker():
+    bright, dark = (
+        evaluate(make_field(exposure=exposure))[1]["specular_coefficients"] for exposure in (1.0, 100.0)
+    )
+    assert 30 < (bright / dark).median() < 100
 
 
 def test_without_a_specular_part_there_are_no_coefficients():

@@ -333,11 +333,11 @@ def test_an_automatic_number_of_endmembers_is_that_of_the_pixels_said_with_evide
     assert "proposed" in reasons
 
 
-def test_a_given_number_of_endmembers_reads_no_data():
+def test_settings_without_auto_read_no_data():
     def unread():
         raise AssertionError
 
-    config = UnmixModelConfig(num_endmembers=4)
+    config = UnmixModelConfig(num_endmembers=4, light="fixed", losses=LossConfig(exposure=1.0))
     assert config.resolve_auto(unread, torch.Generator()) == (config, "")
 
 
@@ -420,3 +420,38 @@ def test_outputs_and_losses_change_nothing_in_the_model():
     losses = model.get_loss_dict(model.get_outputs(rays), batch)
     torch.stack(list(losses.values())).sum().backward()
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+
+
+def test_the_light_and_the_exposure_follow_from_the_data():
+    dark = {**initial_data(), "light_moves": np.array(True)}
+    dark["pixels"] = dark["pixels"] / 20
+    config, reasons = UnmixModelConfig(num_endmembers=3).resolve_auto(lambda: dark, torch.Generator())
+    assert config.light == "camera"
+    brightness = np.sqrt(np.square(dark["pixels"]).mean(axis=1))
+    assert config.losses.exposure == pytest.approx(0.2 / np.median(brightness), rel=5e-3)
+    assert "the scene is dark" in reasons and "the light moves with the camera" in reasons
+
+
+def test_a_bright_scene_in_a_fixed_light_is_left_as_it_is():
+    config, reasons = UnmixModelConfig(num_endmembers=3).resolve_auto(initial_data, torch.Generator())
+    assert (config.light, config.losses.exposure, reasons) == ("fixed", 1.0, "")
+
+
+def test_where_alpha_is_not_trusted_missing_opacity_costs_nothing():
+    spectra = torch.full((2, NUM_BANDS), 0.3)
+    batch = {"spectra": spectra, "alpha": torch.tensor([1.0, 1.0]), "alpha_trust": torch.tensor([1.0, 0.0])}
+    model = make_model(losses=LossConfig(background="white", abundances=0.0, rgb=0.0))
+    outputs = {"spectral": spectra, "accumulation": torch.zeros(2)}
+    assert float(model.get_loss_dict(outputs, batch)["spectral"]) == pytest.approx(0.5)
+
+
+def test_images_of_many_pixels_are_sampled_coarsely_at_first():
+    renderer = replace(CONFIG.renderer, coarse_samples=10, coarse_until=0.5)
+    model = make_model(renderer=renderer).train()
+    counts = []
+    for progress in (0.0, 0.25, 0.5, 1.0):
+        model._progress = progress
+        counts.append(int(model.get_outputs(make_rays(50))["num_samples"]))
+    assert 2.0 < counts[2] / counts[0] < 2.6  # 23 samples along an edge in the end
+    assert counts[0] < counts[1] < counts[2] == counts[3]
+    assert int(model.eval().get_outputs(make_rays(50))["num_samples"]) == counts[3]

@@ -236,6 +236,17 @@ def test_psnr_of_matter_leaves_the_background_and_invalid_pixels_out(scene, view
     )
 
 
+def test_blown_out_pixels_count_in_one_psnr_and_not_in_the_other(scene, view):
+    measured = torch.where(view.shows_matter[..., None], 0.5, torch.zeros_like(view.spectra))
+    rows = view.shows_matter.nonzero()[:4]
+    measured[rows[:, 0], rows[:, 1], 0] = 0.95
+    predicted = replace(perfect(view, SHUFFLED), spectra=(measured - 0.1).clamp(min=0, max=0.4))
+    found = evaluated(scene, replace(view, spectra=measured), predicted, SHUFFLED).per_view["view"]
+    assert found["psnr_matter_unsaturated"] == pytest.approx(20.0, abs=1e-4)
+    assert found["psnr_matter"] < 19.9
+    assert found["psnr"] < found["psnr_unsaturated"] - 0.1
+
+
 def test_psnr_of_matter_is_unknown_where_nothing_is(scene, view):
     empty = ViewTruth("void", torch.zeros(10, 12, 5), view.valid, torch.zeros(10, 12))
     assert math.isnan(

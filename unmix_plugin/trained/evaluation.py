@@ -20,6 +20,7 @@ from torch import Tensor
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.evidence import is_blown_out
 from unmix_plugin.spectral.materials import default_names
 from unmix_plugin.spectral.metrics import (
     SSIM_WINDOW_PX,
@@ -44,12 +45,24 @@ HALF_COVERED = 0.5
 MOST_SENSOR_SUBPIXELS = 4
 """How many times finer than others the pixels of a coarse sensor are rendered, along an edge."""
 
-VIEW_FIGURES = ("psnr", "psnr_matter", "rmse", "ssim", "sam", "rgb_psnr", "abundance_rmse")
+VIEW_FIGURES = (
+    "psnr",
+    "psnr_matter",
+    "psnr_unsaturated",
+    "psnr_matter_unsaturated",
+    "rmse",
+    "ssim",
+    "sam",
+    "rgb_psnr",
+    "abundance_rmse",
+)
 """Figures of every view, as far as there is truth for them."""
 
 DEFINITIONS = {
     "psnr": "dB, all valid pixels and bands of spectra on black, peak 1",
     "psnr_matter": "dB, the same over valid pixels that are labelled or opaque only, background left out",
+    "psnr_unsaturated": "dB, as psnr without blown-out pixels, in which a band was measured above 0.9",
+    "psnr_matter_unsaturated": "dB, as psnr_matter without blown-out pixels",
     "rmse": "root mean squared error, all valid pixels and bands",
     "ssim": "mean over bands, 7 x 7 uniform window, data range 1",
     "sam": "mean spectral angle in radians over labelled or opaque pixels whose true spectrum is not dark "
@@ -159,10 +172,13 @@ class Evaluation:
         """Count one view; its figures."""
         valid = None if bool(view.valid.all()) else view.valid
         spectra = view.seen(predicted.spectra)
+        blown_out = is_blown_out(view.spectra)
         fits_window = min(spectra.shape[:2]) >= SSIM_WINDOW_PX
         figures = {
             "psnr": psnr(spectra, view.spectra, valid),
             "psnr_matter": psnr(spectra, view.spectra, view.shows_matter),
+            "psnr_unsaturated": psnr(spectra, view.spectra, view.valid & ~blown_out),
+            "psnr_matter_unsaturated": psnr(spectra, view.spectra, view.shows_matter & ~blown_out),
             "rmse": rmse(spectra, view.spectra, valid),
             "ssim": ssim(spectra, view.spectra, valid) if fits_window else math.nan,
             "sam": sam(spectra, view.spectra, view.shows_matter),

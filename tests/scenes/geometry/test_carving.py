@@ -15,7 +15,8 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.scenes import carve, load_scene
 from unmix_plugin.scenes.geometry.bounds import find_bounds, focus_point
-from unmix_plugin.scenes.geometry.carving import carve_box, foreground_mask
+from unmix_plugin.scenes.geometry.carving import carve_box, foreground_mask, needed_witnesses
+from unmix_plugin.scenes.geometry.foreground_rays import foreground_rays
 
 BOX = SceneBox(torch.tensor([[-1.0, -1.2, -0.9], [1.1, 1.0, 1.0]]))
 SIDE, FOCAL = 40, 60.0
@@ -281,3 +282,19 @@ def test_views_of_two_sizes_carve_and_bound_the_same_ball():
     assert (box[0] < -radius + 0.05).all()
     assert (box[1] > radius - 0.05).all()
     assert np.abs(box).max() < 1.4  # pixels of the smaller views are wide
+
+
+def test_a_hole_in_one_mask_does_not_carve_what_all_other_views_see():
+    poses = ring_poses(12)
+    cameras, foreground = make_cameras(poses), ball_matter(poses, 0.5)
+    true = carve_box(cameras, foreground, BOX, 32)
+    foreground[3] = foreground[3].copy()
+    foreground[3][14:26, 14:26] = False
+    rays = foreground_rays(cameras, foreground)
+    assert needed_witnesses(cameras, ball_matter(poses, 0.5), BOX, rays) == 1
+    witnesses = needed_witnesses(cameras, foreground, BOX, rays)
+    assert witnesses == 2
+    spoilt, kept = (carve_box(cameras, foreground, BOX, 32, witnesses=count) for count in (1, witnesses))
+    assert (true & ~spoilt).sum() > 0.1 * true.sum()
+    assert not (true & ~kept).any()
+    assert kept.sum() < 1.6 * true.sum()

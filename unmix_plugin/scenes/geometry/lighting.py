@@ -137,7 +137,7 @@ def _looked_up(
     coords, depths = cameras.project(places.positions, index)
     pixels = coords.floor().long()
     inside = (depths > 0) & (pixels >= 0).all(dim=-1)
-    inside &= (pixels < torch.tensor([cameras.width, cameras.height])).all(dim=-1)
+    inside &= (pixels < torch.tensor(cameras.size(index))).all(dim=-1)
     towards = torch.nn.functional.normalize(cameras.camera_to_world[index, :, 3] - places.positions, dim=-1)
     inside &= (towards * places.normals).sum(dim=-1) > LEAST_FACING
     inside &= ~_is_hidden(places.positions, towards, hull, box)

@@ -1,0 +1,73 @@
+"""When alpha is believed, and what light says instead."""
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from unmix_plugin.spectral.evidence import (
+    alpha_trust,
+    background_level,
+    brightness,
+    exposure_of,
+    is_blown_out,
+    may_show_matter,
+)
+from unmix_plugin.spectral.losses import bounded_square
+
+GENERATOR = torch.Generator().manual_seed(0)
+
+
+def noisy_background(count: int) -> torch.Tensor:
+    return (1e-3 * torch.randn(count, 6, generator=GENERATOR)).abs()
+
+
+def test_noise_of_the_background_is_told_from_the_faintest_matter():
+    spectra = torch.cat([noisy_background(2000), torch.full((500, 6), 0.1)])
+    alpha = torch.cat([torch.zeros(2000), torch.ones(500)])
+    level = background_level(spectra, alpha)
+    assert level is not None
+    assert float((brightness(spectra[:2000]) > level).double().mean()) < 0.002
+    assert level < 0.005
+
+
+def test_a_background_as_bright_as_matter_says_nothing():
+    spectra = torch.cat([torch.full((50, 6), 0.8), torch.full((50, 6), 0.3)])
+    alpha = torch.cat([torch.zeros(50), torch.ones(50)])
+    assert background_level(spectra, alpha) is None
+    assert_close(alpha_trust(spectra, alpha, None), torch.ones(100))
+
+
+@pytest.mark.parametrize(
+    ("value", "alpha", "trust", "shows"),
+    [
+        (0.3, 1.0, 1, True),  # matter
+        (0.0, 0.0, 1, False),  # nothing
+        (0.15, 0.5, 1, True),  # an edge
+        (0.3, 0.0, 0, True),  # a hole in the mask
+        (0.3, 0.1, 0, True),  # a mask that is too small
+        (0.001, 1.0, 0, False),  # a speck, or a mask that is too large
+    ],
+)
+def test_alpha_is_believed_unless_light_contradicts_it(value, alpha, trust, shows):
+    spectra, alphas = torch.full((1, 6), value), torch.tensor([alpha])
+    assert float(alpha_trust(spectra, alphas, 0.002)) == trust
+    assert bool(may_show_matter(spectra, alphas, 0.002)) == shows
+
+
+def test_only_dark_scenes_are_exposed():
+    assert exposure_of(torch.full((10, 3), 0.4)) == 1.0
+    assert exposure_of(torch.full((10, 3), 0.02)) == pytest.approx(10.0)
+    assert exposure_of(torch.zeros(10, 3)) == 100.0
+
+
+def test_one_saturated_band_makes_a_pixel_blown_out():
+    spectra = torch.tensor([[0.2, 0.95, 0.3], [0.2, 0.85, 0.3]])
+    assert is_blown_out(spectra).tolist() == [True, False]
+
+
+def test_large_errors_grow_in_proportion_with_a_continuous_slope():
+    errors = torch.tensor([[-0.5, 1.0], [2.0, 3.0]], requires_grad=True)
+    found = bounded_square(errors, torch.ones(2, 1))
+    assert_close(found.detach(), torch.tensor([[0.25, 1.0], [3.0, 5.0]]))
+    (slopes,) = torch.autograd.grad(found.sum(), errors)
+    assert_close(slopes, torch.tensor([[-1.0, 2.0], [2.0, 2.0]]))
