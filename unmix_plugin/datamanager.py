@@ -56,8 +56,8 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
     scene: SceneOptions = SceneOptions()
     """How the files are read and split."""
     subpixels: int | Auto = "auto"
-    """Rays cast through a pixel, along each of its edges; their mean is the pixel, in training and in rendering. Auto is
-    2, but 1 where the training views have more than 4 million pixels: then more pixels teach more than exact ones."""
+    """Rays cast through a pixel, along each of its edges; their mean is the pixel, in training and in rendering. Auto
+    is 2, but 1 where the training views have more than 4 million pixels: more pixels teach more than exact ones."""
     single_ray_until: float | Auto = "auto"
     """Part of the training in which one ray a pixel has to do: coarse shape needs many pixels, not exact ones. Auto is
     0.4 where alpha is known, else 0.8."""

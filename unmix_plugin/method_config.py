@@ -52,7 +52,14 @@ unmix_nerf_published = MethodSpecification(
                 field=PublishedFieldConfig(),
                 renderer=RendererConfig(visible_weight=1.0),
                 losses=LossConfig(
-                    background="random", spectral=5.0, rgb=1.0, opacity=0.0, spread=0.0, abundances=0.0, exposure=1.0, outlier=1e6
+                    background="random",
+                    spectral=5.0,
+                    rgb=1.0,
+                    opacity=0.0,
+                    spread=0.0,
+                    abundances=0.0,
+                    exposure=1.0,
+                    outlier=1e6,
                 ),
             ),
         ),

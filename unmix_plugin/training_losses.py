@@ -16,7 +16,13 @@ from torch import Tensor
 from unmix_plugin.alpha_preset import AlphaPreset, Auto, choose
 from unmix_plugin.errors import require
 from unmix_plugin.spectral.evidence import is_blown_out
-from unmix_plugin.spectral.losses import bounded_square, forgive_saturation, over_background, solid_evidence, srgb_error
+from unmix_plugin.spectral.losses import (
+    bounded_square,
+    forgive_saturation,
+    over_background,
+    solid_evidence,
+    srgb_error,
+)
 
 Background = Literal["random", "black", "white", "last"]
 

@@ -18,7 +18,19 @@ from unmix_plugin.spectral.metrics import psnr
 from unmix_plugin.trained.evaluation import DEFINITIONS
 
 KEYS = [
-    *("psnr", "psnr_matter", "psnr_unsaturated", "psnr_matter_unsaturated", "rmse", "ssim", "sam", "rgb_psnr", "miou", "macro_f1", "accuracy"),
+    *(
+        "psnr",
+        "psnr_matter",
+        "psnr_unsaturated",
+        "psnr_matter_unsaturated",
+        "rmse",
+        "ssim",
+        "sam",
+        "rgb_psnr",
+        "miou",
+        "macro_f1",
+        "accuracy",
+    ),
     *("abundance_rmse", "endmember_angle", "views", "bands", "train_seconds", "train_rays_per_second"),
 ]
 

@@ -3,8 +3,8 @@
 Alpha is evidence, not law: masks err by a pixel along edges, have holes and specks. Light is evidence too. Where the
 two contradict each other, alpha is not believed, and only light counts.
 
-Notation: `R` pixels, `B` bands; spectra are on black, premultiplied by alpha. The brightness of a pixel is the root mean
-square of its spectrum.
+Notation: `R` pixels, `B` bands; spectra are on black, premultiplied by alpha. The brightness of a pixel is the root
+mean square of its spectrum.
 """
 
 from __future__ import annotations

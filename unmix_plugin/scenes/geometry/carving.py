@@ -51,7 +51,7 @@ BLOCK_CELLS = 1 << 15
 
 
 def carve(
-    scene: Scene, resolution: int, foreground: list[Bool[np.ndarray, "H W"]] | None = None
+    scene: Scene, resolution: int, foreground: list[Bool[np.ndarray, "_ _"]] | None = None
 ) -> Bool[np.ndarray, "R R R"]:
     """Cells of the scene box that may be occupied.
 
@@ -79,7 +79,7 @@ def carve(
 
 
 def needed_witnesses(
-    cameras: Cameras, foreground: list[Bool[np.ndarray, "H W"]], box: SceneBox, rays: RayBundle
+    cameras: Cameras, foreground: list[Bool[np.ndarray, "_ _"]], box: SceneBox, rays: RayBundle
 ) -> int:
     """Views that must agree that a cell is empty, so that the hull explains what single views show.
 

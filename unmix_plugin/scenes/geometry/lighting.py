@@ -51,7 +51,8 @@ class Places:
 
 def hull_places(hull: Bool[np.ndarray, "R R R"], box: SceneBox) -> Places:
     """Evenly thinned-out cells on the surface of a hull, with their normals."""
-    surface = hull & ~ndimage.binary_erosion(hull, border_value=1)
+    inner = np.asarray(ndimage.binary_erosion(hull, border_value=1))
+    surface = hull & ~inner
     cells = np.argwhere(surface)
     cells = cells[:: max(1, -(-len(cells) // NUM_PLACES))]
     blurred = ndimage.gaussian_filter(hull.astype(np.float32), SMOOTHING_CELLS)
@@ -102,7 +103,8 @@ def _coarse(hull: Bool[np.ndarray, "R R R"]) -> Bool[np.ndarray, "R R R"]:
     if factor < 2 or hull.shape[0] % factor:
         return hull
     cells = hull.shape[0] // factor
-    return hull.reshape(cells, factor, cells, factor, cells, factor).any(axis=(1, 3, 5))
+    joined = hull.reshape(cells, factor, cells, factor, cells, factor)
+    return np.asarray(joined.any(axis=(1, 3, 5)))
 
 
 def _halves(cameras: Cameras) -> Bool[Tensor, "2 N"]:
