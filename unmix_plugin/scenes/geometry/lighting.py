@@ -51,7 +51,7 @@ class Places:
 
 def hull_places(hull: Bool[np.ndarray, "R R R"], box: SceneBox) -> Places:
     """Evenly thinned-out cells on the surface of a hull, with their normals."""
-    inner = np.asarray(ndimage.binary_erosion(hull, border_value=1))
+    inner = np.array(ndimage.binary_erosion(hull, border_value=1), dtype=bool)
     surface = hull & ~inner
     cells = np.argwhere(surface)
     cells = cells[:: max(1, -(-len(cells) // NUM_PLACES))]
