@@ -17,6 +17,7 @@ from unmix_plugin.errors import CaptureError
 
 BandIndex: TypeAlias = slice | Int[np.ndarray, " b"]
 """Some bands: a slice, or their indices in any order."""
+_PARTLY_KNOWN = "only some of the files give wavelengths"
 ReadPart: TypeAlias = Callable[[slice, BandIndex], Shaped[np.ndarray, "h W b"]]
 """Stored numbers of some rows and bands."""
 
@@ -44,7 +45,7 @@ class SpectralFile:
     path: Path
     """The file that was named: a header where there is one."""
     reader: str
-    """Name of the reader: envi, tiff, exr, matlab, hdf5, npy, png, torch."""
+    """Name of the reader: envi, tiff, exr, matlab, hdf5, netcdf, npy, torch, picture."""
     shape: tuple[int, int, int]
     """H, W, B."""
     dtype: np.dtype
@@ -169,9 +170,12 @@ def _stack_tables(tables: list[tuple[BandTable, int]]) -> BandTable:
         return np.concatenate(known) if len(known) == len(columns) else None
 
     marks = [np.zeros(bands, bool) if table.bad is None else table.bad for table, bands in tables]
+    centres = join([table.wavelengths_nm for table, _ in tables])
+    known = [table for table, _ in tables if table.wavelengths_nm is not None]
+    evidence = tables[0][0].evidence if len(known) in (0, len(tables)) else _PARTLY_KNOWN
     return BandTable(
-        join([table.wavelengths_nm for table, _ in tables]),
-        tables[0][0].evidence,
+        centres,
+        evidence,
         join([table.fwhm_nm for table, _ in tables]),
         np.concatenate(marks) if any(table.bad is not None for table, _ in tables) else None,
         tuple(name for table, _ in tables for name in table.names or ()) if _all_named(tables) else None,

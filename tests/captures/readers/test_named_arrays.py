@@ -6,6 +6,7 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
+import scipy.sparse
 import torch
 
 from tests.captures.readers.bands import centres_nm, widths_nm
@@ -124,6 +125,27 @@ def test_lists_of_pixels_are_images_once_their_size_is_known(tmp_path):
     np.testing.assert_array_equal(
         open_spectral_file(tmp_path / "c.mat", ReadOptions(size=(8, 9))).read(), CUBE
     )
+
+
+@pytest.mark.parametrize("do_compression", [False, True])
+def test_other_variables_of_matlab_are_passed_over(tmp_path, do_compression):
+    others = {
+        "a_text": "some words",
+        "a_structure": {"cube": CUBE, "name": "x"},
+        "b_cells": np.array([CUBE, "x"], dtype=object),
+        "c_complex": CUBE * 1j,
+        "d_sparse": scipy.sparse.eye_array(4).tocsc(),
+        "e_logical": CUBE > 9,
+        "wl": NM[:, None],
+    }
+    doubles = CUBE.astype(np.float64)  # MATLAB would store them in two bytes each
+    scipy.io.savemat(tmp_path / "a.mat", {**others, "z_cube": doubles}, do_compression=do_compression)
+    file = open_spectral_file(tmp_path / "a.mat", ReadOptions(dataset="z_cube"))
+    assert file.dtype == np.float64
+    np.testing.assert_array_equal(file.read(), doubles)
+    np.testing.assert_array_equal(centres_nm(file), NM)
+    with pytest.raises(CaptureError, match=r"e_logical \(8, 9, 5\), wl \(5, 1\), z_cube \(8, 9, 5\)$"):
+        open_spectral_file(tmp_path / "a.mat")
 
 
 def test_units_scale_and_groups_of_hdf5(tmp_path):

@@ -1,6 +1,7 @@
 """What holds for every reader."""
 
 import sys
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -58,6 +59,10 @@ def test_a_stack_keeps_what_its_parts_share_and_lists_the_rest(tmp_path):
     assert stack.scale is None
     np.testing.assert_array_equal(stack.read(slice(1, 2), np.array([1, 0]))[0, 0], [2, 1])
     alike = stack_bands([part(tmp_path, 1, scale=3.0), part(tmp_path, 2, scale=3.0)], tmp_path)
+    assert (alike.bands.evidence, stack.bands.evidence) == ("test", "test")
+    unknown = replace(part(tmp_path, 3), bands=BandTable())
+    mixed = stack_bands([*parts, unknown], tmp_path).bands
+    assert (mixed.wavelengths_nm, mixed.evidence) == (None, "only some of the files give wavelengths")
     assert (alike.scale, alike.metadata) == (3.0, {"scale": 3.0})
 
 

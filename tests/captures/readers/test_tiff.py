@@ -173,6 +173,19 @@ def test_wavelengths_of_the_description(tmp_path, description):
     assert "image description" in file.bands.evidence
 
 
+def test_wavelengths_of_ome(tmp_path):
+    channels = {"EmissionWavelength": [450, 550, 650], "EmissionWavelengthUnit": ["nm"] * 3}
+    tifffile.imwrite(
+        tmp_path / "a.ome.tif",
+        PLANES[:3],
+        photometric="minisblack",
+        metadata={"axes": "CYX", "Channel": channels},
+    )
+    file = open_spectral_file(tmp_path / "a.ome.tif")
+    np.testing.assert_array_equal(centres_nm(file), [450, 550, 650])
+    np.testing.assert_array_equal(file.read(), CUBE[..., :3])
+
+
 def test_wavelengths_of_pages(tmp_path):
     with tifffile.TiffWriter(tmp_path / "a.tif") as file:
         for nm, plane in zip((660, 550, 450), PLANES, strict=False):

@@ -40,7 +40,7 @@ def choose_axes(
     shortest = int(np.argmin(shape))
     if shape[shortest] < shape[bands]:
         note = f"bands are taken to be axis {bands} of {shape}, though axis {shortest} is the shortest"
-        return default, (f"{note}; if that is wrong, say which axis is which, such as {_other(default)}",)
+        return default, (f"{note}; if that is wrong, say which axis is which (--axes {_other(default)})",)
     return default, ()
 
 

@@ -93,7 +93,11 @@ def find_image(path: Path, arrays: Sequence[FoundArray], options: ReadOptions) -
         images = fitting or images
     if len(images) != 1:
         found = f"{len(images)} data sets could be the image" if images else "no data set has three axes"
-        advice = "name one" if images else "name one, and give rows and columns if it is a list of pixels"
+        advice = (
+            "name one (--dataset)"
+            if images
+            else "name one (--dataset), and give rows and columns if it is a list of pixels"
+        )
         raise CaptureError(f"{path}: {found}; {advice}. The file holds {listed}")
     return images[0]
 

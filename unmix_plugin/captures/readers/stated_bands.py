@@ -13,7 +13,7 @@ from unmix_plugin.captures.spectral_file import BandTable
 _PLAUSIBLE_NM = (100.0, 30_000.0)
 """Range of cameras, from the far ultraviolet to the thermal infrared."""
 _UNUSABLE = "the file gives no wavelengths that can be used, see the notes"
-_ASK = "give the wavelengths yourself"
+_ASK = "give the wavelengths yourself (--wavelengths)"
 
 
 @dataclass(frozen=True)

@@ -116,6 +116,9 @@ def _from_description(page: TiffPage) -> StatedBands | None:
     text = str(page.tags.valueof(_DESCRIPTION) or "")[: 2**20]
     if "wavelength" not in text.lower():
         return None
+    if listed := re.findall(r'<Channel\b[^>]*?\bEmissionWavelength="([^"]+)"', text):
+        unit = re.search(r'EmissionWavelengthUnit="([^"]+)"', text)
+        return StatedBands("OME-XML, EmissionWavelength", listed, unit[1] if unit else "nm")
     try:
         content = json.loads(text)
     except (ValueError, RecursionError):
