@@ -10,6 +10,7 @@ from tests.docs.pages import ROOT, text_of
 from unmix_plugin.commands.demo_scene import write_demo_scene
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import PRODUCTS, export
+from unmix_plugin.commands.process import process
 from unmix_plugin.commands.process_inspect import inspect_command
 from unmix_plugin.commands.render import render
 from unmix_plugin.commands.train import train
@@ -24,7 +25,7 @@ OF_OTHERS = {"--debug", "--constraint", "--help-all", "--pipeline", "--pipeline.
 def flags():
     """Every flag of every command."""
     asked = [(command, ["--help"]) for command in (evaluate, render, view, write_demo_scene)]
-    asked += [(inspect_command, ["--help"])]
+    asked += [(process, ["--help"]), (inspect_command, ["--help"])]
     asked += [(train, [method, "--help-all"]) for method in ("unmix-nerf", "unmix-nerf-published")]
     asked += [(export, [product.name, "--help"]) for product in PRODUCTS]
     return {
