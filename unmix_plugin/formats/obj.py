@@ -34,6 +34,8 @@ def write_obj(
 ) -> list[Path]:
     """Write a mesh as NAME.obj and NAME.mtl, with nine significant digits, exact for float32.
 
+    Positions that are float64 have 17.
+
     Args:
         path_without_suffix: Folder, which is made, and NAME.
         positions, normals: Of the vertices; unit normals.
@@ -47,7 +49,8 @@ def write_obj(
     text = io.StringIO()
     text.writelines(f"# {' '.join(line.split())}\n" for line in comments)
     text.write(f"mtllib {library_path.name}\n")
-    np.savetxt(text, np.hstack([positions, srgb]), fmt="v %.9g %.9g %.9g %.9g %.9g %.9g")
+    digits = " ".join(3 * ["%.17g" if positions.dtype == np.float64 else "%.9g"])
+    np.savetxt(text, np.hstack([positions, srgb]), fmt=f"v {digits} %.9g %.9g %.9g")
     np.savetxt(text, normals, fmt="vn %.9g %.9g %.9g")
     for index in np.unique(materials):
         text.write(f"usemtl {plain[index]}\n")

@@ -133,7 +133,8 @@ def write_mesh(
     """Write a mesh with the colour, material and abundances of each vertex, seen from straight above it.
 
     PLY carries all of it; glTF positions, normals, colours (linear), `_MATERIAL` and abundances; OBJ positions,
-    normals, colours (sRGB) and the material of each face.
+    normals, colours (sRGB) and the material of each face. Large coordinates are float64 in PLY and OBJ; glTF has them
+    less `offset` in the extras of its mesh.
 
     Args:
         folder: Where to write; it is made.
@@ -147,7 +148,7 @@ def write_mesh(
     from unmix_plugin.products.mesh_extraction import TriangleMesh
     from unmix_plugin.trained.surface import look_from_above
     from unmix_plugin.trained.surface_appearance import SurfaceAppearance
-    from unmix_plugin.trained.world_frame import directions_to_world
+    from unmix_plugin.trained.world_frame import directions_to_world, positions_for_files
 
     if len(mesh.faces) == 0:
         raise RunError(
@@ -157,7 +158,7 @@ def write_mesh(
     positions = torch.from_numpy(mesh.vertices).float()
     seen = look_from_above(scene, positions, torch.from_numpy(normals).float())
     looks = SurfaceAppearance(scene.materials, *seen)
-    world = TriangleMesh(frame.to_world(mesh.vertices).astype(np.float32), mesh.faces)
+    world = TriangleMesh(positions_for_files(frame.to_world(mesh.vertices)), mesh.faces)
     turned = directions_to_world(frame, normals).astype(np.float32)
     writers = {"ply": _write_ply, "obj": _write_obj, "glb": _write_glb}
     return [path for kind in formats for path in writers[kind](_paths(folder, kind)[0], world, turned, looks)]
@@ -202,7 +203,12 @@ def _write_glb(
         if name.startswith("abundance_"):
             numbers[f"_{name.upper()}"] = values
     extras = {"materials": list(looks.materials.names), "about": looks.comments(_WHAT)[:2]}
-    return [write_glb(path, mesh.vertices, normals, looks.linear_rgb, mesh.faces, numbers, extras)]
+    vertices = mesh.vertices
+    if vertices.dtype == np.float64:  # glTF has float32 only
+        extras["offset"] = np.round(vertices.mean(axis=0)).tolist()
+        vertices = vertices - extras["offset"]
+    positions = vertices.astype(np.float32)
+    return [write_glb(path, positions, normals, looks.linear_rgb, mesh.faces, numbers, extras)]
 
 
 def _paths(folder: Path, kind: MeshFormat) -> list[Path]:

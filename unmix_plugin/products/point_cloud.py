@@ -86,7 +86,9 @@ def write_point_cloud(
     frame: Normalisation,
     scores: Sequence[PointScore] = (),
 ) -> tuple[Path, int]:
-    """Write `points.ply`, binary: x y z nx ny nz (float32, world), red green blue (uint8, sRGB of the diffuse
+    """Write `points.ply`, binary, in world coordinates.
+
+    x y z (float32, float64 where coordinates are large), nx ny nz (float32), red green blue (uint8, sRGB of the diffuse
     spectrum), material (uint8), every abundance and every score (float32).
 
     Args:
@@ -103,7 +105,7 @@ def write_point_cloud(
         SpectrumError: too few points to judge a target against, or all are alike.
     """
     from unmix_plugin.trained.surface_appearance import SurfaceAppearance
-    from unmix_plugin.trained.world_frame import directions_to_world
+    from unmix_plugin.trained.world_frame import directions_to_world, positions_for_files
 
     points = points.select(torch.from_numpy(~is_outlier(points.positions.numpy())))
     if len(points) == 0:
@@ -116,7 +118,7 @@ def write_point_cloud(
     kept = points.select(torch.from_numpy(chosen))
     diffuse = kept.diffuse(materials)
     looks = SurfaceAppearance(materials, kept.abundances, diffuse)
-    world = frame.to_world(positions[chosen]).astype(np.float32)
+    world = positions_for_files(frame.to_world(positions[chosen]))
     turned = directions_to_world(frame, normals).astype(np.float32)
     vertices = {
         **{name: world[:, axis] for axis, name in enumerate("xyz")},

@@ -104,4 +104,4 @@ def _row(values: Tensor) -> Float64[np.ndarray, " n"]:
 
 
 def _text(point: Float64[np.ndarray, "3"]) -> str:
-    return ",".join(f"{value:.4g}" for value in point)
+    return ",".join(f"{value:.9g}" for value in point)

@@ -1,13 +1,16 @@
-"""Where things are in the scene's own world: the space of its transforms.json, before the run moved and scaled it."""
+"""Where things are in the scene's own world: that of the source of its poses, before anything moved and scaled it."""
 
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float32, Float64
 
 from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.errors import RunError
 from unmix_plugin.scenes.scene import Normalisation
+
+PRECISION = 1e-6
+"""Of positions in files, as a part of the extent of what is exported."""
 
 
 def world_frame(scene: SceneRecord) -> Normalisation:
@@ -25,6 +28,22 @@ def world_frame(scene: SceneRecord) -> Normalisation:
         raise RunError(
             f"the run's scene.json is damaged: its normalisation is {recorded!r} ({error}); train again"
         ) from error
+
+
+def positions_for_files(
+    world: Float64[np.ndarray, "*points 3"],
+) -> Float32[np.ndarray, "*points 3"] | Float64[np.ndarray, "*points 3"]:
+    """World positions in the type that files need: float32 where it keeps them to a millionth of their extent.
+
+    Others, such as geo-referenced ones, stay float64.
+    """
+    if world.size == 0:
+        return world.astype(np.float32)
+    extent = float(
+        (world.max(axis=tuple(range(world.ndim - 1))) - world.min(axis=tuple(range(world.ndim - 1)))).max()
+    )
+    rounding = 0.5 * float(np.spacing(np.float32(np.abs(world).max())))
+    return world if rounding > PRECISION * extent else world.astype(np.float32)
 
 
 def directions_to_world(

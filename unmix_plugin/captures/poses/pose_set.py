@@ -10,11 +10,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from unmix_plugin.errors import CaptureError
-
-SIDES_TOLERANCE = 0.02
-"""How much more one side of a picture may shrink than the other: sizes are rounded."""
-
 
 @dataclass(frozen=True)
 class Lens:
@@ -28,26 +23,6 @@ class Lens:
     """Principal point x, y."""
     distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """k1, k2, p1, p2 of the OPENCV model; zeros are a pinhole."""
-
-    def resized(self, width: int, height: int) -> Lens:
-        """The lens of the same picture at another size.
-
-        Raises:
-            CaptureError: the sides change by different factors, so that it was cropped or is another picture.
-        """
-        factors = width / self.width, height / self.height
-        if abs(factors[0] / factors[1] - 1.0) > SIDES_TOLERANCE:
-            raise CaptureError(
-                f"poses are for pictures of {self.width} x {self.height} px, the view has {width} x {height}; expected "
-                "the same shape: give poses of these pictures, uncropped"
-            )
-        return Lens(
-            width,
-            height,
-            (self.focal_px[0] * factors[0], self.focal_px[1] * factors[1]),
-            (self.center_px[0] * factors[0], self.center_px[1] * factors[1]),
-            self.distortion,
-        )
 
 
 @dataclass(frozen=True)

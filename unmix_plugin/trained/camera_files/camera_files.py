@@ -1,7 +1,8 @@
 """Cameras as files: nerfstudio's camera_path.json, and the frames of a transforms.json.
 
 `camera_path` holds a path in model space, as a viewer of a run shows it. `frames` holds poses in the world space of the
-scene, or in model space where the file says `"space": "model"`, with the lens keys of transforms.json.
+scene, or in model space where the file says `"space": "model"`, with the lens keys of transforms.json. What the keys
+`applied_transform`, `applied_scale` and `offset` of a scene's own transforms.json did is undone first.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import torch
 from jaxtyping import Float64
 
 from unmix_plugin.errors import ConfigError, SceneError
+from unmix_plugin.scenes.placement import read_placement
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.intrinsics import Intrinsics, read_intrinsics
 from unmix_plugin.scenes.reading.json_values import describe, read_number
@@ -85,12 +87,16 @@ def _read_frames(path: Path, content: dict[str, Any], frame: Normalisation) -> C
         raise ConfigError(f"{path}: 'space' is {describe(space)}; expected world or model")
     entries = camera_entries(content, "frames", path)
     names = _names(entries, path)
+    faults = Faults(path)
+    placement = read_placement(content, faults, path.name)
+    faults.raise_if_any()
     views = []
     for index, (entry, name) in enumerate(zip(entries, names, strict=True)):
         pose = needed_pose(entry.get("transform_matrix"), f"frames[{index}]", path, "transform_matrix")
         if space == "world":
-            position = frame.to_model(pose[:, 3])
-            pose = np.concatenate([frame.rotation @ pose[:, :3], position[:, None]], axis=1)
+            position = frame.to_model(placement.to_source(pose[:, 3]))
+            rotation = frame.rotation @ placement.rotation.T @ pose[:, :3]
+            pose = np.concatenate([rotation, position[:, None]], axis=1)
         views.append(_frame_view(name, pose, {**content, **entry}, index, path))
     sizes = {(view.camera.width, view.camera.height) for view in views}
     if len(sizes) > 1:

@@ -1,0 +1,105 @@
+"""Exports of a scene whose poses are geo-referenced: they are where the source says, to a millionth of the scene."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from plyfile import PlyData
+from scipy.spatial.transform import Rotation
+
+from tests.products.ball_model import ALL_ROUND, ball_scene, cameras_around
+from tests.products.mesh_reading import loaded_mesh
+from tests.trained.camera_files.camera_scenes import FRAME, around
+from unmix_plugin.products.mesh import write_mesh
+from unmix_plugin.products.mesh_extraction import TriangleMesh
+from unmix_plugin.products.point_cloud import write_point_cloud
+from unmix_plugin.products.volume import write_volume
+from unmix_plugin.scenes.placement import Placement
+from unmix_plugin.trained.camera_files.camera_files import camera_file_bytes, read_camera_file
+from unmix_plugin.trained.density_grid import GridPoints
+from unmix_plugin.trained.run_views import RunView
+from unmix_plugin.trained.surface import SeenSurface
+from unmix_plugin.trained.world_frame import positions_for_files
+
+SCENE = ball_scene()
+MIDDLE = np.array([-2_499_366.0, -4_256_836.0, 4_029_217.0])
+TURN = Rotation.from_euler("xyz", [0.3, -1.0, 2.0]).as_matrix()
+PLACEMENT = Placement(TURN, np.array([1.0, 2.0, -3.0]), 0.08, MIDDLE)
+FAR = FRAME.after(PLACEMENT)
+EXTENT = 2.0 / FAR.scale
+
+
+def source_of(scene_points):
+    """Points of the placed scene in the source's coordinates."""
+    return (scene_points / PLACEMENT.scale - PLACEMENT.translation) @ TURN + MIDDLE
+
+
+def assert_close(found, expected):
+    assert found.dtype == np.float64
+    assert np.abs(found - expected).max() <= 1e-6 * EXTENT
+
+
+def columns(path):
+    vertex = PlyData.read(path)["vertex"]
+    return np.stack([np.asarray(vertex[name]) for name in "xyz"], axis=1)
+
+
+def test_points_are_where_the_source_says(tmp_path):
+    cameras = cameras_around(ALL_ROUND)
+    surface = SeenSurface(SCENE, 6_000, cameras)
+    for camera in cameras:
+        surface.look(camera)
+    near, far = (
+        columns(write_point_cloud(tmp_path / name, surface.points(), 300, SCENE.materials, frame)[0])
+        for name, frame in (("near", FRAME), ("far", FAR))
+    )
+    assert near.dtype == np.float32
+    assert_close(far, source_of(near.astype(np.float64)))
+
+
+def test_meshes_of_all_formats_are_where_the_source_says(tmp_path):
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
+    mesh = TriangleMesh(np.array(ball.vertices), np.array(ball.faces))
+    ply, obj, _, glb = write_mesh(tmp_path, ("ply", "obj", "glb"), mesh, SCENE, FAR)
+    expected = source_of(FRAME.to_world(mesh.vertices))
+    assert_close(columns(ply), expected)
+    lines = [line.split()[1:4] for line in obj.read_text().splitlines() if line.startswith("v ")]
+    assert_close(np.array(lines, dtype=np.float64), expected)
+    loaded = loaded_mesh(glb)
+    assert_close(np.array(loaded.vertices, dtype=np.float64) + loaded.metadata["offset"], expected)
+
+
+def test_volumes_are_where_the_source_says(tmp_path):
+    grid = GridPoints.over(SCENE.scene_box.aabb, 8)
+    path = write_volume(tmp_path, SCENE, grid, FAR, range(grid.shape[0]))
+    matrix = np.load(path)["index_to_world"]
+    index = np.array([1.0, 2.0, 3.0])
+    model = grid.origin.astype(np.float64) + grid.cell * index
+    assert_close((matrix @ [*index, 1.0])[:3], source_of(FRAME.to_world(model)))
+
+
+def test_cameras_are_written_where_the_source_says_and_a_placed_scenes_frames_are_read_alike(tmp_path):
+    views = [RunView(f"v{index}", around(3)[index]) for index in range(3)]
+    path = tmp_path / "cameras.json"
+    path.write_bytes(camera_file_bytes(views, None, FAR))
+    content = json.loads(path.read_text())
+    for view, entry in zip(views, content["frames"], strict=True):
+        position = view.camera.camera_to_world[0, :, 3].double().numpy()
+        assert_close(np.array(entry["transform_matrix"])[:3, 3], source_of(FRAME.to_world(position)))
+    placed = json.loads(camera_file_bytes(views, None, FRAME)) | PLACEMENT.to_json()
+    (tmp_path / "placed.json").write_text(json.dumps(placed))
+    for name in ("cameras.json", "placed.json"):
+        for view, again in zip(views, read_camera_file(tmp_path / name, FAR).views, strict=True):
+            torch.testing.assert_close(
+                again.camera.camera_to_world, view.camera.camera_to_world, atol=1e-6, rtol=0
+            )
+
+
+@pytest.mark.parametrize(("distance", "expected"), [(5.0, np.float32), (500.0, np.float64)])
+def test_positions_take_the_type_that_keeps_them_to_a_millionth(distance, expected):
+    points = np.random.default_rng(0).uniform(-1, 1, (100, 3)) + np.array([distance, 0.0, 0.0])
+    stored = positions_for_files(points)
+    assert stored.dtype == expected
+    assert np.abs(stored - points).max() <= 2e-6
