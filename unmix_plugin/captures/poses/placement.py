@@ -46,7 +46,7 @@ def place_poses(poses: PoseSet) -> PlacedPoses:
     inner = Placement(rotation, -rotation @ middle, scale)
     cameras = {name: moved(camera, inner) for name, camera in poses.cameras.items()}
     points = None if poses.points is None else inner.to_scene(poses.points)
-    notes = (how_up, how_middle, f"1 unit of the scene is {reach:.6g} of the source")
+    notes = (how_up, how_middle, f"1 unit of the scene is {1.0 / scale:.6g} of the source")
     placed = replace(poses, cameras=cameras, points=points, offset=np.zeros(3), up=np.array([0.0, 0.0, 1.0]))
     return PlacedPoses(placed, replace(inner, offset=poses.offset), notes)
 
