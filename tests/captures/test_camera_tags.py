@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
+import tifffile
 
 from tests.captures.band_files import open_band_file, write_band_file, xmp_packet
-from unmix_plugin.captures.camera_tags import XmpTags, band_of, parse_xmp, tag_numbers, tag_text
+from unmix_plugin.captures.camera_tags import XmpTags, band_of, camera_tags, parse_xmp, tag_numbers, tag_text
 
 
 @pytest.mark.parametrize("as_attributes", [False, True])
@@ -70,3 +71,15 @@ def test_exif_rationals_become_numbers(tmp_path):
     assert {name: found[name] for name in exif} == pytest.approx(exif, rel=1e-6)
     assert found["BlackLevel"] == [4800.0, 4801.0, 4802.0, 4803.0]
     assert found["BitsPerSample"] == 16
+
+
+def test_exposure_that_a_program_moved_out_of_exif_is_found(tmp_path):
+    tags = [(33434, "2I", 1, (1, 250), True), (34855, "H", 1, 200, True), (41488, "H", 1, 4, True)]
+    tifffile.imwrite(tmp_path / "a.tif", np.zeros((2, 3), np.uint16), extratags=tags)
+    with tifffile.TiffFile(tmp_path / "a.tif") as stream:
+        exif = camera_tags(stream.pages.first.tags)["exif"]
+    assert (exif["ExposureTime"], exif["ISOSpeedRatings"], exif["FocalPlaneResolutionUnit"]) == (
+        0.004,
+        200,
+        4,
+    )

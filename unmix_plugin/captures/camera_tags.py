@@ -19,6 +19,9 @@ XmpTags: TypeAlias = dict[str, str | list[str]]
 RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
 EXIF_CODE, BLACK_LEVEL_CODE, XMP_CODE = 34665, 50714, 700
 EXIF_OF_PAGE = ("Make", "Model", "Software", "Orientation", "BitsPerSample", "BlackLevel", "DateTime")
+EXPOSURE_OF_PAGE = ("ExposureTime", "FNumber", "ISOSpeedRatings")
+FOCAL_PLANE_OF_PAGE = tuple(f"FocalPlane{what}" for what in ("XResolution", "YResolution", "ResolutionUnit"))
+"""Where a program moved them out of EXIF's own directory."""
 RATIONAL_TYPES = (5, 10)
 """Of TIFF, unsigned and signed."""
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -70,6 +73,7 @@ def camera_tags(page_tags: Any) -> dict[str, Any]:
         `xmp`, see `parse_xmp`, and `exif`: tags by tifffile's names, rationals as floats.
     """
     exif = {name: page_tags.valueof(name) for name in EXIF_OF_PAGE}
+    exif |= {name: _rational(page_tags.valueof(name)) for name in (*EXPOSURE_OF_PAGE, *FOCAL_PLANE_OF_PAGE)}
     exif |= {name: _rational(value) for name, value in (page_tags.valueof(EXIF_CODE) or {}).items()}
     exif["BlackLevel"] = _black_levels(page_tags.get(BLACK_LEVEL_CODE))
     known = {name: value for name, value in exif.items() if isinstance(value, (str, int, float, list))}

@@ -210,7 +210,7 @@ def test_files_are_grouped_by_name_where_they_share_no_identifier(tmp_path):
     [
         (("DJI_0011.TIF", "DJI_0012.TIF", "DJI_0021.TIF"), ["DJI_001", "DJI_001", "DJI_002"]),
         (("DJI_2023_0001_MS_G.TIF", "DJI_2023_0001_MS_NIR.TIF"), ["DJI_2023_0001", "DJI_2023_0001"]),
-        (("a/IMG_0000_1.tif", "b/IMG_0000_1.tif"), ["a/IMG_0000", "b/IMG_0000"]),
+        (("a/IMG_0000_1.tif", "b/IMG_0000_1.tif"), ["a_IMG_0000", "b_IMG_0000"]),
     ],
 )
 def test_names_of_makers_tell_releases(tmp_path, names, releases):
@@ -221,6 +221,14 @@ def test_names_of_makers_tell_releases(tmp_path, names, releases):
     except CaptureError as error:
         pytest.fail(str(error))
     assert [view.release for view in views] == releases
+
+
+def test_one_name_with_two_identifiers_is_two_releases(tmp_path):
+    for band, identifier in ((1, "A"), (2, "A"), (3, "B"), (4, "B")):
+        tags = {"Camera:CentralWavelength": str(400 + 100 * band), "MicaSense:CaptureId": identifier}
+        write_band_file(tmp_path / f"IMG_0000_{band}.tif", np.full((4, 5), 9), tags)
+    releases = [view.release for view in find_rig(tmp_path, PLAIN).views]
+    assert releases == ["IMG_0000_A", "IMG_0000_A", "IMG_0000_B", "IMG_0000_B"]
 
 
 def test_lenses_of_one_band_name_are_told_apart(tmp_path):

@@ -75,7 +75,7 @@ def find_rig(root: Path, options: LayoutOptions) -> Capture:
             "DJI_..._MS_G.TIF: give the folder of the flight, or use the layout 'cubes' for other files"
         )
     sensors = _sensors(bands)
-    releases = _releases(bands)
+    releases = _releases(bands, str(root))
     splits = _splits(releases)
     names = view_names([str(item.file.path.relative_to(root)) for item in bands], str(root))
     notes = [*_left_out(opened, paths), *_odd(bands, releases)]
@@ -124,25 +124,25 @@ def _sensors(bands: Sequence[_BandFile]) -> list[str]:
     ]
 
 
-def _releases(bands: Sequence[_BandFile]) -> list[str]:
-    """Names of the releases; the name up to the band of the first file of each.
+def _releases(bands: Sequence[_BandFile], where: str) -> list[str]:
+    """Names of the releases: the name up to the band of the first file of each, with its folder where names repeat.
 
     Identifiers count where they join files; cameras that write another one into every file are grouped by name.
+
+    Raises:
+        CaptureError: two releases would have one name.
     """
     identifiers = [tag_text(item.tags, *UNIQUE_TAGS) or "" for item in bands]
-    shared = {identifier for identifier, count in Counter(identifiers).items() if identifier and count > 1}
-    titles: dict[str, str] = {}
-    releases: list[str] = []
-    for item, identifier in zip(bands, identifiers, strict=True):
-        key = identifier if identifier in shared else f"name {item.base}"
-        releases.append(titles.setdefault(key, item.base))
-    if len(set(titles.values())) < len(titles):  # one name, several identifiers: a folder of two flights
-        repeated = {title for title, count in Counter(titles.values()).items() if count > 1}
-        return [
-            f"{release} {identifier}" if release in repeated else release
-            for release, identifier in zip(releases, identifiers, strict=True)
-        ]
-    return releases
+    counts = Counter(identifier for identifier in identifiers if identifier)
+    keys = [
+        identifier if counts[identifier] > 1 else f"name {item.base}"
+        for item, identifier in zip(bands, identifiers, strict=True)
+    ]
+    titles = {key: item.base for key, item in reversed(list(zip(keys, bands, strict=True)))}
+    repeated = {title for title, count in Counter(titles.values()).items() if count > 1}
+    texts = [f"{title} {key}" if title in repeated else title for key, title in titles.items()]
+    names = dict(zip(titles, view_names([f"{text}.tif" for text in texts], where), strict=True))
+    return [names[key] for key in keys]
 
 
 def _splits(releases: Iterable[str]) -> dict[str, Split]:
