@@ -141,7 +141,7 @@ def test_labels_and_poses_are_those_of_the_views(folder, truth):
 
 @pytest.mark.usefixtures("one_ray_a_pixel")
 def test_a_capture_written_again_has_the_same_bytes_and_no_view_of_the_older_one(folder, tmp_path):
-    make_demo_capture(tmp_path, 16, 8, 7)
+    make_demo_capture(tmp_path, 16, 10, 7)
     (tmp_path / "view_of_mine.hdr").write_text("mine")
     make_demo_capture(tmp_path, SIZE, BANDS, VIEWS, overwrite=True)
     (tmp_path / "view_of_mine.hdr").unlink()
@@ -150,7 +150,7 @@ def test_a_capture_written_again_has_the_same_bytes_and_no_view_of_the_older_one
             assert path.read_bytes() == (folder / path.relative_to(tmp_path)).read_bytes(), path.name
 
 
-@pytest.mark.parametrize(("name", "value"), [("size", 8), ("bands", 7), ("views", 3)])
+@pytest.mark.parametrize(("name", "value"), [("size", 8), ("bands", 9), ("views", 3)])
 def test_a_number_out_of_bounds_is_refused_before_anything_is_written(tmp_path, name, value):
     with pytest.raises(ConfigError, match=rf"--{name} of a demo capture must be \d+ to \d+; found {value}"):
         make_demo_capture(tmp_path / "capture", **{name: value})
@@ -160,5 +160,5 @@ def test_a_number_out_of_bounds_is_refused_before_anything_is_written(tmp_path, 
 def test_a_folder_with_something_in_it_is_refused_and_left_alone(tmp_path):
     (tmp_path / "thesis.tex").write_text("years")
     with pytest.raises(ConfigError, match="is not empty"):
-        make_demo_capture(tmp_path, 16, 8, 4)
+        make_demo_capture(tmp_path, 16, 10, 4)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]

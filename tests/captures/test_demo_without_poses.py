@@ -13,7 +13,7 @@ from unmix_plugin.commands.process import process
 from unmix_plugin.scenes.demo.shading import render_view
 from unmix_plugin.scenes.reading.loader import load_scene
 
-SIZE, BANDS, VIEWS = 192, 8, 24
+SIZE, BANDS, VIEWS = 192, 12, 24
 
 
 @pytest.mark.usefixtures("no_wait_for_the_disk")

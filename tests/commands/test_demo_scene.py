@@ -63,10 +63,10 @@ def test_words_that_do_not_parse_exit_2(monkeypatch, capsys, words):
 
 
 def test_raw_writes_a_capture_and_names_the_command_that_makes_a_scene_of_it(monkeypatch, capsys, tmp_path):
-    words = ["--raw", tmp_path / "capture", "--size", "16", "--bands", "8", "--views", "4"]
+    words = ["--raw", tmp_path / "capture", "--size", "16", "--bands", "10", "--views", "4"]
     assert run(monkeypatch, *words) == 0
     printed = capsys.readouterr().out
-    assert "4 raw views of 16 x 16 pixels and 8 bands, 3 of them bad" in printed
+    assert "4 raw views of 16 x 16 pixels and 10 bands, 3 of them bad" in printed
     shown = ("view_000.hdr", "white.hdr", "dark.hdr", "poses-true.json", "truth")
     assert all((tmp_path / "capture" / name).exists() for name in shown)
     assert all(f"  {tmp_path / 'capture' / name}  " in printed for name in shown)

@@ -37,8 +37,8 @@ RAW_SIZE, RAW_BANDS, RAW_VIEWS = 400, 31, 40
 """Defaults: as many views and pixels as structure from motion likes."""
 RAW_LAMP = "A"
 """The lamp of the laboratory: a halogen lamp, which has little blue."""
-RAW_BANDS_BOUNDS = (8, 512)
-"""Fewer would leave too few beside the bad ones."""
+RAW_BANDS_BOUNDS = (10, 512)
+"""Among fewer, a noisy band can't be told from the others."""
 REFERENCE_LINES = 100
 """Rows of the white and of the dark."""
 
