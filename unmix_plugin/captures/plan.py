@@ -78,8 +78,6 @@ def make_plan(
     by_sensor: dict[str, list[CaptureView]] = defaultdict(list)
     for view in views:
         by_sensor[view.sensor].append(view)
-    for same in by_sensor.values():
-        _refuse_unlike(same)
     sensors = {
         name: prepare_sensor(name, same, options, replace(references, views=_of_sensor(capture, name)))
         for name, same in by_sensor.items()
@@ -128,39 +126,6 @@ def input_files(view: CaptureView) -> list[Path]:
     """Every file that a view is made of."""
     more = [path for path in (view.picture, view.mask, view.labels) if path is not None]
     return [*view.cube.files, *more]
-
-
-def _refuse_unlike(views: Sequence[CaptureView]) -> None:
-    """Refuse views of one sensor with other bands or another size than the first."""
-    first = views[0].cube
-    for view in views[1:]:
-        cube = view.cube
-        if cube.shape != first.shape:
-            found, expected = (" x ".join(map(str, file.shape)) for file in (cube, first))
-            raise CaptureError(
-                f"{cube.path} has {found} rows, columns and bands; expected {expected}, as {first.path} has: all views "
-                "of a camera are alike, so crop or remove this one"
-            )
-        wavelengths, expected_nm = cube.bands.wavelengths_nm, first.bands.wavelengths_nm
-        if (wavelengths is None) != (expected_nm is None):
-            raise CaptureError(
-                f"only one of {cube.path} and {first.path} gives wavelengths; give them for all with --wavelengths"
-            )
-        if (
-            wavelengths is not None
-            and expected_nm is not None
-            and not np.allclose(wavelengths, expected_nm, atol=0.1)
-        ):
-            band = int(np.argmax(np.abs(wavelengths - expected_nm)))
-            raise CaptureError(
-                f"{cube.path} has {wavelengths[band]:g} nm at band {band}; expected {expected_nm[band]:g} nm, as "
-                f"{first.path} has: all views of a camera have the same bands"
-            )
-        if cube.dtype != first.dtype:
-            raise CaptureError(
-                f"{cube.path} holds {cube.dtype.name}; expected {first.dtype.name}, as {first.path} holds: convert "
-                "all views alike"
-            )
 
 
 def _choose_mask(views: Sequence[CaptureView], asked: MaskKind | None) -> MaskKind:

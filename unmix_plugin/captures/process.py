@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from unmix_plugin.captures.alike import refuse_unlike_views
 from unmix_plugin.captures.calibration.sensor import References
 from unmix_plugin.captures.capture import Capture, CaptureView
 from unmix_plugin.captures.estimating import estimated_poses
@@ -89,6 +90,7 @@ def _open_capture(options: ProcessOptions) -> Capture:
     capture = find_views(
         options.layout, options.data, LayoutOptions(wavelengths, options.dataset, options.axes, references)
     )
+    refuse_unlike_views(capture.views)
     output = options.output_dir.resolve()
     for view in capture.views:
         if any(path.resolve().is_relative_to(output) for path in input_files(view)):

@@ -1,0 +1,78 @@
+"""Bands that are left out, and where the detector ends."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.captures.files_in_memory import file_of
+from unmix_plugin.captures.calibration.band_choice import BandChoice, drop_found, repeated_wavelengths
+from unmix_plugin.captures.calibration.sampling import Sample, find_saturation, noise_shares
+
+WAVELENGTHS_NM = np.linspace(400.0, 900.0, 12)
+GENERATOR = np.random.default_rng(0)
+SPECTRA = GENERATOR.random((3, 12)) * 0.6 + 0.2
+MIXTURES = (GENERATOR.dirichlet(np.ones(3), 3000) @ SPECTRA).astype(np.float32)
+
+
+def _unsaturated(values: np.ndarray) -> Sample:
+    return Sample(values.astype(np.float32), np.zeros(values.shape, bool))
+
+
+def test_noise_is_found_beside_what_bands_share():
+    level = np.full(12, 0.01)
+    level[7] = 0.3
+    noisy = MIXTURES + level * GENERATOR.standard_normal(MIXTURES.shape)
+    expected = level / np.sqrt((noisy**2).mean(axis=0))
+    found = noise_shares(noisy.astype(np.float32))
+    assert found[7] == pytest.approx(expected[7], rel=0.05)
+    np.testing.assert_allclose(np.delete(found, 7), np.delete(expected, 7), rtol=0.5)
+
+
+def test_noise_is_not_told_from_too_few_pixels_or_bands():
+    assert np.isnan(noise_shares(MIXTURES[:20])).all()
+    assert np.isnan(noise_shares(MIXTURES[:, :3])).all()
+
+
+def test_dead_saturated_and_noisy_bands_are_left_out_with_the_reason():
+    values = MIXTURES.copy()
+    values[:, 2] = 0.5
+    values[:, 7] += 3.0 * GENERATOR.standard_normal(len(values)).astype(np.float32)
+    saturated = np.zeros(values.shape, bool)
+    saturated[: len(values) // 3, 9] = True
+    found = drop_found(BandChoice(WAVELENGTHS_NM, {0: "named"}), Sample(values[:, 1:], saturated[:, 1:]), 0.5)
+    assert {band: reason.split(":")[0].split(" is ")[0] for band, reason in found.dropped.items()} == {
+        0: "named",
+        2: "dead",
+        7: "noise",
+        9: "saturated in more than 20% of sampled pixels",
+    }
+    np.testing.assert_array_equal(found.kept, [1, 3, 4, 5, 6, 8, 10, 11])
+
+
+def test_a_white_background_that_saturates_every_band_drops_none():
+    saturated = np.zeros(MIXTURES.shape, bool)
+    saturated[:2000] = True
+    assert drop_found(BandChoice(WAVELENGTHS_NM, {}), Sample(MIXTURES, saturated), 0.5).dropped == {}
+
+
+def test_bands_are_sorted_and_binned_by_wavelength():
+    choice = BandChoice(np.array([700.0, 500.0, 600.0, 800.0, 550.0]), {3: "named"})
+    np.testing.assert_array_equal(choice.kept, [1, 4, 2, 0])
+    np.testing.assert_allclose(choice.centers_nm(2), [525.0, 650.0])
+
+
+def test_a_wavelength_is_used_once():
+    np.testing.assert_array_equal(repeated_wavelengths(np.array([500.0, 510.0, 500.0])), [False, False, True])
+
+
+@pytest.mark.parametrize(("top", "expected"), [(4095, 4095.0), (3900, 3900.0), (None, 65535.0)])
+def test_the_end_of_the_detector_is_a_plateau(top: int | None, expected: float):
+    counts = GENERATOR.normal(2000, 900, (64, 64, 6)).clip(0, top or 60000).astype(np.uint16)
+    assert find_saturation([file_of(counts)], np.arange(6))[0] == expected
+
+
+def test_a_band_that_is_stuck_does_not_count_as_saturated():
+    counts = GENERATOR.integers(0, 2000, (64, 64, 6)).astype(np.uint16)
+    counts[..., 3] = 60000
+    assert find_saturation([file_of(counts)], np.arange(6))[0] == 65535.0

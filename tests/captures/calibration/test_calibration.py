@@ -1,0 +1,94 @@
+"""From stored numbers to values, some rows at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.captures.files_in_memory import file_of
+from unmix_plugin.captures.calibration.calibration import Calibration, WhiteReference, find_missing
+from unmix_plugin.captures.calibration.raster import Raster
+from unmix_plugin.captures.calibration.references import open_reference
+from unmix_plugin.captures.poses.pose_set import Lens
+
+HEIGHT, WIDTH, BANDS = 12, 8, 4
+EVERY = np.arange(BANDS)
+WHOLE = Raster.of(HEIGHT, WIDTH, None, 1)
+
+
+def _cube():
+    counts = np.random.default_rng(0).integers(100, 4000, (HEIGHT, WIDTH, BANDS)).astype(np.uint16)
+    return counts, file_of(counts)
+
+
+@settings(deadline=None)
+@given(st.integers(1, HEIGHT), st.integers(1, 3))
+def test_blocks_of_any_size_give_the_same_values(rows: int, binning: int):
+    counts, file = _cube()
+    raster = Raster.of(HEIGHT, WIDTH, None, binning)
+    calibration = Calibration(raster, EVERY, saturation=3500.0)
+    whole = calibration.rows(file, 0, raster.height)
+    for first, last in raster.blocks(BANDS, rows * WIDTH * BANDS):
+        part = calibration.rows(file, first, last)
+        np.testing.assert_array_equal(part.values, whole.values[first:last])
+        np.testing.assert_array_equal(part.saturated, whole.saturated[first:last])
+    n = binning
+    squares = counts[: raster.height * n, : raster.width * n].reshape(
+        raster.height, n, raster.width, n, BANDS
+    )
+    np.testing.assert_allclose(whole.values, squares.mean(axis=(1, 3)), rtol=1e-6)
+    np.testing.assert_array_equal(whole.saturated, (squares >= 3500).any(axis=(1, 3)))
+
+
+def test_exposures_are_brought_to_that_of_the_white():
+    counts, _ = _cube()
+    white = open_reference(
+        file_of(np.full((1, WIDTH, BANDS), 3000, np.uint16)), "white reference", file_of(counts)
+    )
+    calibration = Calibration(WHOLE, EVERY, white=WhiteReference(white, np.full(BANDS, 0.5)), exposure=20.0)
+    shorter = file_of(counts, metadata={"exposure_s": 5.0, "gain": 2.0})
+    np.testing.assert_allclose(
+        calibration.rows(shorter, 0, HEIGHT).values, counts / 3000 * 0.5 * 20.0 / 10.0, rtol=1e-6
+    )
+
+
+def test_columns_in_which_the_white_is_not_above_the_dark_are_missing():
+    counts, file = _cube()
+    light = np.full((1, WIDTH, BANDS), 3000, np.uint16)
+    light[0, 3, 2] = 40
+    white = open_reference(file_of(light), "white reference", file)
+    dark = open_reference(file_of(np.full((1, WIDTH, BANDS), 50, np.uint16)), "dark frame", file)
+    found = Calibration(WHOLE, EVERY, dark=dark, white=WhiteReference(white, np.ones(BANDS))).rows(
+        file, 0, HEIGHT
+    )
+    np.testing.assert_array_equal(found.missing, np.arange(WIDTH)[None, :] == 3 + np.zeros((HEIGHT, 1)))
+    assert (found.values[:, 3] == 0).all()
+    np.testing.assert_allclose(found.values[:, 4], (counts[:, 4] - 50.0) / 2950, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("no_data", "expected"), [(7.0, [True, True]), (0.0, [False, True]), (-1.0, [False, False])]
+)
+def test_a_no_data_value_of_zero_has_to_stand_in_every_band(no_data: float, expected: list[bool]):
+    value = 7 if no_data == 7.0 else 0
+    stored = np.array([[[value, 5], [value, value]]], np.uint16)
+    np.testing.assert_array_equal(find_missing(stored, no_data)[0], expected)
+
+
+def test_a_pixel_without_a_number_in_some_band_is_missing():
+    stored = np.array([[[1.0, np.nan], [1.0, 2.0], [np.inf, 1.0]]], np.float32)
+    np.testing.assert_array_equal(find_missing(stored, None)[0], [True, False, True])
+
+
+@given(st.integers(0, 5), st.integers(0, 5), st.integers(1, 3), st.floats(5.0, 500.0), st.floats(-20.0, 40.0))
+def test_the_lens_of_the_file_comes_back_from_that_of_the_result(
+    top: int, left: int, binning: int, focal: float, center: float
+):
+    raster = Raster.of(30, 40, (top, left, 20, 24), binning)
+    lens = Lens(40, 30, (focal, focal + 1.0), (center, center + 2.0), (0.1, 0.0, 0.0, 0.01))
+    back = raster.lens_of_file(raster.lens(lens), 30, 40)
+    np.testing.assert_allclose(back.focal_px, lens.focal_px)
+    np.testing.assert_allclose(back.center_px, lens.center_px, atol=1e-9)
+    assert (back.width, back.height, back.distortion) == (40, 30, lens.distortion)

@@ -1,0 +1,127 @@
+"""What looks wrong is found, and what is right is not complained of."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.captures.checks.view_factory import ball_points, record_of, ring_of, view_at
+from unmix_plugin.captures.checks.coverage import overlap, ring
+from unmix_plugin.captures.checks.moving_light import measure
+from unmix_plugin.captures.checks.pictures import blur, exposure, pixels
+from unmix_plugin.captures.checks.report import check_views, report_text
+from unmix_plugin.captures.pictures import detail
+
+LAMP = np.array([2.0, 1.0, 5.0])
+
+
+def _views(
+    folder: Path,
+    positions: list[np.ndarray],
+    light: np.ndarray | None = LAMP,
+    gains: dict[int, float] | None = None,
+):
+    return [
+        view_at(folder, f"view_{index}", position, light, (gains or {}).get(index, 1.0))
+        for index, position in enumerate(positions)
+    ]
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory):
+    """Views all around of the ball under a lamp that stands still."""
+    return _views(tmp_path_factory.mktemp("sound"), ring_of(32))
+
+
+def test_nothing_is_wrong_with_a_good_capture(sound):
+    checked = check_views(sound, ball_points())
+    assert checked.findings == ()
+    text = report_text("a title", checked, ["something"])
+    assert "nothing that these checks can see" in text
+    assert max(map(len, text.splitlines())) <= 110
+
+
+def test_light_that_stands_still_has_no_slope(sound):
+    found = measure(sound, ball_points())
+    assert found is not None
+    assert abs(found.slope) < 0.08
+    assert not found.moves
+
+
+def test_light_that_moves_with_the_camera_is_found(tmp_path: Path):
+    views = _views(tmp_path, ring_of(32), light=None)
+    found = measure(views, ball_points())
+    assert found is not None
+    assert found.moves
+    assert 0.4 < found.slope < 1.6
+    assert any(
+        finding.startswith("light moves with the camera")
+        for finding in check_views(views, ball_points()).findings
+    )
+
+
+def test_moving_light_is_not_judged_without_points_or_near_views(sound):
+    assert measure(sound, None) is None
+    assert measure(sound[::7], ball_points()) is None
+
+
+def test_a_jump_of_exposure_is_found_in_its_view_alone(tmp_path: Path):
+    views = _views(tmp_path, ring_of(20), gains={4: 0.7})
+    findings, _ = exposure(views, ball_points())
+    assert len(findings) == 1
+    assert "exposure jumps in 1 views" in findings[0]
+    assert "view_4 (0.7" in findings[0]
+
+
+def test_a_narrow_ring_and_a_gap_are_found(tmp_path: Path):
+    findings, _ = ring(_views(tmp_path, ring_of(12, 250.0, (10.0, 14.0))))
+    assert [finding.split(":")[0] for finding in findings[:1]] == ["a narrow ring"]
+    assert findings[1] == "no camera looks from 110 degrees of the circle around the object"
+
+
+def test_cameras_on_one_side_are_no_ring(tmp_path: Path):
+    assert ring(_views(tmp_path, ring_of(12, 60.0, (10.0, 14.0))))[0] == []
+
+
+def test_a_view_far_from_the_others_hardly_overlaps(tmp_path: Path):
+    positions = [*ring_of(6, 60.0), np.array([0.0, 0.0, -4.0001])]
+    positions[-1][0] = 0.01
+    findings, _ = overlap(_views(tmp_path, positions))
+    assert len(findings) == 1
+    assert findings[0].startswith("1 views hardly overlap with another one (view_6)")
+
+
+def test_few_views_are_said(sound):
+    assert check_views(sound[:6], None).findings[0].startswith("only 6 views")
+
+
+def test_blur_is_found_against_the_other_views(sound):
+    spoilt = [replace(sound[0], record=record_of("view_0", detail=0.4)), *sound[1:]]
+    findings, _ = blur(spoilt)
+    assert findings == ["1 views are less sharp than the others: view_0 (40% of the usual detail)"]
+
+
+def test_detail_falls_when_a_picture_is_blurred():
+    from scipy.ndimage import gaussian_filter
+
+    sharp = np.random.default_rng(0).random((80, 80)).astype(np.float32)
+    seen = np.ones((80, 80), bool)
+    details = [detail(gaussian_filter(sharp, sigma), seen) for sigma in (0.3, 0.7, 1.2)]
+    assert details[0] > 1.2 * details[1] > 1.4 * details[2]
+
+
+def test_saturated_missing_and_empty_views_are_named(sound):
+    views = [
+        replace(sound[0], record=record_of("view_0", saturated_pixels=2000)),
+        replace(sound[1], record=record_of("view_1", missing_pixels=2000)),
+        replace(sound[2], record=record_of("view_2", matter_share=0.0)),
+        *sound[3:],
+    ]
+    assert [finding.split(":")[1].split(" (")[0].strip() for finding in pixels(views)] == [
+        "view_0",
+        "view_1",
+        "view_2",
+    ]

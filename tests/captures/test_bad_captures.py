@@ -1,0 +1,265 @@
+"""What is wrong with a capture is told in one message with exit status 2, and nothing like a scene is left."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.captures.capture_factory import (
+    BANDS,
+    HEIGHT,
+    WAVELENGTHS_NM,
+    WIDTH,
+    make_capture,
+    process,
+    write_cube,
+    write_poses,
+)
+from unmix_plugin.commands.entry import USER_ERROR, run_command
+from unmix_plugin.commands.process import process as process_command
+from unmix_plugin.errors import UnmixError
+
+Spoil = Callable[[Path], Any]
+COUNTS = np.full((HEIGHT, WIDTH, BANDS), 500, np.uint16)
+
+
+def _nothing(root: Path) -> None:
+    assert root.is_dir()
+
+
+def _zero_poses(root: Path) -> None:
+    content = json.loads((root / "transforms.json").read_text())
+    for frame in content["frames"]:
+        frame["transform_matrix"] = np.zeros((4, 4)).tolist()
+    (root / "transforms.json").write_text(json.dumps(content))
+
+
+def _cut(root: Path) -> None:
+    path = root / "view_01.raw"
+    path.write_bytes(path.read_bytes()[:1000])
+
+
+def _other_wavelengths(root: Path) -> None:
+    moved = ", ".join(f"{value + 3:g}" for value in WAVELENGTHS_NM)
+    write_cube(root, "view_01", COUNTS, header={"wavelength": f"{{{moved}}}"})
+
+
+def _fill(value: int) -> Spoil:
+    def spoil(root: Path) -> None:
+        for name in ("view_00", "view_01", "view_02", "view_03"):
+            write_cube(root, name, np.full_like(COUNTS, value))
+
+    return spoil
+
+
+def _no_wavelengths(root: Path) -> None:
+    for path in root.glob("*.hdr"):
+        write_cube(root, path.stem, COUNTS, header={"wavelength": None, "wavelength units": None})
+
+
+REFERENCES = {"white": "white.hdr", "dark": "dark.hdr"}
+CASES: dict[str, tuple[Spoil, dict[str, Any], str]] = {
+    "duplicate names": (
+        lambda root: np.save(root / "view_01.npy", COUNTS),
+        {},
+        r"view_01\.hdr and .*view_01\.npy would both be the view 'view_01'",
+    ),
+    "another number of bands": (
+        lambda root: write_cube(root, "view_01", COUNTS[..., :5]),
+        {},
+        r"view_01\.hdr has 24 x 32 x 5 rows, columns and bands; expected 24 x 32 x 9",
+    ),
+    "another size": (
+        lambda root: write_cube(root, "view_02", COUNTS[:10]),
+        {},
+        r"view_02\.hdr has 10 x 32 x 9 rows, columns and bands; expected 24 x 32 x 9",
+    ),
+    "other wavelengths": (_other_wavelengths, {}, r"view_01\.hdr has 453 nm at band 0; expected 450 nm"),
+    "another type": (
+        lambda root: write_cube(root, "view_01", COUNTS.astype(np.float32)),
+        {},
+        "holds float32; expected uint16",
+    ),
+    "cut short": (_cut, {}, r"view_01\.raw: cut short: 1000 bytes; view_01\.hdr promises 13824"),
+    "Git LFS pointer": (
+        lambda root: (root / "view_09.tif").write_text("version https://git-lfs.github.com/spec/v1\n"),
+        {},
+        r"view_09\.tif: a pointer of Git LFS",
+    ),
+    "a header of terabytes": (
+        lambda root: write_cube(root, "view_01", COUNTS, header={"lines": 10**9, "samples": 10**6}),
+        {},
+        r"view_01\.raw: cut short: 13824 bytes; view_01\.hdr promises 18000000000000000",
+    ),
+    "white and dark swapped": (
+        _nothing,
+        {"white": "dark.hdr", "dark": "white.hdr"},
+        "the white reference is not brighter than the dark frame .* in 100% of its bands; are white and dark swapped",
+    ),
+    "white of other bands": (
+        lambda root: write_cube(root, "white", COUNTS[..., :4]),
+        REFERENCES,
+        "the white reference has 4 bands, the cubes have 9",
+    ),
+    "saturated white": (
+        lambda root: write_cube(root, "white", np.full_like(COUNTS, 4095)),
+        {**REFERENCES, "saturation": 4095.0},
+        "100% of the white reference is saturated",
+    ),
+    "a white that is not there": (
+        _nothing,
+        {"white": "nowhere.hdr"},
+        r"--white .*nowhere\.hdr: no such file",
+    ),
+    "all views as dark as the dark": (
+        _fill(50),
+        {"dark": "dark.hdr"},
+        "not above 0 .*; check the dark frame",
+    ),
+    "unknown wavelengths": (
+        _no_wavelengths,
+        {},
+        "the wavelengths of its 9 bands are unknown .* --wavelengths",
+    ),
+    "too few wavelengths": (_nothing, {"wavelengths": "500,600"}, "2 wavelengths were given for .* 9 bands"),
+    "micrometres": (_nothing, {"wavelengths": "0.5,0.6"}, "look like micrometres"),
+    "words for wavelengths": (
+        _nothing,
+        {"wavelengths": "red,green"},
+        "neither a list of numbers, .* nor a CSV file",
+    ),
+    "poses of zeros": (
+        _zero_poses,
+        {},
+        "4 of 4 camera matrices that are no poses: .* the rotation is all zeros",
+    ),
+    "poses of others": (
+        lambda root: write_poses(root / "transforms.json", ["cow", "horse"]),
+        {},
+        "no view has a pose",
+    ),
+    "no poses": (_nothing, {"poses": None}, "the layout 'cubes' has no poses.*; give --poses"),
+    "poses that are not there": (_nothing, {"poses": "nowhere.json"}, r"nowhere\.json is not there"),
+    "poses of another shape": (
+        lambda root: write_poses(root / "transforms.json", ["view_00", "view_01"], 100, 40),
+        {},
+        "has 32 x 24 pixels .*, its lens is given for 100 x 40",
+    ),
+    "a crop that leaves the image": (
+        _nothing,
+        {"crop": (10, 10, 20, 20)},
+        "--crop 10 10 20 20 .* leaves the image",
+    ),
+    "binning to nothing": (_nothing, {"bin_pixels": 20}, "--bin-pixels 20 leaves fewer than 2 x 2"),
+    "binning by nothing": (_nothing, {"bin_bands": 0}, "--bin-bands 0: expected 1 or more"),
+    "no band left": (_nothing, {"drop_bands": "400-900"}, "0 of 9 bands are left, 1 or more are needed"),
+    "bands that are not there": (
+        _nothing,
+        {"drop_bands": "1400"},
+        "no band in '1400' nm; the bands lie at 450 to 850",
+    ),
+    "bands that are no numbers": (_nothing, {"drop_bands": "red"}, "'red' is no wavelength or range"),
+    "two white references": (
+        _nothing,
+        {**REFERENCES, "white_rectangle": ("view_00", 0, 0, 4, 4)},
+        "--white and --white-rectangle both",
+    ),
+    "a panel in no view": (_nothing, {"white_rectangle": ("cow", 0, 0, 4, 4)}, "--white-rectangle cow"),
+    "a panel outside": (
+        _nothing,
+        {"white_rectangle": ("view_00", 20, 0, 10, 4)},
+        "--white-rectangle view_00 20 0 10 4 .* leaves the view",
+    ),
+    "a reflectance in per cent": (
+        _nothing,
+        {**REFERENCES, "white_reflectance": "99"},
+        "is 99 to 99; expected",
+    ),
+    "a reflectance of nowhere": (
+        _nothing,
+        {**REFERENCES, "white_reflectance": "a.csv"},
+        "neither a number nor a file",
+    ),
+    "a reflectance of nothing": (
+        _nothing,
+        {"white_reflectance": "0.5"},
+        "--white-reflectance needs a white reference",
+    ),
+    "masks that are not there": (_nothing, {"mask": "files"}, "--mask files: view view_00 has no mask"),
+    "a background that is not white": (
+        _nothing,
+        {"mask": "white"},
+        "--mask white: the border of the views is at",
+    ),
+    "a scale of nothing": (_nothing, {"scale": 0.0}, "--scale 0: expected a number above 0"),
+    "noise of nothing": (_nothing, {"max_noise": 0.0}, "--max-noise 0: expected a share above 0"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_bad_capture_is_refused(tmp_path: Path, case: str):
+    spoil, options, message = CASES[case]
+    capture = make_capture(tmp_path / "capture")
+    spoil(capture.root)
+    given = {
+        key: capture.root / value if key in ("white", "dark") else value for key, value in options.items()
+    }
+    with pytest.raises(UnmixError, match=message) as caught:
+        process(capture.root, tmp_path / "scene", **given)
+    assert "\n" not in str(caught.value).strip()
+    assert not (tmp_path / "scene").exists()
+    assert not (tmp_path / "scene.unfinished" / "transforms.json").exists()
+
+
+def _run(*arguments: str | Path) -> int:
+    with pytest.raises(SystemExit) as caught:
+        run_command(process_command, list(map(str, arguments)))
+    assert isinstance(caught.value.code, int)
+    return caught.value.code
+
+
+def test_the_command_ends_with_the_users_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert _run("cubes", "--data", tmp_path / "nowhere", "--output-dir", tmp_path / "scene") == USER_ERROR
+    assert "nowhere is not there; give the folder of the capture with --data" in capsys.readouterr().err
+
+
+def test_an_unknown_layout_is_refused_with_the_nearest(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert _run("cube", "--data", tmp_path, "--output-dir", tmp_path / "scene") == USER_ERROR
+    assert "did you mean cubes?" in capsys.readouterr().err
+
+
+def test_an_empty_folder_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "capture").mkdir()
+    assert _run("cubes", "--data", tmp_path / "capture", "--output-dir", tmp_path / "scene") == USER_ERROR
+    assert "holds no cubes; expected one file a view" in capsys.readouterr().err
+
+
+def test_the_last_line_names_the_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    capture = make_capture(tmp_path / "capture")
+    arguments = ["--data", capture.root, "--output-dir", tmp_path / "scene", "--poses", "transforms.json"]
+    assert _run("cubes", *arguments) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == f"scene: {tmp_path / 'scene'}"
+
+
+@pytest.mark.parametrize("name", ["file.txt", "folder/precious.txt"])
+def test_an_output_with_something_in_it_is_left_alone(tmp_path: Path, name: str):
+    capture = make_capture(tmp_path / "capture")
+    path = tmp_path / "out" / name
+    path.parent.mkdir(parents=True)
+    path.write_text("precious")
+    with pytest.raises(UnmixError, match="is not empty; give a new folder"):
+        process(capture.root, tmp_path / "out", overwrite=True)
+    assert path.read_text() == "precious"
+
+
+def test_an_unfinished_folder_of_others_is_left_alone(tmp_path: Path):
+    capture = make_capture(tmp_path / "capture")
+    (tmp_path / "scene.unfinished").mkdir()
+    (tmp_path / "scene.unfinished" / "precious.txt").write_text("precious")
+    with pytest.raises(UnmixError, match="is in the way and was not made by unmix-process"):
+        process(capture.root, tmp_path / "scene")
