@@ -101,7 +101,7 @@ class Normalisation:
             "rotation": self.rotation.tolist(),
             "translation": self.translation.tolist(),
             "scale": self.scale,
-            "offset": self.offset.tolist(),
+            **({"offset": self.offset.tolist()} if self.offset.any() else {}),
         }
 
     @staticmethod
@@ -137,6 +137,8 @@ class Scene:
     """Model space that is modelled; its longest edge is [-1, 1]."""
     normalisation: Normalisation
     """From world to model space."""
+    placement: Placement
+    """From world space to that of transforms.json."""
     material_names: tuple[str, ...] | None
     """True materials in the order of labels and abundances."""
     illuminant: Float64[np.ndarray, " B"] | None

@@ -62,6 +62,17 @@ def test_wrong_poses_without_alpha_are_called_what_they_are(demo, tmp_path, wron
     assert f"the poses look like {wrong}" in warning
 
 
+@pytest.mark.parametrize("wrong", [None, *WRONG])
+def test_conventions_are_told_in_a_scene_that_was_turned_and_is_geo_referenced(demo, tmp_path, wrong):
+    folder = rewritten(demo, tmp_path / "scene", WRONG.get(wrong, lambda pose: pose), with_alpha=False)
+    path = folder / "transforms.json"
+    turn = [[0, 0, 1, 0.5], [1, 0, 0, -2], [0, 1, 0, 0.25]]
+    applied = {"applied_transform": turn, "applied_scale": 0.5, "offset": [-2.5e6, -4.2e6, 4e6]}
+    path.write_text(json.dumps(json.loads(path.read_text()) | applied))
+    warning = check_scene_poses(load_scene(folder))
+    assert warning is None if wrong is None else f"the poses look like {wrong}" in str(warning)
+
+
 def test_the_remedy_of_the_warning_mends_the_poses(demo, tmp_path):
     as_colmap = rewritten(demo, tmp_path / "wrong", WRONG["world to camera, OpenCV axes"], with_alpha=False)
     warning = check_scene_poses(load_scene(as_colmap))

@@ -58,8 +58,9 @@ def check_scene_poses(scene: Scene) -> str | None:
     sensors = [scene.frames[index].sensor for index in scene.train_indices]
     train = [scene.train_indices[row] for row in commonest(sensors)]
     poses = scene.cameras.camera_to_world[train].double().numpy()
-    rotations = scene.normalisation.rotation.T @ poses[:, :, :3]
-    positions = scene.normalisation.to_world(poses[:, :, 3])
+    placement = scene.placement  # conventions are those of the matrices in transforms.json
+    rotations = placement.rotation @ scene.normalisation.rotation.T @ poses[:, :, :3]
+    positions = placement.to_scene(scene.normalisation.to_world(poses[:, :, 3]))
     world = np.concatenate([rotations, positions[:, :, None]], axis=-1)
     lenses = scene.cameras[train]
     return describe(compare_conventions(world, lenses, lambda view, part: scene.cube(train[view], part)))

@@ -129,6 +129,7 @@ def _assemble(
         eval_indices=split.evaluation,
         scene_box=scene_box,
         normalisation=normalisation.after(entry.placement),
+        placement=entry.placement,
         material_names=truth.material_names,
         illuminant=truth.illuminant,
         endmembers=truth.endmembers,
