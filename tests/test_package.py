@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = ("colour", "scipy", "skimage", "matplotlib", "warp", "OpenEXR", "viser", "pandas", "tensorboard")
-COMMANDS = ("train", "eval", "export", "render", "demo_scene", "view")
+COMMANDS = ("train", "eval", "export", "render", "demo_scene", "process", "view")
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +56,7 @@ def test_a_wheel_declares_commands_and_methods(wheel):
         "unmix-export": "unmix_plugin.commands.export:main",
         "unmix-render": "unmix_plugin.commands.render:main",
         "unmix-demo-scene": "unmix_plugin.commands.demo_scene:main",
+        "unmix-process": "unmix_plugin.commands.process:main",
         "unmix-view": "unmix_plugin.commands.view:main",
     }
     assert dict(entry_points["unmix_plugin.method_configs"]) == {

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Int64
-from scipy.ndimage import binary_opening
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.camera_distortion import distort, undistort
@@ -96,6 +95,8 @@ def needed_witnesses(
 
 def _without_specks(foreground: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
     """Foreground that has neighbours: single pixels in the air need no hull behind them."""
+    from scipy.ndimage import binary_opening  # slow to import, and most commands carve nothing
+
     return binary_opening(foreground, np.ones((2, 2), dtype=bool))
 
 

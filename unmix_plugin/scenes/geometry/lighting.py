@@ -18,7 +18,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy import ndimage
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
@@ -51,6 +50,8 @@ class Places:
 
 def hull_places(hull: Bool[np.ndarray, "R R R"], box: SceneBox) -> Places:
     """Evenly thinned-out cells on the surface of a hull, with their normals."""
+    from scipy import ndimage  # slow to import
+
     inner = np.array(ndimage.binary_erosion(hull, border_value=1), dtype=bool)
     surface = hull & ~inner
     cells = np.argwhere(surface)
@@ -120,6 +121,8 @@ def local_log_brightness(
     spectra: Float[Tensor, "H W B"], counts: Bool[Tensor, "H W"]
 ) -> Float[np.ndarray, "H W"]:
     """Logarithm of the mean brightness of 3 x 3 pixels, of those that count; NaN where the middle one doesn't."""
+    from scipy import ndimage  # slow to import
+
     seen = brightness(spectra.flatten(0, 1)).view(counts.shape)
     known = (counts & (seen > 0)).numpy()
     weights = ndimage.uniform_filter(known.astype(np.float32), 3)
