@@ -64,6 +64,8 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
     grid_resolution: int | Auto = "auto"
     """Cells along an edge of the occupancy grid, from which space is carved that the views show to be empty. Auto is
     128 where alpha is known, else 64: only what few cameras see can be carved then."""
+    trust_alpha: bool = False
+    """Believe alpha even where the light of a pixel contradicts it."""
     max_initial_pixels: int = 50_000
     """Pixels, drawn from all training views, from which the endmembers are initialised."""
 
@@ -239,7 +241,7 @@ class HyperspectralDataManager(DataManager):
 
     @cached_property
     def _evidence(self) -> AlphaEvidence:
-        return AlphaEvidence(self._pixels, self.scene.has_alpha)
+        return AlphaEvidence(self._pixels, self.scene.has_alpha and not self.options.trust_alpha)
 
     def _pixels_for(self, num_rays: int) -> int:
         return max(1, int(num_rays // self._rays_a_pixel))

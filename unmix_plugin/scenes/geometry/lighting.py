@@ -58,7 +58,8 @@ def hull_places(hull: Bool[np.ndarray, "R R R"], box: SceneBox) -> Places:
     cells = cells[:: max(1, -(-len(cells) // NUM_PLACES))]
     blurred = ndimage.gaussian_filter(hull.astype(np.float32), SMOOTHING_CELLS)
     sides = np.array(hull.shape)
-    slopes = np.stack(np.gradient(blurred), axis=-1)[tuple(cells.T)] * (sides / box.size.numpy())
+    gradient = [np.asarray(part) for part in np.gradient(blurred)]
+    slopes = np.stack(gradient, axis=-1)[tuple(cells.T)] * (sides / box.size.numpy())
     normals = torch.nn.functional.normalize(-torch.from_numpy(slopes).float(), dim=-1)
     positions = box.aabb[0] + torch.from_numpy((cells + 0.5) / sides).float() * box.size
     return Places(positions, normals)
