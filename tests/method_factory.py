@@ -49,6 +49,7 @@ def make_model(
         "has_alpha": has_alpha,
         "grid_resolution": 8,
         "subpixels": 2,
+        "num_train_views": 3,
         "pixel_size": 0.087,
     }
     model: UnmixModel = replace(CONFIG, **settings).setup(scene_box=BOX, metadata=metadata)

@@ -178,6 +178,7 @@ class HyperspectralDataManager(DataManager):
             "grid_resolution": self._grid_resolution,
             "pixel_size": min(self._pixel_sizes.values()),
             "subpixels": self._final_subpixels,
+            "num_train_views": len(self.train_cameras),
             **({"sensors": [sensor.to_json() for sensor in self.scene.sensors]} if self.scene.is_rig else {}),
         }
 

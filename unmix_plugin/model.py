@@ -51,6 +51,7 @@ from unmix_plugin.spectral.unmixing.given_endmembers import given_endmembers
 from unmix_plugin.spectral.unmixing.num_materials import propose_num_materials
 from unmix_plugin.spectral.unmixing.partial_bands import distinct_spectra, fill_bands
 from unmix_plugin.training_losses import LossConfig, compare_pixels, pixel_mean, spectral_losses
+from unmix_plugin.view_gains import ViewGains
 
 _FEWEST_RAYS, _MOST_RAYS = 64, 8192
 _PIXELS_TO_COUNT_BY = 20_000
@@ -83,10 +84,11 @@ class UnmixModelConfig(ModelConfig):
     come the endmembers', as light that they send on has. Auto is 1 where alpha is known, else all."""
     train_endmembers: bool = True
     """Whether endmembers change while training; else they stay the first guess, or the spectra from a file."""
-    light: Annotated[Literal["fixed", "camera"] | Auto, Common, short("light")] = "auto"
-    """Where the light stands: fixed in the scene, or moving with the camera, as where an object is turned before camera
-    and lamp; then the brightness of a point depends on the direction of view, what it is made of never does. Auto
-    judges by the brightness of the hull's surface; without alpha it is fixed."""
+    light: Annotated[Literal["fixed", "camera", "per-view"] | Auto, Common, short("light")] = "auto"
+    """How scenes are lit: by a fixed light; by one that moves with the camera, as where an object is turned before
+    camera and lamp, so that the brightness of a point depends on the direction of view; or by one whose strength and
+    colour, or the camera's exposure and white balance, differ from view to view. What a point is made of never depends
+    on it. Auto tells camera from fixed by the brightness of the hull's surface; without alpha it is fixed."""
     segmentation: SegmentationMethod = "abundances"
     """Material of a ray: its largest abundance, or the endmember of smallest angle to its spectrum as published."""
     samples_per_step: int = 30_000
@@ -190,6 +192,7 @@ class UnmixModel(Model):
         self.register_buffer("every_band", torch.eye(len(self.bands)), persistent=False)
         self.register_buffer("endmember_bound", torch.ones(()))
         self.guide = AbundanceGuide(*shape)
+        self.view_gains = self._make_view_gains()
         self.seen_by = SensorViews(metadata.get("sensors", ()), self.rgb_weights)
         self._progress = 0.0
 
@@ -219,6 +222,7 @@ class UnmixModel(Model):
         networks = [value for name, value in self.field.named_parameters() if name != "table"]
         spectra = [self.endmembers] if self.endmembers.requires_grad else []
         spectra += [self.specular_spectra] if self.specular_spectra.numel() else []
+        spectra += [] if self.view_gains is None else [self.view_gains.log_gains]
         return {"grid": table, "networks": networks, "spectra": spectra}
 
     @property
@@ -263,6 +267,8 @@ class UnmixModel(Model):
             if self.seen_by
             else {"spectral": self.materials.spectra(coefficients)}
         )
+        if self.view_gains is not None:
+            seen["cameras"] = ray_bundle.camera_indices
         return {
             **seen,
             "accumulation": coefficients.accumulation,
@@ -319,7 +325,14 @@ class UnmixModel(Model):
             if part.sensor is not None:
                 seen = Coefficients(part.outputs["coefficients"], self.num_endmembers)
                 part.outputs["spectral"] = self.materials.through(seen, self.seen_by.matrix(part.sensor).T)
-        return parts
+        return (
+            parts if self.view_gains is None else [self._with_gain(part, self.view_gains) for part in parts]
+        )
+
+    def _with_gain(self, part: SensorPart, view_gains: ViewGains) -> SensorPart:
+        terms = self.seen_by.project(view_gains.terms, part.sensor)
+        gains = view_gains(part.outputs["cameras"], terms / terms[:1])
+        return replace(part, outputs={**part.outputs, "spectral": part.outputs["spectral"] * gains})
 
     def observe(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> None:
         """Note which cells the views see, and how far margins of abundances are from those of measured spectra."""
@@ -442,6 +455,11 @@ class UnmixModel(Model):
                 f"choose at most {len(self.bands)}"
             )
         return count
+
+    def _make_view_gains(self) -> ViewGains | None:
+        if self.config.light != "per-view":
+            return None
+        return ViewGains(self.metadata["num_train_views"], torch.tensor(self.metadata["wavelengths_nm"]))
 
     def _num_dictionary_spectra(self) -> int:
         if self.config.specular != "dictionary":

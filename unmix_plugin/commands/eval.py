@@ -76,6 +76,10 @@ def evaluate(argv: list[str]) -> None:
         return
     subject = _subject(loaded, recipe, options)
     evaluation, num_pictures = _evaluate_views(subject, console)
+    if subject.has_view_gains:
+        print(
+            "each evaluation view was aligned first: exposure and smooth white balance fitted to the measured view"
+        )
     figures = _write_metrics(subject, evaluation)
     _show(console, figures, subject)
     print(f"{subject.folder / 'metrics.json'}  these figures, and those of each view")
@@ -96,6 +100,11 @@ class _Subject:
     """Where to write."""
     edits: str | None
     """The recipe's text."""
+
+    @property
+    def has_view_gains(self) -> bool:
+        """Whether each training view has a gain of its own."""
+        return getattr(self.loaded.config.pipeline.model, "light", None) == "per-view"
 
 
 def _subject(loaded: LoadedPipeline, recipe: Recipe | None, options: EvalOptions) -> _Subject:
@@ -132,10 +141,13 @@ def _scene_of(loaded: LoadedPipeline) -> Scene:
 
 def _evaluate_views(subject: _Subject, console: Console) -> tuple[Evaluation, int]:
     """Measure and draw view by view; the ids alone are kept, since their colours are known after the last view."""
+    import torch
+
     from unmix_plugin.commands.reporting import follow
     from unmix_plugin.formats.files import write_file
     from unmix_plugin.products.evaluation_pictures import draw_colour, draw_matched_abundances, material_look
     from unmix_plugin.trained.evaluation import Evaluation, scene_truth, subpixels_for, view_truth
+    from unmix_plugin.trained.view_alignment import align_gain
     from unmix_plugin.trained.view_rendering import render_view
 
     scene, folder, factors = _scene_of(subject.loaded), subject.folder, subject.light_factors
@@ -147,6 +159,8 @@ def _evaluate_views(subject: _Subject, console: Console) -> tuple[Evaluation, in
         truth = view_truth(scene, index).in_light(factors)
         rays = subpixels_for(scene, index, subject.scene.subpixels, subject.scene.pixel_size)
         predicted = render_view(subject.scene, scene.cameras[index], rays)
+        if subject.has_view_gains and not scene.is_rig:
+            predicted = align_gain(predicted, truth, torch.from_numpy(scene.wavelengths_nm))
         if scene.is_rig:
             evaluation.sensors[truth.name] = scene.sensor_of(index).name
         psnr_db = evaluation.add(truth, predicted)["psnr"]

@@ -32,6 +32,7 @@ class RecordedScene:
     grid_resolution: int = 64
     pixel_size: float = 1.0
     subpixels: int = 1
+    num_train_views: int = 1
     root: str = ""
     normalisation: RecordedFrame | None = None
     material_names: tuple[str, ...] | None = None
@@ -62,6 +63,7 @@ def check_recorded_scene(values: Mapping[str, Any]) -> None:
         "a grid_resolution of 8 to 512": 8 <= scene.grid_resolution <= 512,
         "a pixel_size above 0": scene.pixel_size > 0,
         "subpixels of 1 to 8": 1 <= scene.subpixels <= 8,
+        "num_train_views of at least 1": scene.num_train_views >= 1,
         "a name for each endmember": None in (scene.material_names, scene.endmembers)
         or len(scene.material_names or ()) == len(scene.endmembers or ()),
         "a rotation of 3 x 3 and a scale above 0": scene.normalisation is None
