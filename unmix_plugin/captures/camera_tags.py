@@ -6,7 +6,9 @@ Tags are called `prefix:Name` as in the file, such as `Camera:BandName` or `dron
 from __future__ import annotations
 
 import io
+import math
 import re
+from collections.abc import Mapping
 from typing import Any, TypeAlias
 from xml.etree import ElementTree
 
@@ -97,6 +99,13 @@ def _black_levels(tag: Any) -> list[float] | None:
     if tag.dtype not in RATIONAL_TYPES:
         return numbers
     return [above / below for above, below in zip(numbers[::2], numbers[1::2], strict=True) if below]
+
+
+def exif_number(exif: Mapping[str, Any], *names: str) -> float | None:
+    """The first of some tags that is a finite number."""
+    values = [exif.get(name) for name in names]
+    numbers = [float(value) for value in values if isinstance(value, (int, float))]
+    return next((number for number in numbers if math.isfinite(number)), None)
 
 
 def tag_value(tags: XmpTags, name: str) -> str | list[str] | None:

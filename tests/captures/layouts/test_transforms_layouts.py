@@ -235,6 +235,23 @@ def test_pictures_are_cubes_of_three_bands(tmp_path, mode):
     assert "--wavelengths 610,550,465" in first.cube.bands.evidence
 
 
+def test_frames_may_name_envi_headers_in_a_folder_of_their_own(tmp_path):
+    import spectral.io.envi
+
+    (tmp_path / "raw").mkdir()
+    spectral.io.envi.save_image(
+        str(tmp_path / "raw" / "a.hdr"),
+        cube(3),
+        metadata={"wavelength": [450, 500, 550, 600], "wavelength units": "nm"},
+    )
+    frames = [{"file_path": "a.hdr", "transform_matrix": pose(0)}]
+    write_json(tmp_path / "transforms.json", LENS | {"datadir": "raw", "frames": frames})
+    (view,) = find_nerfstudio(tmp_path, PLAIN).views
+    np.testing.assert_array_equal(view.cube.read(), cube(3))
+    assert view.picture is None
+    assert view.cube.bands.wavelengths_nm is not None
+
+
 def test_given_primaries_are_taken(tmp_path):
     write_picture(tmp_path / "a.png")
     write_json(

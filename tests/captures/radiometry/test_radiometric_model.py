@@ -141,6 +141,13 @@ def test_the_faulty_exposure_of_old_firmware_is_mended(tmp_path, pixels):
     )
 
 
+def test_exif_that_holds_text_is_refused(tmp_path, pixels):
+    file = make(tmp_path, pixels, MICASENSE)
+    file.metadata["exif"]["ExposureTime"] = "a millisecond"
+    with pytest.raises(CaptureError, match="EXIF ExposureTime should hold 1 positive number"):
+        radiometric_model(file)
+
+
 def test_a_file_without_calibration_has_no_model(tmp_path, pixels):
     assert radiometric_model(make(tmp_path, pixels, {"Camera:BandName": "Red"})) is None
 
@@ -159,7 +166,7 @@ def test_a_file_without_calibration_has_no_model(tmp_path, pixels):
             EXIF | {"ExposureTime": 0.0},
             r"ExposureTime should hold 1 positive number; found \[0.0\]",
         ),
-        (SEQUOIA, {"ExposureTime": 0.0008, "FNumber": 2.2}, "EXIF ISO should hold"),
+        (SEQUOIA, {"ExposureTime": 0.0008, "FNumber": 2.2}, "EXIF ISOSpeedRatings should hold"),
         (SEQUOIA | {"Camera:VignettingPolynomial2D": "0.4"}, EXIF, "VignettingPolynomial2D should hold 5"),
         (SEQUOIA | {"Camera:VignettingPolynomial2DName": "-1,0"}, EXIF, "powers"),
         (DJI | {"drone-dji:BlackLevel": ""}, EXIF, "BlackLevel should hold 1 number; it is absent"),

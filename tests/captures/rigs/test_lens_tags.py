@@ -144,6 +144,8 @@ def test_the_lens_of_dji_counts_from_its_optical_centre():
         (PERSPECTIVE | {"Camera:PerspectiveFocalLength": "0"}, EXIF),
         (FISHEYE | {"Camera:FisheyeAffineMatrix": "1640.0"}, EXIF),
         (DJI | {"drone-dji:DewarpData": "2022-06-08;1,2"}, EXIF),
+        (PERSPECTIVE | {"Camera:PrincipalPoint": "1e999,1", "Camera:PerspectiveDistortion": ""}, EXIF),
+        (PERSPECTIVE, {"FocalPlaneXResolution": "many"}),
     ],
 )
 def test_without_the_tags_there_is_no_lens(tags, exif):

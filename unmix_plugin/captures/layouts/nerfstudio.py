@@ -1,5 +1,6 @@
 """Layout `nerfstudio`: RGB pictures with poses, each as a cube of three bands.
 
+Files of other kinds than pictures are opened as what they are, such as the ENVI headers of HSI-Nerfstudio in `datadir`.
 The frames are those of transforms.json, or of Blender's transforms_train.json and its like, whose paths have no suffix.
 An alpha channel says what is matter. A picture has no wavelengths, only primaries; the user gives three numbers.
 """
@@ -39,19 +40,26 @@ def find_nerfstudio(root: Path, options: LayoutOptions) -> Capture:
     listed = read_frames(root)
     require_names(listed.frames, "file_path")
     names = view_names([frame.name for frame in listed.frames], str(root))
-    found = FoundFiles(root)
+    found, folder = FoundFiles(root), listed.top.get("datadir")
     pictures: list[Path] = []
     masks: list[Path | None] = []
     for frame in listed.frames:
         has_suffix = PurePosixPath(frame.name).suffix in SUFFIXES
-        others = () if has_suffix else tuple(f"{frame.name}{suffix}" for suffix in SUFFIXES)
+        others = [] if has_suffix else [f"{frame.name}{suffix}" for suffix in SUFFIXES]
+        others += [f"{folder}/{frame.name}"] if isinstance(folder, str) else []
         path = found.find(frame.where, frame.name, *others)
         pictures += [] if path is None else [path]
         text = frame.text("mask_path")
         masks.append(found.find(frame.where, text) if text else None)
     found.refuse_missing("copy them into the folder, or drop the frames")
     views = tuple(
-        CaptureView(name, _open(path, options), picture=path, mask=mask, split=frame.split)
+        CaptureView(
+            name,
+            _open(path, options),
+            picture=path if path.suffix in SUFFIXES else None,
+            mask=mask,
+            split=frame.split,
+        )
         for frame, name, path, mask in zip(listed.frames, names, pictures, masks, strict=True)
     )
     return make_capture("nerfstudio", root, listed, views)

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from unmix_plugin.captures.camera_tags import XmpTags, tag_text
+from unmix_plugin.captures.camera_tags import XmpTags, exif_number, tag_text
 from unmix_plugin.captures.capture import Capture, CaptureView
 from unmix_plugin.captures.layouts.frames import Split, view_names
 from unmix_plugin.captures.layouts.registry import LayoutOptions
@@ -221,7 +221,9 @@ def _left_out(opened: Iterable[_BandFile], paths: Iterable[Path]) -> list[str]:
 
 
 def _odd(bands: Sequence[_BandFile], releases: Sequence[str]) -> list[str]:
-    turned = sum(int((item.file.metadata.get("exif") or {}).get("Orientation", 1)) > 1 for item in bands)
+    turned = sum(
+        (exif_number(item.file.metadata.get("exif") or {}, "Orientation") or 1) > 1 for item in bands
+    )
     counts = Counter(releases)
     incomplete = [release for release, count in counts.items() if count < max(counts.values())]
     notes = (

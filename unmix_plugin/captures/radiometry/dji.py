@@ -13,7 +13,12 @@ from typing import Any
 import numpy as np
 
 from unmix_plugin.captures.camera_tags import XmpTags, tag_numbers
-from unmix_plugin.captures.radiometry.model import RadiometricModel, radial_polynomial, require_numbers
+from unmix_plugin.captures.radiometry.model import (
+    RadiometricModel,
+    radial_polynomial,
+    require_numbers,
+    stored_range,
+)
 from unmix_plugin.captures.spectral_file import SpectralFile
 
 SATURATED = 65520.0
@@ -47,7 +52,7 @@ def read_model(file: SpectralFile, tags: XmpTags, exif: dict[str, Any]) -> Radio
             for number in tag_numbers(tags, f"drone-dji:CalibratedOpticalCenter{axis}") or []
         ]
         centre = require_numbers(file, "XMP drone-dji:CalibratedOpticalCenterX, Y", middle or None, 2)
-    scale = adjustment[0] / (gain * 1e-6 * microseconds) / 2.0 ** int(exif.get("BitsPerSample", 16))
+    scale = adjustment[0] / (gain * 1e-6 * microseconds) / stored_range(exif)
 
     def factor_of(y: np.ndarray, x: np.ndarray) -> np.ndarray:
         return scale * radial_polynomial(polynomial, centre, y, x)

@@ -13,7 +13,13 @@ from typing import Any
 import numpy as np
 
 from unmix_plugin.captures.camera_tags import XmpTags, tag_numbers
-from unmix_plugin.captures.radiometry.model import RadiometricModel, radial_polynomial, require_numbers
+from unmix_plugin.captures.radiometry.model import (
+    RadiometricModel,
+    radial_polynomial,
+    require_exif,
+    require_numbers,
+    stored_range,
+)
 from unmix_plugin.captures.spectral_file import SpectralFile
 
 SATURATED = 65520.0
@@ -37,15 +43,12 @@ def read_model(file: SpectralFile, tags: XmpTags, exif: dict[str, Any]) -> Radio
         file, "XMP RadiometricCalibration", tag_numbers(tags, "RadiometricCalibration"), 3
     )
     exposure = _exposure_s(file, exif)
-    speed = exif.get("ISOSpeed", exif.get("ISOSpeedRatings", exif.get("PhotographicSensitivity")))
-    (iso,) = require_numbers(
-        file, "EXIF ISOSpeed", None if speed is None else [float(speed)], 1, positive=True
-    )
+    iso = require_exif(file, exif, "ISOSpeed", "ISOSpeedRatings", "PhotographicSensitivity")
     levels = exif.get("BlackLevel") or tag_numbers(tags, "DarkRowValue") or [0.0]
     centre = require_numbers(file, "XMP VignettingCenter", tag_numbers(tags, "VignettingCenter"), 2)
     polynomial = tag_numbers(tags, "VignettingPolynomial")
     polynomial = require_numbers(file, "XMP VignettingPolynomial", polynomial, 6)
-    gain = a1 / (0.01 * iso * exposure) / 2.0 ** int(exif.get("BitsPerSample", 16))
+    gain = a1 / (0.01 * iso * exposure) / stored_range(exif)
 
     def factor_of(y: np.ndarray, x: np.ndarray) -> np.ndarray:
         rows = 1.0 + a2 * y / exposure - a3 * y
@@ -57,10 +60,7 @@ def read_model(file: SpectralFile, tags: XmpTags, exif: dict[str, Any]) -> Radio
 
 
 def _exposure_s(file: SpectralFile, exif: dict[str, Any]) -> float:
-    found = exif.get("ExposureTime")
-    (exposure,) = require_numbers(
-        file, "EXIF ExposureTime", None if found is None else [float(found)], 1, positive=True
-    )
+    exposure = require_exif(file, exif, "ExposureTime")
     is_faulty = exif.get("Model") == "RedEdge" and abs(exposure - FAULTY_EXPOSURE_S) < 1e-6
     return TRUE_EXPOSURE_S if is_faulty else exposure
 

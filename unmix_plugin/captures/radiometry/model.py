@@ -9,13 +9,14 @@ with a factor for exposure, gain, vignetting and, where rows are read one after 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int
 
+from unmix_plugin.captures.camera_tags import exif_number
 from unmix_plugin.captures.spectral_file import SpectralFile
 from unmix_plugin.errors import CaptureError
 
@@ -106,6 +107,23 @@ def require_numbers(
             "Without it the stored numbers can't become radiance: export the image with its metadata"
         )
     return numbers
+
+
+def require_exif(file: SpectralFile, exif: Mapping[str, Any], *names: str) -> float:
+    """The first of some EXIF tags.
+
+    Raises:
+        CaptureError: it is absent, no number, or not above 0.
+    """
+    number = exif_number(exif, *names)
+    return require_numbers(file, f"EXIF {names[0]}", None if number is None else [number], 1, positive=True)[
+        0
+    ]
+
+
+def stored_range(exif: Mapping[str, Any]) -> float:
+    """Stored numbers go up to this, less one."""
+    return 2.0 ** min(32.0, exif_number(exif, "BitsPerSample") or 16.0)
 
 
 def radial_polynomial(

@@ -13,7 +13,12 @@ from typing import Any
 import numpy as np
 
 from unmix_plugin.captures.camera_tags import XmpTags, tag_numbers
-from unmix_plugin.captures.radiometry.model import RadiometricModel, require_numbers
+from unmix_plugin.captures.radiometry.model import (
+    RadiometricModel,
+    require_exif,
+    require_numbers,
+    stored_range,
+)
 from unmix_plugin.captures.spectral_file import SpectralFile
 from unmix_plugin.errors import CaptureError
 
@@ -35,12 +40,8 @@ def read_model(file: SpectralFile, tags: XmpTags, exif: dict[str, Any]) -> Radio
         CaptureError: a tag is absent or of the wrong size.
     """
     a, b, c = require_numbers(file, "XMP SensorModel", tag_numbers(tags, "SensorModel"), 3)
-    speed = exif.get("ISOSpeedRatings", exif.get("PhotographicSensitivity", exif.get("ISOSpeed")))
-    found = {"ExposureTime": exif.get("ExposureTime"), "FNumber": exif.get("FNumber"), "ISO": speed}
-    exposure, f_number, iso = (
-        require_numbers(file, f"EXIF {name}", None if value is None else [float(value)], 1, positive=True)[0]
-        for name, value in found.items()
-    )
+    exposure, f_number = require_exif(file, exif, "ExposureTime"), require_exif(file, exif, "FNumber")
+    iso = require_exif(file, exif, "ISOSpeedRatings", "PhotographicSensitivity", "ISOSpeed")
     vignetting = _vignetting(file, tags)
     height, width = file.shape[:2]
     gain = f_number**2 / (a * exposure * iso + c)
@@ -50,7 +51,7 @@ def read_model(file: SpectralFile, tags: XmpTags, exif: dict[str, Any]) -> Radio
         down = np.vander(y[:, 0] / height, vignetting.shape[1], increasing=True)
         return gain / (down @ vignetting.T @ across.T)
 
-    saturated = SATURATED_10_BITS if int(exif.get("BitsPerSample", 16)) == 10 else SATURATED
+    saturated = SATURATED_10_BITS if stored_range(exif) == 2.0**10 else SATURATED
     return RadiometricModel("Parrot Sequoia", "relative", b, saturated, factor_of)
 
 

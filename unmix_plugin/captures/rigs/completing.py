@@ -89,7 +89,7 @@ def _offset_to(
 def rig_rotation(view: CaptureView) -> Float64[np.ndarray, "3 3"] | None:
     """From the axes of the lens to those of the reference lens, as the file says; None where it doesn't."""
     angles = tag_numbers(view.cube.metadata.get("xmp") or {}, "RigRelatives")
-    if angles is None or len(angles) != 3:
+    if angles is None or len(angles) != 3 or not np.isfinite(angles).all():
         return None
     (cx, cy, cz), (sx, sy, sz) = np.cos(np.deg2rad(angles)), np.sin(np.deg2rad(angles))
     about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])

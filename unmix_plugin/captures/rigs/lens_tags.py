@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from unmix_plugin.captures.camera_tags import XmpTags, tag_numbers, tag_text
+from unmix_plugin.captures.camera_tags import XmpTags, exif_number, tag_numbers, tag_text
 from unmix_plugin.captures.poses.lens_fit import Points, fit_lens, project_opencv
 from unmix_plugin.captures.poses.pose_set import Lens
 from unmix_plugin.captures.spectral_file import SpectralFile
 from unmix_plugin.errors import CaptureError
 
-MM_OF_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
+MM_OF_UNIT: dict[float, float] = {2.0: 25.4, 3.0: 10.0, 4.0: 1.0, 5.0: 1e-3}
 """Millimetres in EXIF's FocalPlaneResolutionUnit: inch, cm, mm, micrometre."""
 TAGS = "lens in the XMP"
 LONGEST_MM = 50.0
@@ -33,7 +33,18 @@ def lens_of(file: SpectralFile) -> tuple[Lens | None, tuple[str, ...]]:
     Raises:
         CaptureError: its model differs from k1, k2, p1, p2 by too much.
     """
-    tags, exif = file.metadata.get("xmp") or {}, file.metadata.get("exif") or {}
+    lens, notes = _stated_lens(file, file.metadata.get("xmp") or {}, file.metadata.get("exif") or {})
+    if lens is None:
+        return None, notes
+    numbers = (*lens.focal_px, *lens.center_px, *lens.distortion)
+    if not np.isfinite(numbers).all() or min(lens.focal_px) <= 0.0:
+        return None, ("no lens in the file's tags: its numbers make no sense",)
+    return lens, notes
+
+
+def _stated_lens(
+    file: SpectralFile, tags: XmpTags, exif: dict[str, Any]
+) -> tuple[Lens | None, tuple[str, ...]]:
     if tag_numbers(tags, "DewarpData") is not None:
         return _dji_lens(file, tags)
     resolution = _resolution(exif)
@@ -49,9 +60,9 @@ def lens_of(file: SpectralFile) -> tuple[Lens | None, tuple[str, ...]]:
 
 def _resolution(exif: dict[str, Any]) -> tuple[float, float] | None:
     """Pixels a millimetre along x and y."""
-    unit = MM_OF_UNIT.get(int(exif.get("FocalPlaneResolutionUnit", 4)), 1.0)
-    across = float(exif.get("FocalPlaneXResolution", 0.0)) / unit
-    down = float(exif.get("FocalPlaneYResolution", 0.0)) / unit
+    unit = MM_OF_UNIT.get(exif_number(exif, "FocalPlaneResolutionUnit") or 4.0, 1.0)
+    across = (exif_number(exif, "FocalPlaneXResolution") or 0.0) / unit
+    down = (exif_number(exif, "FocalPlaneYResolution") or 0.0) / unit
     return (across, down or across) if across > 0.0 else None
 
 
