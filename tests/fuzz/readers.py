@@ -19,6 +19,7 @@ import safetensors.torch
 import torch
 from PIL import Image
 
+from tests.fuzz import pose_samples
 from tests.fuzz.capture_samples import ENVI_DATA, SAMPLES, read_capture
 from tests.fuzz.mutation import Mutator, mutate_bytes, mutate_json, mutate_png
 from tests.scenes.scene_factory import look_at
@@ -413,6 +414,31 @@ def _capture(file_name: str) -> Reader:
     return Reader(SAMPLES[file_name](), file_name, read_capture, (CaptureError,), companions=beside)
 
 
+def _poses(
+    name: str,
+    samples: Callable[[], tuple[bytes, ...]],
+    mutate: Mutator = mutate_bytes,
+    companions: tuple[tuple[str, bytes], ...] = (),
+) -> Reader:
+    return Reader(samples(), name, pose_samples.read_and_place, (CaptureError,), mutate, companions)
+
+
+def _colmap(name: str) -> Reader:
+    """One of COLMAP's text files, damaged, beside the others."""
+    files = {
+        "cameras.txt": pose_samples.COLMAP_CAMERAS,
+        "images.txt": pose_samples.COLMAP_IMAGES,
+        "points3D.txt": pose_samples.COLMAP_POINTS,
+    }
+    beside = tuple((other, content) for other, content in files.items() if other != name)
+    return _poses(name, lambda: (files[name],), companions=beside)
+
+
+def _ply() -> Reader:
+    return Reader(pose_samples.ply_samples(), "points.ply", pose_samples.read_points, (ValueError,))
+
+
+_CALIBRATION = (("AutoCal.xml", pose_samples.CALIBRATED),)
 READERS: dict[str, Callable[[], Reader]] = {
     "transforms.json": _transforms,
     "cube (.npy)": _cube,
@@ -429,6 +455,18 @@ READERS: dict[str, Callable[[], Reader]] = {
     "checkpoint tensors": _checkpoint_tensors,
     "run metrics": _metrics,
     "recipe": _recipe,
+    "poses transforms.json": partial(_poses, "transforms.json", pose_samples.transforms_samples, mutate_json),
+    "poses OpenSfM": partial(_poses, "reconstruction.json", pose_samples.opensfm_samples, mutate_json),
+    "poses Metashape": partial(_poses, "cameras.xml", pose_samples.metashape_samples),
+    "poses MicMac": partial(
+        _poses, "Orientation-a.tif.xml", pose_samples.micmac_samples, companions=_CALIBRATION
+    ),
+    "poses LLFF": partial(_poses, "poses_bounds.npy", pose_samples.llff_samples),
+    **{
+        f"poses COLMAP {name}": partial(_colmap, name)
+        for name in ("cameras.txt", "images.txt", "points3D.txt")
+    },
+    "points (.ply)": _ply,
     **{f"capture {file_name}": partial(_capture, file_name) for file_name in SAMPLES},
 }
 """By name, for messages and tables."""

@@ -44,8 +44,8 @@ def test_other_arrays_and_damaged_files_are_refused(tmp_path):
     with pytest.raises(CaptureError, match=r"shape \(3, 4\)"):
         read_poses(path)
     np.save(path, np.array([{"a": 1}]), allow_pickle=True)
-    with pytest.raises(CaptureError, match="can't be read as an array of numbers"):
+    with pytest.raises(CaptureError, match="never loaded"):
         read_poses(path)
     path.write_bytes(write(tmp_path).read_bytes()[:300])
-    with pytest.raises(CaptureError, match="cut short"):
+    with pytest.raises(CaptureError, match="is cut short"):
         read_poses(path)

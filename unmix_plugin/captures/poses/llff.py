@@ -10,6 +10,7 @@ from unmix_plugin.captures.poses.matching import BY_ORDER
 from unmix_plugin.captures.poses.pose_set import Lens, PoseSet
 from unmix_plugin.captures.poses.raw_poses import RawCamera, make_pose_set
 from unmix_plugin.errors import CaptureError
+from unmix_plugin.scenes.reading.arrays import UnreadableArrayError, map_array, read_array_header
 
 FILE_NAME = "poses_bounds.npy"
 PICTURE_FOLDERS = ("images", "exr")
@@ -23,16 +24,15 @@ def read_llff(path: Path) -> PoseSet:
         CaptureError: it is no array of the right shape, or a size or focal length makes no sense.
     """
     try:
-        table = np.array(np.lib.format.open_memmap(path, mode="r"))
-    except (OSError, ValueError, EOFError, SyntaxError) as error:
-        raise CaptureError(
-            f"{path} can't be read as an array of numbers ({error}); was it cut short?"
-        ) from error
-    if table.ndim != 2 or table.shape[1] not in (15, 17) or len(table) == 0 or table.dtype.kind not in "fiu":
-        raise CaptureError(
-            f"{path} has the shape {table.shape} of {table.dtype}; expected (views, 17) numbers, as LLFF writes"
-        )
-    table = table.astype(np.float64)
+        shape = read_array_header(path).shape
+        is_table = len(shape) == 2 and shape[0] > 0 and shape[1] in (15, 17)
+        table = np.array(map_array(path), dtype=np.float64) if is_table else None
+    except UnreadableArrayError as error:
+        raise CaptureError(f"{path} {error}") from error
+    except OSError as error:
+        raise CaptureError(f"{path} can't be read ({error.strerror or error})") from error
+    if table is None:
+        raise CaptureError(f"{path} has the shape {shape}; expected (views, 17) numbers, as LLFF writes them")
     names, note = _names(path.parent, len(table))
     cameras = []
     for name, row in zip(names, table[:, :15].reshape(-1, 3, 5), strict=True):

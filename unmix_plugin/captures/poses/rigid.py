@@ -88,12 +88,12 @@ def _fault(matrix: Float64[np.ndarray, "3 4"]) -> str | None:
     """What is wrong with a matrix; None if it is a similarity."""
     if not np.isfinite(matrix).all():
         return "the matrix has numbers that are not finite"
+    if np.abs(matrix).max() > GREATEST_POSITION:
+        return "the camera is more than 1e9 units away, or its rotation scaled by more"
     left = matrix[:, :3]
     lengths = np.linalg.norm(left, axis=0)
     if lengths.max() < 1e-9:
         return "the rotation is all zeros"
-    if np.abs(matrix[:, 3]).max() > GREATEST_POSITION or lengths.max() > GREATEST_POSITION:
-        return "the camera is more than 1e9 units away"
     gram = left.T @ left / np.mean(lengths**2)
     if np.abs(gram - np.eye(3)).max() > SHEAR_TOLERANCE:
         axes = ", ".join(f"{length:.4g}" for length in lengths)
