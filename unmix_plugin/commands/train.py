@@ -78,6 +78,7 @@ def _run(trainer: Trainer, console: Console) -> None:
         SystemExit: 130, after a stop on request.
     """
     from unmix_plugin.commands.reporting import say
+    from unmix_plugin.commands.training_remarks import read_remarks
     from unmix_plugin.engine.training.interrupts import Interrupted
 
     try:
@@ -91,6 +92,8 @@ def _run(trainer: Trainer, console: Console) -> None:
         sys.exit(INTERRUPTED)
     speed = f"{record.train_rays_per_second:,.0f} rays/s"
     say(console, f"trained {record.steps} steps in {record.train_seconds:.1f} s, {speed}")
+    for remark in read_remarks(trainer.run.metrics_path):
+        say(console, remark)
     _write_endmembers(trainer)
 
 

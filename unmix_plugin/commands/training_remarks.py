@@ -1,0 +1,62 @@
+"""What the course of the loss says of a training, in words: whether it settled, and what to try where it did not."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+_FEWEST_LINES = 8
+"""Lines of metrics below which nothing is said."""
+_HARDLY_FELL = 0.6
+"""Loss in the last quarter of the training, over that in the first, from which on it hardly fell. Trainings that settle
+stay below 0.35, also short ones."""
+_STILL_FALLS = 0.3
+"""Share by which the loss fell from the third to the last quarter, from which on more steps are worth while."""
+
+
+def read_remarks(metrics_path: Path) -> list[str]:
+    """Remarks on the training whose `metrics.jsonl` this is; none where the file can't be read."""
+    try:
+        lines = [json.loads(line) for line in metrics_path.read_text(encoding="utf-8").splitlines()]
+    except (OSError, ValueError):
+        return []
+    return remarks([line for line in lines if line.get("split") == "train"])
+
+
+def remarks(lines: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Sentences for whoever trains.
+
+    Args:
+        lines: Of training batches in order, each with `step` and `loss` (None where it was not finite).
+    """
+    known = [line for line in lines if line.get("loss") is not None]
+    if len(known) < _FEWEST_LINES:
+        return []
+    last_step = known[-1]["step"]
+    first, third, last = (_typical_loss(known, quarter, last_step) for quarter in (1, 3, 4))
+    if None in (first, third, last) or not first or not third or last is None:
+        return []
+    found = []
+    if last > _HARDLY_FELL * first:
+        found.append(
+            f"the loss hardly fell: in the last quarter of the training it was {last / first:.0%} of that in the "
+            "first. The views don't agree on one scene. Look at the pictures of unmix-eval: double edges mean wrong "
+            "poses; blurred brightness, a light that moves (try --light camera, or --light per-view where exposures "
+            "differ); bright specks, blown-out pixels or background within the masks"
+        )
+    elif 1 - last / third > _STILL_FALLS:
+        found.append(
+            f"the loss still fell by {1 - last / third:.0%} from the third to the last quarter: a longer training "
+            "(--max-num-iterations, --max-seconds) will show more"
+        )
+    return found
+
+
+def _typical_loss(lines: Sequence[Mapping[str, Any]], quarter: int, last_step: int) -> float | None:
+    """Median over a quarter of the training, 1 to 4; None without lines in it."""
+    low, high = (quarter - 1) * last_step / 4, quarter * last_step / 4
+    losses = [float(line["loss"]) for line in lines if low < line["step"] <= high]
+    return median(losses) if losses else None
