@@ -76,9 +76,10 @@ class Calibration:
         missing = find_missing(stored, file.no_data)
         saturated = np.zeros(stored.shape, bool) if self.saturation is None else stored >= self.saturation
         values = self._values(file, whole, rows)
-        sound = np.isfinite(values).all(axis=-1) & ~missing
-        values[~sound] = 0.0
-        saturated[~sound] = False
+        sound = np.isfinite(values.sum(axis=-1)) & ~missing  # one number that is not finite makes the sum so
+        if not sound.all():
+            values[~sound] = 0.0
+            saturated[~sound] = False
         return CalibratedRows(
             self._binned_bands(self.raster.averaged(values)).astype(np.float32, copy=False),
             self._any_band(self.raster.any_in_square(saturated)),
@@ -87,7 +88,7 @@ class Calibration:
 
     def _values(self, file: SpectralFile, whole: np.ndarray, rows: slice) -> Float32[np.ndarray, "h W b"]:
         columns, bands = self.raster.columns, self.bands
-        values = np.array(linear(file, whole, rows)[:, columns])
+        values = linear(file, whole, rows)[:, columns]  # a new array, free to be changed
         factor = np.float32(self.gain * self.exposure_factor(file))
         if self.dark is not None:
             values -= self.dark.rows(rows, columns, bands)

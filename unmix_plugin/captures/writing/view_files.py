@@ -135,15 +135,17 @@ class _Tally:
         rows = slice(first, first + len(part.values))
         values = part.values * np.float32(1.0 / recipe.scale)
         self.missing[rows] |= part.missing
-        above = (values > 1.0) & ~part.saturated
-        self.counts += (above.sum(), (values < 0).sum())
+        if values.max() > 1.0:
+            self.counts[0] += ((values > 1.0) & ~part.saturated).sum()
+        if values.min() < 0.0:
+            self.counts[1] += (values < 0.0).sum()
         self.saturated[rows] = part.saturated.any(axis=-1)
         if recipe.background is not None:
             self.opacity[rows] = np.where(recipe.background.matter(values), OPAQUE, 0)
         self.rgb[rows] = recipe.colours.linear_rgb(values)
         self.brightness[rows] = values.mean(axis=-1)
         counted = (self.opacity[rows] > HALF) & ~self.missing[rows]
-        self.sum += np.einsum("hwb,hw->b", values, counted.astype(np.float32), dtype=np.float64)
+        self.sum += counted.ravel().astype(np.float32) @ values.reshape(-1, values.shape[-1])
         self.num_summed += int(counted.sum())
         return values
 
