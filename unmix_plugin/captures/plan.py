@@ -161,19 +161,16 @@ def _background(
     width = max(1, round(BORDER_SHARE * raster.width))
     columns = np.r_[0:width, raster.width - width : raster.width]
     rows = sorted({0, raster.height - 1, *sampled_rows(raster.height)})
+    step = max(1, len(views) * (2 * raster.width + 2 * width * len(rows)) // MOST_BORDER_PIXELS)
     border = []
     for view in views:
         for row in rows:
             part = sensor.calibration.rows(view.cube, row, row + 1)
-            is_edge = row in (0, raster.height - 1)
-            values, saturated = part.values[0], part.saturated[0]
-            seen = ~part.missing[0]
-            if not is_edge:
-                values, saturated, seen = values[columns], saturated[columns], seen[columns]
-            values = np.where(saturated, np.float32(scale), values)
-            border.append(values[seen])
+            shown = np.arange(raster.width) if row in (0, raster.height - 1) else columns
+            shown = shown[row % step :: step]
+            values = np.where(part.saturated[0, shown], np.float32(scale), part.values[0, shown])
+            border.append(values[~part.missing[0, shown]])
     pixels = np.clip(np.concatenate(border) / np.float32(scale), 0.0, 1.0)
-    pixels = pixels[:: max(1, len(pixels) // MOST_BORDER_PIXELS)]
     everywhere = np.concatenate([background_brightness(kind, sample), background_brightness(kind, pixels)])
     return find_background(
         kind, pixels, float(np.percentile(np.clip(everywhere, 0.0, 1.0), BRIGHT_PERCENTILE))
