@@ -109,3 +109,16 @@ def test_inputs_are_recorded_with_their_hashes(tmp_path: Path):
             data = Path(source["path"]).read_bytes()
             assert source["sha256"] == hashlib.sha256(data).hexdigest()
             assert source["bytes"] == len(data)
+
+
+def test_a_scene_may_be_written_to_the_working_directory(tmp_path: Path, monkeypatch):
+    capture = make_capture(tmp_path / "capture")
+    (tmp_path / "scene").mkdir()
+    monkeypatch.chdir(tmp_path / "scene")
+    process(capture.root, Path())
+    assert (tmp_path / "scene" / "transforms.json").is_file()
+
+
+def test_the_root_of_the_disk_is_no_scene(tmp_path: Path):
+    with pytest.raises(ConfigError, match="can't be a scene"):
+        process(make_capture(tmp_path / "capture").root, Path("/"))

@@ -14,17 +14,17 @@ from unmix_plugin.captures.writing.view_files import ViewRecord
 from unmix_plugin.errors import ConfigError
 
 PLAN_NAME, RECORD_NAME, SCENE_NAME = "plan.json", "process.json", "transforms.json"
-_VIEWS = "views"
+_VIEWS, POSES_NAME = "views", "poses"
 
 
 class WorkFolder:
     """The unfinished scene of one output folder."""
 
     def __init__(self, output: Path) -> None:
-        self.output = output
-        self.path = output.with_name(f"{output.name}.unfinished")
+        self.output = output.resolve()
+        self.path = self.output.with_name(f"{self.output.name}.unfinished")
         """Where files are written until the scene is complete."""
-        self.poses = self.path / "poses"
+        self.poses = self.path / POSES_NAME
         """Where files of the estimation of poses lie while it runs, or after it failed."""
 
     def begin(self, plan: dict[str, Any]) -> bool:
@@ -73,15 +73,16 @@ class WorkFolder:
             RunError: it can't be moved.
         """
         with write_errors_as(self.output):
-            shutil.rmtree(self.path / _VIEWS)
-            shutil.rmtree(self.poses, ignore_errors=True)
-            (self.path / PLAN_NAME).unlink()
             old = self.output.with_name(f"{self.output.name}.old")
             if overwrite and self.output.exists():
                 self.output.rename(old)
             elif self.output.exists():
                 self.output.rmdir()  # empty, see refuse_output
             self.path.rename(self.output)
+            # After a kill here, the scene is whole and has some files too many.
+            for name in (_VIEWS, POSES_NAME):
+                shutil.rmtree(self.output / name, ignore_errors=True)
+            (self.output / PLAN_NAME).unlink()
             shutil.rmtree(old, ignore_errors=True)
 
     def _record(self, name: str) -> Path:
@@ -94,6 +95,8 @@ def refuse_output(output: Path, overwrite: bool) -> None:
     Raises:
         ConfigError: the folder holds something; with `overwrite`, something that this command did not make.
     """
+    if not output.resolve().name:
+        raise ConfigError(f"{output} can't be a scene; give a folder of its own with --output-dir")
     if output.is_file():
         raise ConfigError(f"{output} is a file; give a folder with --output-dir")
     if not output.is_dir() or not any(output.iterdir()):
