@@ -209,6 +209,7 @@ def test_files_are_grouped_by_name_where_they_share_no_identifier(tmp_path):
     ("names", "releases"),
     [
         (("DJI_0011.TIF", "DJI_0012.TIF", "DJI_0021.TIF"), ["DJI_001", "DJI_001", "DJI_002"]),
+        (("IMG_0001_1.tif", "IMG_0001_10.tif"), ["IMG_0001", "IMG_0001"]),
         (("DJI_2023_0001_MS_G.TIF", "DJI_2023_0001_MS_NIR.TIF"), ["DJI_2023_0001", "DJI_2023_0001"]),
         (("a/IMG_0000_1.tif", "b/IMG_0000_1.tif"), ["a_IMG_0000", "b_IMG_0000"]),
     ],

@@ -11,12 +11,11 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 from unmix_plugin.captures.capture import Capture, CaptureView
+from unmix_plugin.captures.layouts.found_files import FoundFiles, view_names
 from unmix_plugin.captures.layouts.frames import (
-    FoundFiles,
     make_capture,
     read_frames,
     require_names,
-    view_names,
 )
 from unmix_plugin.captures.layouts.registry import LayoutOptions
 from unmix_plugin.captures.readers.opening import open_spectral_file

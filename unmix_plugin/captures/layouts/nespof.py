@@ -16,12 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from unmix_plugin.captures.capture import Capture, CaptureView
+from unmix_plugin.captures.layouts.found_files import FoundFiles, view_names
 from unmix_plugin.captures.layouts.frames import (
-    FoundFiles,
     make_capture,
     read_frames,
     require_names,
-    view_names,
     with_wavelengths,
 )
 from unmix_plugin.captures.layouts.registry import LayoutOptions

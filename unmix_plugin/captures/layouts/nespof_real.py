@@ -10,7 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from unmix_plugin.captures.capture import Capture, CaptureView
-from unmix_plugin.captures.layouts.frames import view_names, with_wavelengths
+from unmix_plugin.captures.layouts.found_files import view_names
+from unmix_plugin.captures.layouts.frames import with_wavelengths
 from unmix_plugin.captures.layouts.nespof import stack_intensities, wavelength_entries
 from unmix_plugin.captures.layouts.registry import LayoutOptions
 from unmix_plugin.captures.poses.pose_set import PoseSet

@@ -10,19 +10,24 @@ name up to the band. Pictures in colour are left out, as nothing says what their
 
 from __future__ import annotations
 
-import re
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from unmix_plugin.captures.camera_tags import XmpTags, exif_number, tag_text
+from unmix_plugin.captures.camera_tags import exif_number, tag_text
 from unmix_plugin.captures.capture import Capture, CaptureView
-from unmix_plugin.captures.layouts.frames import Split, view_names
+from unmix_plugin.captures.layouts.found_files import view_names
 from unmix_plugin.captures.layouts.registry import LayoutOptions
-from unmix_plugin.captures.readers.opening import open_spectral_file
+from unmix_plugin.captures.layouts.rig_files import (
+    BandFile,
+    open_band_file,
+    release_names,
+    sensor_names,
+    splits_of,
+)
 from unmix_plugin.captures.rigs.lens_tags import lens_of
 from unmix_plugin.captures.spectral_file import BandTable, SpectralFile
 from unmix_plugin.errors import CaptureError
@@ -31,30 +36,6 @@ TIFF_SUFFIXES = (".tif", ".tiff")
 COLOUR_SUFFIXES = (".jpg", ".jpeg")
 THERMAL_NM = 3000.0
 """Bands from here on measure heat."""
-BAND_ENDING = re.compile(
-    r"(?:_MS)?[_-](\d|GRE|GREEN|RED|REG|REDEDGE|RE|NIR|BLUE|RGB|G|R|B|D|W)$", re.IGNORECASE
-)
-"""Of a file's stem."""
-DJI_NUMBER = re.compile(r"(DJI_\d+)(\d)$", re.IGNORECASE)
-"""Of a Phantom 4 Multispectral: the last digit is the band, 0 the colour picture."""
-EVAL_INTERVAL = 8
-"""Every so many releases, one is for evaluation."""
-UNIQUE_TAGS = ("MicaSense:CaptureId", "CaptureUUID", "CaptureId")
-
-
-@dataclass(frozen=True)
-class _BandFile:
-    """One file before it is a view."""
-
-    file: SpectralFile
-    base: str
-    """Name up to the band, with its folder."""
-    ending: str
-    """What tells the band in the name."""
-
-    @property
-    def tags(self) -> XmpTags:
-        return self.file.metadata.get("xmp") or {}
 
 
 def find_rig(root: Path, options: LayoutOptions) -> Capture:
@@ -67,16 +48,16 @@ def find_rig(root: Path, options: LayoutOptions) -> Capture:
     excluded = {path.resolve() for path in options.exclude}
     paths = [path for path in sorted(root.rglob("*")) if path.is_file() and path.resolve() not in excluded]
     paths = [path for path in paths if not any(part.startswith(".") for part in path.relative_to(root).parts)]
-    opened = [_open(path, root) for path in paths if path.suffix.lower() in TIFF_SUFFIXES]
+    opened = [open_band_file(path, root) for path in paths if path.suffix.lower() in TIFF_SUFFIXES]
     bands = [item for item in opened if item.file.shape[2] == 1 and not _is_thermal(item.file)]
     if not bands:
         raise CaptureError(
             f"{root} holds no TIFF files of single bands; expected IMG_0000_1.tif, IMG_..._GRE.TIF or "
             "DJI_..._MS_G.TIF: give the folder of the flight, or use the layout 'cubes' for other files"
         )
-    sensors = _sensors(bands)
-    releases = _releases(bands, str(root))
-    splits = _splits(releases)
+    sensors = sensor_names(bands)
+    releases = release_names(bands, str(root))
+    splits = splits_of(releases)
     names = view_names([str(item.file.path.relative_to(root)) for item in bands], str(root))
     notes = [*_left_out(opened, paths), *_odd(bands, releases)]
     views: list[CaptureView] = []
@@ -91,66 +72,10 @@ def find_rig(root: Path, options: LayoutOptions) -> Capture:
     return Capture("rig", root, tuple(sorted(views, key=lambda view: view.name)), notes=tuple(notes))
 
 
-def _open(path: Path, root: Path) -> _BandFile:
-    file = open_spectral_file(path)
-    number = DJI_NUMBER.fullmatch(path.stem)
-    found = BAND_ENDING.search(path.stem)
-    base, ending = path.stem, ""
-    if number is not None:
-        base, ending = number[1], number[2]
-    elif found is not None:
-        base, ending = path.stem[: found.start()], found[1]
-    folder = path.parent.relative_to(root)
-    return _BandFile(file, str(folder / base) if folder.parts else base, ending.lower())
-
-
 def _is_thermal(file: SpectralFile) -> bool:
     wavelengths = file.bands.wavelengths_nm
     name = tag_text(file.metadata.get("xmp") or {}, "BandName") or ""
     return name.upper() == "LWIR" or (wavelengths is not None and float(wavelengths.min()) > THERMAL_NM)
-
-
-def _sensors(bands: Sequence[_BandFile]) -> list[str]:
-    """Names of the lenses: the band's, with the index in the rig where several share it; else the file's ending."""
-    titles = [tag_text(item.tags, "BandName") or item.ending or "band" for item in bands]
-    slugs = [re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-") or "band" for title in titles]
-    indices = [tag_text(item.tags, "RigCameraIndex") or item.ending for item in bands]
-    owners: dict[str, set[str]] = defaultdict(set)
-    for slug, index in zip(slugs, indices, strict=True):
-        owners[slug].add(index)
-    return [
-        slug if len(owners[slug]) == 1 else f"{slug}-{index or '0'}"
-        for slug, index in zip(slugs, indices, strict=True)
-    ]
-
-
-def _releases(bands: Sequence[_BandFile], where: str) -> list[str]:
-    """Names of the releases: the name up to the band of the first file of each, with its folder where names repeat.
-
-    Identifiers count where they join files; cameras that write another one into every file are grouped by name.
-
-    Raises:
-        CaptureError: two releases would have one name.
-    """
-    identifiers = [tag_text(item.tags, *UNIQUE_TAGS) or "" for item in bands]
-    counts = Counter(identifier for identifier in identifiers if identifier)
-    keys = [
-        identifier if counts[identifier] > 1 else f"name {item.base}"
-        for item, identifier in zip(bands, identifiers, strict=True)
-    ]
-    titles = {key: item.base for key, item in reversed(list(zip(keys, bands, strict=True)))}
-    repeated = {title for title, count in Counter(titles.values()).items() if count > 1}
-    texts = [f"{title} {key}" if title in repeated else title for key, title in titles.items()]
-    names = dict(zip(titles, view_names([f"{text}.tif" for text in texts], where), strict=True))
-    return [names[key] for key in keys]
-
-
-def _splits(releases: Iterable[str]) -> dict[str, Split]:
-    """Every eighth release is for evaluation, with all its lenses."""
-    return {
-        release: "eval" if index % EVAL_INTERVAL == 0 else "train"
-        for index, release in enumerate(sorted(set(releases)))
-    }
 
 
 def _check_lenses(views: Sequence[CaptureView]) -> None:
@@ -207,7 +132,7 @@ def _with_given_bands(views: list[CaptureView], options: LayoutOptions) -> list[
     return [replace(view, cube=replace(view.cube, bands=tables[view.sensor])) for view in views]
 
 
-def _left_out(opened: Iterable[_BandFile], paths: Iterable[Path]) -> list[str]:
+def _left_out(opened: Iterable[BandFile], paths: Iterable[Path]) -> list[str]:
     files = [item.file for item in opened]
     thermal = sum(file.shape[2] == 1 and _is_thermal(file) for file in files)
     colour = sum(file.shape[2] > 1 for file in files) + sum(
@@ -220,7 +145,7 @@ def _left_out(opened: Iterable[_BandFile], paths: Iterable[Path]) -> list[str]:
     return notes
 
 
-def _odd(bands: Sequence[_BandFile], releases: Sequence[str]) -> list[str]:
+def _odd(bands: Sequence[BandFile], releases: Sequence[str]) -> list[str]:
     turned = sum(
         (exif_number(item.file.metadata.get("exif") or {}, "Orientation") or 1) > 1 for item in bands
     )

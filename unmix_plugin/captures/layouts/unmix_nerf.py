@@ -13,16 +13,15 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from unmix_plugin.captures.capture import Capture, CaptureView
+from unmix_plugin.captures.layouts.found_files import FoundFiles, view_names
 from unmix_plugin.captures.layouts.frames import (
     SPLIT_OF_FILE,
-    FoundFiles,
     Frame,
     FrameList,
     Split,
     make_capture,
     read_frames,
     require_names,
-    view_names,
 )
 from unmix_plugin.captures.layouts.registry import LayoutOptions
 from unmix_plugin.captures.readers.opening import open_spectral_file

@@ -1,0 +1,87 @@
+"""Files that a list names, and the names of the views that they become."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+from unmix_plugin.errors import CaptureError
+
+MOST_NAMED = 3
+
+
+class FoundFiles:
+    """Looks for the files of a capture and tells of all that are missing in one message."""
+
+    def __init__(self, root: Path) -> None:
+        self._root = root.resolve()
+        self._missing: list[str] = []
+
+    def look(self, where: str, *texts: str) -> Path | None:
+        """The first of some paths in the folder that is a file; None if none is.
+
+        Raises:
+            CaptureError: the path leaves the folder.
+        """
+        for text in texts:
+            path = self._root / text
+            try:
+                is_inside = path.resolve().is_relative_to(self._root) and not Path(text).is_absolute()
+                is_file = path.is_file()
+            except (OSError, RuntimeError, ValueError) as error:
+                raise CaptureError(
+                    f"{where}: {text!r} can't be followed ({error}); expected a path in the folder"
+                ) from error
+            if not is_inside:
+                raise CaptureError(
+                    f"{where}: {text!r} leaves the folder {self._root}; copy the file into it and name it from there"
+                )
+            if is_file:
+                return path
+        return None
+
+    def find(self, where: str, text: str, *others: str) -> Path | None:
+        """The same; noted as missing if none is.
+
+        Raises:
+            CaptureError: the path leaves the folder.
+        """
+        path = self.look(where, text, *others)
+        self._missing += [] if path else [text]
+        return path
+
+    def refuse_missing(self, advice: str) -> None:
+        """End here if a file was missing.
+
+        Raises:
+            CaptureError: some were; the message names a few.
+        """
+        if self._missing:
+            shown = ", ".join(self._missing[:MOST_NAMED])
+            more = len(self._missing) - MOST_NAMED
+            raise CaptureError(
+                f"{self._root} lacks {len(self._missing)} files that belong to views: {shown}"
+                f"{f' and {more} more' if more > 0 else ''}; {advice}"
+            )
+
+
+def view_names(texts: Sequence[str], where: str) -> list[str]:
+    """Names of views from the paths of their files: the stems, or with their folders where stems repeat.
+
+    Raises:
+        CaptureError: two paths give the same name.
+    """
+    paths = [PurePosixPath(text.replace("\\", "/")) for text in texts]
+    stems = [path.name if path.suffix[1:].isdecimal() else path.stem for path in paths]
+    if len(set(stems)) < len(stems):
+        stems = ["_".join([*path.parent.parts, stem]) for path, stem in zip(paths, stems, strict=True)]
+    names = [re.sub(r"[^\w.+-]+", "_", stem).strip("._") or "view" for stem in stems]
+    seen: dict[str, str] = {}
+    for name, text in zip(names, texts, strict=True):
+        other = seen.setdefault(name.casefold(), text)
+        if other is not text:
+            raise CaptureError(
+                f"{where}: {other} and {text} would both be the view '{name}'; rename one of them"
+            )
+    return names
