@@ -1,0 +1,102 @@
+"""A part of a block's pixels in memory, renewed from disk while training goes on, for scenes larger than memory.
+
+The block is cut into chunks of neighbouring pixels, and the chunks are put in a random order, again and again. The pool
+holds a run of that order and moves along it as steps go by, one chunk at a time: so the disk is read in large pieces,
+every chunk stays as long as any other, and what the pool holds at a step follows from the step alone. A thread reads
+the chunks that come next.
+
+Notation: `R` drawn pixels, `b` channels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+CHUNK_BYTES = 4 << 20
+"""Of values read at once."""
+PIXELS_PER_STEP = 2048
+"""Drawn in a usual step: so many pixels are renewed in it, too."""
+_CHUNKS_AHEAD = 4
+"""Read before they are needed."""
+_ORDER_SEED = 23
+
+
+class PixelPool:
+    """Values of some of a block's pixels at each step."""
+
+    def __init__(
+        self,
+        valid: Bool[Tensor, " pixels"],
+        pixel_bytes: int,
+        num_bytes: int,
+        read: Callable[[int, int], Tensor],
+    ) -> None:
+        """
+        Args:
+            valid: Pixels of the block that may be drawn, on the CPU; at least one.
+            pixel_bytes: Of a pixel's values.
+            num_bytes: Memory of the pool; at least two chunks are held.
+            read: Stored values (pixels, b) from a first pixel to one before a last, called in another thread.
+        """
+        self._chunk_pixels = max(1, min(CHUNK_BYTES // pixel_bytes, len(valid)))
+        self._num_chunks = -(-len(valid) // self._chunk_pixels)
+        self._num_held = min(self._num_chunks, max(2, num_bytes // (self._chunk_pixels * pixel_bytes)))
+        self._steps_per_chunk = max(1, self._chunk_pixels // PIXELS_PER_STEP)
+        self._valid, self._read = valid, read
+        self._reader = ThreadPoolExecutor(1, thread_name_prefix="pixels")
+        self._arriving: dict[int, Future[Tensor]] = {}
+        self._held: list[int] = []
+        """Position in the order of the chunk in each slot; empty before the first draw."""
+
+    def draw(
+        self, count: int, step: int, generator: torch.Generator
+    ) -> tuple[Int[Tensor, " R"], Tensor]:
+        """Random valid pixels of the block by their index in it, and their stored values (R, b)."""
+        self._move_to(step // self._steps_per_chunk)
+        chosen = torch.randint(len(self._drawable), (count,), generator=generator)
+        return self._numbers[self._drawable[chosen]], self._values[self._drawable[chosen]]
+
+    def _move_to(self, first: int) -> None:
+        """Hold the chunks of the order from `first` on; where that is no step ahead, all are read anew."""
+        wanted = range(first, first + self._num_held)
+        if self._held and sorted(self._held) == list(wanted):
+            return
+        for position in [*wanted, *range(wanted.stop, wanted.stop + _CHUNKS_AHEAD)]:
+            if position not in self._held and position not in self._arriving:
+                self._arriving[position] = self._reader.submit(self._read, *self._range(position))
+        if not self._held:
+            self._allocate(self._arriving[first].result())
+        for position in wanted:
+            if position not in self._held:
+                self._put(position, self._arriving.pop(position).result())
+        for position in [p for p in self._arriving if p < first or p >= wanted.stop + _CHUNKS_AHEAD]:
+            self._arriving.pop(position).cancel()
+        self._drawable = (self._numbers >= 0).nonzero()[:, 0]
+
+    def _allocate(self, example: Tensor) -> None:
+        self._values = example.new_empty(self._num_held * self._chunk_pixels, example.shape[1])
+        self._numbers = torch.full((len(self._values),), -1)
+        self._held = [-1] * self._num_held
+
+    def _put(self, position: int, values: Tensor) -> None:
+        """A chunk in its slot; numbers of pixels that can't be drawn are -1."""
+        slot = position % self._num_held
+        start = slot * self._chunk_pixels
+        first, last = self._range(position)
+        self._values[start : start + len(values)] = values
+        numbers = torch.arange(first, last)
+        self._numbers[start : start + self._chunk_pixels] = -1
+        self._numbers[start : start + len(values)] = torch.where(self._valid[first:last], numbers, -1)
+        self._held[slot] = position
+
+    def _range(self, position: int) -> tuple[int, int]:
+        """First pixel of the chunk at a position of the order, and the one after its last."""
+        turn, place = divmod(position, self._num_chunks)
+        order = torch.randperm(self._num_chunks, generator=torch.Generator().manual_seed(_ORDER_SEED + turn))
+        first = int(order[place]) * self._chunk_pixels
+        return first, min(first + self._chunk_pixels, len(self._valid))
