@@ -69,6 +69,10 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
     max_initial_pixels: int = 50_000
     """Pixels, drawn from all training views, from which the endmembers are initialised."""
 
+    memory_gb: float | Auto = "auto"
+    """GiB of memory for training pixels. Auto is most of what the device has left. Pixels that need more stay in the
+    scene's files, and a part of them is held that is renewed while training goes on."""
+
     def __post_init__(self) -> None:
         """Refuse impossible settings.
 
@@ -77,6 +81,7 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
         """
         super().__post_init__()
         rules = {
+            "memory-gb of at least 0.01 or auto": self.memory_gb == "auto" or self.memory_gb >= 0.01,
             "subpixels of 1 to 8 or auto": self.subpixels == "auto" or 1 <= self.subpixels <= 8,
             "single-ray-until in [0, 1] or auto": self.single_ray_until == "auto"
             or 0 <= self.single_ray_until <= 1,
@@ -122,7 +127,7 @@ class HyperspectralDataManager(DataManager):
         """Random valid pixels of the training views; the draw depends on (seed, step) only."""
         generator = step_generator(self.seed, step)
         parts = []
-        for drawn in self._pixels.draw(self._pixels_for(self._num_rays), generator):
+        for drawn in self._pixels.draw(self._pixels_for(self._num_rays), generator, step):
             measured = {
                 "spectra": drawn.spectra,
                 "alpha": drawn.alpha,
@@ -229,6 +234,7 @@ class HyperspectralDataManager(DataManager):
             found.append(
                 f"no other sensor shares a band with {', '.join(alone)}: only their poses hold their spectra together"
             )
+        found.append(self._pixels.note)
         return [warning for warning in found if warning is not None]
 
     def identity(self, summary: Mapping[str, Any]) -> dict[str, Any]:
@@ -238,7 +244,8 @@ class HyperspectralDataManager(DataManager):
     @cached_property
     def _pixels(self) -> PixelTable:
         """Read when training asks: evaluation needs none of it."""
-        return PixelTable(self.scene, self.device, self.scene.train_indices)
+        memory_gb = None if self.options.memory_gb == "auto" else self.options.memory_gb
+        return PixelTable(self.scene, self.device, self.scene.train_indices, memory_gb)
 
     @cached_property
     def _evidence(self) -> AlphaEvidence:

@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from tests.scenes.scene_factory import make_scene
-from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes import SceneOptions, load_scene
 from unmix_plugin.scenes.pixel_table import PixelTable, memory
 from unmix_plugin.scenes.pixel_table.block import PixelBlock
@@ -65,12 +64,40 @@ def test_clipped_pixels_come_out_clipped(tmp_path):
     assert read_block(scene, (1,)).spectra(torch.arange(320)).min() == 0.0
 
 
-def test_pixels_that_do_not_fit_are_refused_with_sizes_before_any_is_read(tmp_path, monkeypatch):
-    scene = load_scene(make_scene(tmp_path / "scene").edit_cubes(lambda cube: cube.astype("f4")).root)
-    monkeypatch.setattr(memory, "available_bytes", lambda _: 10_000)
-    monkeypatch.setattr(type(scene), "cube", lambda *_: pytest.fail("a cube was read"))
-    with pytest.raises(ConfigError, match=r"5 views x 16 x 20 pixels x 4 bands x 4 bytes need .* available"):
-        PixelTable(scene, CPU, scene.train_indices)
+@pytest.mark.parametrize(
+    ("stored", "scale"), [("<f2", None), (">f4", None), ("<f8", None), ("u1", 255.0), (">u2", 65535.0)]
+)
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_pixels_on_disk_are_the_same_as_those_in_memory(tmp_path, stored, scale, order):
+    folder = make_scene(tmp_path / "scene")
+    folder.edit_cubes(
+        lambda cube: np.asarray((cube.astype(np.float64) * (scale or 1.0)).round(5), stored, order=order)
+    )
+    scene = load_scene(folder.root, SceneOptions(value_scale=scale))
+    held, mapped = read_block(scene, (1, 3, 4)), PixelBlock(scene, (1, 3, 4), (0, 1, 2))
+    mapped.read(CPU, pool_bytes=1)
+    assert torch.equal(mapped._read_range(250, 700), held._values[250:700])
+    assert mapped.pool is not None
+    pixels, values = mapped.pool.draw(200, 3, torch.Generator().manual_seed(0))
+    expected, found = held.take(pixels, 7), mapped.take(pixels, 7, values)
+    for name in ("numbers", "cameras", "corners", "spectra", "alpha"):
+        assert torch.equal(getattr(found, name), getattr(expected, name))
+    assert torch.equal(mapped.spectra(pixels), expected.spectra)
+    for one, other in zip(mapped.images(), held.images(), strict=True):
+        assert all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+def test_pixels_are_held_unless_they_need_more_than_the_budget(tmp_path, monkeypatch):
+    scene = load_scene(make_scene(tmp_path / "scene").root)
+    needed = 5 * 320 * (4 * 2 + 5)
+    monkeypatch.setattr(memory, "available_bytes", lambda _: 2 * needed)
+    assert PixelTable(scene, CPU, scene.train_indices).note is None
+    assert PixelTable(scene, CPU, scene.train_indices, memory_gb=(needed + 1) / 2**30).note is None
+    note = PixelTable(scene, CPU, scene.train_indices, memory_gb=(needed - 1) / 2**30).note
+    assert note is not None
+    assert "5 views x 16 x 20 pixels x 4 bands x 2 bytes are 1.94e-05 GiB" in note
+    monkeypatch.setattr(memory, "available_bytes", lambda _: needed)
+    assert PixelTable(scene, CPU, scene.train_indices).note is not None
 
 
 def test_the_memory_left_is_known_on_this_machine():

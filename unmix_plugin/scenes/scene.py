@@ -167,7 +167,7 @@ class Scene:
         """What took a view."""
         return self.sensors[self.frames[index].sensor]
 
-    def cube(self, index: int, part: tuple[slice, ...] = ()) -> Float32[np.ndarray, "H W b"]:
+    def cube(self, index: int, part: tuple[slice | np.ndarray, ...] = ()) -> Float32[np.ndarray, "*pixels b"]:
         """Spectra of a view in [0, 1], as its sensor sees them.
 
         Values above 1 after the division by `value_scale` are clipped to 1, as a saturated sensor does. Unless
@@ -180,9 +180,11 @@ class Scene:
         """NumPy's code of a cube's numbers, such as f2 or u2, in any byte order."""
         return map_array(self.frames[index].cube_path).dtype.str[1:]
 
-    def stored_cube(self, index: int) -> Shaped[np.ndarray, "H W b"]:
-        """A cube as it is stored, before any division, in the machine's byte order."""
-        stored = map_array(self.frames[index].cube_path)
+    def stored_cube(
+        self, index: int, part: tuple[slice | np.ndarray, ...] = ()
+    ) -> Shaped[np.ndarray, "*pixels b"]:
+        """A cube as it is stored, before any division, in the machine's byte order; `part` as NumPy indexes it."""
+        stored = map_array(self.frames[index].cube_path)[part]
         return np.array(stored, dtype=stored.dtype.newbyteorder("="), order="C")
 
     def alpha(self, index: int) -> Float32[np.ndarray, "H W"] | None:

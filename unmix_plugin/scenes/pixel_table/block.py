@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from unmix_plugin.scenes.pixel_table.pool import PixelPool
 from unmix_plugin.scenes.scene import Scene
 
 COMPACT_TYPES = ("f2", "u1", "i1", "i2", "u2")
@@ -84,26 +85,37 @@ class PixelBlock:
             f"{self.value_bytes} bytes"
         )
 
-    def read(self, device: torch.device) -> None:
-        """Read the pixels to a device."""
+    def read(self, device: torch.device, pool_bytes: int | None = None) -> None:
+        """Read the pixels to a device; with `pool_bytes` values stay on disk, and so much of them is held for draws."""
         scene, num_pixels = self._scene, self._width * self._height
         shape = (len(self._views), num_pixels)
         blank = torch.from_numpy(np.empty(0, self._kept))
-        values = torch.empty(*shape, self._num_channels, dtype=blank.dtype, device=device)
+        size = 0 if pool_bytes is not None else num_pixels
+        values = torch.empty(shape[0], size, self._num_channels, dtype=blank.dtype, device=device)
         alpha, valid = torch.ones(shape, device=device), torch.empty(shape, dtype=torch.bool)
         for row, view in enumerate(self._views):
-            cube = scene.stored_cube(view) if self._is_compact else scene.cube(view)
-            values[row] = torch.from_numpy(cube.reshape(num_pixels, -1).view(self._kept))
+            if pool_bytes is None:
+                values[row] = self._stored(view, ())
             valid[row] = torch.from_numpy(scene.valid_mask(view)).flatten()
             opacity = scene.alpha(view)
             if opacity is not None:
                 alpha[row] = torch.from_numpy(opacity).flatten()
         self._values, self.alpha, self.valid = values.flatten(0, 1), alpha.flatten(), valid.flatten()
         self._camera_of = torch.tensor(self.cameras, device=device)
+        pixel_bytes = self._num_channels * self.value_bytes
+        self.pool = (
+            None
+            if pool_bytes is None or not self.valid.any()
+            else PixelPool(self.valid, pixel_bytes, pool_bytes, self._read_range)
+        )
 
     def spectra(self, pixels: Int[Tensor, " R"]) -> Float[Tensor, "R b"]:
         """Spectra of some pixels in [0, 1], the numbers of `Scene.cube`; only of valid ones."""
-        values = self._values[pixels]
+        if self.pool is not None:
+            return self._scaled(self._gathered(pixels.cpu())).to(self.alpha.device)
+        return self._scaled(self._values[pixels])
+
+    def _scaled(self, values: Tensor) -> Float[Tensor, "R b"]:
         if not self._is_compact:
             return values
         if self._is_unsigned:
@@ -120,15 +132,47 @@ class PixelBlock:
             spectra = self.spectra(chosen).cpu().unflatten(0, shape)
             yield spectra, self.alpha[chosen].cpu().view(shape), self.valid[pixels].view(shape)
 
-    def take(self, pixels: Int[Tensor, " R"], first: int) -> DrawnPixels:
-        """Some pixels by their index in the block, on any device; `first` is the number of the block's first."""
+    def take(self, pixels: Int[Tensor, " R"], first: int, stored: Tensor | None = None) -> DrawnPixels:
+        """Some pixels by their index in the block, on any device.
+
+        Args:
+            first: Number of the block's first pixel.
+            stored: Their values as they are stored, where they were read already.
+        """
         pixels = pixels.to(self.alpha.device)
+        spectra = self.spectra(pixels) if stored is None else self._scaled(stored).to(self.alpha.device)
         within = pixels % (self._width * self._height)
         return DrawnPixels(
             self.sensor,
             pixels + first,
             self._camera_of[pixels // (self._width * self._height)],
             torch.stack([within % self._width, within // self._width], dim=-1),
-            self.spectra(pixels),
+            spectra,
             self.alpha[pixels],
         )
+
+    def _stored(self, view: int, part: tuple[slice | np.ndarray, ...]) -> Tensor:
+        """Values (pixels, b) of a part of a view."""
+        cube = self._scene.stored_cube(view, part) if self._is_compact else self._scene.cube(view, part)
+        return torch.from_numpy(cube.reshape(-1, self._num_channels).view(self._kept))
+
+    def _read_range(self, first: int, last: int) -> Tensor:
+        """Values of neighbouring pixels of the block, whole rows at a time."""
+        size, width, parts = self._width * self._height, self._width, []
+        for row in range(first // size, (last - 1) // size + 1):
+            start, end = max(first - row * size, 0), min(last - row * size, size)
+            top, bottom = start // width, -(-end // width)
+            rows = self._stored(self._views[row], (slice(top, bottom),))
+            parts.append(rows[start - top * width : end - top * width])
+        return torch.cat(parts)
+
+    def _gathered(self, pixels: Int[Tensor, " R"]) -> Tensor:
+        """Values of any pixels of the block, from disk."""
+        size = self._width * self._height
+        rows = torch.div(pixels, size, rounding_mode="floor")
+        found = torch.empty(len(pixels), self._num_channels, dtype=self._values.dtype)
+        for row in rows.unique().tolist():
+            chosen = (rows == row).nonzero()[:, 0]
+            lines, columns = np.divmod((pixels[chosen] - row * size).numpy(), self._width)
+            found[chosen] = self._stored(self._views[row], (lines, columns))
+        return found

@@ -1,4 +1,4 @@
-"""Whether pixels fit in memory."""
+"""How much memory pixels take, and how much of them to hold."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ from pathlib import Path
 
 import torch
 
-from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.pixel_table.block import PixelBlock
 
 _GIB = 2**30
+_USABLE_SHARE = 0.8
+"""Of the memory that is left."""
+_LARGEST_POOL = 2**30
+"""Of pixels on disk; more in memory would not be drawn from more evenly."""
 
 
 def available_bytes(device: torch.device) -> int | None:
@@ -33,22 +36,29 @@ def available_bytes(device: torch.device) -> int | None:
     return min(free, max(0, limit - used))
 
 
-def require_memory(blocks: tuple[PixelBlock, ...], device: torch.device) -> None:
-    """Refuse pixels that a device has no room for.
+def pool_bytes(blocks: tuple[PixelBlock, ...], device: torch.device, memory_gb: float | None) -> int | None:
+    """How much of the pixels' values to hold at a time; None if all of them fit.
 
-    Raises:
-        ConfigError: they don't fit.
+    Args:
+        memory_gb: What pixels may take, in GiB; None: most of what the device has left.
     """
     needed = sum(block.num_bytes for block in blocks)
+    if memory_gb is not None:
+        budget = int(memory_gb * _GIB)
+        return None if needed <= budget else budget
     available = available_bytes(device)
-    if available is None or needed <= available:
-        return
-    what = " and ".join(block.description for block in blocks)
-    smaller = (
-        ", store the cubes as float16, which halves them" if any(b.value_bytes == 4 for b in blocks) else ""
-    )
-    raise ConfigError(
-        f"the training pixels don't fit in memory: {what} need {needed / _GIB:.1f} GiB on {device}, "
-        f"{available / _GIB:.1f} GiB are available; train on fewer views, bin pixels or bands{smaller}, or use a "
-        "machine with more memory"
+    if available is None or needed <= _USABLE_SHARE * available:
+        return None
+    return min(_LARGEST_POOL, int(_USABLE_SHARE * available))
+
+
+def describe_pool(blocks: tuple[PixelBlock, ...]) -> str | None:
+    """What stays on disk, in words; None if nothing does."""
+    held = sum(block.pool.num_bytes for block in blocks if block.pool is not None)
+    if held == 0:
+        return None
+    what, needed = " and ".join(block.description for block in blocks), sum(b.num_bytes for b in blocks)
+    return (
+        f"the training pixels stay on disk: {what} are {needed / _GIB:.3g} GiB; {held / _GIB:.3g} GiB of them are in "
+        "memory at a time, and others are read while training goes on (memory-gb)"
     )

@@ -44,18 +44,22 @@ class PixelPool:
             read: Stored values (pixels, b) from a first pixel to one before a last, called in another thread.
         """
         self._chunk_pixels = max(1, min(CHUNK_BYTES // pixel_bytes, len(valid)))
-        self._num_chunks = -(-len(valid) // self._chunk_pixels)
-        self._num_held = min(self._num_chunks, max(2, num_bytes // (self._chunk_pixels * pixel_bytes)))
+        firsts = range(0, len(valid), self._chunk_pixels)
+        self._firsts = [first for first in firsts if bool(valid[first : first + self._chunk_pixels].any())]
+        self._num_held = min(len(self._firsts), max(2, num_bytes // (self._chunk_pixels * pixel_bytes)))
         self._steps_per_chunk = max(1, self._chunk_pixels // PIXELS_PER_STEP)
-        self._valid, self._read = valid, read
+        self._valid, self._read, self._pixel_bytes = valid, read, pixel_bytes
         self._reader = ThreadPoolExecutor(1, thread_name_prefix="pixels")
         self._arriving: dict[int, Future[Tensor]] = {}
         self._held: list[int] = []
         """Position in the order of the chunk in each slot; empty before the first draw."""
 
-    def draw(
-        self, count: int, step: int, generator: torch.Generator
-    ) -> tuple[Int[Tensor, " R"], Tensor]:
+    @property
+    def num_bytes(self) -> int:
+        """Memory that the values held take."""
+        return self._num_held * self._chunk_pixels * self._pixel_bytes
+
+    def draw(self, count: int, step: int, generator: torch.Generator) -> tuple[Int[Tensor, " R"], Tensor]:
         """Random valid pixels of the block by their index in it, and their stored values (R, b)."""
         self._move_to(step // self._steps_per_chunk)
         chosen = torch.randint(len(self._drawable), (count,), generator=generator)
@@ -96,7 +100,7 @@ class PixelPool:
 
     def _range(self, position: int) -> tuple[int, int]:
         """First pixel of the chunk at a position of the order, and the one after its last."""
-        turn, place = divmod(position, self._num_chunks)
-        order = torch.randperm(self._num_chunks, generator=torch.Generator().manual_seed(_ORDER_SEED + turn))
-        first = int(order[place]) * self._chunk_pixels
+        turn, place = divmod(position, len(self._firsts))
+        generator = torch.Generator().manual_seed(_ORDER_SEED + turn)
+        first = self._firsts[int(torch.randperm(len(self._firsts), generator=generator)[place])]
         return first, min(first + self._chunk_pixels, len(self._valid))

@@ -20,13 +20,15 @@ OPAQUE_ALPHA = 0.99
 
 
 class PixelTable:
-    """What training draws from; a draw is a function of its generator alone."""
+    """What training draws from; a draw is a function of its generator and the step alone."""
 
-    def __init__(self, scene: Scene, device: torch.device, views: tuple[int, ...]) -> None:
-        """Read the pixels.
+    def __init__(
+        self, scene: Scene, device: torch.device, views: tuple[int, ...], memory_gb: float | None = None
+    ) -> None:
+        """Read the pixels, or what of them `memory_gb` GiB hold; None for most of the memory that is left.
 
         Raises:
-            ConfigError: they don't fit in the memory of the device (nothing was read), or none is valid.
+            ConfigError: no pixel is valid.
         """
         cameras_of: dict[int, list[int]] = {}
         for camera, view in enumerate(views):
@@ -35,13 +37,13 @@ class PixelTable:
             PixelBlock(scene, tuple(views[camera] for camera in cameras), tuple(cameras))
             for _, cameras in sorted(cameras_of.items())
         )
-        memory.require_memory(self.blocks, device)
+        held, total = memory.pool_bytes(self.blocks, device, memory_gb), sum(b.num_bytes for b in self.blocks)
         for block in self.blocks:
-            block.read(device)
+            block.read(device, None if held is None else held * block.num_bytes // total)
+        self.note = memory.describe_pool(self.blocks)
+        """What a user should know of pixels that stay on disk; None if none does."""
         self._firsts = list(accumulate((len(block) for block in self.blocks), initial=0))
-        valid = torch.cat([block.valid for block in self.blocks])
-        self._valid = None if bool(valid.all()) else valid.nonzero()[:, 0]
-        if self._valid is not None and len(self._valid) == 0:
+        if not any(bool(block.valid.any()) for block in self.blocks):
             raise ConfigError("no valid pixel is left in the training views: masks leave out every one")
 
     def __len__(self) -> int:
@@ -53,8 +55,20 @@ class PixelTable:
         counts = {block.sensor: int(block.valid.sum()) for block in self.blocks}
         return {sensor: count / sum(counts.values()) for sensor, count in counts.items()}
 
-    def draw(self, count: int, generator: torch.Generator) -> tuple[DrawnPixels, ...]:
-        """Random valid pixels, in one group for each sensor that some of them are of."""
+    @cached_property
+    def _valid(self) -> Int[Tensor, " valid"] | None:
+        """Numbers of the valid pixels; None if all are."""
+        valid = torch.cat([block.valid for block in self.blocks])
+        return None if bool(valid.all()) else valid.nonzero()[:, 0]
+
+    def draw(self, count: int, generator: torch.Generator, step: int = 0) -> tuple[DrawnPixels, ...]:
+        """Random valid pixels, in one group for each sensor that some of them are of.
+
+        Args:
+            step: Of the training; what pixels on disk are drawn from moves on with it.
+        """
+        if self.note is not None:
+            return self._draw_from_disk(count, generator, step)
         pool = len(self) if self._valid is None else len(self._valid)
         drawn = torch.randint(pool, (count,), generator=generator)
         chosen = drawn if self._valid is None else self._valid[drawn]
@@ -68,11 +82,23 @@ class PixelTable:
             if end > start
         )
 
+    def _draw_from_disk(self, count: int, generator: torch.Generator, step: int) -> tuple[DrawnPixels, ...]:
+        """As many of each sensor as chance gives it, from what its pool holds at a step."""
+        bounds = torch.tensor(list(self.shares.values())).cumsum(0)
+        places = torch.rand(count, generator=generator).clamp(max=float(bounds[-1]) - 1e-6)
+        counts = torch.bincount(torch.searchsorted(bounds, places), minlength=len(self.blocks)).tolist()
+        groups = []
+        for block, first, number in zip(self.blocks, self._firsts, counts, strict=False):
+            if block.pool is not None and number > 0:
+                pixels, stored = block.pool.draw(number, step, generator)
+                groups.append(block.take(pixels, first, stored))
+        return tuple(groups)
+
     def sample_opaque(self, sensor: int, count: int, seed: int) -> Float[np.ndarray, "pixels b"]:
         """Spectra of at most `count` random valid pixels of a sensor that are opaque."""
         block = next(block for block in self.blocks if block.sensor == sensor)
         pool: Int[Tensor, " pool"] = (
-            torch.arange(len(block)) if self._valid is None else block.valid.nonzero()[:, 0]
+            torch.arange(len(block)) if bool(block.valid.all()) else block.valid.nonzero()[:, 0]
         )
         opaque = pool[block.alpha.cpu()[pool] > OPAQUE_ALPHA]
         chosen = opaque[torch.randperm(len(opaque), generator=step_generator(seed, 0))[:count]]

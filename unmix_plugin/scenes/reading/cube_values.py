@@ -121,12 +121,15 @@ def measure_cube(path: Path, value_scale: float | None, invalid_pixels: InvalidP
 
 
 def read_cube(
-    path: Path, value_scale: float | None, invalid_pixels: InvalidPixels, part: tuple[slice, ...] = ()
-) -> Float32[np.ndarray, "H W B"]:
+    path: Path,
+    value_scale: float | None,
+    invalid_pixels: InvalidPixels,
+    part: tuple[slice | np.ndarray, ...] = (),
+) -> Float32[np.ndarray, "*pixels B"]:
     """Spectra in [0, 1]: divided by the scale, values above 1 clipped as a saturated sensor does, unusable pixels 0.
 
     Args:
-        part: Rows, columns and bands to read; all by default.
+        part: What to read, as NumPy indexes it; all by default.
     """
     values = _read_scaled(path, value_scale, part)
     if invalid_pixels != "refuse":
@@ -142,15 +145,15 @@ def read_invalid(
 
 
 def _read_scaled(
-    path: Path, value_scale: float | None, part: tuple[slice, ...] = ()
-) -> Float32[np.ndarray, "H W B"]:
+    path: Path, value_scale: float | None, part: tuple[slice | np.ndarray, ...] = ()
+) -> Float32[np.ndarray, "*pixels B"]:
     with np.errstate(over="ignore"):  # a float64 beyond float32 is infinite, hence invalid
         values = np.array(map_array(path)[part], dtype=np.float32, order="C")
     return values if value_scale is None else np.divide(values, np.float32(value_scale), out=values)
 
 
-def find_invalid(values: np.ndarray, invalid_pixels: InvalidPixels) -> Bool[np.ndarray, "H W"]:
-    """Pixels of (H, W, B) values, already divided, that can't be used: NaN, infinite or negative in some band.
+def find_invalid(values: np.ndarray, invalid_pixels: InvalidPixels) -> Bool[np.ndarray, "*pixels"]:
+    """Pixels of (..., B) values, already divided, that can't be used: NaN, infinite or negative in some band.
 
     With `clip` negative values count as 0 and don't make a pixel invalid.
     """

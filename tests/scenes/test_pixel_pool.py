@@ -1,0 +1,80 @@
+"""What the pool holds follows from the step alone, and every pixel comes up equally often."""
+
+import pytest
+import torch
+
+from unmix_plugin.scenes.pixel_table import pool as pool_module
+from unmix_plugin.scenes.pixel_table.pool import PixelPool
+
+PIXELS = 1000
+
+
+@pytest.fixture(autouse=True)
+def small_chunks(monkeypatch):
+    """Chunks of 40 pixels of 4 bytes, each of two steps."""
+    monkeypatch.setattr(pool_module, "CHUNK_BYTES", 160)
+    monkeypatch.setattr(pool_module, "PIXELS_PER_STEP", 20)
+
+
+def make_pool(valid=None, num_bytes=800, reads=None) -> PixelPool:
+    values = torch.arange(PIXELS, dtype=torch.int32)[:, None]
+
+    def read(first: int, last: int) -> torch.Tensor:
+        if reads is not None:
+            reads.append((first, last))
+        return values[first:last]
+
+    return PixelPool(torch.ones(PIXELS, dtype=torch.bool) if valid is None else valid, 4, num_bytes, read)
+
+
+def draw(pool: PixelPool, step: int, count: int = 20) -> torch.Tensor:
+    pixels, values = pool.draw(count, step, torch.Generator().manual_seed(step))
+    assert torch.equal(values[:, 0].long(), pixels)
+    return pixels
+
+
+def test_a_draw_is_the_same_whatever_was_drawn_before():
+    going_on, resumed = make_pool(), make_pool()
+    drawn = [draw(going_on, step) for step in range(120)]
+    for step in (77, 78, 119, 3):
+        assert torch.equal(draw(resumed, step), drawn[step])
+
+
+def test_every_valid_pixel_comes_up_equally_often():
+    valid = torch.ones(PIXELS, dtype=torch.bool)
+    valid[100:250], valid[990:] = False, False
+    pool, counts = make_pool(valid), torch.zeros(PIXELS)
+    steps = 2 * 23 * 20  # whole turns of all chunks that have valid pixels
+    for step in range(steps):
+        counts += torch.bincount(draw(pool, step, 200), minlength=PIXELS)
+    assert counts[~valid].sum() == 0
+    expected = 200 * steps / int(valid.sum())
+    assert float((counts[valid] / expected - 1).abs().max()) < 0.5
+    halves = counts[valid].view(-1, 84).sum(dim=1) / (84 * expected)
+    assert float((halves - 1).abs().max()) < 0.1
+
+
+def test_chunks_are_read_whole_and_once_a_turn_as_they_come_into_the_pool():
+    reads: list[tuple[int, int]] = []
+    pool = make_pool(reads=reads)
+    for step in range(40):
+        draw(pool, step)
+    # Five chunks are held, one comes every two steps, and four are read ahead.
+    assert 5 + 19 <= len(reads) <= 5 + 19 + 4
+    assert all(last - first == 40 for first, last in reads)
+    assert pool.num_bytes == 800
+
+
+def test_a_pool_as_large_as_the_block_reads_it_once_a_turn():
+    pool = make_pool(num_bytes=10**6)
+    assert pool.num_bytes == 4 * PIXELS
+    assert len(draw(pool, 0, 20_000).unique()) == PIXELS
+
+
+def test_an_error_of_the_disk_is_said_where_pixels_are_drawn():
+    def fail(first: int, last: int) -> torch.Tensor:
+        raise OSError("the disk is gone")
+
+    pool = PixelPool(torch.ones(PIXELS, dtype=torch.bool), 4, 800, fail)
+    with pytest.raises(OSError, match="the disk is gone"):
+        draw(pool, 0)
