@@ -17,6 +17,7 @@ from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.runs.scene_record import SceneRecord, check_same_scene, scene_record_to_json
 from unmix_plugin.errors import ConfigError, RunError, SceneError
 from unmix_plugin.scenes.demo.scene import make_demo_scene
+from unmix_plugin.scenes.pixel_table import memory, pool
 from unmix_plugin.scenes.scene import SceneOptions
 
 CONFIG = HyperspectralDataManagerConfig(train_num_rays_per_batch=64, grid_resolution=16, single_ray_until=0.0)
@@ -55,6 +56,24 @@ def test_the_rays_of_a_pixel_lie_within_it_one_in_each_cell(scene_folder):
         row, column = int(corner[1]), int(corner[0])
         cube = manager.scene.cube(manager.scene.train_indices[camera])
         assert_close(batch["spectra"][pixel], torch.from_numpy(cube[row, column]))
+
+
+def test_batches_from_disk_depend_on_seed_and_step_and_hold_what_was_measured(scene_folder, monkeypatch):
+    monkeypatch.setattr(pool, "CHUNK_BYTES", 12 * 40)
+    monkeypatch.setattr(pool, "PIXELS_PER_STEP", 8)
+    monkeypatch.setattr(memory, "available_bytes", lambda _: 4000)
+    going_on, resumed = make(scene_folder), make(scene_folder)
+    assert any("stay on disk" in warning for warning in going_on.warnings())
+    for step in range(30):
+        bundle, batch = going_on.next_train(step)
+    again, expected = resumed.next_train(29)
+    assert torch.equal(bundle.directions, again.directions)
+    assert all(torch.equal(batch[name], expected[name]) for name in expected)
+    held = make(scene_folder, memory_gb=1.0)
+    assert held.warnings() == []
+    [block] = held._pixels.blocks
+    assert torch.equal(batch["spectra"], block.spectra(batch["pixels"]))
+    np.testing.assert_array_equal(going_on.initial_data()["pixels"], held.initial_data()["pixels"])
 
 
 def test_masked_and_invalid_pixels_are_never_drawn(scene_folder, tmp_path):

@@ -73,7 +73,7 @@ def test_a_pool_as_large_as_the_block_reads_it_once_a_turn():
 
 def test_an_error_of_the_disk_is_said_where_pixels_are_drawn():
     def fail(first: int, last: int) -> torch.Tensor:
-        raise OSError("the disk is gone")
+        raise OSError(f"the disk is gone: {first} to {last}")
 
     pool = PixelPool(torch.ones(PIXELS, dtype=torch.bool), 4, 800, fail)
     with pytest.raises(OSError, match="the disk is gone"):
