@@ -123,3 +123,50 @@ def test_pictures_become_linear_bands(tmp_path: Path):
     encoded = pixels[..., ::-1] / 255.0
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
     np.testing.assert_allclose(scene.cube(0), linear, atol=1e-4)
+
+
+def test_the_lamp_is_read_off_the_white_and_reflectances_are_seen_in_flat_light(tmp_path: Path):
+    capture = make_capture(tmp_path / "capture")
+    references = {name: capture.root / f"{name}.hdr" for name in ("white", "dark")}
+    panel = np.linspace(0.5, 0.9, len(WAVELENGTHS_NM))
+    rows = [
+        f"{nm:g},{value:.6f}"
+        for nm, value in zip(WAVELENGTHS_NM, panel, strict=True)  # its colour is not the lamp's
+    ]
+    (tmp_path / "panel.csv").write_text("\n".join(["wavelength,reflectance", *rows]))
+    process(capture.root, tmp_path / "scene", white_reflectance=str(tmp_path / "panel.csv"), **references)
+
+    lamp = capture.white.mean(axis=0) / panel
+    written = np.loadtxt(tmp_path / "scene" / "illuminant.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(written[:, 1], lamp / lamp.max(), rtol=1e-4)
+    scene = load_scene(tmp_path / "scene")
+    np.testing.assert_array_equal(scene.illuminant, np.ones(len(WAVELENGTHS_NM)))
+    np.testing.assert_allclose(scene.cube(0), capture.reflectance["view_00"] * panel, atol=1.0 / 1000)
+
+
+def test_a_panel_in_a_view_serves_as_white(tmp_path: Path):
+    capture = make_capture(tmp_path / "capture", views=2)
+    counts = np.full((HEIGHT, WIDTH, len(WAVELENGTHS_NM)), 600, np.uint16)
+    counts[4:10, 5:12] = 2400
+    counts += np.random.default_rng(0).integers(0, 41, counts.shape, np.uint16)  # else its top is a plateau
+    write_cube(capture.root, "view_00", counts)
+    process(
+        capture.root, tmp_path / "scene", white_rectangle=("view_00", 4, 5, 6, 7), white_reflectance="0.5"
+    )
+    cube = load_scene(tmp_path / "scene").cube(0)
+    white = counts[4:10, 5:12].mean(axis=(0, 1))
+    np.testing.assert_allclose(cube, 0.5 * counts / white, atol=1e-4)
+
+
+def test_what_was_done_is_written_for_people(tmp_path: Path):
+    capture = make_capture(tmp_path / "capture")
+    findings = process(capture.root, tmp_path / "scene", drop_bands="500-600")
+    report = (tmp_path / "scene" / "report.txt").read_text()
+    assert "3 bands left out: named in --drop-bands" in report
+    assert findings[0] == "only 4 views: expect holes and fog; 15 or more all around serve better"
+    assert findings[0] in report
+    assert (tmp_path / "scene" / "contact-sheet.png").read_bytes().startswith(b"\x89PNG")
+    record = json.loads((tmp_path / "scene" / "process.json").read_text())
+    assert record["what_looks_wrong"] == findings
+    dropped = record["decisions"]["sensors"]["all views"]["dropped_bands"]
+    assert [band["wavelength_nm"] for band in dropped] == [500.0, 550.0, 600.0]

@@ -5,6 +5,7 @@ Notation: `h x w` pixels of a small picture, `B` bands.
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -24,6 +25,8 @@ SHEET_PX, TILE_PX = 1300, (96, 300)
 OUTLINE, IGNORED, BEHIND = (255, 0, 200), (255, 60, 60), 60
 """Colours of the mask's outline and of pixels without a measurement; grey of the background."""
 _CHARTS_INCHES, _LEAST_WIDTH_INCHES = 3.6, 11.0
+_LETTERS_AN_INCH = 10
+"""Of the heading."""
 _MOST_POINTS = 6000
 
 
@@ -58,10 +61,11 @@ def contact_sheet(
     tiles = _tiles(views)
     height, width = (length / FIGURE_DPI for length in tiles.shape[:2])
     page_width = max(width + 0.4, _LEAST_WIDTH_INCHES)
-    page = (page_width, height + _CHARTS_INCHES + 1.0)
+    lines = textwrap.wrap(heading, int(page_width * _LETTERS_AN_INCH))
+    top = 0.27 + 0.18 * len(lines)
+    page = (page_width, top + height + _CHARTS_INCHES + 0.55)
     figure = Figure(figsize=page, facecolor="white")
-    figure.text(0.2 / page[0], 1 - 0.15 / page[1], heading, fontsize=11, fontweight="bold", va="top")
-    top = 0.45
+    figure.text(0.2 / page[0], 1 - 0.15 / page[1], "\n".join(lines), fontsize=11, fontweight="bold", va="top")
     axes = figure.add_axes((0.2 / page[0], 1 - (top + height) / page[1], width / page[0], height / page[1]))
     axes.imshow(tiles, interpolation="none")
     axes.set_axis_off()

@@ -94,6 +94,19 @@ def test_a_view_far_from_the_others_hardly_overlaps(tmp_path: Path):
     assert findings[0].startswith("1 views hardly overlap with another one (view_6)")
 
 
+def test_overlap_of_cameras_in_parallel_takes_sparse_points(tmp_path: Path):
+    looking_down = view_at(tmp_path, "a", np.array([0.0, 0.01, 4.0]), LAMP)
+    pose = looking_down.camera.camera_to_world
+    views = [
+        replace(looking_down, camera=replace(looking_down.camera, camera_to_world=pose + shift))
+        for shift in (np.eye(3, 4, 3) * x for x in (0.0, 0.5, 1.0, 9.0))
+    ]
+    assert overlap(views)[0] == []
+    findings, said = overlap(views, ball_points())
+    assert "1 views hardly overlap with another one (a)" in findings[0]
+    assert "least 0%" in said
+
+
 def test_few_views_are_said(sound):
     assert check_views(sound[:6], None).findings[0].startswith("only 6 views")
 

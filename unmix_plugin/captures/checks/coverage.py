@@ -56,16 +56,21 @@ def ring(views: Sequence[SeenView]) -> tuple[list[str], str]:
     return findings, said
 
 
-def overlap(views: Sequence[SeenView]) -> tuple[list[str], str]:
+def overlap(
+    views: Sequence[SeenView], points: Float64[np.ndarray, "P 3"] | None = None
+) -> tuple[list[str], str]:
     """Whether each view shows something that another view shows from a similar side.
 
-    A grid of rays of each view is followed to the depth of the middle of the scene; what other cameras see of these
-    points is the overlap, if they look from within 35 degrees.
+    A grid of rays of each view is followed to the depth of the middle of the scene: where the cameras look, or that of
+    the sparse points if they look in parallel. What other cameras see of these places is the overlap, if they look from
+    within 35 degrees.
     """
     poses = np.stack([view.camera.camera_to_world for view in views])
     focus = focus_of(poses)
+    if focus is None and points is not None and len(points):
+        focus = np.median(points, axis=0)
     if focus is None or len(views) < 2:
-        return [], "overlap is not judged"
+        return [], "overlap is not judged: the cameras look in parallel, and there are no sparse points"
     between = angles_between(views)
     shares = np.zeros(len(views))
     nearest = np.zeros(len(views))

@@ -36,7 +36,7 @@ def check_views(views: Sequence[SeenView], points: np.ndarray | None) -> Checked
     findings, measured = [*few_views(views), *pixels(views)], []
     for found, said in (
         ring(views),
-        overlap(views),
+        overlap(views, points),
         blur(views),
         exposure(views, points),
         moving_light(views, points),

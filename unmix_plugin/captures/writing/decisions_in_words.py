@@ -20,11 +20,16 @@ REFERENCES = {"dark": "dark frame", "white": "white reference"}
 def sizes_in_words(plan: Plan) -> str:
     """Pixels and bands of each sensor."""
     found = [
-        f"{name + ': ' if name else ''}{raster.height} x {raster.width} pixels, {Bands(sensor.centers_nm)}"
+        f"{name + ': ' if name else ''}{raster.height} x {raster.width} pixels, {_bands_in_words(sensor)}"
         for name, sensor in plan.sensors.items()
         for raster in [sensor.calibration.raster]
     ]
     return "; ".join(found)
+
+
+def _bands_in_words(sensor: Sensor) -> str:
+    centers = sensor.centers_nm
+    return f"1 band at {centers[0]:g} nm" if len(centers) == 1 else str(Bands(centers))
 
 
 def what_was_done(plan: Plan, posed: PosedViews, records: dict[str, ViewRecord]) -> list[str]:
