@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
 from unmix_plugin.alpha_preset import Auto, choose, preset_for
@@ -30,7 +30,8 @@ from unmix_plugin.scenes.geometry.carving import carve
 from unmix_plugin.scenes.geometry.lighting import light_moves
 from unmix_plugin.scenes.geometry.pose_check import check_scene_poses
 from unmix_plugin.scenes.identity import scene_identity
-from unmix_plugin.scenes.pixel_table import DrawnPixels, PixelTable
+from unmix_plugin.scenes.pixel_rays import PixelRays
+from unmix_plugin.scenes.pixel_table import PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.reading.sensors import lonely_sensors
 from unmix_plugin.scenes.recorded_scene import check_recorded_scene
@@ -38,8 +39,6 @@ from unmix_plugin.scenes.scene import Scene, SceneOptions
 from unmix_plugin.sensor_batches import join_parts
 from unmix_plugin.spectral.unmixing.partial_bands import typical_spectrum
 
-_MOST_SENSOR_SUBPIXELS = 4
-"""Along an edge of a coarse sensor's pixel, in multiples of the finest sensor's."""
 _MANY_PIXELS = 4_000_000
 """Pixels of all training views beyond which one ray a pixel is enough."""
 DEMO = Path("demo")
@@ -118,7 +117,7 @@ class HyperspectralDataManager(DataManager):
         self.scene_box = self.scene.scene_box
         self.train_cameras = self.scene.cameras[list(self.scene.train_indices)]
         self.eval_cameras = self.scene.cameras[list(self.scene.eval_indices)]
-        self._device_cameras = self.train_cameras.to(device)
+        self._rays = PixelRays(self.scene, device)
         self._preset = preset_for(self.scene.has_alpha)
         self._num_rays = config.train_num_rays_per_batch
         self._choose_subpixels(step=0, progress=0.0)
@@ -134,7 +133,7 @@ class HyperspectralDataManager(DataManager):
                 "alpha_trust": self._evidence.trust(drawn),
                 "pixels": drawn.numbers,
             }
-            parts.append((drawn.sensor, self._rays_through(drawn, generator), measured))
+            parts.append((drawn.sensor, self._rays.through(drawn, self._subpixels, generator), measured))
         return join_parts(parts) if self.scene.is_rig else parts[0][1:]
 
     def eval_image(self, index: int) -> tuple[Cameras, dict[str, Tensor]]:
@@ -181,7 +180,7 @@ class HyperspectralDataManager(DataManager):
             "illuminant": None if illuminant is None else illuminant.tolist(),
             "has_alpha": self.scene.has_alpha,
             "grid_resolution": self._grid_resolution,
-            "pixel_size": min(self._pixel_sizes.values()),
+            "pixel_size": min(self._rays.pixel_sizes.values()),
             "subpixels": self._final_subpixels,
             "num_train_views": len(self.train_cameras),
             **({"sensors": [sensor.to_json() for sensor in self.scene.sensors]} if self.scene.is_rig else {}),
@@ -256,13 +255,7 @@ class HyperspectralDataManager(DataManager):
 
     @property
     def _rays_a_pixel(self) -> float | int:
-        """In the mean over the pixels of all sensors."""
-        if not self.scene.is_rig:
-            return self._subpixels**2
-        shares = self._pixels.shares.items()
-        return sum(
-            share * (self._subpixels * self._sensor_subpixels[sensor]) ** 2 for sensor, share in shares
-        )
+        return self._rays.rays_a_pixel(self._subpixels, self._pixels.shares if self.scene.is_rig else {})
 
     def _choose_subpixels(self, step: int, progress: float) -> None:
         until = choose(self.options.single_ray_until, self._preset.single_ray_until)
@@ -278,42 +271,10 @@ class HyperspectralDataManager(DataManager):
     def _grid_resolution(self) -> int:
         return choose(self.options.grid_resolution, self._preset.grid_resolution)
 
-    @cached_property
-    def _pixel_sizes(self) -> dict[int, float]:
-        """Of each sensor, the edge of a pixel where it looks at the middle of the scene box, median over its views."""
-        centre = self.scene_box.aabb.mean(dim=0)
-        distances = (self.train_cameras.camera_to_world[:, :, 3] - centre).norm(dim=-1)
-        edges = distances / self.train_cameras.focal_px.mean(dim=-1)
-        sensors = torch.tensor([self.scene.frames[view].sensor for view in self.scene.train_indices])
-        return {sensor: float(edges[sensors == sensor].median()) for sensor in set(sensors.tolist())}
-
-    @property
-    def _sensor_subpixels(self) -> dict[int, int]:
-        """Of each sensor, by how many times more rays its pixels are wide: as many as fine pixels lie along an edge."""
-        finest = min(self._pixel_sizes.values())
-        return {
-            sensor: min(max(1, round(size / finest)), _MOST_SENSOR_SUBPIXELS)
-            for sensor, size in self._pixel_sizes.items()
-        }
-
     def _light_moves(self, reachable: Bool[np.ndarray, "R R R"]) -> bool:
         """Judged by the views of the sensor that took most."""
         views, seen = self._evidence.log_brightness()
         return light_moves(self.train_cameras[views], seen, reachable, self.scene_box)
-
-    def _rays_through(self, pixels: DrawnPixels, generator: torch.Generator) -> RayBundle:
-        """Rays scattered over pixels of one sensor."""
-        edge = self._subpixels * self._sensor_subpixels[pixels.sensor]
-        offsets = _scattered_offsets(len(pixels.cameras), edge, generator).to(pixels.corners.device)
-        points = (pixels.corners[:, None] + offsets).flatten(0, 1)
-        return self._device_cameras.generate_rays(pixels.cameras.repeat_interleave(edge**2), points)
-
-
-def _scattered_offsets(num_pixels: int, subpixels: int, generator: torch.Generator) -> Float[Tensor, "R P 2"]:
-    """One random point in each cell of a subpixels x subpixels grid on every pixel, (x, y) in [0, 1)."""
-    cells = torch.arange(subpixels)
-    grid = torch.stack(torch.meshgrid(cells, cells, indexing="xy"), dim=-1).reshape(1, -1, 2)
-    return (grid + torch.rand(num_pixels, subpixels**2, 2, generator=generator)) / subpixels
 
 
 def _load(folder: Path, options: SceneOptions) -> Scene:

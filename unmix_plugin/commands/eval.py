@@ -146,9 +146,9 @@ def _evaluate_views(subject: _Subject, console: Console) -> tuple[Evaluation, in
     from unmix_plugin.commands.reporting import follow
     from unmix_plugin.formats.files import write_file
     from unmix_plugin.products.evaluation_pictures import draw_colour, draw_matched_abundances, material_look
-    from unmix_plugin.trained.evaluation import Evaluation, scene_truth, subpixels_for, view_truth
+    from unmix_plugin.trained.evaluation import Evaluation, scene_truth, view_truth
     from unmix_plugin.trained.view_alignment import align_gain
-    from unmix_plugin.trained.view_rendering import render_view
+    from unmix_plugin.trained.view_rendering import render_view, subpixels_for
 
     scene, folder, factors = _scene_of(subject.loaded), subject.folder, subject.light_factors
     materials = subject.scene.materials

@@ -8,6 +8,7 @@ from typing import Any, TypeAlias
 
 from unmix_plugin.engine.runs.config_json import config_from_json
 from unmix_plugin.scenes.scene import SceneOptions
+from unmix_plugin.spectral.scene_sensor import SceneSensor
 
 Numbers: TypeAlias = tuple[float, ...]
 
@@ -49,6 +50,7 @@ def check_recorded_scene(values: Mapping[str, Any]) -> None:
 
     Raises:
         ValueError: an entry is of the wrong type, or a number out of its range.
+        KeyError, IndexError, TypeError: a sensor is damaged.
         ConfigError: the same, found by `config_from_json`.
     """
     known = {entry.name: values[entry.name] for entry in fields(RecordedScene) if entry.name in values}
@@ -70,5 +72,7 @@ def check_recorded_scene(values: Mapping[str, Any]) -> None:
         or (scene.normalisation.scale > 0 and all(len(row) == 3 for row in scene.normalisation.rotation)),
     }
     broken = [rule for rule, holds in rules.items() if not holds]
+    for sensor in values.get("sensors", ()):
+        SceneSensor.from_json(sensor, bands)
     if broken:
         raise ValueError(f"the scene needs {' and '.join(broken)}")

@@ -42,9 +42,6 @@ OPAQUE_ALPHA = 0.99
 HALF_COVERED = 0.5
 """Opacity from which a pixel's abundances count."""
 
-MOST_SENSOR_SUBPIXELS = 4
-"""How many times finer than others the pixels of a coarse sensor are rendered, along an edge."""
-
 VIEW_FIGURES = (
     "psnr",
     "psnr_matter",
@@ -257,19 +254,6 @@ def view_truth(scene: Scene, index: int) -> ViewTruth:
         abundances=_tensor(scene.abundances(index)),
         sensor=None if sensor.sees_all_bands else sensor,
     )
-
-
-def subpixels_for(scene: Scene, index: int, subpixels: int, pixel_size: float) -> int:
-    """Rays along the edge of a pixel with which to render a view, so that coarse sensors' pixels are means too.
-
-    Args:
-        subpixels, pixel_size: Rays along the edge of a pixel of this size, in the middle of the scene.
-    """
-    if not scene.is_rig:
-        return subpixels
-    distance = scene.cameras.camera_to_world[index, :, 3] - scene.scene_box.aabb.mean(dim=0)
-    edge = float(distance.norm() / scene.cameras.focal_px[index].mean())
-    return subpixels * min(max(1, round(edge / pixel_size)), MOST_SENSOR_SUBPIXELS)
 
 
 def finite_or_none(figures: dict[str, float]) -> dict[str, float | None]:

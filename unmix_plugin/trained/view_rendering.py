@@ -11,10 +11,12 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.figures.picture_grid import Picture, premultiplied_over_neutral
+from unmix_plugin.scenes.pixel_rays import MOST_SENSOR_SUBPIXELS
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
 
 if TYPE_CHECKING:
+    from unmix_plugin.scenes.scene import Scene
     from unmix_plugin.trained.trained_scene import TrainedScene
 
 
@@ -43,6 +45,19 @@ def render_view(scene: TrainedScene, camera: Cameras, subpixels: int | None = No
     names = ("spectral", "accumulation", "abundances", "segmentation", "material_scores")
     outputs = scene.render(camera, names, subpixels)
     return RenderedView(*(outputs[name].detach().cpu() for name in names))
+
+
+def subpixels_for(scene: Scene, index: int, subpixels: int, pixel_size: float) -> int:
+    """Rays along the edge of a pixel with which to render a view, so that coarse sensors' pixels are means too.
+
+    Args:
+        subpixels, pixel_size: Rays along the edge of a pixel of this size, in the middle of the scene.
+    """
+    if not scene.is_rig:
+        return subpixels
+    distance = scene.cameras.camera_to_world[index, :, 3] - scene.scene_box.aabb.mean(dim=0)
+    edge = float(distance.norm() / scene.cameras.focal_px[index].mean())
+    return subpixels * min(max(1, round(edge / pixel_size)), MOST_SENSOR_SUBPIXELS)
 
 
 def picture(spectra: Float[Tensor, "H W B"], opacity: Float[Tensor, "H W"], bands: Bands) -> Picture:

@@ -58,6 +58,13 @@ def test_a_record_of_a_rig_keeps_its_sensors_and_other_bands_are_another_scene(t
     folder = make_rig(tmp_path / "rig")
     first = json.loads(json.dumps(load_scene(folder.root).summary()))
     check_recorded_scene(first)
+    for damaged in (
+        {"name": "x"},
+        {"name": "x", "bands": [7]},
+        {"name": "x", "responses": [[1.0, -1.0, 0, 0]]},
+    ):
+        with pytest.raises((LookupError, ValueError)):
+            check_recorded_scene({**first, "sensors": [damaged]})
     again = [SceneSensor.from_json(values, 4) for values in first["sensors"]]
     for sensor, other in zip(load_scene(folder.root).sensors, again, strict=True):
         assert sensor.name == other.name
