@@ -52,12 +52,12 @@ class Options:
     results: Path | None = None
     """Folder for captures.json and captures.md; None: beside the benchmarks."""
     quick: bool = False
-    """12 views of 200 pixels and 40 steps."""
+    """24 views of 192 pixels and 40 steps."""
 
 
 def main(options: Options) -> None:
     """Measure and publish."""
-    steps, size, views = (40, 200, 12) if options.quick else (options.steps, options.size, options.views)
+    steps, size, views = (40, 192, 24) if options.quick else (options.steps, options.size, options.views)
     machine = _machine.describe_machine()
     with ExitStack() as stack:
         folder = options.folder or Path(

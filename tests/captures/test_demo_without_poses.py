@@ -34,3 +34,7 @@ def test_estimated_poses_are_those_of_the_truth(tmp_path, monkeypatch):
     assert len(names) >= 0.8 * VIEWS
     assert align_poses(found, truth, names).rms_px < 0.5
     assert len(load_scene(scene).frames) == len(names)
+    report = (scene / "report.txt").read_text()
+    assert "- bands left out: 400 nm, 509.091 nm (marked as bad in the file)\n" in report
+    assert "- bands left out: 618.182 nm (noisy)\n" in report
+    assert "- saturation: from 65535 (" in report

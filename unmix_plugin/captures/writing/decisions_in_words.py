@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,6 +15,8 @@ from unmix_plugin.spectral.bands import Bands
 
 REFERENCES = {"dark": "dark frame", "white": "white reference"}
 """Entries of a sensor's evidence."""
+MOST_BANDS = 8
+"""Bands left out for one reason that are named."""
 
 
 def sizes_in_words(plan: Plan) -> str:
@@ -40,10 +42,9 @@ def what_was_done(plan: Plan, posed: PosedViews, records: dict[str, ViewRecord])
         facts = sensor.evidence
         lines.append(f"{where}values are {sensor.unit}; wavelengths from {facts['wavelengths']}")
         lines += [f"{where}{what}: {facts[key]['use']}" for key, what in REFERENCES.items() if key in facts]
-        lines.append(
-            f"{where}saturated from {facts['saturation']['stored']} ({facts['saturation']['evidence']})"
-        )
-        lines += [f"{where}{count} bands left out: {reason}" for reason, count in _reasons(sensor).items()]
+        stored, evidence = facts["saturation"]["stored"], facts["saturation"]["evidence"]
+        lines.append(f"{where}saturation: {evidence if stored is None else f'from {stored:g} ({evidence})'}")
+        lines += [f"{where}bands left out: {bands} ({reason})" for reason, bands in _left_out(sensor).items()]
     scale = plan.decisions["scale"]
     lines.append(
         f"{scale['calibrated']:g} is written as 1: {scale['evidence']}; full scale of the cubes is {FULL_SCALE}"
@@ -58,10 +59,17 @@ def what_was_done(plan: Plan, posed: PosedViews, records: dict[str, ViewRecord])
     return [*lines, *posed.notes, *plan.notes]
 
 
-def _reasons(sensor: Sensor) -> Counter[str]:
-    return Counter(
-        "noisy" if reason.startswith("noise") else reason for reason in sensor.bands.dropped.values()
-    )
+def _left_out(sensor: Sensor) -> dict[str, str]:
+    """Wavelengths of the bands that were left out, by reason; the first few of many."""
+    found: dict[str, list[str]] = defaultdict(list)
+    for band, reason in sorted(sensor.bands.dropped.items()):
+        wavelength = f"{sensor.bands.wavelengths_nm[band]:g} nm"
+        found["noisy" if reason.startswith("noise") else reason].append(wavelength)
+    return {
+        reason: ", ".join(names[:MOST_BANDS])
+        + (f" and {len(names) - MOST_BANDS} more" if len(names) > MOST_BANDS else "")
+        for reason, names in found.items()
+    }
 
 
 def _sum(views: Sequence[ViewRecord], what: str) -> int:
