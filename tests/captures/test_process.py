@@ -162,7 +162,7 @@ def test_what_was_done_is_written_for_people(tmp_path: Path):
     capture = make_capture(tmp_path / "capture")
     findings = process(capture.root, tmp_path / "scene", drop_bands="500-600")
     report = (tmp_path / "scene" / "report.txt").read_text()
-    assert "3 bands left out: named in --drop-bands" in report
+    assert "bands left out: 500 nm, 550 nm, 600 nm (named in --drop-bands)" in report
     assert findings[0] == "only 4 views: expect holes and fog; 15 or more all around serve better"
     assert findings[0] in report
     assert (tmp_path / "scene" / "contact-sheet.png").read_bytes().startswith(b"\x89PNG")
