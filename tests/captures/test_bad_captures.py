@@ -52,7 +52,7 @@ def _other_wavelengths(root: Path) -> None:
 def _fill(value: int) -> Spoil:
     def spoil(root: Path) -> None:
         for name in ("view_00", "view_01", "view_02", "view_03"):
-            write_cube(root, name, np.full_like(COUNTS, value))
+            write_cube(root, name, np.full_like(COUNTS, value), header={"data ignore value": 7})
 
     return spoil
 
@@ -197,6 +197,16 @@ CASES: dict[str, tuple[Spoil, dict[str, Any], str]] = {
         "--mask white: the border of the views is at",
     ),
     "a scale of nothing": (_nothing, {"scale": 0.0}, "--scale 0: expected a number above 0"),
+    "a saturation of nothing": (
+        _nothing,
+        {"saturation": float("nan")},
+        "--saturation nan: expected a stored number",
+    ),
+    "nothing measured": (
+        _fill(7),
+        {"saturation": 4000.0},
+        "no sampled pixel of it and of the other views has a measurement in all bands",
+    ),
     "noise of nothing": (_nothing, {"max_noise": 0.0}, "--max-noise 0: expected a share above 0"),
 }
 

@@ -80,6 +80,8 @@ def _check(options: ProcessOptions) -> None:
     for name, number in (("--bin-pixels", options.bin_pixels), ("--bin-bands", options.bin_bands)):
         if number < 1:
             raise ConfigError(f"{name} {number}: expected 1 or more")
+    if options.saturation is not None and not 0 < options.saturation < float("inf"):
+        raise ConfigError(f"--saturation {options.saturation:g}: expected a stored number above 0")
     if not options.max_noise > 0:
         raise ConfigError(f"--max-noise {options.max_noise:g}: expected a share above 0")
 

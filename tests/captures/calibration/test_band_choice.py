@@ -40,7 +40,9 @@ def test_dead_saturated_and_noisy_bands_are_left_out_with_the_reason():
     values[:, 7] += 3.0 * GENERATOR.standard_normal(len(values)).astype(np.float32)
     saturated = np.zeros(values.shape, bool)
     saturated[: len(values) // 3, 9] = True
-    found = drop_found(BandChoice(WAVELENGTHS_NM, {0: "named"}), Sample(values[:, 1:], saturated[:, 1:]), 0.5)
+    found, _ = drop_found(
+        BandChoice(WAVELENGTHS_NM, {0: "named"}), Sample(values[:, 1:], saturated[:, 1:]), 0.5
+    )
     assert {band: reason.split(":")[0].split(" is ")[0] for band, reason in found.dropped.items()} == {
         0: "named",
         2: "dead",
@@ -53,7 +55,14 @@ def test_dead_saturated_and_noisy_bands_are_left_out_with_the_reason():
 def test_a_white_background_that_saturates_every_band_drops_none():
     saturated = np.zeros(MIXTURES.shape, bool)
     saturated[:2000] = True
-    assert drop_found(BandChoice(WAVELENGTHS_NM, {}), Sample(MIXTURES, saturated), 0.5).dropped == {}
+    assert drop_found(BandChoice(WAVELENGTHS_NM, {}), Sample(MIXTURES, saturated), 0.5)[0].dropped == {}
+
+
+def test_bands_that_have_nothing_in_common_are_not_all_noise():
+    independent = GENERATOR.random((3000, 12)).astype(np.float32)
+    found, notes = drop_found(BandChoice(WAVELENGTHS_NM, {}), _unsaturated(independent), 0.3)
+    assert found.dropped == {}
+    assert notes == ("12 of 12 bands have noise above 30% of their signal; all are kept",)
 
 
 def test_bands_are_sorted_and_binned_by_wavelength():

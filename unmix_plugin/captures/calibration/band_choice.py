@@ -15,6 +15,8 @@ from unmix_plugin.errors import CaptureError
 
 MOST_SATURATED = 0.2
 """Share of sampled values by which a band may be saturated more than bands usually are."""
+MOST_NOISY = 0.5
+"""Share of bands that may be left out for their noise."""
 LEAST_WHITE = 0.01
 """Signal of the white reference in a band, as a share of the greatest, below which the band is too dark."""
 
@@ -54,12 +56,16 @@ def repeated_wavelengths(wavelengths_nm: Float64[np.ndarray, " B"]) -> Bool[np.n
     return repeated
 
 
-def drop_found(choice: BandChoice, sample: Sample, max_noise: float) -> BandChoice:
+def drop_found(choice: BandChoice, sample: Sample, max_noise: float) -> tuple[BandChoice, tuple[str, ...]]:
     """Leave out bands that are dead, saturated or noisy in the sample.
+
+    Where most bands are noisy none is left out for it: bands have little in common then, or the whole capture is noisy.
 
     Args:
         choice: Bands that were kept so far; the sample has these, in their order.
         max_noise: Greatest noise as a share of a band's signal.
+    Returns:
+        The choice, and what a user should know.
     """
     kept, bands = choice.kept, len(choice.wavelengths_nm)
 
@@ -68,8 +74,6 @@ def drop_found(choice: BandChoice, sample: Sample, max_noise: float) -> BandChoi
         all_bands[kept[found]] = True
         return all_bands
 
-    if not len(sample.values):
-        return choice
     shares = sample.saturated.mean(axis=0)
     is_saturated = shares > MOST_SATURATED + np.median(shares)
     is_dead = np.ptp(sample.values, axis=0) == 0
@@ -77,7 +81,12 @@ def drop_found(choice: BandChoice, sample: Sample, max_noise: float) -> BandChoi
     noise = np.zeros(len(kept))
     usable = ~sample.saturated[:, is_alive].any(axis=1)
     noise[is_alive] = noise_shares(sample.values[usable][:, is_alive])
-    is_noisy = noise > max_noise  # false for NaN
+    is_noisy, notes = noise > max_noise, ()  # false for NaN
+    if is_noisy.mean() > MOST_NOISY:
+        notes = (
+            f"{is_noisy.sum()} of {len(kept)} bands have noise above {max_noise:.0%} of their signal; all are kept",
+        )
+        is_noisy[:] = False
     choice = choice.without(marks(is_dead), "dead: the same value in every sampled pixel")
     choice = choice.without(
         marks(is_saturated), f"saturated in more than {MOST_SATURATED:.0%} of sampled pixels"
@@ -86,7 +95,7 @@ def drop_found(choice: BandChoice, sample: Sample, max_noise: float) -> BandChoi
         one = np.zeros(len(kept), bool)
         one[band] = True
         choice = choice.without(marks(one), f"noise is {noise[band]:.0%} of the signal")
-    return choice
+    return choice, notes
 
 
 def require_bands(choice: BandChoice, binning: int, where: str) -> None:

@@ -95,7 +95,13 @@ def prepare_sensor(
     notes += said
     calibration = Calibration(raster, choice.kept, 1, dark, white, saturation, _gain(files[0]), exposure)
     sample = draw_sample(files, calibration)
-    choice = drop_found(choice, sample, options.max_noise)
+    if not len(sample.values):
+        raise CaptureError(
+            f"{files[0].path}: no sampled pixel of it and of the other views has a measurement in all bands (NaN, no-data, "
+            "or no light on the white panel); check no-data value and white, or leave bands out with --drop-bands"
+        )
+    choice, noted = drop_found(choice, sample, options.max_noise)
+    notes += noted
     require_bands(choice, options.bin_bands, str(files[0].path))
     still_kept = np.isin(calibration.bands, choice.kept)
     calibration = replace(calibration, bands=choice.kept, bin_bands=options.bin_bands)
