@@ -98,7 +98,7 @@ def prepare_sensor(
     if not len(sample.values):
         raise CaptureError(
             f"{files[0].path}: no sampled pixel of it and of the other views has a measurement in all bands (NaN, "
-            "no-data, or no light on the white panel); check no-data value and white, or leave bands out with --drop-bands"
+            "no-data, or no light on the white panel); check these, or leave bands out with --drop-bands"
         )
     choice, noted = drop_found(choice, sample, options.max_noise)
     notes += noted
