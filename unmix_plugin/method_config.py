@@ -48,6 +48,7 @@ unmix_nerf_published = MethodSpecification(
             model=UnmixModelConfig(
                 endmember_init="vca",
                 specular="full",
+                light="fixed",
                 segmentation="probe",
                 field=PublishedFieldConfig(),
                 renderer=RendererConfig(visible_weight=1.0),
