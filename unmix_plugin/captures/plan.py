@@ -84,21 +84,13 @@ def make_plan(
     }
     scale, why = choose_scale(list(sensors.values()), options.scale)
     mask = _choose_mask(views, options.mask)
-    recipes, evidence = {}, {}
-    for name, sensor in sensors.items():
-        recipes[name] = _recipe(sensor, by_sensor[name], scale, mask)
-        evidence[name or "all views"] = {
-            "unit": sensor.unit,
-            "bands": len(sensor.centers_nm),
-            "size": [recipes[name].calibration.raster.height, recipes[name].calibration.raster.width],
-            "colours": recipes[name].colours.description,
-            **sensor.evidence,
-            "background": None if recipes[name].background is None else asdict(recipes[name].background),
-        }
+    recipes = {name: _recipe(sensor, by_sensor[name], scale, mask) for name, sensor in sensors.items()}
     decisions = {
         "scale": {"calibrated": scale, "evidence": why},
         "mask": mask,
-        "sensors": evidence,
+        "sensors": {
+            name or "all views": _evidence(sensor, recipes[name]) for name, sensor in sensors.items()
+        },
     }
     said = [note for sensor in sensors.values() for note in sensor.notes]
     if any(is_srgb(view.cube) for view in views):
@@ -116,6 +108,19 @@ def make_plan(
         (*capture.notes, *said),
         tuple(path for file in opened for path in file.files),
     )
+
+
+def _evidence(sensor: Sensor, recipe: ViewRecipe) -> dict[str, Any]:
+    """What was decided on a sensor, for the record."""
+    raster, background = recipe.calibration.raster, recipe.background
+    return {
+        "unit": sensor.unit,
+        "bands": len(sensor.centers_nm),
+        "size": [raster.height, raster.width],
+        "colours": recipe.colours.description,
+        **sensor.evidence,
+        "background": None if background is None else asdict(background),
+    }
 
 
 def _of_sensor(capture: Capture, name: str) -> tuple[CaptureView, ...]:

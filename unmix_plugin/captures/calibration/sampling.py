@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float32, Float64
 
 from unmix_plugin.captures.calibration.calibration import Calibration
 from unmix_plugin.captures.spectral_file import SpectralFile
+from unmix_plugin.errors import CaptureError
 
 ROWS_A_VIEW = 12
 MOST_ALIKE = 4
@@ -84,6 +85,8 @@ def draw_sample(files: Sequence[SpectralFile], calibration: Calibration) -> Samp
     Args:
         files: Of the views of one sensor.
         calibration: Without band binning; all bands that it keeps are sampled.
+    Raises:
+        CaptureError: every sampled pixel is missing, or a file can't be read.
     """
     raster = calibration.raster
     rows = sampled_rows(raster.height)
@@ -96,7 +99,13 @@ def draw_sample(files: Sequence[SpectralFile], calibration: Calibration) -> Samp
         keep &= ~part.missing[0]
         values.append(part.values[0][keep])
         saturated.append(part.saturated[0][keep])
-    return Sample(np.concatenate(values), np.concatenate(saturated))
+    sample = Sample(np.concatenate(values), np.concatenate(saturated))
+    if not len(sample.values):
+        raise CaptureError(
+            f"{files[0].path}: no sampled pixel of it and of the other views has a measurement in all bands (NaN, "
+            "no-data, or no light on the white panel); check these, or leave bands out with --drop-bands"
+        )
+    return sample
 
 
 def noise_shares(values: Float32[np.ndarray, "N B"]) -> Float64[np.ndarray, " B"]:

@@ -95,20 +95,12 @@ def prepare_sensor(
     notes += said
     calibration = Calibration(raster, choice.kept, 1, dark, white, saturation, _gain(files[0]), exposure)
     sample = draw_sample(files, calibration)
-    if not len(sample.values):
-        raise CaptureError(
-            f"{files[0].path}: no sampled pixel of it and of the other views has a measurement in all bands (NaN, "
-            "no-data, or no light on the white panel); check these, or leave bands out with --drop-bands"
-        )
     choice, noted = drop_found(choice, sample, options.max_noise)
     notes += noted
     require_bands(choice, options.bin_bands, str(files[0].path))
     still_kept = np.isin(calibration.bands, choice.kept)
     calibration = replace(calibration, bands=choice.kept, bin_bands=options.bin_bands)
-    for what, reference in (("dark", dark), ("white", None if white is None else white.reference)):
-        if reference is not None:
-            evidence[what] = {"file": str(reference.file.path), "use": reference.how}
-    evidence |= _band_evidence(files[0], choice) | _light_evidence(views)
+    evidence |= _reference_evidence(dark, white) | _band_evidence(files[0], choice) | _light_evidence(views)
     return Sensor(
         name,
         calibration,
@@ -232,6 +224,15 @@ def _light_evidence(views: Sequence[CaptureView]) -> dict[str, Any]:
         name: model.irradiance for name, model in models.items() if model and model.irradiance is not None
     }
     return {"irradiance": light} if light else {}
+
+
+def _reference_evidence(dark: Reference | None, white: WhiteReference | None) -> dict[str, Any]:
+    used = {"dark": dark, "white": None if white is None else white.reference}
+    return {
+        what: {"file": str(reference.file.path), "use": reference.how}
+        for what, reference in used.items()
+        if reference is not None
+    }
 
 
 def _band_evidence(file: SpectralFile, choice: BandChoice) -> dict[str, Any]:
