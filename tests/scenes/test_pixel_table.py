@@ -7,6 +7,7 @@ import torch
 from tests.scenes.rig_factory import make_rig
 from unmix_plugin.scenes import SceneOptions, load_scene
 from unmix_plugin.scenes.pixel_table import PixelTable
+from unmix_plugin.scenes.pixel_table import table as table_module
 
 CPU = torch.device("cpu")
 
@@ -56,6 +57,16 @@ def test_opaque_pixels_are_sampled_of_one_sensor(rig):
     pixels = PixelTable(rig, CPU, (1, 3, 4, 5)).sample_opaque(1, 12, seed=0)
     assert pixels.shape == (12, 2)
     np.testing.assert_allclose(pixels[:, 1], 0.25 * pixels[:, 0], atol=1e-3)
+
+
+def test_of_large_blocks_some_opaque_pixels_are_sampled_from(rig, monkeypatch):
+    everything = PixelTable(rig, CPU, (3, 4)).sample_opaque(1, 1000, seed=0)
+    monkeypatch.setattr(table_module, "MOST_LISTED", 100)
+    table = PixelTable(rig, CPU, (3, 4))
+    found = table.sample_opaque(1, 1000, seed=0)
+    assert 0 < len(found) < 13
+    assert {tuple(row) for row in found.tolist()} <= {tuple(row) for row in everything.tolist()}
+    np.testing.assert_array_equal(table.sample_opaque(1, 1000, seed=0), found)
 
 
 def test_draws_of_a_single_sensor_do_not_depend_on_the_table_having_blocks(rig):

@@ -92,15 +92,17 @@ class PixelBlock:
         blank = torch.from_numpy(np.empty(0, self._kept))
         size = 0 if pool_bytes is not None else num_pixels
         values = torch.empty(shape[0], size, self._num_channels, dtype=blank.dtype, device=device)
-        alpha, valid = torch.ones(shape, device=device), torch.empty(shape, dtype=torch.bool)
+        ones = torch.ones(1, device=device)
+        alpha = ones.repeat(len(self)) if scene.has_alpha else ones.expand(len(self))  # which takes no memory
+        valid = torch.empty(shape, dtype=torch.bool)
         for row, view in enumerate(self._views):
             if pool_bytes is None:
                 values[row] = self._stored(view, ())
             valid[row] = torch.from_numpy(scene.valid_mask(view)).flatten()
             opacity = scene.alpha(view)
             if opacity is not None:
-                alpha[row] = torch.from_numpy(opacity).flatten()
-        self._values, self.alpha, self.valid = values.flatten(0, 1), alpha.flatten(), valid.flatten()
+                alpha[row * num_pixels :][:num_pixels] = torch.from_numpy(opacity).flatten()
+        self._values, self.alpha, self.valid = values.flatten(0, 1), alpha, valid.flatten()
         self._camera_of = torch.tensor(self.cameras, device=device)
         pixel_bytes = self._num_channels * self.value_bytes
         self.pool = (

@@ -17,6 +17,8 @@ from unmix_plugin.scenes.pixel_table.block import DrawnPixels, PixelBlock
 from unmix_plugin.scenes.scene import Scene
 
 OPAQUE_ALPHA = 0.99
+MOST_LISTED = 1 << 24
+"""Pixels of a block that are listed one by one to sample from; of larger blocks some are."""
 
 
 class PixelTable:
@@ -97,9 +99,13 @@ class PixelTable:
     def sample_opaque(self, sensor: int, count: int, seed: int) -> Float[np.ndarray, "pixels b"]:
         """Spectra of at most `count` random valid pixels of a sensor that are opaque."""
         block = next(block for block in self.blocks if block.sensor == sensor)
-        pool: Int[Tensor, " pool"] = (
-            torch.arange(len(block)) if bool(block.valid.all()) else block.valid.nonzero()[:, 0]
-        )
+        pool: Int[Tensor, " pool"]
+        if len(block) > MOST_LISTED:
+            some = torch.Generator().manual_seed(seed)
+            pool = torch.randint(len(block), (MOST_LISTED // 8,), generator=some).unique()
+            pool = pool[block.valid[pool]]
+        else:
+            pool = torch.arange(len(block)) if bool(block.valid.all()) else block.valid.nonzero()[:, 0]
         opaque = pool[block.alpha.cpu()[pool] > OPAQUE_ALPHA]
         chosen = opaque[torch.randperm(len(opaque), generator=step_generator(seed, 0))[:count]]
         return block.spectra(chosen.to(block.alpha.device)).cpu().numpy()
