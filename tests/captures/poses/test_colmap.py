@@ -70,7 +70,7 @@ def test_lenses_see_what_colmaps_own_projection_sees(tmp_path, model):
     assert lens is not None
     ideal = np.random.default_rng(0).uniform([-0.3, -0.22], [0.3, 0.22], (50, 2))
     wanted = made.cameras[7].img_from_cam(np.column_stack([ideal, np.ones(50)]))
-    mine = project_opencv(ideal, lens.focal_px, lens.center_px, lens.distortion[:2], lens.distortion[2:])
+    mine = project_opencv(ideal, lens.focal_px, lens.center_px, lens.radial, lens.tangential)
     is_exact = not any("replaced by the nearest" in note for note in found.notes)
     assert is_exact == (
         model not in ("FULL_OPENCV", "OPENCV_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE")

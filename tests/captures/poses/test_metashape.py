@@ -79,13 +79,17 @@ def test_metashapes_p1_and_b1_are_ours_in_its_own_order(tmp_path):
     x, y, squared = 0.3, -0.2, 0.13
     bent_x = x * (1 + 0.1 * squared) + 0.01 * (squared + 2 * x**2) + 2 * 0.02 * x * y
     bent_y = y * (1 + 0.1 * squared) + 0.02 * (squared + 2 * y**2) + 2 * 0.01 * x * y
-    mine = project_opencv(
-        np.array([[x, y]]), lens.focal_px, lens.center_px, lens.distortion[:2], lens.distortion[2:]
-    )
+    mine = project_opencv(np.array([[x, y]]), lens.focal_px, lens.center_px, lens.radial, lens.tangential)
     np.testing.assert_allclose(mine, [[323 + bent_x * 502, 236 + bent_y * 500]])
 
 
-def test_skew_and_higher_terms_are_fitted_and_their_effect_said(tmp_path):
+def test_higher_radial_terms_are_kept(tmp_path):
+    found = read(tmp_path, ring(), terms="<k3>-9.1</k3><k4>0.5</k4>")
+    assert lens_of(found).higher_radial == (-9.1, 0.5)
+    assert not any("replaced" in note for note in found.notes)
+
+
+def test_skew_is_fitted_and_its_effect_said(tmp_path):
     found = read(tmp_path, ring(), terms="<b2>0.3</b2><k3>0.01</k3>")
     assert any("replaced by the nearest" in note and "px" in note for note in found.notes)
     assert lens_of(found).distortion != (0, 0, 0, 0)

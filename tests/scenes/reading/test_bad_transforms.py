@@ -113,7 +113,6 @@ def test_a_scene_without_frames_is_refused(folder):
             lambda c: c["frames"][1].update(w=24, h=16),
             "the cube has 20 x 16 pixels (width x height); expected 24 x 16, as 'w' and 'h' say",
         ),
-        (lambda c: c.update(k3=0.1), "k3 and k4 must be 0"),
         (
             lambda c: c.update(distortion_params=[0.1]),
             "'distortion_params' is a list of 1; expected the numbers k1",

@@ -187,6 +187,14 @@ def test_distortion_params_are_read_in_nerfstudios_order(tmp_path):
     )
 
 
+def test_higher_radial_terms_of_one_frame_give_all_frames_six_coefficients(tmp_path):
+    folder = make_scene(tmp_path / "scene").edit(lambda c: c["frames"][1].update(k1=0.1, k3=0.02, k4=0.03))
+    found = load_scene(folder.root).cameras.distortion
+    np.testing.assert_allclose(found[1].numpy(), [0.1, 0, 0, 0, 0.02, 0.03], rtol=1e-6)
+    assert found.shape[1] == 6
+    assert not found[0].any()
+
+
 def test_poses_of_three_rows_read_like_those_of_four(tmp_path):
     folder = make_scene(tmp_path / "scene")
     expected = load_scene(folder.root).cameras.camera_to_world

@@ -103,9 +103,8 @@ def project(camera: PosedCamera, points: Float64[np.ndarray, "P 3"]) -> Float64[
     x, y, z = ((points - position) @ rotation).T
     depth = np.where(z > 1e-9, z, np.nan)
     lens = camera.lens
-    k1, k2, p1, p2 = lens.distortion
     ideal = np.column_stack([x / depth, y / depth])
-    return project_opencv(ideal, lens.focal_px, lens.center_px, (k1, k2), (p1, p2))
+    return project_opencv(ideal, lens.focal_px, lens.center_px, lens.radial, lens.tangential)
 
 
 def moved(camera: PosedCamera, similarity: Placement) -> PosedCamera:

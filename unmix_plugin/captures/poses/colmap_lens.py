@@ -73,8 +73,9 @@ def colmap_lens(
         return Lens(width, height, focal, center, (k1, k2, p1, p2)), None
     start = Lens(width, height, focal, center)
     if model == "FULL_OPENCV":
-        if not any(terms[4:]):
-            return Lens(width, height, focal, center, (terms[0], terms[1], terms[2], terms[3])), None
+        if not any(terms[5:]):
+            k1, k2, p1, p2, k3 = terms[:5]
+            return Lens(width, height, focal, center, (k1, k2, p1, p2), (k3, 0.0)), None
         return fit_lens(_full_opencv(focal, center, terms), start, model, where)
     return fit_lens(lambda ideal: project_fisheye(ideal, focal, center, terms), start, model, where)
 

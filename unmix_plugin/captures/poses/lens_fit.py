@@ -55,7 +55,7 @@ def project_fisheye(
 def fit_lens(
     project: Project, start: Lens, model: str, where: str, limit_px: float = LARGEST_ERROR_PX
 ) -> tuple[Lens, str]:
-    """The lens with k1, k2, p1, p2 that is nearest to another model.
+    """The OPENCV lens that is nearest to another model.
 
     Args:
         project: The other model.
@@ -81,29 +81,27 @@ def fit_lens(
     def errors(values: np.ndarray) -> np.ndarray:
         return (_project(values, ideal) - pixels).ravel()
 
-    first = np.array([*start.focal_px, *start.center_px, *start.distortion])
-    scales = np.array([*start.focal_px, *start.focal_px, 0.1, 0.1, 0.01, 0.01])
+    first = np.array([*start.focal_px, *start.center_px, *start.tangential, *start.radial])
+    scales = np.array([*start.focal_px, *start.focal_px, 0.01, 0.01, 0.1, 0.1, 0.1, 0.1])
     found = least_squares(errors, first, x_scale=scales).x
     worst = float(np.linalg.norm(errors(found).reshape(-1, 2), axis=1).max())
     if worst > limit_px:
         raise CaptureError(
-            f"{where}: the lens model {model} differs from the nearest one with k1, k2, p1, p2 by up to "
+            f"{where}: the lens model {model} differs from the nearest OPENCV lens by up to "
             f"{worst:.3g} px; expected at most {limit_px:g} px: {advice}"
         )
-    lens = Lens(start.width, start.height, _pair(found[:2]), _pair(found[2:4]), _four(found[4:]))
-    return lens, f"lens model {model} replaced by the nearest k1, k2, p1, p2; off by at most {worst:.2g} px"
+    bends = (*_pair(found[6:8]), *_pair(found[4:6])), _pair(found[8:])
+    lens = Lens(start.width, start.height, _pair(found[:2]), _pair(found[2:4]), *bends)
+    return lens, f"lens model {model} replaced by the nearest OPENCV lens; off by at most {worst:.2g} px"
 
 
 def _project(values: np.ndarray, ideal: Points) -> Points:
-    return project_opencv(ideal, _pair(values[:2]), _pair(values[2:4]), _pair(values[4:6]), _pair(values[6:]))
+    radial = tuple(values[6:].tolist())
+    return project_opencv(ideal, _pair(values[:2]), _pair(values[2:4]), radial, _pair(values[4:6]))
 
 
 def _pair(values: np.ndarray) -> tuple[float, float]:
     return float(values[0]), float(values[1])
-
-
-def _four(values: np.ndarray) -> tuple[float, float, float, float]:
-    return (*_pair(values), *_pair(values[2:]))
 
 
 def _pixel_grid(width: int, height: int) -> Points:

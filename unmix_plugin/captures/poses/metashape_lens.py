@@ -46,9 +46,9 @@ def metashape_lens(sensor: ElementTree.Element, where: str) -> tuple[Lens | None
     focal, center = (f_x, f_y), (width / 2 + values["cx"], height / 2 + values["cy"])
     radial = tuple(values[key] for key in RADIAL)
     tangential = (values["p2"], values["p1"])
-    lens = Lens(width, height, focal, center, (radial[0], radial[1], *tangential))
-    if kind == "frame" and not (skew or radial[2] or radial[3]):
-        return lens, []
+    if kind == "frame" and not skew:
+        bends = (radial[0], radial[1], *tangential), (radial[2], radial[3])
+        return Lens(width, height, focal, center, *bends), []
 
     def project(ideal: Points) -> Points:
         if kind == "fisheye":
@@ -57,7 +57,7 @@ def metashape_lens(sensor: ElementTree.Element, where: str) -> tuple[Lens | None
             bent = project_opencv(ideal, (1.0, 1.0), (0.0, 0.0), radial, tangential)
         return bent * focal + np.column_stack([skew * bent[:, 1], np.zeros(len(bent))]) + center
 
-    model = "Metashape fisheye" if kind == "fisheye" else "Metashape (b2, k3, k4)"
+    model = "Metashape fisheye" if kind == "fisheye" else "Metashape with b2"
     fitted, note = fit_lens(project, Lens(width, height, focal, center), model, where)
     return fitted, [f"sensor {name}: {note}"]
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.captures.poses.lens_fit import fit_lens, project_fisheye, project_opencv
+from unmix_plugin.captures.poses.lens_fit import fit_lens, project_fisheye
 from unmix_plugin.captures.poses.pose_set import Lens, PoseSet
 from unmix_plugin.captures.poses.raw_poses import RawCamera, SparsePoints, make_pose_set
 from unmix_plugin.captures.poses.rigid import FLIP, name_some
@@ -117,7 +117,6 @@ def _lens(camera: Any, where: str) -> tuple[Lens, str | None]:
     center = (width / 2 + side * number("c_x"), height / 2 + side * number("c_y"))
     radial = tuple(number(key) for key in ("k1", "k2", "k3", "k4"))
     tangential = (number("p1"), number("p2"))
-    start = Lens(width, height, focal, center, (radial[0], radial[1], *tangential))
     if kind in FISHEYES:
         return fit_lens(
             lambda ideal: project_fisheye(ideal, focal, center, radial),
@@ -125,14 +124,7 @@ def _lens(camera: Any, where: str) -> tuple[Lens, str | None]:
             kind,
             where,
         )
-    if not radial[2]:
-        return start, None
-    return fit_lens(
-        lambda ideal: project_opencv(ideal, focal, center, radial[:3], tangential),
-        start,
-        f"{kind} with k3",
-        where,
-    )
+    return Lens(width, height, focal, center, (radial[0], radial[1], *tangential), (radial[2], 0.0)), None
 
 
 def _points(content: dict[str, Any], where: str) -> SparsePoints | None:

@@ -23,6 +23,18 @@ class Lens:
     """Principal point x, y."""
     distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """k1, k2, p1, p2 of the OPENCV model; zeros are a pinhole."""
+    higher_radial: tuple[float, float] = (0.0, 0.0)
+    """k3, k4: radial terms of the sixth and eighth power."""
+
+    @property
+    def radial(self) -> tuple[float, float, float, float]:
+        """k1 to k4."""
+        return (*self.distortion[:2], *self.higher_radial)
+
+    @property
+    def tangential(self) -> tuple[float, float]:
+        """p1, p2."""
+        return self.distortion[2:]
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from unmix_plugin.captures.poses.lens_fit import fit_lens, project_fisheye, project_opencv
+from unmix_plugin.captures.poses.lens_fit import fit_lens, project_fisheye
 from unmix_plugin.captures.poses.pose_set import Lens
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.scenes.reading.json_values import describe, read_number
@@ -79,14 +79,7 @@ def make_lens(
             f"{where}: camera_model {describe(model)} is not supported; expected one of "
             f"{', '.join((*PLAIN_MODELS, 'OPENCV_FISHEYE'))}: undistort the images first"
         )
-    if not (radial[2] or radial[3]):
-        return Lens(*size, focal, center, (radial[0], radial[1], p1, p2)), None
-    return fit_lens(
-        lambda ideal: project_opencv(ideal, focal, center, radial, (p1, p2)),
-        plain,
-        "OPENCV with k3, k4",
-        where,
-    )
+    return Lens(*size, focal, center, (radial[0], radial[1], p1, p2), (radial[2], radial[3])), None
 
 
 def _focal(numbers: Numbers, size: Sequence[int], where: str) -> tuple[float, float] | None:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from unmix_plugin.captures.camera_tags import XmpTags, exif_number, tag_numbers, tag_text
-from unmix_plugin.captures.poses.lens_fit import Points, fit_lens, project_opencv
+from unmix_plugin.captures.poses.lens_fit import Points, fit_lens
 from unmix_plugin.captures.poses.pose_set import Lens
 from unmix_plugin.captures.spectral_file import SpectralFile
 from unmix_plugin.errors import CaptureError
@@ -98,32 +98,9 @@ def _lens(
     radial: tuple[float, float, float],
     tangential: tuple[float, float],
 ) -> tuple[Lens, tuple[str, ...]]:
-    """A lens with k3, which is refitted if it is not 0."""
+    """A lens of the file's size; nothing to say of it."""
     height, width = file.shape[:2]
-    if radial[2] == 0.0:
-        return Lens(width, height, focal_px, centre, (*radial[:2], *tangential)), ()
-    try:
-        lens, note = _fit_radial((width, height), focal_px, centre, radial, tangential)
-    except CaptureError as error:
-        raise CaptureError(f"{file.path}, {error}") from error
-    return lens, (note,)
-
-
-@lru_cache
-def _fit_radial(
-    size: tuple[int, int],
-    focal_px: tuple[float, float],
-    centre: tuple[float, float],
-    radial: tuple[float, float, float],
-    tangential: tuple[float, float],
-) -> tuple[Lens, str]:
-    """The lens nearest to one with k3; all files of a lens have the same."""
-
-    def project(ideal: Points) -> Points:
-        return project_opencv(ideal, focal_px, centre, radial, tangential)
-
-    start = Lens(*size, focal_px, centre, (*radial[:2], *tangential))
-    return fit_lens(project, start, "with k3", TAGS, LIMIT_PX)
+    return Lens(width, height, focal_px, centre, (*radial[:2], *tangential), (radial[2], 0.0)), ()
 
 
 def _fisheye_lens(

@@ -77,7 +77,8 @@ def _facts(view: WrittenView, bands: Float64[np.ndarray, " B"]) -> dict[str, Any
     facts: dict[str, Any] = {"w": lens.width, "h": lens.height}
     facts |= dict(zip(("fl_x", "fl_y"), map(float, lens.focal_px), strict=True))
     facts |= dict(zip(("cx", "cy"), map(float, lens.center_px), strict=True))
-    facts |= dict(zip(("k1", "k2", "p1", "p2"), map(float, lens.distortion), strict=True))
+    bends = zip(("k1", "k2", "p1", "p2", "k3", "k4"), (*lens.distortion, *lens.higher_radial), strict=True)
+    facts |= {key: float(value) for key, value in bends}
     if view.sensor:
         facts["sensor"] = view.sensor
     if view.release:

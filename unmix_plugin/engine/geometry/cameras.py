@@ -31,8 +31,8 @@ class Cameras:
     """Focal lengths along x and y in pixels, > 0."""
     center_px: Float[Tensor, "N 2"]
     """Principal point x, y in pixels."""
-    distortion: Float[Tensor, "N 4"]
-    """k1, k2, p1, p2 of the OPENCV model; zeros are a pinhole."""
+    distortion: Float[Tensor, "N D"]
+    """k1, k2, p1, p2 of the OPENCV model, and perhaps k3, k4 (D is 4 or 6); zeros are a pinhole."""
     width: int
     """Columns of every image, pixels; of the largest image where sizes differ."""
     height: int
@@ -48,7 +48,7 @@ class Cameras:
         camera_to_world: Float[Tensor, "N 3 4"],
         focal_px: Float[Tensor, "N 2"],
         center_px: Float[Tensor, "N 2"],
-        distortion: Float[Tensor, "N 4"],
+        distortion: Float[Tensor, "N D"],
         sizes: Sequence[tuple[int, int]],
     ) -> Cameras:
         """Cameras whose images have these widths and heights, at least one."""
@@ -194,11 +194,13 @@ class Cameras:
             torch.tensor(values["camera_to_world"], dtype=torch.float32).reshape(count, 3, 4),
             torch.tensor(values["focal_px"], dtype=torch.float32).reshape(count, 2),
             torch.tensor(values["center_px"], dtype=torch.float32).reshape(count, 2),
-            torch.tensor(values["distortion"], dtype=torch.float32).reshape(count, 4),
+            torch.tensor(values["distortion"], dtype=torch.float32).reshape(count, -1),
             width,
             height,
             tuple(sizes) or None,
         )
+        if cameras.distortion.shape[1] not in (4, 6):
+            raise ValueError(f"{cameras.distortion.shape[1]} coefficients of distortion; expected 4 or 6")
         numbers = torch.cat(
             [part.flatten() for part in (cameras.camera_to_world, cameras.center_px, cameras.distortion)]
         )

@@ -259,7 +259,7 @@ class _View:
 
 
 def _bend(
-    low: Float32[np.ndarray, "2 M"], high: Float32[np.ndarray, "2 M"], distortion: Float[Tensor, "4"]
+    low: Float32[np.ndarray, "2 M"], high: Float32[np.ndarray, "2 M"], distortion: Float[Tensor, " D"]
 ) -> tuple[Float32[np.ndarray, "2 M"], Float32[np.ndarray, "2 M"]]:
     """Bounds of distorted rectangles, from their corners, the middles of their edges and their centres.
 

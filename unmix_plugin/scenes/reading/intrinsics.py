@@ -32,6 +32,13 @@ class Intrinsics:
     """None is the middle of the image."""
     distortion: tuple[float, float, float, float]
     """k1, k2, p1, p2."""
+    higher_radial: tuple[float, float]
+    """k3, k4: radial terms of the sixth and eighth power."""
+
+    @property
+    def coefficients(self) -> tuple[float, ...]:
+        """k1, k2, p1, p2, and k3, k4 where one of them is not 0."""
+        return (*self.distortion, *(self.higher_radial if any(self.higher_radial) else ()))
 
     def focal_at(self, width: int) -> tuple[float, float]:
         """Focal lengths x, y in pixels for images of this width."""
@@ -60,8 +67,6 @@ def read_intrinsics(
     angle_x = numbers.read("camera_angle_x")
     _check_focal(focal_x, focal_y, angle_x, numbers, where, faults)
     bending = numbers.read_bending()
-    if any(bending[key] for key in ("k3", "k4")):
-        faults.add(where, "k3 and k4 must be 0 (OPENCV has k1, k2, p1, p2 here); undistort the images first")
     if model in ("PINHOLE", "SIMPLE_PINHOLE") and any(bending.values()):
         faults.add(where, f"camera_model {model} comes with distortion {bending}; expected OPENCV or zeros")
     if faults.noted > noted_before:
@@ -74,6 +79,7 @@ def read_intrinsics(
         angle_x=angle_x,
         center_px=(numbers.read("cx"), numbers.read("cy")),
         distortion=(bending["k1"], bending["k2"], bending["p1"], bending["p2"]),
+        higher_radial=(bending["k3"], bending["k4"]),
     )
 
 

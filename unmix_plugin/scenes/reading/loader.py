@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
@@ -18,6 +18,7 @@ from unmix_plugin.scenes.reading.cube_values import read_cube
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.frame_files import CheckedFiles, check_files, locate_files
 from unmix_plugin.scenes.reading.images import Size
+from unmix_plugin.scenes.reading.intrinsics import Intrinsics
 from unmix_plugin.scenes.reading.scene_paths import resolve_path, sha256_of
 from unmix_plugin.scenes.reading.sensors import check_coverage
 from unmix_plugin.scenes.reading.spectra_files import read_endmembers, read_illuminant
@@ -201,9 +202,16 @@ def _make_cameras(entry: SceneEntry, sizes: list[Size], normalisation: Normalisa
         camera_to_world=torch.from_numpy(np.concatenate([rotations, positions[:, :, None]], axis=-1)).float(),
         focal_px=torch.tensor(focal_px, dtype=torch.float32),
         center_px=torch.tensor(centers, dtype=torch.float32),
-        distortion=torch.tensor([lens.distortion for lens in lenses], dtype=torch.float32),
+        distortion=_distortion(lenses),
         sizes=[(width, height) for height, width in sizes],
     )
+
+
+def _distortion(lenses: list[Intrinsics]) -> Float[torch.Tensor, "N D"]:
+    """Coefficients of all lenses: six where any has higher radial terms, else four."""
+    count = max(len(lens.coefficients) for lens in lenses)
+    rows = [(*lens.distortion, *lens.higher_radial)[:count] for lens in lenses]
+    return torch.tensor(rows, dtype=torch.float32)
 
 
 def _name_frames(

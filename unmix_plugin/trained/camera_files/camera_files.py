@@ -121,7 +121,7 @@ def _frame_view(
     width, height = check_size(lens.width, lens.height, f"{path}: {where}")
     x, y = lens.center_px
     centre = (width / 2 if x is None else x, height / 2 if y is None else y)
-    return one_view(name, pose, lens.focal_at(width), centre, lens.distortion, (width, height))
+    return one_view(name, pose, lens.focal_at(width), centre, lens.coefficients, (width, height))
 
 
 def _names(entries: Sequence[dict[str, Any]], path: Path) -> list[str]:
@@ -146,6 +146,6 @@ def _frame_entry(view: RunView, frame: Normalisation) -> dict[str, Any]:
     position = frame.to_world(pose[:, 3])
     pose = np.concatenate([frame.rotation.T @ pose[:, :3], position[:, None]], axis=1)
     lens = torch.cat([camera.focal_px, camera.center_px, camera.distortion], dim=1)[0].tolist()
-    keys = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
+    keys = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4")[: len(lens)]
     matrix = [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]]
     return {"name": view.name, "transform_matrix": matrix, **dict(zip(keys, lens, strict=True))}
