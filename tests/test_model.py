@@ -333,6 +333,14 @@ def test_an_automatic_number_of_endmembers_is_that_of_the_pixels_said_with_evide
     assert "proposed" in reasons
 
 
+@pytest.mark.parametrize(("num_bands", "expected"), [(3, 3), (8, 6)])
+def test_without_a_number_there_are_six_endmembers_or_as_many_as_bands(num_bands, expected):
+    data = {**initial_data(), "pixels": np.random.default_rng(0).uniform(0.2, 0.8, (50, num_bands))}
+    config, reasons = UnmixModelConfig().resolve_auto(lambda: data, torch.Generator())
+    assert config.num_endmembers == expected
+    assert ("num-endmembers is 3" in reasons) == (num_bands == 3)
+
+
 def test_settings_without_auto_read_no_data():
     def unread():
         raise AssertionError

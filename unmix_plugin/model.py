@@ -54,6 +54,7 @@ from unmix_plugin.training_losses import LossConfig, compare_pixels, pixel_mean,
 from unmix_plugin.view_gains import ViewGains
 
 _FEWEST_RAYS, _MOST_RAYS = 64, 8192
+_USUAL_ENDMEMBERS = 6
 _PIXELS_TO_COUNT_BY = 20_000
 _GRID_INTERVAL = 16
 """Steps between updates of the occupancy grid."""
@@ -70,8 +71,9 @@ class UnmixModelConfig(ModelConfig):
     """Settings of the model of UnMix-NeRF."""
 
     _target: Target = field(default_factory=lambda: UnmixModel)
-    num_endmembers: Annotated[int | Auto, Common, short("endmembers")] = 6
-    """K, the number of materials to unmix into; auto proposes it from the training pixels, with its evidence."""
+    num_endmembers: Annotated[int | Auto | None, Common, short("endmembers")] = None
+    """K, the number of materials to unmix into; None is 6, or the number of bands where it is smaller; auto proposes
+    it from the training pixels, with its evidence."""
     endmember_init: Annotated[EndmemberMethod | Literal["file"], Common, short("endmember-init")] = "pairs"
     """First guess of the endmembers from the pixels of all training views, or spectra from `endmember_file`."""
     endmember_file: Annotated[Path | None, Common, short("endmember-file")] = None
@@ -112,7 +114,7 @@ class UnmixModelConfig(ModelConfig):
         super().__post_init__()
         count, opacity = self.num_endmembers, self.initial_opacity
         rules = {
-            "num-endmembers of 1 to 255 or auto": count == "auto" or 1 <= count <= 255,
+            "num-endmembers of 1 to 255 or auto": count in (None, "auto") or 1 <= int(count) <= 255,
             "num-specular-spectra of 1 to 256 or auto": self.num_specular_spectra == "auto"
             or 1 <= self.num_specular_spectra <= 256,
             "samples-per-step of 1 to 100 million": 1 <= self.samples_per_step <= 100_000_000,
@@ -126,12 +128,20 @@ class UnmixModelConfig(ModelConfig):
     def resolve_auto(
         self, initial_data: Callable[[], Mapping[str, np.ndarray]], generator: torch.Generator
     ) -> tuple[UnmixModelConfig, str]:
-        """With `num_endmembers` auto, the number that the training pixels propose, and the evidence for it.
+        """With a number of endmembers, the scene's exposure and its light, and the evidence for them.
 
         Raises:
             SpectrumError: no pixel is neither dark nor saturated.
         """
         found, reasons = self, []
+        if self.num_endmembers is None:
+            first = initial_data()
+            num_bands = len(first["typical"]) if "typical" in first else first["pixels"].shape[1]
+            found = replace(found, num_endmembers=_usual_num_endmembers(num_bands))
+            if num_bands < _USUAL_ENDMEMBERS:
+                reasons.append(
+                    f"num-endmembers is {num_bands}: {num_bands} bands can't tell more materials apart"
+                )
         if self.num_endmembers == "auto":
             pixels = drop_uninformative_pixels(torch.from_numpy(initial_data()["pixels"]))
             kept = torch.randperm(len(pixels), generator=generator)[:_PIXELS_TO_COUNT_BY]
@@ -151,6 +161,10 @@ class UnmixModelConfig(ModelConfig):
             if moves:
                 reasons.append("the light moves with the camera: brightness depends on the direction of view")
         return found, "\n".join(reasons)
+
+
+def _usual_num_endmembers(num_bands: int) -> int:
+    return min(_USUAL_ENDMEMBERS, num_bands)
 
 
 class UnmixModel(Model):
@@ -447,6 +461,8 @@ class UnmixModel(Model):
 
     def _checked_num_endmembers(self) -> int:
         count = self.config.num_endmembers
+        if count is None:
+            return _usual_num_endmembers(len(self.bands))
         if count == "auto":
             raise ConfigError("num-endmembers is auto: call resolve_auto first")
         if count > len(self.bands):
