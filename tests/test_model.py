@@ -18,7 +18,8 @@ from tests.method_factory import (
 )
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.errors import ConfigError, SpectrumError
-from unmix_plugin.model import UnmixModel, UnmixModelConfig
+from unmix_plugin.model import UnmixModel
+from unmix_plugin.model_settings import UnmixModelConfig
 from unmix_plugin.renderer import _points
 from unmix_plugin.rendering.compositing import volume_weights_twin
 from unmix_plugin.training_losses import LossConfig

@@ -9,7 +9,7 @@ from torch.testing import assert_close
 from tests.method_factory import BOX, NUM_BANDS, make_model, make_rays, scene_of
 from unmix_plugin.engine.runs.config_json import config_from_json, config_to_json
 from unmix_plugin.method_config import unmix_nerf_published
-from unmix_plugin.model import UnmixModelConfig
+from unmix_plugin.model_settings import UnmixModelConfig
 from unmix_plugin.published_field import PublishedField, PublishedFieldConfig
 
 SMALL = PublishedFieldConfig(num_levels=3, log2_rows_per_level=8, finest_resolution=32, hidden_width=16)

@@ -7,7 +7,7 @@ from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.pipeline import PipelineConfig
 from unmix_plugin.engine.registry import MethodSpecification
 from unmix_plugin.engine.training.optimizers import OptimizerConfig
-from unmix_plugin.model import UnmixModelConfig
+from unmix_plugin.model_settings import UnmixModelConfig
 from unmix_plugin.published_field import PublishedFieldConfig
 from unmix_plugin.renderer import RendererConfig
 from unmix_plugin.trained.snapshot import unmix_scene

@@ -13,49 +13,36 @@ Source: Perez et al. 2025, UnMix-NeRF, eqs. 4 to 9.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Annotated, Literal
+from collections.abc import Collection, Mapping
+from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
 from unmix_plugin.abundance_guide import AbundanceGuide
-from unmix_plugin.alpha_preset import Auto, choose, preset_for
+from unmix_plugin.alpha_preset import choose, preset_for
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
-from unmix_plugin.engine.instantiate import Common, Target, short
-from unmix_plugin.engine.model import Model, ModelConfig
+from unmix_plugin.engine.model import Model
 from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
-from unmix_plugin.errors import ConfigError, require
-from unmix_plugin.field import CoefficientField, UnmixFieldConfig
-from unmix_plugin.renderer import RendererConfig, VolumeRenderer
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.field import CoefficientField
+from unmix_plugin.first_endmembers import first_endmembers
+from unmix_plugin.model_settings import UnmixModelConfig, usual_num_endmembers
+from unmix_plugin.renderer import VolumeRenderer
 from unmix_plugin.rendering.occupancy import OccupancyGrid
 from unmix_plugin.sensor_batches import SensorPart, mean_over_parts, split_parts
 from unmix_plugin.sensor_views import SensorViews
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.coefficients import Coefficients
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
-from unmix_plugin.spectral.evidence import exposure_of
-from unmix_plugin.spectral.materials import Materials, SegmentationMethod
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.metrics import psnr
-from unmix_plugin.spectral.unmixing.endmembers import (
-    EndmemberMethod,
-    drop_uninformative_pixels,
-    initialise_endmembers,
-)
-from unmix_plugin.spectral.unmixing.given_endmembers import given_endmembers
-from unmix_plugin.spectral.unmixing.num_materials import propose_num_materials
-from unmix_plugin.spectral.unmixing.partial_bands import distinct_spectra, fill_bands
-from unmix_plugin.training_losses import LossConfig, compare_pixels, pixel_mean, spectral_losses
+from unmix_plugin.training_losses import compare_pixels, pixel_mean, spectral_losses
 from unmix_plugin.view_gains import ViewGains
 
 _FEWEST_RAYS, _MOST_RAYS = 64, 8192
-_USUAL_ENDMEMBERS = 6
-_PIXELS_TO_COUNT_BY = 20_000
 _GRID_INTERVAL = 16
 """Steps between updates of the occupancy grid."""
 _PROBED_CELLS = 32_768
@@ -64,107 +51,6 @@ _GRID_DECAY = 0.5
 """Factor on the remembered density of a probed cell: lower forgets emptied space sooner."""
 _OCCUPIED_OPACITY = 0.03
 """Opacity of one sample's interval from which a cell counts as occupied."""
-
-
-@dataclass(frozen=True)
-class UnmixModelConfig(ModelConfig):
-    """Settings of the model of UnMix-NeRF."""
-
-    _target: Target = field(default_factory=lambda: UnmixModel)
-    num_endmembers: Annotated[int | Auto | None, Common, short("endmembers")] = None
-    """K, the number of materials to unmix into; None is 6, or the number of bands where it is smaller; auto proposes
-    it from the training pixels, with its evidence."""
-    endmember_init: Annotated[EndmemberMethod | Literal["file"], Common, short("endmember-init")] = "pairs"
-    """First guess of the endmembers from the pixels of all training views, or spectra from `endmember_file`."""
-    endmember_file: Annotated[Path | None, Common, short("endmember-file")] = None
-    """CSV of reflectances (wavelength,name,...) for `endmember_init` file; multiplied by the scene's light if known,
-    and by one factor for the scene's brightness."""
-    specular: Literal["none", "dictionary", "full"] = "dictionary"
-    """View-dependent part: none, multiples of a few spectra, or one value a band as published."""
-    num_specular_spectra: int | Auto = "auto"
-    """Spectra of the specular dictionary. The first is the light's, a highlight's colour on anything but metal; then
-    come the endmembers', as light that they send on has. Auto is 1 where alpha is known, else all."""
-    train_endmembers: bool = True
-    """Whether endmembers change while training; else they stay the first guess, or the spectra from a file."""
-    light: Annotated[Literal["fixed", "camera", "per-view"] | Auto, Common, short("light")] = "auto"
-    """How scenes are lit: by a fixed light; by one that moves with the camera, as where an object is turned before
-    camera and lamp, so that the brightness of a point depends on the direction of view; or by one whose strength and
-    colour, or the camera's exposure and white balance, differ from view to view. What a point is made of never depends
-    on it. Auto tells camera from fixed by the brightness of the hull's surface; without alpha it is fixed."""
-    segmentation: SegmentationMethod = "abundances"
-    """Material of a ray: its largest abundance, or the endmember of smallest angle to its spectrum as published."""
-    samples_per_step: int = 30_000
-    """Samples marched in a training step; the number of rays adapts to it."""
-    initial_opacity: float | Auto = "auto"
-    """Opacity of one sample's interval in the untrained field. Auto is 0.05 where alpha is known, else 0.01: space
-    between cameras and walls must stay clear."""
-    field: UnmixFieldConfig = UnmixFieldConfig()
-    """Sizes of the field."""
-    renderer: RendererConfig = RendererConfig()
-    """How rays are sampled."""
-    losses: LossConfig = LossConfig()
-    """What training asks for, and how strongly."""
-
-    def __post_init__(self) -> None:
-        """Refuse impossible settings.
-
-        Raises:
-            ConfigError: a number out of its range or settings that contradict each other.
-        """
-        super().__post_init__()
-        count, opacity = self.num_endmembers, self.initial_opacity
-        rules = {
-            "num-endmembers of 1 to 255 or auto": count in (None, "auto") or 1 <= int(count) <= 255,
-            "num-specular-spectra of 1 to 256 or auto": self.num_specular_spectra == "auto"
-            or 1 <= self.num_specular_spectra <= 256,
-            "samples-per-step of 1 to 100 million": 1 <= self.samples_per_step <= 100_000_000,
-            "eval-num-rays-per-chunk of at least 1": self.eval_num_rays_per_chunk >= 1,
-            "initial-opacity in (0, 1) or auto": opacity == "auto" or 0 < opacity < 1,
-            "endmember-file exactly when endmember-init is file": (self.endmember_init == "file")
-            == (self.endmember_file is not None),
-        }
-        require("the model", rules)
-
-    def resolve_auto(
-        self, initial_data: Callable[[], Mapping[str, np.ndarray]], generator: torch.Generator
-    ) -> tuple[UnmixModelConfig, str]:
-        """With a number of endmembers, the scene's exposure and its light, and the evidence for them.
-
-        Raises:
-            SpectrumError: no pixel is neither dark nor saturated.
-        """
-        found, reasons = self, []
-        if self.num_endmembers is None:
-            first = initial_data()
-            num_bands = len(first["typical"]) if "typical" in first else first["pixels"].shape[1]
-            found = replace(found, num_endmembers=_usual_num_endmembers(num_bands))
-            if num_bands < _USUAL_ENDMEMBERS:
-                reasons.append(
-                    f"num-endmembers is {num_bands}: {num_bands} bands can't tell more materials apart"
-                )
-        if self.num_endmembers == "auto":
-            pixels = drop_uninformative_pixels(torch.from_numpy(initial_data()["pixels"]))
-            kept = torch.randperm(len(pixels), generator=generator)[:_PIXELS_TO_COUNT_BY]
-            count = propose_num_materials(pixels[kept], generator)
-            found = replace(found, num_endmembers=count.number)
-            reasons.append(count.evidence())
-        if self.losses.exposure == "auto":
-            exposure = round(exposure_of(torch.from_numpy(initial_data()["pixels"])), 3)
-            found = replace(found, losses=replace(self.losses, exposure=exposure))
-            if exposure > 1:
-                reasons.append(
-                    f"the scene is dark: training compares spectra multiplied by {exposure:.3g} (exposure)"
-                )
-        if self.light == "auto":
-            moves = bool(initial_data().get("light_moves", False))
-            found = replace(found, light="camera" if moves else "fixed")
-            if moves:
-                reasons.append("the light moves with the camera: brightness depends on the direction of view")
-        return found, "\n".join(reasons)
-
-
-def _usual_num_endmembers(num_bands: int) -> int:
-    return min(_USUAL_ENDMEMBERS, num_bands)
 
 
 class UnmixModel(Model):
@@ -220,7 +106,9 @@ class UnmixModel(Model):
         light = self.metadata["illuminant"]
         lamp = torch.ones(len(self.bands)) if light is None else torch.tensor(light, dtype=torch.float32)
         pixels = torch.from_numpy(initial_data["pixels"])
-        endmembers = self._first_endmembers(initial_data, lamp, generator)
+        endmembers = first_endmembers(
+            self.config, self.num_endmembers, self.seen_by, lamp, self.bands, initial_data, generator
+        )
         self.endmembers.copy_(endmembers)
         self.endmember_bound.fill_(max(1.0, float(endmembers.max())))
         seen = self.seen_by.project(endmembers, initial_data.get("sensor"))
@@ -462,7 +350,7 @@ class UnmixModel(Model):
     def _checked_num_endmembers(self) -> int:
         count = self.config.num_endmembers
         if count is None:
-            return _usual_num_endmembers(len(self.bands))
+            return usual_num_endmembers(len(self.bands))
         if count == "auto":
             raise ConfigError("num-endmembers is auto: call resolve_auto first")
         if count > len(self.bands):
@@ -483,23 +371,3 @@ class UnmixModel(Model):
         if self.config.num_specular_spectra == "auto":
             return 1 + self.num_endmembers if self.preset.specular_endmembers else 1
         return self.config.num_specular_spectra
-
-    def _first_endmembers(
-        self, initial_data: Mapping[str, np.ndarray], lamp: Float[Tensor, "B"], generator: torch.Generator
-    ) -> Float[Tensor, "K B"]:
-        config, count = self.config, self.num_endmembers
-        pixels, sensor = torch.from_numpy(initial_data["pixels"]), initial_data.get("sensor")
-        if config.endmember_file is not None:
-            everywhere = pixels if sensor is None else self._on_all_bands(pixels, initial_data)
-            return given_endmembers(config.endmember_file, count, self.bands, lamp, everywhere, generator)
-        assert config.endmember_init != "file"
-        if not self.seen_by.tells_materials(sensor, count):
-            return distinct_spectra(torch.from_numpy(initial_data["typical"]), count)
-        seen = initialise_endmembers(pixels, count, config.endmember_init, generator)
-        return seen if sensor is None else self._on_all_bands(seen, initial_data)
-
-    def _on_all_bands(
-        self, seen: Float[Tensor, "N b"], initial_data: Mapping[str, np.ndarray]
-    ) -> Float[Tensor, "N B"]:
-        matrix = self.seen_by.matrix(initial_data["sensor"]).cpu()
-        return fill_bands(seen, matrix, torch.from_numpy(initial_data["typical"]))

@@ -23,7 +23,8 @@ from unmix_plugin.engine import registry
 from unmix_plugin.engine.runs.load_run import load_model
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.model import UnmixModel, UnmixModelConfig
+from unmix_plugin.model import UnmixModel
+from unmix_plugin.model_settings import UnmixModelConfig
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 
 

@@ -1,0 +1,58 @@
+"""The endmembers that a training starts from: spectra from a file, or found in the training pixels.
+
+Notation: `N` pixels, `K` endmembers, `B` bands of the scene, `b` channels of a sensor of a rig.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from unmix_plugin.model_settings import UnmixModelConfig
+from unmix_plugin.sensor_views import SensorViews
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.unmixing.endmembers import initialise_endmembers
+from unmix_plugin.spectral.unmixing.given_endmembers import given_endmembers
+from unmix_plugin.spectral.unmixing.partial_bands import distinct_spectra, fill_bands
+
+
+def first_endmembers(
+    config: UnmixModelConfig,
+    count: int,
+    sensors: SensorViews,
+    lamp: Float[Tensor, "B"],
+    bands: Bands,
+    initial_data: Mapping[str, np.ndarray],
+    generator: torch.Generator,
+) -> Float[Tensor, "K B"]:
+    """The first endmembers, on all bands.
+
+    Args:
+        count: K.
+        sensors: What the sensors of a rig see.
+        lamp: Spectrum of the light, which reflectances of a file are multiplied by.
+        initial_data: What the data manager knows of the training pixels.
+    Raises:
+        SpectrumError: more endmembers than distinct pixels, or spectra that don't cover the bands.
+        ConfigError: the file has another number of spectra.
+    """
+    pixels, sensor = torch.from_numpy(initial_data["pixels"]), initial_data.get("sensor")
+    if config.endmember_file is not None:
+        everywhere = pixels if sensor is None else _on_all_bands(pixels, sensors, initial_data)
+        return given_endmembers(config.endmember_file, count, bands, lamp, everywhere, generator)
+    assert config.endmember_init != "file"
+    if not sensors.tells_materials(sensor, count):
+        return distinct_spectra(torch.from_numpy(initial_data["typical"]), count)
+    seen = initialise_endmembers(pixels, count, config.endmember_init, generator)
+    return seen if sensor is None else _on_all_bands(seen, sensors, initial_data)
+
+
+def _on_all_bands(
+    seen: Float[Tensor, "N b"], sensors: SensorViews, initial_data: Mapping[str, np.ndarray]
+) -> Float[Tensor, "N B"]:
+    matrix = sensors.matrix(initial_data["sensor"]).cpu()
+    return fill_bands(seen, matrix, torch.from_numpy(initial_data["typical"]))

@@ -1,0 +1,134 @@
+"""Settings of the model of UnMix-NeRF, and how those that follow from the scene are found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+
+from unmix_plugin.alpha_preset import Auto
+from unmix_plugin.engine.instantiate import Common, Target, short
+from unmix_plugin.engine.model import Model, ModelConfig
+from unmix_plugin.errors import require
+from unmix_plugin.field import UnmixFieldConfig
+from unmix_plugin.renderer import RendererConfig
+from unmix_plugin.spectral.evidence import exposure_of
+from unmix_plugin.spectral.materials import SegmentationMethod
+from unmix_plugin.spectral.unmixing.endmembers import EndmemberMethod, drop_uninformative_pixels
+from unmix_plugin.spectral.unmixing.num_materials import propose_num_materials
+from unmix_plugin.training_losses import LossConfig
+
+_USUAL_ENDMEMBERS = 6
+_PIXELS_TO_COUNT_BY = 20_000
+
+
+def _model() -> type[Model]:
+    from unmix_plugin.model import UnmixModel
+
+    return UnmixModel
+
+
+@dataclass(frozen=True)
+class UnmixModelConfig(ModelConfig):
+    """Settings of the model of UnMix-NeRF."""
+
+    _target: Target = field(default_factory=_model)
+    num_endmembers: Annotated[int | Auto | None, Common, short("endmembers")] = None
+    """K, the number of materials to unmix into; None is 6, or the number of bands where it is smaller; auto proposes
+    it from the training pixels, with its evidence."""
+    endmember_init: Annotated[EndmemberMethod | Literal["file"], Common, short("endmember-init")] = "pairs"
+    """First guess of the endmembers from the pixels of all training views, or spectra from `endmember_file`."""
+    endmember_file: Annotated[Path | None, Common, short("endmember-file")] = None
+    """CSV of reflectances (wavelength,name,...) for `endmember_init` file; multiplied by the scene's light if known,
+    and by one factor for the scene's brightness."""
+    specular: Literal["none", "dictionary", "full"] = "dictionary"
+    """View-dependent part: none, multiples of a few spectra, or one value a band as published."""
+    num_specular_spectra: int | Auto = "auto"
+    """Spectra of the specular dictionary. The first is the light's, a highlight's colour on anything but metal; then
+    come the endmembers', as light that they send on has. Auto is 1 where alpha is known, else all."""
+    train_endmembers: bool = True
+    """Whether endmembers change while training; else they stay the first guess, or the spectra from a file."""
+    light: Annotated[Literal["fixed", "camera", "per-view"] | Auto, Common, short("light")] = "auto"
+    """How scenes are lit: by a fixed light; by one that moves with the camera, as where an object is turned before
+    camera and lamp, so that the brightness of a point depends on the direction of view; or by one whose strength and
+    colour, or the camera's exposure and white balance, differ from view to view. What a point is made of never depends
+    on it. Auto tells camera from fixed by the brightness of the hull's surface; without alpha it is fixed."""
+    segmentation: SegmentationMethod = "abundances"
+    """Material of a ray: its largest abundance, or the endmember of smallest angle to its spectrum as published."""
+    samples_per_step: int = 30_000
+    """Samples marched in a training step; the number of rays adapts to it."""
+    initial_opacity: float | Auto = "auto"
+    """Opacity of one sample's interval in the untrained field. Auto is 0.05 where alpha is known, else 0.01: space
+    between cameras and walls must stay clear."""
+    field: UnmixFieldConfig = UnmixFieldConfig()
+    """Sizes of the field."""
+    renderer: RendererConfig = RendererConfig()
+    """How rays are sampled."""
+    losses: LossConfig = LossConfig()
+    """What training asks for, and how strongly."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible settings.
+
+        Raises:
+            ConfigError: a number out of its range or settings that contradict each other.
+        """
+        super().__post_init__()
+        count, opacity = self.num_endmembers, self.initial_opacity
+        rules = {
+            "num-endmembers of 1 to 255 or auto": count in (None, "auto") or 1 <= int(count) <= 255,
+            "num-specular-spectra of 1 to 256 or auto": self.num_specular_spectra == "auto"
+            or 1 <= self.num_specular_spectra <= 256,
+            "samples-per-step of 1 to 100 million": 1 <= self.samples_per_step <= 100_000_000,
+            "eval-num-rays-per-chunk of at least 1": self.eval_num_rays_per_chunk >= 1,
+            "initial-opacity in (0, 1) or auto": opacity == "auto" or 0 < opacity < 1,
+            "endmember-file exactly when endmember-init is file": (self.endmember_init == "file")
+            == (self.endmember_file is not None),
+        }
+        require("the model", rules)
+
+    def resolve_auto(
+        self, initial_data: Callable[[], Mapping[str, np.ndarray]], generator: torch.Generator
+    ) -> tuple[UnmixModelConfig, str]:
+        """With a number of endmembers, the scene's exposure and its light, and the evidence for them.
+
+        Raises:
+            SpectrumError: no pixel is neither dark nor saturated.
+        """
+        found, reasons = self, []
+        if self.num_endmembers is None:
+            first = initial_data()
+            num_bands = len(first["typical"]) if "typical" in first else first["pixels"].shape[1]
+            found = replace(found, num_endmembers=usual_num_endmembers(num_bands))
+            if num_bands < _USUAL_ENDMEMBERS:
+                reasons.append(
+                    f"num-endmembers is {num_bands}: {num_bands} bands can't tell more materials apart"
+                )
+        if self.num_endmembers == "auto":
+            pixels = drop_uninformative_pixels(torch.from_numpy(initial_data()["pixels"]))
+            kept = torch.randperm(len(pixels), generator=generator)[:_PIXELS_TO_COUNT_BY]
+            count = propose_num_materials(pixels[kept], generator)
+            found = replace(found, num_endmembers=count.number)
+            reasons.append(count.evidence())
+        if self.losses.exposure == "auto":
+            exposure = round(exposure_of(torch.from_numpy(initial_data()["pixels"])), 3)
+            found = replace(found, losses=replace(self.losses, exposure=exposure))
+            if exposure > 1:
+                reasons.append(
+                    f"the scene is dark: training compares spectra multiplied by {exposure:.3g} (exposure)"
+                )
+        if self.light == "auto":
+            moves = bool(initial_data().get("light_moves", False))
+            found = replace(found, light="camera" if moves else "fixed")
+            if moves:
+                reasons.append("the light moves with the camera: brightness depends on the direction of view")
+        return found, "\n".join(reasons)
+
+
+def usual_num_endmembers(num_bands: int) -> int:
+    """Endmembers of a scene whose user gives no number."""
+    return min(_USUAL_ENDMEMBERS, num_bands)
