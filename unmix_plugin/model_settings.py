@@ -38,8 +38,8 @@ class UnmixModelConfig(ModelConfig):
 
     _target: Target = field(default_factory=_model)
     num_endmembers: Annotated[int | Auto | None, Common, short("endmembers")] = None
-    """K, the number of materials to unmix into; None is 6, or the number of bands where it is smaller; auto proposes
-    it from the training pixels, with its evidence."""
+    """K, the number of materials to unmix into; auto proposes it from the training pixels. None is 6, or the number of
+    bands if that is smaller."""
     endmember_init: Annotated[EndmemberMethod | Literal["file"], Common, short("endmember-init")] = "pairs"
     """First guess of the endmembers from the pixels of all training views, or spectra from `endmember_file`."""
     endmember_file: Annotated[Path | None, Common, short("endmember-file")] = None
@@ -53,10 +53,8 @@ class UnmixModelConfig(ModelConfig):
     train_endmembers: bool = True
     """Whether endmembers change while training; else they stay the first guess, or the spectra from a file."""
     light: Annotated[Literal["fixed", "camera", "per-view"] | Auto, Common, short("light")] = "auto"
-    """How scenes are lit: by a fixed light; by one that moves with the camera, as where an object is turned before
-    camera and lamp, so that the brightness of a point depends on the direction of view; or by one whose strength and
-    colour, or the camera's exposure and white balance, differ from view to view. What a point is made of never depends
-    on it. Auto tells camera from fixed by the brightness of the hull's surface; without alpha it is fixed."""
+    """Light that is fixed, that moves with the camera (objects turned before camera and lamp), or that differs from
+    view to view (also exposure). Auto finds which of the first two it is, and takes fixed without alpha."""
     segmentation: SegmentationMethod = "abundances"
     """Material of a ray: its largest abundance, or the endmember of smallest angle to its spectrum as published."""
     samples_per_step: int = 30_000

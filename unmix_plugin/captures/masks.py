@@ -90,9 +90,9 @@ def clean(matter: Bool[np.ndarray, "H W"]) -> CleanMask:
     """Remove specks, then fill holes, each connected by edges and smaller than `SMALL_SHARE` of the picture.
 
     >>> mask = np.zeros((100, 100), bool)
-    ... mask[20:80, 20:80] = True
-    ... mask[40, 40] = False
-    ... mask[5, 5] = True
+    >>> mask[20:80, 20:80] = True
+    >>> mask[40, 40] = False
+    >>> mask[5, 5] = True
     >>> done = clean(mask)
     >>> int(done.matter.sum()), done.specks, done.holes
     (3600, 1, 1)

@@ -95,17 +95,15 @@ class TrainedScene:
         count = self.subpixels if subpixels is None else subpixels
         return MaterialView(self, camera, self.renderer.composite_view(self.field, camera, count))
 
-    def render(
-        self, camera: Cameras, names: Collection[str], subpixels: int | None = None
-    ) -> dict[str, Tensor]:
-        """Outputs of a view by name, (H, W, ...); `subpixels` as `look` takes them.
+    def render(self, camera: Cameras, names: Collection[str]) -> dict[str, Tensor]:
+        """Outputs of a view by name, (H, W, ...).
 
         Raises:
             ConfigError: an unknown name, or an argument that can't be read; before anything is rendered.
             SpectrumError: the bands don't cover what is asked for.
         """
         outputs = {name: self.output(name) for name in names}
-        view = self.look(camera, subpixels)
+        view = self.look(camera)
         with torch.no_grad():
             return {name: output.compute(view) for name, output in outputs.items()}
 

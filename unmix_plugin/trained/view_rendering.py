@@ -43,8 +43,8 @@ class RenderedView:
 def render_view(scene: TrainedScene, camera: Cameras, subpixels: int | None = None) -> RenderedView:
     """Render all that is written about a view; `subpixels` squared rays a pixel, None for as many as in training."""
     names = ("spectral", "accumulation", "abundances", "segmentation", "material_scores")
-    outputs = scene.render(camera, names, subpixels)
-    return RenderedView(*(outputs[name].detach().cpu() for name in names))
+    view = scene.look(camera, subpixels)
+    return RenderedView(*(view[name].detach().cpu() for name in names))
 
 
 def subpixels_for(scene: Scene, index: int, subpixels: int, pixel_size: float) -> int:

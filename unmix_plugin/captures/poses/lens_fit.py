@@ -95,6 +95,23 @@ def fit_lens(
     return lens, f"lens model {model} replaced by the nearest OPENCV lens; off by at most {worst:.2g} px"
 
 
+def require_unfolded(lens: Lens, where: str) -> None:
+    """Refuse a lens that maps two directions to one pixel of its image.
+
+    Raises:
+        CaptureError: it does.
+    """
+
+    def project(ideal: Points) -> Points:
+        return project_opencv(ideal, lens.focal_px, lens.center_px, lens.radial, lens.tangential)
+
+    if _invert(project, _pixel_grid(lens.width, lens.height), lens) is None:
+        raise CaptureError(
+            f"{where}: the distortion {[*lens.radial, *lens.tangential]} folds the corners of the image over; "
+            "calibrate the camera again, or undistort the images and export the poses with a pinhole lens"
+        )
+
+
 def _project(values: np.ndarray, ideal: Points) -> Points:
     radial = tuple(values[6:].tolist())
     return project_opencv(ideal, _pair(values[:2]), _pair(values[2:4]), radial, _pair(values[4:6]))

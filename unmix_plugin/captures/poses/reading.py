@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from unmix_plugin.captures.poses.colmap import find_models, read_colmap
+from unmix_plugin.captures.poses.lens_fit import require_unfolded
 from unmix_plugin.captures.poses.llff import FILE_NAME as LLFF_FILE
 from unmix_plugin.captures.poses.llff import read_llff
 from unmix_plugin.captures.poses.metashape import read_metashape
@@ -36,11 +37,14 @@ def read_poses(path: Path, picture_sizes: Mapping[str, Size] | None = None) -> P
     Raises:
         CaptureError: nothing known is there, or what is there is damaged or can't be represented.
     """
-    if path.is_dir():
-        return _read_folder(path, picture_sizes or {})
-    if not path.is_file():
+    if not path.exists():
         raise CaptureError(f"{path} is not there; give a file or folder with poses: {KNOWN}")
-    return _read_file(path, picture_sizes or {})
+    read = _read_folder if path.is_dir() else _read_file
+    poses = read(path, picture_sizes or {})
+    for lens in {camera.lens for camera in poses.cameras.values()} - {None}:
+        if lens is not None and any(lens.higher_radial):
+            require_unfolded(lens, str(path))
+    return poses
 
 
 def _read_file(path: Path, given: Mapping[str, Size]) -> PoseSet:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from unmix_plugin.captures.camera_tags import XmpTags, exif_number, tag_numbers, tag_text
-from unmix_plugin.captures.poses.lens_fit import Points, fit_lens
+from unmix_plugin.captures.poses.lens_fit import Points, fit_lens, require_unfolded
 from unmix_plugin.captures.poses.pose_set import Lens
 from unmix_plugin.captures.spectral_file import SpectralFile
 from unmix_plugin.errors import CaptureError
@@ -100,7 +100,10 @@ def _lens(
 ) -> tuple[Lens, tuple[str, ...]]:
     """A lens of the file's size; nothing to say of it."""
     height, width = file.shape[:2]
-    return Lens(width, height, focal_px, centre, (*radial[:2], *tangential), (radial[2], 0.0)), ()
+    lens = Lens(width, height, focal_px, centre, (*radial[:2], *tangential), (radial[2], 0.0))
+    if lens.higher_radial[0]:
+        require_unfolded(lens, f"{file.path}, {TAGS}")
+    return lens, ()
 
 
 def _fisheye_lens(

@@ -99,7 +99,7 @@ def foretold_share(
     return _least_share(torch.stack(seen, dim=1), torch.stack(turned, dim=1), _halves(cameras))
 
 
-def _coarse(hull: Bool[np.ndarray, "R R R"]) -> Bool[np.ndarray, "R R R"]:
+def _coarse(hull: Bool[np.ndarray, "R R R"]) -> Bool[np.ndarray, "r r r"]:
     """The hull in fewer cells, each occupied if one of its parts is."""
     factor = hull.shape[0] // LARGEST_HULL
     if factor < 2 or hull.shape[0] % factor:
