@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 from unmix_plugin.captures.capture import Capture, CaptureView
+from unmix_plugin.captures.json_files import load_json
 from unmix_plugin.captures.layouts.registry import LayoutOptions
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.spectral_file import BandTable, SpectralFile
 from unmix_plugin.errors import CaptureError
-from unmix_plugin.scenes.reading.json_values import UnreadableJsonError, describe, read_json_file
+from unmix_plugin.scenes.reading.json_values import describe
 
 Split: TypeAlias = Literal["train", "eval"]
 SPLIT_OF_FILE: dict[str, Split] = {"train": "train", "val": "eval", "eval": "eval", "test": "eval"}
@@ -73,7 +74,7 @@ def read_frames(root: Path) -> FrameList:
     frames: dict[str, Frame] = {}
     repeated: dict[str, int] = defaultdict(int)
     for path, split in files.items():
-        content = _read(path)
+        content = load_json(path)
         top = {**(content if isinstance(content, dict) else {}), **top}
         listed = content.get("frames") if isinstance(content, dict) else content
         for index, values in enumerate(_checked(listed, path)):
@@ -83,15 +84,6 @@ def read_frames(root: Path) -> FrameList:
     notes = [f"{count} frames of {name} are listed before: left out" for name, count in repeated.items()]
     source = whole if whole in files else root
     return FrameList(source, _split_by_lists(tuple(frames.values()), top), top, tuple(notes))
-
-
-def _read(path: Path) -> Any:
-    try:
-        return read_json_file(path)
-    except UnreadableJsonError as error:
-        raise CaptureError(f"{path} {error}") from error
-    except OSError as error:
-        raise CaptureError(f"{path} can't be read ({error.strerror or error})") from error
 
 
 def _checked(listed: Any, path: Path) -> list[dict[str, Any]]:

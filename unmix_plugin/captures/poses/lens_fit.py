@@ -6,6 +6,7 @@ Notation: `P` points; ideal coordinates are x/z, y/z before the camera, +x right
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import TypeAlias
 
 import numpy as np
@@ -101,15 +102,21 @@ def require_unfolded(lens: Lens, where: str) -> None:
     Raises:
         CaptureError: it does.
     """
-
-    def project(ideal: Points) -> Points:
-        return project_opencv(ideal, lens.focal_px, lens.center_px, lens.radial, lens.tangential)
-
-    if _invert(project, _pixel_grid(lens.width, lens.height), lens) is None:
+    if _folds(lens):
         raise CaptureError(
             f"{where}: the distortion {[*lens.radial, *lens.tangential]} folds the corners of the image over; "
             "calibrate the camera again, or undistort the images and export the poses with a pinhole lens"
         )
+
+
+@lru_cache
+def _folds(lens: Lens) -> bool:
+    """Remembered, since all files of one camera have the same lens."""
+
+    def project(ideal: Points) -> Points:
+        return project_opencv(ideal, lens.focal_px, lens.center_px, lens.radial, lens.tangential)
+
+    return _invert(project, _pixel_grid(lens.width, lens.height), lens) is None
 
 
 def _project(values: np.ndarray, ideal: Points) -> Points:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
+from unmix_plugin.captures.json_files import load_json
 from unmix_plugin.captures.poses.colmap import find_models, read_colmap
 from unmix_plugin.captures.poses.lens_fit import require_unfolded
 from unmix_plugin.captures.poses.llff import FILE_NAME as LLFF_FILE
@@ -19,7 +19,7 @@ from unmix_plugin.captures.poses.sizes import PictureSizes, Size
 from unmix_plugin.captures.poses.transforms_json import has_frames, read_transforms
 from unmix_plugin.captures.poses.xml_text import load_xml
 from unmix_plugin.errors import CaptureError
-from unmix_plugin.scenes.reading.json_values import UnreadableJsonError, describe, read_json_file
+from unmix_plugin.scenes.reading.json_values import describe
 
 KNOWN = (
     "transforms.json, a COLMAP model (.bin or .txt), Metashape's cameras as XML, OpenSfM's reconstruction.json, "
@@ -62,7 +62,7 @@ def _read_file(path: Path, given: Mapping[str, Size]) -> PoseSet:
 
 
 def _read_json(path: Path, given: Mapping[str, Size]) -> PoseSet:
-    content = _load_json(path)
+    content = load_json(path)
     if has_frames(content):
         return read_transforms({path: content}, PictureSizes(given, path.parent))
     if is_reconstruction(content):
@@ -111,7 +111,7 @@ def _read_folder(folder: Path, given: Mapping[str, Size]) -> PoseSet:
 
 
 def _read_splits(folder: Path, paths: list[Path], given: Mapping[str, Size]) -> PoseSet:
-    return read_transforms({path: _load_json(path) for path in paths}, PictureSizes(given, folder))
+    return read_transforms({path: load_json(path) for path in paths}, PictureSizes(given, folder))
 
 
 def _documents(folder: Path) -> list[Path]:
@@ -126,15 +126,6 @@ def _greatest_model(models: list[Path]) -> PoseSet:
         return poses
     note = f"{len(models)} COLMAP models are there; the one with the most images was read"
     return replace(poses, notes=(*poses.notes, note))
-
-
-def _load_json(path: Path) -> Any:
-    try:
-        return read_json_file(path)
-    except UnreadableJsonError as error:
-        raise CaptureError(f"{path} {error}") from error
-    except OSError as error:
-        raise CaptureError(f"{path} can't be read ({error.strerror or error})") from error
 
 
 def _first_bytes(path: Path) -> bytes:

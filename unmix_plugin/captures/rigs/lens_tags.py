@@ -31,7 +31,7 @@ def lens_of(file: SpectralFile) -> tuple[Lens | None, tuple[str, ...]]:
     """The lens of a file, and what there is to say of it; no lens where its tags don't tell one.
 
     Raises:
-        CaptureError: its model differs from k1, k2, p1, p2 by too much.
+        CaptureError: its model differs from every OPENCV lens by too much, or folds the image over.
     """
     lens, notes = _stated_lens(file, file.metadata.get("xmp") or {}, file.metadata.get("exif") or {})
     if lens is None:
