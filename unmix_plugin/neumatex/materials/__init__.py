@@ -1,0 +1,1 @@
+"""Families of materials: reflectances that share a set of parameters."""

@@ -1,0 +1,50 @@
+"""What a family of materials offers: evaluation and importance sampling of its reflectances.
+
+Notation: `N` surface points, `P` parameters of a material, `C` colours or bands. Directions are unit vectors in the local
+frame of a point, whose z axis is the shading normal; `wi` points to the light, `wo` to the eye.
+"""
+
+from typing import Protocol
+
+from jaxtyping import Float
+from torch import Tensor
+
+
+class MaterialFamily(Protocol):
+    """Reflectances with a common set of parameters, each parameter in [0, 1]; differentiable by the parameters."""
+
+    @property
+    def num_parameters(self) -> int:
+        """P."""
+        ...
+
+    @property
+    def num_colours(self) -> int:
+        """C."""
+        ...
+
+    def evaluate(
+        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N C"]:
+        """Reflectance, 1/sr, without the cosine; 0 where a direction is below the surface."""
+        ...
+
+    def sample(
+        self, parameters: Float[Tensor, "N P"], wo: Float[Tensor, "N 3"], uniforms: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N 3"]:
+        """Directions to the light, drawn about as the reflectance times the cosine is distributed; no gradient.
+
+        Args:
+            uniforms: Independent numbers in [0, 1).
+        """
+        ...
+
+    def density(
+        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, " N"]:
+        """Probability density of `sample`, 1/sr; no gradient."""
+        ...
+
+    def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
+        """Diffuse base colour, linear, [0, 1]."""
+        ...
