@@ -1,7 +1,7 @@
 """What a family of materials offers: evaluation and importance sampling of its reflectances.
 
-Notation: `N` surface points, `P` parameters of a material, `C` colours or bands. Directions are unit vectors in the local
-frame of a point, whose z axis is the shading normal; `wi` points to the light, `wo` to the eye.
+Notation: `N` surface points, `P` parameters of a material, `C` colours or bands. Directions are unit vectors in the
+local frame of a point, whose z axis is the shading normal; `wi` points to the light, `wo` to the eye.
 """
 
 from typing import Protocol
