@@ -1,0 +1,127 @@
+"""A material on a surface: three planes of features, read by two small networks that all objects share.
+
+Notation: `N` points in model space, where the mesh lies in [-1, 1]^3; `P` parameters of a material; `C` channels and
+`R` texels along an edge of a plane. Plane 0 is XY, plane 1 YZ, plane 2 XZ; the first letter runs along a plane's columns,
+the second along its rows. The first texel lies at -1, the last at +1, and points outside read the border.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+PLANE_AXES = ((0, 1), (1, 2), (0, 2))
+"""Axes of the model that run along the columns and the rows of XY, YZ, XZ."""
+NUM_CHANNELS = 12
+"""Channels of a plane, as published."""
+NUM_FREQUENCIES = 3
+"""Bands of the positional encoding, as published."""
+LOG_VARIANCE_RANGE = (-9.0, 0.0)
+"""Least and largest log-variance of a parameter: standard deviations of 0.011 and 1, the parameters being in [0, 1]."""
+_WIDTH = 64
+
+
+class Triplane(nn.Module):
+    """Parameters of a material and their log-variance at points of one object."""
+
+    def __init__(
+        self,
+        num_parameters: int,
+        resolution: int = 128,
+        num_channels: int = NUM_CHANNELS,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        """A random material, nearly the same everywhere.
+
+        Args:
+            num_parameters: P; 9 for the neural material, 5 for base colour, roughness and metallicity.
+            resolution: R, at least 2.
+            generator: Draws the planes and the networks.
+        """
+        super().__init__()
+        inputs = 3 * num_channels + 3 + 6 * NUM_FREQUENCIES
+        texels = (3, num_channels, resolution, resolution)
+        self.num_parameters = num_parameters
+        self.planes = nn.Parameter(0.1 * torch.randn(texels, generator=generator))
+        self.material_network = _network(inputs, num_parameters, generator)
+        self.variance_network = _network(inputs, num_parameters, generator)
+
+    def parameters_at(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N P"]:
+        """Parameters of the material in (0, 1); differentiable by planes and networks."""
+        return material_parameters(self.material_network, self._features(positions))
+
+    def log_variance(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N P"]:
+        """Logarithm of the expected squared error of each parameter, within `LOG_VARIANCE_RANGE`."""
+        return bounded_log_variance(self.variance_network, self._features(positions))
+
+    def parameter_groups(self) -> dict[Literal["planes", "networks"], list[nn.Parameter]]:
+        """What an optimiser may move: an object's planes, and the networks that are frozen while one is fitted."""
+        networks = [*self.material_network.parameters(), *self.variance_network.parameters()]
+        return {"planes": [self.planes], "networks": networks}
+
+    def _features(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N F"]:
+        return point_features(self.planes, positions)
+
+
+def point_features(planes: Float[Tensor, "3 C R R"], positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N F"]:
+    """What the networks read: 3 C numbers of the planes, the position, and its sines and cosines."""
+    return torch.cat([look_up(planes, positions), positions, encode(positions)], dim=-1)
+
+
+def look_up(planes: Float[Tensor, "3 C R R"], positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3*C"]:
+    """Bilinear look-ups in the three planes, one after the other."""
+    places = torch.stack([positions[:, list(axes)] for axes in PLANE_AXES])[:, None]
+    found = functional.grid_sample(planes, places, padding_mode="border", align_corners=True)
+    return found[:, :, 0].permute(2, 0, 1).flatten(1)
+
+
+def look_up_twin(planes: Float[Tensor, "3 C R R"], positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3*C"]:
+    """`look_up` in plain steps."""
+    last = planes.shape[-1] - 1
+    texels = (positions.clamp(-1, 1) + 1) / 2 * last
+    low = texels.floor().clamp(0, last - 1).long()
+    share = texels - low
+    parts = []
+    for plane, (column, row) in zip(planes, PLANE_AXES, strict=True):
+        x, y, u, v = low[:, column], low[:, row], share[:, column], share[:, row]
+        upper = plane[:, y, x] * (1 - u) + plane[:, y, x + 1] * u
+        lower = plane[:, y + 1, x] * (1 - u) + plane[:, y + 1, x + 1] * u
+        parts.append((upper * (1 - v) + lower * v).T)
+    return torch.cat(parts, dim=-1)
+
+
+def encode(positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N E"]:
+    """Sines and cosines of the position times pi, 2 pi and 4 pi: 18 numbers."""
+    angles = torch.cat([positions * (math.pi * 2.0**band) for band in range(NUM_FREQUENCIES)], dim=-1)
+    return torch.cat([angles.sin(), angles.cos()], dim=-1)
+
+
+def material_parameters(network: nn.Module, features: Float[Tensor, "N F"]) -> Float[Tensor, "N P"]:
+    """Parameters in (0, 1) that a material network gives for features of points."""
+    return torch.sigmoid(network(features))
+
+
+def bounded_log_variance(network: nn.Module, features: Float[Tensor, "N F"]) -> Float[Tensor, "N P"]:
+    """Log-variances within `LOG_VARIANCE_RANGE` that a network gives for features of points."""
+    low, high = LOG_VARIANCE_RANGE
+    return low + (high - low) * torch.sigmoid(network(features))
+
+
+def _network(inputs: int, outputs: int, generator: torch.Generator | None) -> nn.Sequential:
+    sizes = [inputs, _WIDTH, _WIDTH, _WIDTH, outputs]
+    layers: list[nn.Module] = []
+    for index, (before, after) in enumerate(itertools.pairwise(sizes)):
+        is_last = index == len(sizes) - 2
+        layer = nn.Linear(before, after, device="meta").to_empty(device="cpu")  # no global random numbers
+        bound = (3 if is_last else 6) ** 0.5 / before**0.5
+        with torch.no_grad():
+            layer.weight.uniform_(-bound, bound, generator=generator)
+            layer.bias.zero_()
+        layers += [layer] if is_last else [layer, nn.ReLU()]
+    return nn.Sequential(*layers)
