@@ -1,8 +1,8 @@
 """A material on a surface: three planes of features, read by two small networks that all objects share.
 
 Notation: `N` points in model space, where the mesh lies in [-1, 1]^3; `P` parameters of a material; `C` channels and
-`R` texels along an edge of a plane. Plane 0 is XY, plane 1 YZ, plane 2 XZ; the first letter runs along a plane's columns,
-the second along its rows. The first texel lies at -1, the last at +1, and points outside read the border.
+`R` texels along an edge of a plane. Plane 0 is XY, plane 1 YZ, plane 2 XZ; the first letter runs along a plane's
+columns, the second along its rows. The first texel lies at -1, the last at +1, and points outside read the border.
 """
 
 from __future__ import annotations
