@@ -1,6 +1,6 @@
 """Where the path tracer gets materials from: one family, and its parameters at points of a mesh."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -8,6 +8,7 @@ from torch import Tensor
 from unmix_plugin.neumatex.materials.family import MaterialFamily
 
 
+@runtime_checkable
 class Surface(Protocol):
     """A mesh's materials."""
 

@@ -4,12 +4,13 @@ Notation: `N` surface points, `P` parameters of a material, `C` colours or bands
 local frame of a point, whose z axis is the shading normal; `wi` points to the light, `wo` to the eye.
 """
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
 
 
+@runtime_checkable
 class MaterialFamily(Protocol):
     """Reflectances with a common set of parameters, each parameter in [0, 1]; differentiable by the parameters."""
 
