@@ -1,0 +1,183 @@
+"""The large prior: every shape and count of the real size without memory, and a tiny one that runs."""
+
+import builtins
+import json
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from torch.testing import assert_close
+
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.neumatex.prior.wan import WAN_1_3B, WanPrior, diffusers_models
+from unmix_plugin.neumatex.prior.wan_weights import read_wan_prior
+
+TINY = {
+    **WAN_1_3B,
+    "num_layers": 2,
+    "num_attention_heads": 2,
+    "attention_head_dim": 12,
+    "ffn_dim": 32,
+    "text_dim": 8,
+}
+TINY_AUTOENCODER = {"base_dim": 4, "dim_mult": [1, 1, 1, 1], "num_res_blocks": 1}
+
+
+def tiny_models():
+    transformer, autoencoder = diffusers_models()
+    return transformer(**TINY), autoencoder(**TINY_AUTOENCODER)
+
+
+def views(size: int, device="cpu"):
+    g = torch.Generator().manual_seed(0)
+    orbit, canonical = (torch.rand(1, 3, count, size, size, generator=g) * 2 - 1 for count in (17, 6))
+    return orbit.to(device), canonical.to(device)
+
+
+def count(module: torch.nn.Module) -> int:
+    return sum(parameter.numel() for parameter in module.parameters())
+
+
+@pytest.fixture(scope="module")
+def real_size() -> WanPrior:
+    with torch.device("meta"):
+        transformer, autoencoder = diffusers_models()
+        models = transformer(**WAN_1_3B), autoencoder()
+    return WanPrior(*models, num_parameters=9)
+
+
+def test_the_real_size_has_the_published_parameters(real_size):
+    # 2.84 GB in bfloat16 and 0.51 GB in float32 are what the files of Wan2.1-T2V-1.3B have.
+    assert count(real_size.transformer) == 1_418_996_800
+    _, autoencoder = diffusers_models()
+    with torch.device("meta"):
+        assert count(autoencoder()) == 126_892_531
+    assert len(real_size.transformer.blocks) == 30
+
+
+def test_every_tensor_of_a_block_has_the_published_shape(real_size):
+    shapes = {name: tuple(p.shape) for name, p in real_size.transformer.blocks[0].named_parameters()}
+    for attention in ("attn1", "attn2"):
+        for layer in ("to_q", "to_k", "to_v", "to_out.0"):
+            assert shapes.pop(f"{attention}.{layer}.weight") == (1536, 1536)
+            assert shapes.pop(f"{attention}.{layer}.bias") == (1536,)
+        assert shapes.pop(f"{attention}.norm_q.weight") == shapes.pop(f"{attention}.norm_k.weight") == (1536,)
+    assert shapes == {
+        "scale_shift_table": (1, 6, 1536),
+        "norm2.weight": (1536,),
+        "norm2.bias": (1536,),
+        "ffn.net.0.proj.weight": (8960, 1536),
+        "ffn.net.0.proj.bias": (8960,),
+        "ffn.net.2.weight": (1536, 8960),
+        "ffn.net.2.bias": (1536,),
+    }
+
+
+def test_the_real_size_turns_views_into_planes_of_their_resolution(real_size):
+    latents = real_size.encode(*(view.to("meta") for view in views(512)))
+    assert latents.shape == (1, 16, 11, 64, 64)
+    planes = real_size.translate(latents)
+    assert planes.shape == (1, 16, 3, 64, 64)
+    assert real_size.decode(planes).shape == (1, 3, 12, 512, 512)
+
+
+def test_a_tiny_prior_gives_a_triplane_that_can_be_optimised():
+    torch.manual_seed(0)  # diffusers draws weights from the global generator
+    prior = WanPrior(*tiny_models(), num_parameters=9, generator=torch.Generator().manual_seed(0))
+    planes = prior(*views(32))
+    assert planes.shape == (1, 3, 12, 32, 32)
+    triplane = prior.triplane(planes[0])
+    assert_close(triplane.planes.detach(), planes[0].detach())
+    assert triplane.parameters_at(torch.zeros(5, 3)).shape == (5, 9)
+    planes.square().mean().backward()
+    groups = prior.parameter_groups()
+    assert all(p.grad is None for p in prior.autoencoder.encoder.parameters())
+    assert prior.planes_head.weight.grad is not None
+    assert prior.planes_head.weight.grad.abs().sum() > 0
+    trained = {id(p) for group in groups.values() for p in group}
+    assert trained == {id(p) for p in prior.parameters() if p.requires_grad}
+
+
+def test_each_plane_is_decoded_alone():
+    torch.manual_seed(0)
+    prior = WanPrior(*tiny_models(), num_parameters=5)
+    latents = torch.randn(1, 16, 3, 4, 4, generator=torch.Generator().manual_seed(0))
+    changed = latents.clone()
+    changed[:, :, 1] += 1
+    with torch.no_grad():
+        before, after = prior.decode(latents), prior.decode(changed)
+    assert_close(before[:, [0, 2]], after[:, [0, 2]])
+    assert (before[:, 1] - after[:, 1]).abs().max() > 1e-4
+
+
+def test_the_decoder_starts_as_the_colours_of_the_autoencoder():
+    torch.manual_seed(0)
+    transformer, autoencoder = tiny_models()
+    latents = torch.randn(1, 16, 3, 4, 4, generator=torch.Generator().manual_seed(0))
+    std, mean = (
+        torch.tensor(autoencoder.config[f"latents_{name}"])[:, None, None, None] for name in ("std", "mean")
+    )
+    with torch.no_grad():
+        films = (latents * std + mean).transpose(1, 2)[0][:, :, None]
+        colours = torch.cat([autoencoder.decode(film[None], return_dict=False)[0][:, :, 0] for film in films])
+        planes = WanPrior(transformer, autoencoder, num_parameters=5).decode(latents)[0]
+    for start in range(0, 12, 3):
+        assert_close(planes[:, start : start + 3].clamp(-1, 1), colours)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    torch.manual_seed(0)
+    for name, model in zip(("transformer", "vae"), tiny_models(), strict=True):
+        model.save_pretrained(tmp_path / name)
+    return tmp_path
+
+
+def test_weights_of_a_folder_are_those_that_were_written(folder):
+    written = load_file(folder / "transformer" / "diffusion_pytorch_model.safetensors")
+    embedding = torch.randn(512, 8, generator=torch.Generator().manual_seed(1))
+    save_file({"embedding": embedding}, folder / "null_text.safetensors")
+    prior = read_wan_prior(folder, num_parameters=9)
+    for name, tensor in prior.transformer.state_dict().items():
+        assert_close(tensor, written[name], rtol=0, atol=0)
+    assert_close(prior.null_text, embedding)
+    assert torch.isfinite(prior(*views(32))).all()
+
+
+def test_a_folder_without_models_is_refused(tmp_path):
+    with pytest.raises(
+        ConfigError, match=r"transformer.config\.json is missing; name a folder in diffusers' layout"
+    ):
+        read_wan_prior(tmp_path, num_parameters=9)
+
+
+def test_a_tensor_of_another_shape_is_named(folder):
+    path = folder / "vae" / "config.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "z_dim": 12}))
+    with pytest.raises(ConfigError, match=r"vae: tensor \S+ has shape \(.*\), but config.json says \("):
+        read_wan_prior(folder, num_parameters=9)
+
+
+def test_another_model_in_the_folder_is_named(folder):
+    (folder / "transformer" / "config.json").write_text('{"_class_name": "FluxTransformer2DModel"}')
+    with pytest.raises(ConfigError, match="describes FluxTransformer2DModel; expected WanTransformer3DModel"):
+        read_wan_prior(folder, num_parameters=9)
+
+
+def test_a_null_text_of_another_shape_is_refused(folder):
+    save_file({"embedding": torch.zeros(3, 8)}, folder / "null_text.safetensors")
+    with pytest.raises(ConfigError, match=r"has shape \(3, 8\), expected \(512, 8\)"):
+        read_wan_prior(folder, num_parameters=9)
+
+
+def test_without_the_extra_the_message_names_it(monkeypatch, tmp_path):
+    real_import = builtins.__import__
+
+    def without_diffusers(name, *rest):
+        if name.split(".")[0] == "diffusers":
+            raise ImportError(name)
+        return real_import(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", without_diffusers)
+    with pytest.raises(ConfigError, match=r"pip install 'unmix-nerf\[lmrm\]'"):
+        read_wan_prior(tmp_path, num_parameters=9)

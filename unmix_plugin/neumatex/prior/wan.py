@@ -1,0 +1,161 @@
+"""The published prior's shape: Wan2.1's video transformer and its autoencoder, from 23 views to three planes.
+
+Notation: `B` objects, `S` pixels along an edge of a view and texels along an edge of a plane (512 as published), `L`
+the same in latents (S / 8), `Z` channels of latents, `F` their frames (11 as published), `T` tokens of `D` numbers for
+a text. Needs the extra `lmrm` (diffusers).
+
+The published weights of this prior are not public, and neither is how eleven frames become three planes. Here a linear
+layer mixes the frames of each place. Weights of Wan2.1 itself are what training starts from: with them alone the planes
+mean nothing. The prior that is trained and shipped is `prior.small`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.neumatex.triplane import NUM_CHANNELS, Triplane
+
+if TYPE_CHECKING:
+    from diffusers.models.autoencoders.autoencoder_kl_wan import AutoencoderKLWan
+    from diffusers.models.transformers.transformer_wan import WanTransformer3DModel
+
+ORBIT_VIEWS = 17
+"""Views of a circle around the object, which the autoencoder takes for a film."""
+CANONICAL_VIEWS = 6
+"""Views along the axes, each taken for a film of one frame."""
+LATENT_FRAMES = 1 + (ORBIT_VIEWS - 1) // 4 + CANONICAL_VIEWS
+"""F: the autoencoder puts the first frame of a film alone, then four into one."""
+TEXT_TOKENS = 512
+"""Length of the text embedding that the transformer was trained with."""
+WAN_1_3B: Mapping[str, Any] = {
+    "num_layers": 30,
+    "num_attention_heads": 12,
+    "attention_head_dim": 128,
+    "ffn_dim": 8960,
+    "patch_size": (1, 2, 2),
+    "in_channels": 16,
+    "out_channels": 16,
+    "text_dim": 4096,
+    "freq_dim": 256,
+}
+"""Configuration of the transformer of Wan2.1-T2V-1.3B; the autoencoder's is diffusers' default."""
+
+
+class WanPrior(nn.Module):
+    """Transformer, autoencoder and networks of a large material reconstruction model."""
+
+    null_text: Tensor
+    latents_mean: Tensor
+    latents_std: Tensor
+
+    def __init__(
+        self,
+        transformer: WanTransformer3DModel,
+        autoencoder: AutoencoderKLWan,
+        num_parameters: int,
+        null_text: Float[Tensor, "T D"] | None = None,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        """The prior around a transformer and an autoencoder, which it takes over and changes.
+
+        Args:
+            num_parameters: P of the material; 9 for the neural one, 5 for PBR.
+            null_text: What every cross-attention reads; zeros without it.
+            generator: Draws the networks that read the planes.
+        """
+        super().__init__()
+        channels = autoencoder.config["z_dim"]
+        self.transformer, self.autoencoder = transformer, widened(autoencoder)
+        for frozen in (autoencoder.encoder, autoencoder.quant_conv):
+            frozen.requires_grad_(requires_grad=False)
+        self.planes_head = nn.Linear(LATENT_FRAMES * channels, 3 * channels, device=transformer.device)
+        self.readers = Triplane(num_parameters, resolution=2, generator=generator)
+        del self.readers.planes
+        if null_text is None:
+            null_text = torch.zeros(TEXT_TOKENS, transformer.config["text_dim"], device=transformer.device)
+        self.register_buffer("null_text", null_text)
+        for name in ("latents_mean", "latents_std"):
+            values = torch.tensor(autoencoder.config[name]).to(transformer.device)
+            self.register_buffer(name, values[:, None, None, None], persistent=False)
+
+    def forward(
+        self, orbit: Float[Tensor, "B 3 17 S S"], canonical: Float[Tensor, "B 3 6 S S"]
+    ) -> Float[Tensor, "B 3 12 S S"]:
+        """Planes XY, YZ, XZ of objects.
+
+        Args:
+            orbit: Tone-mapped views in order around the object, [-1, 1].
+            canonical: Tone-mapped views along +x, -x, +y, -y, +z, -z, [-1, 1].
+        """
+        return self.decode(self.translate(self.encode(orbit, canonical)))
+
+    def encode(
+        self, orbit: Float[Tensor, "B 3 17 S S"], canonical: Float[Tensor, "B 3 6 S S"]
+    ) -> Float[Tensor, "B Z F L L"]:
+        """Normalised latents of the views, the orbit's frames first."""
+        films = [orbit, *canonical.split(1, dim=2)]
+        with torch.no_grad():
+            frames = [self.autoencoder.encode(film, return_dict=False)[0].mode() for film in films]
+        return (torch.cat(frames, dim=2) - self.latents_mean) / self.latents_std
+
+    def translate(self, latents: Float[Tensor, "B Z F L L"]) -> Float[Tensor, "B Z 3 L L"]:
+        """Latents of the three planes, by one deterministic pass of the transformer at t = 0."""
+        count = latents.shape[0]
+        time = torch.zeros(count, device=latents.device)
+        text = self.null_text.expand(count, -1, -1)
+        found: Tensor = self.transformer(latents, time, text, return_dict=False)[0]
+        mixed = self.planes_head(found.flatten(1, 2).movedim(1, -1)).movedim(-1, 1)
+        return mixed.unflatten(1, (found.shape[1], 3))
+
+    def decode(self, latents: Float[Tensor, "B Z 3 L L"]) -> Float[Tensor, "B 3 12 S S"]:
+        """Planes from their latents, each decoded alone as a film of one frame."""
+        alone = (latents * self.latents_std + self.latents_mean).transpose(1, 2).flatten(0, 1)[:, :, None]
+        planes = self.autoencoder.decoder(self.autoencoder.post_quant_conv(alone))
+        return planes[:, :, 0].unflatten(0, (-1, 3))
+
+    def triplane(self, planes: Float[Tensor, "3 12 S S"]) -> Triplane:
+        """One object's planes with copies of the networks that read them."""
+        triplane = Triplane(self.readers.num_parameters, resolution=planes.shape[-1])
+        networks = {name: value.detach().clone() for name, value in self.readers.state_dict().items()}
+        triplane.load_state_dict({**networks, "planes": planes.detach().float()})
+        return triplane
+
+    def parameter_groups(self) -> dict[Literal["backbone", "networks"], list[nn.Parameter]]:
+        """What training moves: the backbone slowly (published: 5e-5), what is new faster (5e-4)."""
+        new = [*self.planes_head.parameters(), *self.readers.parameters()]
+        known = {id(parameter) for parameter in new}
+        rest = [p for p in self.parameters() if p.requires_grad and id(p) not in known]
+        return {"backbone": rest, "networks": new}
+
+
+def widened(autoencoder: AutoencoderKLWan) -> AutoencoderKLWan:
+    """The autoencoder with a decoder of 12 channels, which starts as the three colours repeated four times."""
+    last = autoencoder.decoder.conv_out
+    repeats = NUM_CHANNELS // last.out_channels
+    last.weight = nn.Parameter(last.weight.detach().repeat(repeats, 1, 1, 1, 1))
+    if last.bias is not None:
+        last.bias = nn.Parameter(last.bias.detach().repeat(repeats))
+    last.out_channels = NUM_CHANNELS
+    return autoencoder
+
+
+def diffusers_models() -> tuple[type[WanTransformer3DModel], type[AutoencoderKLWan]]:
+    """The two classes of diffusers.
+
+    Raises:
+        ConfigError: the extra is not installed.
+    """
+    try:
+        from diffusers.models.autoencoders.autoencoder_kl_wan import AutoencoderKLWan
+        from diffusers.models.transformers.transformer_wan import WanTransformer3DModel
+    except ImportError as error:
+        raise ConfigError(
+            "the large prior needs diffusers, which is not installed; pip install 'unmix-nerf[lmrm]'"
+        ) from error
+    return WanTransformer3DModel, AutoencoderKLWan
