@@ -1,15 +1,19 @@
 """`unmix-export PRODUCT --run PATH`: files for others, from the run folder alone.
 
-A product is one module in `products` and one entry in `PRODUCTS`.
+A product is one module in `products` and one entry in `PRODUCTS`, or is brought along by a method.
 """
 
 from __future__ import annotations
 
 import inspect
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
 from unmix_plugin.commands.entry import run_command
+from unmix_plugin.commands.method_products import OwnProduct, own_products
 from unmix_plugin.products.abundances import Abundances
 from unmix_plugin.products.cubes import Cubes
 from unmix_plugin.products.endmembers import Endmembers
@@ -17,11 +21,14 @@ from unmix_plugin.products.mesh import Mesh
 from unmix_plugin.products.metamerism import Metamerism
 from unmix_plugin.products.pca import Pca
 from unmix_plugin.products.point_cloud import PointCloud
-from unmix_plugin.products.product import Job, Product
+from unmix_plugin.products.product import Job, Product, RunProduct
 from unmix_plugin.products.report.report import Report
 from unmix_plugin.products.segmentation import Segmentation
 from unmix_plugin.products.spectrum import Spectrum
 from unmix_plugin.products.volume import Volume
+
+if TYPE_CHECKING:
+    from unmix_plugin.trained.open_run import LoadedRun
 
 PRODUCTS: tuple[Product, ...] = (
     Abundances(),
@@ -36,7 +43,7 @@ PRODUCTS: tuple[Product, ...] = (
     Spectrum(),
     Volume(),
 )
-"""All there is, with the defaults of its options."""
+"""All that scenes of mixed materials have, with the defaults of its options."""
 
 _IN_THE_RUNS_BANDS = ("metamerism", "report", "spectrum")
 """Products that compare with spectra and lights known in the run's own bands, and that no sensor can come between."""
@@ -52,33 +59,39 @@ def export(argv: list[str]) -> None:
         SpectrumError: a spectrum or a light that is unknown or does not cover the bands, or a sensor that sees nothing
             in them.
     """
+    own, broken = own_products(frozenset(product.name for product in PRODUCTS))
+    for plugin in broken:
+        print(plugin, file=sys.stderr)
+    offered = sorted((*PRODUCTS, *(one.product for one in own.values())), key=lambda one: one.name)
     choices = tyro.extras.subcommand_type_from_defaults(
-        {product.name: product for product in PRODUCTS},
-        {product.name: inspect.getdoc(product) or "" for product in PRODUCTS},
+        {product.name: product for product in offered},
+        {product.name: inspect.getdoc(product) or "" for product in offered},
     )
-    product: Product = tyro.cli(
+    product: RunProduct = tyro.cli(
         choices, prog="unmix-export", description="Write products of a run as files.", args=argv
     )
-    job = _open(product)
+    job = _open(product, own)
     written = product.write(job)
     for file in written:
         print(file)
     print(f"{len(written)} files written to {job.folder}")
 
 
-def _open(product: Product) -> Job:
+def _open(product: RunProduct, own: dict[str, OwnProduct]) -> Job:
     """Load the run that a product is of."""
     from functools import partial
 
     from unmix_plugin.commands.reporting import CommandConsole, follow, say, working
     from unmix_plugin.commands.run_choice import chosen_run
-    from unmix_plugin.editing.edited_run import load_edited_run
 
-    _refuse_sensor(product)
+    if isinstance(product, Product):
+        _refuse_sensor(product)
     console = CommandConsole()
     path = chosen_run(product.run, product.output_dir)
     with working(console, f"reading {path}"):
-        loaded = load_edited_run(path, product.device, product.edits, product.illuminant, product.sensor)
+        loaded = _loaded(path, product)
+    if product.name in own:
+        own[product.name].require(loaded.config.method_name)
     folder = (product.output or loaded.folder.exports / product.name).resolve()
     for line in loaded.scene.notes:
         say(console, line)
@@ -90,6 +103,16 @@ def _open(product: Product) -> Job:
         partial(working, console),
         partial(follow, console),
     )
+
+
+def _loaded(path: Path, product: RunProduct) -> LoadedRun:
+    """The run, edited where the product can be of an edited one."""
+    from unmix_plugin.editing.edited_run import load_edited_run
+    from unmix_plugin.trained.open_run import load_run
+
+    if isinstance(product, Product):
+        return load_edited_run(path, product.device, product.edits, product.illuminant, product.sensor)
+    return load_run(path, product.device)
 
 
 def _refuse_sensor(product: Product) -> None:

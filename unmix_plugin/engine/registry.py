@@ -1,6 +1,6 @@
 """Finding methods: ours and any third party's, through entry points."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
@@ -23,6 +23,9 @@ class MethodSpecification:
     scene: Callable[..., Any] | None = None
     """From a model, the record of its scene and averaged parameters (None: the model's own) to what commands and the
     viewer show, as `trained.protocol.RenderableScene`; None: the model's `outputs`."""
+    products: Callable[[], Sequence[Any]] | None = None
+    """What `unmix-export` can make of this method's runs and of no other's, as `products.product.RunProduct` with
+    defaults; called when the command is. None: nothing of its own."""
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Product(ABC):
-    """Options that every product has."""
+class RunProduct(ABC):
+    """Options that every product of any method has."""
 
     name: ClassVar[str]
     """Of the product, and of its folder."""
@@ -35,12 +35,6 @@ class Product(ABC):
     """Run folder, as training printed it; None takes the newest under --output-dir."""
     output: Path | None = None
     """Folder to write to; None: exports/ and the product's name, in the run folder."""
-    edits: Path | None = None
-    """Recipe (YAML) of edits of materials and light to apply first."""
-    illuminant: str | None = None
-    """Light to show the scene under: D65, A, E, FL2, ... or a .csv file; None: the one it was taken under."""
-    sensor: Path | None = None
-    """CSV file (wavelength,NAME,...) of the spectral responses of another camera, to see the result with."""
     output_dir: Path = Path("outputs")
     """Folder in which to look for the newest run."""
     device: DeviceName = "auto"
@@ -57,6 +51,18 @@ class Product(ABC):
         Raises:
             UnmixError: something that a user can fix.
         """
+
+
+@dataclass(frozen=True)
+class Product(RunProduct):
+    """A product of a scene of mixed materials, which can be edited before."""
+
+    edits: Path | None = None
+    """Recipe (YAML) of edits of materials and light to apply first."""
+    illuminant: str | None = None
+    """Light to show the scene under: D65, A, E, FL2, ... or a .csv file; None: the one it was taken under."""
+    sensor: Path | None = None
+    """CSV file (wavelength,NAME,...) of the spectral responses of another camera, to see the result with."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,40 @@
+"""The plain RGB method with a product of its own, as a third party would add one."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from tests.engine.rgb_nerf_plugin import rgb_nerf
+from unmix_plugin.formats.files import write_file
+from unmix_plugin.products.product import Job, RunProduct
+
+
+@dataclass(frozen=True)
+class ViewNames(RunProduct):
+    """Names of all views, one a line: names.txt."""
+
+    name = "view-names"
+    capitals: bool = False
+    """In capital letters."""
+
+    def write(self, job: Job) -> list[Path]:
+        job.claim([job.folder / "names.txt"])
+        text = "\n".join(view.name for view in job.views("all"))
+        return [write_file(job.folder / "names.txt", (text.upper() if self.capitals else text).encode())]
+
+
+@dataclass(frozen=True)
+class Clashing(ViewNames):
+    """A product whose name is taken."""
+
+    name = "mesh"
+
+
+def _broken():
+    raise ImportError("no module named scissors")
+
+
+with_product = replace(rgb_nerf, products=lambda: (ViewNames(),))
+clashing = replace(
+    rgb_nerf, config=replace(rgb_nerf.config, method_name="rgb-2"), products=lambda: (Clashing(),)
+)
+broken = replace(rgb_nerf, config=replace(rgb_nerf.config, method_name="rgb-3"), products=_broken)
