@@ -26,7 +26,8 @@ class OwnProduct:
         """
         if method_name not in self.methods:
             raise ConfigError(
-                f"the method {method_name} has no product {self.product.name}: it needs a run of {' or '.join(self.methods)}"
+                f"the method {method_name} has no product {self.product.name}: it needs a run of "
+                f"{' or '.join(self.methods)}"
             )
 
 
