@@ -25,7 +25,8 @@ def own(registered):  # noqa: F811
     return registered
 
 
-def test_a_product_of_a_method_is_listed_and_written_with_its_options(own, short_config, tmp_path):  # noqa: F811
+@pytest.mark.usefixtures("own")
+def test_a_product_of_a_method_is_listed_and_written_with_its_options(short_config, tmp_path):  # noqa: F811
     trainer = Trainer(short_config, console=Console(file=io.StringIO()))
     trainer.train()
     assert "view-names" in run(export, "--help").out
