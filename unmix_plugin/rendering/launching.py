@@ -87,7 +87,7 @@ def as_warp(tensor: torch.Tensor, dtype: Any = None) -> KernelArray:
 def launch(
     kernel: Any,
     size: int,
-    arguments: Sequence[KernelArray | float],
+    arguments: Sequence[KernelArray | float | int],
     device: torch.device,
     cpu_part: int | None = None,
 ) -> None:

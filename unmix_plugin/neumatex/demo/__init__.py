@@ -1,0 +1,1 @@
+"""Built-in objects with layered materials, rendered by the path tracer."""

@@ -1,0 +1,1 @@
+"""Triangle meshes: reading them, and rays against them."""

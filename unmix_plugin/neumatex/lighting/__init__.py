@@ -1,0 +1,1 @@
+"""Light from far away: environment maps, read from files or built in."""

@@ -1,0 +1,1 @@
+"""Light that surfaces reflect: a differentiable path tracer."""
