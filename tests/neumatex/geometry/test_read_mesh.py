@@ -38,7 +38,7 @@ def test_scene_graph_is_applied_and_parts_are_joined(tmp_path):
 
 def test_normals_of_the_file_are_kept(tmp_path):
     sphere = trimesh.creation.icosphere(subdivisions=1)
-    tilted = np.array(sphere.vertices) + [0.3, 0, 0]
+    tilted = np.add(sphere.vertices, (0.3, 0, 0))
     normals = tilted / np.linalg.norm(tilted, axis=1, keepdims=True)
     trimesh.Trimesh(sphere.vertices, sphere.faces, vertex_normals=normals, process=False).export(
         tmp_path / "m.glb", include_normals=True
