@@ -16,7 +16,7 @@ def test_any_coefficients_give_a_curve_that_increases_from_0_to_1(coefficients):
     response.coefficients.data = torch.tensor(coefficients)
     light = torch.linspace(0, 1, 500)[:, None]
     numbers = response(light)[:, 0].detach()
-    assert numbers[0] == pytest.approx(0, abs=1e-5)
+    assert numbers[0] == pytest.approx(0, abs=1e-3)
     assert numbers[-1] == pytest.approx(1, abs=1e-5)
     assert (numbers.diff() >= -1e-6).all()
 

@@ -125,7 +125,7 @@ def _assemble(
         wavelengths_nm=entry.wavelengths_nm,
         sensors=checked.sensors,
         frames=_name_frames(entry, located, checked.sensor_indices),
-        cameras=_make_cameras(entry, checked.sizes, normalisation),
+        cameras=make_cameras(entry, checked.sizes, normalisation),
         train_indices=split.train,
         eval_indices=split.evaluation,
         scene_box=scene_box,
@@ -156,7 +156,7 @@ def _find_model_space(
     middle = positions.mean(axis=0)
     radius = float(np.linalg.norm(positions - middle, axis=-1).max())
     first = Normalisation(np.eye(3), -middle, 1.0 / radius if radius > 0.0 else 1.0)
-    cameras = _make_cameras(entry, checked.sizes, first)[list(train)]
+    cameras = make_cameras(entry, checked.sizes, first)[list(train)]
     foreground = None if checked.foreground is None else [checked.foreground[index] for index in train]
     try:
         low, high = find_bounds(root, cameras, foreground).aabb.double().numpy()
@@ -184,7 +184,14 @@ def _world_poses(entry: SceneEntry) -> Float64[np.ndarray, "N 3 4"]:
     return np.stack(poses)
 
 
-def _make_cameras(entry: SceneEntry, sizes: list[Size], normalisation: Normalisation) -> Cameras:
+def make_cameras(entry: SceneEntry, sizes: list[Size], normalisation: Normalisation) -> Cameras:
+    """Cameras of all frames.
+
+    Args:
+        entry: Without faults.
+        sizes: Height and width of each frame's image.
+        normalisation: From the space of transforms.json to that of the cameras.
+    """
     lenses = [frame.intrinsics for frame in entry.frames if frame.intrinsics is not None]
     assert len(lenses) == len(entry.frames)
     poses = _world_poses(entry)

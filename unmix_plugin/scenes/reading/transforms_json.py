@@ -69,9 +69,13 @@ class SceneEntry:
     """What cubes are divided by, where the options don't say."""
 
 
-def read_transforms(root: Path, faults: Faults) -> SceneEntry:
+def read_transforms(root: Path, faults: Faults, needs_cubes: bool = True) -> SceneEntry:
     """Read transforms.json, noting every fault in it.
 
+    Args:
+        root: Folder that holds it.
+        faults: Where faults are noted.
+        needs_cubes: Whether frames must have cubes of spectra, and the scene wavelengths; without, pictures will do.
     Raises:
         SceneError: the file is absent, is no JSON object, or has no list of frames: there is nothing to go on with.
     """
@@ -85,13 +89,13 @@ def read_transforms(root: Path, faults: Faults) -> SceneEntry:
     if not frames:
         faults.add(FILE_NAME, "'frames' is empty; a scene needs frames to train on and to evaluate")
     return SceneEntry(
-        wavelengths_nm=_read_wavelengths(content, faults),
+        wavelengths_nm=_read_wavelengths(content, faults, needs_cubes),
         materials=_read_materials(content, faults),
         illuminant_path=_read_text(content, "illuminant_path", FILE_NAME, faults),
         endmembers_path=_read_text(content, "endmembers_path", FILE_NAME, faults),
         value_scale=_read_value_scale(content, faults),
         split_lists=_read_split_lists(content, faults),
-        frames=tuple(_read_frame(content, frame, i, faults) for i, frame in enumerate(frames)),
+        frames=tuple(_read_frame(content, frame, i, faults, needs_cubes) for i, frame in enumerate(frames)),
         placement=read_placement(content, faults, FILE_NAME),
     )
 
@@ -122,14 +126,18 @@ def _read_object(path: Path, faults: Faults) -> dict[str, Any]:
     return content
 
 
-def _read_frame(content: dict[str, Any], frame: Any, index: int, faults: Faults) -> FrameEntry:
+def _read_frame(
+    content: dict[str, Any], frame: Any, index: int, faults: Faults, needs_cube: bool
+) -> FrameEntry:
     where = f"frames[{index}]"
     if not isinstance(frame, dict):
         faults.add(where, f"is {describe(frame)}; expected an object")
         return FrameEntry(where, {}, None, None)
     paths = {key: _read_text(frame, key, where, faults) for key in FILE_KEYS}
-    if frame.get("hyperspectral_file_path") is None:
+    if needs_cube and frame.get("hyperspectral_file_path") is None:
         faults.add(where, "has no 'hyperspectral_file_path'; expected the path of its (H, W, B) .npy cube")
+    if frame.get("hyperspectral_file_path") is None and frame.get("file_path") is None and not needs_cube:
+        faults.add(where, "has no 'file_path'; expected the path of its picture")
     return FrameEntry(
         where=where,
         paths={key: path for key, path in paths.items() if path is not None},
@@ -149,8 +157,12 @@ def _read_text(content: dict[str, Any], key: str, where: str, faults: Faults) ->
     return value
 
 
-def _read_wavelengths(content: dict[str, Any], faults: Faults) -> Float64[np.ndarray, " B"] | None:
+def _read_wavelengths(
+    content: dict[str, Any], faults: Faults, is_needed: bool
+) -> Float64[np.ndarray, " B"] | None:
     values = content.get("wavelengths")
+    if values is None and not is_needed:
+        return None
     if values is None:
         faults.add(FILE_NAME, "'wavelengths' is absent; expected a list with the centre of each band in nm")
         return None
