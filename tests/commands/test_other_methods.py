@@ -54,7 +54,8 @@ def test_it_is_rendered_and_evaluated_from_the_command_line(ball_run, tmp_path):
     figures = json.loads((ball_run / "eval" / "metrics.json").read_text())
     assert figures["views"] == 2
     assert figures["psnr"] > 3
-    assert (ball_run / "eval" / "rgb.png").is_file()
+    assert [image["name"] for image in figures["per_image"]] == ["eval_000", "eval_001"]
+    assert (ball_run / "eval" / "rgb" / "eval_001.png").is_file()
     shutil.rmtree(ball_run / "eval")
 
 

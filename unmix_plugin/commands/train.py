@@ -59,7 +59,7 @@ def _prepared(config: TrainerConfig, console: Console) -> Trainer:
     data = trainer.pipeline.datamanager
     say(
         console,
-        f"{len(data.train_cameras)} views to train on, {data.num_eval_images} for evaluation; "
+        f"{len(data.train_cameras)} views to train on, {len(data.eval_cameras)} for evaluation; "
         f"computing on {trainer.pipeline.model.device}",
     )
     if trainer.limits.reached(trainer.step, trainer.clock.seconds):

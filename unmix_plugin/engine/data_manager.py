@@ -80,8 +80,17 @@ class DataManager(ABC):
 
     @property
     def num_eval_images(self) -> int:
-        """Number of evaluation views."""
+        """Number of images to evaluate on: the evaluation views, and after them others that a method may have, such as
+        the same object under another light."""
         return len(self.eval_cameras)
+
+    def eval_name(self, index: int) -> str:
+        """Name of evaluation image `index`, unique and fit for file names."""
+        summary = self.summary()
+        frames, indices = summary.get("frames"), summary.get("eval_indices")
+        if isinstance(frames, list) and isinstance(indices, list) and index < len(indices):
+            return str(frames[indices[index]])
+        return f"eval_{index:03d}"
 
     def metadata(self) -> dict[str, Any]:
         """What gives the model its shape beyond its config (say, the bands); kept in the run folder as JSON.

@@ -113,7 +113,15 @@ class Model(nn.Module, ABC):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Metrics of one whole image, and pictures of it (height, width, 3) in sRGB [0, 1]."""
+        """Metrics of one whole image, nan where there is no truth; pictures of it (height, width, 3) in sRGB [0, 1]."""
+
+    @torch.no_grad()
+    def evaluate_image(
+        self, camera: Cameras, batch: dict[str, Tensor]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """`get_image_metrics_and_images` of a rendered image; a model whose images need more than a camera, such as
+        another light that the batch holds, renders them itself here."""
+        return self.get_image_metrics_and_images(self.get_outputs_for_camera(camera), batch)
 
     def get_training_callbacks(self) -> list[TrainingCallback]:
         """Functions to call around each step."""

@@ -1,6 +1,7 @@
 """A data manager and a model, joined: what one training or evaluation step computes."""
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -81,19 +82,21 @@ class Pipeline(nn.Module):
         return outputs, losses, metrics
 
     @torch.no_grad()
+    def evaluate_images(self) -> Iterator[tuple[str, dict[str, float], dict[str, Tensor]]]:
+        """For each evaluation image its name, metrics and pictures; the model is in evaluation mode meanwhile."""
+        for index in range(self.datamanager.num_eval_images):
+            camera, batch = self.datamanager.eval_image(index)
+            with evaluating(self.model):
+                metrics, pictures = self.model.evaluate_image(camera, batch)
+            yield self.datamanager.eval_name(index), metrics, pictures
+
     def get_average_eval_image_metrics_and_images(self) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Metrics averaged over all evaluation views, each over the views that have it, and pictures of the first."""
-        values: dict[str, list[float]] = {}
-        pictures: dict[str, Tensor] = {}
-        with evaluating(self.model):
-            for index in range(self.datamanager.num_eval_images):
-                camera, batch = self.datamanager.eval_image(index)
-                outputs = self.model.get_outputs_for_camera(camera)
-                metrics, images = self.model.get_image_metrics_and_images(outputs, batch)
-                pictures = pictures or images
-                for name, value in metrics.items():
-                    values.setdefault(name, []).append(float(value))
-        return {name: sum(found) / len(found) for name, found in values.items()}, pictures
+        """Metrics averaged over all evaluation images, each over those that have it, and pictures of the first."""
+        found, pictures = [], dict[str, Tensor]()
+        for _, metrics, images in self.evaluate_images():
+            found.append(metrics)
+            pictures = pictures or images
+        return average_metrics(found), pictures
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """The model's parameters by optimizer name."""
@@ -102,6 +105,14 @@ class Pipeline(nn.Module):
     def get_training_callbacks(self) -> list[TrainingCallback]:
         """The data manager's callbacks, then the model's."""
         return self.datamanager.get_training_callbacks() + self.model.get_training_callbacks()
+
+
+def average_metrics(found: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Metrics by name, each averaged over the images that have it; nan where all that have it are nan."""
+    names = dict.fromkeys(name for metrics in found for name in metrics)
+    values = {name: [float(metrics[name]) for metrics in found if name in metrics] for name in names}
+    known = {name: [value for value in numbers if not math.isnan(value)] for name, numbers in values.items()}
+    return {name: sum(numbers) / len(numbers) if numbers else math.nan for name, numbers in known.items()}
 
 
 @contextmanager

@@ -6,7 +6,7 @@ numbers in [0, 1].
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float
@@ -18,8 +18,9 @@ from unmix_plugin.spectral.colour.conversion import linear_to_srgb
 
 ToneMapping = Literal["linear", "srgb", "agx", "camera"]
 """How pictures were made of light: `linear` is light itself, `camera` an unknown response."""
-LIGHT_CURVES = ("srgb", "agx")
-"""Through which linear pictures can be compared."""
+TONE_MAPPINGS: tuple[ToneMapping, ...] = get_args(ToneMapping)
+LightCurve = Literal["agx", "srgb", "linear"]
+"""Through which pictures of light can be compared."""
 
 
 class Linear(nn.Module):
@@ -57,13 +58,6 @@ _CURVES: dict[str, type[nn.Module]] = {
 def tone_curve(name: ToneMapping) -> nn.Module:
     """The curve of that name; only `camera` has parameters."""
     return _CURVES[name]()
-
-
-def seen_as(
-    name: ToneMapping, curve: nn.Module, numbers: Float[Tensor, "*pixels C"]
-) -> Float[Tensor, "*pixels C"]:
-    """A picture's numbers as they are compared: light goes through the curve, all else is tone mapped already."""
-    return curve(numbers) if name == "linear" else numbers.clamp(0, 1)
 
 
 def psnr_db(squared_error: Float[Tensor, "*pixels"]) -> Float[Tensor, ""]:

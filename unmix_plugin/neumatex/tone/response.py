@@ -76,7 +76,5 @@ def curve_family() -> Float[Tensor, "F S_plus_1"]:
     logs = [
         (torch.log1p(bend * light) / torch.log1p(bend)) ** gamma for bend in bends for gamma in gammas[3:9:2]
     ]
-    shaped = [
-        light**n / (light**n + middle**n) * (1 + middle**n) for n in steepness for middle in middles
-    ]
+    shaped = [light**n / (light**n + middle**n) * (1 + middle**n) for n in steepness for middle in middles]
     return torch.stack([*powers, *logs, *shaped])
