@@ -1,0 +1,124 @@
+"""Layers over a diffuse or metallic base: dust, sheen, clear coat, a glossy surface with haze.
+
+Notation as in `microfacet`. From the top, each layer reflects its share and lets `1 - albedo` of each direction through to
+what is below, on the way in and on the way out. So the stack is reciprocal and never reflects more than it gets. All of
+it is `passed * base / pi + specular`, where only `passed` is the part that meets the diffuse base colour.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from unmix_plugin.neumatex.materials.albedos import ggx_albedo, mean_ggx_albedo, sheen_albedo
+from unmix_plugin.neumatex.materials.dust import DUST_COLOUR, dust_passed, mean_held
+from unmix_plugin.neumatex.materials.lobe_mixture import LobeMixture
+from unmix_plugin.neumatex.materials.microfacet import (
+    alpha_of,
+    distribution,
+    half_vectors,
+    schlick,
+    visibility,
+)
+from unmix_plugin.neumatex.materials.sheen import sheen_reflection
+
+_COAT_F0 = 0.04
+
+
+@dataclass(frozen=True)
+class LayerStack:
+    """Materials at N points; every number in [0, 1]."""
+
+    dust_cover: Float[Tensor, " N"]
+    """How much of light at normal incidence meets dust."""
+    sheen_colour: Float[Tensor, "N 3"]
+    sheen_roughness: Float[Tensor, " N"]
+    coat_weight: Float[Tensor, " N"]
+    roughness: Float[Tensor, "N 3"]
+    """Perceptual: of the coat, of the surface, of its haze."""
+    haze_weight: Float[Tensor, " N"]
+    """How much of the surface's reflection is spread into the haze."""
+    metallicity: Float[Tensor, " N"]
+    metal_colour: Float[Tensor, "N 3"]
+    dielectric_f0: Float[Tensor, " N"]
+
+    def reflectance(
+        self, wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
+    ) -> tuple[Float[Tensor, " N"], Float[Tensor, "N 3"]]:
+        """`(passed, specular)`: what passes down to the base and up again, and what the layers reflect, 1/sr.
+
+        Both are 0 where a direction is below the surface.
+        """
+        light, eye = self.passing(wi[:, 2]), self.passing(wo[:, 2])
+        dust = light.dust * eye.dust
+        sheen = dust * light.sheen * eye.sheen
+        coat = sheen * light.coat * eye.coat
+        half = half_vectors(wi, wo)
+        edge = schlick((wo * half).sum(-1, keepdim=True))
+        alpha = alpha_of(self.roughness)
+        lobes = distribution(alpha, half) * visibility(alpha, wi[:, 2:], wo[:, 2:])
+        of_coat = self.coat_weight * (_COAT_F0 + (1.0 - _COAT_F0) * edge[:, 0]) * lobes[:, 0]
+        surface = lobes[:, 1] + self.haze_weight * (lobes[:, 2] - lobes[:, 1])
+        f0 = self.f0
+        specular = (
+            self._dust(light.dust, eye.dust)
+            + (dust * sheen_reflection(self.sheen_roughness, wi, wo))[:, None] * self.sheen_colour
+            + (sheen * of_coat)[:, None]
+            + (coat * surface)[:, None] * (f0 + (1.0 - f0) * edge)
+        )
+        above = (wi[:, 2] > 0) & (wo[:, 2] > 0)
+        passed = coat * (1.0 - self.metallicity) * light.surface * eye.surface / self._surface_mean()
+        return passed * above, specular * above[:, None]
+
+    def mixture(self, wo: Float[Tensor, "N 3"], base: Float[Tensor, "N C"]) -> LobeMixture:
+        """A density about like the reflectance times the cosine; without gradient."""
+        with torch.no_grad():
+            eye = self.passing(wo[:, 2])
+            f0 = self.f0.mean(-1)
+            edge = schlick(wo[:, 2])
+            surface = (
+                eye.dust * eye.sheen * eye.coat * (f0 + (1.0 - f0) * edge * (1.0 - self.roughness[:, 1]))
+            )
+            coat = eye.dust * eye.sheen * (1.0 - eye.coat)
+            specular = torch.stack([coat, surface * (1.0 - self.haze_weight), surface * self.haze_weight], -1)
+            below = eye.dust * eye.sheen * eye.coat * eye.surface * (1.0 - self.metallicity) * base.mean(-1)
+            diffuse = below + 0.5 * (1.0 - eye.dust) + eye.dust * (1.0 - eye.sheen)
+            return LobeMixture.of_albedos(alpha_of(self.roughness), diffuse, specular)
+
+    @property
+    def f0(self) -> Float[Tensor, "N 3"]:
+        """What the surface reflects at normal incidence."""
+        dielectric = self.dielectric_f0[:, None]
+        return dielectric + self.metallicity[:, None] * (self.metal_colour - dielectric)
+
+    def _dust(self, passed_light: Tensor, passed_eye: Tensor) -> Tensor:
+        held = (1.0 - passed_light) * (1.0 - passed_eye) / mean_held(self.dust_cover).clamp_min(1e-6)
+        return held[:, None] * torch.tensor(DUST_COLOUR, device=held.device) / math.pi
+
+    def passing(self, cosine: Tensor) -> "Passing":
+        """What each layer lets through from one direction to what is below."""
+        cosine = cosine.clamp_min(0.0)
+        a, b = ggx_albedo(self.roughness, cosine)
+        coat = 1.0 - self.coat_weight * (_COAT_F0 * a[:, 0] + b[:, 0])
+        dielectric = self.dielectric_f0[:, None] * a[:, 1:] + b[:, 1:]
+        surface = 1.0 - (dielectric[:, 0] + self.haze_weight * (dielectric[:, 1] - dielectric[:, 0]))
+        sheen = 1.0 - self.sheen_colour.amax(-1) * sheen_albedo(self.sheen_roughness[:, None], cosine)[:, 0]
+        return Passing(dust_passed(self.dust_cover, cosine), sheen, coat, surface)
+
+    def _surface_mean(self) -> Tensor:
+        """Mean of `surface` over directions, which makes a white base under it lose no light."""
+        a, b = mean_ggx_albedo(self.roughness[:, 1:])
+        dielectric = self.dielectric_f0[:, None] * a + b
+        return 1.0 - (dielectric[:, 0] + self.haze_weight * (dielectric[:, 1] - dielectric[:, 0]))
+
+
+@dataclass(frozen=True)
+class Passing:
+    """Shares of light along one direction that pass each layer, (N)."""
+
+    dust: Tensor
+    sheen: Tensor
+    coat: Tensor
+    surface: Tensor

@@ -1,0 +1,92 @@
+"""Analytic layered materials: the truth that the neural decoder learns, and procedural objects are made of.
+
+Notation as in `family`.
+"""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from unmix_plugin.neumatex.materials.dust import LARGEST_COVER
+from unmix_plugin.neumatex.materials.layer_stack import LayerStack
+
+_LARGEST_DIELECTRIC_F0 = 0.08
+_LARGEST_COAT_ROUGHNESS = 0.6
+_LARGEST_SHEEN = 0.6
+_LARGEST_HAZE = 0.7
+
+
+class LayeredFamily:
+    """Dust over sheen over clear coat over a surface with haze over a base that is diffuse or metal.
+
+    Parameters, each in [0, 1]:
+
+    | index | name | meaning |
+    | --- | --- | --- |
+    | 0 to 2 | base colour | linear RGB; what a metal reflects, and the diffuse albedo of all else |
+    | 3 | metallicity | 0 dielectric, 1 metal |
+    | 4 | roughness | perceptual; the GGX width is about its square |
+    | 5 | specular level | `f0` of the dielectric, 0 to 0.08; 0.5 is a refractive index of 1.5 |
+    | 6 | coat weight | of a clear coat of index 1.5 |
+    | 7 | coat roughness | perceptual, 0 to 0.6 |
+    | 8 | sheen weight | 0 to 0.6 |
+    | 9 | sheen roughness | 0 hugs the silhouette, 1 is all over |
+    | 10 | sheen tint | from white to the hue of the base colour |
+    | 11 | haze weight | share of the surface's reflection that is spread, 0 to 0.7 |
+    | 12 | haze spread | the haze's roughness is `roughness + (1 - roughness) (0.15 + 0.6 spread)` |
+    | 13 | dust | cover at normal incidence, 0 to 0.7 |
+    """
+
+    PARAMETERS = (
+        "base colour R", "base colour G", "base colour B", "metallicity", "roughness", "specular level", "coat weight",
+        "coat roughness", "sheen weight", "sheen roughness", "sheen tint", "haze weight", "haze spread", "dust",
+    )  # fmt: skip
+    num_parameters = len(PARAMETERS)
+    num_colours = 3
+
+    def evaluate(
+        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N C"]:
+        """Reflectance, 1/sr, without the cosine; 0 where a direction is below the surface."""
+        passed, specular = self.stack(parameters).reflectance(wi, wo)
+        return passed[:, None] * parameters[:, :3] / math.pi + specular
+
+    @torch.no_grad()
+    def sample(
+        self, parameters: Float[Tensor, "N P"], wo: Float[Tensor, "N 3"], uniforms: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N 3"]:
+        """Directions to the light, drawn from a cosine lobe and three GGX lobes."""
+        return self.stack(parameters).mixture(wo, parameters[:, :3]).sample(wo, uniforms)
+
+    @torch.no_grad()
+    def density(
+        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, " N"]:
+        """Probability density of `sample`, 1/sr."""
+        return self.stack(parameters).mixture(wo, parameters[:, :3]).density(wi, wo)
+
+    def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
+        """Linear base colour; of metals, the colour of what they reflect."""
+        return parameters[:, :3]
+
+    @staticmethod
+    def stack(parameters: Float[Tensor, "N P"]) -> LayerStack:
+        """The layers that the parameters stand for."""
+        base, scalars = parameters[:, :3], parameters[:, 3:].unbind(-1)
+        metallicity, roughness, level, coat, coat_roughness = scalars[:5]
+        sheen, sheen_roughness, tint, haze, spread, dust = scalars[5:]
+        hue = base / base.amax(-1, keepdim=True).clamp_min(1e-3)
+        hazy = roughness + (1.0 - roughness) * (0.15 + 0.6 * spread)
+        return LayerStack(
+            dust_cover=LARGEST_COVER * dust,
+            sheen_colour=_LARGEST_SHEEN * sheen[:, None] * (1.0 + tint[:, None] * (hue - 1.0)),
+            sheen_roughness=sheen_roughness,
+            coat_weight=coat,
+            roughness=torch.stack([_LARGEST_COAT_ROUGHNESS * coat_roughness, roughness, hazy], -1),
+            haze_weight=_LARGEST_HAZE * haze,
+            metallicity=metallicity,
+            metal_colour=base,
+            dielectric_f0=_LARGEST_DIELECTRIC_F0 * level,
+        )
