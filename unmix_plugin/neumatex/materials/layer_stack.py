@@ -1,8 +1,8 @@
 """Layers over a diffuse or metallic base: dust, sheen, clear coat, a glossy surface with haze.
 
-Notation as in `microfacet`. From the top, each layer reflects its share and lets `1 - albedo` of each direction through to
-what is below, on the way in and on the way out. So the stack is reciprocal and never reflects more than it gets. All of
-it is `passed * base / pi + specular`, where only `passed` is the part that meets the diffuse base colour.
+Notation as in `microfacet`. From the top, each layer reflects its share and lets `1 - albedo` of each direction through
+to what is below, on the way in and on the way out. So the stack is reciprocal and never reflects more than it gets.
+All of it is `passed * base / pi + specular`, where only `passed` is the part that meets the diffuse base colour.
 """
 
 import math

@@ -1,7 +1,7 @@
 """GGX microfacets: distribution, masking, reflection at the half vector, sampling of visible normals.
 
-Notation: `N` points, `K` lobes of a point. `alpha` is the width of a lobe, about the square of its roughness. Directions
-are local, z along the normal; `n_i` and `n_o` are the cosines of `wi` (light) and `wo` (eye).
+Notation: `N` points, `K` lobes of a point. `alpha` is the width of a lobe, about the square of its roughness.
+Directions are local, z along the normal; `n_i` and `n_o` are the cosines of `wi` (light) and `wo` (eye).
 """
 
 import math
