@@ -1,0 +1,81 @@
+"""A tiny object on disk: a ball in a small studio, six views of 24 x 24 pixels, and one held-out light."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from PIL import Image
+
+from unmix_plugin.formats.exr import write_exr
+
+SIZE = 24
+NUM_VIEWS = 6
+CENTRE = np.array([0.3, -0.2, 1.5])
+RADIUS = 0.5
+DISTANCE = 3.0
+LENS_PX = 60.0
+
+
+def write_object(folder: Path, suffix: str = ".exr", **extra: Any) -> Path:
+    """Write the object; `extra` are further keys of transforms.json."""
+    folder.mkdir(parents=True, exist_ok=True)
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=RADIUS)
+    ball.apply_translation(CENTRE)
+    ball.export(folder / "mesh.ply")
+    write_light(folder, sky=1.0)
+    write_views(folder, suffix, colour=(0.5, 0.3, 0.1), **extra)
+    for index in (0,):
+        write_picture(folder / "truth" / "base_colour" / f"{index:03d}.exr", (0.5, 0.3, 0.1))
+    relit = folder / "relit" / "dim"
+    write_light(relit, sky=0.5)
+    write_views(relit, suffix, colour=(0.25, 0.15, 0.05), count=2, tone_mapping="linear")
+    return folder
+
+
+def write_light(folder: Path, sky: float, name: str = "environment.exr") -> Path:
+    """A latitude-longitude map of even light."""
+    folder.mkdir(parents=True, exist_ok=True)
+    image = np.full((8, 16), sky, np.float32)
+    return write_exr(folder / name, {"R": image, "G": image, "B": image}, {})
+
+
+def write_views(
+    folder: Path, suffix: str, colour: tuple[float, ...], count: int = NUM_VIEWS, **extra: Any
+) -> None:
+    """Pictures of the ball in one colour, with alpha, and their transforms.json."""
+    frames = []
+    for index in range(count):
+        angle = 2 * math.pi * index / count
+        name = f"images/{index:03d}{suffix}"
+        write_picture(folder / name, colour)
+        frames.append({"file_path": name, "transform_matrix": pose(angle).tolist()})
+    content = {"fl_x": LENS_PX, "frames": frames, **extra}
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
+def write_picture(path: Path, colour: tuple[float, ...]) -> None:
+    """The ball's silhouette filled with a colour."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    side = np.arange(SIZE) + 0.5 - SIZE / 2
+    radius = LENS_PX * RADIUS / math.sqrt(DISTANCE**2 - RADIUS**2)
+    alpha = (np.hypot(*np.meshgrid(side, side)) < radius).astype(np.float32)
+    if path.suffix == ".exr":
+        channels = {name: alpha * np.float32(value) for name, value in zip("RGB", colour, strict=True)}
+        write_exr(path, {**channels, "A": alpha}, {})
+        return
+    pixels = np.dstack([np.full_like(alpha, value) for value in colour] + [alpha])
+    Image.fromarray((pixels * 255 + 0.5).astype(np.uint8)).save(path)
+
+
+def pose(angle: float) -> np.ndarray:
+    """A camera that looks at the ball's centre from an angle about +z."""
+    back = np.array([math.cos(angle), math.sin(angle), 0.0])
+    right = np.array([-math.sin(angle), math.cos(angle), 0.0])
+    matrix = np.eye(4)
+    matrix[:3] = np.column_stack([right, np.cross(back, right), back, CENTRE + DISTANCE * back])
+    return matrix

@@ -1,0 +1,165 @@
+"""Reading an object's folder: where things lie afterwards, and one message for each thing that is wrong."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from tests.neumatex.object_factory import CENTRE, RADIUS, write_light, write_object, write_picture
+from unmix_plugin.errors import SceneError
+from unmix_plugin.formats.exr import write_exr
+from unmix_plugin.neumatex.geometry.ray_mesh import RayMesh
+from unmix_plugin.neumatex.scene.load_object import load_object
+from unmix_plugin.scenes.placement import Placement
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_object(tmp_path_factory.mktemp("object") / "ball")
+
+
+@pytest.fixture
+def folder(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "ball"))
+
+
+def _change(folder: Path, **keys) -> None:
+    path = folder / "transforms.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **keys}))
+
+
+def test_the_mesh_fills_model_space_and_cameras_see_it_where_alpha_is(made):
+    scene = load_object(made)
+    vertices = scene.mesh.vertices
+    assert float(vertices.abs().max()) == pytest.approx(1, abs=1e-5)
+    np.testing.assert_allclose(scene.frame.to_world(np.zeros(3)), CENTRE, atol=1e-6)
+    assert scene.frame.scale == pytest.approx(1 / RADIUS, rel=1e-5)
+    assert scene.split.evaluation == (0,)
+    assert len(scene.split.train) == 5
+    rays = scene.pictures.cameras.image_rays(2)
+    seen = RayMesh(scene.mesh).closest(rays.origins, rays.directions).found.reshape(24, 24).numpy()
+    alpha = scene.pictures.read(2).alpha
+    assert alpha is not None
+    assert (seen == (alpha > 0.5)).mean() > 0.96
+
+
+def test_light_truth_tone_and_held_out_lights_are_read(made):
+    scene = load_object(made)
+    assert scene.pictures.tone == "linear"
+    assert [light.name for light in scene.lights] == ["dim"]
+    assert len(scene.lights[0].pictures) == 2
+    assert float(scene.lights[0].environment.image.max()) == 0.5
+    truth = scene.base_colour(0)
+    assert truth is not None
+    np.testing.assert_allclose(truth[12, 12], (0.5, 0.3, 0.1), rtol=1e-6)
+    assert scene.base_colour(1) is None
+
+
+def test_poses_that_nerfstudio_turned_and_scaled_find_the_mesh_in_the_world(made, folder):
+    expected = load_object(made).pictures.cameras
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    placement = Placement(turn, np.array([1.0, 2.0, 3.0]), 0.25, np.array([5.0, 0.0, 0.0]))
+    content = json.loads((folder / "transforms.json").read_text())
+    for frame in content["frames"]:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, 3] = placement.to_scene(pose[:3, 3])
+        pose[:3, :3] = turn @ pose[:3, :3]
+        frame["transform_matrix"] = pose.tolist()
+    (folder / "transforms.json").write_text(json.dumps({**content, **placement.to_json()}))
+    found = load_object(folder).pictures.cameras
+    np.testing.assert_allclose(found.camera_to_world, expected.camera_to_world, atol=1e-5)
+
+
+def test_display_pictures_get_a_learnt_response_unless_the_folder_says_otherwise(tmp_path):
+    folder = write_object(tmp_path / "ball", suffix=".png")
+    assert load_object(folder).pictures.tone == "camera"
+    _change(folder, tone_mapping="agx")
+    assert load_object(folder).pictures.tone == "agx"
+
+
+def test_light_can_be_turned_and_exposed(folder):
+    _change(folder, environment_rotation_deg=90, environment_exposure_stops=1)
+    light = load_object(folder).environment
+    assert (light.rotation_deg, light.exposure_stops) == (90, 1)
+
+
+def _move_mesh(folder: Path) -> None:
+    mesh = trimesh.load_mesh(folder / "mesh.ply", process=False)
+    mesh.apply_translation([0.0, 0.0, 2.0])
+    mesh.export(folder / "mesh.ply")
+
+
+def _flatten_mesh(folder: Path) -> None:
+    mesh = trimesh.load_mesh(folder / "mesh.ply", process=False)
+    mesh.apply_scale(0.0)
+    mesh.export(folder / "mesh.ply")
+
+
+def _bad_light(folder: Path) -> None:
+    image = np.full((8, 16), np.nan, np.float32)
+    write_exr(folder / "environment.exr", {"R": image, "G": image, "B": image}, {})
+
+
+def _second_mesh(folder: Path) -> None:
+    shutil.move(folder / "mesh.ply", folder / "a.ply")
+    shutil.copy(folder / "a.ply", folder / "b.ply")
+
+
+def _no_pose(folder: Path) -> None:
+    content = json.loads((folder / "transforms.json").read_text())
+    del content["frames"][3]["transform_matrix"]
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
+FAULTS = {
+    "mesh elsewhere": (_move_mesh, r"mesh.ply is not where .* in 6 of 6 views .* 2 away"),
+    "mesh without area": (_flatten_mesh, "has an area"),
+    "no mesh": (lambda folder: (folder / "mesh.ply").unlink(), r"has no mesh; put mesh.glb or .* there"),
+    "several meshes": (_second_mesh, r"has several: a.ply, b.ply; name one with 'mesh_path'"),
+    "no light": (
+        lambda folder: (folder / "environment.exr").unlink(),
+        "has no environment; put environment.exr",
+    ),
+    "broken light": (_bad_light, "environment.exr.*not finite"),
+    "no pose": (_no_pose, r"frames\[3\]: 'transform_matrix' is absent"),
+    "no picture": (lambda folder: (folder / "images/004.exr").unlink(), "'images/004.exr' is missing"),
+    "unknown tone": (lambda folder: _change(folder, tone_mapping="filmic"), "'tone_mapping' is \"filmic\""),
+    "wrong turn": (
+        lambda folder: _change(folder, environment_rotation_deg="north"),
+        "environment_rotation_deg",
+    ),
+    "negative picture": (
+        lambda folder: write_picture(folder / "images/001.exr", (-1.0, 0.0, 0.0)),
+        "001.exr: .* pixels hold negative",
+    ),
+    "mixed pictures": (
+        lambda folder: _change(folder, frames=_with_png(folder)),
+        "mix pictures of light",
+    ),
+    "wrong held-out light": (
+        lambda folder: write_light(folder / "relit" / "dim", sky=0.0),
+        "relit/dim/environment.exr",
+    ),
+}
+
+
+def _with_png(folder: Path) -> list:
+    write_picture(folder / "images" / "png.png", (0.1, 0.1, 0.1))
+    frames = json.loads((folder / "transforms.json").read_text())["frames"]
+    return [*frames[:-1], {**frames[-1], "file_path": "images/png.png"}]
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_is_told_in_one_message(folder, fault):
+    spoil, expected = FAULTS[fault]
+    spoil(folder)
+    with pytest.raises(SceneError) as error:
+        load_object(folder)
+    text = str(error.value)
+    assert len(text.splitlines()) == 1
+    import re
+
+    assert re.search(expected, text), text

@@ -1,0 +1,1 @@
+"""An object's folder: mesh, environment and posed pictures, read and checked."""

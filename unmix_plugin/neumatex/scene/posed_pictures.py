@@ -1,0 +1,168 @@
+"""Pictures of an object with their cameras: what a transforms.json lists.
+
+Notation: `N` pictures of `H x W` pixels, `C` colours or bands.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from jaxtyping import Float32
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.errors import SceneError
+from unmix_plugin.neumatex.scene.picture_files import LIGHT_SUFFIXES, Picture, read_picture
+from unmix_plugin.neumatex.tone.curves import ToneMapping
+from unmix_plugin.scenes.reading.faults import Faults
+from unmix_plugin.scenes.reading.loader import make_cameras
+from unmix_plugin.scenes.reading.scene_paths import resolve_path, sha256_of
+from unmix_plugin.scenes.reading.transforms_json import SceneEntry
+from unmix_plugin.scenes.scene import Normalisation
+
+
+@dataclass(frozen=True)
+class PictureFiles:
+    """The files of one picture."""
+
+    name: str
+    """Short name, unique among its neighbours, fit for file names."""
+    colours: Path
+    """What holds its colours."""
+    opacity: Path | None = None
+    """What holds its alpha, where that is another file."""
+
+
+@dataclass(frozen=True)
+class PosedPictures:
+    """Pictures and their cameras, read when asked for."""
+
+    files: tuple[PictureFiles, ...]
+    cameras: Cameras
+    """Model space, one a picture."""
+    tone: ToneMapping
+    """What the numbers are of light."""
+    num_colours: int
+    """C."""
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    @property
+    def names(self) -> list[str]:
+        """Of the pictures."""
+        return [files.name for files in self.files]
+
+    def read(self, index: int) -> Picture:
+        """One picture, checked; premultiplied cubes whose alpha is apart are divided by it.
+
+        Raises:
+            SceneError: it can't be read, or its size has changed.
+        """
+        files = self.files[index]
+        picture = read_files(files)
+        width, height = self.cameras.size(index)
+        if picture.numbers.shape[:2] != (height, width):
+            raise SceneError(f"{files.colours} has changed since it was first read; start again")
+        return picture
+
+    @cached_property
+    def hashes(self) -> dict[str, str]:
+        """SHA-256 of each file, by its picture's name."""
+        return {files.name: sha256_of(files.colours) for files in self.files}
+
+
+def read_files(files: PictureFiles) -> Picture:
+    """A picture from its one or two files.
+
+    Raises:
+        SceneError: one can't be read, or their sizes differ.
+    """
+    picture = read_picture(files.colours)
+    if files.opacity is None:
+        return picture
+    alpha = read_picture(files.opacity).alpha
+    if alpha is None:
+        return picture
+    if alpha.shape != picture.numbers.shape[:2]:
+        raise SceneError(
+            f"{files.opacity}: has {alpha.shape[1]} x {alpha.shape[0]} pixels, its cube {files.colours.name} has "
+            f"{picture.numbers.shape[1]} x {picture.numbers.shape[0]}; give both one size"
+        )
+    return Picture(picture.numbers / np.maximum(alpha, np.float32(1e-3))[..., None], alpha)
+
+
+def read_posed_pictures(
+    root: Path, entry: SceneEntry, frame: Normalisation, tone: ToneMapping | None, faults: Faults
+) -> PosedPictures:
+    """Find and check the pictures of a transforms.json.
+
+    Args:
+        root: Its folder.
+        entry: Its content, without faults.
+        frame: From the space of its poses to model space.
+        tone: What it says of the pictures; None for light in files that hold light, an unknown response in others.
+        faults: Where faults are noted.
+    Raises:
+        SceneError: pictures are missing or malformed; all their faults in one message.
+    """
+    located = [_locate(root, paths.paths, paths.where, faults) for paths in entry.frames]
+    faults.raise_if_any()
+    names = _names([str(files.colours.relative_to(root)) for files in located if files is not None])
+    named = [
+        PictureFiles(name, files.colours, files.opacity)
+        for name, files in zip(names, located, strict=True)
+        if files is not None
+    ]
+    sizes, colours = _check(root, named, faults)
+    kinds = {files.colours.suffix.lower() in LIGHT_SUFFIXES for files in named}
+    if len(kinds) > 1 or len(colours) > 1:
+        faults.add(
+            "frames", f"mix pictures of light (.exr, .npy) and others, or of {colours} colours; give one kind"
+        )
+    faults.raise_if_any()
+    usual: ToneMapping = "linear" if kinds == {True} else "camera"
+    return PosedPictures(tuple(named), make_cameras(entry, sizes, frame), tone or usual, colours.pop())
+
+
+def _locate(root: Path, paths: dict[str, str], where: str, faults: Faults) -> PictureFiles | None:
+    """The files of a frame; None with noted faults where one is missing."""
+    keys = [key for key in ("hyperspectral_file_path", "file_path") if key in paths]
+    found = [resolve_path(root, paths[key], False, where, faults) for key in keys]
+    if any(path is None for path in found) or not found:
+        return None
+    return PictureFiles("", *[path for path in found if path is not None])
+
+
+def _check(root: Path, named: list[PictureFiles], faults: Faults) -> tuple[list[tuple[int, int]], set[int]]:
+    """Sizes of all pictures, and the numbers of colours that they have."""
+    sizes, colours = [], set()
+    for files in named:
+        try:
+            shape = read_files(files).numbers.shape
+        except SceneError as error:
+            faults.add(str(root), str(error).replace(f"{root}/", ""))
+            continue
+        sizes.append((shape[0], shape[1]))
+        colours.add(shape[2])
+    return sizes, colours
+
+
+def _names(paths: list[str]) -> list[str]:
+    """The shortest names that differ: stems, with folders before them, or with numbers."""
+    plain = [PurePosixPath(path).with_suffix("") for path in paths]
+    candidates = ([path.name for path in plain], ["_".join(path.parts) for path in plain])
+    numbered = [f"{path.name}_{index}" for index, path in enumerate(plain)]
+    return next((names for names in candidates if len(set(names)) == len(names)), numbered)
+
+
+def has_alpha(picture: Picture) -> bool:
+    """Whether some pixel is not opaque."""
+    return picture.alpha is not None and bool((picture.alpha < 1).any())
+
+
+def opacity(picture: Picture) -> Float32[np.ndarray, "H W"]:
+    """Alpha; 1 where the picture has none."""
+    return np.ones(picture.numbers.shape[:2], np.float32) if picture.alpha is None else picture.alpha
