@@ -432,7 +432,7 @@ def test_outputs_and_losses_change_nothing_in_the_model():
 
 
 def test_the_light_and_the_exposure_follow_from_the_data():
-    dark = {**initial_data(), "light_moves": np.array(True)}
+    dark = {**initial_data(), "light": np.array("camera")}
     dark["pixels"] = dark["pixels"] / 20
     config, reasons = UnmixModelConfig(num_endmembers=3).resolve_auto(lambda: dark, torch.Generator())
     assert config.light == "camera"

@@ -27,7 +27,7 @@ from unmix_plugin.engine.training.seeding import step_generator
 from unmix_plugin.errors import SceneError, require
 from unmix_plugin.scenes.alpha_evidence import AlphaEvidence
 from unmix_plugin.scenes.geometry.carving import carve
-from unmix_plugin.scenes.geometry.lighting import light_moves
+from unmix_plugin.scenes.geometry.lighting import judge_light
 from unmix_plugin.scenes.geometry.pose_check import check_scene_poses
 from unmix_plugin.scenes.identity import scene_identity
 from unmix_plugin.scenes.pixel_rays import PixelRays
@@ -187,8 +187,8 @@ class HyperspectralDataManager(DataManager):
         }
 
     def initial_data(self) -> Mapping[str, np.ndarray]:
-        """`pixels`: spectra pooled over all training views; `reachable`: where something may be; `light_moves`: whether
-        the light moves with the camera, as far as pictures with alpha tell.
+        """`pixels`: spectra pooled over all training views; `reachable`: where something may be; `light`: fixed,
+        camera or per-view, as far as pictures with alpha tell.
 
         Of a rig, pixels of the sensor with most channels, and of those the one with most pixels; `sensor`, which that
         is; and `typical`, a spectrum on all bands that fits the mean of each sensor's pixels.
@@ -205,7 +205,7 @@ class HyperspectralDataManager(DataManager):
         found = {
             "pixels": self._pixels.sample_opaque(chosen, most, seed),
             "reachable": reachable,
-            "light_moves": np.array(self.scene.has_alpha and self._light_moves(reachable)),
+            "light": np.array(self._light(reachable) if self.scene.has_alpha else "fixed"),
         }
         if not self.scene.is_rig:
             return found
@@ -271,10 +271,10 @@ class HyperspectralDataManager(DataManager):
     def _grid_resolution(self) -> int:
         return choose(self.options.grid_resolution, self._preset.grid_resolution)
 
-    def _light_moves(self, reachable: Bool[np.ndarray, "R R R"]) -> bool:
+    def _light(self, reachable: Bool[np.ndarray, "R R R"]) -> str:
         """Judged by the views of the sensor that took most."""
         views, seen = self._evidence.log_brightness()
-        return light_moves(self.train_cameras[views], seen, reachable, self.scene_box)
+        return judge_light(self.train_cameras[views], seen, reachable, self.scene_box)
 
 
 def _load(folder: Path, options: SceneOptions) -> Scene:

@@ -22,8 +22,14 @@ from unmix_plugin.spectral.unmixing.endmembers import EndmemberMethod, drop_unin
 from unmix_plugin.spectral.unmixing.num_materials import propose_num_materials
 from unmix_plugin.training_losses import LossConfig
 
+Light = Literal["fixed", "camera", "per-view"]
+
 _USUAL_ENDMEMBERS = 6
 _PIXELS_TO_COUNT_BY = 20_000
+_WHY_LIGHT = {
+    "camera": "the light moves with the camera: brightness depends on the direction of view",
+    "per-view": "views differ in exposure: training finds a gain for each (--light fixed leaves them out)",
+}
 
 
 def _model() -> type[Model]:
@@ -52,9 +58,9 @@ class UnmixModelConfig(ModelConfig):
     come the endmembers', as light that they send on has. Auto is 1 where alpha is known, else all."""
     train_endmembers: bool = True
     """Whether endmembers change while training; else they stay the first guess, or the spectra from a file."""
-    light: Annotated[Literal["fixed", "camera", "per-view"] | Auto, Common, short("light")] = "auto"
+    light: Annotated[Light | Auto, Common, short("light")] = "auto"
     """Light that is fixed, that moves with the camera (objects turned before camera and lamp), or that differs from
-    view to view (also exposure). Auto finds which of the first two it is, and takes fixed without alpha."""
+    view to view (also exposure). Auto finds which it is, and takes fixed without alpha."""
     segmentation: SegmentationMethod = "abundances"
     """Material of a ray: its largest abundance, or the endmember of smallest angle to its spectrum as published."""
     samples_per_step: int = 30_000
@@ -120,10 +126,10 @@ class UnmixModelConfig(ModelConfig):
                     f"the scene is dark: training compares spectra multiplied by {exposure:.3g} (exposure)"
                 )
         if self.light == "auto":
-            moves = bool(initial_data().get("light_moves", False))
-            found = replace(found, light="camera" if moves else "fixed")
-            if moves:
-                reasons.append("the light moves with the camera: brightness depends on the direction of view")
+            light: Light = initial_data().get("light", np.array("fixed")).item()
+            found = replace(found, light=light)
+            if light != "fixed":
+                reasons.append(_WHY_LIGHT[light])
         return found, "\n".join(reasons)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from unmix_plugin.scenes.geometry.lighting import local_log_brightness
+from unmix_plugin.scenes.geometry.hull_places import local_log_brightness
 from unmix_plugin.scenes.pixel_table import DrawnPixels, PixelTable
 from unmix_plugin.scenes.pixel_table.block import PixelBlock
 from unmix_plugin.spectral.evidence import alpha_trust, background_level, may_show_matter

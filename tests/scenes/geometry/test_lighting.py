@@ -7,12 +7,8 @@ import torch
 from tests.scenes.geometry.test_carving import BOX, FOCAL, SIDE, ball_matter, make_cameras
 from tests.scenes.scene_factory import ring_poses
 from unmix_plugin.scenes.geometry.carving import carve_box
-from unmix_plugin.scenes.geometry.lighting import (
-    foretold_share,
-    hull_places,
-    light_moves,
-    local_log_brightness,
-)
+from unmix_plugin.scenes.geometry.hull_places import hull_places, local_log_brightness, seen_places
+from unmix_plugin.scenes.geometry.lighting import foretold_share, gain_spread, judge_light, view_gains
 
 RADIUS = 0.6
 LAMP = np.array([0.8, 0.3, 0.52])
@@ -32,27 +28,57 @@ def ball_brightness(pose: np.ndarray, lamp: np.ndarray) -> np.ndarray:
     return np.where(beside < RADIUS**2, 0.1 + np.maximum(normals @ lamp, 0), 0.0)
 
 
-def foretold(follows_camera: bool, noise: float = 0.0) -> tuple[float, bool]:
+def ball_views(follows_camera: bool, noise: float = 0.0, log_gains: np.ndarray | None = None):
+    """Cameras, brightness and hull of a ball, as `seen_places` takes them."""
     poses = ring_poses(16)
     generator = np.random.default_rng(0)
     images = []
-    for pose in poses:
+    for index, pose in enumerate(poses):
         lamp = pose[:3, :3] @ LAMP if follows_camera else LAMP
         seen = ball_brightness(pose, lamp) * np.exp(noise * generator.normal(size=(SIDE, SIDE)))
+        seen *= 1.0 if log_gains is None else np.exp(log_gains[index])
         spectra = torch.from_numpy(np.repeat(seen[..., None], 3, axis=-1)).float()
         images.append(local_log_brightness(spectra, torch.from_numpy(seen > 0)))
     cameras = make_cameras(poses)
-    hull = carve_box(cameras, ball_matter(poses, RADIUS), BOX, 32)
-    arguments = (cameras, images, hull, BOX)
-    return foretold_share(*arguments), light_moves(*arguments)
+    return cameras, images, carve_box(cameras, ball_matter(poses, RADIUS), BOX, 32), BOX
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.5])
 def test_a_light_that_moves_with_the_camera_is_told_from_a_fixed_one(noise):
-    moving, fixed = foretold(True, noise), foretold(False, noise)
-    assert moving[0] > 0.1
-    assert fixed[0] < 0.0
-    assert (moving[1], fixed[1]) == (True, False)
+    moving, fixed = ball_views(True, noise), ball_views(False, noise)
+    assert foretold_share(moving[0], *seen_places(*moving)) > 0.1
+    assert foretold_share(fixed[0], *seen_places(*fixed)) < 0.0
+    assert (judge_light(*moving), judge_light(*fixed)) == ("camera", "fixed")
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.5])
+def test_views_of_different_exposure_are_told_from_views_of_one(noise):
+    log_gains = np.log(np.random.default_rng(1).uniform(0.8, 1.2, 16))
+    views = ball_views(False, noise, log_gains)
+    assert gain_spread(views[0], *seen_places(*views)) == pytest.approx(log_gains.std(), rel=0.5)
+    assert judge_light(*views) == "per-view"
+
+
+def test_gains_are_found_exactly_where_places_differ_by_nothing_else():
+    generator = np.random.default_rng(0)
+    log_gains = torch.from_numpy(generator.normal(size=8) * 0.2).float()
+    seen = torch.from_numpy(generator.normal(size=(100, 1))).float() + log_gains
+    seen[torch.from_numpy(generator.random((100, 8)) < 0.6)] = torch.nan
+    found = view_gains(seen)
+    torch.testing.assert_close(found, log_gains - log_gains.mean(), atol=1e-4, rtol=0)
+    seen[:, 3] = torch.nan
+    assert view_gains(seen).isnan().tolist() == [index == 3 for index in range(8)]
+
+
+def test_few_views_of_different_exposure_are_left_alone():
+    views = ball_views(False, log_gains=np.log(np.linspace(0.8, 1.2, 16)))
+    few = (views[0][:10], views[1][:10], *views[2:])
+    assert judge_light(*few) == "fixed"
+
+
+def test_a_light_that_moves_is_no_difference_of_exposure():
+    views = ball_views(True)
+    assert gain_spread(views[0], *seen_places(*views)) < 0.03
 
 
 def test_normals_of_a_hull_point_outwards():
@@ -67,5 +93,6 @@ def test_too_few_views_say_nothing():
     poses = ring_poses(6)
     blank = [np.zeros((SIDE, SIDE)) for _ in poses]
     hull = carve_box(make_cameras(poses), ball_matter(poses, RADIUS), BOX, 32)
-    assert foretold_share(make_cameras(poses), blank, hull, BOX) == 0.0
-    assert foretold_share(make_cameras(poses), blank, np.zeros((32, 32, 32), bool), BOX) == 0.0
+    dark = (make_cameras(poses), [image * np.nan for image in blank])
+    for shape in (hull, np.zeros((32, 32, 32), bool)):
+        assert judge_light(*dark, shape, BOX) == "fixed"

@@ -1,4 +1,4 @@
-"""Does the light move with the camera? Judged by the brightness of the hull's surface, before any training.
+"""Does the light move with the camera, or differ from view to view? Judged by the hull's surface, before any training.
 
 Where an object is turned before a fixed camera and lamp, the light follows the camera: a place gets brighter when it
 turns to the side of the image that the lamp stands on. Where the light is fixed to the object, a place looks about as
@@ -8,12 +8,16 @@ half of the views. If they foretell the changes in the other half, whichever way
 Functions that don't tell sides are left out: surfaces seen at a grazing angle look different under any light. So a
 lamp at the camera's very place is not found.
 
+Where exposures differ, all places of a view are brighter or darker than in other views, by the same factor: what one
+half of the places says of the views' gains, the other half says too, whichever way the places are halved. Highlights
+and errors of the hull change some places only.
+
 Notation: `P` places, `N` views, `F` functions of a normal, `V` values, `R` cells along an edge.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -22,91 +26,104 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
-from unmix_plugin.spectral.evidence import brightness
+from unmix_plugin.scenes.geometry.hull_places import Places, seen_places
+
+FoundLight = Literal["fixed", "camera", "per-view"]
 
 MOVING_SHARE = 0.015
 """Share of the changes of brightness that must be foretold in every half of the views. Two turntables have 0.03 and 0.2
 or more, three scenes with a fixed light none."""
-NUM_PLACES, FEWEST_VIEWS, FEWEST_PLACES = 2000, 4, 50
-"""Places that are followed, views of one half that must see each, and places that must be seen by so many."""
-LARGEST_HULL = 64
-"""Cells along an edge of the hull that places are taken from; finer ones are joined."""
-SMOOTHING_CELLS = 2.0
-"""Standard deviation of the blur of the hull from whose slope normals are taken."""
-LEAST_FACING = 0.35
-"""Cosine between normal and direction to the camera from which on a place is looked at."""
-CLEAR_CELLS, MOST_CELLS = 4.0, 64
-"""Way from a place, in cells, that is not checked for what stands in front of it; and how far it is checked."""
+LEAST_GAIN_SPREAD = 0.04
+"""Standard deviation of the views' log gains that both halves of the places must agree on. Seven scenes of one exposure
+have up to 0.02, since hulls are not surfaces; with gains of +-20 % all have 0.09 or more, with +-10 % 0.04 to 0.08."""
+FEWEST_VIEWS, FEWEST_PLACES = 4, 50
+"""Views that must see a place, of one half of them for a moving light; and places that must be seen by so many."""
+NUM_FITS, SMALLEST_ERROR = 10, 0.02
+"""Least squares fits of gains; and error of a place's log brightness below which it weighs no more."""
 
 
-@dataclass(frozen=True)
-class Places:
-    """Places on the surface of a hull."""
-
-    positions: Float[Tensor, "P 3"]
-    normals: Float[Tensor, "P 3"]
-    """Unit vectors, outwards."""
-
-
-def hull_places(hull: Bool[np.ndarray, "R R R"], box: SceneBox) -> Places:
-    """Evenly thinned-out cells on the surface of a hull, with their normals."""
-    from scipy import ndimage  # slow to import
-
-    inner = np.array(ndimage.binary_erosion(hull, border_value=1), dtype=bool)
-    surface = hull & ~inner
-    cells = np.argwhere(surface)
-    cells = cells[:: max(1, -(-len(cells) // NUM_PLACES))]
-    blurred = ndimage.gaussian_filter(hull.astype(np.float32), SMOOTHING_CELLS)
-    sides = np.array(hull.shape)
-    gradient = [np.asarray(part) for part in np.gradient(blurred)]
-    slopes = np.stack(gradient, axis=-1)[tuple(cells.T)] * (sides / box.size.numpy())
-    normals = torch.nn.functional.normalize(-torch.from_numpy(slopes).float(), dim=-1)
-    positions = box.aabb[0] + torch.from_numpy((cells + 0.5) / sides).float() * box.size
-    return Places(positions, normals)
-
-
-def light_moves(
+def judge_light(
     cameras: Cameras,
     log_brightness: list[Float[np.ndarray, "H W"]],
     hull: Bool[np.ndarray, "R R R"],
     box: SceneBox,
-) -> bool:
-    """Whether the light moves with the camera; False where too little is seen to tell. Arguments as below."""
-    return foretold_share(cameras, log_brightness, hull, box) > MOVING_SHARE
+) -> FoundLight:
+    """Which light the views were taken in; fixed where too little is seen to tell. Arguments as of `seen_places`."""
+    places, seen = seen_places(cameras, log_brightness, hull, box)
+    if foretold_share(cameras, places, seen) > MOVING_SHARE:
+        return "camera"
+    return "per-view" if gain_spread(cameras, places, seen) > LEAST_GAIN_SPREAD else "fixed"
 
 
-def foretold_share(
-    cameras: Cameras,
-    log_brightness: list[Float[np.ndarray, "H W"]],
-    hull: Bool[np.ndarray, "R R R"],
-    box: SceneBox,
-) -> float:
+def foretold_share(cameras: Cameras, places: Places, seen: Float[Tensor, "P N"]) -> float:
     """Least share of the changes of brightness that the other half of the views foretells; 0 if too little is seen.
 
     Args:
-        cameras: Of the views.
-        log_brightness: Of each view, NaN on pixels that say nothing: background, saturated ones.
-        hull: Cells that may be occupied, of the box.
+        places, seen: As `seen_places` gives them.
     """
-    hull = _coarse(hull)
-    places = hull_places(hull, box)
     if len(places.positions) == 0:
         return 0.0
-    seen, turned = [], []
-    for index, image in enumerate(log_brightness):
-        seen.append(_looked_up(cameras, index, image, places, hull, box))
-        turned.append(_smooth_functions(places.normals @ cameras.camera_to_world[index, :, :3]))
-    return _least_share(torch.stack(seen, dim=1), torch.stack(turned, dim=1), _halves(cameras))
+    rotations = cameras.camera_to_world[:, :, :3]
+    turned = _smooth_functions(torch.einsum("pi,nij->pnj", places.normals, rotations))
+    return _least_share(seen, turned, _halves(cameras))
 
 
-def _coarse(hull: Bool[np.ndarray, "R R R"]) -> Bool[np.ndarray, "r r r"]:
-    """The hull in fewer cells, each occupied if one of its parts is."""
-    factor = hull.shape[0] // LARGEST_HULL
-    if factor < 2 or hull.shape[0] % factor:
-        return hull
-    cells = hull.shape[0] // factor
-    joined = hull.reshape(cells, factor, cells, factor, cells, factor)
-    return np.asarray(joined.any(axis=(1, 3, 5)))
+def gain_spread(cameras: Cameras, places: Places, seen: Float[Tensor, "P N"]) -> float:
+    """Standard deviation of the views' log gains, as far as two halves of the places agree on them.
+
+    The least of the three ways to halve the places, along the axes; 0 if too little is seen. Gains that are a smooth
+    function of the camera's direction don't count: where brightness changes across a surface, a hull that is a little
+    too large looks as if they were there. Arguments as above.
+    """
+    enough = seen.isfinite().sum(dim=1) >= FEWEST_VIEWS
+    seen, positions = seen[enough], places.positions[enough]
+    if len(seen) < FEWEST_PLACES:
+        return 0.0
+    directions = torch.nn.functional.normalize(
+        cameras.camera_to_world[:, :, 3] - positions.mean(dim=0), dim=-1
+    )
+    smooth = _low_harmonics(directions)
+    shared = []
+    for half in (positions > positions.median(dim=0).values).T:
+        one, other = view_gains(seen[half]), view_gains(seen[~half])
+        both = one.isfinite() & other.isfinite()
+        left = int(both.sum()) - smooth.shape[1]
+        if left < FEWEST_VIEWS:
+            return 0.0
+        rest = _without(torch.stack([one[both], other[both]], dim=1), smooth[both])
+        shared.append(float(rest.prod(dim=1).sum()) / left)
+    return max(min(shared), 0.0) ** 0.5
+
+
+def view_gains(seen: Float[Tensor, "P N"]) -> Float[Tensor, " N"]:
+    """Logarithms of the views' gains, of mean 0, by which places look most alike; NaN where a view sees none.
+
+    Least absolute differences of what a place looks like, gains taken off, from its mean over views; by repeated least
+    squares, in which the places' means are eliminated.
+    """
+    known = seen.isfinite()
+    values, weights = torch.where(known, seen, 0.0).double(), known.double()
+    gains = values.new_zeros(seen.shape[1])
+    for _ in range(NUM_FITS):
+        shares = weights / weights.sum(dim=1, keepdim=True).clamp(min=1e-12)
+        means = (shares * values).sum(dim=1, keepdim=True)
+        system = torch.diag(weights.sum(dim=0)) - weights.T @ shares
+        gains = torch.linalg.pinv(system, hermitian=True) @ (weights * (values - means)).sum(dim=0)
+        lit = values - gains
+        errors = (lit - (shares * lit).sum(dim=1, keepdim=True)).abs()
+        weights = known / errors.clamp(min=SMALLEST_ERROR)
+    return torch.where(known.any(dim=0), gains, torch.nan).float()
+
+
+def _low_harmonics(directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N F"]:
+    """Polynomials up to second degree on the sphere; F is 9."""
+    x, y, z = directions.unbind(-1)
+    return torch.stack([torch.ones_like(x), x, y, z, x * y, y * z, z * x, x * x - y * y, z * z], dim=-1)
+
+
+def _without(values: Float[Tensor, "N V"], functions: Float[Tensor, "N F"]) -> Float[Tensor, "N V"]:
+    """What of values the functions can't fit."""
+    return values - functions @ torch.linalg.lstsq(functions, values, driver="gelsd").solution
 
 
 def _halves(cameras: Cameras) -> Bool[Tensor, "2 N"]:
@@ -118,58 +135,7 @@ def _halves(cameras: Cameras) -> Bool[Tensor, "2 N"]:
     return (along > along.median(dim=0).values).T
 
 
-def local_log_brightness(
-    spectra: Float[Tensor, "H W B"], counts: Bool[Tensor, "H W"]
-) -> Float[np.ndarray, "H W"]:
-    """Logarithm of the mean brightness of 3 x 3 pixels, of those that count; NaN where the middle one doesn't."""
-    from scipy import ndimage  # slow to import
-
-    seen = brightness(spectra.flatten(0, 1)).view(counts.shape)
-    known = (counts & (seen > 0)).numpy()
-    weights = ndimage.uniform_filter(known.astype(np.float32), 3)
-    means = ndimage.uniform_filter(np.where(known, seen.numpy(), 0.0), 3) / np.maximum(weights, 1e-6)
-    return np.where(known, np.log(np.where(known, means, 1.0)), np.nan)
-
-
-def _looked_up(
-    cameras: Cameras,
-    index: int,
-    image: Float[np.ndarray, "H W"],
-    places: Places,
-    hull: Bool[np.ndarray, "R R R"],
-    box: SceneBox,
-) -> Float[Tensor, " P"]:
-    """What a view shows of the places, NaN where it does not see them."""
-    coords, depths = cameras.project(places.positions, index)
-    pixels = coords.floor().long()
-    inside = (depths > 0) & (pixels >= 0).all(dim=-1)
-    inside &= (pixels < torch.tensor(cameras.size(index))).all(dim=-1)
-    towards = torch.nn.functional.normalize(cameras.camera_to_world[index, :, 3] - places.positions, dim=-1)
-    inside &= (towards * places.normals).sum(dim=-1) > LEAST_FACING
-    inside &= ~_is_hidden(places.positions, towards, hull, box)
-    columns, rows = torch.where(inside[:, None], pixels, 0).unbind(-1)
-    return torch.where(inside, torch.from_numpy(image).float()[rows, columns], torch.nan)
-
-
-def _is_hidden(
-    positions: Float[Tensor, "P 3"],
-    towards: Float[Tensor, "P 3"],
-    hull: Bool[np.ndarray, "R R R"],
-    box: SceneBox,
-) -> Bool[Tensor, " P"]:
-    """Places with hull before them."""
-    cells, kept = hull.shape[0], torch.from_numpy(hull)
-    cell = float(box.size.max()) / cells
-    hidden = torch.zeros(len(positions), dtype=torch.bool)
-    for steps in torch.arange(CLEAR_CELLS, MOST_CELLS):
-        unit = box.normalise(positions + steps * cell * towards)
-        inside = ((unit >= 0) & (unit < 1)).all(dim=-1)
-        x, y, z = (unit * cells).long().clamp(0, cells - 1).unbind(-1)
-        hidden |= inside & kept[x, y, z]
-    return hidden
-
-
-def _smooth_functions(normals: Float[Tensor, "P 3"]) -> Float[Tensor, "P F"]:
+def _smooth_functions(normals: Float[Tensor, "P N 3"]) -> Float[Tensor, "P N F"]:
     """Polynomials that change sign with x or y."""
     x, y, z = normals.unbind(-1)
     return torch.stack([x, y, x * z, y * z, x * y], dim=-1)
