@@ -38,6 +38,10 @@ class Hits:
     distances: Float[Tensor, " N"]
     """Along the ray; 1e30 where nothing is hit."""
 
+    def select(self, rows: Tensor) -> Hits:
+        """Hits of some of the rays: by a mask or by indices."""
+        return Hits(self.found[rows], self.triangles[rows], self.barycentric[rows], self.distances[rows])
+
 
 @dataclass(frozen=True)
 class SurfacePoints:
@@ -53,11 +57,6 @@ class SurfacePoints:
     def select(self, rows: Tensor) -> SurfacePoints:
         """Some of the points: by a mask or by indices."""
         return SurfacePoints(self.positions[rows], self.normals[rows], self.geometric_normals[rows])
-
-    def repeated(self, times: int) -> SurfacePoints:
-        """Each point `times` times, one after the other."""
-        parts = (self.positions, self.normals, self.geometric_normals)
-        return SurfacePoints(*(part.repeat_interleave(times, dim=0) for part in parts))
 
 
 class RayMesh:

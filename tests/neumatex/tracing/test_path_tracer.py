@@ -1,0 +1,289 @@
+"""The path tracer against closed forms, single strategies and finite differences."""
+
+import pytest
+import torch
+import trimesh
+from torch.testing import assert_close
+
+from tests.neumatex.simple_materials import Glossy, Lambert, Uniform, unit
+from unmix_plugin.neumatex.geometry.mesh import mesh_of
+from unmix_plugin.neumatex.geometry.ray_mesh import RayMesh
+from unmix_plugin.neumatex.lighting.built_in import built_in_environment
+from unmix_plugin.neumatex.lighting.environment import Environment, directions_of_pixels
+from unmix_plugin.neumatex.tracing.local_frames import LocalFrames
+from unmix_plugin.neumatex.tracing.path_tracer import reflected_radiance
+from unmix_plugin.neumatex.tracing.sample_points import SamplePoints
+
+GLOSSY = [0.4, 0.3, 0.2, 0.3, 0.5]
+
+
+def _rays(mesh):
+    return RayMesh(mesh_of(torch.tensor(mesh.vertices), torch.tensor(mesh.faces)))
+
+
+def _sphere(subdivisions=3):
+    return _rays(trimesh.creation.icosphere(subdivisions=subdivisions))
+
+
+def _two_spheres():
+    first, second = (trimesh.creation.icosphere(subdivisions=3, radius=0.5) for _ in range(2))
+    first.apply_translation((-0.5, 0, 0))
+    second.apply_translation((0.52, 0.1, 0.1))
+    return _rays(trimesh.util.concatenate([first, second]))
+
+
+def _white():
+    return Environment(torch.ones(8, 16, 3))
+
+
+def _generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def _seen(rays, count=200, origin=(0.3, -3.0, 0.4), seed=0):
+    """Points that a viewer outside (or inside) sees, and directions to the viewer."""
+    targets = 1.2 * torch.rand(count, 3, generator=_generator(seed)) - 0.6
+    origins = torch.tensor(origin).expand(count, 3)
+    directions = unit(targets - origins)
+    hits = rays.closest(origins, directions)
+    directions = directions[hits.found]
+    return rays.points(hits.select(hits.found), directions), -directions
+
+
+def _radiance(surface, rays, environment, points, to_eye, samples=64, bounces=1, seed=0):
+    return reflected_radiance(
+        surface,
+        rays,
+        environment,
+        points,
+        to_eye,
+        samples=samples,
+        bounces=bounces,
+        generator=_generator(seed),
+    )
+
+
+def test_white_furnace_of_a_convex_lambertian():
+    rays = _sphere(5)
+    points, to_eye = _seen(rays)
+    surface = Uniform(Lambert(), [1.0, 0.5, 0.0])
+    radiance = _radiance(surface, rays, _white(), points, to_eye, 256, bounces=3)
+    expected = torch.tensor([1.0, 0.5, 0.0]).expand_as(radiance)
+    # Facets hide a little of the hemispheres of interpolated normals.
+    assert_close(radiance, expected, atol=0.03, rtol=0)
+    assert_close(radiance.mean(dim=0), expected[0], atol=0.004, rtol=0)
+
+
+@pytest.mark.parametrize("bounces", [0, 1, 2])
+def test_bounces_within_a_closed_sphere_are_a_geometric_series(bounces):
+    """A hole of a known size lets light in; all of it comes from the hole's solid angle."""
+    sphere = trimesh.creation.icosphere(subdivisions=4)
+    middles = sphere.triangles_center
+    open_sphere = trimesh.Trimesh(sphere.vertices, sphere.faces[middles[:, 2] < 0.8], process=False)
+    hole = 1 - open_sphere.area / sphere.area
+    points, to_eye = _seen(_rays(open_sphere), count=3000, origin=(0.0, 0.0, 0.0))
+    below = points.positions[:, 2] < 0.75
+    albedo = torch.tensor([0.9, 0.6, 0.3])
+    radiance = _radiance(
+        Uniform(Lambert(), albedo),
+        _rays(open_sphere),
+        _white(),
+        points.select(below),
+        to_eye[below],
+        samples=16,
+        bounces=bounces,
+    )
+    # Inside a sphere every point sees every part under cos cos / (pi r^2) = 1 / area, so the irradiance is the same
+    # everywhere and each reflection keeps the albedo and the closed part.
+    closed = albedo * (1 - hole)
+    expected = albedo * hole * sum(closed**order for order in range(bounces + 1))
+    assert_close(radiance.mean(dim=0), expected, rtol=0.03, atol=0)
+
+
+def test_energy_is_not_made():
+    rays = _two_spheres()
+    points, to_eye = _seen(rays)
+    radiance = _radiance(
+        Uniform(Lambert(), [1.0] * 3), rays, _white(), points, to_eye, samples=256, bounces=6
+    )
+    assert radiance.max() < 1.05
+    direct = _radiance(Uniform(Lambert(), [1.0] * 3), rays, _white(), points, to_eye, samples=256, bounces=0)
+    assert direct.min() < 0.8  # one sphere shadows the other, which bounces make up for
+    assert_close(radiance.mean(), torch.tensor(1.0), atol=0.02, rtol=0)
+
+
+class _OnlyEnvironment(Glossy):
+    """Draws nothing itself."""
+
+    def sample(self, parameters, wo, uniforms):
+        return -cosine_below(uniforms)
+
+    def density(self, parameters, wi, wo):
+        return torch.zeros(len(wi))
+
+
+def cosine_below(uniforms):
+    return unit(uniforms + 0.1)
+
+
+class _NeverDrawn(Environment):
+    """Can't be drawn from."""
+
+    def sample(self, uniforms):
+        directions, density = super().sample(uniforms)
+        return directions, torch.zeros_like(density)
+
+    def density(self, directions):
+        return torch.zeros(len(directions))
+
+
+def test_both_strategies_together_agree_with_each_alone():
+    rays, light = _two_spheres(), built_in_environment("studio", 3, height=16)
+    points, to_eye = _seen(rays)
+    together = _radiance(Uniform(Glossy(), GLOSSY), rays, light, points, to_eye, 1024, bounces=0)
+    by_light = _radiance(Uniform(_OnlyEnvironment(), GLOSSY), rays, light, points, to_eye, 1024, bounces=0)
+    by_material = _radiance(
+        Uniform(Glossy(), GLOSSY), rays, _NeverDrawn(light.image), points, to_eye, 1024, bounces=0
+    )
+    mean = together.mean(dim=0)
+    assert_close(by_light.mean(dim=0), mean, rtol=0.01, atol=0)
+    assert_close(by_material.mean(dim=0), mean, rtol=0.01, atol=0)
+    errors = [(single - together).abs().mean() for single in (by_light, by_material)]
+    assert max(errors) < 0.1 * together.mean()
+
+
+def test_transport_is_reciprocal():
+    """Light from a small source far away in direction a, seen from b, equals light from b seen from a."""
+    rays, surface = _two_spheres(), Uniform(Lambert(), [0.8, 0.5, 0.2])
+    a, b = unit(torch.tensor([0.5, -1.0, 0.3])), unit(torch.tensor([-1.0, -0.4, 0.6]))
+    assert_close(_flux(rays, surface, a, b), _flux(rays, surface, b, a), rtol=0.03, atol=0)
+
+
+def _flux(rays, surface, light, eye):
+    """Radiance over the projected area that the eye sees, from a light of a few degrees; two reflections or one."""
+    frame = LocalFrames.about(eye[None])
+    x, y = torch.meshgrid(*2 * [torch.linspace(-1.3, 1.3, 120)], indexing="ij")
+    origins = 5 * eye + x.reshape(-1, 1) * frame.first + y.reshape(-1, 1) * frame.second
+    directions = -eye.expand_as(origins).contiguous()
+    hits = rays.closest(origins, directions)
+    points = rays.points(hits.select(hits.found), directions[hits.found])
+    spot = (directions_of_pixels(64, 128) @ light > 0.985).float()[..., None].expand(-1, -1, 3)
+    emitter = Environment(spot.contiguous())
+    power = emitter.mean_radiance().sum()
+    radiance = _radiance(surface, rays, emitter, points, eye.expand(len(points.normals), 3), 32, bounces=1)
+    return radiance.sum(dim=0) / power
+
+
+def test_gradients_are_those_of_finite_differences():
+    rays, light = _two_spheres(), built_in_environment("window-room", 1, height=16)
+    points, to_eye = _seen(rays, count=30)
+    values = torch.tensor(GLOSSY, requires_grad=True)
+    cotangent = torch.rand(len(to_eye), 3, generator=_generator(7))
+
+    def value(parameters):
+        # Densities come from the fixed material, reflectances from the changed one: the same paths in both.
+        family = _FixedDraws(values.detach())
+        return (_radiance(Uniform(family, parameters), rays, light, points, to_eye, 32) * cotangent).sum()
+
+    surface = Uniform(_FixedDraws(values.detach()), GLOSSY)
+    surface.values = values
+    loss = (_radiance(surface, rays, light, points, to_eye, 32) * cotangent).sum()
+    (gradient,) = torch.autograd.grad(loss, values)
+    step = 0.01
+    expected = torch.stack(
+        [
+            (value(values.detach() + step * unit_) - value(values.detach() - step * unit_)) / (2 * step)
+            for unit_ in torch.eye(5)
+        ]
+    )
+    assert_close(gradient, expected, rtol=5e-3, atol=1e-3 * float(expected.abs().max()))
+
+
+class _FixedDraws(Glossy):
+    """Draws as another material would, so that changed parameters leave the paths alone."""
+
+    def __init__(self, drawn_as):
+        self._drawn_as = drawn_as
+
+    def sample(self, parameters, wo, uniforms):
+        return super().sample(self._drawn_as.expand_as(parameters), wo, uniforms)
+
+    def density(self, parameters, wi, wo):
+        return super().density(self._drawn_as.expand_as(parameters), wi, wo)
+
+
+def test_gradient_of_the_mean_is_the_mean_of_gradients_with_moving_draws():
+    """The derivative without fixing draws is estimated without bias: compare with differences of good estimates."""
+    rays, light = _sphere(3), built_in_environment("overcast", 1, height=16)
+    points, to_eye = _seen(rays, count=60)
+    values = torch.tensor(GLOSSY, requires_grad=True)
+    surface = Uniform(Glossy(), GLOSSY)
+    surface.values = values
+    (gradient,) = torch.autograd.grad(_radiance(surface, rays, light, points, to_eye, 512).mean(), values)
+    step = 0.1 * torch.tensor([0.0, 0, 0, 0, 1.0])
+    up, down = (
+        _radiance(Uniform(Glossy(), values.detach() + s * step), rays, light, points, to_eye, 2048).mean()
+        for s in (1, -1)
+    )
+    assert_close(gradient[4], (up - down) / 0.2, rtol=0.08, atol=2e-4)
+
+
+def test_two_calls_are_independent_and_a_seed_repeats():
+    rays, light = _sphere(2), built_in_environment("studio", 0, height=16)
+    points, to_eye = _seen(rays)
+    surface, generator = Uniform(Glossy(), GLOSSY), _generator(4)
+    first, second = (
+        reflected_radiance(surface, rays, light, points, to_eye, samples=4, generator=generator)
+        for _ in range(2)
+    )
+    again = _radiance(surface, rays, light, points, to_eye, samples=4, seed=4)
+    assert torch.equal(first, again)
+    truth = _radiance(surface, rays, light, points, to_eye, samples=2048, seed=9)
+    errors = torch.stack([(first - truth)[:, 0], (second - truth)[:, 0]])
+    assert torch.corrcoef(errors)[0, 1].abs() < 0.2
+
+
+def test_nothing_seen_gives_nothing():
+    rays = _sphere(1)
+    points, to_eye = _seen(rays, origin=(0.0, 0.0, 9.0))
+    nothing = torch.zeros(0, dtype=torch.int64)
+    radiance = _radiance(
+        Uniform(Lambert(), [1.0] * 3), rays, _white(), points.select(nothing), to_eye[nothing]
+    )
+    assert radiance.shape == (0, 3)
+
+
+def test_colours_must_agree():
+    rays = _sphere(1)
+    points, to_eye = _seen(rays)
+    with pytest.raises(ValueError, match="environment has 5 colours, the materials have 3"):
+        _radiance(Uniform(Lambert(), [1.0] * 3), rays, Environment(torch.ones(4, 8, 5)), points, to_eye)
+
+
+def test_numbers_are_uniform_and_even():
+    numbers = SamplePoints.draw(3, 64, 2, _generator(), torch.device("cpu"))
+    drawn = numbers.of(torch.arange(3 * 64), 1)
+    assert drawn.shape == (192, 5)
+    for point in range(3):
+        for dimension in range(5):
+            counts = torch.histc(drawn[64 * point : 64 * (point + 1), dimension], 16, 0, 1)
+            assert counts.min() >= 2
+            assert counts.max() <= 6
+
+
+def test_digits_within_an_even_spread_are_random():
+    """A table of as many bins as samples sees a different part of each bin."""
+    drawn = SamplePoints.draw(1, 1024, 1, _generator(), torch.device("cpu")).of(torch.arange(1024), 0)
+    within = (drawn[:, 0] * 1024) % 1
+    assert_close(within.std(), torch.tensor(12**-0.5, dtype=torch.float64), atol=0.02, rtol=0)
+
+
+def test_local_frames_are_orthonormal_and_invert():
+    normals = unit(torch.randn(500, 3, generator=_generator()))
+    normals[:2] = torch.tensor([[0.0, 0, 1], [0, 0, -1]])
+    frames = LocalFrames.about(normals)
+    axes = torch.stack([frames.first, frames.second, frames.normals], dim=1)
+    assert_close(axes @ axes.mT, torch.eye(3).expand(500, 3, 3), atol=1e-5, rtol=0)
+    assert_close(torch.linalg.det(axes), torch.ones(500), atol=1e-5, rtol=0)
+    vectors = torch.randn(500, 3, generator=_generator(1))
+    assert_close(frames.to_world(frames.to_local(vectors)), vectors, atol=1e-5, rtol=0)
