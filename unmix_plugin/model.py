@@ -242,7 +242,8 @@ class UnmixModel(Model):
         threshold = choose(self.config.renderer.visible_weight, self.preset.visible_weight)
         if threshold < 1:
             is_seen = outputs["weights"] > threshold
-            self.grid.visibility.record(outputs["positions"], outputs["views"], is_seen, num_rays)
+            in_all = num_rays * self.processes.count
+            self.grid.visibility.record(outputs["positions"], outputs["views"], is_seen, in_all)
         if self.config.losses.abundances == 0:
             return
         for part in split_parts(outputs, batch, self.seen_by.num_channels):
@@ -299,7 +300,7 @@ class UnmixModel(Model):
     def next_num_rays(self, outputs: dict[str, Tensor], current: int) -> int | None:
         """Half of the way to the rays with which a step would march `samples_per_step`."""
         samples_a_ray = max(self.num_samples(outputs) / current, 1.0)
-        wanted = self.config.samples_per_step / samples_a_ray
+        wanted = self.config.samples_per_step / self.processes.count / samples_a_ray
         return int(min(max((current + wanted) / 2, _FEWEST_RAYS), _MOST_RAYS))
 
     def warm_up(self) -> None:
@@ -329,7 +330,9 @@ class UnmixModel(Model):
         if step % _GRID_INTERVAL:
             return
         box = self.renderer.box
-        seed = int(torch.randint(2**62, (1,), generator=self.generator, device=self._generator_device))
+        drawn = torch.randint(2**62, (1,), generator=self.generator, device=self._generator_device)
+        seed = int(self.processes.of_first(drawn))  # each process probes the same cells
+        self._share_observations()
         self.grid.update(
             lambda points: self.field.get_density(points * box.size + box.aabb[0])[0],
             threshold=-math.log1p(-_OCCUPIED_OPACITY) / self._training_step,
@@ -337,6 +340,14 @@ class UnmixModel(Model):
             num_cells=_PROBED_CELLS,
             generator=torch.Generator().manual_seed(seed),
         )
+
+    def _share_observations(self) -> None:
+        """Take in what the processes that train together observed; twice is as good as once."""
+        visibility = self.grid.visibility
+        self.processes.smallest(visibility.lowest_view)
+        self.processes.largest(visibility.highest_view)
+        self.processes.largest(visibility.num_rays)
+        self.processes.mean(self.guide.margin_variance)
 
     @property
     def _generator_device(self) -> torch.device:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from unmix_plugin.commands.entry import INTERRUPTED, run_command
 from unmix_plugin.commands.train_arguments import PROGRAM, overview, parse_all
 from unmix_plugin.engine.configs import TrainerConfig
+from unmix_plugin.engine.processes.joining import are_started
 from unmix_plugin.engine.registry import discover_methods
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.viewer.options import TrainingViewerOptions
@@ -18,6 +19,7 @@ from unmix_plugin.viewer.options import TrainingViewerOptions
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from unmix_plugin.engine.processes.processes import Processes
     from unmix_plugin.engine.training.trainer import Trainer
     from unmix_plugin.scenes.scene import Scene
 
@@ -30,6 +32,7 @@ def train(argv: list[str]) -> None:
         SystemExit: help was asked for (0), arguments that do not parse (2), or a stop on request (130).
     """
     from unmix_plugin.engine.training.progress import ProgressConsole
+    from unmix_plugin.engine.training.training_steps import follow_training, joined
 
     methods, broken = discover_methods()
     for plugin in broken:
@@ -38,20 +41,28 @@ def train(argv: list[str]) -> None:
         print(overview(methods))
         return
     config, viewing = parse_all(argv)
-    console = ProgressConsole()
-    trainer = _prepared(config, console)
-    with _shown(trainer, viewing, console):
-        _run(trainer, console)
-    print(f"run: {trainer.run.path}", flush=True)
+    if config.machine.num_devices > 1 and not are_started():
+        from unmix_plugin.engine.processes.launching import run_processes
+
+        sys.exit(run_processes("unmix_plugin.commands.train", argv, config.machine.num_devices))
+    with joined(config) as processes:
+        if not processes.is_first:
+            follow_training(config, processes)
+            return
+        console = ProgressConsole()
+        trainer = _prepared(config, console, processes)
+        with _shown(trainer, viewing, console):
+            _run(trainer, console)
+        print(f"run: {trainer.run.path}", flush=True)
 
 
-def _prepared(config: TrainerConfig, console: Console) -> Trainer:
+def _prepared(config: TrainerConfig, console: Console, processes: Processes) -> Trainer:
     """The trainer, with everything read and compiled that training needs."""
     from unmix_plugin.commands.reporting import announce_kernel_compilation, say, working
     from unmix_plugin.engine.training.trainer import Trainer
 
     with nullcontext() if config.data is None else working(console, f"reading {config.data}"):
-        trainer = Trainer(config, console=console)
+        trainer = Trainer(config, console=console, processes=processes)
     if trainer.pipeline.reasons:
         say(console, trainer.pipeline.reasons)
     with announce_kernel_compilation(console):
@@ -161,3 +172,7 @@ def _write_endmembers(trainer: Trainer) -> None:
 def main() -> None:
     """Console script."""
     run_command(train)
+
+
+if __name__ == "__main__":
+    main()

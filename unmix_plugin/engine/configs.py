@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from unmix_plugin.engine.instantiate import Common, InstantiateConfig, Target
+from unmix_plugin.engine.instantiate import Common, InstantiateConfig, Target, require_in_range
 from unmix_plugin.engine.pipeline import PipelineConfig
 from unmix_plugin.engine.training.optimizers import OptimizerConfig
 from unmix_plugin.errors import ConfigError
@@ -17,6 +17,23 @@ __all__ = ["DeviceName", "InstantiateConfig", "OptimizerConfig", "Target", "Trai
 
 DeviceName = Literal["auto", "cpu", "cuda"]
 """`auto` is CUDA where there is one."""
+
+
+@dataclass(frozen=True)
+class MachineConfig:
+    """On what to train."""
+
+    num_devices: int = 1
+    """Processes that share the rays of each step, on CUDA each on a device of its own, on the CPU each with a part of
+    the cores. Several machines: start them with torchrun, which says how many there are."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible numbers.
+
+        Raises:
+            ConfigError: out of range.
+        """
+        require_in_range("machine.num_devices", self.num_devices, 1, 1024)
 
 
 @dataclass(frozen=True)
@@ -50,6 +67,8 @@ class TrainerConfig:
     training it decays faster, to span at most about a ninth of the steps so far. None: no average."""
     load_run: Annotated[Path | None, Common] = None
     """Run folder to continue instead of starting a new one."""
+    machine: MachineConfig = MachineConfig()
+    """Devices and processes."""
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)
     """Data and model."""
     optimizers: Mapping[str, OptimizerConfig] = field(default_factory=dict)

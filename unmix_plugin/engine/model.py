@@ -16,6 +16,7 @@ from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.engine.instantiate import InstantiateConfig, Target, require_in_range
 from unmix_plugin.engine.outputs import Output
+from unmix_plugin.engine.processes.processes import ALONE, Processes
 from unmix_plugin.engine.training.callbacks import TrainingCallback
 from unmix_plugin.errors import ConfigError
 
@@ -69,6 +70,9 @@ class Model(nn.Module, ABC):
         self.generator: torch.Generator | None = None
         """Source of every random draw of a training step, on the model's device, seeded by the trainer from (seed,
         step); None is torch's global one."""
+        self.processes: Processes = ALONE
+        """That train this model together. `next_num_rays` says what this one should have, a `count`-th of the rays of a
+        step; what is learnt without gradients is made equal by the model itself."""
         self.populate_modules()
 
     @property

@@ -18,6 +18,8 @@ from unmix_plugin.engine.training.seeding import step_generator, step_seed
 
 MODEL_STREAM = 1
 """Stream of randomness of the model's own draws in a step; data managers draw from stream 0."""
+_PROCESS_STREAM = 2
+"""From which the other processes of a training take their seeds."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,11 @@ class Pipeline(nn.Module):
             self.model.initialise(self.datamanager.initial_data(), torch.Generator().manual_seed(self.seed))
         warnings = [f"warning: {warning}" for warning in self.datamanager.warnings()]
         self.reasons = "\n".join(filter(None, [self.reasons, *warnings]))
+
+    def draw_as(self, rank: int) -> None:
+        """Draw the rays of process number `rank` from now on; those of the first are the ones of a single process."""
+        if rank > 0:
+            self.seed = self.datamanager.seed = step_seed(self.seed, rank, _PROCESS_STREAM)
 
     def seed_step(self, step: int) -> None:
         """Make everything that the model draws in training step `step` a function of (seed, step)."""

@@ -53,7 +53,7 @@ class VisibleCells(nn.Module):
             points: Samples in the unit cube.
             views: Number of the view of each.
             seen: Samples that send enough of their ray's light to the camera.
-            num_rays: Rays that the samples are of.
+            num_rays: Rays that the samples are of; of all processes, where several train together.
         """
         _, side_y, side_z = self.visible.shape
         x, y, z = cells_at(points, self.visible.shape).unbind(-1)

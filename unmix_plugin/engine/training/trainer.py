@@ -10,8 +10,7 @@ from rich.console import Console
 from torch import Tensor
 
 from unmix_plugin.engine.configs import TrainerConfig
-from unmix_plugin.engine.devices import resolve_device
-from unmix_plugin.engine.pipeline import Pipeline
+from unmix_plugin.engine.processes.processes import ALONE, Processes
 from unmix_plugin.engine.runs.checkpoints import checkpoint_steps, save_checkpoint
 from unmix_plugin.engine.runs.config_json import config_to_json
 from unmix_plugin.engine.runs.load_run import require_checkpoint, require_data, write_config
@@ -20,22 +19,18 @@ from unmix_plugin.engine.runs.run_folder import RunFolder, create_run_folder, op
 from unmix_plugin.engine.runs.run_lock import RunLock
 from unmix_plugin.engine.runs.scene_record import check_same_scene, read_scene_record, scene_record_to_json
 from unmix_plugin.engine.training.averages import AVERAGE_INTERVAL, ParameterAverage
-from unmix_plugin.engine.training.callbacks import TrainingCallbackLocation, run_callbacks
-from unmix_plugin.engine.training.guards import GradientGuard
 from unmix_plugin.engine.training.interrupts import Interrupted, StopSignals
 from unmix_plugin.engine.training.limits import Limits, TrainingClock
 from unmix_plugin.engine.training.memory import keep_freed_memory
-from unmix_plugin.engine.training.optimizers import build_optimizer, set_learning_rates
 from unmix_plugin.engine.training.progress import ProgressConsole, ProgressDisplay, TrainingStatus
-from unmix_plugin.engine.training.seeding import seed_everything
 from unmix_plugin.engine.training.training_control import TrainingControl
 from unmix_plugin.engine.training.training_state import (
     AVERAGE,
     TrainingRecord,
     collect_tensors,
     part,
-    restore_training,
 )
+from unmix_plugin.engine.training.training_steps import prepare_steps
 from unmix_plugin.engine.training.writers import MetricsWriter, RunLog
 from unmix_plugin.errors import RunError
 
@@ -48,7 +43,12 @@ class Trainer:
     """
 
     def __init__(
-        self, config: TrainerConfig, *, console: Console | None = None, control: TrainingControl | None = None
+        self,
+        config: TrainerConfig,
+        *,
+        console: Console | None = None,
+        control: TrainingControl | None = None,
+        processes: Processes = ALONE,
     ) -> None:
         """Read the scene, make the model, then make the run folder or reopen the one in `config.load_run`.
 
@@ -56,43 +56,35 @@ class Trainer:
             config: All settings; to resume, `load_config(path)`, in which limits may be changed.
             console: Where progress is shown; standard output if None.
             control: Through which other threads watch and steer this training.
+            processes: That train together, of which this is the first; the others call `follow_training`.
         Raises:
             SceneError, ConfigError: scene or settings are wrong; nothing has been written.
             RunError: the run to resume is unusable, or the folder can't be made.
         """
         config_to_json(config)  # settings that can't be written down are refused before anything is
-        self.config = _with_absolute_data(config)
         self.console = console or ProgressConsole()
         self.control = control or TrainingControl()
+        self.processes = processes
         keep_freed_memory()
-        device = resolve_device(config.device)
-        seed_everything(config.seed)
-        resumed = None if config.load_run is None else open_run_folder(config.load_run)
-        self.pipeline: Pipeline = config.pipeline.setup(
-            data=require_data(self.config), device=device, seed=config.seed
-        )
-        self.config = replace(self.config, pipeline=self.pipeline.config)
-        if resumed is None:
-            self.pipeline.initialise()
-        self.optimizer = build_optimizer(self.pipeline.get_param_groups(), config.optimizers)
-        self.guard = GradientGuard(self.optimizer)
-        self.callbacks = self.pipeline.get_training_callbacks()
+        with processes.together():
+            resumed = None if config.load_run is None else open_run_folder(config.load_run)
+            self.config, self.steps = prepare_steps(_with_absolute_data(config), processes)
+        self.pipeline, self.optimizer = self.steps.pipeline, self.steps.optimizer
+        self.callbacks, self.guard = self.steps.callbacks, self.steps.guard
         self.limits = Limits(config.max_num_iterations, config.max_seconds)
         self.clock = TrainingClock()
         self.step = 0
         """Training steps done."""
         self.total_rays = 0
-        self.learning_rates: dict[str, float] = {}
         self.average = self._new_average()
         self._saved_step: int | None = None
-        self.run = self._new_run() if resumed is None else resumed
-        self.log = RunLog(self.run)
-        if resumed is not None:
-            self._resume()
+        with processes.together():
+            self.run = self._new_run() if resumed is None else resumed
+            self.log = RunLog(self.run)
+            if resumed is not None:
+                self._resume()
         self.writer = MetricsWriter(self.run, self.step)
-        self.log.write(f"{'resumed' if resumed else 'started'} on {device}, torch {torch.__version__}")
-        for line in self.pipeline.reasons.splitlines():
-            self.log.write(line)
+        self._log_start("started" if resumed is None else "resumed")
 
     @property
     def progress(self) -> float:
@@ -107,10 +99,10 @@ class Trainer:
             train_seconds=self.clock.seconds,
             total_rays=self.total_rays,
             skipped_steps=self.guard.skipped,
-            num_rays=self.pipeline.datamanager.get_train_rays_per_batch(),
+            num_rays=self.steps.num_rays,
             average_updates=0 if self.average is None else self.average.updates,
             progress=self.progress,
-            learning_rates=self.learning_rates,
+            learning_rates=self.steps.learning_rates,
         )
 
     def train(self) -> TrainingRecord:
@@ -125,6 +117,7 @@ class Trainer:
         try:
             with self.control.device.training_turn():
                 self.pipeline.model.warm_up()
+            self.steps.begin(self.step)
             with StopSignals() as stop, ProgressDisplay(self.console) as display, self.control.running():
                 self._loop(stop, display)
         except KeyboardInterrupt as error:
@@ -177,6 +170,7 @@ class Trainer:
             elif self.control.wait_while_paused():
                 with self.control.device.training_turn():
                     self.save()
+        self.processes.announce(None)
         with self.control.device.training_turn():
             self.save()
         if not self._is_at_limit:
@@ -205,32 +199,16 @@ class Trainer:
     def _train_step(self) -> tuple[float, dict[str, Tensor]]:
         """One step; its loss, and all losses and metrics without their graphs."""
         with self.clock.running():
-            progress, step, datamanager = self.progress, self.step, self.pipeline.datamanager
-            num_rays = datamanager.get_train_rays_per_batch()
-            self.pipeline.train()  # a guest may have left it in evaluation mode
-            self.pipeline.seed_step(step)
-            self.learning_rates = set_learning_rates(self.optimizer, self.config.optimizers, progress)
-            run_callbacks(self.callbacks, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, step, progress)
-            outputs, losses, metrics = self.pipeline.get_train_loss_dict(step)
-            total = torch.stack(list(losses.values())).sum()
-            self.optimizer.zero_grad(set_to_none=True)
-            total.backward()
-            is_finite, loss = self.guard.check(total)
-            if is_finite:
-                self.optimizer.step()
-            else:
-                self.log.write(f"step {step} skipped: non-finite loss ({loss:g}) or gradient")
+            step, progress = self.step, self.progress
+            self.processes.announce(progress)
+            result = self.steps.take(step, progress)
             self.step += 1
-            self.total_rays += num_rays
-            run_callbacks(self.callbacks, TrainingCallbackLocation.AFTER_TRAIN_ITERATION, step, progress)
+            self.total_rays += result.num_rays
             if self.average is not None:
                 self.average.update(self.step)  # after the callbacks, which keep parameters in their bounds
-            next_num_rays = self.pipeline.model.next_num_rays(outputs, num_rays)
-            if next_num_rays is not None:
-                datamanager.set_train_rays_per_batch(next_num_rays)
-        counts = {"num_rays": num_rays, "num_samples": self.pipeline.model.num_samples(outputs)}
-        detached = {name: value.detach() for name, value in {**losses, **metrics}.items()}
-        return loss, {**detached, **{name: torch.tensor(float(count)) for name, count in counts.items()}}
+        if result.is_refused:
+            self.log.write(f"step {step} skipped: non-finite loss ({result.loss:g}) or gradient")
+        return result.loss, result.values
 
     def _evaluate(self, display: ProgressDisplay) -> None:
         if not self._is_time_for(self.config.steps_per_eval_all_images):
@@ -243,7 +221,7 @@ class Trainer:
         display.message(f"step {self.step}: evaluation views: {found}")
 
     def _write_metrics(self, loss: float, values: Mapping[str, Tensor]) -> None:
-        rates = {f"lr/{name}": rate for name, rate in self.learning_rates.items()}
+        rates = {f"lr/{name}": rate for name, rate in self.steps.learning_rates.items()}
         numbers = {name: float(value) for name, value in values.items()}
         speed = {
             "rays_per_second": self.record.train_rays_per_second,
@@ -258,6 +236,13 @@ class Trainer:
 
     def _is_time_for(self, interval: int) -> bool:
         return interval > 0 and self.step % interval == 0
+
+    def _log_start(self, how: str) -> None:
+        count = self.processes.count
+        together = f", {count} processes" if count > 1 else ""
+        self.log.write(f"{how} on {self.pipeline.model.device}, torch {torch.__version__}{together}")
+        for line in self.pipeline.reasons.splitlines():
+            self.log.write(line)
 
     def _new_average(self) -> ParameterAverage | None:
         if self.config.average_decay is None:
@@ -280,12 +265,9 @@ class Trainer:
         require_checkpoint(self.run)  # before anything is written
         self._lock = RunLock(self.run.lock_path)
         checkpoint = require_checkpoint(self.run)  # another training may have saved one since
-        restore_training(checkpoint.tensors, self.pipeline.model, self.optimizer, datamanager)
-        record = TrainingRecord.from_json(checkpoint.record)
-        datamanager.set_train_rays_per_batch(record.num_rays)
+        record = self.steps.restore(checkpoint)
         self.step = self._saved_step = record.steps
-        self.total_rays, self.learning_rates = record.total_rays, record.learning_rates
-        self.guard.skipped = record.skipped_steps
+        self.total_rays = record.total_rays
         self.clock = TrainingClock(record.train_seconds)
         self.average = self._new_average()
         averaged = part(checkpoint.tensors, AVERAGE)

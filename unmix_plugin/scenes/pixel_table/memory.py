@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 
+from unmix_plugin.engine.processes.joining import processes_here
 from unmix_plugin.scenes.pixel_table.block import PixelBlock
 
 _GIB = 2**30
@@ -47,6 +48,8 @@ def pool_bytes(blocks: tuple[PixelBlock, ...], device: torch.device, memory_gb: 
         budget = int(memory_gb * _GIB)
         return None if needed <= budget else budget
     available = available_bytes(device)
+    if available is not None and device.type == "cpu":
+        available //= processes_here()
     if available is None or needed <= _USABLE_SHARE * available:
         return None
     return min(_LARGEST_POOL, int(_USABLE_SHARE * available))

@@ -1,0 +1,86 @@
+"""What several processes that train one model owe each other."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.engine.processes.worker import STEPS, config_for, fixed_batch
+from unmix_plugin.engine.processes.launching import run_processes
+from unmix_plugin.engine.processes.processes import ALONE, Processes
+from unmix_plugin.engine.training.trainer import Trainer
+from unmix_plugin.engine.training.training_steps import prepare_steps
+from unmix_plugin.errors import ConfigError
+
+MODULE = "tests.engine.processes.worker"
+
+
+@pytest.fixture
+def run(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+    """Runs an action in two processes: exit code, standard error and what each process kept."""
+
+    def run_action(action: str) -> tuple[int, str, list[dict[str, torch.Tensor]]]:
+        code = run_processes(MODULE, [str(tmp_path), action], 2)
+        kept = [torch.load(path) for path in sorted(tmp_path.glob("rank-*.pt"))]
+        return code, capfd.readouterr().err, kept
+
+    return run_action
+
+
+def test_the_gradient_of_a_batch_is_that_of_one_process(run, tmp_path: Path):
+    code, errors, (first, second) = run("gradients")
+    assert code == 0, errors
+    _, steps = prepare_steps(config_for(tmp_path))
+    rays, batch = fixed_batch(steps.pipeline)
+    losses = steps.pipeline.model.get_loss_dict(steps.pipeline.model(rays), batch)
+    loss = torch.stack(list(losses.values())).sum()
+    loss.backward()
+    assert torch.allclose(first["loss"], loss.detach(), rtol=1e-6)
+    for name, parameter in steps.pipeline.model.named_parameters():
+        assert parameter.grad is not None
+        assert torch.equal(first[name], second[name])
+        scale = float(parameter.grad.abs().max())
+        torch.testing.assert_close(first[name], parameter.grad, rtol=0, atol=1e-6 * scale)
+
+
+def test_two_processes_go_on_where_one_stopped_and_end_with_the_same_model(run, tmp_path: Path):
+    Trainer(config_for(tmp_path)).train()
+    (training,) = (tmp_path / "outputs").glob("*/*/*/training.json")
+    assert json.loads(training.read_text())["steps"] == STEPS
+    code, errors, (first, second) = run("resume")
+    assert code == 0, errors
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    assert json.loads(training.read_text())["steps"] == STEPS + 10
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        ("other-seed", "process 2 of 2 has seed 5, the first has 4; start all with the same arguments"),
+        ("no-scene", "process 2 of 2: no scene: give its folder with --data"),
+        ("die", "can't reach the others, one of which has ended; what was saved before is whole"),
+    ],
+)
+def test_a_failure_anywhere_ends_all_with_one_message(run, action: str, message: str):
+    code, errors, kept = run(action)
+    assert (code, kept) == (2, [])
+    lines = [line for line in errors.splitlines() if line.startswith(("error:", "this is a bug"))]
+    assert len(lines) == 1, errors
+    assert message in lines[0]
+
+
+def test_more_processes_than_rays_are_refused(tmp_path: Path):
+    _, steps = prepare_steps(config_for(tmp_path))
+    steps.processes = Processes(0, 4)
+    with pytest.raises(ConfigError, match="4 processes for 3 rays a step; use fewer processes"):
+        steps.share_rays(3)
+
+
+def test_alone_nothing_is_exchanged():
+    values = torch.tensor([1.0, 2.0])
+    assert ALONE.is_first
+    assert ALONE.gather("word") == ["word"]
+    assert ALONE.announce(0.5) == 0.5
+    for unchanged in (ALONE.mean, ALONE.smallest, ALONE.largest, ALONE.of_first):
+        assert torch.equal(unchanged(values), torch.tensor([1.0, 2.0]))

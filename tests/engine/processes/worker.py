@@ -1,0 +1,111 @@
+"""A process of a training of the second method, as the tests start it: `worker.py FOLDER ACTION`.
+
+Each process writes what its model has at the end to FOLDER/rank-N.pt.
+"""
+
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from tests.engine.rgb_nerf_plugin import rgb_nerf
+from unmix_plugin.commands.entry import run_command
+from unmix_plugin.engine.pipeline import Pipeline
+from unmix_plugin.engine.runs import load_run
+from unmix_plugin.engine.training.trainer import Trainer
+from unmix_plugin.engine.training.training_steps import (
+    TrainingSteps,
+    follow_training,
+    joined,
+    prepare_steps,
+)
+
+STEPS = 12
+
+
+def config_for(folder: Path) -> Any:
+    """A short training of the second method."""
+    scene = folder / "ball"
+    scene.mkdir(exist_ok=True)
+    return replace(
+        rgb_nerf.config,
+        data=scene,
+        output_dir=folder / "outputs",
+        max_num_iterations=STEPS,
+        steps_per_save=4,
+        device="cpu",
+    )
+
+
+def train(folder: Path, config: Any) -> None:
+    """Train together; keep the parameters that each process ends with."""
+    steps: list[TrainingSteps] = []
+    made = TrainingSteps.__init__
+
+    def remember(self: TrainingSteps, *args: Any) -> None:
+        made(self, *args)
+        steps.append(self)
+
+    TrainingSteps.__init__ = remember
+    with joined(config) as processes:
+        if processes.is_first:
+            Trainer(config, processes=processes).train()
+        else:
+            follow_training(config, processes)
+        torch.save(steps[0].pipeline.model.state_dict(), folder / f"rank-{processes.rank}.pt")
+
+
+def gradients(folder: Path, config: Any) -> None:
+    """Average the gradients of half a batch in each process; each keeps what it has then."""
+    with joined(config) as processes:
+        _, steps = prepare_steps(config, processes)
+        steps.begin(0)
+        rays, batch = fixed_batch(steps.pipeline)
+        half = slice(processes.rank, None, processes.count)
+        losses = steps.pipeline.model.get_loss_dict(
+            steps.pipeline.model(rays[half]), {name: values[half] for name, values in batch.items()}
+        )
+        loss = torch.stack(list(losses.values())).sum()
+        loss.backward()
+        (mean,) = processes.average_gradients(list(steps.pipeline.model.parameters()), [loss])
+        found = {name: p.grad for name, p in steps.pipeline.model.named_parameters()}
+        torch.save({**found, "loss": mean.detach()}, folder / f"rank-{processes.rank}.pt")
+
+
+def fixed_batch(pipeline: Pipeline) -> Any:
+    """The same rays in each process, an even number of them."""
+    pipeline.datamanager.seed = 7
+    pipeline.datamanager.set_train_rays_per_batch(64)
+    pipeline.model.eval()
+    return pipeline.datamanager.next_train(0)
+
+
+def main(argv: list[str]) -> None:
+    """Do what was asked."""
+    load_run.find_method = lambda _: rgb_nerf
+    folder, action = Path(argv[0]), argv[1]
+    config = config_for(folder)
+    is_second = os.environ.get("RANK") == "1"
+    if action == "gradients":
+        gradients(folder, config)
+    elif action == "train":
+        train(folder, config)
+    elif action == "resume":
+        (run,) = (folder / "outputs").glob("*/*/*")
+        train(folder, replace(load_run.load_config(run), max_num_iterations=STEPS + 10))
+    elif action == "other-seed":
+        train(folder, replace(config, seed=5 if is_second else 4))
+    elif action == "no-scene":
+        train(folder, replace(config, data=None) if is_second else config)
+    elif action == "die":
+        if is_second:
+            TrainingSteps.take = lambda *_: os._exit(9)
+        train(folder, config)
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    run_command(main, sys.argv[1:])
