@@ -49,7 +49,7 @@ def train(folder: Path, config: Any) -> None:
         made(self, *args)
         steps.append(self)
 
-    TrainingSteps.__init__ = remember
+    setattr(TrainingSteps, "__init__", remember)  # noqa: B010 - type checkers refuse the plain assignment
     with joined(config) as processes:
         if processes.is_first:
             Trainer(config, processes=processes).train()
@@ -102,7 +102,7 @@ def main(argv: list[str]) -> None:
         train(folder, replace(config, data=None) if is_second else config)
     elif action == "die":
         if is_second:
-            TrainingSteps.take = lambda *_: os._exit(9)
+            setattr(TrainingSteps, "take", lambda *_: os._exit(9))  # noqa: B010
         train(folder, config)
 
 
