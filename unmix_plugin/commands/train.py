@@ -89,6 +89,7 @@ def _run(trainer: Trainer, console: Console) -> None:
         SystemExit: 130, after a stop on request.
     """
     from unmix_plugin.commands.reporting import say
+    from unmix_plugin.commands.run_choice import spectral_scene
     from unmix_plugin.commands.training_remarks import read_remarks
     from unmix_plugin.engine.training.interrupts import Interrupted
 
@@ -103,8 +104,9 @@ def _run(trainer: Trainer, console: Console) -> None:
         sys.exit(INTERRUPTED)
     speed = f"{record.train_rays_per_second:,.0f} rays/s"
     say(console, f"trained {record.steps} steps in {record.train_seconds:.1f} s, {speed}")
-    for remark in read_remarks(trainer.run.metrics_path):
-        say(console, remark)
+    if spectral_scene(trainer.pipeline.datamanager) is not None:  # remarks name settings of spectral methods
+        for remark in read_remarks(trainer.run.metrics_path):
+            say(console, remark)
     _write_endmembers(trainer)
 
 

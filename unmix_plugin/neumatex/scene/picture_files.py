@@ -73,7 +73,7 @@ def _read_exr(path: Path) -> Picture:
 
     everything = (slice(None), slice(None))
     file = open_exr(path, ReadOptions())
-    numbers = np.asarray(file.read_part(*everything), dtype=np.float32)
+    numbers = np.array(file.read_part(*everything), dtype=np.float32, order="C")
     if numbers.shape[2] < 3:
         raise SceneError(f"{path}: has {numbers.shape[2]} channels of colour; expected R, G and B")
     if "A" not in file.metadata.get("other_channels", []):

@@ -1,0 +1,199 @@
+"""Training batches of an object's pixels, and its evaluation images under its own light and others.
+
+Notation: `R` pixels of a batch, `C` colours or bands, `H x W` pixels of a view.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from unmix_plugin.engine import (
+    Cameras,
+    DataManager,
+    DataManagerConfig,
+    RayBundle,
+    SceneBox,
+    Target,
+    TrainingCallback,
+    step_generator,
+)
+from unmix_plugin.errors import require
+from unmix_plugin.neumatex.lighting.environment import Environment
+from unmix_plugin.neumatex.object_record import ObjectRecord
+from unmix_plugin.neumatex.scene.load_object import load_object
+from unmix_plugin.neumatex.scene.pixel_list import PixelList
+from unmix_plugin.neumatex.scene.posed_pictures import PosedPictures, opacity
+from unmix_plugin.neumatex.tone.curves import TONE_MAPPINGS
+from unmix_plugin.scenes.scene import Normalisation
+
+_THINNEST = 1e-3
+"""Least half edge of the scene box: a mesh may be flat."""
+
+
+@dataclass(frozen=True)
+class ObjectDataManagerConfig(DataManagerConfig):
+    """How an object's pictures are sampled."""
+
+    _target: Target = field(default_factory=lambda: ObjectDataManager)
+    train_num_rays_per_batch: int = 4096
+    """Pixels of a training step, drawn from all training views where they show the mesh."""
+    max_pixels: int = 8_000_000
+    """Training pixels kept in memory; of more, these are drawn evenly."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible settings.
+
+        Raises:
+            ConfigError: a number out of its range.
+        """
+        super().__post_init__()
+        require("the data manager", {"max-pixels of at least 1": self.max_pixels >= 1})
+
+
+class ObjectDataManager(DataManager):
+    """Serves pixels that show the object and nothing else.
+
+    A training batch has `numbers` (R, C) as pictures hold them; rays pass through random places of their pixels. An
+    image batch has `numbers` (H, W, C), `alpha` (H, W), `tone` (which of `TONE_MAPPINGS`), `lights` (how many are
+    held out) and, where it is known, `base_colour` (H, W, 3). Images under a held-out light follow the evaluation
+    views and have `environment` (h, w, C) and `environment_placement` (degrees, stops) too.
+    """
+
+    def __init__(
+        self, config: ObjectDataManagerConfig, *, data: Path, device: torch.device, seed: int = 0
+    ) -> None:
+        """
+        Raises:
+            SceneError: the object is missing or malformed.
+        """
+        super().__init__(config, data=data, device=device, seed=seed)
+        self.options = config
+        self.object = load_object(data)
+        pictures, split = self.object.pictures, self.object.split
+        self.train_cameras = pictures.cameras[list(split.train)]
+        self.eval_cameras = pictures.cameras[list(split.evaluation)]
+        reach = self.object.mesh.vertices.abs().amax(dim=0).clamp(min=_THINNEST)
+        self.scene_box = SceneBox(torch.stack([-reach, reach]))
+        self._num_rays = config.train_num_rays_per_batch
+
+    def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
+        """Random object pixels of the training views; the draw depends on (seed, step) only."""
+        drawn = self._pixels.draw(self._num_rays, step_generator(self.seed, step))
+        rays = self.train_cameras.generate_rays(drawn.views, drawn.places)
+        return rays.to(self.device), {"numbers": drawn.numbers.to(self.device)}
+
+    @property
+    def num_eval_images(self) -> int:
+        """Evaluation views, and every picture under a held-out light."""
+        return len(self.eval_cameras) + sum(len(light.pictures) for light in self.object.lights)
+
+    def eval_image(self, index: int) -> tuple[Cameras, dict[str, Tensor]]:
+        """Camera and whole image; those under held-out lights come after the evaluation views."""
+        place = self._find_image(index)
+        if isinstance(place, int):
+            camera, batch = self._image(self.object.pictures, place)
+            truth = self.object.base_colour(place)
+            return camera, batch if truth is None else {**batch, "base_colour": self._tensor(truth)}
+        light, view = place
+        held_out = self.object.lights[light]
+        camera, batch = self._image(held_out.pictures, view)
+        return camera, {**batch, **_environment_entries(held_out.environment.to(self.device))}
+
+    def eval_name(self, index: int) -> str:
+        """The picture's name, after its light's where that is held out."""
+        place = self._find_image(index)
+        if isinstance(place, int):
+            return self.object.pictures.names[place]
+        held_out = self.object.lights[place[0]]
+        return f"{held_out.name}-{held_out.pictures.names[place[1]]}"
+
+    def get_train_rays_per_batch(self) -> int:
+        """Pixels of the next training batch."""
+        return self._num_rays
+
+    def set_train_rays_per_batch(self, num_rays: int) -> None:
+        """Let the next training batches have `num_rays` pixels."""
+        self._num_rays = num_rays
+
+    def get_training_callbacks(self) -> list[TrainingCallback]:
+        """None; asked for before the training clock starts, hence the place to read the training pixels."""
+        _ = self._pixels
+        return []
+
+    def metadata(self) -> dict[str, Any]:
+        """Shapes of mesh and environment, and what the pictures' numbers are."""
+        return ObjectRecord.of(self.object).to_json()
+
+    def initial_data(self) -> Mapping[str, np.ndarray]:
+        """Mesh and environment, which become buffers of the model: a run renders without its data."""
+        mesh, light = self.object.mesh, self.object.environment
+        arrays = {"vertices": mesh.vertices, "faces": mesh.faces, "normals": mesh.normals, "uv": mesh.uv}
+        arrays["light_map"] = light.image
+        return {name: array.numpy() for name, array in arrays.items() if array is not None}
+
+    def summary(self) -> dict[str, Any]:
+        """Files, splits, normalisation, hashes."""
+        return self.object.summary()
+
+    @classmethod
+    def check_record(cls, metadata: Mapping[str, Any], summary: Mapping[str, Any]) -> None:
+        """Refuse what no object has."""
+        ObjectRecord.from_json(metadata)
+        Normalisation.from_json(summary["normalisation"])
+
+    def identity(self, summary: Mapping[str, Any]) -> dict[str, Any]:
+        """Views and the content of all files."""
+        return {key: summary.get(key) for key in ("frames", "train_indices", "eval_indices", "input_hashes")}
+
+    def warnings(self) -> list[str]:
+        """What the reader noted of the mesh."""
+        return list(self.object.notes)
+
+    @cached_property
+    def _pixels(self) -> PixelList:
+        """Read when training asks: evaluation needs none of it."""
+        return PixelList.of(self.object, self.options.max_pixels, self.seed)
+
+    def _find_image(self, index: int) -> int | tuple[int, int]:
+        """A view of the object's own pictures, or a light and a view of its pictures."""
+        if index < len(self.eval_cameras):
+            return self.object.split.evaluation[index]
+        index -= len(self.eval_cameras)
+        for light, held_out in enumerate(self.object.lights):
+            if index < len(held_out.pictures):
+                return light, index
+            index -= len(held_out.pictures)
+        raise IndexError(f"{self.num_eval_images} evaluation images; asked for one beyond")
+
+    def _image(self, pictures: PosedPictures, view: int) -> tuple[Cameras, dict[str, Tensor]]:
+        picture = pictures.read(view)
+        return pictures.cameras[view], {
+            "numbers": self._tensor(picture.numbers),
+            "alpha": self._tensor(opacity(picture)),
+            "tone": torch.tensor(TONE_MAPPINGS.index(pictures.tone)),
+            "lights": torch.tensor(len(self.object.lights)),
+        }
+
+    def _tensor(self, array: np.ndarray) -> Tensor:
+        return torch.from_numpy(array).to(self.device)
+
+
+def _environment_entries(environment: Environment) -> dict[str, Tensor]:
+    placement = torch.tensor([environment.rotation_deg, environment.exposure_stops])
+    return {"environment": environment.image, "environment_placement": placement}
+
+
+def batch_environment(batch: Mapping[str, Tensor]) -> Environment | None:
+    """The held-out light of an image batch; None where it has the object's own."""
+    if "environment" not in batch:
+        return None
+    rotation_deg, exposure_stops = batch["environment_placement"].tolist()
+    return Environment(batch["environment"], rotation_deg, exposure_stops)

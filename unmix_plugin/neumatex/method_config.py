@@ -1,0 +1,24 @@
+"""What the package registers for objects: the method `neumatex`, with all its settings."""
+
+from pathlib import Path
+
+from unmix_plugin.engine import MethodSpecification, OptimizerConfig, PipelineConfig, TrainerConfig
+from unmix_plugin.neumatex.datamanager import ObjectDataManagerConfig
+from unmix_plugin.neumatex.model import NeumatexModelConfig
+
+neumatex = MethodSpecification(
+    config=TrainerConfig(
+        method_name="neumatex",
+        output_dir=Path("outputs"),
+        max_num_iterations=300,
+        steps_per_save=100,
+        steps_per_log=5,
+        pipeline=PipelineConfig(datamanager=ObjectDataManagerConfig(), model=NeumatexModelConfig()),
+        optimizers={
+            "planes": OptimizerConfig(lr=5e-3, final_factor=0.2),
+            "networks": OptimizerConfig(lr=5e-3, final_factor=0.2),
+            "response": OptimizerConfig(lr=2e-2, final_factor=0.1),
+        },
+    ),
+    description="relightable materials on a known mesh, from posed pictures under a known environment",
+)

@@ -1,0 +1,236 @@
+"""The model neumatex: materials on a known mesh under known light, fitted to pictures through a path tracer.
+
+Notation: `R` rays, one a pixel; `N` of them meet the mesh; `C` colours; `P` parameters of a material; `H x W` pixels.
+
+The loss is the squared error of tone-mapped light. Rendered light is a random estimate, whose square would add its
+variance to the error: each of the two factors has an estimate of its own, from independent samples. That is unbiased
+where the tone curve is linear over the spread of the estimates, and nearly so where it bends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from unmix_plugin.engine import Cameras, Model, ModelConfig, Output, RayBundle, Target
+from unmix_plugin.engine.instantiate import Common
+from unmix_plugin.errors import ConfigError, require
+from unmix_plugin.neumatex.datamanager import batch_environment
+from unmix_plugin.neumatex.geometry.mesh import Mesh
+from unmix_plugin.neumatex.image_evaluation import evaluate_object_image
+from unmix_plugin.neumatex.lighting.environment import Environment
+from unmix_plugin.neumatex.material_surface import MaterialName, TriplaneSurface, material_family
+from unmix_plugin.neumatex.object_record import ObjectRecord
+from unmix_plugin.neumatex.tone.curves import LightCurve, ToneMapping, psnr_db, tone_curve
+from unmix_plugin.neumatex.traced_object import SeenPoints, TracedObject, TracedObjectCache
+from unmix_plugin.neumatex.triplane import Triplane
+
+_START_SEED = 0
+"""Of networks and planes before training; the run's own seed draws all else."""
+
+
+@dataclass(frozen=True)
+class NeumatexModelConfig(ModelConfig):
+    """What is fitted, and how it is rendered meanwhile."""
+
+    _target: Target = field(default_factory=lambda: NeumatexModel)
+    eval_num_rays_per_chunk: int = 4096
+    """Pixels rendered at once for a whole image; fewer take less memory."""
+    material: Annotated[MaterialName, Common] = "pbr"
+    """Family of materials: pbr is base colour, roughness and metallicity."""
+    samples: Annotated[int, Common] = 8
+    """Paths a pixel in training, in two independent halves; more is slower and less noisy."""
+    bounces: Annotated[int, Common] = 1
+    """How often light may be reflected between parts of the object before it reaches the point that is seen."""
+    eval_samples: Annotated[int, Common] = 64
+    """Paths a pixel in renders and evaluation."""
+    plane_resolution: int = 128
+    """Texels along an edge of each of the three planes."""
+    light_curve: LightCurve = "agx"
+    """Tone curve through which pictures of linear light are compared; others are compared as they are."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible settings.
+
+        Raises:
+            ConfigError: a number out of its range.
+        """
+        super().__post_init__()
+        rules = {
+            "samples of 2 to 1024": 2 <= self.samples <= 1024,
+            "bounces of 0 to 8": 0 <= self.bounces <= 8,
+            "eval-samples of 1 to 65536": 1 <= self.eval_samples <= 65536,
+            "plane-resolution of 2 to 2048": 2 <= self.plane_resolution <= 2048,
+        }
+        require("the model", rules)
+
+
+class NeumatexModel(Model):
+    """Triplane, family of materials, tone curve; mesh and environment as buffers."""
+
+    config: NeumatexModelConfig
+    outputs = (
+        Output("rgb", "srgb", "colour", "sRGB on black, 0 to 1"),
+        Output("base_colour", "linear", "base colour", "linear, 0 to 1, on black"),
+        Output("accumulation", "map", "opacity", "1 where the mesh is", (0.0, 1.0), "gray"),
+    )
+
+    def populate_modules(self) -> None:
+        """Modules and buffers in the shapes that config and object ask for."""
+        record = ObjectRecord.from_json(self.metadata)
+        self.record = record
+        self.family = material_family(self.config.material)
+        generator = torch.Generator().manual_seed(_START_SEED)
+        parameters, resolution = self.family.num_parameters, self.config.plane_resolution
+        self.triplane = Triplane(parameters, resolution, generator=generator)
+        if self.family.num_colours != record.num_colours:
+            raise ConfigError(
+                f"the material {self.config.material} has {self.family.num_colours} colours, the pictures have "
+                f"{record.num_colours}; give pictures of 3 colours"
+            )
+        self.light_curve = tone_curve(self.config.light_curve)
+        is_light = record.tone_mapping == "linear"
+        self.curve: nn.Module = self.light_curve if is_light else tone_curve(record.tone_mapping)
+        for name, buffer in _empty_buffers(record).items():
+            self.register_buffer(name, buffer)
+        self._traced = TracedObjectCache()
+
+    def initialise(self, initial_data: Mapping[str, np.ndarray], generator: torch.Generator) -> None:
+        """Take mesh and environment over."""
+        for name, array in initial_data.items():
+            self.get_buffer(name).copy_(torch.from_numpy(array))
+
+    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Planes, networks, and the camera's response where there is one."""
+        groups = self.triplane.parameter_groups()
+        return {**groups, "response": list(self.curve.parameters())}
+
+    @property
+    def mesh(self) -> Mesh:
+        """In model space."""
+        uv = self.get_buffer("uv") if self.record.has_uv else None
+        return Mesh(self.get_buffer("vertices"), self.get_buffer("faces"), self.get_buffer("normals"), uv)
+
+    @property
+    def environment(self) -> Environment:
+        """The light of the pictures."""
+        record = self.record
+        return Environment(self.get_buffer("light_map"), record.rotation_deg, record.exposure_stops)
+
+    @property
+    def surface(self) -> TriplaneSurface:
+        """The materials as they are now."""
+        return TriplaneSurface(self.family, self.triplane)
+
+    @property
+    def traced(self) -> TracedObject:
+        """Mesh, light and materials, ready for rays."""
+        return self._traced.get(self.mesh, self.environment, self.surface)
+
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
+        """What is seen along the rays; in training two independent estimates of the light, `halves` (2, R, C)."""
+        traced = self.traced
+        seen = traced.seen(ray_bundle.origins, ray_bundle.directions)
+        if self.training:
+            samples = self.config.samples // 2
+            twice = SeenPoints.cat([seen, seen])
+            light = traced.light(twice, samples, self.config.bounces, self._random())
+            halves = torch.stack([seen.scatter(part) for part in light.unflatten(0, (2, -1)).unbind()])
+            return {"halves": halves, "found": seen.found}
+        light = traced.light(seen, self.config.eval_samples, self.config.bounces, self._random())
+        base = self.family.base_colour(self.surface.parameters(seen.points.positions))
+        found = seen.found[:, None]
+        return {
+            "rgb": torch.where(found, self.curve(seen.scatter(light)), 0.0),
+            "base_colour": seen.scatter(base),
+            "accumulation": seen.found.float(),
+        }
+
+    def get_loss_dict(
+        self,
+        outputs: dict[str, Tensor],
+        batch: dict[str, Tensor],
+        metrics_dict: dict[str, Tensor] | None = None,
+    ) -> dict[str, Tensor]:
+        """`picture`: the squared error of tone-mapped light, from two independent estimates."""
+        return {"picture": _squared_error(self._residuals(outputs, batch), outputs["found"])}
+
+    def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """PSNR of the batch, the noise of its few samples left out."""
+        with torch.no_grad():
+            error = _squared_error(self._residuals(outputs, batch), outputs["found"])
+        return {"psnr": psnr_db(error)}
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """See `evaluate_image`, which needs more than one render."""
+        raise NotImplementedError("images of an object are evaluated with evaluate_image")
+
+    @torch.no_grad()
+    def evaluate_image(
+        self, camera: Cameras, batch: dict[str, Tensor]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Figures and pictures of one view, under the light that the batch may hold: see `image_evaluation`."""
+        light = batch_environment(batch)
+        traced = self.traced if light is None else self.traced.under(light)
+        return evaluate_object_image(self, traced, camera.to(self.device), batch)
+
+    def warm_up(self) -> None:
+        """Compile the kernels, forward and backward, on a few rays that meet the mesh."""
+        towards = -nn.functional.normalize(self.mesh.vertices[:4] + 1e-3, dim=-1)
+        bundle = RayBundle(
+            -3 * towards, towards, torch.zeros(len(towards), dtype=torch.int64, device=self.device)
+        )
+        was_training, generator = self.training, self.generator
+        self.train()
+        self.generator = torch.Generator(self.device).manual_seed(0)
+        halves = self.get_outputs(bundle)["halves"]
+        torch.autograd.grad(halves.sum(), [self.triplane.planes], allow_unused=True)
+        self.generator = generator
+        self.train(was_training)
+
+    def compared(
+        self, light: Float[Tensor, "*n C"], numbers: Float[Tensor, "*m C"], tone: ToneMapping
+    ) -> tuple[Tensor, Tensor]:
+        """Predicted light and a picture's numbers as they are compared, both in [0, 1] unless nothing bends them.
+
+        Args:
+            tone: What the numbers are of light; light itself goes through the curve for light.
+        """
+        if tone == "linear":
+            return self.light_curve(light), self.light_curve(numbers)
+        curve = self.curve if tone == self.record.tone_mapping else tone_curve(tone)
+        return curve(light), numbers.clamp(0, 1)
+
+    def _residuals(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> Float[Tensor, "2 R C"]:
+        shown, wanted = self.compared(outputs["halves"], batch["numbers"], self.record.tone_mapping)
+        return shown - wanted
+
+    def _random(self) -> torch.Generator:
+        """The step's source of random numbers; outside training always the same."""
+        if self.generator is not None and self.training:
+            return self.generator
+        return torch.Generator(self.device).manual_seed(0)
+
+
+def _squared_error(residuals: Float[Tensor, "2 R C"], found: Tensor) -> Float[Tensor, ""]:
+    """Mean over the pixels that meet the mesh; may be below 0 by chance where the error is small."""
+    products = residuals[0] * residuals[1] * found[:, None]
+    return products.sum() / (found.sum().clamp(min=1) * residuals.shape[-1])
+
+
+def _empty_buffers(record: ObjectRecord) -> dict[str, Tensor]:
+    buffers = {
+        "vertices": torch.zeros(record.num_vertices, 3),
+        "faces": torch.zeros(record.num_faces, 3, dtype=torch.int32),
+        "normals": torch.zeros(record.num_vertices, 3),
+        "light_map": torch.zeros(*record.environment_size, record.num_light_colours),
+    }
+    return {**buffers, "uv": torch.zeros(record.num_vertices, 2)} if record.has_uv else buffers

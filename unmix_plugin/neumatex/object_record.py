@@ -1,0 +1,72 @@
+"""What gives a model of an object its shape: `metadata` of its data manager, checked when a run is opened."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+from unmix_plugin.engine.runs.config_json import config_from_json
+from unmix_plugin.neumatex.tone.curves import ToneMapping
+
+if TYPE_CHECKING:
+    from unmix_plugin.neumatex.scene.object_scene import ObjectScene
+
+
+@dataclass(frozen=True)
+class ObjectRecord:
+    """Sizes of an object's buffers, and what does not fit in them."""
+
+    num_vertices: int = 3
+    num_faces: int = 1
+    has_uv: bool = False
+    environment_size: tuple[int, int] = (1, 2)
+    """Rows and columns."""
+    num_light_colours: int = 3
+    rotation_deg: float = 0.0
+    """Of the environment about +z."""
+    exposure_stops: float = 0.0
+    """Of the environment."""
+    num_colours: int = 3
+    """Of the pictures."""
+    tone_mapping: ToneMapping = "linear"
+    """What the pictures' numbers are of light."""
+    wavelengths_nm: tuple[float, ...] = ()
+    """Of spectral pictures; empty for RGB."""
+
+    @staticmethod
+    def of(scene: ObjectScene) -> ObjectRecord:
+        """The record of an object."""
+        mesh, light = scene.mesh, scene.environment
+        height, width, light_colours = light.image.shape
+        return ObjectRecord(
+            num_vertices=len(mesh.vertices),
+            num_faces=len(mesh.faces),
+            has_uv=mesh.uv is not None,
+            environment_size=(height, width),
+            num_light_colours=light_colours,
+            rotation_deg=light.rotation_deg,
+            exposure_stops=light.exposure_stops,
+            num_colours=scene.pictures.num_colours,
+            tone_mapping=scene.pictures.tone,
+            wavelengths_nm=scene.wavelengths_nm,
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON-able values."""
+        values = asdict(self)
+        lists = {name: list(value) for name, value in values.items() if isinstance(value, tuple)}
+        return {**values, **lists}
+
+    @staticmethod
+    def from_json(values: Mapping[str, Any]) -> ObjectRecord:
+        """What `to_json` wrote.
+
+        Raises:
+            ConfigError, ValueError: a value is of the wrong type or out of its range.
+        """
+        record = config_from_json(dict(values), ObjectRecord(), "the object")
+        counts = (record.num_vertices, record.num_faces, *record.environment_size, record.num_colours)
+        if min(counts) < 1 or record.num_light_colours < 1:
+            raise ValueError(f"an object needs sizes of at least 1; found {counts}")
+        return record
