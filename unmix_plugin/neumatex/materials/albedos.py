@@ -14,6 +14,7 @@ from torch import Tensor
 from unmix_plugin.neumatex.materials.microfacet import (
     SMALLEST_COSINE,
     alpha_of,
+    dot,
     half_vectors,
     sample_reflections,
     schlick,
@@ -24,26 +25,25 @@ _ROWS, _COLUMNS, _STRATA = 32, 48, 32
 
 
 def ggx_albedo(
-    roughness: Float[Tensor, "N K"], cosine: Float[Tensor, " N"]
-) -> tuple[Float[Tensor, "N K"], Float[Tensor, "N K"]]:
+    roughness: Float[Tensor, "K N"], cosine: Float[Tensor, " N"]
+) -> tuple[Float[Tensor, "K N"], Float[Tensor, "K N"]]:
     """`(a, b)`: a GGX lobe of Schlick's Fresnel term reflects `f0 a + b` of what comes from this cosine."""
-    found = _look_up(_ggx_cells(), roughness, cosine)
-    return found[..., 0], found[..., 1]
+    found = _look_up(_ggx_cells(roughness.device), roughness, cosine)
+    return found[0], found[1]
 
 
-def sheen_albedo(roughness: Float[Tensor, "N K"], cosine: Float[Tensor, " N"]) -> Float[Tensor, "N K"]:
+def sheen_albedo(roughness: Float[Tensor, " N"], cosine: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
     """Directional albedo of white sheen, [0, 1]."""
-    return _look_up(_sheen_cells(), roughness, cosine)[..., 0]
+    return _look_up(_sheen_cells(roughness.device), roughness[None], cosine)[0, 0]
 
 
-def mean_ggx_albedo(roughness: Float[Tensor, "N K"]) -> tuple[Float[Tensor, "N K"], Float[Tensor, "N K"]]:
+def mean_ggx_albedo(roughness: Float[Tensor, "K N"]) -> tuple[Float[Tensor, "K N"], Float[Tensor, "K N"]]:
     """`(a, b)` of `ggx_albedo`, averaged over the hemisphere with the cosine as weight."""
-    means = _mean(ggx_table())
-    at = roughness.detach() * (_ROWS - 1)
-    row = at.floor().clamp(0, _ROWS - 2)
-    low, high = means[row.long()], means[row.long() + 1]
-    found = low + (roughness * (_ROWS - 1) - row)[..., None] * (high - low)
-    return found[..., 0], found[..., 1]
+    means = _mean(ggx_table()).to(roughness.device).T.contiguous()
+    row = (roughness.detach() * (_ROWS - 1)).floor().clamp(0, _ROWS - 2)
+    low, high = means[:, row.long()], means[:, row.long() + 1]
+    found = low + (roughness * (_ROWS - 1) - row) * (high - low)
+    return found[0], found[1]
 
 
 @lru_cache(maxsize=1)
@@ -52,16 +52,16 @@ def ggx_table() -> Float[Tensor, "R M 2"]:
     roughness, cosine = _nodes(_COLUMNS, alpha_of(torch.linspace(0.0, 1.0, _ROWS)))
     table = torch.empty(_ROWS * _COLUMNS, 2)
     steps = (torch.arange(_STRATA) + 0.5) / _STRATA
-    uniforms = torch.cartesian_prod(steps, steps)
+    uniforms = torch.cartesian_prod(steps, steps).T
     for node in range(_ROWS * _COLUMNS):
-        wo = _direction(cosine[node]).expand(len(uniforms), 3)
-        alpha = roughness[node].expand(len(uniforms))
+        wo = _direction(cosine[node])[:, None].expand(3, uniforms.shape[1])
+        alpha = roughness[node].expand(uniforms.shape[1])
         wi = sample_reflections(alpha, wo, uniforms)
-        a2, n_i, n_o = alpha[0] ** 2, wi[:, 2].clamp_min(0.0), wo[:, 2]
+        a2, n_i, n_o = alpha[0] ** 2, wi[2].clamp_min(0.0), wo[2]
         root_i, root_o = (torch.sqrt(a2 + (1.0 - a2) * n * n) for n in (n_i, n_o))
         # Reflectance times cosine over density: masking of both directions over masking of the eye's alone.
         passed = n_i * (n_o + root_o) / (n_o * root_i + n_i * root_o).clamp_min(1e-9)
-        edge = schlick((half_vectors(wi, wo) * wo).sum(-1))
+        edge = schlick(dot(half_vectors(wi, wo), wo))
         table[node] = torch.stack([((1.0 - edge) * passed).mean(), (edge * passed).mean()])
     return table.reshape(_ROWS, _COLUMNS, 2)
 
@@ -75,11 +75,11 @@ def sheen_table() -> Float[Tensor, "R M 1"]:
     # Squared steps crowd at the horizon; du of the cosine is 2 u.
     wi_z, weight = u * u, 2.0 * u
     sine = torch.sqrt(1.0 - wi_z * wi_z)
-    wi = torch.stack([sine * torch.cos(math.pi * v), sine * torch.sin(math.pi * v), wi_z], -1)
+    wi = torch.stack([sine * torch.cos(math.pi * v), sine * torch.sin(math.pi * v), wi_z])
     table = torch.empty(_ROWS * _COLUMNS, 1)
     for node in range(_ROWS * _COLUMNS):
-        wo = _direction(cosine[node]).expand_as(wi)
-        value = sheen_reflection(roughness[node].expand(len(wi)), wi, wo)
+        wo = _direction(cosine[node])[:, None].expand_as(wi)
+        value = sheen_reflection(roughness[node].expand_as(wi_z), half_vectors(wi, wo), wi_z, wo[2])
         table[node] = (value * wi_z * weight).mean() * 2.0 * math.pi
     return table.reshape(_ROWS, _COLUMNS, 1)
 
@@ -99,29 +99,30 @@ def _mean(table: Tensor) -> Tensor:
     return torch.trapezoid(4.0 * s[:, None] ** 3 * table, s, dim=1)
 
 
-@lru_cache(maxsize=1)
-def _ggx_cells() -> Tensor:
-    return _cells(ggx_table())
+@lru_cache(maxsize=4)
+def _ggx_cells(device: torch.device) -> Tensor:
+    return _cells(ggx_table()).to(device)
 
 
-@lru_cache(maxsize=1)
-def _sheen_cells() -> Tensor:
-    return _cells(sheen_table())
+@lru_cache(maxsize=4)
+def _sheen_cells(device: torch.device) -> Tensor:
+    return _cells(sheen_table()).to(device)
 
 
 def _cells(table: Tensor) -> Tensor:
-    """Four coefficients of each bilinear cell side by side, so that a look-up reads memory once."""
+    """Four coefficients of each bilinear cell for each channel, (4 channels, cells)."""
     corner, right = table[:-1, :-1], table[:-1, 1:] - table[:-1, :-1]
     below, twist = table[1:, :-1] - table[:-1, :-1], table[1:, 1:] - table[1:, :-1] - right
-    return torch.stack([corner, right, below, twist], -1).reshape(-1, table.shape[2], 4)
+    cells = torch.stack([corner, right, below, twist])
+    return cells.permute(0, 3, 1, 2).reshape(4 * table.shape[2], -1).contiguous()
 
 
 def _look_up(cells: Tensor, roughness: Tensor, cosine: Tensor) -> Tensor:
-    """Bilinear; the gradient goes to the roughness."""
+    """Bilinear, (channels K N); the gradient goes to the roughness."""
     row = (roughness.detach() * (_ROWS - 1)).floor().clamp(0, _ROWS - 2)
     at = torch.sqrt(cosine.clamp(0.0, 1.0)) * (_COLUMNS - 1)
     column = at.floor().clamp(0, _COLUMNS - 2)
-    index = (row * (_COLUMNS - 1) + column[:, None]).long()
-    cell = cells.to(roughness.device)[index]
-    x, y = (at - column)[:, None, None], (roughness * (_ROWS - 1) - row)[..., None]
-    return cell[..., 0] + x * cell[..., 1] + y * (cell[..., 2] + x * cell[..., 3])
+    index = (row * (_COLUMNS - 1) + column).long().reshape(-1)
+    corner, right, below, twist = cells.index_select(1, index).reshape(4, -1, *roughness.shape)
+    x = at - column
+    return (corner + x * right) + (roughness * (_ROWS - 1) - row) * (below + x * twist)

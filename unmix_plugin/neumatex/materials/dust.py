@@ -29,11 +29,12 @@ def mean_held(cover: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
 
     With tau = -log(1 - cover) it is 1 - 2 E3(tau); the exponential integral is summed at Gauss-Legendre nodes.
     """
-    tau = -torch.log1p(-cover)[:, None]
-    mu, weights = _NODES.to(cover.device, cover.dtype), _WEIGHTS.to(cover.device, cover.dtype)
-    return 1.0 - (2.0 * weights * mu * torch.exp(-tau / mu)).sum(-1)
+    log_passed = torch.log1p(-cover)
+    nodes = zip(_NODES, _WEIGHTS, strict=True)
+    passed = [2.0 * weight * mu * torch.exp(log_passed * (1.0 / mu)) for mu, weight in nodes]
+    return 1.0 - torch.stack(passed).sum(0)
 
 
 # Six nodes of Gauss and Legendre on [0, 1].
-_NODES = torch.tensor([0.03376524, 0.16939531, 0.38069041, 0.61930959, 0.83060469, 0.96623476])
-_WEIGHTS = torch.tensor([0.08566225, 0.18038079, 0.23395697, 0.23395697, 0.18038079, 0.08566225])
+_NODES = (0.03376524, 0.16939531, 0.38069041, 0.61930959, 0.83060469, 0.96623476)
+_WEIGHTS = (0.08566225, 0.18038079, 0.23395697, 0.23395697, 0.18038079, 0.08566225)

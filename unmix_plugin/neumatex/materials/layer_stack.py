@@ -6,7 +6,7 @@ All of it is `passed * base / pi + specular`, where only `passed` is the part th
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Float
@@ -18,6 +18,7 @@ from unmix_plugin.neumatex.materials.lobe_mixture import LobeMixture
 from unmix_plugin.neumatex.materials.microfacet import (
     alpha_of,
     distribution,
+    dot,
     half_vectors,
     schlick,
     visibility,
@@ -25,6 +26,10 @@ from unmix_plugin.neumatex.materials.microfacet import (
 from unmix_plugin.neumatex.materials.sheen import sheen_reflection
 
 _COAT_F0 = 0.04
+LARGEST_DIELECTRIC_F0 = 0.08
+LARGEST_COAT_ROUGHNESS = 0.6
+LARGEST_SHEEN = 0.6
+LARGEST_HAZE = 0.7
 
 
 @dataclass(frozen=True)
@@ -33,85 +38,85 @@ class LayerStack:
 
     dust_cover: Float[Tensor, " N"]
     """How much of light at normal incidence meets dust."""
-    sheen_colour: Float[Tensor, "N 3"]
+    sheen_colour: Float[Tensor, "3 N"]
     sheen_roughness: Float[Tensor, " N"]
     coat_weight: Float[Tensor, " N"]
-    roughness: Float[Tensor, "N 3"]
+    roughness: Float[Tensor, "3 N"]
     """Perceptual: of the coat, of the surface, of its haze."""
     haze_weight: Float[Tensor, " N"]
     """How much of the surface's reflection is spread into the haze."""
     metallicity: Float[Tensor, " N"]
-    metal_colour: Float[Tensor, "N 3"]
+    metal_colour: Float[Tensor, "3 N"]
     dielectric_f0: Float[Tensor, " N"]
 
+    def repeat(self, times: int) -> "LayerStack":
+        """Each material `times` times in a row."""
+        return LayerStack(
+            **{each.name: getattr(self, each.name).repeat_interleave(times, -1) for each in fields(self)}
+        )
+
     def reflectance(
-        self, wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
-    ) -> tuple[Float[Tensor, " N"], Float[Tensor, "N 3"]]:
+        self, wi: Float[Tensor, "3 N"], wo: Float[Tensor, "3 N"]
+    ) -> tuple[Float[Tensor, " N"], Float[Tensor, "3 N"]]:
         """`(passed, specular)`: what passes down to the base and up again, and what the layers reflect, 1/sr.
 
         Both are 0 where a direction is below the surface.
         """
-        light, eye = self.passing(wi[:, 2]), self.passing(wo[:, 2])
+        light, eye = self.passing(wi[2]), self.passing(wo[2])
         dust = light.dust * eye.dust
         sheen = dust * light.sheen * eye.sheen
         coat = sheen * light.coat * eye.coat
         half = half_vectors(wi, wo)
-        edge = schlick((wo * half).sum(-1, keepdim=True))
+        edge = schlick(dot(wo, half))
         alpha = alpha_of(self.roughness)
-        lobes = distribution(alpha, half) * visibility(alpha, wi[:, 2:], wo[:, 2:])
-        of_coat = self.coat_weight * (_COAT_F0 + (1.0 - _COAT_F0) * edge[:, 0]) * lobes[:, 0]
-        surface = lobes[:, 1] + self.haze_weight * (lobes[:, 2] - lobes[:, 1])
-        f0 = self.f0
-        specular = (
-            self._dust(light.dust, eye.dust)
-            + (dust * sheen_reflection(self.sheen_roughness, wi, wo))[:, None] * self.sheen_colour
-            + (sheen * of_coat)[:, None]
-            + (coat * surface)[:, None] * (f0 + (1.0 - f0) * edge)
-        )
-        above = (wi[:, 2] > 0) & (wo[:, 2] > 0)
+        lobes = distribution(alpha, half) * visibility(alpha, wi[2], wo[2])
+        of_coat = self.coat_weight * (_COAT_F0 + (1.0 - _COAT_F0) * edge) * lobes[0]
+        surface = coat * (lobes[1] + self.haze_weight * (lobes[2] - lobes[1]))
+        of_sheen = dust * sheen_reflection(self.sheen_roughness, half, wi[2], wo[2])
+        # f0 + (1 - f0) edge, of three colours, with what has none apart.
+        specular = self.f0 * (surface * (1.0 - edge)) + (surface * edge + sheen * of_coat)
+        specular = specular + of_sheen * self.sheen_colour + self._dust(light.dust, eye.dust)
+        above = (wi[2] > 0) & (wo[2] > 0)
         passed = coat * (1.0 - self.metallicity) * light.surface * eye.surface / self._surface_mean()
-        return passed * above, specular * above[:, None]
+        return passed * above, specular * above
 
-    def mixture(self, wo: Float[Tensor, "N 3"], base: Float[Tensor, "N C"]) -> LobeMixture:
+    def mixture(self, wo: Float[Tensor, "3 N"], base: Float[Tensor, "C N"]) -> LobeMixture:
         """A density about like the reflectance times the cosine; without gradient."""
         with torch.no_grad():
-            eye = self.passing(wo[:, 2])
-            f0 = self.f0.mean(-1)
-            edge = schlick(wo[:, 2])
-            surface = (
-                eye.dust * eye.sheen * eye.coat * (f0 + (1.0 - f0) * edge * (1.0 - self.roughness[:, 1]))
-            )
+            eye = self.passing(wo[2])
+            f0 = self.f0.mean(0)
+            edge = schlick(wo[2]) * (1.0 - self.roughness[1])
+            surface = eye.dust * eye.sheen * eye.coat * (f0 + (1.0 - f0) * edge)
             coat = eye.dust * eye.sheen * (1.0 - eye.coat)
-            specular = torch.stack([coat, surface * (1.0 - self.haze_weight), surface * self.haze_weight], -1)
-            below = eye.dust * eye.sheen * eye.coat * eye.surface * (1.0 - self.metallicity) * base.mean(-1)
+            specular = torch.stack([coat, surface * (1.0 - self.haze_weight), surface * self.haze_weight])
+            below = eye.dust * eye.sheen * eye.coat * eye.surface * (1.0 - self.metallicity) * base.mean(0)
             diffuse = below + 0.5 * (1.0 - eye.dust) + eye.dust * (1.0 - eye.sheen)
             return LobeMixture.of_albedos(alpha_of(self.roughness), diffuse, specular)
 
     @property
-    def f0(self) -> Float[Tensor, "N 3"]:
+    def f0(self) -> Float[Tensor, "3 N"]:
         """What the surface reflects at normal incidence."""
-        dielectric = self.dielectric_f0[:, None]
-        return dielectric + self.metallicity[:, None] * (self.metal_colour - dielectric)
+        return self.dielectric_f0 + self.metallicity * (self.metal_colour - self.dielectric_f0)
 
     def _dust(self, passed_light: Tensor, passed_eye: Tensor) -> Tensor:
         held = (1.0 - passed_light) * (1.0 - passed_eye) / mean_held(self.dust_cover).clamp_min(1e-6)
-        return held[:, None] * torch.tensor(DUST_COLOUR, device=held.device) / math.pi
+        return held * (torch.tensor(DUST_COLOUR, device=held.device)[:, None] / math.pi)
 
-    def passing(self, cosine: Tensor) -> "Passing":
+    def passing(self, cosine: Float[Tensor, " N"]) -> "Passing":
         """What each layer lets through from one direction to what is below."""
         cosine = cosine.clamp_min(0.0)
         a, b = ggx_albedo(self.roughness, cosine)
-        coat = 1.0 - self.coat_weight * (_COAT_F0 * a[:, 0] + b[:, 0])
-        dielectric = self.dielectric_f0[:, None] * a[:, 1:] + b[:, 1:]
-        surface = 1.0 - (dielectric[:, 0] + self.haze_weight * (dielectric[:, 1] - dielectric[:, 0]))
-        sheen = 1.0 - self.sheen_colour.amax(-1) * sheen_albedo(self.sheen_roughness[:, None], cosine)[:, 0]
+        coat = 1.0 - self.coat_weight * (_COAT_F0 * a[0] + b[0])
+        dielectric = self.dielectric_f0 * a[1:] + b[1:]
+        surface = 1.0 - (dielectric[0] + self.haze_weight * (dielectric[1] - dielectric[0]))
+        sheen = 1.0 - self.sheen_colour.amax(0) * sheen_albedo(self.sheen_roughness, cosine)
         return Passing(dust_passed(self.dust_cover, cosine), sheen, coat, surface)
 
     def _surface_mean(self) -> Tensor:
         """Mean of `surface` over directions, which makes a white base under it lose no light."""
-        a, b = mean_ggx_albedo(self.roughness[:, 1:])
-        dielectric = self.dielectric_f0[:, None] * a + b
-        return 1.0 - (dielectric[:, 0] + self.haze_weight * (dielectric[:, 1] - dielectric[:, 0]))
+        a, b = mean_ggx_albedo(self.roughness[1:])
+        dielectric = self.dielectric_f0 * a + b
+        return 1.0 - (dielectric[0] + self.haze_weight * (dielectric[1] - dielectric[0]))
 
 
 @dataclass(frozen=True)

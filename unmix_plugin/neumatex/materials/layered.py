@@ -3,19 +3,19 @@
 Notation as in `family`.
 """
 
-import math
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.neumatex.materials.dust import LARGEST_COVER
-from unmix_plugin.neumatex.materials.layer_stack import LayerStack
-
-_LARGEST_DIELECTRIC_F0 = 0.08
-_LARGEST_COAT_ROUGHNESS = 0.6
-_LARGEST_SHEEN = 0.6
-_LARGEST_HAZE = 0.7
+from unmix_plugin.neumatex.materials.layer_stack import (
+    LARGEST_COAT_ROUGHNESS,
+    LARGEST_DIELECTRIC_F0,
+    LARGEST_HAZE,
+    LARGEST_SHEEN,
+    LayerStack,
+)
+from unmix_plugin.neumatex.materials.stack_family import density_of_stack, evaluate_stack, sample_stack
 
 
 class LayeredFamily:
@@ -50,22 +50,21 @@ class LayeredFamily:
         self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N C"]:
         """Reflectance, 1/sr, without the cosine; 0 where a direction is below the surface."""
-        passed, specular = self.stack(parameters).reflectance(wi, wo)
-        return passed[:, None] * parameters[:, :3] / math.pi + specular
+        return evaluate_stack(self.stack(parameters), parameters[:, :3], wi, wo)
 
     @torch.no_grad()
     def sample(
         self, parameters: Float[Tensor, "N P"], wo: Float[Tensor, "N 3"], uniforms: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N 3"]:
         """Directions to the light, drawn from a cosine lobe and three GGX lobes."""
-        return self.stack(parameters).mixture(wo, parameters[:, :3]).sample(wo, uniforms)
+        return sample_stack(self.stack(parameters), parameters[:, :3], wo, uniforms)
 
     @torch.no_grad()
     def density(
         self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
     ) -> Float[Tensor, " N"]:
         """Probability density of `sample`, 1/sr."""
-        return self.stack(parameters).mixture(wo, parameters[:, :3]).density(wi, wo)
+        return density_of_stack(self.stack(parameters), parameters[:, :3], wi, wo)
 
     def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
         """Linear base colour; of metals, the colour of what they reflect."""
@@ -74,19 +73,20 @@ class LayeredFamily:
     @staticmethod
     def stack(parameters: Float[Tensor, "N P"]) -> LayerStack:
         """The layers that the parameters stand for."""
-        base, scalars = parameters[:, :3], parameters[:, 3:].unbind(-1)
+        columns = parameters.T.contiguous()
+        base, scalars = columns[:3], columns[3:].unbind(0)
         metallicity, roughness, level, coat, coat_roughness = scalars[:5]
         sheen, sheen_roughness, tint, haze, spread, dust = scalars[5:]
-        hue = base / base.amax(-1, keepdim=True).clamp_min(1e-3)
+        hue = base / base.amax(0).clamp_min(1e-3)
         hazy = roughness + (1.0 - roughness) * (0.15 + 0.6 * spread)
         return LayerStack(
             dust_cover=LARGEST_COVER * dust,
-            sheen_colour=_LARGEST_SHEEN * sheen[:, None] * (1.0 + tint[:, None] * (hue - 1.0)),
+            sheen_colour=LARGEST_SHEEN * sheen * (1.0 + tint * (hue - 1.0)),
             sheen_roughness=sheen_roughness,
             coat_weight=coat,
-            roughness=torch.stack([_LARGEST_COAT_ROUGHNESS * coat_roughness, roughness, hazy], -1),
-            haze_weight=_LARGEST_HAZE * haze,
+            roughness=torch.stack([LARGEST_COAT_ROUGHNESS * coat_roughness, roughness, hazy]),
+            haze_weight=LARGEST_HAZE * haze,
             metallicity=metallicity,
             metal_colour=base,
-            dielectric_f0=_LARGEST_DIELECTRIC_F0 * level,
+            dielectric_f0=LARGEST_DIELECTRIC_F0 * level,
         )

@@ -17,35 +17,34 @@ from unmix_plugin.neumatex.materials.microfacet import reflection_density, sampl
 class LobeMixture:
     """A density of directions to the light for one `wo` per point."""
 
-    alphas: Float[Tensor, "N K"]
+    alphas: Float[Tensor, "K N"]
     """Widths of the GGX lobes."""
-    shares: Float[Tensor, "N K1"]
+    shares: Float[Tensor, "K1 N"]
     """Of the cosine lobe, then of each GGX lobe; they sum to 1."""
 
     @staticmethod
     def of_albedos(
-        alphas: Float[Tensor, "N K"], diffuse: Float[Tensor, " N"], specular: Float[Tensor, "N K"]
+        alphas: Float[Tensor, "K N"], diffuse: Float[Tensor, " N"], specular: Float[Tensor, "K N"]
     ) -> "LobeMixture":
         """Shares in proportion to what each lobe reflects; every lobe keeps a small one, which bounds estimates."""
-        albedos = torch.cat([diffuse[:, None] + 0.05, specular + 0.005], -1)
-        return LobeMixture(alphas, albedos / albedos.sum(-1, keepdim=True))
+        albedos = torch.cat([diffuse[None] + 0.05, specular + 0.005])
+        return LobeMixture(alphas, albedos / albedos.sum(0))
 
-    def sample(self, wo: Float[Tensor, "N 3"], uniforms: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    def sample(self, wo: Float[Tensor, "3 N"], uniforms: Float[Tensor, "3 N"]) -> Float[Tensor, "3 N"]:
         """Directions to the light; those of GGX lobes can point below the surface."""
-        lobe = (uniforms[:, 2:] >= self.shares.cumsum(-1)).sum(-1).clamp_max(self.alphas.shape[-1])
-        alpha = self.alphas.gather(-1, (lobe - 1).clamp_min(0)[:, None])[:, 0]
-        reflected = sample_reflections(alpha, wo, uniforms[:, :2])
-        return torch.where((lobe == 0)[:, None], cosine_directions(uniforms[:, :2]), reflected)
+        lobe = (uniforms[2] >= self.shares.cumsum(0)).sum(0).clamp_max(len(self.alphas))
+        alpha = self.alphas.gather(0, (lobe - 1).clamp_min(0)[None])[0]
+        reflected = sample_reflections(alpha, wo, uniforms[:2])
+        return torch.where(lobe == 0, cosine_directions(uniforms[:2]), reflected)
 
-    def density(self, wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
+    def density(self, wi: Float[Tensor, "3 N"], wo: Float[Tensor, "3 N"]) -> Float[Tensor, " N"]:
         """Of `sample`, 1/sr, on the whole sphere."""
-        cosine = wi[:, 2].clamp_min(0.0) / math.pi
-        lobes = (self.shares[:, 1:] * reflection_density(self.alphas, wi, wo)).sum(-1)
-        return self.shares[:, 0] * cosine + lobes
+        lobes = (self.shares[1:] * reflection_density(self.alphas, wi, wo)).sum(0)
+        return self.shares[0] * (wi[2].clamp_min(0.0) / math.pi) + lobes
 
 
-def cosine_directions(uniforms: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
+def cosine_directions(uniforms: Float[Tensor, "2 N"]) -> Float[Tensor, "3 N"]:
     """Directions above the surface whose density is their cosine over pi."""
-    radius, angle = torch.sqrt(uniforms[:, 1]), 2.0 * math.pi * uniforms[:, 0]
-    z = torch.sqrt((1.0 - uniforms[:, 1]).clamp_min(0.0))
-    return torch.stack([radius * torch.cos(angle), radius * torch.sin(angle), z], -1)
+    radius, angle = torch.sqrt(uniforms[1]), 2.0 * math.pi * uniforms[0]
+    z = torch.sqrt((1.0 - uniforms[1]).clamp_min(0.0))
+    return torch.stack([radius * torch.cos(angle), radius * torch.sin(angle), z])

@@ -1,7 +1,8 @@
 """GGX microfacets: distribution, masking, reflection at the half vector, sampling of visible normals.
 
 Notation: `N` points, `K` lobes of a point. `alpha` is the width of a lobe, about the square of its roughness.
-Directions are local, z along the normal; `n_i` and `n_o` are the cosines of `wi` (light) and `wo` (eye).
+Directions are local, z along the normal; `n_i` and `n_o` are the cosines of `wi` (light) and `wo` (eye). Components and
+lobes come first, `3 N` and `K N`: numbers that meet are then side by side in memory, which is several times faster.
 """
 
 import math
@@ -25,10 +26,19 @@ def alpha_of(roughness: Tensor) -> Tensor:
     return SMALLEST_ALPHA + (1.0 - SMALLEST_ALPHA) * roughness * roughness
 
 
-def half_vectors(wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+def roughness_of(alpha: Tensor) -> Tensor:
+    """Perceptual roughness of a lobe's width: the inverse of `alpha_of`."""
+    return torch.sqrt(((alpha - SMALLEST_ALPHA) / (1.0 - SMALLEST_ALPHA)).clamp(1e-8, 1.0))
+
+
+def half_vectors(wi: Float[Tensor, "3 N"], wo: Float[Tensor, "3 N"]) -> Float[Tensor, "3 N"]:
     """Unit vectors halfway; short ones where the directions are opposite."""
-    sums = wi + wo
-    return sums / sums.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+    return _unit(wi + wo)
+
+
+def dot(a: Float[Tensor, "3 N"], b: Float[Tensor, "3 N"]) -> Float[Tensor, " N"]:
+    """Inner products."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def schlick(cosine: Tensor) -> Tensor:
@@ -38,49 +48,53 @@ def schlick(cosine: Tensor) -> Tensor:
     return x2 * x2 * x
 
 
-def distribution(alpha: Float[Tensor, "N K"], half: Float[Tensor, "N 3"]) -> Float[Tensor, "N K"]:
+def distribution(alpha: Float[Tensor, "K N"], half: Float[Tensor, "3 N"]) -> Float[Tensor, "K N"]:
     """GGX density of microfacet normals, 1/sr; 0 below the surface."""
     # The sine comes from x and y: one minus the squared cosine would lose the digits of a sharp lobe.
-    sine2 = half[:, :1].square() + half[:, 1:2].square()
-    cosine = half[:, 2:].clamp_min(0.0)
+    sine2 = half[0] * half[0] + half[1] * half[1]
+    cosine = half[2].clamp_min(0.0)
     a2 = alpha * alpha
-    spread = (a2 * cosine * cosine + sine2).clamp_min(1e-9)  # 0 where directions are opposite
-    return (cosine > 0) * a2 / (math.pi * spread * spread)
+    spread = (a2 * (cosine * cosine) + sine2).clamp_min(1e-9)  # 0 where directions are opposite
+    return ((cosine > 0) / math.pi) * a2 / (spread * spread)
 
 
 def visibility(
-    alpha: Float[Tensor, "N K"], n_i: Float[Tensor, "N 1"], n_o: Float[Tensor, "N 1"]
-) -> Float[Tensor, "N K"]:
+    alpha: Float[Tensor, "K N"], n_i: Float[Tensor, " N"], n_o: Float[Tensor, " N"]
+) -> Float[Tensor, "K N"]:
     """Smith's height-correlated masking and shadowing over 4 n_i n_o."""
     a2 = alpha * alpha
     n_i, n_o = n_i.clamp_min(SMALLEST_COSINE), n_o.clamp_min(SMALLEST_COSINE)
-    of_eye = n_i * torch.sqrt(a2 + (1.0 - a2) * n_o * n_o)
-    of_light = n_o * torch.sqrt(a2 + (1.0 - a2) * n_i * n_i)
+    of_eye = n_i * torch.sqrt(n_o * n_o + a2 * (1.0 - n_o * n_o))
+    of_light = n_o * torch.sqrt(n_i * n_i + a2 * (1.0 - n_i * n_i))
     return 0.5 / (of_eye + of_light)
 
 
 def sample_reflections(
-    alpha: Float[Tensor, " N"], wo: Float[Tensor, "N 3"], uniforms: Float[Tensor, "N 2"]
-) -> Float[Tensor, "N 3"]:
+    alpha: Float[Tensor, " N"], wo: Float[Tensor, "3 N"], uniforms: Float[Tensor, "2 N"]
+) -> Float[Tensor, "3 N"]:
     """Directions to the light by reflection of `wo` at visible normals; some point below the surface.
 
     Source:
         Dupuy and Benyoub 2023, Sampling visible GGX normals with spherical caps.
     """
-    scale = torch.stack([alpha, alpha, torch.ones_like(alpha)], -1)
-    stretched = torch.nn.functional.normalize(wo * scale, dim=-1)
-    z = (1.0 - uniforms[:, 1]) * (1.0 + stretched[:, 2]) - stretched[:, 2]
+    scale = torch.stack([alpha, alpha, torch.ones_like(alpha)])
+    stretched = _unit(wo * scale)
+    z = (1.0 - uniforms[1]) * (1.0 + stretched[2]) - stretched[2]
     sine = torch.sqrt((1.0 - z * z).clamp(0.0, 1.0))
-    angle = 2.0 * math.pi * uniforms[:, 0]
-    cap = torch.stack([sine * torch.cos(angle), sine * torch.sin(angle), z], -1)
-    normals = torch.nn.functional.normalize((cap + stretched) * scale, dim=-1)
-    return 2.0 * (wo * normals).sum(-1, keepdim=True) * normals - wo
+    angle = 2.0 * math.pi * uniforms[0]
+    cap = torch.stack([sine * torch.cos(angle), sine * torch.sin(angle), z])
+    normals = _unit((cap + stretched) * scale)
+    return 2.0 * dot(wo, normals) * normals - wo
 
 
 def reflection_density(
-    alpha: Float[Tensor, "N K"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
-) -> Float[Tensor, "N K"]:
+    alpha: Float[Tensor, "K N"], wi: Float[Tensor, "3 N"], wo: Float[Tensor, "3 N"]
+) -> Float[Tensor, "K N"]:
     """Density of `sample_reflections` on the whole sphere, 1/sr; `wo` must be above the surface."""
-    n_o = wo[:, 2:].clamp_min(SMALLEST_COSINE)
-    a2 = alpha * alpha
-    return distribution(alpha, half_vectors(wi, wo)) * 0.5 / (n_o + torch.sqrt(a2 + (1.0 - a2) * n_o * n_o))
+    n_o = wo[2].clamp_min(SMALLEST_COSINE)
+    root = torch.sqrt(n_o * n_o + alpha * alpha * (1.0 - n_o * n_o))
+    return distribution(alpha, half_vectors(wi, wo)) * 0.5 / (n_o + root)
+
+
+def _unit(vectors: Float[Tensor, "3 N"]) -> Float[Tensor, "3 N"]:
+    return vectors * torch.rsqrt(dot(vectors, vectors).clamp_min(1e-12))

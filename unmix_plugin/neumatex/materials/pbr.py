@@ -1,7 +1,8 @@
 """The metallic-roughness materials of glTF 2.0: five numbers a point.
 
-Notation as in `family`. As published they may reflect up to twice the light at grazing angles, where the diffuse part
-does not know how much the surface reflects; that is kept, since files of this kind mean just this.
+Notation as in `family`; inside, as in `microfacet`. As published these materials may reflect up to twice the light at
+grazing angles, where the diffuse part does not know how much the surface reflects. That is kept: files of this kind
+mean just this.
 """
 
 import math
@@ -14,6 +15,7 @@ from unmix_plugin.neumatex.materials.lobe_mixture import LobeMixture
 from unmix_plugin.neumatex.materials.microfacet import (
     alpha_of,
     distribution,
+    dot,
     half_vectors,
     schlick,
     visibility,
@@ -37,37 +39,45 @@ class PbrFamily:
         self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N C"]:
         """Reflectance, 1/sr, without the cosine; 0 where a direction is below the surface."""
-        base, metallicity = parameters[:, :3], parameters[:, 4:5]
+        base, roughness, metallicity = _columns(parameters)
+        wi, wo = wi.T.contiguous(), wo.T.contiguous()
         half = half_vectors(wi, wo)
-        edge = schlick((wo * half).sum(-1, keepdim=True))
         f0 = _DIELECTRIC_F0 + metallicity * (base - _DIELECTRIC_F0)
-        fresnel = f0 + (1.0 - f0) * edge
-        alpha = alpha_of(parameters[:, 3:4])
-        lobe = distribution(alpha, half) * visibility(alpha, wi[:, 2:], wo[:, 2:])
-        diffuse = (1.0 - fresnel) * (1.0 - metallicity) * base / math.pi
-        return (diffuse + fresnel * lobe) * ((wi[:, 2:] > 0) & (wo[:, 2:] > 0))
+        fresnel = f0 + (1.0 - f0) * schlick(dot(wo, half))
+        alpha = alpha_of(roughness)
+        lobe = distribution(alpha, half) * visibility(alpha, wi[2], wo[2])
+        diffuse = (1.0 - fresnel) * ((1.0 - metallicity) / math.pi) * base
+        return ((diffuse + fresnel * lobe) * ((wi[2] > 0) & (wo[2] > 0))).T
 
     @torch.no_grad()
     def sample(
         self, parameters: Float[Tensor, "N P"], wo: Float[Tensor, "N 3"], uniforms: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N 3"]:
         """Directions to the light, drawn from a cosine lobe and visible GGX normals."""
-        return self._mixture(parameters, wo).sample(wo, uniforms)
+        wo = wo.T.contiguous()
+        return self._mixture(parameters, wo).sample(wo, uniforms.T.contiguous()).T.contiguous()
 
     @torch.no_grad()
     def density(
         self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
     ) -> Float[Tensor, " N"]:
         """Probability density of `sample`, 1/sr."""
-        return self._mixture(parameters, wo).density(wi, wo)
+        wo = wo.T.contiguous()
+        return self._mixture(parameters, wo).density(wi.T.contiguous(), wo)
 
     def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
         """Linear base colour; of metals, the colour of what they reflect."""
         return parameters[:, :3]
 
     def _mixture(self, parameters: Tensor, wo: Tensor) -> LobeMixture:
-        base, metallicity = parameters[:, :3].mean(-1), parameters[:, 4]
-        f0 = _DIELECTRIC_F0 + metallicity * (base - _DIELECTRIC_F0)
-        specular = f0 + (1.0 - f0) * schlick(wo[:, 2])
-        diffuse = (1.0 - metallicity) * base * (1.0 - f0)
-        return LobeMixture.of_albedos(alpha_of(parameters[:, 3:4]), diffuse, specular[:, None])
+        base, roughness, metallicity = _columns(parameters)
+        f0 = _DIELECTRIC_F0 + metallicity * (base.mean(0) - _DIELECTRIC_F0)
+        specular = f0 + (1.0 - f0) * schlick(wo[2])
+        diffuse = (1.0 - metallicity) * base.mean(0) * (1.0 - f0)
+        return LobeMixture.of_albedos(alpha_of(roughness), diffuse[0], specular)
+
+
+def _columns(parameters: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Base colour (3 N), roughness (1 N) and metallicity (1 N)."""
+    columns = parameters.T.contiguous()
+    return columns[:3], columns[3:4], columns[4:5]

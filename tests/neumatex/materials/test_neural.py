@@ -1,0 +1,74 @@
+"""The decoder stands for layered materials it has not seen, keeps light, and is trained the same way twice."""
+
+import math
+
+import torch
+from torch.testing import assert_close
+
+from tests.neumatex.materials.hemisphere import eye_directions, numbers
+from unmix_plugin.neumatex.materials.decoder_training import DecoderTraining, response_error, train
+from unmix_plugin.neumatex.materials.layered import LayeredFamily
+from unmix_plugin.neumatex.materials.layered_prior import draw_materials
+from unmix_plugin.neumatex.materials.neural import NeuralFamily
+
+FAMILY = NeuralFamily()
+
+
+def test_encoded_materials_look_like_the_layered_ones():
+    generator = torch.Generator().manual_seed(77)
+    layered = draw_materials(2000, generator)
+    neural = FAMILY.from_layered(layered)
+    truth, found = LayeredFamily.stack(layered), FAMILY.stack(neural)
+    error = response_error(truth, found, layered[:, :3].T, 16, generator)
+    assert -10 * math.log10(float(error.mean())) > 36
+    assert -10 * float(torch.log10(error).mean()) > 39
+
+
+def test_encoding_keeps_base_colours_and_gives_latents_in_range():
+    layered = draw_materials(200, torch.Generator().manual_seed(78))
+    neural = FAMILY.from_layered(layered)
+    assert torch.equal(neural[:, :3], layered[:, :3])
+    assert neural.min() >= 0
+    assert neural.max() <= 1
+
+
+def test_latents_of_any_value_never_brighten_a_white_furnace():
+    uniforms = torch.quasirandom.SobolEngine(3, scramble=True, seed=0).draw(1 << 14)
+    white = numbers(40, 9)
+    white[:, :3] = 1.0
+    for row, wo in zip(white, eye_directions(40), strict=True):
+        rows, eyes = row.expand(len(uniforms), -1), wo.expand(len(uniforms), 3)
+        wi = FAMILY.sample(rows, eyes, uniforms)
+        weights = wi[:, 2].clamp_min(0) / FAMILY.density(rows, wi, eyes)
+        assert float((FAMILY.evaluate(rows, wi, eyes) * weights[:, None]).mean(0).max()) < 1.005
+
+
+def test_the_specular_part_does_not_know_the_base_colour():
+    rows = numbers(100, 9)
+    black, white = rows.clone(), rows.clone()
+    black[:, :3], white[:, :3] = 0.0, 1.0
+    wi, wo = eye_directions(100, seed=3), eye_directions(100, seed=4)
+    passed, specular = FAMILY.stack(rows).reflectance(wi.T, wo.T)
+    assert_close(FAMILY.evaluate(black, wi, wo), specular.T)
+    assert_close(
+        FAMILY.evaluate(white, wi, wo) - specular.T,
+        (passed / math.pi)[:, None].expand(-1, 3),
+        rtol=1e-3,
+        atol=1e-4,
+    )
+
+
+def test_training_is_the_same_twice():
+    settings = DecoderTraining(steps=10, materials=32, lights=2, seed=3)
+    runs = []
+    for _ in range(2):
+        figures: list[float] = []
+        decoder, _ = train(settings, lambda _, psnr, figures=figures: figures.append(psnr))
+        runs.append((figures, decoder.last.weight.tolist()))
+    assert runs[0] == runs[1]
+
+
+def test_training_gets_better():
+    figures: list[float] = []
+    train(DecoderTraining(steps=300, materials=32, lights=2), lambda _, psnr: figures.append(psnr))
+    assert figures[1] > figures[0] + 0.4

@@ -1,0 +1,81 @@
+"""D_neu: the one decoder that all objects share, from six latents to reflection; and its encoder.
+
+The last layer of the network names a stack of analytic layers: widths, colours and weights of lobes. A network that
+gave reflectances themselves would have to draw each highlight; here sharp ones cost no more than soft ones, the stack
+is reciprocal, never brighter than its light, and can be sampled exactly.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from unmix_plugin.neumatex.materials.dust import LARGEST_COVER
+from unmix_plugin.neumatex.materials.layer_stack import (
+    LARGEST_COAT_ROUGHNESS,
+    LARGEST_DIELECTRIC_F0,
+    LARGEST_HAZE,
+    LARGEST_SHEEN,
+    LayerStack,
+)
+
+NUM_LATENTS = 6
+_NUM_OUTPUTS = 15
+_NUM_FEATURES = 23
+
+
+class Decoder(nn.Module):
+    """Latents to layers: two hidden layers."""
+
+    def __init__(self, width: int = 48) -> None:
+        super().__init__()
+        self.hidden = nn.ModuleList([nn.Linear(NUM_LATENTS, width), nn.Linear(width, width)])
+        self.last = nn.Linear(width, _NUM_OUTPUTS)
+
+    def forward(self, latents: Float[Tensor, "N 6"]) -> LayerStack:
+        """The layers of latents in [0, 1]."""
+        x = 2.0 * latents - 1.0
+        for layer in self.hidden:
+            x = nn.functional.silu(layer(x))
+        numbers = torch.sigmoid(torch.addmm(self.last.bias[:, None], self.last.weight, x.T))
+        coat, surface, haze = numbers[6:9].unbind(0)
+        return LayerStack(
+            dust_cover=LARGEST_COVER * numbers[0],
+            sheen_colour=LARGEST_SHEEN * numbers[1:4],
+            sheen_roughness=numbers[4],
+            coat_weight=numbers[5],
+            roughness=torch.stack([LARGEST_COAT_ROUGHNESS * coat, surface, surface + (1.0 - surface) * haze]),
+            haze_weight=LARGEST_HAZE * numbers[9],
+            metallicity=numbers[10],
+            metal_colour=numbers[11:14],
+            dielectric_f0=LARGEST_DIELECTRIC_F0 * numbers[14],
+        )
+
+
+class Encoder(nn.Module):
+    """Layers to latents: where the decoder comes nearest to them."""
+
+    def __init__(self, width: int = 128) -> None:
+        super().__init__()
+        self.hidden = nn.ModuleList([nn.Linear(_NUM_FEATURES, width), nn.Linear(width, width)])
+        self.last = nn.Linear(width, NUM_LATENTS)
+
+    def forward(self, stack: LayerStack) -> Float[Tensor, "N 6"]:
+        """Latents in [0, 1]."""
+        x = _features(stack)
+        for layer in self.hidden:
+            x = nn.functional.silu(layer(x))
+        return torch.sigmoid(self.last(x))
+
+
+def _features(stack: LayerStack) -> Tensor:
+    """What is in the stack, in numbers that vanish with the layer that they belong to."""
+    sheen, roughness = stack.sheen_colour / LARGEST_SHEEN, stack.roughness
+    dust, level = stack.dust_cover / LARGEST_COVER, stack.dielectric_f0 / LARGEST_DIELECTRIC_F0
+    coat, metallicity, haze = stack.coat_weight, stack.metallicity, stack.haze_weight / LARGEST_HAZE
+    scalars = [
+        dust, stack.sheen_roughness * sheen.amax(0), coat, coat * roughness[0], torch.sqrt(coat + 1e-4),
+        roughness[1], torch.sqrt(roughness[1] + 1e-4), haze, haze * roughness[2], haze * (1 - roughness[1]),
+        metallicity, level, level * (1.0 - metallicity), torch.sqrt(dust + 1e-4),
+    ]  # fmt: skip
+    metal = metallicity * stack.metal_colour
+    return 2.0 * torch.cat([torch.stack(scalars), sheen, metal, torch.sqrt(metal + 1e-4)]).T - 1.0
