@@ -134,3 +134,14 @@ def test_a_full_disk_exits_2_and_leaves_no_part_of_a_file(run_copy, monkeypatch)
     assert ended.status == 2
     assert "No space left on device; make room" in ended.err
     assert [path for path in (run_copy / "eval").rglob("*") if path.is_file()] == []
+
+
+def test_two_processes_find_what_one_finds(evaluated, tmp_path):
+    path = Path(shutil.copytree(evaluated[0], tmp_path / "run"))
+    alone = (path / "eval" / "metrics.json").read_bytes()
+    shutil.rmtree(path / "eval")
+    assert run(evaluate, "--run", path, "--device", "cpu", "--num-devices", 2).status == 0
+    assert (path / "eval" / "metrics.json").read_bytes() == alone
+    assert {picture.name for picture in (path / "eval").glob("*/*.png")} == {
+        picture.name for picture in (evaluated[0] / "eval").glob("*/*.png")
+    }

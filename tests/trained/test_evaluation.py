@@ -272,3 +272,16 @@ def test_a_view_is_measured_as_its_sensor_sees_it():
     assert evaluation.per_sensor()["other"]["psnr"] == other["psnr"]
     relit = ViewTruth("a", measured, valid, sensor=sensor).in_light(np.array([1.0, 3.0, 0, 0.5, 0]))
     assert_close(relit.spectra, (measured * torch.tensor([2.0, 0.5])).clamp(max=1))
+
+
+def test_views_counted_apart_and_merged_are_views_counted_together(scene, view):
+    """The second prediction has two materials exchanged, so that order and figures matter."""
+    predictions = [perfect(view, order) for order in ([0, 1, 2], SHUFFLED, [0, 1, 2])]
+    together, first, second = (Evaluation(scene, scene.endmembers) for _ in range(3))
+    for name, predicted, part in zip("cab", predictions, (first, second, first), strict=True):
+        together.add(replace(view, name=name), predicted)
+        part.add(replace(view, name=name), predicted)
+    first.merge([second], "cab")
+    assert finite_or_none(first.figures()) == finite_or_none(together.figures())
+    assert list(first.per_view) == ["c", "a", "b"]
+    assert first.segmentation() == together.segmentation()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,8 +20,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from unmix_plugin.editing.recipe import Recipe
+    from unmix_plugin.engine.processes.processes import Processes
     from unmix_plugin.engine.runs.load_run import LoadedPipeline
-    from unmix_plugin.products.evaluation_pictures import MaterialLook
     from unmix_plugin.scenes.scene import Scene
     from unmix_plugin.trained.evaluation import Evaluation
     from unmix_plugin.trained.trained_scene import TrainedScene
@@ -46,6 +47,8 @@ class EvalOptions:
     """Folder in which to look for the newest run."""
     device: DeviceName = "auto"
     """Where to compute; auto takes CUDA where there is one."""
+    num_devices: int = 1
+    """Processes that share the views, on CUDA each on a device of its own."""
 
 
 def evaluate(argv: list[str]) -> None:
@@ -60,6 +63,16 @@ def evaluate(argv: list[str]) -> None:
     """
     options = tyro.cli(EvalOptions, prog="unmix-eval", args=argv)
 
+    from unmix_plugin.engine.processes.joining import are_started, joined
+    from unmix_plugin.engine.processes.launching import run_processes
+
+    if options.num_devices > 1 and not are_started():
+        sys.exit(run_processes("unmix_plugin.commands.eval", argv, options.num_devices))
+    with joined(options.device) as processes:
+        _evaluate(options, processes)
+
+
+def _evaluate(options: EvalOptions, processes: Processes) -> None:
     from unmix_plugin.commands.eval_by_model import evaluate_by_model
     from unmix_plugin.commands.reporting import CommandConsole, working
     from unmix_plugin.commands.run_choice import chosen_run, spectral_scene
@@ -67,15 +80,23 @@ def evaluate(argv: list[str]) -> None:
     from unmix_plugin.engine.runs.load_run import load_pipeline
 
     console = CommandConsole()
-    path = chosen_run(options.run, options.output_dir)
-    recipe = requested_recipe(options.edits, options.illuminant)
-    with working(console, f"reading {path} and its scene"):
-        loaded = load_pipeline(path, options.device, options.data)
+    with processes.together():
+        path = chosen_run(options.run, options.output_dir)
+        recipe = requested_recipe(options.edits, options.illuminant)
+        with working(console, f"reading {path} and its scene"):
+            loaded = load_pipeline(path, options.device, options.data)
     if recipe is None and spectral_scene(loaded.pipeline.datamanager) is None:
-        evaluate_by_model(loaded, console)
+        if processes.is_first:
+            evaluate_by_model(loaded, console)
         return
-    subject = _subject(loaded, recipe, options)
-    evaluation, num_pictures = _evaluate_views(subject, console)
+    with processes.together():
+        subject = _subject(loaded, recipe, options)
+        evaluation, ids = _evaluate_views(subject, console, processes)
+    ids = _merged(subject, evaluation, ids, processes)
+    if not processes.is_first:
+        return
+    num_pictures = 3 * len(ids)
+    _draw_segmentations(subject, evaluation, ids, console)
     if subject.has_view_gains:
         print(
             "each evaluation view was aligned first: exposure and smooth white balance fitted to the measured view"
@@ -139,8 +160,11 @@ def _scene_of(loaded: LoadedPipeline) -> Scene:
     return scene
 
 
-def _evaluate_views(subject: _Subject, console: Console) -> tuple[Evaluation, int]:
-    """Measure and draw view by view; the ids alone are kept, since their colours are known after the last view."""
+def _evaluate_views(
+    subject: _Subject, console: Console, processes: Processes
+) -> tuple[Evaluation, dict[int, np.ndarray]]:
+    """Measure and draw this process's share of the views; the ids alone are kept, since their colours are known after
+    the last view."""
     import torch
 
     from unmix_plugin.commands.reporting import follow
@@ -155,7 +179,7 @@ def _evaluate_views(subject: _Subject, console: Console) -> tuple[Evaluation, in
     evaluation = Evaluation(scene_truth(scene).in_light(factors), materials.endmembers, materials.names)
     look = material_look(evaluation)
     ids: dict[int, np.ndarray] = {}
-    for index in follow(console, "evaluating views", scene.eval_indices):
+    for index in follow(console, "evaluating views", scene.eval_indices[processes.rank :: processes.count]):
         truth = view_truth(scene, index).in_light(factors)
         rays = subpixels_for(scene, index, subject.scene.subpixels, subject.scene.pixel_size)
         predicted = render_view(subject.scene, scene.cameras[index], rays)
@@ -168,21 +192,32 @@ def _evaluate_views(subject: _Subject, console: Console) -> tuple[Evaluation, in
         write_file(folder / "rgb" / name, draw_colour(truth, predicted, evaluation.truth.bands, psnr_db))
         write_file(folder / "abundances" / name, draw_matched_abundances(truth, predicted, evaluation, look))
         ids[index] = predicted.segmentation.numpy()
-    _draw_segmentations(subject, evaluation, look, ids, console)
-    return evaluation, 3 * len(ids)
+    return evaluation, ids
+
+
+def _merged(
+    subject: _Subject, evaluation: Evaluation, ids: dict[int, np.ndarray], processes: Processes
+) -> dict[int, np.ndarray]:
+    """The ids of all views; in the first process `evaluation` then has counted all of them."""
+    if processes.count == 1:
+        return ids
+    parts = processes.gather((evaluation, ids))
+    if not processes.is_first:
+        return ids
+    scene = _scene_of(subject.loaded)
+    order = [scene.frames[index].name for index in scene.eval_indices]
+    evaluation.merge((other for other, _ in parts[1:]), order)
+    return {index: found for _, part in parts for index, found in part.items()}
 
 
 def _draw_segmentations(
-    subject: _Subject,
-    evaluation: Evaluation,
-    look: MaterialLook,
-    ids: dict[int, np.ndarray],
-    console: Console,
+    subject: _Subject, evaluation: Evaluation, ids: dict[int, np.ndarray], console: Console
 ) -> None:
     from unmix_plugin.commands.reporting import follow
     from unmix_plugin.formats.files import write_file
-    from unmix_plugin.products.evaluation_pictures import draw_matched_segmentation
+    from unmix_plugin.products.evaluation_pictures import draw_matched_segmentation, material_look
 
+    look = material_look(evaluation)
     scene, matching = _scene_of(subject.loaded), evaluation.segmentation().matching
     for index in follow(console, "drawing segmentations", list(ids)):
         name = scene.frames[index].name
@@ -236,3 +271,7 @@ def _show(console: Console, figures: dict[str, Any], subject: _Subject) -> None:
 def main() -> None:
     """Console script."""
     run_command(evaluate)
+
+
+if __name__ == "__main__":
+    main()

@@ -32,7 +32,7 @@ def train(argv: list[str]) -> None:
         SystemExit: help was asked for (0), arguments that do not parse (2), or a stop on request (130).
     """
     from unmix_plugin.engine.training.progress import ProgressConsole
-    from unmix_plugin.engine.training.training_steps import follow_training, joined
+    from unmix_plugin.engine.training.training_steps import follow_training, joined_training
 
     methods, broken = discover_methods()
     for plugin in broken:
@@ -45,7 +45,7 @@ def train(argv: list[str]) -> None:
         from unmix_plugin.engine.processes.launching import run_processes
 
         sys.exit(run_processes("unmix_plugin.commands.train", argv, config.machine.num_devices))
-    with joined(config) as processes:
+    with joined_training(config) as processes:
         if not processes.is_first:
             follow_training(config, processes)
             return

@@ -190,6 +190,15 @@ class Evaluation:
         self.per_view[view.name] = figures
         return figures
 
+    def merge(self, others: Iterable[Evaluation], order: Iterable[str]) -> None:
+        """Count the views of others of the same scene, too; `order` has the names of all views."""
+        for other in others:
+            self.per_view |= other.per_view
+            self.sensors |= other.sensors
+            if self._tally is not None and other._tally is not None:
+                self._tally.confusion += other._tally.confusion
+        self.per_view = {name: self.per_view[name] for name in order}
+
     def segmentation(self) -> SegmentationScores:
         """Scores over all views counted so far, and which id stands for which material."""
         if self._tally is None:

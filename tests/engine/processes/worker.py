@@ -19,7 +19,7 @@ from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.engine.training.training_steps import (
     TrainingSteps,
     follow_training,
-    joined,
+    joined_training,
     prepare_steps,
 )
 
@@ -50,7 +50,7 @@ def train(folder: Path, config: Any) -> None:
         steps.append(self)
 
     setattr(TrainingSteps, "__init__", remember)  # noqa: B010 - type checkers refuse the plain assignment
-    with joined(config) as processes:
+    with joined_training(config) as processes:
         if processes.is_first:
             Trainer(config, processes=processes).train()
         else:
@@ -60,7 +60,7 @@ def train(folder: Path, config: Any) -> None:
 
 def gradients(folder: Path, config: Any) -> None:
     """Average the gradients of half a batch in each process; each keeps what it has then."""
-    with joined(config) as processes:
+    with joined_training(config) as processes:
         _, steps = prepare_steps(config, processes)
         steps.begin(0)
         rays, batch = fixed_batch(steps.pipeline)

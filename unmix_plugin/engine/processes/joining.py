@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from datetime import timedelta
 from typing import Any
 
@@ -51,6 +52,22 @@ def leave(processes: Processes) -> None:
     """End what `join` began."""
     if processes.count > 1 and distributed.is_initialized():
         distributed.destroy_process_group()
+
+
+@contextmanager
+def joined(device: str) -> Iterator[Processes]:
+    """Context in which this process works with those that were started with it.
+
+    Args:
+        device: As `join` takes it.
+    Raises:
+        ConfigError: as `join`.
+    """
+    processes = join(device)
+    try:
+        yield processes
+    finally:
+        leave(processes)
 
 
 def require_equal_settings(processes: Processes, settings: Mapping[str, Any]) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.devices import resolve_device
 from unmix_plugin.engine.pipeline import Pipeline
-from unmix_plugin.engine.processes.joining import join, leave, require_equal_settings
+from unmix_plugin.engine.processes.joining import joined, require_equal_settings
 from unmix_plugin.engine.processes.processes import ALONE, Follower, Processes
 from unmix_plugin.engine.runs.checkpoints import Checkpoint
 from unmix_plugin.engine.runs.config_json import config_to_json
@@ -166,20 +166,17 @@ def prepare_steps(config: TrainerConfig, processes: Processes = ALONE) -> tuple[
 
 
 @contextmanager
-def joined(config: TrainerConfig) -> Iterator[Processes]:
+def joined_training(config: TrainerConfig) -> Iterator[Processes]:
     """Context in which this process trains with the others that were started with it.
 
     Raises:
         ConfigError: their settings differ, or this machine can't run them.
         Follower: the same, in a process that isn't the first.
     """
-    processes = join(config.device)
-    try:
+    with joined(config.device) as processes:
         everywhere = replace(config, output_dir=Path(), data=None, load_run=None)
         require_equal_settings(processes, config_to_json(everywhere))
         yield processes
-    finally:
-        leave(processes)
 
 
 def follow_training(config: TrainerConfig, processes: Processes) -> None:
