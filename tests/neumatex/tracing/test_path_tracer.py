@@ -10,7 +10,7 @@ from unmix_plugin.neumatex.geometry.mesh import mesh_of
 from unmix_plugin.neumatex.geometry.ray_mesh import RayMesh
 from unmix_plugin.neumatex.lighting.built_in import built_in_environment
 from unmix_plugin.neumatex.lighting.environment import Environment, directions_of_pixels
-from unmix_plugin.neumatex.tracing.local_frames import LocalFrames
+from unmix_plugin.neumatex.materials.shading_frame import frames
 from unmix_plugin.neumatex.tracing.path_tracer import reflected_radiance
 from unmix_plugin.neumatex.tracing.sample_points import SamplePoints
 
@@ -161,9 +161,9 @@ def test_transport_is_reciprocal():
 
 def _flux(rays, surface, light, eye):
     """Radiance over the projected area that the eye sees, from a light of a few degrees; two reflections or one."""
-    frame = LocalFrames.about(eye[None])
+    first, second, _ = frames(eye[None])[0]
     x, y = torch.meshgrid(*2 * [torch.linspace(-1.3, 1.3, 120)], indexing="ij")
-    origins = 5 * eye + x.reshape(-1, 1) * frame.first + y.reshape(-1, 1) * frame.second
+    origins = 5 * eye + x.reshape(-1, 1) * first + y.reshape(-1, 1) * second
     directions = -eye.expand_as(origins).contiguous()
     hits = rays.closest(origins, directions)
     points = rays.points(hits.select(hits.found), directions[hits.found])
@@ -276,14 +276,3 @@ def test_digits_within_an_even_spread_are_random():
     drawn = SamplePoints.draw(1, 1024, 1, _generator(), torch.device("cpu")).of(torch.arange(1024), 0)
     within = (drawn[:, 0] * 1024) % 1
     assert_close(within.std(), torch.tensor(12**-0.5, dtype=torch.float64), atol=0.02, rtol=0)
-
-
-def test_local_frames_are_orthonormal_and_invert():
-    normals = unit(torch.randn(500, 3, generator=_generator()))
-    normals[:2] = torch.tensor([[0.0, 0, 1], [0, 0, -1]])
-    frames = LocalFrames.about(normals)
-    axes = torch.stack([frames.first, frames.second, frames.normals], dim=1)
-    assert_close(axes @ axes.mT, torch.eye(3).expand(500, 3, 3), atol=1e-5, rtol=0)
-    assert_close(torch.linalg.det(axes), torch.ones(500), atol=1e-5, rtol=0)
-    vectors = torch.randn(500, 3, generator=_generator(1))
-    assert_close(frames.to_world(frames.to_local(vectors)), vectors, atol=1e-5, rtol=0)

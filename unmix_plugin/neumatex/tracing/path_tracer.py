@@ -22,8 +22,8 @@ from torch import Tensor
 
 from unmix_plugin.neumatex.geometry.ray_mesh import Hits, RayMesh, SurfacePoints
 from unmix_plugin.neumatex.lighting.environment import Environment
+from unmix_plugin.neumatex.materials.shading_frame import frames, to_local, to_world
 from unmix_plugin.neumatex.surface import Surface
-from unmix_plugin.neumatex.tracing.local_frames import LocalFrames
 from unmix_plugin.neumatex.tracing.sample_points import SamplePoints
 
 
@@ -43,7 +43,8 @@ class _Vertices:
     paths: Int[Tensor, " M"]
     """Which path, point after point and sample after sample."""
     points: SurfacePoints
-    frames: LocalFrames
+    axes: Float[Tensor, "M 3 3"]
+    """Frames of shading."""
     wo: Float[Tensor, "M 3"]
     """Direction back along the path, local."""
     parameters: Float[Tensor, "M P"]
@@ -109,13 +110,13 @@ def reflected_radiance(
 def _first_vertices(world: _World, points: SurfacePoints, to_eye: Tensor, samples: int) -> _Vertices:
     # Materials are looked up once a point, not once a sample.
     parameters = world.surface.parameters(points.positions)
-    frames = LocalFrames.about(points.normals)
-    wo = frames.to_local(to_eye)
+    axes = frames(points.normals)
+    wo = to_local(axes, to_eye)
     rows = torch.arange(len(to_eye), device=to_eye.device).repeat_interleave(samples)
     return _Vertices(
         torch.arange(len(rows), device=to_eye.device),
         points.select(rows),
-        frames.select(rows),
+        axes[rows],
         wo[rows],
         parameters[rows],
         torch.ones(len(rows), world.environment.num_colours, device=to_eye.device),
@@ -128,7 +129,7 @@ def _shade(
     """Direct light at vertices by both strategies, and the vertices that the paths reach next."""
     light = _light_by_environment(world, vertices, drawn[:, :2])
     wi = world.surface.family.sample(vertices.parameters.detach(), vertices.wo, drawn[:, 2:].float())
-    directions = vertices.frames.to_world(wi)
+    directions = to_world(vertices.axes, wi)
     rows = vertices.front(directions, wi[:, 2]).nonzero()[:, 0]
     vertices, wi, directions = _select(vertices, rows), wi[rows], directions[rows]
     if is_last:
@@ -152,7 +153,7 @@ def _light_by_environment(world: _World, vertices: _Vertices, drawn: Float[Tenso
     rows = (vertices.front(directions, cosines) & (density > 0)).nonzero()[:, 0]
     rows = rows[~world.ray_mesh.blocked(vertices.points.positions[rows], directions[rows])]
     vertices, directions, density = _select(vertices, rows), directions[rows], density[rows]
-    family, wi = world.surface.family, vertices.frames.to_local(directions)
+    family, wi = world.surface.family, to_local(vertices.axes, directions)
     reflectance = family.evaluate(vertices.parameters, wi, vertices.wo)
     other = family.density(vertices.parameters.detach(), wi, vertices.wo)
     factor = (cosines[rows] * _power_heuristic(density, other) / density)[:, None]
@@ -183,16 +184,16 @@ def _light_by_material(
 def _reached(world: _World, paths: Tensor, hits: Hits, directions: Tensor, carried: Tensor) -> _Vertices:
     """The next vertices of paths that met the mesh."""
     points = world.ray_mesh.points(hits, directions)
-    frames = LocalFrames.about(points.normals)
+    axes = frames(points.normals)
     parameters = world.surface.parameters(points.positions)
-    return _Vertices(paths, points, frames, frames.to_local(-directions), parameters, carried)
+    return _Vertices(paths, points, axes, to_local(axes, -directions), parameters, carried)
 
 
 def _select(vertices: _Vertices, rows: Int[Tensor, " M"]) -> _Vertices:
     return _Vertices(
         vertices.paths[rows],
         vertices.points.select(rows),
-        vertices.frames.select(rows),
+        vertices.axes[rows],
         vertices.wo[rows],
         vertices.parameters[rows],
         vertices.throughput[rows],

@@ -52,7 +52,7 @@ def demo_scene_path(cache_dir: Path | None = None) -> Path:
     Raises:
         SceneError: the cache can't be written.
     """
-    target = (cache_dir or _user_cache()) / f"demo-{_generator_hash()}" / "demo"
+    target = (cache_dir or user_cache()) / f"demo-{_generator_hash()}" / "demo"
     if is_complete(target):
         return target
     try:
@@ -190,8 +190,8 @@ def _move_files(built: Path, directory: Path) -> None:
     (built / _TRANSFORMS).replace(directory / _TRANSFORMS)
 
 
-def _user_cache() -> Path:
-    """XDG base directory specification: XDG_CACHE_HOME counts only if absolute."""
+def user_cache() -> Path:
+    """Where generated data is kept, by the XDG base directory specification: XDG_CACHE_HOME counts only if absolute."""
     configured = Path(os.environ.get("XDG_CACHE_HOME", ""))
     return (configured if configured.is_absolute() else Path.home() / ".cache") / "unmix-nerf"
 
