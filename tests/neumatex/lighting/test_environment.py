@@ -7,9 +7,9 @@ import torch
 from torch.testing import assert_close
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.neumatex.lighting.alias_table import alias_table
 from unmix_plugin.neumatex.lighting.built_in import NAMES, built_in_environment
 from unmix_plugin.neumatex.lighting.environment import Environment, directions_of_pixels
+from unmix_plugin.neumatex.lighting.picture_inversion import PictureInversion
 
 
 def _uniforms(count, seed=0):
@@ -26,22 +26,23 @@ def _spotty(height=16):
     return Environment(torch.rand(height, 2 * height, 3, generator=g) ** 6)
 
 
-@pytest.mark.parametrize("weights", [[1.0], [0, 3.0], [1, 1, 1, 1.0], [0.1, 7, 0, 0.2, 2, 2], [0.1] * 7])
-def test_alias_table_holds_the_weights(weights):
+@pytest.mark.parametrize(
+    "weights", [[[1.0]], [[0, 3.0], [0, 0]], [[1, 1, 1, 1.0]] * 2, [[0.1, 7, 0], [0.2, 2, 2]]]
+)
+def test_pixels_are_drawn_by_their_weights_and_evenly_within(weights):
     given = torch.tensor(weights)
-    table = alias_table(given)
-    held = table.keep.clone().index_add_(0, table.aliases, 1 - table.keep) / len(given)
-    assert_close(held, given.double() / given.double().sum(), atol=1e-7, rtol=0)
-
-
-def test_alias_draws_leave_a_uniform_number():
-    table = alias_table(torch.tensor([0.1, 7, 0, 0.2, 2, 2]))
-    items, rest = table.draw((torch.arange(100_000, dtype=torch.float64) + 0.5) / 100_000)
-    assert 2 not in items
-    for item in (1, 4):
-        numbers = rest[items == item]
-        assert_close(numbers.mean(), torch.tensor(0.5, dtype=torch.float64), atol=0.01, rtol=0)
-        assert_close(numbers.var(), torch.tensor(1 / 12, dtype=torch.float64), atol=0.003, rtol=0)
+    axis = (torch.arange(600, dtype=torch.float64) + 0.5) / 600
+    grid = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), dim=-1).reshape(-1, 2)
+    row, column, down, across = PictureInversion.of(given).draw(grid)
+    drawn = torch.zeros_like(given, dtype=torch.float64).index_put_(
+        (row, column), torch.ones_like(down), True
+    )
+    assert_close(drawn / len(grid), given.double() / given.double().sum(), atol=3e-3, rtol=0)
+    assert bool((drawn[given == 0] == 0).all())
+    for place in (down, across):
+        heaviest = place[(row * given.shape[1] + column) == given.argmax()]
+        assert_close(heaviest.mean(), torch.tensor(0.5, dtype=torch.float64), atol=0.01, rtol=0)
+        assert_close(heaviest.std(), torch.tensor(12**-0.5, dtype=torch.float64), atol=0.01, rtol=0)
 
 
 def test_directions_follow_the_stated_convention():

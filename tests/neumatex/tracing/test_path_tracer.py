@@ -269,10 +269,3 @@ def test_numbers_are_uniform_and_even():
             counts = torch.histc(drawn[64 * point : 64 * (point + 1), dimension], 16, 0, 1)
             assert counts.min() >= 2
             assert counts.max() <= 6
-
-
-def test_digits_within_an_even_spread_are_random():
-    """A table of as many bins as samples sees a different part of each bin."""
-    drawn = SamplePoints.draw(1, 1024, 1, _generator(), torch.device("cpu")).of(torch.arange(1024), 0)
-    within = (drawn[:, 0] * 1024) % 1
-    assert_close(within.std(), torch.tensor(12**-0.5, dtype=torch.float64), atol=0.02, rtol=0)

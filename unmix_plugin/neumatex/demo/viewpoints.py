@@ -12,7 +12,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 
 _DISTANCE = 4.2
 _ELEVATIONS_DEG = (-40.0, 70.0)
-_MARGIN = 1.06
+_MARGIN = 1.12
 """Half of a picture, as a multiple of the object's radius."""
 
 

@@ -1,9 +1,7 @@
 """Random numbers of paths: uniform for each path, evenly spread over the paths of a point.
 
 A Sobol sequence over the samples is shifted by random numbers of each point (modulo 1), so that each path's numbers
-are uniform and independent between points, dimensions and calls, but fill the unit cube evenly. The first number of a
-vertex draws from a table, which also uses its low digits: they would be the same in all samples of a point, so it is
-moved by a random part of the distance between samples.
+are uniform and independent between points, dimensions and calls, but fill the unit cube evenly.
 
 Source: Cranley and Patterson 1976, Randomization of Number Theoretic Methods for Multiple Integration.
 """
@@ -28,8 +26,6 @@ class SamplePoints:
     """Common to the points."""
     shifts: Float64[Tensor, "N D"]
     """Of each point."""
-    jitter: Float64[Tensor, "paths V"]
-    """Of the first number of each vertex of each path, in [0, 1 / S)."""
 
     @staticmethod
     def draw(
@@ -48,17 +44,13 @@ class SamplePoints:
             raise ValueError(f"samples must be at least 1; got {samples}")
         dimensions = NUMBERS_A_VERTEX * vertices
         sequence = torch.quasirandom.SobolEngine(dimensions).draw(samples, dtype=torch.float64)
-        shifts, jitter = (
-            torch.rand(*shape, generator=generator, dtype=torch.float64, device=device)
-            for shape in ((num_points, dimensions), (num_points * samples, vertices))
-        )
-        return SamplePoints(sequence.to(device), shifts, jitter / samples)
+        shifts = torch.rand(num_points, dimensions, generator=generator, dtype=torch.float64, device=device)
+        return SamplePoints(sequence.to(device), shifts)
 
     def of(self, paths: Int[Tensor, " M"], vertex: int) -> Float[Tensor, "M 5"]:
         """Numbers of a vertex of paths; path p is sample p % S of point p // S."""
         samples = len(self.sequence)
         part = slice(NUMBERS_A_VERTEX * vertex, NUMBERS_A_VERTEX * (vertex + 1))
         moved = self.sequence[:, part][paths % samples] + self.shifts[:, part][paths // samples]
-        moved[:, 0] += self.jitter[paths, vertex]
         # Rounding to float32 later must not reach 1.
         return (moved - moved.floor()).clamp(max=1 - 2.0**-24)
