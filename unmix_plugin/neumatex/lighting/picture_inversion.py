@@ -18,9 +18,9 @@ from torch import Tensor
 class PictureInversion:
     """Cumulative shares of a picture's pixels."""
 
-    rows: Float64[Tensor, " H+1"]
+    rows: Float64[Tensor, " row_edges"]
     """Share of all rows before each, from 0 to 1."""
-    columns: Float64[Tensor, "H W+1"]
+    columns: Float64[Tensor, "H column_edges"]
     """In each row, the share of all pixels before each."""
     ends: Float64[Tensor, " HW"]
     """Share up to and with each pixel of its row, plus the row's index: one increasing list."""
