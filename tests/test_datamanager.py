@@ -240,3 +240,26 @@ def test_light_outside_a_mask_counts_as_evidence(scene_folder, tmp_path):
     assert 0.005 < float((trust == 0).double().mean()) < 0.1
     believing = make(folder, trust_alpha=True)
     assert bool((believing.next_train(0)[1]["alpha_trust"] == 1).all())
+
+
+def test_noise_stripes_and_spikes_are_found_and_named(tmp_path):
+    folder = tmp_path / "demo"
+    make_demo_scene(folder, size=32, bands=16, views=8)
+    sound = make(folder)
+    assert sound.warnings() == []
+    assert (sound.initial_data()["band_weights"] == 1).all()
+    generator = np.random.default_rng(0)
+    for path in sorted((folder / "cubes").glob("train_*.npy")):
+        cube = np.load(path).astype(np.float32)
+        cube[..., 5] = generator.uniform(0, 0.5, cube.shape[:2])
+        cube[:, 16, 11] *= 0.1
+        cube[20, 12, 13] = 1.0
+        np.save(path, cube.astype(np.float16))
+    manager = make(folder)
+    noisy, bad = manager.warnings()
+    assert f"band {manager.scene.wavelengths_nm[5]:g} nm is mostly noise" in noisy
+    assert "stripes, spikes" in bad
+    weights = manager.initial_data()["band_weights"]
+    assert weights.argmin() == 5
+    assert weights[5] < 0.1 * weights[4]
+    assert make(folder, mend_values=False).warnings() == [noisy]

@@ -174,3 +174,33 @@ def test_sensors_that_share_no_band_are_named(tmp_path):
     config = HyperspectralDataManagerConfig(grid_resolution=16)
     [warning] = config.setup(data=folder.root, device=torch.device("cpu")).warnings()
     assert "no other sensor shares a band with odd, small" in warning
+
+
+def test_a_rig_whose_sensors_look_elsewhere_is_named(tmp_path):
+    folder = make_rig(tmp_path / "rig")
+
+    def turn_away(content) -> None:
+        for frame in content["frames"]:
+            if frame.get("sensor") == "small":
+                matrix = np.array(frame["transform_matrix"])
+                matrix[:3, 0] *= -1.0
+                matrix[:3, 2] *= -1.0
+                frame["transform_matrix"] = matrix.tolist()
+
+    folder.edit(turn_away)
+    config = HyperspectralDataManagerConfig(grid_resolution=16)
+    said = config.setup(data=folder.root, device=torch.device("cpu")).warnings()
+    assert any(
+        "of what sensor 'small' sees, the other sensors see 0 %" in warning.replace("0%", "0 %")
+        for warning in said
+    )
+
+
+def test_endmembers_that_a_sensor_cannot_carry_are_named():
+    (warning,) = make_model(num_endmembers=3).warnings()
+    assert (
+        "3 endmembers are more than these sensors have channels: colour (2); materials are found" in warning
+    )
+    (warning,) = make_model(num_endmembers=5).warnings()
+    assert "spectral (4), colour (2)" in warning
+    assert "try --endmembers 4" in warning

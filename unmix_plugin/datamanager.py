@@ -33,10 +33,16 @@ from unmix_plugin.scenes.identity import scene_identity
 from unmix_plugin.scenes.pixel_rays import PixelRays
 from unmix_plugin.scenes.pixel_table import PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
-from unmix_plugin.scenes.reading.sensors import lonely_sensors
 from unmix_plugin.scenes.recorded_scene import check_recorded_scene
 from unmix_plugin.scenes.scene import Scene, SceneOptions
+from unmix_plugin.scenes.training_evidence import (
+    band_weights,
+    judge_sensors,
+    noise_warnings,
+    rig_warnings,
+)
 from unmix_plugin.sensor_batches import join_parts
+from unmix_plugin.spectral.band_noise import BandNoise
 from unmix_plugin.spectral.unmixing.partial_bands import typical_spectrum
 
 _MANY_PIXELS = 4_000_000
@@ -65,6 +71,9 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
     128 where alpha is known, else 64: only what few cameras see can be carved then."""
     trust_alpha: bool = False
     """Believe alpha even where the light of a pixel contradicts it."""
+    mend_values: bool = True
+    """Replace stripes and spikes in training views by what is around them: values that stand out from the bands
+    beside them and from the pixels around them in that. From 8 bands on, for pixels that memory holds."""
     max_initial_pixels: int = 50_000
     """Pixels, drawn from all training views, from which the endmembers are initialised."""
 
@@ -120,6 +129,7 @@ class HyperspectralDataManager(DataManager):
         self._rays = PixelRays(self.scene, device)
         self._preset = preset_for(self.scene.has_alpha)
         self._num_rays = config.train_num_rays_per_batch
+        self._bad_share = 0.0
         self._choose_subpixels(step=0, progress=0.0)
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
@@ -188,7 +198,7 @@ class HyperspectralDataManager(DataManager):
 
     def initial_data(self) -> Mapping[str, np.ndarray]:
         """`pixels`: spectra pooled over all training views; `reachable`: where something may be; `light`: fixed,
-        camera or per-view, as far as pictures with alpha tell.
+        camera or per-view, as far as pictures with alpha tell; `band_weights`, of squared errors, mean 1.
 
         Of a rig, pixels of the sensor with most channels, and of those the one with most pixels; `sensor`, which that
         is; and `typical`, a spectrum on all bands that fits the mean of each sensor's pixels.
@@ -205,6 +215,7 @@ class HyperspectralDataManager(DataManager):
         found = {
             "pixels": self._pixels.sample_opaque(chosen, most, seed),
             "reachable": reachable,
+            "band_weights": band_weights(self.scene, self._noise),
             "light": np.array(self._light(reachable) if self.scene.has_alpha else "fixed"),
         }
         if not self.scene.is_rig:
@@ -225,15 +236,11 @@ class HyperspectralDataManager(DataManager):
         check_recorded_scene(summary)
 
     def warnings(self) -> list[str]:
-        """Poses that seem to follow another convention, and sensors that share no band with another."""
-        scene = self.scene
-        found = [check_scene_poses(scene)]
-        alone = lonely_sensors(scene.sensors, {scene.frames[view].sensor for view in scene.train_indices})
-        if alone:
-            found.append(
-                f"no other sensor shares a band with {', '.join(alone)}: only their poses hold their spectra together"
-            )
-        found.append(self._pixels.note)
+        """Poses that seem to follow another convention, sensors that share no band or no place with another, and bad
+        bands and values."""
+        found = [check_scene_poses(self.scene), self._pixels.note]
+        found += noise_warnings(self.scene, self._noise, self._bad_share)
+        found += rig_warnings(self.scene, self._initial_data["reachable"]) if self.scene.is_rig else []
         return [warning for warning in found if warning is not None]
 
     def identity(self, summary: Mapping[str, Any]) -> dict[str, Any]:
@@ -244,7 +251,13 @@ class HyperspectralDataManager(DataManager):
     def _pixels(self) -> PixelTable:
         """Read when training asks: evaluation needs none of it."""
         memory_gb = None if self.options.memory_gb == "auto" else self.options.memory_gb
-        return PixelTable(self.scene, self.device, self.scene.train_indices, memory_gb)
+        table = PixelTable(self.scene, self.device, self.scene.train_indices, memory_gb)
+        self._bad_share = table.mend(self.scene, self.seed) if self.options.mend_values else 0.0
+        return table
+
+    @cached_property
+    def _noise(self) -> dict[int, BandNoise]:
+        return judge_sensors(self.scene, self._pixels, self.seed)
 
     @cached_property
     def _evidence(self) -> AlphaEvidence:

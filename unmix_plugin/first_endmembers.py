@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from unmix_plugin.band_balance import BandBalance
 from unmix_plugin.model_settings import UnmixModelConfig
 from unmix_plugin.sensor_views import SensorViews
 from unmix_plugin.spectral.bands import Bands
@@ -23,6 +24,7 @@ from unmix_plugin.spectral.unmixing.partial_bands import distinct_spectra, fill_
 def first_endmembers(
     config: UnmixModelConfig,
     count: int,
+    balance: BandBalance,
     sensors: SensorViews,
     lamp: Float[Tensor, "B"],
     bands: Bands,
@@ -33,6 +35,7 @@ def first_endmembers(
 
     Args:
         count: K.
+        balance: What each band counts where pixels are compared.
         sensors: What the sensors of a rig see.
         lamp: Spectrum of the light, which reflectances of a file are multiplied by.
         initial_data: What the data manager knows of the training pixels.
@@ -47,7 +50,8 @@ def first_endmembers(
     assert config.endmember_init != "file"
     if not sensors.tells_materials(sensor, count):
         return distinct_spectra(torch.from_numpy(initial_data["typical"]), count)
-    seen = initialise_endmembers(pixels, count, config.endmember_init, generator)
+    balanced = balance.scaled(pixels, sensor)
+    seen = balance.restored(initialise_endmembers(balanced, count, config.endmember_init, generator), sensor)
     return seen if sensor is None else _on_all_bands(seen, sensors, initial_data)
 
 

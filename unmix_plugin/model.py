@@ -22,6 +22,7 @@ from torch import Tensor, nn
 
 from unmix_plugin.abundance_guide import AbundanceGuide
 from unmix_plugin.alpha_preset import choose, preset_for
+from unmix_plugin.band_balance import BandBalance
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.model import Model
@@ -50,7 +51,7 @@ _PROBED_CELLS = 32_768
 _GRID_DECAY = 0.5
 """Factor on the remembered density of a probed cell: lower forgets emptied space sooner."""
 _OCCUPIED_OPACITY = 0.03
-"""Opacity of one sample's interval from which a cell counts as occupied."""
+"""Opacity of one sample's interval, as samples lie at the start of training, from which a cell counts as occupied."""
 
 
 class UnmixModel(Model):
@@ -94,6 +95,8 @@ class UnmixModel(Model):
         self.guide = AbundanceGuide(*shape)
         self.view_gains = self._make_view_gains()
         self.seen_by = SensorViews(metadata.get("sensors", ()), self.rgb_weights)
+        weights = () if config.losses.band_weights == "auto" else config.losses.band_weights
+        self.balance = BandBalance(weights, self.bands, self.seen_by)
         self._progress = 0.0
 
     def initialise(self, initial_data: Mapping[str, np.ndarray], generator: torch.Generator) -> None:
@@ -105,13 +108,21 @@ class UnmixModel(Model):
         """
         light = self.metadata["illuminant"]
         lamp = torch.ones(len(self.bands)) if light is None else torch.tensor(light, dtype=torch.float32)
-        pixels = torch.from_numpy(initial_data["pixels"])
         endmembers = first_endmembers(
-            self.config, self.num_endmembers, self.seen_by, lamp, self.bands, initial_data, generator
+            self.config,
+            self.num_endmembers,
+            self.balance,
+            self.seen_by,
+            lamp,
+            self.bands,
+            initial_data,
+            generator,
         )
         self.endmembers.copy_(endmembers)
         self.endmember_bound.fill_(max(1.0, float(endmembers.max())))
-        seen = self.seen_by.project(endmembers, initial_data.get("sensor"))
+        sensor = initial_data.get("sensor")
+        pixels = self.balance.scaled(torch.from_numpy(initial_data["pixels"]), sensor)
+        seen = self.balance.scaled(self.seen_by.project(endmembers, sensor), sensor)
         self.guide.start(pixels, endmembers, self.config.losses.mixing_penalty, seen)
         for row in range(len(self.specular_spectra)):
             spectrum = lamp if row == 0 else endmembers[(row - 1) % len(endmembers)]
@@ -213,12 +224,17 @@ class UnmixModel(Model):
             config.outlier,
         )
         exposed = choose(config.exposure, 1.0) * measured
-        losses = spectral_losses(pixels, exposed, self.seen_by.rgb_weights(part.sensor), wanted)
+        colours, weights = self.seen_by.rgb_weights(part.sensor), self.balance.of(part.sensor)
+        losses = spectral_losses(pixels, exposed, colours, wanted, weights)
         if "abundances" in wanted and self.seen_by.tells_materials(part.sensor, self.num_endmembers):
             abundances = pixel_mean(outputs["abundances"], len(measured))
-            endmembers = self.seen_by.project(self.guide.endmembers, part.sensor)
-            losses["abundances"] = self.guide.error(abundances, batch, endmembers)
+            losses["abundances"] = self.guide.error(abundances, *self._guided(part))
         return losses
+
+    def _guided(self, part: SensorPart) -> tuple[dict[str, Tensor], Tensor]:
+        """A part's pixels and the guide's endmembers (K, b), both as they are unmixed."""
+        endmembers = self.seen_by.project(self.guide.endmembers, part.sensor)
+        return self.balance.batch(part.batch, part.sensor), self.balance.scaled(endmembers, part.sensor)
 
     def _parts(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> list[SensorPart]:
         """A batch by sensor, each part with the `spectral` (R, b) that its sensor sees."""
@@ -249,8 +265,11 @@ class UnmixModel(Model):
         for part in split_parts(outputs, batch, self.seen_by.num_channels):
             if self.seen_by.tells_materials(part.sensor, self.num_endmembers):
                 abundances = pixel_mean(part.outputs["abundances"], len(part.batch["spectra"]))
-                endmembers = self.seen_by.project(self.guide.endmembers, part.sensor)
-                self.guide.observe(abundances, part.batch, endmembers)
+                self.guide.observe(abundances, *self._guided(part))
+
+    def warnings(self) -> list[str]:
+        """Sensors whose pixels can't be unmixed into so many endmembers one by one."""
+        return self.seen_by.warnings(self.num_endmembers)
 
     def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """`psnr` of the batch in dB, on black."""
@@ -335,7 +354,8 @@ class UnmixModel(Model):
         self._share_observations()
         self.grid.update(
             lambda points: self.field.get_density(points * box.size + box.aabb[0])[0],
-            threshold=-math.log1p(-_OCCUPIED_OPACITY) / self._training_step,
+            # Not of the present samples: as these get closer, untrained cells would fall below the threshold.
+            threshold=-math.log1p(-_OCCUPIED_OPACITY) / (self.step * self._coarseness(0.0)),
             decay=_GRID_DECAY,
             num_cells=_PROBED_CELLS,
             generator=torch.Generator().manual_seed(seed),

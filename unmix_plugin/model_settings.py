@@ -120,11 +120,15 @@ class UnmixModelConfig(ModelConfig):
             reasons.append(count.evidence())
         if self.losses.exposure == "auto":
             exposure = round(exposure_of(torch.from_numpy(initial_data()["pixels"])), 3)
-            found = replace(found, losses=replace(self.losses, exposure=exposure))
+            found = replace(found, losses=replace(found.losses, exposure=exposure))
             if exposure > 1:
                 reasons.append(
                     f"the scene is dark: training compares spectra multiplied by {exposure:.3g} (exposure)"
                 )
+        if self.losses.band_weights == "auto":
+            given = initial_data().get("band_weights", np.ones(1))
+            weights = () if bool((given == 1).all()) else tuple(round(float(w), 6) for w in given)
+            found = replace(found, losses=replace(found.losses, band_weights=weights))
         if self.light == "auto":
             light: Light = initial_data().get("light", np.array("fixed")).item()
             found = replace(found, light=light)

@@ -29,6 +29,7 @@ class SensorViews(nn.Module):
             rgb_weights: From a spectrum on all bands to linear sRGB.
         """
         super().__init__()
+        self.sensor_names = [str(values["name"]) for values in sensors]
         self._names = [f"matrix_{index}" for index in range(len(sensors))]
         for index, values in enumerate(sensors):
             sensor = SceneSensor.from_json(values, len(rgb_weights))
@@ -63,3 +64,19 @@ class SensorViews(nn.Module):
     def tells_materials(self, sensor: SupportsInt | None, num_endmembers: int) -> bool:
         """Whether a pixel alone can be unmixed: it has as many channels as there are endmembers, and at least 3."""
         return sensor is None or self.num_channels(int(sensor)) >= max(num_endmembers, _FEWEST_CHANNELS)
+
+    def warnings(self, num_endmembers: int) -> list[str]:
+        """Sensors with too few channels to tell so many endmembers apart, and what that means."""
+        counts = [self.num_channels(sensor) for sensor in range(len(self._names))]
+        few = [s for s in range(len(counts)) if not self.tells_materials(s, num_endmembers)]
+        if not few:
+            return []
+        named = ", ".join(f"{self.sensor_names[s]} ({counts[s]})" for s in few)
+        what = f"{num_endmembers} endmembers are more than these sensors have channels: {named}"
+        if len(few) < len(counts):
+            return [f"{what}; materials are found in the other sensors' pictures"]
+        fitting = max([count for count in counts if count >= _FEWEST_CHANNELS], default=None)
+        advice = "no sensor tells materials apart" if fitting is None else f"try --endmembers {fitting}"
+        return [
+            f"{what}; no sensor's pixels can be unmixed one by one, and materials may be mixed up: {advice}"
+        ]

@@ -36,6 +36,9 @@ class LossConfig:
     is random where alpha is known, else black."""
     spectral: float = 1.0
     """Weight of the mean squared error of spectra."""
+    band_weights: tuple[float, ...] | Auto = "auto"
+    """Weight of the squared error in each band of the scene; none are equal weights. Auto gives less to bands that are
+    much noisier than the others, or dead: the reciprocal of their noise's variance. The mean is 1."""
     rgb: float | Auto = "auto"
     """Weight of the mean squared error of their sRGB colours, in which dark pixels count more. Auto is 0.2 where alpha
     is known, else 0: where black may be the void, it costs quality."""
@@ -73,6 +76,8 @@ class LossConfig:
         weights = (self.spectral, self.rgb, self.opacity, self.spread, self.abundances, self.mixing_penalty)
         rules = {
             "weights of at least 0": all(weight == "auto" or weight >= 0 for weight in weights),
+            "band-weights above 0, auto or none": self.band_weights == "auto"
+            or all(weight > 0 for weight in self.band_weights),
             "an exposure above 0 or auto": self.exposure == "auto" or self.exposure > 0,
             "outlier above 0": self.outlier > 0,
             "spread-until in (0, 1]": 0 < self.spread_until <= 1,
@@ -143,9 +148,11 @@ def spectral_losses(
     measured: Float[Tensor, "R B"],
     rgb_weights: Float[Tensor, "B 3"],
     wanted: set[str],
+    band_weights: Float[Tensor, "B"] | None = None,
 ) -> dict[str, Tensor]:
-    """Those of `spectral`, `rgb` and `opacity` that are wanted, not yet weighted."""
-    losses = {"spectral": bounded_square(pixels.predicted - pixels.target, pixels.outliers).mean()}
+    """Those of `spectral`, `rgb` and `opacity` that are wanted, not yet weighted; bands count alike without weights."""
+    squares = bounded_square(pixels.predicted - pixels.target, pixels.outliers)
+    losses = {"spectral": (squares if band_weights is None else band_weights * squares).mean()}
     if "rgb" in wanted:
         losses["rgb"] = srgb_error(pixels.predicted, pixels.target, rgb_weights, pixels.outliers)
     if "opacity" in wanted:

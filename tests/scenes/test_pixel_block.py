@@ -104,3 +104,30 @@ def test_the_memory_left_is_known_on_this_machine():
     left = available_bytes(CPU)
     assert left is not None
     assert left > 2**20
+
+
+@pytest.mark.parametrize(
+    ("stored", "scale"), [("<f2", None), ("<f4", None), ("u1", 255.0), ("<i2", 10000.0), ("<u2", 65535.0)]
+)
+def test_mended_pixels_are_kept_as_small_as_others(tmp_path, stored, scale):
+    folder = make_scene(tmp_path / "scene")
+    wavelengths = [450.0 + 20 * band for band in range(10)]
+    folder.edit(lambda content: content.update(wavelengths=wavelengths))
+    folder.edit(lambda content: [content.pop(key, None) for key in ("endmembers_path", "illuminant_path")])
+
+    def write(cube: np.ndarray, bad: bool) -> np.ndarray:
+        wide = np.repeat(cube[..., 2:3].astype(np.float64), 10, axis=-1) * np.linspace(0.9, 1.0, 10)
+        if bad:
+            wide[8, 10, 4] = 0.0
+        return (wide * (scale or 1.0)).round(5).astype(stored)
+
+    for index in range(6):
+        folder.edit_cube(index, lambda cube, index=index: write(cube, bad=index == 3))
+    scene = load_scene(folder.root, SceneOptions(value_scale=scale))
+    table = PixelTable(scene, CPU, (1, 3))
+    size = table.blocks[0]._values.element_size()
+    assert table.mend(scene, seed=0) == pytest.approx(1 / (2 * 320 * 10))
+    mended = table.blocks[0].spectra(torch.tensor([320 + 8 * 20 + 10]))[0]
+    expected = torch.from_numpy(scene.cube(1)[8, 10])
+    assert torch.allclose(mended, expected, atol=0.01)
+    assert table.blocks[0]._values.element_size() == size

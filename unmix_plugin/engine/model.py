@@ -127,6 +127,10 @@ class Model(nn.Module, ABC):
         another light that the batch holds, renders them itself here."""
         return self.get_image_metrics_and_images(self.get_outputs_for_camera(camera), batch)
 
+    def warnings(self) -> list[str]:
+        """What a user should know of the model on this scene before a training."""
+        return []
+
     def get_training_callbacks(self) -> list[TrainingCallback]:
         """Functions to call around each step."""
         return []

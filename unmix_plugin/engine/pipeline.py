@@ -64,7 +64,8 @@ class Pipeline(nn.Module):
         """Let the model of a new run take its first values from the scene; its warnings join `reasons`."""
         with torch.no_grad():
             self.model.initialise(self.datamanager.initial_data(), torch.Generator().manual_seed(self.seed))
-        warnings = [f"warning: {warning}" for warning in self.datamanager.warnings()]
+        said = [*self.datamanager.warnings(), *self.model.warnings()]
+        warnings = [f"warning: {warning}" for warning in said]
         self.reasons = "\n".join(filter(None, [self.reasons, *warnings]))
 
     def draw_as(self, rank: int) -> None:

@@ -3,7 +3,7 @@
 A bad detector element makes a line of an image wrong in one band; a cosmic ray or a bit error, one value. A real
 feature of a spectrum is seen in the pixels around it too, and the edge of a thing in the bands beside it. So a value
 is bad if it deviates from the mean of the two bands beside it far more than other pixels' values of that band do, and
-than those of the pixels around it. What spreads over two bands, or over three lines, is not found.
+than those of the pixels around it. What spreads over two bands, or over two lines side by side, is not found.
 
 Notation: `H x W` pixels, `B` bands, `C` candidates.
 """
@@ -25,6 +25,8 @@ _END_FACTOR = 0.75
 """Of a deviation at either end of the spectrum, from the one band beside it."""
 _REACH_PX = 2
 """Pixels around one that it is compared with."""
+_MOST_ALIKE = 5
+"""Of these 24, so many may deviate like a bad value, as those of its line do; at the corner of a real thing, 8 do."""
 
 
 def deviations(spectra: Float[Tensor, "*pixels B"]) -> Float[Tensor, "*pixels B"]:
@@ -61,10 +63,11 @@ def repaired(
     beside = torch.nn.functional.pad(size, (1, 1))
     is_peak = size > _PEAK * torch.maximum(beside[..., :-2], beside[..., 2:])
     candidates = (is_peak & (size > limits)).nonzero()
-    usual = _around(found, candidates)
     rows, columns, bands = candidates.unbind(dim=-1)
-    excess = found[rows, columns, bands] - usual
-    kept = excess.abs() > limits[bands]
+    around = _around(found, candidates)
+    differences = (found[rows, columns, bands][:, None] - around).abs().sort(dim=1).values
+    kept = differences[:, _MOST_ALIKE] > limits[bands]
+    excess = found[rows, columns, bands] - around.median(dim=1).values
     rows, columns, bands, excess = (part[kept] for part in (rows, columns, bands, excess))
     is_bad = torch.zeros_like(image, dtype=torch.bool)
     is_bad[rows, columns, bands] = True
@@ -73,11 +76,17 @@ def repaired(
     return is_bad, values.clamp(min=0)
 
 
-def _around(found: Float[Tensor, "H W B"], candidates: Int[Tensor, "C 3"]) -> Float[Tensor, " C"]:
-    """Median of the deviations in the same band of the pixels around candidates."""
+def _around(found: Float[Tensor, "H W B"], candidates: Int[Tensor, "C 3"]) -> Float[Tensor, "C 24"]:
+    """Deviations in the same band of the pixels around candidates."""
     reach = torch.arange(-_REACH_PX, _REACH_PX + 1)
     shifts = torch.cartesian_prod(reach, reach)
     shifts = shifts[(shifts != 0).any(dim=1)]
-    rows = (candidates[:, None, 0] + shifts[:, 0]).clamp(0, found.shape[0] - 1)
-    columns = (candidates[:, None, 1] + shifts[:, 1]).clamp(0, found.shape[1] - 1)
-    return found[rows, columns, candidates[:, None, 2]].median(dim=1).values
+    rows = _mirrored(candidates[:, None, 0] + shifts[:, 0], found.shape[0])
+    columns = _mirrored(candidates[:, None, 1] + shifts[:, 1], found.shape[1])
+    return found[rows, columns, candidates[:, None, 2]]
+
+
+def _mirrored(places: Int[Tensor, "C 24"], size: int) -> Int[Tensor, "C 24"]:
+    """Places within an image, mirrored at its first and last line so that no pixel is its own neighbour."""
+    inside = places.abs()
+    return torch.where(inside < size, inside, 2 * size - 2 - inside).clamp(0, size - 1)

@@ -100,12 +100,17 @@ class Hits:
 
 
 def render_view(
-    cameras: Cameras, index: int, subpixels: int = SUBPIXELS, things: Sequence[Thing] = THINGS
+    cameras: Cameras,
+    index: int,
+    subpixels: int = SUBPIXELS,
+    things: Sequence[Thing] = THINGS,
+    lamp: tuple[float, float, float] = LAMP_POSITION,
 ) -> ViewCoefficients:
     """Look at the scene through one camera with `subpixels`^2 rays a pixel.
 
     Args:
         things: Those of `THINGS`, if need be with other surfaces.
+        lamp: Middle of the lamp's disc.
     """
     count = subpixels**2
     pixels = cameras.height * cameras.width
@@ -115,7 +120,7 @@ def render_view(
     for i in range(count):
         offset = ((i % subpixels + 0.5) / subpixels, (i // subpixels + 0.5) / subpixels)
         rays = cameras.image_rays(index, offset)
-        hits = trace(rays.origins.numpy(), rays.directions.numpy(), lamp_point(i, count), things)
+        hits = trace(rays.origins.numpy(), rays.directions.numpy(), lamp_point(i, count, lamp), things, lamp)
         coverage += hits.is_hit
         abundances += hits.abundances
         diffuse += hits.diffuse
@@ -134,8 +139,13 @@ def trace(
     directions: Float[np.ndarray, "R 3"],
     lamp: Float[np.ndarray, "3"],
     things: Sequence[Thing] = THINGS,
+    lamp_middle: tuple[float, float, float] = LAMP_POSITION,
 ) -> Hits:
-    """What each ray sees first, lit by one point of the lamp and by the sky. Directions have length 1."""
+    """What each ray sees first, lit by one point of the lamp and by the sky. Directions have length 1.
+
+    Args:
+        lamp_middle: Of the lamp's disc, where highlights come from.
+    """
     distances, nearest = first_hits(_PLACEMENTS, origins, directions)
     is_hit = np.isfinite(distances)
     shape = (len(origins), len(MATERIALS))
@@ -150,12 +160,16 @@ def trace(
         abundances[rows] = thing.surface.abundances(local_points)
         diffuse[rows] = abundances[rows] * (lamplight + sky_light(points, normals, thing))[:, None]
         if thing.surface.roughness is not None:
-            highlight = coat_highlight(points, normals, -directions[rows], thing.surface.roughness)
+            highlight = coat_highlight(
+                points, normals, -directions[rows], thing.surface.roughness, lamp_middle
+            )
             specular[rows] = lamplight * highlight
     return Hits(is_hit, abundances, diffuse, specular)
 
 
-def lamp_point(i: int, count: int) -> Float[np.ndarray, "3"]:
+def lamp_point(
+    i: int, count: int, middle: tuple[float, float, float] = LAMP_POSITION
+) -> Float[np.ndarray, "3"]:
     """The i-th of `count` points that are spread evenly over the lamp's horizontal disc.
 
     Source:
@@ -165,7 +179,7 @@ def lamp_point(i: int, count: int) -> Float[np.ndarray, "3"]:
     rank = i * 7 % count if count % 7 else i
     angle, radius = rank * np.pi * (3 - np.sqrt(5)), LAMP_RADIUS * np.sqrt((rank + 0.5) / count)
     offset = np.array([radius * np.cos(angle), radius * np.sin(angle), 0])
-    return (np.array(LAMP_POSITION) + offset).astype(np.float32)
+    return (np.array(middle) + offset).astype(np.float32)
 
 
 def direct_light(
@@ -208,6 +222,7 @@ def coat_highlight(
     normals: Float[np.ndarray, "P 3"],
     towards_eye: Float[np.ndarray, "P 3"],
     roughness: float,
+    lamp_middle: tuple[float, float, float] = LAMP_POSITION,
 ) -> Float[np.ndarray, " P"]:
     """Mirrored radiance for irradiance 1 from the lamp's centre, in units of a white matt surface's.
 
@@ -215,7 +230,7 @@ def coat_highlight(
         Walter et al. 2007 (GGX; separable Smith term), Schlick 1994 (Fresnel); times pi, for a matt white surface has
         a reflectance distribution of 1 / pi.
     """
-    towards_lamp = np.asarray(LAMP_POSITION, dtype=np.float32) - points
+    towards_lamp = np.asarray(lamp_middle, dtype=np.float32) - points
     towards_lamp /= np.sqrt(dot(towards_lamp, towards_lamp))[:, None]
     halfway = towards_lamp + towards_eye
     halfway /= np.sqrt(dot(halfway, halfway))[:, None]

@@ -18,9 +18,11 @@ from torch import Tensor
 
 from unmix_plugin.scenes.pixel_table.pool import PixelPool
 from unmix_plugin.scenes.scene import Scene
+from unmix_plugin.spectral.bad_values import repaired
 
 COMPACT_TYPES = ("f2", "u1", "i1", "i2", "u2")
 """Of NumPy, at most half as large as float32."""
+_LARGEST_INT16, _UINT16_VALUES = 2**15 - 1, 2**16
 
 
 @dataclass(frozen=True)
@@ -111,6 +113,23 @@ class PixelBlock:
             else PixelPool(self.valid, pixel_bytes, pool_bytes, self._read_range)
         )
 
+    def mend(self, limits: Float[Tensor, " b"]) -> int:
+        """Replace stripes and spikes by what is around them, of values held in memory; how many there were.
+
+        Args:
+            limits: As `deviation_limits` gives them.
+        """
+        size, count = self._width * self._height, 0
+        shape = (self._height, self._width, self._num_channels)
+        for first in range(0, len(self), size):
+            image = self._scaled(self._values[first : first + size]).cpu().view(shape)
+            is_bad, values = repaired(image, limits.cpu())
+            if len(values):
+                view = self._values[first : first + size].view(shape)
+                view[is_bad.to(view.device)] = self._as_stored(values).to(view.device)
+                count += len(values)
+        return count
+
     def spectra(self, pixels: Int[Tensor, " R"]) -> Float[Tensor, "R b"]:
         """Spectra of some pixels in [0, 1], the numbers of `Scene.cube`; only of valid ones."""
         if self.pool is not None:
@@ -124,6 +143,17 @@ class PixelBlock:
             values = values.to(torch.int32) & 0xFFFF
         values, scale = values.float(), self._scene.options.value_scale
         return (values if scale is None else values / scale).clamp(0.0, 1.0)
+
+    def _as_stored(self, values: Float[Tensor, " values"]) -> Tensor:
+        """Spectra as `_scaled` takes them."""
+        if not self._is_compact:
+            return values
+        scale = self._scene.options.value_scale
+        values = values if scale is None else values * scale
+        if self._kept.kind == "f":
+            return values.to(self._values.dtype)
+        whole = values.round().to(torch.int32)
+        return torch.where(whole > _LARGEST_INT16, whole - _UINT16_VALUES, whole).to(self._values.dtype)
 
     def images(self) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         """Of each view spectra (H, W, b), alpha and which pixels are valid (H, W); on the CPU."""

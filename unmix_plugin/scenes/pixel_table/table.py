@@ -15,8 +15,10 @@ from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.pixel_table import memory
 from unmix_plugin.scenes.pixel_table.block import DrawnPixels, PixelBlock
 from unmix_plugin.scenes.scene import Scene
+from unmix_plugin.spectral.bad_values import FEWEST_BANDS, deviation_limits
 
 OPAQUE_ALPHA = 0.99
+_PIXELS_TO_MEND_BY = 20_000
 MOST_LISTED = 1 << 24
 """Pixels of a block that are listed one by one to sample from; of larger blocks some are."""
 
@@ -95,6 +97,24 @@ class PixelTable:
                 pixels, stored = block.pool.draw(number, step, generator)
                 groups.append(block.take(pixels, first, stored))
         return tuple(groups)
+
+    def mend(self, scene: Scene, seed: int) -> float:
+        """Replace stripes and spikes in memory (see `spectral.bad_values`); share of the values that were bad."""
+        bad = total = 0
+        for block in self.blocks:
+            bands = scene.sensors[block.sensor].bands
+            if (
+                block.pool is not None
+                or bands is None
+                or len(bands) < FEWEST_BANDS
+                or list(bands) != sorted(bands)
+            ):
+                continue
+            pixels = torch.from_numpy(self.sample_opaque(block.sensor, _PIXELS_TO_MEND_BY, seed))
+            if len(pixels):
+                bad += block.mend(deviation_limits(pixels))
+                total += len(block) * len(bands)
+        return bad / max(total, 1)
 
     def sample_opaque(self, sensor: int, count: int, seed: int) -> Float[np.ndarray, "pixels b"]:
         """Spectra of at most `count` random valid pixels of a sensor that are opaque."""
