@@ -40,7 +40,7 @@ class Options:
     steps: int = 800
     """Of each training."""
     only: tuple[str, ...] = ()
-    """Names of disturbances; all if none is given. The undisturbed scene is always trained on."""
+    """What to train on; all if none is given. The others keep their earlier results, if they took as many steps."""
     runs: Path | None = None
     """Keep scenes and run folders here."""
     results: Path | None = None
@@ -51,25 +51,43 @@ class Options:
 
 def main(options: Options) -> None:
     """Measure every disturbance and publish."""
-    machine, measured = _machine.describe_machine("cpu"), {}
+    machine = _machine.describe_machine("cpu")
     steps = 10 if options.quick else options.steps
+    results = _common.results_folder(options.results, options.quick)
+    measured = earlier(results, steps)
     with ExitStack() as stack:
         place = Path(
             options.runs or stack.enter_context(tempfile.TemporaryDirectory(prefix="unmix-disturbed-"))
         )
         for name, folder in write_scenes(place / "scenes", options).items():
             measured[name] = measure(name, folder, steps, place / "runs")
+            publish(measured, steps, machine, results)
+
+
+def publish(
+    measured: dict[str, dict[str, Any]], steps: int, machine: dict[str, Any], results: Path | None
+) -> None:
+    """All that was measured so far."""
     figures = [
         figure
         for name, found in measured.items()
-        if name not in (BASE, KEPT_NOISE)
+        if name not in (BASE, KEPT_NOISE) and BASE in measured
         for figure in judge(name, found, measured[BASE])
     ]
     rows = [[key, *(f"{found[key]:.4g}" for found in measured.values())] for key in SHOWN]
     table = _common.DetailTable("All figures", ["metric", *measured], rows)
     question = "What disturbances of the demo scene cost on true evaluation views"
     report = _common.Report("disturbed", question, {"steps": steps}, machine, figures, measured, (table,))
-    _common.publish(report, _common.results_folder(options.results, options.quick))
+    _common.publish(report, results)
+
+
+def earlier(results: Path | None, steps: int) -> dict[str, dict[str, Any]]:
+    """What was measured before with as many steps, by name."""
+    path = None if results is None else results / "disturbed.json"
+    if path is None or not path.is_file():
+        return {}
+    report = json.loads(path.read_text(encoding="utf-8"))
+    return report["measured"] if report["setting"] == {"steps": steps} else {}
 
 
 def write_scenes(folder: Path, options: Options) -> dict[str, Path]:
@@ -84,7 +102,7 @@ def write_scenes(folder: Path, options: Options) -> dict[str, Path]:
         "noise": disturbing.noise,
         KEPT_NOISE: disturbing.noise,
     }
-    scenes = {BASE: source}
+    scenes = {BASE: source} if BASE in (options.only or (BASE,)) else {}
     if "light" in (options.only or ("light",)):
         scenes["light"] = disturbing.write_lit_by_camera(source, folder / "light")
     for name, change in changes.items():
