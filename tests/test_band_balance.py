@@ -44,7 +44,9 @@ def test_weights_of_1_change_no_bit():
 
 def test_a_noisy_band_hardly_moves_the_mixtures_of_pixels():
     generator = torch.Generator().manual_seed(0)
-    endmembers = torch.tensor([[0.6, 0.2, 0.2, 0.2, 0.3], [0.2, 0.6, 0.8, 0.2, 0.3], [0.2, 0.2, 0.5, 0.6, 0.3]])
+    endmembers = torch.tensor(
+        [[0.6, 0.2, 0.2, 0.2, 0.3], [0.2, 0.6, 0.8, 0.2, 0.3], [0.2, 0.2, 0.5, 0.6, 0.3]]
+    )
     shares = torch.eye(3)[torch.randint(3, (200,), generator=generator)]
     pixels = shares @ endmembers
     pixels[:, 2] = (pixels[:, 2] + 0.3 * torch.randn(200, generator=generator)).clamp(min=0)
