@@ -26,7 +26,9 @@ def flags():
     """Every flag of every command."""
     asked = [(command, ["--help"]) for command in (evaluate, render, view, write_demo_scene)]
     asked += [(process, ["--help"]), (inspect_command, ["--help"])]
-    asked += [(train, [method, "--help-all"]) for method in ("unmix-nerf", "unmix-nerf-published")]
+    asked += [
+        (train, [method, "--help-all"]) for method in ("unmix-nerf", "unmix-nerf-published", "neumatex")
+    ]
     asked += [(export, [product.name, "--help"]) for product in PRODUCTS]
     return {
         flag for command, argv in asked for flag in re.findall(r"--[a-z0-9][\w.-]*", run(command, *argv).out)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from unmix_plugin.engine import Cameras
 from unmix_plugin.neumatex.scene.pixel_list import OPAQUE
-from unmix_plugin.neumatex.tone.curves import TONE_MAPPINGS, psnr_db
+from unmix_plugin.neumatex.tone.curves import TONE_MAPPINGS, psnr_db, tone_curve
 from unmix_plugin.neumatex.traced_object import TracedObject
 from unmix_plugin.neumatex.tracing.primary_hits import pixel_hits
 from unmix_plugin.neumatex.tracing.render_view import rays_radiance
@@ -32,7 +32,7 @@ SUBPIXELS = 2
 def evaluate_object_image(
     model: NeumatexModel, traced: TracedObject, camera: Cameras, batch: dict[str, Tensor]
 ) -> tuple[dict[str, float], dict[str, Tensor]]:
-    """Metrics and pictures, truth left and prediction right.
+    """Metrics and pictures, truth left and prediction right; pictures of light are compared as AgX shows them.
 
     Without a light of its own in the batch: `psnr`, `base_colour_psnr` (linear, as it is), `base_colour_psnr_scaled`
     (after the best factor for each colour). With one: `relit_psnr`. `psnr_image` and `relit_psnr_image` count the
@@ -41,7 +41,7 @@ def evaluate_object_image(
     shown = batch["alpha"] >= OPAQUE
     light, base = render_pixels(model, traced, camera, shown)
     tone = TONE_MAPPINGS[int(batch["tone"])]
-    predicted, true = model.compared(light, batch["numbers"][shown], tone)
+    predicted, true = model.compared(light, batch["numbers"][shown], tone, tone_curve("agx"))
     error = (predicted - true).square()
     prefix = "relit_" if "environment" in batch else ""
     metrics = {

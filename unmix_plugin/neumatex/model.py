@@ -53,7 +53,7 @@ class NeumatexModelConfig(ModelConfig):
     plane_resolution: int = 128
     """Texels along an edge of each of the three planes."""
     light_curve: LightCurve = "agx"
-    """Tone curve through which pictures of linear light are compared; others are compared as they are."""
+    """Tone curve through which pictures of linear light are compared in training; others are compared as they are."""
 
     def __post_init__(self) -> None:
         """Refuse impossible settings.
@@ -197,20 +197,26 @@ class NeumatexModel(Model):
         self.train(was_training)
 
     def compared(
-        self, light: Float[Tensor, "*n C"], numbers: Float[Tensor, "*m C"], tone: ToneMapping
+        self,
+        light: Float[Tensor, "*n C"],
+        numbers: Float[Tensor, "*m C"],
+        tone: ToneMapping,
+        light_curve: nn.Module,
     ) -> tuple[Tensor, Tensor]:
-        """Predicted light and a picture's numbers as they are compared, both in [0, 1] unless nothing bends them.
+        """Predicted light and a picture's numbers as they are compared.
 
         Args:
-            tone: What the numbers are of light; light itself goes through the curve for light.
+            tone: What the numbers are of light.
+            light_curve: What light and numbers go through where the numbers are light.
         """
         if tone == "linear":
-            return self.light_curve(light), self.light_curve(numbers)
+            return light_curve(light), light_curve(numbers)
         curve = self.curve if tone == self.record.tone_mapping else tone_curve(tone)
         return curve(light), numbers.clamp(0, 1)
 
     def _residuals(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> Float[Tensor, "2 R C"]:
-        shown, wanted = self.compared(outputs["halves"], batch["numbers"], self.record.tone_mapping)
+        tone = self.record.tone_mapping
+        shown, wanted = self.compared(outputs["halves"], batch["numbers"], tone, self.light_curve)
         return shown - wanted
 
     def _random(self) -> torch.Generator:

@@ -1,0 +1,178 @@
+"""How well does an object look under light that it was never photographed in?
+
+    python benchmarks/neumatex.py [--objects 8] [--size 256] [--lights 4]
+
+Writes procedural objects of layered materials whose seeds were not used while settings were chosen, fits each by the
+commands that a user would give, and evaluates on held-out views, under held-out lights and against the true base
+colour. A variant is a family of materials with or without the prior.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import mean
+from typing import Any, Literal
+
+import _common
+import _machine
+import tyro
+
+RELIT = _common.Limit(30.0, unit=" dB")
+ABOVE_PBR = _common.Limit(3.0, unit=" dB")
+BASE_COLOUR = _common.Limit(25.0, unit=" dB")
+SECONDS = _common.Limit(600.0, is_upper=True, unit=" s")
+PEAK_MEMORY = _common.Limit(4.0, is_upper=True, unit=" GiB")
+MAIN, BASELINE = "neural", "pbr"
+VARIANTS: dict[str, tuple[str, ...]] = {
+    MAIN: ("--pipeline.model.material", "neural"),
+    BASELINE: ("--pipeline.model.material", "pbr"),
+}
+COLUMNS = {
+    "relit_psnr": "relit PSNR",
+    "psnr": "PSNR, held-out views",
+    "base_colour_psnr": "base colour PSNR",
+    "base_colour_psnr_scaled": "base colour PSNR, scaled",
+    "relit_psnr_image": "relit PSNR, whole image",
+    "train_seconds": "training, s",
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Fit unseen objects in several ways, and look at them under lights that were held out."""
+
+    objects: int = 8
+    """How many objects, of seeds 0, 1, ..."""
+    size: int = 256
+    """Rows and columns of the pictures."""
+    views: int = 24
+    """Pictures of an object under the light of training."""
+    lights: int = 4
+    """Held-out lights."""
+    steps: int = 300
+    """Training steps."""
+    variants: tuple[str, ...] = tuple(VARIANTS)
+    """Which ways of fitting."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to train."""
+    runs: Path | None = None
+    """Keep objects and run folders here."""
+    results: Path | None = None
+    """Folder for neumatex.json and neumatex.md; None: beside the benchmarks."""
+    quick: bool = False
+    """One small object, three steps."""
+
+
+def main(options: Options) -> None:
+    """Measure every object and variant, and publish."""
+    size = (32, 8, 1) if options.quick else (options.size, options.views, options.lights)
+    seeds = range(1 if options.quick else options.objects)
+    steps = 3 if options.quick else options.steps
+    setting = {
+        "objects": f"procedural, seeds {seeds.start} to {seeds.stop - 1}",
+        "pictures": f"{size[1]} of {size[0]} x {size[0]} pixels, and {size[2]} held-out lights",
+        "steps": steps,
+        "device": options.device,
+        "variants": {name: " ".join(VARIANTS[name]) for name in options.variants},
+    }
+    machine = _machine.describe_machine(options.device)
+    measured: dict[str, list[dict[str, Any]]] = {name: [] for name in options.variants}
+    with ExitStack() as stack:
+        root = options.runs or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="neumatex-")))
+        for seed in seeds:
+            folder = written_object(root / f"object-{seed}", seed, *size)
+            for name in options.variants:
+                found = measure(folder, VARIANTS[name], steps, options.device, root / "runs" / name)
+                measured[name].append({"seed": seed, **found})
+                print(f"object {seed}, {name}: relit {found['relit_psnr']:.2f} dB", flush=True)
+    question = f"Unseen objects under unseen lights after {steps} steps"
+    report = _common.Report(
+        "neumatex",
+        question,
+        setting,
+        machine,
+        judge(measured),
+        measured,
+        (means(measured), details(measured)),
+    )
+    _common.publish(report, _common.results_folder(options.results, options.quick))
+
+
+def written_object(folder: Path, seed: int, size: int, views: int, lights: int) -> Path:
+    """An object's folder, made if it is not there."""
+    from unmix_plugin.neumatex.demo.demo_object import demo_object
+
+    if not folder.exists():
+        print(f"object {seed}: rendering its pictures ...", flush=True)
+        demo_object(folder, seed, size=size, views=views, lights=lights)
+    return folder
+
+
+def measure(folder: Path, words: tuple[str, ...], steps: int, device: str, runs: Path) -> dict[str, Any]:
+    """Train and evaluate one object in one way."""
+    load_average = _machine.load_average()
+    common = ["neumatex", "--data", str(folder), "--output-dir", str(runs), "--device", device]
+    limit = ["--max-num-iterations", str(steps)]
+    trained = _common.run_command([_common.console_script("unmix-train"), *common, *limit, *words])
+    evaluate = [_common.console_script("unmix-eval"), "--run", str(trained.run), "--device", device]
+    evaluated = _common.run_command(evaluate)
+    figures = json.loads((trained.run / "eval" / "metrics.json").read_text(encoding="utf-8"))
+    return {
+        **figures,
+        "training_peak_gib": trained.peak_bytes / 2**30,
+        "evaluation_command_seconds": evaluated.seconds,
+        "load_average_at_start": load_average,
+    }
+
+
+def judge(measured: dict[str, list[dict[str, Any]]]) -> list[_common.Figure]:
+    """The lines asked for, of means over the objects."""
+    everything = [run for runs in measured.values() for run in runs]
+    figures = [
+        SECONDS.judge("longest training", max(run["train_seconds"] for run in everything)),
+        PEAK_MEMORY.judge("peak memory of training", max(run["training_peak_gib"] for run in everything)),
+    ]
+    if MAIN not in measured:
+        return figures
+    relit = mean_of(measured[MAIN], "relit_psnr")
+    found = [RELIT.judge(f"{MAIN}: relit PSNR", relit)]
+    if BASELINE in measured and relit is not None:
+        beside = mean_of(measured[BASELINE], "relit_psnr")
+        difference = None if beside is None else relit - beside
+        found.append(ABOVE_PBR.judge(f"{MAIN} above {BASELINE}, relit PSNR", difference))
+    found.append(BASE_COLOUR.judge(f"{MAIN}: base colour PSNR", mean_of(measured[MAIN], "base_colour_psnr")))
+    return [*found, *figures]
+
+
+def mean_of(runs: list[dict[str, Any]], name: str) -> float | None:
+    """Mean over the objects; None where one has no such figure."""
+    values = [float(run[name]) for run in runs if run.get(name) is not None]
+    return mean(values) if values and len(values) == len(runs) else None
+
+
+def means(measured: dict[str, list[dict[str, Any]]]) -> _common.DetailTable:
+    """A line a variant."""
+    rows = [[name, *(_text(mean_of(runs, column)) for column in COLUMNS)] for name, runs in measured.items()]
+    return _common.DetailTable("Means over the objects, dB", ["variant", *COLUMNS.values()], rows)
+
+
+def details(measured: dict[str, list[dict[str, Any]]]) -> _common.DetailTable:
+    """A line an object and variant."""
+    rows = [
+        [str(run["seed"]), name, *(_text(run.get(column)) for column in COLUMNS)]
+        for name, runs in measured.items()
+        for run in runs
+    ]
+    return _common.DetailTable("Each object", ["object", "variant", *COLUMNS.values()], sorted(rows))
+
+
+def _text(value: float | None) -> str:
+    return "" if value is None else f"{value:.2f}"
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))
