@@ -34,6 +34,8 @@ from unmix_plugin.neumatex.scene.posed_pictures import PosedPictures, opacity
 from unmix_plugin.neumatex.tone.curves import TONE_MAPPINGS
 from unmix_plugin.scenes.scene import Normalisation
 
+DEMO_OBJECT = Path("demo-object")
+"""`--data demo-object` stands for the built-in object."""
 _THINNEST = 1e-3
 """Least half edge of the scene box: a mesh may be flat."""
 
@@ -76,7 +78,7 @@ class ObjectDataManager(DataManager):
         """
         super().__init__(config, data=data, device=device, seed=seed)
         self.options = config
-        self.object = load_object(data)
+        self.object = load_object(_object_folder(data))
         pictures, split = self.object.pictures, self.object.split
         self.train_cameras = pictures.cameras[list(split.train)]
         self.eval_cameras = pictures.cameras[list(split.evaluation)]
@@ -197,3 +199,11 @@ def batch_environment(batch: Mapping[str, Tensor]) -> Environment | None:
         return None
     rotation_deg, exposure_stops = batch["environment_placement"].tolist()
     return Environment(batch["environment"], rotation_deg, exposure_stops)
+
+
+def _object_folder(data: Path) -> Path:
+    if data == DEMO_OBJECT:
+        from unmix_plugin.neumatex.demo.demo_object import demo_object_path
+
+        return demo_object_path()
+    return data

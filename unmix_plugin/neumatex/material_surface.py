@@ -6,13 +6,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from unmix_plugin.neumatex.materials.family import MaterialFamily
+from unmix_plugin.neumatex.materials.neural import NeuralFamily
 from unmix_plugin.neumatex.materials.pbr import PbrFamily
 from unmix_plugin.neumatex.triplane import Triplane
 
-MaterialName = Literal["pbr"]
+MaterialName = Literal["neural", "pbr"]
 """Families that can be trained."""
 
 
@@ -29,5 +30,16 @@ class TriplaneSurface:
 
 
 def material_family(name: MaterialName) -> MaterialFamily:
-    """The family of that name."""
-    return {"pbr": PbrFamily}[name]()
+    """The family of that name; the neural one with the shipped decoder.
+
+    Raises:
+        ConfigError: the shipped decoder can't be read.
+    """
+    families: dict[MaterialName, type] = {"neural": NeuralFamily, "pbr": PbrFamily}
+    return families[name]()
+
+
+def frozen_parts(family: MaterialFamily) -> dict[str, nn.Module]:
+    """Networks of a family by name, which have to be on the model's device and stay as they are."""
+    parts = {name: getattr(family, name, None) for name in ("decoder", "encoder")}
+    return {name: part.requires_grad_(False) for name, part in parts.items() if isinstance(part, nn.Module)}

@@ -25,7 +25,7 @@ from unmix_plugin.neumatex.datamanager import batch_environment
 from unmix_plugin.neumatex.geometry.mesh import Mesh
 from unmix_plugin.neumatex.image_evaluation import evaluate_object_image
 from unmix_plugin.neumatex.lighting.environment import Environment
-from unmix_plugin.neumatex.material_surface import MaterialName, TriplaneSurface, material_family
+from unmix_plugin.neumatex.material_surface import MaterialName, TriplaneSurface, frozen_parts, material_family
 from unmix_plugin.neumatex.object_record import ObjectRecord
 from unmix_plugin.neumatex.tone.curves import LightCurve, ToneMapping, psnr_db, tone_curve
 from unmix_plugin.neumatex.traced_object import SeenPoints, TracedObject, TracedObjectCache
@@ -42,8 +42,9 @@ class NeumatexModelConfig(ModelConfig):
     _target: Target = field(default_factory=lambda: NeumatexModel)
     eval_num_rays_per_chunk: int = 4096
     """Pixels rendered at once for a whole image; fewer take less memory."""
-    material: Annotated[MaterialName, Common] = "pbr"
-    """Family of materials: pbr is base colour, roughness and metallicity."""
+    material: Annotated[MaterialName, Common] = "neural"
+    """Family of materials: neural (base colour and latents of a shared decoder) or pbr (base colour, roughness,
+    metallicity)."""
     samples: Annotated[int, Common] = 8
     """Paths a pixel in training, in two independent halves; more is slower and less noisy."""
     bounces: Annotated[int, Common] = 1
@@ -86,6 +87,8 @@ class NeumatexModel(Model):
         record = ObjectRecord.from_json(self.metadata)
         self.record = record
         self.family = material_family(self.config.material)
+        # A run keeps the decoder that it was fitted with.
+        self.family_parts = nn.ModuleDict(frozen_parts(self.family))
         generator = torch.Generator().manual_seed(_START_SEED)
         parameters, resolution = self.family.num_parameters, self.config.plane_resolution
         self.triplane = Triplane(parameters, resolution, generator=generator)

@@ -123,6 +123,8 @@ def _look_up(cells: Tensor, roughness: Tensor, cosine: Tensor) -> Tensor:
     at = torch.sqrt(cosine.clamp(0.0, 1.0)) * (_COLUMNS - 1)
     column = at.floor().clamp(0, _COLUMNS - 2)
     index = (row * (_COLUMNS - 1) + column).long().reshape(-1)
-    corner, right, below, twist = cells.index_select(1, index).reshape(4, -1, *roughness.shape)
+    corner, right, below, twist = cells.index_select(1, index).reshape(
+        4, cells.shape[0] // 4, *roughness.shape
+    )
     x = at - column
     return (corner + x * right) + (roughness * (_ROWS - 1) - row) * (below + x * twist)
