@@ -25,7 +25,12 @@ from unmix_plugin.neumatex.datamanager import batch_environment
 from unmix_plugin.neumatex.geometry.mesh import Mesh
 from unmix_plugin.neumatex.image_evaluation import evaluate_object_image
 from unmix_plugin.neumatex.lighting.environment import Environment
-from unmix_plugin.neumatex.material_surface import MaterialName, TriplaneSurface, frozen_parts, material_family
+from unmix_plugin.neumatex.material_surface import (
+    MaterialName,
+    TriplaneSurface,
+    frozen_parts,
+    material_family,
+)
 from unmix_plugin.neumatex.object_record import ObjectRecord
 from unmix_plugin.neumatex.tone.curves import LightCurve, ToneMapping, psnr_db, tone_curve
 from unmix_plugin.neumatex.traced_object import SeenPoints, TracedObject, TracedObjectCache
