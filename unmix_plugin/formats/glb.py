@@ -19,8 +19,8 @@ from jaxtyping import Float32, Int
 from unmix_plugin import __version__
 from unmix_plugin.formats.files import write_file
 
-_FLOAT, _UNSIGNED_INT = 5126, 5125
-_VERTEX_BUFFER, _INDEX_BUFFER = 34962, 34963
+FLOAT, UNSIGNED_INT = 5126, 5125
+VERTEX_BUFFER, INDEX_BUFFER = 34962, 34963
 _JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 
 
@@ -44,15 +44,15 @@ def write_glb(
         numbers: More of each vertex, (P,) float32, by a name that starts with `_`.
         extras: What else the file says of the mesh, as JSON has it.
     """
-    builder = _Builder()
+    builder = GlbBuilder()
     attributes = {
-        "POSITION": builder.add(positions, "VEC3", _FLOAT, _VERTEX_BUFFER, has_bounds=True),
-        "NORMAL": builder.add(normals, "VEC3", _FLOAT, _VERTEX_BUFFER),
-        "COLOR_0": builder.add(linear_rgb, "VEC3", _FLOAT, _VERTEX_BUFFER),
+        "POSITION": builder.add(positions, "VEC3", FLOAT, VERTEX_BUFFER, has_bounds=True),
+        "NORMAL": builder.add(normals, "VEC3", FLOAT, VERTEX_BUFFER),
+        "COLOR_0": builder.add(linear_rgb, "VEC3", FLOAT, VERTEX_BUFFER),
     }
     for name, values in numbers.items():
-        attributes[name] = builder.add(values, "SCALAR", _FLOAT, _VERTEX_BUFFER)
-    indices = builder.add(faces.astype("<u4").ravel(), "SCALAR", _UNSIGNED_INT, _INDEX_BUFFER)
+        attributes[name] = builder.add(values, "SCALAR", FLOAT, VERTEX_BUFFER)
+    indices = builder.add(faces.astype("<u4").ravel(), "SCALAR", UNSIGNED_INT, INDEX_BUFFER)
     primitive = {"attributes": attributes, "indices": indices, "material": 0}
     content = {
         "asset": {"version": "2.0", "generator": f"unmix-nerf {__version__}"},
@@ -65,10 +65,10 @@ def write_glb(
         "bufferViews": builder.views,
         "buffers": [{"byteLength": len(builder.data)}],
     }
-    return write_file(path, _container(json.dumps(content).encode(), bytes(builder.data)))
+    return write_file(path, glb_container(json.dumps(content).encode(), bytes(builder.data)))
 
 
-class _Builder:
+class GlbBuilder:
     """The binary part and what describes it."""
 
     def __init__(self) -> None:
@@ -80,7 +80,7 @@ class _Builder:
         self, values: np.ndarray, kind: str, component: int, target: int, has_bounds: bool = False
     ) -> int:
         """Append an array of 4-byte numbers; the index of its accessor."""
-        raw = np.ascontiguousarray(values, dtype="<u4" if component == _UNSIGNED_INT else "<f4").tobytes()
+        raw = np.ascontiguousarray(values, dtype="<u4" if component == UNSIGNED_INT else "<f4").tobytes()
         view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": len(raw), "target": target}
         accessor = {
             "bufferView": len(self.views),
@@ -95,8 +95,14 @@ class _Builder:
         self.accessors.append(accessor)
         return len(self.accessors) - 1
 
+    def add_file(self, content: bytes) -> int:
+        """Append a file, such as a picture; the index of its view."""
+        self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": len(content)})
+        self.data += content + b"\0" * (-len(content) % 4)
+        return len(self.views) - 1
 
-def _container(text: bytes, data: bytes) -> bytes:
+
+def glb_container(text: bytes, data: bytes) -> bytes:
     """Header and two chunks, padded to multiples of four bytes."""
     text += b" " * (-len(text) % 4)
     data += b"\0" * (-len(data) % 4)
