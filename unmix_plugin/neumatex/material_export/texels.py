@@ -86,11 +86,13 @@ def _inside(
 
 
 def _barycentric(corners: Float[np.ndarray, "N 3 2"], points: Int[np.ndarray, "N 2"]) -> np.ndarray:
-    """Weights of the corners; not a number for triangles without area."""
+    """Weights of the corners; -1 for triangles without area, which have no inside."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     ab, ac, ap = b - a, c - a, points - a
     area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        second = (ap[:, 0] * ac[:, 1] - ap[:, 1] * ac[:, 0]) / area
-        third = (ab[:, 0] * ap[:, 1] - ab[:, 1] * ap[:, 0]) / area
-    return np.stack([1 - second - third, second, third], axis=1)
+    is_flat = area == 0
+    safe = np.where(is_flat, 1.0, area)
+    second = (ap[:, 0] * ac[:, 1] - ap[:, 1] * ac[:, 0]) / safe
+    third = (ab[:, 0] * ap[:, 1] - ab[:, 1] * ap[:, 0]) / safe
+    weights = np.stack([1 - second - third, second, third], axis=1)
+    return np.where(is_flat[:, None], -1.0, weights)
