@@ -18,7 +18,14 @@ from jaxtyping import Float32, Int
 
 from unmix_plugin import __version__
 from unmix_plugin.formats.files import write_file
-from unmix_plugin.formats.glb import FLOAT, INDEX_BUFFER, UNSIGNED_INT, VERTEX_BUFFER, GlbBuilder, glb_container
+from unmix_plugin.formats.glb import (
+    FLOAT,
+    INDEX_BUFFER,
+    UNSIGNED_INT,
+    VERTEX_BUFFER,
+    GlbBuilder,
+    glb_container,
+)
 
 _LINEAR, _LINEAR_MIPMAPS, _CLAMP = 9729, 9987, 33071
 
@@ -72,9 +79,7 @@ def write_textured_glb(path: Path, mesh: TexturedMesh, extras: Mapping[str, Any]
         "meshes": [{"primitives": [primitive], "extras": dict(extras)}],
         "materials": [_MATERIAL],
         "textures": [{"sampler": 0, "source": 0}, {"sampler": 0, "source": 1}],
-        "samplers": [
-            {"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAPS, "wrapS": _CLAMP, "wrapT": _CLAMP}
-        ],
+        "samplers": [{"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAPS, "wrapS": _CLAMP, "wrapT": _CLAMP}],
         "images": images,
         "accessors": builder.accessors,
         "bufferViews": builder.views,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -28,6 +28,20 @@ class ModelView:
 
     camera: Cameras
     tensors: dict[str, Tensor]
+    num_estimates: int = 1
+    """Independent estimates that it is the mean of."""
+    num_wanted: int = 1
+    """How many of them make a finished view."""
+
+    def averaged(self, other: ModelView) -> ModelView:
+        """The mean of this view and another estimate of it, each weighted by the estimates in it; ids stay."""
+        count = self.num_estimates + other.num_estimates
+        part = other.num_estimates / count
+        tensors = {
+            name: torch.lerp(values, other.tensors[name], part) if values.is_floating_point() else values
+            for name, values in self.tensors.items()
+        }
+        return replace(self, tensors=tensors, num_estimates=count)
 
     @property
     def opacity(self) -> Tensor:

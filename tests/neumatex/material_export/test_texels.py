@@ -2,19 +2,11 @@
 
 import numpy as np
 import pytest
-import torch
 
+from tests.neumatex.material_export.surfaces import ball
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.neumatex.geometry.mesh import mesh_of
 from unmix_plugin.neumatex.material_export.atlas import Atlas, unwrap
 from unmix_plugin.neumatex.material_export.texels import texels_of
-
-
-def ball(subdivisions=2):
-    import trimesh
-
-    shape = trimesh.creation.icosphere(subdivisions=subdivisions)
-    return mesh_of(torch.as_tensor(np.array(shape.vertices)), torch.as_tensor(np.array(shape.faces)))
 
 
 def flat_atlas(uv, faces):
@@ -88,7 +80,7 @@ def test_triangles_are_found_whatever_chunks_they_are_looked_at_in(monkeypatch):
 
 
 def test_without_xatlas_one_message_names_it(monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "xatlas", None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     with pytest.raises(ConfigError, match="pip install xatlas"):
         unwrap(ball(1), 64)
 

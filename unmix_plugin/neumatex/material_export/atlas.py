@@ -52,9 +52,7 @@ def unwrap(mesh: Mesh, texture_size: int) -> Atlas:
     positions, faces = mesh.vertices.cpu().double().numpy(), mesh.faces.cpu().long().numpy()
     charts, axes = chart_labels(positions, faces)
     # A vertex is there once for each chart that it has a part in.
-    keys, corners = np.unique(
-        charts[:, None].astype(np.int64) * len(positions) + faces, return_inverse=True
-    )
+    keys, corners = np.unique(charts[:, None].astype(np.int64) * len(positions) + faces, return_inverse=True)
     cut, vertices = corners.reshape(faces.shape), keys % len(positions)
     axis_of_chart = np.zeros(charts.max() + 1, dtype=np.int64)
     axis_of_chart[charts] = axes

@@ -45,9 +45,7 @@ def chart_labels(
     return _components(axes, links)[0], axes
 
 
-def chart_uv(
-    positions: Float[np.ndarray, "N 3"], axes: Int[np.ndarray, " N"]
-) -> Float[np.ndarray, "N 2"]:
+def chart_uv(positions: Float[np.ndarray, "N 3"], axes: Int[np.ndarray, " N"]) -> Float[np.ndarray, "N 2"]:
     """Points as they are seen along an axis each, in the positions' unit, not mirrored."""
     right = np.roll(np.abs(_AXES), 1, axis=1)
     up = np.cross(_AXES, right)
@@ -75,7 +73,9 @@ def _links(faces: np.ndarray) -> Any:
     count = len(faces)
     ends = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
     _, edges = np.unique(ends[:, 0] * (ends.max() + 1) + ends[:, 1], return_inverse=True)
-    sides = coo_matrix((np.ones(3 * count), (np.repeat(np.arange(count), 3), edges)), dtype=np.float64).tocsr()
+    sides = coo_matrix(
+        (np.ones(3 * count), (np.repeat(np.arange(count), 3), edges)), dtype=np.float64
+    ).tocsr()
     links = (sides @ sides.T).tocsr()
     links.setdiag(0)
     links.eliminate_zeros()

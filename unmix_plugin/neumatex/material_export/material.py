@@ -26,8 +26,7 @@ _SIZES = (16, 8192)
 @dataclass(frozen=True)
 class MaterialProduct(RunProduct):
     """The material on the mesh: material.glb, a glTF with its nearest metallic-roughness material; textures of base colour,
-    roughness, metallicity and latents as PNG and EXR; parameters.exr, all parameters; shader/, the decoder of the latents
-    for other programs; material.json, which says what is what."""
+    roughness and metallicity as PNG and EXR; parameters.exr, all parameters; material.json, which says what is what."""
 
     name = "material"
 
@@ -46,7 +45,9 @@ class MaterialProduct(RunProduct):
             written, error = write_material(
                 job.folder, scene.mesh, scene.surface, scene.frame, self.texture_size
             )
-        job.say(f"the glTF material differs from the trained one by {100 * error:.1f} % of the reflected light")
+        job.say(
+            f"the glTF material differs from the trained one by {100 * error:.1f} % of the reflected light"
+        )
         return written
 
 
@@ -64,14 +65,10 @@ def require_texture_size(texture_size: int) -> None:
 def material_paths(folder: Path, surface: Surface) -> list[Path]:
     """Files that `write_material` makes."""
     from unmix_plugin.neumatex.material_export.files import texture_paths
-    from unmix_plugin.neumatex.material_export.shader import shader_paths
-    from unmix_plugin.neumatex.materials.neural import NeuralFamily
 
     names = ["base_colour", "gltf_base_colour", "gltf_metallic_roughness"]
     single = [folder / name for name in ("parameters.exr", "material.glb", "material.json")]
-    if not isinstance(surface.family, NeuralFamily):
-        return [*texture_paths(folder, names), *single]
-    return [*texture_paths(folder, [*names, "latents_a", "latents_b"]), *single, *shader_paths(folder / "shader")]
+    return [*texture_paths(folder, names), *single]
 
 
 def write_material(
@@ -96,8 +93,6 @@ def write_material(
     from unmix_plugin.neumatex.material_export import files
     from unmix_plugin.neumatex.material_export.baking import bake
     from unmix_plugin.neumatex.material_export.pbr_fit import fit_pbr
-    from unmix_plugin.neumatex.material_export.shader import write_shader
-    from unmix_plugin.neumatex.materials.neural import NeuralFamily
 
     family, baked = surface.family, bake(mesh, surface, texture_size)
     fit = fit_pbr(family, baked.parameters, torch.Generator().manual_seed(seed))
@@ -112,8 +107,6 @@ def write_material(
     written.append(files.write_material_glb(folder / "material.glb", mesh, baked, frame, shown))
     report = files.report_bytes(baked, type(family).__name__, names, fit, textures)
     written.append(write_file(folder / "material.json", report))
-    if isinstance(family, NeuralFamily):
-        written += write_shader(folder / "shader", family)
     return written, fit.mean_error
 
 
@@ -128,7 +121,6 @@ def textures_of(
 ) -> list[Texture]:
     """The textures of a material and of its glTF approximation."""
     from unmix_plugin.neumatex.material_export.files import Texture
-    from unmix_plugin.neumatex.materials.neural import NeuralFamily
 
     roughness, metallicity = fitted[:, 3], fitted[:, 4]
     unused = torch.ones_like(roughness)  # red may hold occlusion: nothing is hidden
@@ -143,9 +135,4 @@ def textures_of(
             False,
         ),
     ]
-    if isinstance(family, NeuralFamily):
-        latents = parameters[:, 3:9]
-        for letter, values, first in (("a", latents[:, :3], 1), ("b", latents[:, 3:], 4)):
-            channels = (f"latent {first}", f"latent {first + 1}", f"latent {first + 2}")
-            textures.append(Texture(f"latents_{letter}", values, channels, False))
     return textures

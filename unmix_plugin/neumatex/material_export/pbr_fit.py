@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from unmix_plugin.neumatex.materials.family import MaterialFamily
 from unmix_plugin.neumatex.materials.pbr import PbrFamily
 
-_STEPS, _MATERIALS, _DIRECTIONS, _WIDTH = 500, 384, 24, 48
+_STEPS, _MATERIALS, _DIRECTIONS, _WIDTH = 300, 256, 16, 48
 _CHUNK = 1 << 16
 _JUDGED = 512
 """Materials whose error is measured."""
@@ -29,8 +29,8 @@ class PbrFit:
 
     parameters: Float[Tensor, "T 5"]
     mean_error: float
-    """Mean absolute difference of reflected light, cosine included, over light from all of the hemisphere, as a part of
-    its mean; 0 where nothing was to be fitted."""
+    """Mean absolute difference of reflected light x, cosine included, between all directions, as a part of its mean;
+    light is compressed to x / (1 + x), as by an eye. 0 where nothing was to be fitted."""
 
 
 def fit_pbr(family: MaterialFamily, parameters: Float[Tensor, "T P"], generator: torch.Generator) -> PbrFit:
@@ -140,5 +140,6 @@ def _mean_error(
     repeated, pbr = (values[chosen].repeat_interleave(_DIRECTIONS, dim=0) for values in (parameters, fitted))
     uniforms = torch.rand(len(repeated), 4, generator=generator).to(repeated)
     wi, wo = _cosine_lobe(uniforms[:, :2]), _cosine_lobe(uniforms[:, 2:])
-    target, found = _reflected(family, repeated, wi, wo), _reflected(PbrFamily(), pbr, wi, wo)
+    light = _reflected(family, repeated, wi, wo), _reflected(PbrFamily(), pbr, wi, wo)
+    target, found = (one / (1 + one) for one in light)
     return float((found - target).abs().mean() / target.mean().clamp(min=1e-9))

@@ -77,7 +77,9 @@ def _inside(
     for first, last in zip([0, *(ends[:-1] + 1)], ends + 1, strict=True):
         chosen = np.arange(first, min(last, len(counts)))
         triangles = np.repeat(chosen, counts[chosen])
-        within = np.arange(len(triangles)) - np.repeat(np.cumsum(counts[chosen]) - counts[chosen], counts[chosen])
+        within = np.arange(len(triangles)) - np.repeat(
+            np.cumsum(counts[chosen]) - counts[chosen], counts[chosen]
+        )
         widths = extent[triangles, 0]
         column, row = low[triangles, 0] + within % widths, low[triangles, 1] + within // widths
         weights = _barycentric(corners[triangles], np.stack([column, row], axis=1))
