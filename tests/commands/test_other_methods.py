@@ -66,3 +66,13 @@ def test_what_needs_endmembers_is_refused_in_one_sentence(ball_run, tmp_path):
         assert "the method rgb-nerf has no endmembers" in " ".join(ended.err.split())
     ended = run(evaluate, "--run", ball_run, "--illuminant", "A", "--device", "cpu")
     assert ended.status == 2
+
+
+def test_another_environment_needs_a_method_that_knows_light_and_material_apart(ball_run, tmp_path):
+    words = ["--run", ball_run, "--output", tmp_path / "out", "--device", "cpu"]
+    ended = run(render, *words, "--environment", "studio")
+    assert ended.status == 2
+    assert "the method rgb-nerf has no environment that could be exchanged" in " ".join(ended.err.split())
+    ended = run(render, *words, "--environment-rotation", "nan")
+    assert ended.status == 2
+    assert "--environment-rotation is nan; give a finite number" in " ".join(ended.err.split())

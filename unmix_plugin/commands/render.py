@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,6 +59,13 @@ class RenderOptions:
     """Light to show the scene under: D65, A, E, FL2, ... or a .csv file; None: the one it was taken under."""
     sensor: Path | None = None
     """CSV file (wavelength,NAME,...) of the spectral responses of another camera, to see the result with."""
+    environment: str | None = None
+    """Environment to light an object with: an .exr or .hdr file, or the name of a built-in one; for methods that know
+    light and material apart. None: that of the pictures."""
+    environment_rotation: float = 0.0
+    """Degrees by which the environment is turned about the world's +z."""
+    environment_exposure: float = 0.0
+    """Stops by which the environment is brighter."""
     output: Path | None = None
     """Folder to write to; None: exports/render in the run folder."""
     output_dir: Path = Path("outputs")
@@ -76,6 +84,7 @@ def render(argv: list[str]) -> None:
         ConfigError: cameras, outputs or formats that are not there or don't fit each other, a recipe that is wrong or
             does not fit the run, files that would be overwritten, a method that does not unmix spectra, or a device
             that is not there.
+        SceneError: the environment map is missing, damaged or of no use.
         SpectrumError: a wavelength outside the bands, a light that is unknown, or a sensor that sees nothing in them.
     """
     options = tyro.cli(RenderOptions, prog="unmix-render", args=argv)
@@ -91,6 +100,7 @@ def render(argv: list[str]) -> None:
     path = chosen_run(options.run, options.output_dir)
     with working(console, f"reading {path}"):
         loaded = load_edited_run(path, options.device, options.edits, options.illuminant, options.sensor)
+        loaded = _relit(loaded, options)
         cameras = choose_cameras(loaded.scene, request)
     for line in loaded.scene.notes:
         say(console, line)
@@ -109,6 +119,23 @@ def _camera_request(options: RenderOptions) -> CameraRequest:
             raise ConfigError(f"--size {options.size}: expected width and height in pixels, as in 640x480")
         size = (int(match[1]), int(match[2]))
     return CameraRequest(options.cameras, options.view, size, options.downscale, options.frames, options.fps)
+
+
+def _relit(loaded: LoadedRun, options: RenderOptions) -> LoadedRun:
+    """The run in the environment asked for."""
+    from dataclasses import replace
+
+    from unmix_plugin.errors import ConfigError
+    from unmix_plugin.trained.relighting import LightChoice, relit
+
+    choice = LightChoice(options.environment, options.environment_rotation, options.environment_exposure)
+    if choice == LightChoice():
+        return loaded
+    numbers = {"--environment-rotation": choice.rotation_deg, "--environment-exposure": choice.exposure_stops}
+    for flag, value in numbers.items():
+        if not math.isfinite(value):
+            raise ConfigError(f"{flag} is {value:g}; give a finite number")
+    return replace(loaded, scene=relit(loaded.scene, choice, loaded.config.method_name))
 
 
 def _render(

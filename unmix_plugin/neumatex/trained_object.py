@@ -5,11 +5,9 @@ Notation: `H x W` pixels, `K` rays that meet the mesh, `P` parameters, `C` colou
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float
@@ -18,7 +16,6 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.engine.outputs import Output
-from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.errors import ConfigError, did_you_mean
 from unmix_plugin.neumatex.geometry.mesh import Mesh
 from unmix_plugin.neumatex.geometry.ray_mesh import RayMesh
@@ -30,15 +27,11 @@ from unmix_plugin.neumatex.surface import Surface
 from unmix_plugin.neumatex.tracing.primary_hits import pixel_hits
 from unmix_plugin.neumatex.tracing.render_view import rays_radiance
 from unmix_plugin.scenes.scene import Normalisation
-from unmix_plugin.trained.model_scene import ModelView, frozen_parameters
+from unmix_plugin.trained.model_scene import ModelView
 from unmix_plugin.trained.probe import one_pixel
 from unmix_plugin.trained.protocol import Probe
 from unmix_plugin.trained.relighting import LightChoice
-from unmix_plugin.trained.run_views import RunView, recorded_views
-from unmix_plugin.trained.world_frame import world_frame
-
-if TYPE_CHECKING:
-    from unmix_plugin.neumatex.model import NeumatexModel
+from unmix_plugin.trained.run_views import RunView
 
 OWN_LIGHT = "of the pictures"
 """Name of the light that the pictures were taken under."""
@@ -195,31 +188,3 @@ def _named_light(name: str, known: tuple[str, ...]) -> Environment:
             f"({', '.join(SUFFIXES)})"
         )
     return read_environment(Path(name))
-
-
-def trained_object(
-    model: NeumatexModel, record: SceneRecord, averages: Mapping[str, Tensor] | None = None
-) -> TrainedObject:
-    """The object of a model as it is now; training that goes on does not change it.
-
-    Args:
-        model, averages: As `frozen_parameters` takes them.
-        record: Cameras and frame of its run.
-    Raises:
-        RunError: the record is damaged.
-    """
-    frozen = frozen_parameters(model, averages)
-    triplane = copy.deepcopy(model.triplane, dict(frozen)).eval()  # type: ignore[arg-type]
-    curve = copy.deepcopy(model.curve, dict(frozen)).eval()  # type: ignore[arg-type]
-    return TrainedObject(
-        model.traced.ray_mesh,
-        replace(model.surface, triplane=triplane),
-        model.environment,
-        world_frame(record),
-        recorded_views(record),
-        record.scene_box,
-        curve,
-        triplane.log_variance,
-        model.config.eval_samples,
-        model.config.bounces,
-    )

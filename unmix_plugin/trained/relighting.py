@@ -43,7 +43,7 @@ class RelightableScene(RenderableScene, Protocol):
 
 
 @runtime_checkable
-class EstimatedScene(Protocol):
+class EstimatedScene(RenderableScene, Protocol):
     """A scene whose pictures are random estimates, which become finer the more of them are averaged."""
 
     @property

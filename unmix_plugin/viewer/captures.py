@@ -76,7 +76,7 @@ class StripCapture:
         camera = self._request.camera
         last = min(self._first_row + self._rows, camera.height)
         strip = rows_of(camera, self._first_row, last)
-        render = FrameRender(strip, self._request.subpixels)
+        render = FrameRender(strip, self._request.subpixels, is_finished=True)
         share = (last - self._first_row) / camera.height
         begun = self._first_row / camera.height
         self._capture = Capture(

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from unmix_plugin.trained.relighting import LightChoice
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings
 from unmix_plugin.viewer.recipe_editor import RecipeHistory
 from unmix_plugin.viewer.view_cameras import ViewPose
@@ -33,6 +34,7 @@ class PageState:
     history: RecipeHistory
     largest_height: int
     subpixels: int
+    light: LightChoice = LightChoice()
 
 
 class KeptPages:

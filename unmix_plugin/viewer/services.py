@@ -18,6 +18,7 @@ from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.colour.illuminants import illuminant_names
+from unmix_plugin.trained.relighting import RelightableScene
 from unmix_plugin.trained.run_views import RunView, recorded_views
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.failures import failures_said
@@ -69,6 +70,7 @@ class Services:
         with source.borrowed() as scene:
             self.layers = layers_of(scene)
             self.has_materials = isinstance(scene, TrainedScene)
+            self.lights = scene.lights if isinstance(scene, RelightableScene) else ()
             channels = (
                 num_channels(scene.materials) if isinstance(scene, TrainedScene) else 4 * len(scene.outputs)
             )

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from unmix_plugin.spectral.library.material_library import LibraryMatch, measured_library
+from unmix_plugin.trained.relighting import LightChoice
 from unmix_plugin.viewer import html
 from unmix_plugin.viewer.failures import failures_said
 from unmix_plugin.viewer.inputs import number
@@ -75,7 +76,8 @@ class Session:
         self.services = services
         self.browser = browser
         self.history = RecipeHistory(services.first_recipe) if state is None else state.history
-        self.view = View(show=self._show, report=self._report, edit=Edit(self.history.present))
+        light = LightChoice() if state is None else state.light
+        self.view = View(show=self._show, report=self._report, edit=Edit(self.history.present, light))
         if state is None:
             self.view.settings = self._first_settings()
             self.view.largest_height = _first_height(client.camera.image_height)
@@ -142,7 +144,9 @@ class Session:
     def state(self) -> PageState:
         """What the page shows, to be restored when it is loaded again."""
         view = self.view
-        return PageState(view.pose, view.settings, self.history, view.largest_height, view.subpixels)
+        return PageState(
+            view.pose, view.settings, self.history, view.largest_height, view.subpixels, view.edit.light
+        )
 
     def tick(self) -> None:
         """Update what panels show of a run in progress."""
@@ -213,6 +217,10 @@ class Session:
         for tell in self.on_edit:
             tell()
         self._tell_notes(notes)
+
+    def change_light(self, light: LightChoice) -> None:
+        """Show a scene whose light can be exchanged under another one."""
+        self.services.loop.change_edit(self.view, Edit(self.view.edit.recipe, light))
 
     def show_objects(self, owner: str, has_some: bool) -> None:
         """Note whether a panel shows objects of the browser's own, which need depth to be hidden behind the picture."""

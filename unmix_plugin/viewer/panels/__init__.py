@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from unmix_plugin.viewer.panels.capture_panel import CapturePanel
 from unmix_plugin.viewer.panels.layer_panel import LayerPanel
+from unmix_plugin.viewer.panels.light_panel import LightPanel
 from unmix_plugin.viewer.panels.materials_panel import MaterialsPanel
 from unmix_plugin.viewer.panels.probe_panel import ProbePanel
 from unmix_plugin.viewer.panels.scene_panel import ScenePanel
@@ -20,6 +21,7 @@ def has_materials(services: Services) -> bool:
 
 PANELS = (
     Panel("view", LayerPanel),
+    Panel("light", LightPanel, lambda services: bool(services.lights)),
     Panel("scene", ScenePanel),
     Panel("probe", ProbePanel, has_materials),
     Panel("probe", ValuesPanel, lambda services: not has_materials(services)),

@@ -11,6 +11,7 @@ from unmix_plugin.editing import Recipe, changes_geometry, edit_scene
 from unmix_plugin.spectral.coefficients import Coefficients
 from unmix_plugin.trained.open_run import require_materials
 from unmix_plugin.trained.protocol import RenderableScene
+from unmix_plugin.trained.relighting import LightChoice, relit
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 _RENEWAL_S = 0.5
@@ -24,7 +25,7 @@ See = Callable[[TrainedScene], Coefficients]
 class _Kept:
     """The edited scene made last."""
 
-    edited: TrainedScene
+    edited: RenderableScene
     version: int
     made_at: float
 
@@ -34,16 +35,18 @@ class _Kept:
 
 @dataclass(frozen=True, eq=False)
 class Edit:
-    """A recipe, and the scene that it last gave; compared by identity."""
+    """A recipe or another light, and the scene that it last gave; compared by identity."""
 
     recipe: Recipe = Recipe()
+    light: LightChoice = LightChoice()
+    """For scenes whose light can be exchanged; such scenes have no recipes."""
     _kept: list[_Kept] = field(default_factory=list, repr=False)
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     @property
     def is_none(self) -> bool:
         """Whether nothing is changed."""
-        return not self.recipe.operations and self.recipe.illuminant is None
+        return not self.recipe.operations and self.recipe.illuminant is None and self.light == LightChoice()
 
     @property
     def changes_geometry(self) -> bool:
@@ -52,6 +55,8 @@ class Edit:
 
     def reuses(self, other: Edit) -> bool:
         """Whether what was rendered with `other` can be shown with this edit's materials."""
+        if self.light != other.light:
+            return False
         return self is other or (not self.changes_geometry and not other.changes_geometry)
 
     def apply(self, scene: RenderableScene, version: int, see: See) -> RenderableScene:
@@ -67,8 +72,12 @@ class Edit:
         if self.is_none:
             return scene
         with self._lock:
-            scene = require_materials(scene, "of this run")
             if not self._kept or not self._kept[0].serves(version):
-                edited = edit_scene(scene, self.recipe, see(scene) if self.recipe.wants_pictures else None)
-                self._kept[:] = [_Kept(edited, version, time.monotonic())]
+                self._kept[:] = [_Kept(self._applied(scene, see), version, time.monotonic())]
             return self._kept[0].edited
+
+    def _applied(self, scene: RenderableScene, see: See) -> RenderableScene:
+        if self.light != LightChoice():
+            return relit(scene, self.light, "of this run")
+        scene = require_materials(scene, "of this run")
+        return edit_scene(scene, self.recipe, see(scene) if self.recipe.wants_pictures else None)

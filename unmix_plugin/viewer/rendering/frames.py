@@ -17,6 +17,7 @@ from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.trained.model_scene import ModelView
 from unmix_plugin.trained.protocol import RenderableScene, RenderedView
+from unmix_plugin.trained.relighting import EstimatedScene
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.view_cameras import pixel_rays
 
@@ -27,13 +28,18 @@ _CPU_CHUNK, _CUDA_CHUNK = 4096, 1 << 16
 class FrameRender:
     """A view under way. Blocks may come from different steps of a training; materials are those of the end."""
 
-    def __init__(self, camera: Cameras, subpixels: int = 1) -> None:
+    def __init__(
+        self, camera: Cameras, subpixels: int = 1, before: ModelView | None = None, is_finished: bool = False
+    ) -> None:
         """
         Args:
             camera: One camera.
             subpixels: Rays through a pixel along each of its edges, averaged.
+            before: Estimates of the same view, which the new one is averaged with.
+            is_finished: Whether the view has to be as fine as the scene makes it, rather than an estimate.
         """
         self.camera = camera
+        self._subpixels, self._before, self._is_finished = subpixels, before, is_finished
         centres = [(index + 0.5) / subpixels for index in range(subpixels)]
         self._offsets = [(x, y) for y in centres for x in centres]
         self._num_pixels = camera.width * camera.height
@@ -42,6 +48,7 @@ class FrameRender:
         self._coefficients: Coefficients | None = None
         self._strips: list[dict[str, Tensor]] = []
         self._opacities: list[Tensor] = []
+        self._num_wanted = 1
 
     @property
     def num_rays(self) -> int:
@@ -83,7 +90,15 @@ class FrameRender:
         width, turns = self.camera.width, len(self._offsets)
         first = self._rays_done // (width * turns)
         last = min(first + max(1, num_rays // (width * turns)), self.camera.height)
-        strip = scene.look(rows_of(self.camera, first, last).to(scene.device))
+        camera = rows_of(self.camera, first, last).to(scene.device)
+        if isinstance(scene, EstimatedScene) and self._is_finished:
+            strip = scene.look(camera, self._subpixels)
+        elif isinstance(scene, EstimatedScene):
+            number = 0 if self._before is None else self._before.num_estimates
+            strip = scene.estimate(camera, self._subpixels, number)
+            self._num_wanted = strip.num_wanted
+        else:
+            strip = scene.look(camera)
         self._strips.append({output.name: strip[output.name] for output in scene.outputs})
         self._opacities.append(strip.opacity)
         self._rays_done = last * width * turns
@@ -95,7 +110,9 @@ class FrameRender:
         if not isinstance(scene, TrainedScene):
             names = (output.name for output in scene.outputs)
             tensors = {name: torch.cat([strip[name] for strip in self._strips]) for name in names}
-            return ModelView(self.camera, {"accumulation": torch.cat(self._opacities), **tensors})
+            tensors = {"accumulation": torch.cat(self._opacities), **tensors}
+            view = ModelView(self.camera, tensors, num_wanted=self._num_wanted)
+            return view if self._before is None else self._before.averaged(view)
         assert self._coefficients is not None
         image = self._coefficients.unflatten(self.camera.height, self.camera.width)
         return MaterialView(scene, self.camera, image)

@@ -13,6 +13,7 @@ import torch
 from unmix_plugin.editing.edited_field import EditedField
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.trained.material_view import MaterialView
+from unmix_plugin.trained.model_scene import ModelView
 from unmix_plugin.trained.open_run import require_materials
 from unmix_plugin.trained.protocol import RenderedView
 from unmix_plugin.trained.trained_scene import TrainedScene
@@ -80,8 +81,10 @@ class PictureMaker:
     def finer_render(
         self, pose: ViewPose, frame: RenderedView, largest_height: int, subpixels: int
     ) -> FrameRender:
-        """The picture after `frame`: a finer one, or at the end the same anew."""
+        """The picture after `frame`: a finer one, another estimate of the same, or at the end the same anew."""
         target = self.target_height(pose, largest_height)
+        if isinstance(frame, ModelView) and frame.camera.height >= target and wants_more(frame):
+            return FrameRender(frame.camera, subpixels, frame)
         height = finer_height(frame.camera.height, target) or target
         is_last = height == target and not self.source.is_changing
         return FrameRender(camera_of(pose, height, self._largest_pixels), subpixels if is_last else 1)
@@ -186,6 +189,11 @@ class PictureMaker:
             picture, legend = layer.paint(frame, settings, aids)
         depth = picture_depth(frame) if with_depth and isinstance(frame, MaterialView) else None
         return Shown(as_bytes(picture), depth, legend, is_moving, layer.is_labels)
+
+
+def wants_more(frame: RenderedView) -> bool:
+    """Whether a frame is an estimate that is to be averaged with others."""
+    return isinstance(frame, ModelView) and frame.num_estimates < frame.num_wanted
 
 
 def _without_traces(frame: RenderedView) -> RenderedView:

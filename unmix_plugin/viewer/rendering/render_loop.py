@@ -14,7 +14,7 @@ from unmix_plugin.trained.protocol import RenderedView
 from unmix_plugin.viewer.failures import failures_said
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings
 from unmix_plugin.viewer.rendering.edits import Edit
-from unmix_plugin.viewer.rendering.picture_maker import RESTING_COST, PictureMaker
+from unmix_plugin.viewer.rendering.picture_maker import RESTING_COST, PictureMaker, wants_more
 from unmix_plugin.viewer.rendering.view import Capture, View
 from unmix_plugin.viewer.view_cameras import ViewPose
 
@@ -160,6 +160,8 @@ class RenderLoop:
         if view.frame.camera.height < self._maker.target_height(view.pose, view.largest_height):
             return True
         is_stale = view.frame_version != self._maker.source.version
+        if not is_stale and wants_more(view.frame):
+            return True
         return is_stale and time.monotonic() - view.shown_at > _POLL_S
 
     def _guarded(self, view: View, work: Callable[[View], None]) -> None:
