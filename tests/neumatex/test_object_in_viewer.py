@@ -8,6 +8,7 @@ from tests.neumatex.test_trained_object import RECORD, make_object
 from tests.viewer.pages import decoded, has_control, opened, serving, show_layer
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.training.device_share import DeviceShare
+from unmix_plugin.trained.model_scene import ModelView
 from unmix_plugin.viewer.rendering.scene_source import SceneSource
 
 
@@ -25,13 +26,14 @@ def finished(page, viewer):
     def is_finished():
         frame = view.frame
         return (
-            frame is not None
+            isinstance(frame, ModelView)
             and frame.camera.height == 48
             and view.asked_at is None
             and frame.num_estimates == frame.num_wanted == 4
         )
 
     page.wait_until(is_finished)
+    assert isinstance(view.frame, ModelView)
     return view.frame
 
 

@@ -1,4 +1,4 @@
-"""What a scene offers beside the common protocol if its light can be exchanged, or its pictures are random estimates."""
+"""What a scene offers beside the common protocol if its light can be exchanged or its pictures are estimates."""
 
 from __future__ import annotations
 

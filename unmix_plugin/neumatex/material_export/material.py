@@ -25,8 +25,9 @@ _SIZES = (16, 8192)
 
 @dataclass(frozen=True)
 class MaterialProduct(RunProduct):
-    """The material on the mesh: material.glb, a glTF with its nearest metallic-roughness material; textures of base colour,
-    roughness and metallicity as PNG and EXR; parameters.exr, all parameters; material.json, which says what is what."""
+    """The material on the mesh: material.glb, a glTF with its nearest metallic-roughness material; textures of base
+    colour, roughness and metallicity as PNG and EXR; parameters.exr, all parameters; material.json, which says what is
+    what."""
 
     name = "material"
 
@@ -40,7 +41,7 @@ class MaterialProduct(RunProduct):
         scene = job.loaded.scene
         assert isinstance(scene, TrainedObject)  # what else has another method and is refused before
         require_texture_size(self.texture_size)
-        job.claim(material_paths(job.folder, scene.surface))
+        job.claim(material_paths(job.folder))
         with job.working("unwrapping the mesh and baking its material"):
             written, error = write_material(
                 job.folder, scene.mesh, scene.surface, scene.frame, self.texture_size
@@ -62,7 +63,7 @@ def require_texture_size(texture_size: int) -> None:
         raise ConfigError(f"--texture-size is {texture_size}; choose {low} to {high} texels")
 
 
-def material_paths(folder: Path, surface: Surface) -> list[Path]:
+def material_paths(folder: Path) -> list[Path]:
     """Files that `write_material` makes."""
     from unmix_plugin.neumatex.material_export.files import texture_paths
 
@@ -125,7 +126,7 @@ def textures_of(
     roughness, metallicity = fitted[:, 3], fitted[:, 4]
     unused = torch.ones_like(roughness)  # red may hold occlusion: nothing is hidden
     colours = ("red", "green", "blue")
-    textures = [
+    return [
         Texture("base_colour", family.base_colour(parameters), colours, True),
         Texture("gltf_base_colour", fitted[:, :3], colours, True),
         Texture(
@@ -135,4 +136,3 @@ def textures_of(
             False,
         ),
     ]
-    return textures
