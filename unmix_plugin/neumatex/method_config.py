@@ -1,10 +1,27 @@
 """What the package registers for objects: the method `neumatex`, with all its settings."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from unmix_plugin.engine import MethodSpecification, OptimizerConfig, PipelineConfig, TrainerConfig
 from unmix_plugin.neumatex.datamanager import ObjectDataManagerConfig
 from unmix_plugin.neumatex.model import NeumatexModelConfig
+
+
+def _scene(*arguments: Any) -> Any:
+    """See `object_snapshot.trained_object`; imported when a run is opened."""
+    from unmix_plugin.neumatex.object_snapshot import trained_object
+
+    return trained_object(*arguments)
+
+
+def _products() -> Sequence[Any]:
+    """What `unmix-export` makes of objects; imported when the command is called."""
+    from unmix_plugin.neumatex.material_export.material import MaterialProduct
+
+    return (MaterialProduct(),)
+
 
 neumatex = MethodSpecification(
     config=TrainerConfig(
@@ -21,4 +38,6 @@ neumatex = MethodSpecification(
         },
     ),
     description="relightable materials on a known mesh, from posed pictures under a known environment",
+    scene=_scene,
+    products=_products,
 )

@@ -26,8 +26,8 @@ _SIZES = (16, 8192)
 @dataclass(frozen=True)
 class MaterialProduct(RunProduct):
     """The material on the mesh: material.glb, a glTF with its nearest metallic-roughness material; textures of base
-    colour, roughness and metallicity as PNG and EXR; parameters.exr, all parameters; material.json, which says what is
-    what."""
+    colour, roughness, metallicity and latents as PNG and EXR; parameters.exr, all parameters; decoder.glsl and
+    decoder.json, with which other programs can use the latents; material.json, which says what is what."""
 
     name = "material"
 
@@ -41,7 +41,7 @@ class MaterialProduct(RunProduct):
         scene = job.loaded.scene
         assert isinstance(scene, TrainedObject)  # what else has another method and is refused before
         require_texture_size(self.texture_size)
-        job.claim(material_paths(job.folder))
+        job.claim(material_paths(job.folder, scene.surface.family))
         with job.working("unwrapping the mesh and baking its material"):
             written, error = write_material(
                 job.folder, scene.mesh, scene.surface, scene.frame, self.texture_size
@@ -63,13 +63,17 @@ def require_texture_size(texture_size: int) -> None:
         raise ConfigError(f"--texture-size is {texture_size}; choose {low} to {high} texels")
 
 
-def material_paths(folder: Path) -> list[Path]:
+def material_paths(folder: Path, family: MaterialFamily) -> list[Path]:
     """Files that `write_material` makes."""
     from unmix_plugin.neumatex.material_export.files import texture_paths
+    from unmix_plugin.neumatex.material_export.shader import shader_paths
+    from unmix_plugin.neumatex.materials.neural import NeuralFamily
 
     names = ["base_colour", "gltf_base_colour", "gltf_metallic_roughness"]
     single = [folder / name for name in ("parameters.exr", "material.glb", "material.json")]
-    return [*texture_paths(folder, names), *single]
+    if not isinstance(family, NeuralFamily):
+        return [*texture_paths(folder, names), *single]
+    return [*texture_paths(folder, [*names, "latents_a", "latents_b"]), *single, *shader_paths(folder)]
 
 
 def write_material(
@@ -94,6 +98,8 @@ def write_material(
     from unmix_plugin.neumatex.material_export import files
     from unmix_plugin.neumatex.material_export.baking import bake
     from unmix_plugin.neumatex.material_export.pbr_fit import fit_pbr
+    from unmix_plugin.neumatex.material_export.shader import write_shader
+    from unmix_plugin.neumatex.materials.neural import NeuralFamily
 
     family, baked = surface.family, bake(mesh, surface, texture_size)
     fit = fit_pbr(family, baked.parameters, torch.Generator().manual_seed(seed))
@@ -108,6 +114,8 @@ def write_material(
     written.append(files.write_material_glb(folder / "material.glb", mesh, baked, frame, shown))
     report = files.report_bytes(baked, type(family).__name__, names, fit, textures)
     written.append(write_file(folder / "material.json", report))
+    if isinstance(family, NeuralFamily):
+        written += write_shader(folder, family)
     return written, fit.mean_error
 
 
@@ -122,11 +130,12 @@ def textures_of(
 ) -> list[Texture]:
     """The textures of a material and of its glTF approximation."""
     from unmix_plugin.neumatex.material_export.files import Texture
+    from unmix_plugin.neumatex.materials.neural import NeuralFamily
 
     roughness, metallicity = fitted[:, 3], fitted[:, 4]
     unused = torch.ones_like(roughness)  # red may hold occlusion: nothing is hidden
     colours = ("red", "green", "blue")
-    return [
+    textures = [
         Texture("base_colour", family.base_colour(parameters), colours, True),
         Texture("gltf_base_colour", fitted[:, :3], colours, True),
         Texture(
@@ -136,3 +145,9 @@ def textures_of(
             False,
         ),
     ]
+    if isinstance(family, NeuralFamily):
+        for letter, first in (("a", 0), ("b", 3)):
+            channels = (f"latent {first + 1}", f"latent {first + 2}", f"latent {first + 3}")
+            values = parameters[:, 3 + first : 6 + first]
+            textures.append(Texture(f"latents_{letter}", values, channels, False))
+    return textures
