@@ -70,7 +70,7 @@ class Services:
         with source.borrowed() as scene:
             self.layers = layers_of(scene)
             self.has_materials = isinstance(scene, TrainedScene)
-            self.lights = scene.lights if isinstance(scene, RelightableScene) else ()
+            self.lights: tuple[str, ...] = scene.lights if isinstance(scene, RelightableScene) else ()
             channels = (
                 num_channels(scene.materials) if isinstance(scene, TrainedScene) else 4 * len(scene.outputs)
             )

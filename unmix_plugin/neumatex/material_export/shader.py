@@ -77,7 +77,9 @@ def decoder_constants(family: NeuralFamily) -> dict[str, Any]:
 
 def shader_text(constants: dict[str, Any]) -> str:
     """The shader with its constants."""
-    template = files(__package__).joinpath("decoder.glsl").read_text(encoding="utf-8")
+    template = (
+        files("unmix_plugin.neumatex.material_export").joinpath("decoder.glsl").read_text(encoding="utf-8")
+    )
     assert _PLACE in template
     declared = [_declaration(name, value) for name, value in constants.items()]
     return template.replace(_PLACE, "\n".join(declared))
