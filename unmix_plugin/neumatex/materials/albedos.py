@@ -39,7 +39,7 @@ def sheen_albedo(roughness: Float[Tensor, " N"], cosine: Float[Tensor, " N"]) ->
 
 def mean_ggx_albedo(roughness: Float[Tensor, "K N"]) -> tuple[Float[Tensor, "K N"], Float[Tensor, "K N"]]:
     """`(a, b)` of `ggx_albedo`, averaged over the hemisphere with the cosine as weight."""
-    means = _mean(ggx_table()).to(roughness.device).T.contiguous()
+    means = _ggx_means(roughness.device)
     row = (roughness.detach() * (_ROWS - 1)).floor().clamp(0, _ROWS - 2)
     low, high = means[:, row.long()], means[:, row.long() + 1]
     found = low + (roughness * (_ROWS - 1) - row) * (high - low)
@@ -102,6 +102,11 @@ def _mean(table: Tensor) -> Tensor:
 @lru_cache(maxsize=4)
 def _ggx_cells(device: torch.device) -> Tensor:
     return _cells(ggx_table()).to(device)
+
+
+@lru_cache(maxsize=4)
+def _ggx_means(device: torch.device) -> Tensor:
+    return _mean(ggx_table()).T.contiguous().to(device)
 
 
 @lru_cache(maxsize=4)

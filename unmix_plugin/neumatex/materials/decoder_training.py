@@ -23,8 +23,8 @@ from unmix_plugin.neumatex.materials.microfacet import alpha_of, roughness_of
 class DecoderTraining:
     """Settings of one training."""
 
-    steps: int = 12_000
-    materials: int = 1024
+    steps: int = 4000
+    materials: int = 2048
     """Materials of a step; each is seen under `lights`."""
     lights: int = 8
     learning_rate: float = 3e-3
@@ -55,21 +55,19 @@ def train(settings: DecoderTraining, report: Callable[[int, float], None]) -> tu
     )
     running = math.nan
     for step in range(1, settings.steps + 1):
-        errors = _errors(decoder, encoder, settings, generator)
+        loss = _loss(decoder, encoder, settings, generator)
         optimiser.zero_grad()
-        # The root keeps the few materials that six numbers can't hold from ruling over all others.
-        torch.sqrt(errors + 1e-5).mean().backward()
-        torch.nn.utils.clip_grad_norm_(parameters, 1.0)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(parameters, 0.1)
         optimiser.step()
         schedule.step()
-        error = errors.detach().mean().item()
-        running = error if math.isnan(running) else 0.98 * running + 0.02 * error
+        running = loss.item() if math.isnan(running) else 0.98 * running + 0.02 * loss.item()
         if step % 200 == 0 or step == settings.steps:
             report(step, -10.0 * math.log10(running))
     return decoder, encoder
 
 
-def _errors(
+def _loss(
     decoder: Decoder, encoder: Encoder, settings: DecoderTraining, generator: torch.Generator
 ) -> Tensor:
     materials = draw_materials(settings.materials, generator)
@@ -77,7 +75,7 @@ def _errors(
     latents = encoder(truth)
     noise = torch.randn(latents.shape, generator=generator)
     latents = (latents + settings.latent_noise * noise).clamp(0.0, 1.0)
-    return response_error(truth, decoder(latents), materials[:, :3].T, settings.lights, generator)
+    return response_error(truth, decoder(latents), materials[:, :3].T, settings.lights, generator).mean()
 
 
 def response_error(
@@ -91,7 +89,7 @@ def response_error(
     truth, found = _widened(truth.repeat(lights), widening), _widened(found.repeat(lights), widening)
     wo = _eyes(rows, generator)
     with torch.no_grad():
-        wi = truth.mixture(wo, base).sample(wo, torch.rand(3, rows, generator=generator))
+        wi = truth.mixture(wo, base).sample(wo, torch.rand(rows, 3, generator=generator).T)
         # Where a lobe pointed below the surface, any direction above is as good.
         wi = torch.cat([wi[:2], wi[2:].abs().clamp_min(1e-3)])
         received = math.pi * torch.exp(strength) * wi[2]
@@ -112,7 +110,7 @@ def _widened(stack: LayerStack, widening: Tensor) -> LayerStack:
 
 def _eyes(number: int, generator: torch.Generator) -> Tensor:
     """As often as a picture of a sphere shows them, and some more of the grazing ones; (3 N)."""
-    u = torch.rand(3, number, generator=generator)
+    u = torch.rand(number, 3, generator=generator).T
     z = torch.where(u[2] < 0.7, torch.sqrt(u[0]), u[0]).clamp_min(0.02)
     sine, angle = torch.sqrt(1.0 - z * z), 2.0 * math.pi * u[1]
     return torch.stack([sine * torch.cos(angle), sine * torch.sin(angle), z])
