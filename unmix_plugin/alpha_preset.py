@@ -2,12 +2,12 @@
 
 With alpha, space outside the objects' visual hull is carved away before training, and a transparent pixel is known to
 be empty. Without it, as in a closed room, a black pixel may show a black thing or nothing at all, and free space is
-only cleared by training.
+only cleared by training. In a world without end every ray ends on something, if only the sky.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 Auto = Literal["auto"]
@@ -30,6 +30,7 @@ class AlphaPreset:
     rgb_loss_weight: float
     opacity_loss_weight: float
     spread_loss_weight: float
+    coarse_samples: int
     specular_endmembers: bool
     """Whether the specular dictionary has the endmembers' spectra too: in rooms, walls colour the light."""
 
@@ -44,6 +45,7 @@ WITH_ALPHA = AlphaPreset(
     rgb_loss_weight=0.2,
     opacity_loss_weight=0.0,
     spread_loss_weight=0.0,
+    coarse_samples=256,
     specular_endmembers=False,
 )
 WITHOUT_ALPHA = AlphaPreset(
@@ -56,13 +58,17 @@ WITHOUT_ALPHA = AlphaPreset(
     rgb_loss_weight=0.0,
     opacity_loss_weight=0.01,
     spread_loss_weight=1e-3,
+    coarse_samples=256,
     specular_endmembers=True,
 )
 
 
-def preset_for(has_alpha: bool) -> AlphaPreset:
-    """The preset of a scene with or without alpha."""
-    return WITH_ALPHA if has_alpha else WITHOUT_ALPHA
+UNBOUNDED = replace(WITHOUT_ALPHA, initial_opacity=0.005, opacity_loss_weight=0.0, coarse_samples=64)
+
+
+def preset_for(has_alpha: bool, is_unbounded: bool = False) -> AlphaPreset:
+    """The preset of a scene with or without alpha, in a box or in a world without end."""
+    return UNBOUNDED if is_unbounded else WITH_ALPHA if has_alpha else WITHOUT_ALPHA
 
 
 def choose(setting: Any, preset: Any) -> Any:

@@ -127,7 +127,7 @@ class HyperspectralDataManager(DataManager):
         self.train_cameras = self.scene.cameras[list(self.scene.train_indices)]
         self.eval_cameras = self.scene.cameras[list(self.scene.eval_indices)]
         self._rays = PixelRays(self.scene, device)
-        self._preset = preset_for(self.scene.has_alpha)
+        self._preset = preset_for(self.scene.has_alpha, self.scene.is_unbounded)
         self._num_rays = config.train_num_rays_per_batch
         self._bad_share = 0.0
         self._choose_subpixels(step=0, progress=0.0)
@@ -189,6 +189,7 @@ class HyperspectralDataManager(DataManager):
             "wavelengths_nm": self.scene.wavelengths_nm.tolist(),
             "illuminant": None if illuminant is None else illuminant.tolist(),
             "has_alpha": self.scene.has_alpha,
+            "is_unbounded": self.scene.is_unbounded,
             "grid_resolution": self._grid_resolution,
             "pixel_size": min(self._rays.pixel_sizes.values()),
             "subpixels": self._final_subpixels,

@@ -20,6 +20,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from unmix_plugin.engine.field import Field
+from unmix_plugin.engine.geometry.contraction import contracted_unit
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.engine.instantiate import InstantiateConfig, Target
 from unmix_plugin.errors import require
@@ -98,6 +99,10 @@ class CoefficientField(Field):
     def abundances_of(self, features: Float[Tensor, "S G"]) -> Float[Tensor, "S K"]:
         """Abundances a of points with these geometry features, summing to 1."""
 
+    def sky(self, directions: Float[Tensor, "R 3"]) -> Float[Tensor, "R C"] | None:
+        """What is infinitely far away: K abundances, and the brightness they are multiplied with; None if nothing."""
+        return None
+
     def get_density(self, positions: Float[Tensor, "S 3"]) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
         """Density per scene unit and geometry features."""
         return self.density_of(self.encode(positions))
@@ -118,6 +123,7 @@ class UnmixField(CoefficientField):
         pixel_size: float,
         exposure: float = 1.0,
         lit_by_camera: bool = False,
+        is_unbounded: bool = False,
     ) -> None:
         """
         Args:
@@ -129,6 +135,7 @@ class UnmixField(CoefficientField):
             pixel_size: Edge of a pixel in the middle of the scene, scene units.
             exposure: How dark the scene is: the view-dependent part starts so many times darker.
             lit_by_camera: Whether the light moves with the camera, so that scales depend on the direction of view.
+            is_unbounded: Whether the field is defined in all of space, contracted around the box, with a sky behind.
         """
         super().__init__()
         self.config = config
@@ -141,13 +148,16 @@ class UnmixField(CoefficientField):
             config.num_levels,
             config.features_per_level,
             config.coarsest_resolution,
-            config.cells_of_finest_level(scene_box, pixel_size),
+            config.cells_of_finest_level(scene_box, pixel_size) * (2 if is_unbounded else 1),
             config.log2_rows_per_level,
         )
         self.register_buffer("aabb", scene_box.aabb.clone())
+        self.is_unbounded = is_unbounded
         table = torch.empty(self.layout.num_rows, config.features_per_level)
         self.table = nn.Parameter(nn.init.uniform_(table, -1e-4, 1e-4))
         self._make_networks()
+        if is_unbounded:
+            self.sky_network = bias_free_network(NUM_SKY_FEATURES, config.hidden_width, num_endmembers + 1)
 
     def _make_networks(self) -> None:
         width, num_features = self.config.hidden_width, self.config.num_features + 1
@@ -164,8 +174,21 @@ class UnmixField(CoefficientField):
         self, positions: Float[Tensor, "S 3"], known: Float[Tensor, "S LF"] | None = None
     ) -> Float[Tensor, "S LF"]:
         """The hash grid's encoding of positions; `known` as `hash_encode` takes it."""
-        unit_positions = (positions - self.aabb[0]) / (self.aabb[1] - self.aabb[0])
-        return hash_encode(unit_positions, self.table, self.layout, known)
+        return hash_encode(self._to_unit(positions), self.table, self.layout, known)
+
+    def _to_unit(self, positions: Float[Tensor, "S 3"]) -> Float[Tensor, "S 3"]:
+        low, high = self.aabb
+        if not self.is_unbounded:
+            return (positions - low) / (high - low)
+        return contracted_unit((positions - (low + high) / 2) / ((high - low).max() / 2))
+
+    def sky(self, directions: Float[Tensor, "R 3"]) -> Float[Tensor, "R C"] | None:
+        """Abundances and brightness of what is infinitely far away; None in a bounded scene."""
+        if not self.is_unbounded:
+            return None
+        found = self.sky_network(sky_features(directions))
+        shares = torch.softmax(found[:, :-1] / self.config.temperature, dim=-1)
+        return torch.cat([shares, torch.sigmoid(found[:, -1:])], dim=-1)
 
     def density_of(self, encoded: Float[Tensor, "S LF"]) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
         """Density per scene unit and geometry features where the encoding is `encoded`."""
@@ -240,6 +263,16 @@ def direction_features(directions: Float[Tensor, "S 3"]) -> Float[Tensor, "S 15"
         ],
         dim=-1,
     )
+
+
+_SKY_OCTAVES = 4
+NUM_SKY_FEATURES = NUM_DIRECTION_FEATURES + 6 * _SKY_OCTAVES
+
+
+def sky_features(directions: Float[Tensor, "R 3"]) -> Float[Tensor, "R 39"]:
+    """Harmonics of unit directions, and sines and cosines of 1, 2, 4 and 8 times their components."""
+    angles = torch.cat([2.0**octave * directions for octave in range(_SKY_OCTAVES)], dim=-1)
+    return torch.cat([direction_features(directions), angles.sin(), angles.cos()], dim=-1)
 
 
 def bounded_exp(raw: Float[Tensor, "S"]) -> Float[Tensor, "S"]:

@@ -70,7 +70,8 @@ class UnmixModel(Model):
         """
         config, metadata = self.config, self.metadata
         self.bands = Bands.of(metadata["wavelengths_nm"])
-        self.preset = preset_for(metadata["has_alpha"])
+        self.is_unbounded = bool(metadata.get("is_unbounded", False))
+        self.preset = preset_for(metadata["has_alpha"], self.is_unbounded)
         self.num_endmembers = self._checked_num_endmembers()
         shape = (self.num_endmembers, len(self.bands))
         self.endmembers = nn.Parameter(torch.zeros(shape), requires_grad=config.train_endmembers)
@@ -88,6 +89,7 @@ class UnmixModel(Model):
             pixel_size=metadata["pixel_size"],
             exposure=choose(config.losses.exposure, 1.0),
             lit_by_camera=config.light == "camera",
+            is_unbounded=self.is_unbounded,
         )
         self.register_buffer("rgb_weights", rgb_matrix(self.bands), persistent=False)
         self.register_buffer("every_band", torch.eye(len(self.bands)), persistent=False)
@@ -149,6 +151,7 @@ class UnmixModel(Model):
                 self.grid.reachable,
                 self.step,
                 choose(config.renderer.smallest_weight, self.preset.smallest_weight),
+                self.is_unbounded,
                 config.losses.background == "last",
                 config.eval_num_rays_per_chunk,
             )
@@ -169,7 +172,7 @@ class UnmixModel(Model):
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
         """`spectral` (R, B) on black (of a rig `coefficients`, from which `_parts` makes what its sensors see),
-        `abundances` (R, K), `accumulation` (R), `spread` and `num_samples`, one number each, and of the samples that
+        `abundances` (R, K) with those of the sky, `accumulation` (R), `spread` and `num_samples`, one number each, and of the samples that
         carry weight `positions`, `weights` and `views` (S)."""
         generator = self.generator if self.training else None
         renderer = replace(self.renderer, step=self._training_step) if self.training else self.renderer
@@ -185,7 +188,7 @@ class UnmixModel(Model):
         return {
             **seen,
             "accumulation": coefficients.accumulation,
-            "abundances": coefficients.abundances,
+            "abundances": rendered.mixtures,
             "spread": rendered.spread,
             "num_samples": torch.tensor(rendered.num_samples),
             "positions": rendered.positions,
@@ -342,18 +345,19 @@ class UnmixModel(Model):
     def _coarseness(self, progress: float) -> float:
         """How many times farther apart samples are in training than in the end: large images begin coarsely."""
         samples = float(self.scene_box.size.max()) / self.step
-        return self.config.renderer.coarseness(samples, progress)
+        config = self.config.renderer
+        return config.coarseness(samples, choose(config.coarse_samples, self.preset.coarse_samples), progress)
 
     def _begin_step(self, step: int, progress: float) -> None:
         self._progress = progress
         if step % _GRID_INTERVAL:
             return
-        box = self.renderer.box
+        space = self.renderer.space
         drawn = torch.randint(2**62, (1,), generator=self.generator, device=self._generator_device)
         seed = int(self.processes.of_first(drawn))  # each process probes the same cells
         self._share_observations()
         self.grid.update(
-            lambda points: self.field.get_density(points * box.size + box.aabb[0])[0],
+            lambda points: self.field.get_density(space.from_unit(points))[0],
             # Not of the present samples: as these get closer, untrained cells would fall below the threshold.
             threshold=-math.log1p(-_OCCUPIED_OPACITY) / (self.step * self._coarseness(0.0)),
             decay=_GRID_DECAY,

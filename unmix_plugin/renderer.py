@@ -15,11 +15,13 @@ from torch import Tensor
 
 from unmix_plugin.alpha_preset import Auto
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.contraction import UnitSpace
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.errors import require
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.rendering.compositing import accumulate, volume_weights
+from unmix_plugin.rendering.contracted_marching import march_contracted
 from unmix_plugin.rendering.grid_cells import cells_at
 from unmix_plugin.rendering.marching import PackedSamples, march
 from unmix_plugin.spectral.coefficients import Coefficients
@@ -34,9 +36,10 @@ class RendererConfig:
 
     samples_per_pixel: float = 1.5
     """Samples of a ray along the length of a pixel's edge where it meets the middle of the scene box."""
-    coarse_samples: int = 256
+    coarse_samples: int | Auto = "auto"
     """Samples along the longest edge of the scene box at the start of training, if there are more in the end: what is
-    coarse must be found first, by many rays of few samples."""
+    coarse must be found first, by many rays of few samples. Auto is 256, but 64 in an unbounded world, where rays go
+    on outside the box."""
     coarse_until: float = 0.5
     """Part of the training in which samples move together to the distance they have in the end."""
     smallest_weight: float | Auto = "auto"
@@ -54,7 +57,7 @@ class RendererConfig:
         """
         rules = {
             "samples-per-pixel of 0.01 to 100": 0.01 <= self.samples_per_pixel <= 100,
-            "coarse-samples of at least 1": self.coarse_samples >= 1,
+            "coarse-samples of at least 1 or auto": self.coarse_samples == "auto" or self.coarse_samples >= 1,
             "coarse-until in [0, 1]": 0 <= self.coarse_until <= 1,
             "smallest-weight in [0, 1) or auto": self.smallest_weight == "auto"
             or 0 <= self.smallest_weight < 1,
@@ -62,18 +65,18 @@ class RendererConfig:
         }
         require("the renderer", rules)
 
-    def coarseness(self, samples: float, progress: float) -> float:
+    def coarseness(self, samples: float, coarse_samples: int, progress: float) -> float:
         """Factor on the distance of samples when that part of the training is over.
 
         Args:
-            samples: Along the longest edge of the scene box in the end.
+            samples, coarse_samples: Along the longest edge of the scene box in the end, and at the start.
             progress: In [0, 1].
 
-        >>> RendererConfig(coarse_samples=100, coarse_until=0.5).coarseness(400.0, 0.25)
+        >>> RendererConfig(coarse_until=0.5).coarseness(400.0, 100, 0.25)
         2.0
         """
         left = 0.0 if progress >= self.coarse_until else 1.0 - progress / self.coarse_until
-        return max(samples / self.coarse_samples, 1.0) ** left
+        return max(samples / coarse_samples, 1.0) ** left
 
 
 @dataclass(frozen=True)
@@ -81,6 +84,8 @@ class RenderedRays:
     """What rendering a bundle of rays gives."""
 
     coefficients: Coefficients
+    mixtures: Float[Tensor, "R K"]
+    """Abundances of all that a ray sees, the sky included."""
     num_samples: int
     """Samples marched for all rays."""
     spread: Float[Tensor, ""]
@@ -105,9 +110,11 @@ class VolumeRenderer:
     reachable: Bool[Tensor, "X Y Z"]
     """Cells that were not carved away before training."""
     step: float
-    """Distance of samples, model units."""
+    """Distance of samples, model units; larger outside the box of a world without end."""
     smallest_weight: float
     """Samples that contribute less are left out."""
+    is_unbounded: bool = False
+    """Whether rays go on outside the box, through contracted space, and end on the sky."""
     residual_on_last_sample: bool = False
     """Whether the last sample of a ray takes all the light that is left."""
     rays_per_chunk: int = 8192
@@ -127,9 +134,13 @@ class VolumeRenderer:
         kept, encoded = self._carrying_weight(field, samples, ray_bundle)
         positions, along = _points(kept, ray_bundle)
         densities, features = field.density_of(field.encode(positions, encoded))
-        depths = densities * self.step
-        weights = volume_weights(depths, kept.packed_info)
         outputs = field.get_outputs(positions, along, features)
+        if self.is_unbounded:
+            near = self._near_cameras(kept.t)
+            densities = scale_gradient(densities, near)
+            outputs = {name: scale_gradient(values, near[:, None]) for name, values in outputs.items()}
+        depths = kept.optical_depths(densities)
+        weights = volume_weights(depths, kept.packed_info)
         ones = torch.ones_like(kept.t)
         values = Coefficients.of(
             ones,
@@ -141,11 +152,18 @@ class VolumeRenderer:
         totals = accumulate(weights, values.packed, kept.packed_info)
         if self.residual_on_last_sample:
             totals = totals + _residual_transmittance(totals[:, 0], values.packed, kept)
+        coefficients = Coefficients(totals, values.num_endmembers)
+        mixtures, sky = coefficients.abundances, field.sky(ray_bundle.directions)
+        if sky is not None:
+            left = (1 - coefficients.accumulation)[:, None]
+            mixtures = mixtures + left * sky[:, :-1]
+            coefficients = coefficients.with_light(left * sky[:, -1:] * sky[:, :-1])
         return RenderedRays(
-            Coefficients(totals, values.num_endmembers),
+            coefficients,
+            mixtures,
             len(samples),
             torch.log1p(depths / _SPREAD_DEPTH).sum() / max(len(ray_bundle), 1),
-            self.box.normalise(positions).detach(),
+            self.space.to_unit(positions).detach(),
             weights.detach(),
             kept.ray_indices,
         )
@@ -200,15 +218,31 @@ class VolumeRenderer:
         return self._lie_in(self.reachable, positions)
 
     def _lie_in(self, cells: Bool[Tensor, "X Y Z"], positions: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
-        unit = self.box.normalise(positions)
-        return self.box.contains(positions) & cells[cells_at(unit, cells.shape).unbind(-1)]
+        unit = self.space.to_unit(positions)
+        return self.space.contains(positions) & cells[cells_at(unit, cells.shape).unbind(-1)]
+
+    @property
+    def space(self) -> UnitSpace:
+        """Where the cells of the grid lie."""
+        return UnitSpace(self.box, self.is_unbounded)
+
+    def _near_cameras(self, t: Float[Tensor, "S"]) -> Float[Tensor, "S"]:
+        """Factor on gradients: what is near a camera fills more of its pixels than what is far, so it would learn
+        faster, and from one view alone.
+
+        Source: Philip and Deschaintre 2023, Floaters No More.
+        """
+        return (t / self.space.half_edge).square().clamp(max=1.0)
 
     def _march(self, ray_bundle: RayBundle, generator: torch.Generator | None) -> PackedSamples:
         origins, directions = ray_bundle.origins, ray_bundle.directions
-        t_near, t_far = self.box.intersect(origins, directions)
-        jitter = torch.full_like(t_near, 0.5)
+        jitter = torch.full_like(origins[:, 0], 0.5)
         if generator is not None:
-            jitter = torch.rand(t_near.shape, generator=generator, device=generator.device).to(t_near)
+            jitter = torch.rand(jitter.shape, generator=generator, device=generator.device).to(jitter)
+        if self.is_unbounded:
+            inner_origins, inner_directions = self.space.centred(origins), directions / self.space.half_edge
+            return march_contracted(inner_origins, inner_directions, jitter, self.occupied, self.step)
+        t_near, t_far = self.box.intersect(origins, directions)
         unit_origins, unit_directions = self.box.normalise(origins), directions / self.box.size
         return march(unit_origins, unit_directions, t_near, t_far, jitter, self.occupied, self.step)
 
@@ -219,8 +253,15 @@ class VolumeRenderer:
         """The samples that contribute enough of their ray's light, and their encodings."""
         encoded = field.encode(_points(samples, ray_bundle)[0])
         densities, _ = field.density_of(encoded)
-        keep = volume_weights(densities * self.step, samples.packed_info) > self.smallest_weight
+        weights = volume_weights(samples.optical_depths(densities), samples.packed_info)
+        keep = weights > self.smallest_weight
         return samples.select(keep), encoded.index_select(0, keep.nonzero()[:, 0])
+
+
+def scale_gradient(values: Float[Tensor, "*S"], factors: Float[Tensor, "*S"]) -> Float[Tensor, "*S"]:
+    """The same values; gradients that reach them are multiplied with `factors`."""
+    constant = values.detach()
+    return constant + factors * (values - constant)
 
 
 def _points(

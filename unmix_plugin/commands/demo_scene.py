@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -19,7 +19,9 @@ from unmix_plugin.captures.demo.capture import (
     make_demo_capture,
 )
 from unmix_plugin.commands.entry import run_command
+from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.demo.materials import LAMP
+from unmix_plugin.scenes.demo.places import PLACES
 from unmix_plugin.scenes.demo.scene import DEFAULT_BANDS, DEFAULT_SIZE, DEFAULT_VIEWS, make_demo_scene
 from unmix_plugin.spectral.colour.illuminants import parse_light
 
@@ -42,6 +44,9 @@ class DemoSceneOptions:
     illuminant: str | None = None
     """What lights the scene: a CIE illuminant (D50, D65, A, E, FL2, ...) or a .csv file (wavelength,power); D50, or A
     with --raw."""
+    place: Literal["table", "world", "room"] = "table"
+    """What stands around the table: nothing, so that images have alpha; a ground that runs to the horizon under a sky;
+    or a room with windows onto the same world, seen as by a phone held by hand."""
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Accept a folder that is not empty: a demo scene in it is replaced, other files stay."""
 
@@ -49,6 +54,8 @@ class DemoSceneOptions:
 def write_demo_scene(arguments: list[str]) -> None:
     """Parse the arguments, write the scene or the capture, say what is where."""
     options = tyro.cli(DemoSceneOptions, prog="unmix-demo-scene", args=arguments)
+    if options.raw and options.place != "table":
+        raise ConfigError(f"--raw writes the table alone, not --place {options.place}; leave one of them out")
     if options.raw:
         _write_capture(options)
     else:
@@ -60,7 +67,8 @@ def _write_scene(options: DemoSceneOptions) -> None:
     size, bands, views = _numbers(options, (DEFAULT_SIZE, DEFAULT_BANDS, DEFAULT_VIEWS))
     light = parse_light(options.illuminant or LAMP)
     started = time.perf_counter()
-    make_demo_scene(folder, size, bands, views, options.overwrite, light)
+    place = PLACES[options.place]
+    make_demo_scene(folder, size, bands, views, options.overwrite, light, place)
     seconds = time.perf_counter() - started
     evaluation = len(list((folder / "abundances").glob("eval_*")))
     print(
@@ -72,7 +80,7 @@ def _write_scene(options: DemoSceneOptions) -> None:
         (
             ("transforms.json", "cameras, wavelengths, splits"),
             ("cubes", "radiance in [0, 1], float16 (H, W, B)"),
-            ("images", "sRGB with alpha"),
+            ("images", "sRGB with alpha" if place.sky is None else "sRGB"),
             ("labels", "true material of each pixel, 255 where there is none"),
             ("abundances", "true abundances of evaluation views, float16 (H, W, K)"),
             ("endmembers.csv", "true reflectances"),

@@ -8,6 +8,7 @@ everything where it is: unmixing sees a trace of each material everywhere, and a
 
 from __future__ import annotations
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -56,6 +57,13 @@ class EditedField(CoefficientField):
     ) -> Float[Tensor, "S LF"]:
         """As the edited field does."""
         return self.field.encode(positions, known)
+
+    def sky(self, directions: Float[Tensor, "R 3"]) -> Float[Tensor, "R C"] | None:
+        """The sky, without the light that removed materials stand for."""
+        found = self.field.sky(directions)
+        if found is None:
+            return None
+        return torch.cat([found[:, :-1] * self.is_kept.to(found), found[:, -1:]], dim=-1)
 
     def get_density(self, positions: Float[Tensor, "S 3"]) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
         """Density per scene unit of what is left, and geometry features."""

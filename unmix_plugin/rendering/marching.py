@@ -26,10 +26,16 @@ class PackedSamples:
     packed_info: Int[Tensor, "R 2"]
     """First sample and number of samples of each ray."""
     step: float
-    """Length of every sample's interval."""
+    """Length of every sample's interval; in contracted space of those in the inner cube."""
+    lengths: Float[Tensor, "S"] | None = None
+    """What each density counts for in contracted space; None: all count for `step`."""
 
     def __len__(self) -> int:
         return len(self.t)
+
+    def optical_depths(self, densities: Float[Tensor, "S"]) -> Float[Tensor, "S"]:
+        """Density times length of each sample."""
+        return densities * (self.step if self.lengths is None else self.lengths)
 
     def select(self, keep: Bool[Tensor, "S"]) -> PackedSamples:
         """Only the samples marked in `keep`, still packed."""
@@ -38,9 +44,9 @@ class PackedSamples:
         ends = kept_before[self.packed_info[:, 0] + self.packed_info[:, 1]]
         packed_info = torch.stack([starts, ends - starts], dim=-1)
         kept = keep.nonzero()[:, 0]
-        return PackedSamples(
-            self.t.index_select(0, kept), self.ray_indices.index_select(0, kept), packed_info, self.step
-        )
+        t, ray_indices = self.t.index_select(0, kept), self.ray_indices.index_select(0, kept)
+        lengths = None if self.lengths is None else self.lengths.index_select(0, kept)
+        return PackedSamples(t, ray_indices, packed_info, self.step, lengths)
 
 
 def march(
@@ -65,7 +71,7 @@ def march(
     """
     from unmix_plugin.rendering._marching_kernels import count_kernel, write_kernel
 
-    _check_step(step)
+    check_step(step)
     device, point = origins.device, vector_type(3, torch.float32)
     rays = [
         as_warp(origins.contiguous(), point),
@@ -97,7 +103,7 @@ def march_twin(
     step: float,
 ) -> PackedSamples:
     """The same as `march` in plain PyTorch: tests every lattice point of every ray."""
-    _check_step(step)
+    check_step(step)
     t_first = t_near + jitter * step
     longest = float((t_far - t_first).max()) if len(t_far) else 0.0
     index = torch.arange(max(int(longest / step) + 2, 1), device=origins.device)
@@ -111,6 +117,7 @@ def march_twin(
     return PackedSamples(t[hit], ray_indices, torch.stack([starts, counts], dim=-1), step)
 
 
-def _check_step(step: float) -> None:
+def check_step(step: float) -> None:
+    """Refuse a distance of samples that isn't positive."""
     if not step > 0:
         raise ValueError(f"step must be positive; got {step}")

@@ -30,6 +30,7 @@ class RecordedScene:
     wavelengths_nm: Numbers = ()
     illuminant: Numbers | None = None
     has_alpha: bool = False
+    is_unbounded: bool = False
     grid_resolution: int = 64
     pixel_size: float = 1.0
     subpixels: int = 1

@@ -43,6 +43,9 @@ class SceneOptions:
     of these that the scene supports."""
     eval_interval: int = 8
     """With an interval split every n-th frame, from the first on, is for evaluation."""
+    world: Annotated[Literal["bounded", "unbounded", "auto"], Common, short("world")] = "auto"
+    """Whether all that pictures show lies in a box, or goes on behind it as far as the sky. Auto is bounded where
+    pictures have alpha; else it is unbounded if views agree on places outside of the box."""
 
 
 @dataclass(frozen=True)
@@ -147,6 +150,8 @@ class Scene:
     """True reflectance of each material, [0, 1]."""
     has_alpha: bool
     """Every picture has an alpha channel and at least one pixel of one is not opaque."""
+    is_unbounded: bool
+    """Pictures show a world behind the scene box, up to the sky."""
     has_labels: bool
     """Every evaluation frame has labels."""
     has_abundances: bool
@@ -240,6 +245,7 @@ class Scene:
             "endmembers": None if self.endmembers is None else self.endmembers.tolist(),
             **self._rig_summary(),
             "has_alpha": self.has_alpha,
+            "is_unbounded": self.is_unbounded,
             "has_labels": self.has_labels,
             "has_abundances": self.has_abundances,
             "input_hashes": dict(self.input_hashes),

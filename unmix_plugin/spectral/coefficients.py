@@ -75,6 +75,13 @@ class Coefficients:
         """Rays that show a material."""
         return self.accumulation > OCCUPIED_ACCUMULATION
 
+    def with_light(self, scaled_abundances: Float[Tensor, "*rays K"]) -> Coefficients:
+        """The same with more light of that mixture, and no more matter."""
+        first = 2 + self.num_endmembers
+        packed = self.packed.clone()
+        packed[..., first : first + self.num_endmembers] += scaled_abundances
+        return replace(self, packed=packed)
+
     def map(self, function: Callable[[Tensor], Tensor]) -> Coefficients:
         """The same after a change of leading axes, device or dtype."""
         return replace(self, packed=function(self.packed))

@@ -23,9 +23,9 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.demo.folders import check_bounds, staging_beside, staging_for
 from unmix_plugin.scenes.demo.materials import LAMP, MATERIALS, band_centers_nm, lamp_power, reflectances
+from unmix_plugin.scenes.demo.places import TABLE, Place
 from unmix_plugin.scenes.demo.shading import ViewCoefficients, render_view
 from unmix_plugin.scenes.demo.views import (
-    demo_cameras,
     frame_name,
     label_image,
     lens_entries,
@@ -78,6 +78,7 @@ def make_demo_scene(
     views: int = DEFAULT_VIEWS,
     overwrite: bool = False,
     illuminant: str | Path = LAMP,
+    place: Place = TABLE,
 ) -> None:
     """Write a demo scene. It is built beside the folder and moved in when complete.
 
@@ -86,6 +87,7 @@ def make_demo_scene(
         overwrite: Whether a folder with something in it is accepted: an older demo scene there is replaced, other
             files stay.
         illuminant: What the scene is lit by: the name of a known light, or a CSV file (wavelength,power).
+        place: What there is to see, and from where.
     Raises:
         ConfigError: a number out of bounds; a folder with something in it, or no folder at all.
         SpectrumError: an unknown light, or one that is not known at all bands.
@@ -96,7 +98,7 @@ def make_demo_scene(
         {"size": (size, SIZE_BOUNDS), "bands": (bands, BANDS_BOUNDS), "views": (views, VIEWS_BOUNDS)},
     )
     with staging_for(directory, "the demo scene", overwrite) as staging:
-        _write_scene(staging / "scene", size, bands, views, illuminant)
+        _write_scene(staging / "scene", size, bands, views, illuminant, place)
         _move_files(staging / "scene", directory)
 
 
@@ -113,7 +115,9 @@ def is_complete(directory: Path) -> bool:
     return all((directory / path).is_file() for path in paths)
 
 
-def _write_scene(folder: Path, size: int, bands: int, views: int, illuminant: str | Path = LAMP) -> None:
+def _write_scene(
+    folder: Path, size: int, bands: int, views: int, illuminant: str | Path = LAMP, place: Place = TABLE
+) -> None:
     sampling = Bands.of(band_centers_nm(bands))
     spectra, lamp = reflectances(sampling.centers_nm), lamp_power(sampling.centers_nm, illuminant)
     for name in _FOLDERS:
@@ -121,12 +125,12 @@ def _write_scene(folder: Path, size: int, bands: int, views: int, illuminant: st
     to_rgb = rgb_matrix(sampling)
     write_spectra_csv(folder / "endmembers.csv", SpectraTable(sampling, MATERIALS, spectra))
     write_spectra_csv(folder / "illuminant.csv", SpectraTable(sampling, ("power",), lamp[None]))
-    cameras = demo_cameras(size, views)
+    cameras = place.cameras(size, views)
     frames = []
     for index in range(views):
-        view = render_view(cameras, index)
+        view = render_view(cameras, index, things=place.things, sky=place.sky)
         cube = radiance_cube(view, spectra, lamp)
-        frames.append(_write_view(folder, frame_name(index), view, cube, to_rgb))
+        frames.append(_write_view(folder, frame_name(index), view, cube, to_rgb, place.sky is None))
         frames[-1]["transform_matrix"] = transform_matrix(cameras, index)
     content = _header(cameras, sampling) | _splits(views) | {"frames": frames}
     (folder / _TRANSFORMS).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
@@ -138,18 +142,19 @@ def _write_view(
     view: ViewCoefficients,
     cube: Float[np.ndarray, "H W B"],
     to_rgb: Float[torch.Tensor, "B 3"],
+    with_alpha: bool,
 ) -> dict[str, Any]:
     """Write the files of one view; gives its entry in transforms.json, but for the pose."""
     from PIL import Image
 
     srgb = linear_to_srgb(torch.from_numpy(cube) @ to_rgb).clamp(0, 1).numpy()
-    rgba = np.concatenate([srgb, view.alpha[..., None]], axis=-1)
+    picture = np.concatenate([srgb, view.alpha[..., None]], axis=-1) if with_alpha else srgb
     entry: dict[str, Any] = {
         "file_path": f"images/{name}.png",
         "hyperspectral_file_path": f"cubes/{name}.npy",
         "seg_file_path": f"labels/{name}.png",
     }
-    Image.fromarray((rgba * 255).round().astype(np.uint8)).save(folder / entry["file_path"])
+    Image.fromarray((picture * 255).round().astype(np.uint8)).save(folder / entry["file_path"])
     np.save(folder / entry["hyperspectral_file_path"], cube.astype(np.float16))
     Image.fromarray(label_image(view)).save(folder / entry["seg_file_path"])
     if name.startswith("eval"):

@@ -9,7 +9,7 @@ occlusion has a closed form.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,7 +75,10 @@ THINGS = (
     ),
 )
 
-_PLACEMENTS = tuple(thing.placement for thing in THINGS)
+PLACEMENTS = tuple(thing.placement for thing in THINGS)
+
+Sky = Callable[[Float[np.ndarray, "R 3"]], Float[np.ndarray, "R K"]]
+"""From directions to what the sky there sends, in multiples of the materials as the lamp shows them."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +87,7 @@ class ViewCoefficients:
 
     alpha: Float[np.ndarray, "H W"]
     abundances: Float[np.ndarray, "H W K"]
-    """Fractions of what is covered: they sum to 1 where alpha > 0, and are 0 elsewhere."""
+    """Fractions of what is covered: they sum to 1 where alpha > 0, and are 0 elsewhere; the sky covers nothing."""
     diffuse: Float[np.ndarray, "H W K"]
     specular: Float[np.ndarray, "H W"]
 
@@ -105,12 +108,14 @@ def render_view(
     subpixels: int = SUBPIXELS,
     things: Sequence[Thing] = THINGS,
     lamp: tuple[float, float, float] = LAMP_POSITION,
+    sky: Sky | None = None,
 ) -> ViewCoefficients:
     """Look at the scene through one camera with `subpixels`^2 rays a pixel.
 
     Args:
-        things: Those of `THINGS`, if need be with other surfaces.
+        things: What there is.
         lamp: Middle of the lamp's disc.
+        sky: What shows behind it; None is black.
     """
     count = subpixels**2
     pixels = cameras.height * cameras.width
@@ -124,6 +129,8 @@ def render_view(
         coverage += hits.is_hit
         abundances += hits.abundances
         diffuse += hits.diffuse
+        if sky is not None:
+            diffuse[~hits.is_hit] += sky(rays.directions.numpy()[~hits.is_hit])
         specular += hits.specular
     shape = (cameras.height, cameras.width)
     return ViewCoefficients(
@@ -146,7 +153,8 @@ def trace(
     Args:
         lamp_middle: Of the lamp's disc, where highlights come from.
     """
-    distances, nearest = first_hits(_PLACEMENTS, origins, directions)
+    placements = [thing.placement for thing in things]
+    distances, nearest = first_hits(placements, origins, directions)
     is_hit = np.isfinite(distances)
     shape = (len(origins), len(MATERIALS))
     abundances, diffuse = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
@@ -156,9 +164,9 @@ def trace(
         points = origins[rows] + distances[rows, None] * directions[rows]
         local_points = thing.placement.to_local(points)
         normals = thing.placement.normals_at(local_points)
-        lamplight = direct_light(points, normals, lamp)
+        lamplight = direct_light(points, normals, lamp, placements)
         abundances[rows] = thing.surface.abundances(local_points)
-        diffuse[rows] = abundances[rows] * (lamplight + sky_light(points, normals, thing))[:, None]
+        diffuse[rows] = abundances[rows] * (lamplight + sky_light(points, normals, thing, things))[:, None]
         if thing.surface.roughness is not None:
             highlight = coat_highlight(
                 points, normals, -directions[rows], thing.surface.roughness, lamp_middle
@@ -183,18 +191,24 @@ def lamp_point(
 
 
 def direct_light(
-    points: Float[np.ndarray, "P 3"], normals: Float[np.ndarray, "P 3"], lamp: Float[np.ndarray, "3"]
+    points: Float[np.ndarray, "P 3"],
+    normals: Float[np.ndarray, "P 3"],
+    lamp: Float[np.ndarray, "3"],
+    placements: Sequence[Placement] = PLACEMENTS,
 ) -> Float[np.ndarray, " P"]:
-    """Irradiance from one point of the lamp: 0 in shadow, no fall-off with distance."""
+    """Irradiance from one point of the lamp: 0 in the shadow of `placements`, no fall-off with distance."""
     towards_lamp = lamp - points
     cosines = (dot(towards_lamp, normals) / np.sqrt(dot(towards_lamp, towards_lamp))).clip(0)
     # The segment to the lamp has length 1 here: nothing of the scene lies beyond the lamp.
-    blocked, _ = first_hits(_PLACEMENTS, points + 1e-3 * normals, towards_lamp)
+    blocked, _ = first_hits(placements, points + 1e-3 * normals, towards_lamp)
     return np.where(np.isfinite(blocked), 0, LAMP_IRRADIANCE * cosines).astype(np.float32)
 
 
 def sky_light(
-    points: Float[np.ndarray, "P 3"], normals: Float[np.ndarray, "P 3"], thing: Thing
+    points: Float[np.ndarray, "P 3"],
+    normals: Float[np.ndarray, "P 3"],
+    thing: Thing,
+    things: Sequence[Thing] = THINGS,
 ) -> Float[np.ndarray, " P"]:
     """Irradiance from a sky of one brightness and from the ground, less what other things hide of it.
 
@@ -203,7 +217,7 @@ def sky_light(
         hemisphere; the power 1.5 for one that the horizon cuts is the fit of I. Quilez, "sphere ambient occlusion".
     """
     open_share = np.ones(len(points), dtype=np.float32)
-    for other in THINGS:
+    for other in things:
         for *center, radius in other.sky_blockers if other.placement is not thing.placement else ():
             offsets = np.asarray(center, dtype=np.float32) - points
             lengths = np.sqrt(dot(offsets, offsets))

@@ -26,6 +26,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.scenes.geometry.foreground_rays import MIN_EXPLAINED, foreground_rays, share_through
+from unmix_plugin.scenes.geometry.world_carving import carve_world
 from unmix_plugin.scenes.scene import Scene
 
 PIXEL_MARGIN = 1.0
@@ -52,7 +53,7 @@ BLOCK_CELLS = 1 << 15
 def carve(
     scene: Scene, resolution: int, foreground: list[Bool[np.ndarray, "_ _"]] | None = None
 ) -> Bool[np.ndarray, "R R R"]:
-    """Cells of the scene box that may be occupied.
+    """Cells of the scene box, or of the world contracted around it, that may be occupied.
 
     Args:
         scene: With alpha its hull is carved; without, what hardly any training camera sees.
@@ -63,6 +64,8 @@ def carve(
     """
     indices = list(scene.train_indices)
     cameras, box = scene.cameras[indices], scene.scene_box
+    if scene.is_unbounded:
+        return carve_world(cameras, box, resolution)
     if not scene.has_alpha:
         fewest_views = max(1, math.ceil(FAIR_SHARE_OPEN * len(indices)))
         return carve_box(cameras, None, box, resolution, fewest_views)

@@ -82,7 +82,7 @@ def compare_conventions(poses: Poses, lenses: Cameras, read_view: ReadView) -> d
     """
     if len(poses) < NUM_AGREEING + 1:
         return {}
-    neighbours = _choose_neighbours(poses)
+    neighbours = choose_neighbours(poses)
     generator = torch.Generator().manual_seed(0)
     used = sorted({*neighbours, *(other for others in neighbours.values() for other in others)})
     corner = read_view(used[0], (slice(1), slice(1)))
@@ -92,14 +92,14 @@ def compare_conventions(poses: Poses, lenses: Cameras, read_view: ReadView) -> d
     )
     part = (slice(None, None, stride), slice(None, None, stride), slice(None, None, band_step))
     views = [read_view(view, part) for view in used]
-    features = dict(zip(used, _features(views, generator), strict=True))
+    features = dict(zip(used, view_features(views, generator), strict=True))
     pixels = {view: _busy_pixels(features[view], generator) for view in neighbours}
     drawn = torch.cat([features[view].flatten(0, 1)[pixels[view]] for view in neighbours])
     chance = float((drawn - drawn[torch.randperm(len(drawn), generator=generator)]).norm(dim=-1).median())
     if chance <= 0.0:  # nothing in the views changes
         return {}
     return {
-        name: _disagreement(_cameras(meant, lenses, features[used[0]], stride), features, pixels, neighbours)
+        name: _disagreement(thinned_cameras(meant, lenses, features[used[0]], stride), features, pixels, neighbours)
         / chance
         for name, meant in _meanings(poses).items()
     }
@@ -135,7 +135,7 @@ def _meanings(poses: Poses) -> dict[str, Poses]:
     }
 
 
-def _choose_neighbours(poses: Poses) -> dict[int, list[int]]:
+def choose_neighbours(poses: Poses) -> dict[int, list[int]]:
     """For some views the others that are turned least against them; the same under every convention."""
     rotations, positions = poses[:, :, :3], poses[:, :, 3]
     cosines = (np.einsum("iab,jab->ij", rotations, rotations) - 1.0) / 2.0
@@ -149,7 +149,7 @@ def _choose_neighbours(poses: Poses) -> dict[int, list[int]]:
     return {int(view): np.argsort(ranks[view])[:count].tolist() for view in chosen}
 
 
-def _features(
+def view_features(
     views: list[Float32[np.ndarray, "H W B"]], generator: torch.Generator
 ) -> list[Float[Tensor, "H W F"]]:
     """Principal components of the spectra of all views, the first with a spread of 1, smoothed a little."""
@@ -169,15 +169,21 @@ def _smooth(image: Float[Tensor, "H W F"]) -> Float[Tensor, "H W F"]:
 
 def _busy_pixels(image: Float[Tensor, "H W F"], generator: torch.Generator) -> Int[Tensor, " P"]:
     """Random pixels among those where the image changes most, row-major numbers."""
-    change = torch.zeros(image.shape[:2])
-    across = (image[1:-1, 2:] - image[1:-1, :-2]).norm(dim=-1)
-    change[1:-1, 1:-1] = across + (image[2:, 1:-1] - image[:-2, 1:-1]).norm(dim=-1)
+    change = local_change(image)
     order = change.flatten().argsort(descending=True)
     busy = order[: max(NUM_PIXELS, int(BUSIEST_SHARE * int((change > 0).sum())))]
     return busy[torch.randperm(len(busy), generator=generator)[:NUM_PIXELS]]
 
 
-def _cameras(poses: Poses, lenses: Cameras, image: Float[Tensor, "H W F"], stride: int) -> Cameras:
+def local_change(image: Float[Tensor, "H W F"]) -> Float[Tensor, "H W"]:
+    """How much an image changes around each pixel, along its rows and columns; 0 on its border."""
+    change = torch.zeros(image.shape[:2])
+    across = (image[1:-1, 2:] - image[1:-1, :-2]).norm(dim=-1)
+    change[1:-1, 1:-1] = across + (image[2:, 1:-1] - image[:-2, 1:-1]).norm(dim=-1)
+    return change
+
+
+def thinned_cameras(poses: Poses, lenses: Cameras, image: Float[Tensor, "H W F"], stride: int) -> Cameras:
     """Cameras of thinned-out views, in coordinates of order 1."""
     poses = poses.copy()
     poses[:, :, 3] -= poses[:, :, 3].mean(axis=0)
@@ -213,13 +219,13 @@ def _disagreement(
         rays = cameras.generate_rays(torch.full((len(chosen),), view), coords)
         points = (rays.origins[:, None] + rays.directions[:, None] * depths[:, None]).flatten(0, 1)
         own = features[view].flatten(0, 1)[chosen]
-        seen = [_differences(points, own, features[other], cameras, other) for other in others]
+        seen = [view_differences(points, own, features[other], cameras, other) for other in others]
         ranked = torch.stack(seen, dim=-1).sort(dim=-1).values[..., :NUM_AGREEING]
         least.append(ranked.mean(dim=-1).min(dim=-1).values)
     return float(torch.cat(least).median())
 
 
-def _differences(
+def view_differences(
     points: Float[Tensor, "PD 3"],
     own: Float[Tensor, "P F"],
     image: Float[Tensor, "H W F"],

@@ -7,13 +7,14 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float32, Float64
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.geometry.bounds import find_bounds
 from unmix_plugin.scenes.geometry.pose_check import commonest, compare_conventions, describe
+from unmix_plugin.scenes.geometry.world_evidence import find_world_evidence
 from unmix_plugin.scenes.reading.cube_values import read_cube
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.frame_files import CheckedFiles, check_files, locate_files
@@ -57,6 +58,12 @@ def load_scene(root: Path, options: SceneOptions | None = None) -> Scene:
     if checked is not None and split.train and entry.wavelengths_nm is not None:
         used = {checked.sensor_indices[index] for index in split.train}
         check_coverage(checked.sensors, used, entry.wavelengths_nm, faults)
+    if options.world == "unbounded" and checked is not None and checked.foreground is not None:
+        faults.add(
+            "world",
+            "is unbounded, but pictures have alpha, and behind what is transparent there is nothing; expected bounded "
+            "or auto, or pictures without alpha",
+        )
     faults.raise_if_any()
     assert checked is not None
     return _assemble(root, entry, located, checked, truth, split, options)
@@ -113,7 +120,7 @@ def _assemble(
     options: SceneOptions,
 ) -> Scene:
     assert entry.wavelengths_nm is not None
-    normalisation, scene_box = _find_model_space(root, entry, checked, split.train, options)
+    normalisation, scene_box, is_unbounded = _find_model_space(root, entry, checked, split.train, options)
     inputs = [path for paths in located for key, path in paths.items() if key in MEASURED_KEYS]
     inputs += [root / FILE_NAME, *truth.light_paths]
     truths = [path for paths in located for key, path in paths.items() if key not in MEASURED_KEYS]
@@ -135,6 +142,7 @@ def _assemble(
         illuminant=truth.illuminant,
         endmembers=truth.endmembers,
         has_alpha=checked.foreground is not None,
+        is_unbounded=is_unbounded,
         has_labels=all("seg_file_path" in paths for paths in evaluated),
         has_abundances=all("abundance_file_path" in paths for paths in evaluated),
         input_hashes={_relative(path, root): hashes.get(path) or sha256_of(path) for path in inputs},
@@ -145,8 +153,8 @@ def _assemble(
 
 def _find_model_space(
     root: Path, entry: SceneEntry, checked: CheckedFiles, train: tuple[int, ...], options: SceneOptions
-) -> tuple[Normalisation, SceneBox]:
-    """The box that the training views show, and how its longest edge becomes [-1, 1].
+) -> tuple[Normalisation, SceneBox, bool]:
+    """The box that the training views show, how its longest edge becomes [-1, 1], and whether the world goes on.
 
     The similarity starts from the space of transforms.json. The box is found in a space centred on the training
     cameras, where coordinates are of order 1.
@@ -158,24 +166,26 @@ def _find_model_space(
     first = Normalisation(np.eye(3), -middle, 1.0 / radius if radius > 0.0 else 1.0)
     cameras = make_cameras(entry, checked.sizes, first)[list(train)]
     foreground = None if checked.foreground is None else [checked.foreground[index] for index in train]
+    alike = commonest([checked.sensor_indices[index] for index in train])
+
+    def read_view(view: int, part: tuple[slice, ...]) -> Float32[np.ndarray, "H W B"]:
+        return read_cube(cubes[train[alike[view]]], options.value_scale, options.invalid_pixels, part)
+
     try:
-        low, high = find_bounds(root, cameras, foreground).aabb.double().numpy()
+        first_box = find_bounds(root, cameras, foreground)
     except SceneError as error:
-        scale, invalid = options.value_scale, options.invalid_pixels
-        alike = commonest([checked.sensor_indices[index] for index in train])
-        hint = describe(
-            compare_conventions(
-                _world_poses(entry)[[train[row] for row in alike]],
-                cameras[alike],
-                lambda view, part: read_cube(cubes[train[alike[view]]], scale, invalid, part),
-            )
-        )
+        alike_poses = _world_poses(entry)[[train[row] for row in alike]]
+        hint = describe(compare_conventions(alike_poses, cameras[alike], read_view))
         raise SceneError(f"{error}\n{hint}" if hint else str(error)) from error
+    is_unbounded = options.world == "unbounded"
+    if options.world == "auto" and foreground is None:
+        is_unbounded = find_world_evidence(first_box, cameras[alike], read_view).goes_on
+    low, high = first_box.aabb.double().numpy()
     scale = float(2.0 / (high - low).max())
     half = 0.5 * scale * (high - low)
     translation = first.translation - 0.5 * (low + high) / first.scale
     box = SceneBox(torch.from_numpy(np.stack([-half, half])).float())
-    return Normalisation(first.rotation, translation, first.scale * scale), box
+    return Normalisation(first.rotation, translation, first.scale * scale), box, is_unbounded
 
 
 def _world_poses(entry: SceneEntry) -> Float64[np.ndarray, "N 3 4"]:

@@ -1,0 +1,103 @@
+"""Samples along rays through a world without end, in the occupied cells of a grid over contracted space.
+
+Rays start at their origins. Samples lie `step` apart within the inner cube and farther apart outside, as the contracted
+cells are: `step` r up to r = 2, `step` r^2 / 2 beyond, r the maximum norm in units of the inner cube's half edge. They
+end at r = 512, behind which nothing but the sky is told apart.
+
+A sample's length is the length of its interval over r, at least 1: densities count per inner unit near by and less far
+away, so that a sample is about as opaque anywhere in an untrained field.
+
+Notation: as in marching.py; points are in units of the inner cube's half edge, centred on it.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from unmix_plugin.engine.geometry.contraction import contracted_unit
+from unmix_plugin.rendering.grid_cells import cells_at
+from unmix_plugin.rendering.launching import as_warp, launch, vector_type
+from unmix_plugin.rendering.marching import PackedSamples, check_step
+
+FAR_RADIUS = 512.0
+LINEAR_RADIUS = 2.0
+
+
+def march_contracted(
+    origins: Float[Tensor, "R 3"],
+    directions: Float[Tensor, "R 3"],
+    jitter: Float[Tensor, "R"],
+    occupied: UInt8[Tensor, "X Y Z"],
+    step: float,
+) -> PackedSamples:
+    """Samples of each ray from its origin to r = 512, in occupied cells of contracted space.
+
+    Args:
+        origins, directions: Rays in units of the inner cube's half edge.
+        jitter: Where in its interval a ray's samples lie, [0, 1).
+        occupied: Non-zero in occupied cells of the cube from -2 to 2.
+        step: Distance of samples in the inner cube, in the ray parameter, > 0.
+    Returns:
+        Samples with lengths, in the ray parameter.
+    Raises:
+        ValueError: step isn't positive.
+    """
+    from unmix_plugin.rendering._contracted_kernels import count_kernel, write_kernel
+
+    check_step(step)
+    device, point = origins.device, vector_type(3, torch.float32)
+    rays = [
+        as_warp(origins.contiguous(), point),
+        as_warp(directions.contiguous(), point),
+        as_warp(jitter.contiguous()),
+        step,
+        as_warp(occupied.contiguous()),
+    ]
+    counts = torch.empty(len(origins), dtype=torch.int64, device=device)
+    launch(count_kernel, len(origins), [*rays, as_warp(counts)], device)
+    ends = counts.cumsum(0)
+    packed_info = torch.stack([ends - counts, counts], dim=-1)
+    total = int(ends[-1]) if len(ends) else 0
+    t_samples, lengths = (torch.empty(total, dtype=torch.float32, device=device) for _ in range(2))
+    ray_indices = torch.empty(total, dtype=torch.int64, device=device)
+    if total:
+        written = [as_warp(packed_info), as_warp(ray_indices), as_warp(t_samples), as_warp(lengths)]
+        launch(write_kernel, len(origins), [*rays, *written], device)
+    return PackedSamples(t_samples, ray_indices, packed_info, step, lengths)
+
+
+def march_contracted_twin(
+    origins: Float[Tensor, "R 3"],
+    directions: Float[Tensor, "R 3"],
+    jitter: Float[Tensor, "R"],
+    occupied: UInt8[Tensor, "X Y Z"],
+    step: float,
+) -> PackedSamples:
+    """The same as `march_contracted` in plain PyTorch: walks all rays at once."""
+    check_step(step)
+    t = torch.zeros_like(jitter)
+    found: list[tuple[Tensor, Tensor, Tensor]] = []
+    while True:
+        radius = (origins + t[:, None] * directions).abs().amax(dim=-1)
+        is_inside = radius <= FAR_RADIUS
+        if not bool(is_inside.any()):
+            break
+        near = radius.clamp(min=1.0)
+        stride = step * near * (near / LINEAR_RADIUS).clamp(min=1.0)
+        at = t + jitter * stride
+        unit = contracted_unit(origins + at[:, None] * directions)
+        hit = is_inside & (occupied[tuple(cells_at(unit, occupied.shape).unbind(-1))] != 0)
+        found.append((hit, at, stride / near))
+        t = torch.where(is_inside, t + stride, t)
+    if not found:
+        hit = torch.zeros(len(origins), 0, dtype=torch.bool, device=origins.device)
+        t_samples = lengths = torch.zeros(len(origins), 0, device=origins.device)
+    else:
+        hit, t_samples, lengths = (
+            torch.stack(values, dim=1) for values in zip(*found, strict=True)
+        )
+    counts = hit.sum(dim=1)
+    packed_info = torch.stack([counts.cumsum(0) - counts, counts], dim=-1)
+    return PackedSamples(t_samples[hit], hit.nonzero()[:, 0], packed_info, step, lengths[hit])
