@@ -139,7 +139,7 @@ class VolumeRenderer:
             near = self._near_cameras(kept.t)
             densities = scale_gradient(densities, near)
             outputs = {name: scale_gradient(values, near[:, None]) for name, values in outputs.items()}
-        depths = kept.optical_depths(densities)
+        depths = densities * self.step
         weights = volume_weights(depths, kept.packed_info)
         ones = torch.ones_like(kept.t)
         values = Coefficients.of(
@@ -253,12 +253,11 @@ class VolumeRenderer:
         """The samples that contribute enough of their ray's light, and their encodings."""
         encoded = field.encode(_points(samples, ray_bundle)[0])
         densities, _ = field.density_of(encoded)
-        weights = volume_weights(samples.optical_depths(densities), samples.packed_info)
-        keep = weights > self.smallest_weight
+        keep = volume_weights(densities * self.step, samples.packed_info) > self.smallest_weight
         return samples.select(keep), encoded.index_select(0, keep.nonzero()[:, 0])
 
 
-def scale_gradient(values: Float[Tensor, "*S"], factors: Float[Tensor, "*S"]) -> Float[Tensor, "*S"]:
+def scale_gradient(values: Float[Tensor, "*S"], factors: Float[Tensor, "*#S"]) -> Float[Tensor, "*S"]:
     """The same values; gradients that reach them are multiplied with `factors`."""
     constant = values.detach()
     return constant + factors * (values - constant)

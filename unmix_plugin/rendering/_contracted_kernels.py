@@ -75,7 +75,6 @@ def write_kernel(
     packed_info: wp.array2d(dtype=wp.int64),
     ray_indices: wp.array(dtype=wp.int64),
     t_samples: wp.array(dtype=float),
-    lengths: wp.array(dtype=float),
 ):
     index = first + wp.tid()
     while index < end:
@@ -89,7 +88,6 @@ def write_kernel(
             # An empty point's entry is overwritten by the next point's.
             ray_indices[slot] = wp.int64(index)
             t_samples[slot] = middle
-            lengths[slot] = length / wp.max(radius, 1.0)
             slot += is_occupied(origins[index] + middle * directions[index], occupied)
             t += length
             radius = radius_at(origins[index] + t * directions[index])

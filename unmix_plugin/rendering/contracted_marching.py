@@ -4,8 +4,8 @@ Rays start at their origins. Samples lie `step` apart within the inner cube and 
 cells are: `step` r up to r = 2, `step` r^2 / 2 beyond, r the maximum norm in units of the inner cube's half edge. They
 end at r = 512, behind which nothing but the sky is told apart.
 
-A sample's length is the length of its interval over r, at least 1: densities count per inner unit near by and less far
-away, so that a sample is about as opaque anywhere in an untrained field.
+Every sample counts for one `step`, however long its interval: density is per unit of contracted space, and a sample
+is as opaque anywhere in an untrained field.
 
 Notation: as in marching.py; points are in units of the inner cube's half edge, centred on it.
 """
@@ -39,8 +39,6 @@ def march_contracted(
         jitter: Where in its interval a ray's samples lie, [0, 1).
         occupied: Non-zero in occupied cells of the cube from -2 to 2.
         step: Distance of samples in the inner cube, in the ray parameter, > 0.
-    Returns:
-        Samples with lengths, in the ray parameter.
     Raises:
         ValueError: step isn't positive.
     """
@@ -60,12 +58,12 @@ def march_contracted(
     ends = counts.cumsum(0)
     packed_info = torch.stack([ends - counts, counts], dim=-1)
     total = int(ends[-1]) if len(ends) else 0
-    t_samples, lengths = (torch.empty(total, dtype=torch.float32, device=device) for _ in range(2))
+    t_samples = torch.empty(total, dtype=torch.float32, device=device)
     ray_indices = torch.empty(total, dtype=torch.int64, device=device)
     if total:
-        written = [as_warp(packed_info), as_warp(ray_indices), as_warp(t_samples), as_warp(lengths)]
+        written = [as_warp(packed_info), as_warp(ray_indices), as_warp(t_samples)]
         launch(write_kernel, len(origins), [*rays, *written], device)
-    return PackedSamples(t_samples, ray_indices, packed_info, step, lengths)
+    return PackedSamples(t_samples, ray_indices, packed_info, step)
 
 
 def march_contracted_twin(
@@ -78,7 +76,7 @@ def march_contracted_twin(
     """The same as `march_contracted` in plain PyTorch: walks all rays at once."""
     check_step(step)
     t = torch.zeros_like(jitter)
-    found: list[tuple[Tensor, Tensor, Tensor]] = []
+    found: list[tuple[Tensor, Tensor]] = []
     while True:
         radius = (origins + t[:, None] * directions).abs().amax(dim=-1)
         is_inside = radius <= FAR_RADIUS
@@ -89,15 +87,12 @@ def march_contracted_twin(
         at = t + jitter * stride
         unit = contracted_unit(origins + at[:, None] * directions)
         hit = is_inside & (occupied[tuple(cells_at(unit, occupied.shape).unbind(-1))] != 0)
-        found.append((hit, at, stride / near))
+        found.append((hit, at))
         t = torch.where(is_inside, t + stride, t)
-    if not found:
-        hit = torch.zeros(len(origins), 0, dtype=torch.bool, device=origins.device)
-        t_samples = lengths = torch.zeros(len(origins), 0, device=origins.device)
-    else:
-        hit, t_samples, lengths = (
-            torch.stack(values, dim=1) for values in zip(*found, strict=True)
-        )
+    nothing = torch.zeros(len(origins), 0, device=origins.device)
+    hit, t_samples = (
+        (torch.stack(values, dim=1) for values in zip(*found, strict=True)) if found else (nothing > 0, nothing)
+    )
     counts = hit.sum(dim=1)
     packed_info = torch.stack([counts.cumsum(0) - counts, counts], dim=-1)
-    return PackedSamples(t_samples[hit], hit.nonzero()[:, 0], packed_info, step, lengths[hit])
+    return PackedSamples(t_samples[hit], hit.nonzero()[:, 0], packed_info, step)

@@ -27,15 +27,9 @@ class PackedSamples:
     """First sample and number of samples of each ray."""
     step: float
     """Length of every sample's interval; in contracted space of those in the inner cube."""
-    lengths: Float[Tensor, "S"] | None = None
-    """What each density counts for in contracted space; None: all count for `step`."""
 
     def __len__(self) -> int:
         return len(self.t)
-
-    def optical_depths(self, densities: Float[Tensor, "S"]) -> Float[Tensor, "S"]:
-        """Density times length of each sample."""
-        return densities * (self.step if self.lengths is None else self.lengths)
 
     def select(self, keep: Bool[Tensor, "S"]) -> PackedSamples:
         """Only the samples marked in `keep`, still packed."""
@@ -44,9 +38,9 @@ class PackedSamples:
         ends = kept_before[self.packed_info[:, 0] + self.packed_info[:, 1]]
         packed_info = torch.stack([starts, ends - starts], dim=-1)
         kept = keep.nonzero()[:, 0]
-        t, ray_indices = self.t.index_select(0, kept), self.ray_indices.index_select(0, kept)
-        lengths = None if self.lengths is None else self.lengths.index_select(0, kept)
-        return PackedSamples(t, ray_indices, packed_info, self.step, lengths)
+        return PackedSamples(
+            self.t.index_select(0, kept), self.ray_indices.index_select(0, kept), packed_info, self.step
+        )
 
 
 def march(

@@ -81,7 +81,7 @@ def _far_things(count: int = 14, seed: int = 5) -> list[Thing]:
         names = [str(name) for name in generator.choice(MATERIALS, 2, replace=False)]
         primitive = ("box", "sphere", "cylinder")[index % 3]
         placement = Placement(primitive, center, (size, size, size), turn_deg=float(generator.uniform(0, 90)))
-        blend = plain if index % 2 else patches(1.3, index)
+        blend = plain if index % 2 else patches(1.3, float(index))
         found.append(Thing(placement, Surface(names[0], names[1], blend)))
     return found
 
