@@ -91,7 +91,9 @@ def march_contracted_twin(
         t = torch.where(is_inside, t + stride, t)
     nothing = torch.zeros(len(origins), 0, device=origins.device)
     hit, t_samples = (
-        (torch.stack(values, dim=1) for values in zip(*found, strict=True)) if found else (nothing > 0, nothing)
+        (torch.stack(values, dim=1) for values in zip(*found, strict=True))
+        if found
+        else (nothing > 0, nothing)
     )
     counts = hit.sum(dim=1)
     packed_info = torch.stack([counts.cumsum(0) - counts, counts], dim=-1)

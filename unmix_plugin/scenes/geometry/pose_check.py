@@ -99,7 +99,9 @@ def compare_conventions(poses: Poses, lenses: Cameras, read_view: ReadView) -> d
     if chance <= 0.0:  # nothing in the views changes
         return {}
     return {
-        name: _disagreement(thinned_cameras(meant, lenses, features[used[0]], stride), features, pixels, neighbours)
+        name: _disagreement(
+            thinned_cameras(meant, lenses, features[used[0]], stride), features, pixels, neighbours
+        )
         / chance
         for name, meant in _meanings(poses).items()
     }

@@ -83,7 +83,9 @@ def find_world_evidence(box: SceneBox, cameras: Cameras, read_view: ReadView) ->
     bands = read_view(used[0], (slice(1), slice(1))).shape[2]
     stride = -(-max(cameras.width, cameras.height) // LONGEST_SIDE_PX)
     part = (slice(None, None, stride), slice(None, None, stride), slice(None, None, -(-bands // MOST_BANDS)))
-    features = dict(zip(used, view_features([read_view(view, part) for view in used], generator), strict=True))
+    features = dict(
+        zip(used, view_features([read_view(view, part) for view in used], generator), strict=True)
+    )
     pixels = {view: _spread_pixels(features[view]) for view in neighbours}
     drawn = torch.cat([features[view].flatten(0, 1)[pixels[view]] for view in neighbours])
     chance = float((drawn - drawn[torch.randperm(len(drawn), generator=generator)]).norm(dim=-1).median())

@@ -1,0 +1,93 @@
+"""What tells a world without end from a closed box, and which of its cells are carved."""
+
+import json
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+
+from tests.scenes.geometry.test_carving import make_cameras
+from tests.scenes.scene_factory import look_at
+from unmix_plugin.engine.geometry.contraction import UnitSpace
+from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.errors import SceneError
+from unmix_plugin.scenes import SceneOptions, carve, load_scene
+from unmix_plugin.scenes.demo import scene as demo_scene
+from unmix_plugin.scenes.demo.places import ROOM, TABLE, WORLD
+from unmix_plugin.scenes.demo.scene import make_demo_scene
+from unmix_plugin.scenes.demo.shading import render_view
+from unmix_plugin.scenes.geometry.world_carving import carve_world
+from unmix_plugin.scenes.geometry.world_evidence import WorldEvidence
+
+BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """Small scenes of each place."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demo_scene, "render_view", partial(render_view, subpixels=1))
+        root = tmp_path_factory.mktemp("places")
+        for name, place, size in (("table", TABLE, 48), ("world", WORLD, 48), ("room", ROOM, 72)):
+            make_demo_scene(root / name, size, 3, 16, place=place)
+    return root
+
+
+@pytest.mark.parametrize(("name", "is_unbounded"), [("table", False), ("world", True), ("room", True)])
+def test_what_goes_on_behind_the_box_is_found_from_the_views(folders, name, is_unbounded):
+    scene = load_scene(folders / name)
+    assert scene.has_alpha == (name == "table")
+    assert scene.is_unbounded == is_unbounded
+    assert not load_scene(folders / name, SceneOptions(world="bounded")).is_unbounded
+
+
+def test_a_room_whose_inside_explains_all_pixels_is_bounded():
+    assert not WorldEvidence(num_pixels=1000, num_inside=900, num_behind=20, num_explained=850).goes_on
+    assert WorldEvidence(num_pixels=1000, num_inside=600, num_behind=300, num_explained=850).goes_on
+    assert WorldEvidence(num_pixels=1000, num_inside=300, num_behind=10, num_explained=350).goes_on
+    assert not WorldEvidence(0, 0, 0, 0).goes_on
+
+
+def test_a_world_behind_what_is_transparent_is_refused(folders):
+    with pytest.raises(SceneError, match="world: is unbounded, but pictures have alpha"):
+        load_scene(folders / "table", SceneOptions(world="unbounded"))
+
+
+def test_the_table_looks_the_same_in_any_place_and_the_world_covers_the_ground(folders):
+    names = json.loads((folders / "table" / "transforms.json").read_text())["frames"]
+    for frame in names[:4]:
+        alone, around = (load_cube(folders / place, frame) for place in ("table", "world"))
+        shows = alone.max(axis=-1) > 0  # one ray a pixel: either of the table or of what is around it
+        assert 0.2 < shows.mean() < 0.8
+        assert np.array_equal(alone[shows], around[shows])
+    around = load_cube(folders / "world", names[0])
+    assert (around.max(axis=-1) > 0).all()
+
+
+def load_cube(folder, frame):
+    return np.load(folder / frame["hyperspectral_file_path"]).astype(np.float32)
+
+
+def test_cells_that_one_view_alone_sees_are_carved_and_those_that_many_see_are_not():
+    """Two cameras side by side see the same far places, and each what is right before it alone."""
+    positions = [np.array([3.0, side, 0.3]) for side in (-1.0, 1.0)]
+    cameras = make_cameras([look_at(position, np.array([-20.0, 0.0, 0.0])) for position in positions])
+    kept = torch.from_numpy(carve_world(cameras, BOX, 32))
+    space = UnitSpace(BOX, is_unbounded=True)
+
+    def is_kept(*point: float) -> bool:
+        cell = (space.to_unit(torch.tensor(point)) * 32).long()
+        return bool(kept[tuple(cell)])
+
+    assert is_kept(0.0, 0.0, 0.0)
+    assert is_kept(-30.0, 0.0, 0.0)
+    assert not is_kept(2.2, -1.0, 0.3)
+    assert not is_kept(8.0, 0.0, 0.0)
+
+
+def test_the_grid_of_a_world_has_the_cells_asked_for(folders):
+    scene = load_scene(folders / "world")
+    assert carve(scene, 24).shape == (24, 24, 24)
+    coarse, fine = (carve(scene, cells).mean() for cells in (64, 128))
+    assert coarse == fine
