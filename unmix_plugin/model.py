@@ -172,8 +172,8 @@ class UnmixModel(Model):
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
         """`spectral` (R, B) on black (of a rig `coefficients`, from which `_parts` makes what its sensors see),
-        `abundances` (R, K) with those of the sky, `accumulation` (R), `spread` and `num_samples`, one number each, and of
-        the samples that carry weight `positions`, `weights` and `views` (S)."""
+        `abundances` (R, K) with those of the sky, `accumulation` (R), `spread` and `num_samples`, one number each, and
+        of the samples that carry weight `positions`, `weights` and `views` (S)."""
         generator = self.generator if self.training else None
         renderer = replace(self.renderer, step=self._training_step) if self.training else self.renderer
         rendered = renderer.render(self.field, ray_bundle, generator)
