@@ -24,9 +24,10 @@ def make_rays(num_rays: int, seed: int = 0):
 @pytest.mark.parametrize("sides", [(8, 8, 8), (3, 5, 7), (1, 1, 1)])
 def test_kernel_and_twin_take_the_same_samples(num_rays, sides, device):
     occupied = (torch.rand(sides, generator=torch.Generator().manual_seed(3)) < 0.3).to(device, torch.uint8)
-    rays = [values.to(device) for values in make_rays(num_rays)]
+    origins, directions, jitter = (values.to(device) for values in make_rays(num_rays))
     found, expected = (
-        function(*rays, occupied, 0.05) for function in (march_contracted, march_contracted_twin)
+        function(origins, directions, jitter, occupied, 0.05)
+        for function in (march_contracted, march_contracted_twin)
     )
     # A sample within rounding of a cell's face may fall to either side.
     differing = (found.packed_info[:, 1] - expected.packed_info[:, 1]).abs()

@@ -1,6 +1,7 @@
 """Which cells of contracted space may be occupied: those that enough training views see.
 
 What one view alone sees is not held by the others: before each camera lies such a space, and what grows there is fog.
+Far away, where a small part of a world fits into a view, two views are enough; near a camera more must agree.
 
 Notation: `R` cells along an edge of the contracted cube, `N` cameras.
 """
@@ -21,6 +22,10 @@ SEEN_CELLS = 64
 """Cells along an edge in which visibility is judged; finer grids repeat it."""
 SHARE = 0.05
 """Share of the training views that must see a cell, but two of them at least."""
+NEAR_SHARE = 0.2
+"""The same of cells near a camera."""
+NEAR = 0.6
+"""What is near, in distances from the cameras to the middle of the box, median over cameras."""
 _BLOCK = 1 << 16
 
 
@@ -36,10 +41,18 @@ def carve_world(cameras: Cameras, box: SceneBox, resolution: int) -> Bool[np.nda
     unit = (torch.cartesian_prod(*[torch.arange(cells)] * 3) + 0.5) / cells
     points = UnitSpace(box, is_unbounded=True).from_unit(unit)
     seen_by = torch.cat([_count_views(cameras, part) for part in points.split(_BLOCK)])
-    fewest = min(max(2, math.ceil(SHARE * len(cameras))), len(cameras))
+    positions = cameras.camera_to_world[:, :, 3]
+    limit = NEAR * float((positions - box.aabb.mean(dim=0)).norm(dim=-1).median())
+    nearest = torch.cat([torch.cdist(part, positions).amin(dim=1) for part in points.split(_BLOCK)])
+    fewest = torch.where(nearest < limit, _number(NEAR_SHARE, cameras), _number(SHARE, cameras))
     kept = _with_neighbours((seen_by >= fewest).view(cells, cells, cells))
     index = torch.arange(resolution) * cells // resolution
     return kept[index][:, index][:, :, index].numpy()
+
+
+def _number(share: float, cameras: Cameras) -> int:
+    """Of views: a share of all, but two at least if there are two."""
+    return min(max(2, math.ceil(share * len(cameras))), len(cameras))
 
 
 def _count_views(cameras: Cameras, points: torch.Tensor) -> torch.Tensor:
