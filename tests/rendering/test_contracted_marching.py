@@ -4,11 +4,13 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from unmix_plugin.engine.geometry.contraction import contracted_unit
 from unmix_plugin.rendering.contracted_marching import (
     FAR_RADIUS,
     LINEAR_RADIUS,
     march_contracted,
     march_contracted_twin,
+    unit_points,
 )
 
 
@@ -57,6 +59,11 @@ def test_a_ray_from_beyond_the_far_end_has_no_samples():
     full = torch.ones(4, 4, 4, dtype=torch.uint8)
     origins, directions = torch.tensor([[600.0, 0.0, 0.0]]), torch.tensor([[-1.0, 0.0, 0.0]])
     assert len(march_contracted(origins, directions, torch.zeros(1), full, 0.05)) == 0
+
+
+def test_grids_and_fields_contract_space_alike():
+    points = 5 * torch.randn(100, 3, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(unit_points(points), contracted_unit(points))
 
 
 def test_steps_of_no_length_are_refused():

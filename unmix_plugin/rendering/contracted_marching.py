@@ -16,7 +16,6 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.contraction import contracted_unit
 from unmix_plugin.rendering.grid_cells import cells_at
 from unmix_plugin.rendering.launching import as_warp, launch, vector_type
 from unmix_plugin.rendering.marching import PackedSamples, check_step
@@ -85,7 +84,7 @@ def march_contracted_twin(
         near = radius.clamp(min=1.0)
         stride = step * near * (near / LINEAR_RADIUS).clamp(min=1.0)
         at = t + jitter * stride
-        unit = contracted_unit(origins + at[:, None] * directions)
+        unit = unit_points(origins + at[:, None] * directions)
         hit = is_inside & (occupied[tuple(cells_at(unit, occupied.shape).unbind(-1))] != 0)
         found.append((hit, at))
         t = torch.where(is_inside, t + stride, t)
@@ -98,3 +97,9 @@ def march_contracted_twin(
     counts = hit.sum(dim=1)
     packed_info = torch.stack([counts.cumsum(0) - counts, counts], dim=-1)
     return PackedSamples(t_samples[hit], hit.nonzero()[:, 0], packed_info, step)
+
+
+def unit_points(points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
+    """Where points of the world lie in the unit cube that the grid fills."""
+    radius = points.abs().amax(dim=-1, keepdim=True).clamp(min=1.0)
+    return points * ((2.0 - 1.0 / radius) / radius) / 4.0 + 0.5
