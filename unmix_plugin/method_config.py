@@ -60,6 +60,7 @@ unmix_nerf_published = MethodSpecification(
                     spread=0.0,
                     abundances=0.0,
                     exposure=1.0,
+                    band_weights=(),
                     outlier=1e6,
                 ),
             ),
