@@ -346,7 +346,9 @@ def test_settings_without_auto_read_no_data():
     def unread():
         raise AssertionError
 
-    config = UnmixModelConfig(num_endmembers=4, light="fixed", losses=LossConfig(exposure=1.0, band_weights=()))
+    config = UnmixModelConfig(
+        num_endmembers=4, light="fixed", losses=LossConfig(exposure=1.0, band_weights=())
+    )
     assert config.resolve_auto(unread, torch.Generator()) == (config, "")
 
 
