@@ -4,7 +4,8 @@
 
 Spheres of random layered materials under point lights and environments, tone-mapped with AgX: the neural material whose
 latents the encoder gives, the same after a short fit to the pictures, and glTF's metallic-roughness material after the
-same fit. Both fits start at what belongs to the truth's own parameters.
+same fit. Both fits start at what belongs to the truth's own parameters. Truth and candidate are sampled in the same
+directions, so that their pictures share their noise.
 """
 
 from __future__ import annotations

@@ -28,8 +28,8 @@ def ggx_albedo(
     roughness: Float[Tensor, "K N"], cosine: Float[Tensor, " N"]
 ) -> tuple[Float[Tensor, "K N"], Float[Tensor, "K N"]]:
     """`(a, b)`: a GGX lobe of Schlick's Fresnel term reflects `f0 a + b` of what comes from this cosine."""
-    found = _look_up(_ggx_cells(roughness.device), roughness, cosine)
-    return found[0], found[1]
+    a, b = _look_up(_ggx_cells(roughness.device), roughness, cosine).unbind(0)
+    return a, b
 
 
 def sheen_albedo(roughness: Float[Tensor, " N"], cosine: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
@@ -41,9 +41,10 @@ def mean_ggx_albedo(roughness: Float[Tensor, "K N"]) -> tuple[Float[Tensor, "K N
     """`(a, b)` of `ggx_albedo`, averaged over the hemisphere with the cosine as weight."""
     means = _ggx_means(roughness.device)
     row = (roughness.detach() * (_ROWS - 1)).floor().clamp(0, _ROWS - 2)
-    low, high = means[:, row.long()], means[:, row.long() + 1]
-    found = low + (roughness * (_ROWS - 1) - row) * (high - low)
-    return found[0], found[1]
+    index = row.long().reshape(-1)
+    low, rise = (each.index_select(1, index).reshape(2, *roughness.shape) for each in means)
+    a, b = (low + (roughness * (_ROWS - 1) - row) * rise).unbind(0)
+    return a, b
 
 
 @lru_cache(maxsize=1)
@@ -105,8 +106,10 @@ def _ggx_cells(device: torch.device) -> Tensor:
 
 
 @lru_cache(maxsize=4)
-def _ggx_means(device: torch.device) -> Tensor:
-    return _mean(ggx_table()).T.contiguous().to(device)
+def _ggx_means(device: torch.device) -> tuple[Tensor, Tensor]:
+    """Means of each row, (2, rows), and their rise to the next row."""
+    means = _mean(ggx_table()).T.contiguous().to(device)
+    return means, means.diff(dim=1)
 
 
 @lru_cache(maxsize=4)

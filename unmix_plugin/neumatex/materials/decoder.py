@@ -37,17 +37,23 @@ class Decoder(nn.Module):
         for layer in self.hidden:
             x = nn.functional.silu(layer(x))
         numbers = torch.sigmoid(torch.addmm(self.last.bias[:, None], self.last.weight, x.T))
-        coat, surface, haze = numbers[6:9].unbind(0)
+        # Gradients of a split are joined once; each index into `numbers` would fill zeros for all of them.
+        dust, sheen, sheen_roughness, coat, roughness, haze, metallicity, metal, level = numbers.split(
+            [1, 3, 1, 1, 3, 1, 1, 3, 1]
+        )
+        of_coat, surface, beyond = roughness.unbind(0)
         return LayerStack(
-            dust_cover=LARGEST_COVER * numbers[0],
-            sheen_colour=LARGEST_SHEEN * numbers[1:4],
-            sheen_roughness=numbers[4],
-            coat_weight=numbers[5],
-            roughness=torch.stack([LARGEST_COAT_ROUGHNESS * coat, surface, surface + (1.0 - surface) * haze]),
-            haze_weight=LARGEST_HAZE * numbers[9],
-            metallicity=numbers[10],
-            metal_colour=numbers[11:14],
-            dielectric_f0=LARGEST_DIELECTRIC_F0 * numbers[14],
+            dust_cover=LARGEST_COVER * dust[0],
+            sheen_colour=LARGEST_SHEEN * sheen,
+            sheen_roughness=sheen_roughness[0],
+            coat_weight=coat[0],
+            roughness=torch.stack(
+                [LARGEST_COAT_ROUGHNESS * of_coat, surface, surface + (1.0 - surface) * beyond]
+            ),
+            haze_weight=LARGEST_HAZE * haze[0],
+            metallicity=metallicity[0],
+            metal_colour=metal,
+            dielectric_f0=LARGEST_DIELECTRIC_F0 * level[0],
         )
 
 

@@ -70,8 +70,9 @@ class LayerStack:
         edge = schlick(dot(wo, half))
         alpha = alpha_of(self.roughness)
         lobes = distribution(alpha, half) * visibility(alpha, wi[2], wo[2])
-        of_coat = self.coat_weight * (_COAT_F0 + (1.0 - _COAT_F0) * edge) * lobes[0]
-        surface = coat * (lobes[1] + self.haze_weight * (lobes[2] - lobes[1]))
+        coat_lobe, sharp, hazy = lobes.unbind(0)
+        of_coat = self.coat_weight * (_COAT_F0 + (1.0 - _COAT_F0) * edge) * coat_lobe
+        surface = coat * self._mixed(sharp, hazy)
         of_sheen = dust * sheen_reflection(self.sheen_roughness, half, wi[2], wo[2])
         # f0 + (1 - f0) edge, of three colours, with what has none apart.
         specular = self.f0 * (surface * (1.0 - edge)) + (surface * edge + sheen * of_coat)
@@ -105,18 +106,19 @@ class LayerStack:
     def passing(self, cosine: Float[Tensor, " N"]) -> "Passing":
         """What each layer lets through from one direction to what is below."""
         cosine = cosine.clamp_min(0.0)
-        a, b = ggx_albedo(self.roughness, cosine)
-        coat = 1.0 - self.coat_weight * (_COAT_F0 * a[0] + b[0])
-        dielectric = self.dielectric_f0 * a[1:] + b[1:]
-        surface = 1.0 - (dielectric[0] + self.haze_weight * (dielectric[1] - dielectric[0]))
+        (coat_a, *surface_a), (coat_b, *surface_b) = (x.unbind(0) for x in ggx_albedo(self.roughness, cosine))
+        coat = 1.0 - self.coat_weight * (_COAT_F0 * coat_a + coat_b)
+        surface = 1.0 - (self.dielectric_f0 * self._mixed(*surface_a) + self._mixed(*surface_b))
         sheen = 1.0 - self.sheen_colour.amax(0) * sheen_albedo(self.sheen_roughness, cosine)
         return Passing(dust_passed(self.dust_cover, cosine), sheen, coat, surface)
 
     def _surface_mean(self) -> Tensor:
         """Mean of `surface` over directions, which makes a white base under it lose no light."""
-        a, b = mean_ggx_albedo(self.roughness[1:])
-        dielectric = self.dielectric_f0 * a + b
-        return 1.0 - (dielectric[0] + self.haze_weight * (dielectric[1] - dielectric[0]))
+        (_, *a), (_, *b) = (x.unbind(0) for x in mean_ggx_albedo(self.roughness))
+        return 1.0 - (self.dielectric_f0 * self._mixed(*a) + self._mixed(*b))
+
+    def _mixed(self, sharp: Tensor, hazy: Tensor) -> Tensor:
+        return sharp + self.haze_weight * (hazy - sharp)
 
 
 @dataclass(frozen=True)

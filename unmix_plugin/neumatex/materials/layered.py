@@ -73,10 +73,9 @@ class LayeredFamily:
     @staticmethod
     def stack(parameters: Float[Tensor, "N P"]) -> LayerStack:
         """The layers that the parameters stand for."""
-        columns = parameters.T.contiguous()
-        base, scalars = columns[:3], columns[3:].unbind(0)
-        metallicity, roughness, level, coat, coat_roughness = scalars[:5]
-        sheen, sheen_roughness, tint, haze, spread, dust = scalars[5:]
+        base, scalars = parameters.T.contiguous().split([3, parameters.shape[1] - 3])
+        metallicity, roughness, level, coat, coat_roughness, *others = scalars.unbind(0)
+        sheen, sheen_roughness, tint, haze, spread, dust = others
         hue = base / base.amax(0).clamp_min(1e-3)
         hazy = roughness + (1.0 - roughness) * (0.15 + 0.6 * spread)
         return LayerStack(

@@ -46,7 +46,8 @@ class NeuralFamily:
         self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N C"]:
         """Reflectance, 1/sr, without the cosine; 0 where a direction is below the surface."""
-        return evaluate_stack(self.stack(parameters), parameters[:, :3], wi, wo)
+        base, latents = parameters.split([3, NUM_LATENTS], 1)
+        return evaluate_stack(self.decoder(latents), base, wi, wo)
 
     @torch.no_grad()
     def sample(

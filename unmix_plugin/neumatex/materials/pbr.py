@@ -79,5 +79,5 @@ class PbrFamily:
 
 def _columns(parameters: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Base colour (3 N), roughness (1 N) and metallicity (1 N)."""
-    columns = parameters.T.contiguous()
-    return columns[:3], columns[3:4], columns[4:5]
+    base, roughness, metallicity = parameters.T.contiguous().split([3, 1, 1])
+    return base, roughness, metallicity
