@@ -55,6 +55,8 @@ class Options:
     """Held-out lights."""
     steps: int = 300
     """Training steps."""
+    pixels: int = 4096
+    """Pixels a step."""
     variants: tuple[str, ...] = tuple(VARIANTS)
     """Which ways of fitting."""
     device: Literal["cpu", "cuda"] = "cpu"
@@ -75,7 +77,7 @@ def main(options: Options) -> None:
     setting = {
         "objects": f"procedural, seeds {seeds.start} to {seeds.stop - 1}",
         "pictures": f"{size[1]} of {size[0]} x {size[0]} pixels, and {size[2]} held-out lights",
-        "steps": steps,
+        "steps": f"{steps} of {options.pixels} pixels",
         "device": options.device,
         "variants": {name: " ".join(VARIANTS[name]) for name in options.variants},
     }
@@ -86,7 +88,9 @@ def main(options: Options) -> None:
         for seed in seeds:
             folder = written_object(root / f"object-{seed}", seed, *size)
             for name in options.variants:
-                found = measure(folder, VARIANTS[name], steps, options.device, root / "runs" / name)
+                words = [*VARIANTS[name], "--max-num-iterations", str(steps), "--device", options.device]
+                words += ["--pipeline.datamanager.train-num-rays-per-batch", str(options.pixels)]
+                found = measure(folder, words, options.device, root / "runs" / name)
                 measured[name].append({"seed": seed, **found})
                 print(f"object {seed}, {name}: relit {found['relit_psnr']:.2f} dB", flush=True)
     question = f"Unseen objects under unseen lights after {steps} steps"
@@ -112,12 +116,11 @@ def written_object(folder: Path, seed: int, size: int, views: int, lights: int) 
     return folder
 
 
-def measure(folder: Path, words: tuple[str, ...], steps: int, device: str, runs: Path) -> dict[str, Any]:
+def measure(folder: Path, words: list[str], device: str, runs: Path) -> dict[str, Any]:
     """Train and evaluate one object in one way."""
     load_average = _machine.load_average()
-    common = ["neumatex", "--data", str(folder), "--output-dir", str(runs), "--device", device]
-    limit = ["--max-num-iterations", str(steps)]
-    trained = _common.run_command([_common.console_script("unmix-train"), *common, *limit, *words])
+    common = ["neumatex", "--data", str(folder), "--output-dir", str(runs)]
+    trained = _common.run_command([_common.console_script("unmix-train"), *common, *words])
     evaluate = [_common.console_script("unmix-eval"), "--run", str(trained.run), "--device", device]
     evaluated = _common.run_command(evaluate)
     figures = json.loads((trained.run / "eval" / "metrics.json").read_text(encoding="utf-8"))
