@@ -27,6 +27,36 @@ LOG_VARIANCE_RANGE = (-9.0, 0.0)
 _WIDTH = 64
 
 
+class Readers(nn.Module):
+    """Two networks that read features of points: the material's parameters, and how wrong they may be."""
+
+    def __init__(
+        self,
+        num_parameters: int,
+        num_channels: int = NUM_CHANNELS,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        """Random networks.
+
+        Args:
+            num_parameters: P.
+            generator: Draws the weights.
+        """
+        super().__init__()
+        inputs = 3 * num_channels + 3 + 6 * NUM_FREQUENCIES
+        self.num_parameters = num_parameters
+        self.material_network = _network(inputs, num_parameters, generator)
+        self.variance_network = _network(inputs, num_parameters, generator)
+
+    def material(self, features: Float[Tensor, "N F"]) -> Float[Tensor, "N P"]:
+        """Parameters in (0, 1) of points whose `point_features` are given."""
+        return torch.sigmoid(self.material_network(features))
+
+    def log_variance(self, features: Float[Tensor, "N F"]) -> Float[Tensor, "N P"]:
+        """Log-variances within `LOG_VARIANCE_RANGE` of points whose `point_features` are given."""
+        return bounded_log_variance(self.variance_network(features))
+
+
 class Triplane(nn.Module):
     """Parameters of a material and their log-variance at points of one object."""
 
@@ -45,28 +75,26 @@ class Triplane(nn.Module):
             generator: Draws the planes and the networks.
         """
         super().__init__()
-        inputs = 3 * num_channels + 3 + 6 * NUM_FREQUENCIES
         texels = (3, num_channels, resolution, resolution)
-        self.num_parameters = num_parameters
         self.planes = nn.Parameter(0.1 * torch.randn(texels, generator=generator))
-        self.material_network = _network(inputs, num_parameters, generator)
-        self.variance_network = _network(inputs, num_parameters, generator)
+        self.readers = Readers(num_parameters, num_channels, generator)
+
+    @property
+    def num_parameters(self) -> int:
+        """P."""
+        return self.readers.num_parameters
 
     def parameters_at(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N P"]:
         """Parameters of the material in (0, 1); differentiable by planes and networks."""
-        return material_parameters(self.material_network, self._features(positions))
+        return self.readers.material(point_features(self.planes, positions))
 
     def log_variance(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N P"]:
         """Logarithm of the expected squared error of each parameter, within `LOG_VARIANCE_RANGE`."""
-        return bounded_log_variance(self.variance_network, self._features(positions))
+        return self.readers.log_variance(point_features(self.planes, positions))
 
     def parameter_groups(self) -> dict[Literal["planes", "networks"], list[nn.Parameter]]:
         """What an optimiser may move: an object's planes, and the networks that are frozen while one is fitted."""
-        networks = [*self.material_network.parameters(), *self.variance_network.parameters()]
-        return {"planes": [self.planes], "networks": networks}
-
-    def _features(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N F"]:
-        return point_features(self.planes, positions)
+        return {"planes": [self.planes], "networks": list(self.readers.parameters())}
 
 
 def point_features(planes: Float[Tensor, "3 C R R"], positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N F"]:
@@ -96,21 +124,16 @@ def look_up_twin(planes: Float[Tensor, "3 C R R"], positions: Float[Tensor, "N 3
     return torch.cat(parts, dim=-1)
 
 
-def encode(positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N E"]:
+def encode(positions: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n E"]:
     """Sines and cosines of the position times pi, 2 pi and 4 pi: 18 numbers."""
     angles = torch.cat([positions * (math.pi * 2.0**band) for band in range(NUM_FREQUENCIES)], dim=-1)
     return torch.cat([angles.sin(), angles.cos()], dim=-1)
 
 
-def material_parameters(network: nn.Module, features: Float[Tensor, "N F"]) -> Float[Tensor, "N P"]:
-    """Parameters in (0, 1) that a material network gives for features of points."""
-    return torch.sigmoid(network(features))
-
-
-def bounded_log_variance(network: nn.Module, features: Float[Tensor, "N F"]) -> Float[Tensor, "N P"]:
-    """Log-variances within `LOG_VARIANCE_RANGE` that a network gives for features of points."""
+def bounded_log_variance(raw: Float[Tensor, "*n P"]) -> Float[Tensor, "*n P"]:
+    """Log-variances within `LOG_VARIANCE_RANGE` from any numbers."""
     low, high = LOG_VARIANCE_RANGE
-    return low + (high - low) * torch.sigmoid(network(features))
+    return low + (high - low) * torch.sigmoid(raw)
 
 
 def _network(inputs: int, outputs: int, generator: torch.Generator | None) -> nn.Sequential:

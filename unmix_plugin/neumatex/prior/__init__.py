@@ -1,6 +1,7 @@
 """What a material is likely to be, from pictures of it: the guess that a fit starts from and returns to.
 
-A prior takes posed views of an object under a known environment and gives a filled `Triplane`:
-`prior.small.predict(views: PosedViews, mesh: Mesh, ray_mesh: RayMesh, environment: Environment,
-material: "neural" | "pbr", *, resolution: int = 128, generator: torch.Generator) -> Triplane`.
+A prior takes posed views of an object under a known environment and gives a filled `Triplane`, whose networks stay as
+they are while its planes are fitted:
+`prior.small.predict(views: PosedViews, ray_mesh: RayMesh, environment: Environment, material: "neural" | "pbr", *,
+resolution: int = 128, generator: torch.Generator) -> Triplane`.
 """

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.neumatex.triplane import NUM_CHANNELS, Triplane
+from unmix_plugin.neumatex.triplane import NUM_CHANNELS, Readers, Triplane
 
 if TYPE_CHECKING:
     from diffusers.models.autoencoders.autoencoder_kl_wan import AutoencoderKLWan
@@ -75,8 +75,7 @@ class WanPrior(nn.Module):
         for frozen in (autoencoder.encoder, autoencoder.quant_conv):
             frozen.requires_grad_(requires_grad=False)
         self.planes_head = nn.Linear(LATENT_FRAMES * channels, 3 * channels, device=transformer.device)
-        self.readers = Triplane(num_parameters, resolution=2, generator=generator)
-        del self.readers.planes
+        self.readers = Readers(num_parameters, generator=generator)
         if null_text is None:
             null_text = torch.zeros(TEXT_TOKENS, transformer.config["text_dim"], device=transformer.device)
         self.register_buffer("null_text", null_text)
@@ -122,8 +121,9 @@ class WanPrior(nn.Module):
     def triplane(self, planes: Float[Tensor, "3 12 S S"]) -> Triplane:
         """One object's planes with copies of the networks that read them."""
         triplane = Triplane(self.readers.num_parameters, resolution=planes.shape[-1])
-        networks = {name: value.detach().clone() for name, value in self.readers.state_dict().items()}
-        triplane.load_state_dict({**networks, "planes": planes.detach().float()})
+        triplane.readers.load_state_dict(self.readers.state_dict())
+        with torch.no_grad():
+            triplane.planes.copy_(planes)
         return triplane
 
     def parameter_groups(self) -> dict[Literal["backbone", "networks"], list[nn.Parameter]]:
