@@ -25,6 +25,7 @@ from unmix_plugin.engine.instantiate import Target
 from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.engine.training.seeding import step_generator
 from unmix_plugin.errors import SceneError, require
+from unmix_plugin.pose_refinement import Knots
 from unmix_plugin.scenes.alpha_evidence import AlphaEvidence
 from unmix_plugin.scenes.geometry.carving import carve
 from unmix_plugin.scenes.geometry.lighting import judge_light
@@ -194,12 +195,14 @@ class HyperspectralDataManager(DataManager):
             "pixel_size": min(self._rays.pixel_sizes.values()),
             "subpixels": self._final_subpixels,
             "num_train_views": len(self.train_cameras),
+            **({} if self.train_cameras.key_poses is None else {"line_rows": list(self._knots.rows)}),
             **({"sensors": [sensor.to_json() for sensor in self.scene.sensors]} if self.scene.is_rig else {}),
         }
 
     def initial_data(self) -> Mapping[str, np.ndarray]:
-        """`pixels`: spectra pooled over all training views; `reachable`: where something may be; `light`: fixed,
-        camera or per-view, as far as pictures with alpha tell; `band_weights`, of squared errors, mean 1.
+        """`pixels`: spectra pooled over all training views; `reachable`: where something may be; `knots`: where cameras
+        stand whose poses may be corrected; `light`: fixed, camera or per-view, as far as pictures with alpha tell;
+        `band_weights`, of squared errors, mean 1.
 
         Of a rig, pixels of the sensor with most channels, and of those the one with most pixels; `sensor`, which that
         is; and `typical`, a spectrum on all bands that fits the mean of each sensor's pixels.
@@ -214,6 +217,7 @@ class HyperspectralDataManager(DataManager):
         foreground = self._evidence.foreground() if self.scene.has_alpha else None
         reachable = carve(self.scene, self._grid_resolution, foreground)
         found = {
+            "knots": self._knots.positions(self.train_cameras).numpy(),
             "pixels": self._pixels.sample_opaque(chosen, most, seed),
             "reachable": reachable,
             "band_weights": band_weights(self.scene, self._noise),
@@ -247,6 +251,11 @@ class HyperspectralDataManager(DataManager):
     def identity(self, summary: Mapping[str, Any]) -> dict[str, Any]:
         """Views, cameras, bands and the hashes of what was measured."""
         return scene_identity(summary)
+
+    @cached_property
+    def _knots(self) -> Knots:
+        """Where corrections of the training views' poses stand."""
+        return Knots.of(self.train_cameras)
 
     @cached_property
     def _pixels(self) -> PixelTable:

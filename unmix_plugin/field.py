@@ -112,6 +112,8 @@ class UnmixField(CoefficientField):
     """Density, abundances, scales and specular coefficients of points in a scene box."""
 
     aabb: Tensor
+    level_weights: Tensor | None
+    """(L), by which the grid's levels are multiplied; None where all count alike."""
 
     def __init__(
         self,
@@ -124,6 +126,7 @@ class UnmixField(CoefficientField):
         exposure: float = 1.0,
         lit_by_camera: bool = False,
         is_unbounded: bool = False,
+        coarse_to_fine: bool = False,
     ) -> None:
         """
         Args:
@@ -136,6 +139,7 @@ class UnmixField(CoefficientField):
             exposure: How dark the scene is: the view-dependent part starts so many times darker.
             lit_by_camera: Whether the light moves with the camera, so that scales depend on the direction of view.
             is_unbounded: Whether the field is defined in all of space, contracted around the box, with a sky behind.
+            coarse_to_fine: Whether the grid's levels have weights, as refining poses needs them.
         """
         super().__init__()
         self.config = config
@@ -158,6 +162,8 @@ class UnmixField(CoefficientField):
         self._make_networks()
         if is_unbounded:
             self.sky_network = bias_free_network(NUM_SKY_FEATURES, config.hidden_width, num_endmembers + 1)
+        weights = torch.ones(config.num_levels) if coarse_to_fine else None
+        self.register_buffer("level_weights", weights)
 
     def _make_networks(self) -> None:
         width, num_features = self.config.hidden_width, self.config.num_features + 1
@@ -192,6 +198,8 @@ class UnmixField(CoefficientField):
 
     def density_of(self, encoded: Float[Tensor, "S LF"]) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
         """Density per scene unit and geometry features where the encoding is `encoded`."""
+        if self.level_weights is not None:
+            encoded = encoded * self.level_weights.repeat_interleave(self.config.features_per_level)
         features = self.density_network(encoded)
         return bounded_exp(features[:, 0] + self.log_initial_density), features
 

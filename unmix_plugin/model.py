@@ -28,9 +28,10 @@ from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.model import Model
 from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.field import CoefficientField
+from unmix_plugin.field import CoefficientField, UnmixField
 from unmix_plugin.first_endmembers import first_endmembers
 from unmix_plugin.model_settings import UnmixModelConfig, usual_num_endmembers
+from unmix_plugin.pose_refinement import PoseRefinement
 from unmix_plugin.renderer import VolumeRenderer
 from unmix_plugin.rendering.occupancy import OccupancyGrid
 from unmix_plugin.sensor_batches import SensorPart, mean_over_parts, split_parts
@@ -81,7 +82,11 @@ class UnmixModel(Model):
         self._renderer: VolumeRenderer | None = None
         self.step = metadata["pixel_size"] / config.renderer.samples_per_pixel
         opacity = choose(config.initial_opacity, self.preset.initial_opacity)
-        self.field: CoefficientField = config.field.setup(
+        refines, field = config.poses == "refine", config.field
+        if refines:
+            coarsest = min(field.coarsest_resolution, config.pose_refinement.coarsest_resolution)
+            field = replace(field, coarsest_resolution=coarsest)
+        self.field: CoefficientField = field.setup(
             scene_box=self.scene_box,
             num_endmembers=self.num_endmembers,
             num_specular=len(self.bands) if config.specular == "full" else num_dictionary,
@@ -90,12 +95,14 @@ class UnmixModel(Model):
             exposure=choose(config.losses.exposure, 1.0),
             lit_by_camera=config.light == "camera",
             is_unbounded=self.is_unbounded,
+            coarse_to_fine=refines,
         )
         self.register_buffer("rgb_weights", rgb_matrix(self.bands), persistent=False)
         self.register_buffer("every_band", torch.eye(len(self.bands)), persistent=False)
         self.register_buffer("endmember_bound", torch.ones(()))
         self.guide = AbundanceGuide(*shape)
         self.view_gains = self._make_view_gains()
+        self.poses = self._make_pose_refinement()
         self.seen_by = SensorViews(metadata.get("sensors", ()), self.rgb_weights)
         weights = () if config.losses.band_weights == "auto" else config.losses.band_weights
         self.balance = BandBalance(weights, self.bands, self.seen_by)
@@ -129,7 +136,11 @@ class UnmixModel(Model):
         for row in range(len(self.specular_spectra)):
             spectrum = lamp if row == 0 else endmembers[(row - 1) % len(endmembers)]
             self.specular_spectra[row] = spectrum
-        self.grid = OccupancyGrid(torch.from_numpy(initial_data["reachable"])).to(self.device)
+        reachable = torch.from_numpy(initial_data["reachable"])
+        if self.poses is not None:
+            self.poses.begin(torch.from_numpy(initial_data["knots"]), self.scene_box.aabb.mean(dim=0))
+            reachable = torch.ones_like(reachable)  # poses that are off carve away what is there
+        self.grid = OccupancyGrid(reachable).to(self.device)
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """The hash table, the networks and the spectra."""
@@ -138,7 +149,10 @@ class UnmixModel(Model):
         spectra = [self.endmembers] if self.endmembers.requires_grad else []
         spectra += [self.specular_spectra] if self.specular_spectra.numel() else []
         spectra += [] if self.view_gains is None else [self.view_gains.log_gains]
-        return {"grid": table, "networks": networks, "spectra": spectra}
+        poses = (
+            [] if self.poses is None else [value for value in self.poses.parameters() if value.requires_grad]
+        )
+        return {"grid": table, "networks": networks, "spectra": spectra, "poses": poses}
 
     @property
     def renderer(self) -> VolumeRenderer:
@@ -175,6 +189,8 @@ class UnmixModel(Model):
         `abundances` (R, K) with those of the sky, `accumulation` (R), `spread` and `num_samples`, one number each, and
         of the samples that carry weight `positions`, `weights` and `views` (S)."""
         generator = self.generator if self.training else None
+        if self.poses is not None and self.training and self._progress >= self.config.pose_refinement.start:
+            ray_bundle = self.poses(ray_bundle)
         renderer = replace(self.renderer, step=self._training_step) if self.training else self.renderer
         rendered = renderer.render(self.field, ray_bundle, generator)
         coefficients = rendered.coefficients
@@ -210,6 +226,8 @@ class UnmixModel(Model):
         )
         if "spread" in weights:
             losses["spread"] = outputs["spread"]
+        if self.poses is not None:
+            weights["poses"], losses["poses"] = self.config.pose_refinement.penalty, self.poses.penalty()
         return {name: weights[name] * losses[name] for name in weights if name in losses}
 
     def _pixel_losses(self, part: SensorPart, wanted: set[str]) -> dict[str, Tensor]:
@@ -275,7 +293,7 @@ class UnmixModel(Model):
         return self.seen_by.warnings(self.num_endmembers)
 
     def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        """`psnr` of the batch in dB, on black."""
+        """`psnr` of the batch in dB, on black; of poses that are corrected by how much, and how many were undone."""
 
         def error(part: SensorPart) -> dict[str, Tensor]:
             measured = part.batch["spectra"]
@@ -283,7 +301,8 @@ class UnmixModel(Model):
             return {"psnr": (spectra.detach().clamp(0, 1) - measured).square().mean()}
 
         errors = mean_over_parts(self._parts(outputs, batch), error)
-        return {"psnr": -10 * torch.log10(errors["psnr"].clamp(min=1e-12))}
+        found = {"psnr": -10 * torch.log10(errors["psnr"].clamp(min=1e-12))}
+        return found if self.poses is None else {**found, **self.poses.figures()}
 
     @torch.no_grad()
     def get_outputs_for_camera(
@@ -350,6 +369,13 @@ class UnmixModel(Model):
 
     def _begin_step(self, step: int, progress: float) -> None:
         self._progress = progress
+        if (
+            self.poses is not None
+            and isinstance(self.field, UnmixField)
+            and self.field.level_weights is not None
+        ):
+            levels = self.config.pose_refinement.level_weights(len(self.field.level_weights), progress)
+            self.field.level_weights.copy_(torch.tensor(levels))
         if step % _GRID_INTERVAL:
             return
         space = self.renderer.space
@@ -381,6 +407,8 @@ class UnmixModel(Model):
     def _bound_spectra(self, step: int, progress: float) -> None:
         self.endmembers.clamp_(min=0.0).clamp_(max=self.endmember_bound)
         self.specular_spectra.clamp_(0, 1)
+        if self.poses is not None:
+            self.poses.undo_runaways()
 
     def _checked_num_endmembers(self) -> int:
         count = self.config.num_endmembers
@@ -399,6 +427,12 @@ class UnmixModel(Model):
         if self.config.light != "per-view":
             return None
         return ViewGains(self.metadata["num_train_views"], torch.tensor(self.metadata["wavelengths_nm"]))
+
+    def _make_pose_refinement(self) -> PoseRefinement | None:
+        if self.config.poses != "refine":
+            return None
+        rows = self.metadata.get("line_rows") or [0] * self.metadata["num_train_views"]
+        return PoseRefinement(rows, self.config.pose_refinement.lens)
 
     def _num_dictionary_spectra(self) -> int:
         if self.config.specular != "dictionary":

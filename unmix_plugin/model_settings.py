@@ -15,6 +15,7 @@ from unmix_plugin.engine.instantiate import Common, Target, short
 from unmix_plugin.engine.model import Model, ModelConfig
 from unmix_plugin.errors import require
 from unmix_plugin.field import UnmixFieldConfig
+from unmix_plugin.pose_refinement import PoseConfig
 from unmix_plugin.renderer import RendererConfig
 from unmix_plugin.spectral.evidence import exposure_of
 from unmix_plugin.spectral.materials import SegmentationMethod
@@ -61,6 +62,10 @@ class UnmixModelConfig(ModelConfig):
     light: Annotated[Light | Auto, Common, short("light")] = "auto"
     """Light that is fixed, that moves with the camera (objects turned before camera and lamp), or that differs from
     view to view (also exposure). Auto finds which it is, and takes fixed without alpha."""
+    poses: Annotated[Literal["fixed", "refine"] | Auto, Common, short("poses")] = "auto"
+    """Whether training takes the poses as they are, or corrects them with the field; auto takes them as they are."""
+    pose_refinement: PoseConfig = PoseConfig()
+    """How poses are corrected."""
     segmentation: SegmentationMethod = "abundances"
     """Material of a ray: its largest abundance, or the endmember of smallest angle to its spectrum as published."""
     samples_per_step: int = 30_000
@@ -134,6 +139,8 @@ class UnmixModelConfig(ModelConfig):
             found = replace(found, light=light)
             if light != "fixed":
                 reasons.append(_WHY_LIGHT[light])
+        if self.poses == "auto":
+            found = replace(found, poses="fixed")
         return found, "\n".join(reasons)
 
 

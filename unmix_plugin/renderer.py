@@ -235,7 +235,7 @@ class VolumeRenderer:
         return (t / self.box.size.max()).square().clamp(max=1.0)
 
     def _march(self, ray_bundle: RayBundle, generator: torch.Generator | None) -> PackedSamples:
-        origins, directions = ray_bundle.origins, ray_bundle.directions
+        origins, directions = ray_bundle.origins.detach(), ray_bundle.directions.detach()
         jitter = torch.full_like(origins[:, 0], 0.5)
         if generator is not None:
             jitter = torch.rand(jitter.shape, generator=generator, device=generator.device).to(jitter)

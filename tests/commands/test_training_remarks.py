@@ -43,3 +43,10 @@ def test_remarks_are_read_from_the_metrics_of_a_run(tmp_path):
     path.write_text('{"step": 1')
     assert read_remarks(path) == []
     assert read_remarks(tmp_path / "missing.jsonl") == []
+
+
+def test_poses_that_ran_away_are_said():
+    lines = course(1.0, 0.2, 0.1, 0.09)
+    assert remarks([*lines[:-1], {**lines[-1], "poses_undone": 0.0}]) == []
+    said = remarks([*lines[:-1], {**lines[-1], "poses_undone": 3.0}])
+    assert "corrections of the poses of 3 views went beyond" in said[0]

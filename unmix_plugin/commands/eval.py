@@ -101,6 +101,10 @@ def _evaluate(options: EvalOptions, processes: Processes) -> None:
         print(
             "each evaluation view was aligned first: exposure and smooth white balance fitted to the measured view"
         )
+    if subject.has_refined_poses:
+        print(
+            "each evaluation view was aligned first: its pose fitted to the measured view with the field as it is"
+        )
     figures = _write_metrics(subject, evaluation)
     _show(console, figures, subject)
     print(f"{subject.folder / 'metrics.json'}  these figures, and those of each view")
@@ -126,6 +130,17 @@ class _Subject:
     def has_view_gains(self) -> bool:
         """Whether each training view has a gain of its own."""
         return getattr(self.loaded.config.pipeline.model, "light", None) == "per-view"
+
+    @property
+    def has_refined_poses(self) -> bool:
+        """Whether training corrected poses."""
+        return getattr(self.loaded.config.pipeline.model, "poses", None) == "refine"
+
+    @property
+    def aligned(self) -> list[str]:
+        """What of each evaluation view was fitted to the measured one before it was measured."""
+        gains = self.has_view_gains and not _scene_of(self.loaded).is_rig
+        return [*(["pose"] if self.has_refined_poses else []), *(["gain"] if gains else [])]
 
 
 def _subject(loaded: LoadedPipeline, recipe: Recipe | None, options: EvalOptions) -> _Subject:
@@ -171,6 +186,7 @@ def _evaluate_views(
     from unmix_plugin.formats.files import write_file
     from unmix_plugin.products.evaluation_pictures import draw_colour, draw_matched_abundances, material_look
     from unmix_plugin.trained.evaluation import Evaluation, scene_truth, view_truth
+    from unmix_plugin.trained.pose_alignment import align_pose
     from unmix_plugin.trained.view_alignment import align_gain
     from unmix_plugin.trained.view_rendering import render_view, subpixels_for
 
@@ -182,7 +198,10 @@ def _evaluate_views(
     for index in follow(console, "evaluating views", scene.eval_indices[processes.rank :: processes.count]):
         truth = view_truth(scene, index).in_light(factors)
         rays = subpixels_for(scene, index, subject.scene.subpixels, subject.scene.pixel_size)
-        predicted = render_view(subject.scene, scene.cameras[index], rays)
+        camera = scene.cameras[index]
+        if subject.has_refined_poses:
+            camera = align_pose(subject.scene, camera, truth)
+        predicted = render_view(subject.scene, camera, rays)
         if subject.has_view_gains and not scene.is_rig:
             predicted = align_gain(predicted, truth, torch.from_numpy(scene.wavelengths_nm))
         if scene.is_rig:
@@ -243,6 +262,7 @@ def _write_metrics(subject: _Subject, evaluation: Evaluation) -> dict[str, Any]:
     content = {**figures, "per_view": per_view, "definitions": DEFINITIONS}
     per_sensor = {name: finite_or_none(found) for name, found in evaluation.per_sensor().items()}
     content |= {"per_sensor": per_sensor} if per_sensor else {}
+    content |= {"aligned": subject.aligned} if subject.aligned else {}
     content |= {} if subject.edits is None else {"edits": subject.edits}
     text = json.dumps(content, indent=1, allow_nan=False) + "\n"
     write_file(subject.folder / "metrics.json", text.encode())

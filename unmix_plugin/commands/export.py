@@ -21,6 +21,7 @@ from unmix_plugin.products.mesh import Mesh
 from unmix_plugin.products.metamerism import Metamerism
 from unmix_plugin.products.pca import Pca
 from unmix_plugin.products.point_cloud import PointCloud
+from unmix_plugin.products.poses import Poses
 from unmix_plugin.products.product import Job, Product, RunProduct
 from unmix_plugin.products.report.report import Report
 from unmix_plugin.products.segmentation import Segmentation
@@ -38,6 +39,7 @@ PRODUCTS: tuple[Product, ...] = (
     Metamerism(),
     Pca(),
     PointCloud(),
+    Poses(),
     Report(),
     Segmentation(),
     Spectrum(),

@@ -40,6 +40,12 @@ def remarks(lines: Sequence[Mapping[str, Any]]) -> list[str]:
     if None in (first, third, last) or not first or not third or last is None:
         return []
     found = []
+    undone = int(known[-1].get("poses_undone") or 0)
+    if undone:
+        found.append(
+            f"corrections of the poses of {undone} views went beyond a quarter of the distance to the scene (or 14 "
+            "degrees) and were undone: look whether these views belong to the scene, or train with --poses fixed"
+        )
     if last > _HARDLY_FELL * first:
         found.append(
             f"the loss hardly fell: in the last quarter of the training it was {last / first:.0%} of that in the "

@@ -55,7 +55,9 @@ class MaterialView:
     def depth(self) -> Float[Tensor, "H W"]:
         """Along the viewing axis, world units; 0 where nothing is."""
         camera = self.camera.to(self.coefficients.packed.device)
-        along_axis = camera.image_rays(0).directions @ -camera.camera_to_world[0, :, 2]
+        rays = camera.image_rays(0)
+        assert rays.axes is not None
+        along_axis = (rays.directions * rays.axes).sum(dim=-1)
         return self.ray_distance * along_axis.view_as(self.opacity)
 
     @property

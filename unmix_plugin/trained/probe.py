@@ -5,7 +5,6 @@ Notation: `B` bands, `K` endmembers.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -95,8 +94,7 @@ def one_pixel(camera: Cameras, column: int, row: int) -> Cameras:
             f"pixel {column},{row} (column, row) is outside the image; "
             f"columns are 0 to {camera.width - 1}, rows 0 to {camera.height - 1}"
         )
-    corner = camera.center_px.new_tensor([float(column), float(row)])
-    return replace(camera, center_px=camera.center_px - corner, width=1, height=1)
+    return camera.pixel(column, row)
 
 
 def _row(values: Tensor) -> Float64[np.ndarray, " n"]:

@@ -26,13 +26,16 @@ def unmix_scene(
 
     Args:
         model, averages: As `frozen_parameters` takes them.
-        record: Cameras and frame of its run.
+        record: Cameras and frame of its run; training cameras are shown as they were corrected.
     Raises:
         RunError: the record is damaged.
     """
     frozen = frozen_parameters(model, averages)
     materials, renderer = model.materials, model.renderer
     specular = frozen.get(id(materials.specular_spectra), materials.specular_spectra)
+    if model.poses is not None:
+        own = copy.deepcopy(model.poses, frozen)  # type: ignore[arg-type]
+        record = replace(record, train_cameras=own.refined(record.train_cameras))
     materials = replace(materials, endmembers=frozen[id(model.endmembers)], specular_spectra=specular)
     renderer = replace(renderer, occupied=renderer.occupied.clone(), reachable=renderer.reachable.clone())
     return TrainedScene(

@@ -152,7 +152,8 @@ def _excess_px(
     size = torch.tensor([camera.width, camera.height])
     inside = (depths > 0) & (coords >= 0).all(dim=-1) & (coords < size).all(dim=-1)
     columns, rows = coords[inside].long().unbind(-1)
-    own = (positions[inside] - camera.camera_to_world[0, :, 3]).norm(dim=-1)
+    places = camera.poses_at(torch.zeros_like(rows), coords[inside, 1])[:, :, 3]
+    own = (positions[inside] - places).norm(dim=-1)
     return inside, (distances[rows, columns] - own) * camera.focal_px[0].min() / depths[inside]
 
 

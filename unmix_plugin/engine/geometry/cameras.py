@@ -2,12 +2,16 @@
 
 Notation: `N` cameras, `R` rays, `P` points. Axes are OpenGL: +x right, +y up, a camera looks along -z. Pixel
 coordinates are x to the right and y down in pixels from the image's top left corner, so pixel centres lie at +0.5.
+
+A pose is a function of the camera and of y: constant for frame cameras, interpolated between key poses for line
+cameras. At each y a line camera sees the line that its x axis and its optical axis span; its focal length and principal
+point along y don't count.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -16,6 +20,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.camera_distortion import distort, undistort
+from unmix_plugin.engine.geometry.key_poses import KeyPoses
+from unmix_plugin.engine.geometry.line_projection import project_by_row
 from unmix_plugin.engine.geometry.rays import RayBundle
 
 _LONGEST_EDGE_PX = 1 << 16
@@ -23,10 +29,11 @@ _LONGEST_EDGE_PX = 1 << 16
 
 @dataclass(frozen=True)
 class Cameras:
-    """Pinhole cameras, optionally with OPENCV distortion."""
+    """Pinhole cameras, optionally with OPENCV distortion; line cameras among them where there are key poses."""
 
     camera_to_world: Float[Tensor, "N 3 4"]
-    """Rotation (orthonormal, determinant 1) and position in scene units, OpenGL axes."""
+    """Rotation (orthonormal, determinant 1) and position in scene units, OpenGL axes; of a line camera its pose in the
+    middle of the image, for whoever wants one pose a view."""
     focal_px: Float[Tensor, "N 2"]
     """Focal lengths along x and y in pixels, > 0."""
     center_px: Float[Tensor, "N 2"]
@@ -39,6 +46,8 @@ class Cameras:
     """Rows of every image, pixels; of the largest image where sizes differ."""
     sizes: tuple[tuple[int, int], ...] | None = None
     """Width and height of each image where they differ; None where all have one size."""
+    key_poses: KeyPoses | None = None
+    """Of all cameras, where one of them is a line camera."""
 
     def __len__(self) -> int:
         return self.camera_to_world.shape[0]
@@ -50,11 +59,14 @@ class Cameras:
         center_px: Float[Tensor, "N 2"],
         distortion: Float[Tensor, "N D"],
         sizes: Sequence[tuple[int, int]],
+        key_poses: KeyPoses | None = None,
     ) -> Cameras:
         """Cameras whose images have these widths and heights, at least one."""
         largest = max(sizes, key=lambda size: size[0] * size[1])
         own = None if len(set(sizes)) == 1 else tuple(sizes)
-        return Cameras(camera_to_world, focal_px, center_px, distortion, *largest, own)
+        if key_poses is not None and max(key_poses.counts) == 1:
+            key_poses = None
+        return Cameras(camera_to_world, focal_px, center_px, distortion, *largest, own, key_poses)
 
     def size(self, index: int) -> tuple[int, int]:
         """Width and height of one image in pixels."""
@@ -64,10 +76,11 @@ class Cameras:
         """Some of the cameras, in the order asked for; an int gives a `Cameras` of one."""
         rows = [index] if isinstance(index, int) else index
         parts = (self.camera_to_world[rows], self.focal_px[rows], self.center_px[rows], self.distortion[rows])
-        if self.sizes is None:
+        numbers = range(len(self))[rows] if isinstance(rows, slice) else rows
+        if len(numbers) == 0 or (self.sizes is None and self.key_poses is None):
             return Cameras(*parts, self.width, self.height)
-        chosen = self.sizes[rows] if isinstance(rows, slice) else [self.sizes[row] for row in rows]
-        return Cameras.of_sizes(*parts, chosen) if chosen else Cameras(*parts, self.width, self.height)
+        keys = None if self.key_poses is None else KeyPoses.join([self.key_poses.of(row) for row in numbers])
+        return Cameras.of_sizes(*parts, [self.size(row) for row in numbers], keys)
 
     def to(self, device: torch.device | str) -> Cameras:
         """The same cameras on another device."""
@@ -79,6 +92,7 @@ class Cameras:
             self.width,
             self.height,
             self.sizes,
+            None if self.key_poses is None else self.key_poses.to(device),
         )
 
     def resized(self, width: int, height: int) -> Cameras:
@@ -87,7 +101,41 @@ class Cameras:
         scale = self.focal_px.new_tensor([[height / rows] for _, rows in old]).reshape(-1, 1)
         middle = self.center_px.new_tensor(old).reshape(-1, 2) / 2
         center_px = (self.center_px - middle) * scale + self.center_px.new_tensor((width, height)) / 2
-        return Cameras(self.camera_to_world, self.focal_px * scale, center_px, self.distortion, width, height)
+        keys = self.key_poses
+        if keys is not None:
+            factors = scale[:, 0].repeat_interleave(torch.tensor(keys.counts, device=scale.device))
+            keys = keys.with_heights(keys.heights * factors)
+        return Cameras(
+            self.camera_to_world,
+            self.focal_px * scale,
+            center_px,
+            self.distortion,
+            width,
+            height,
+            key_poses=keys,
+        )
+
+    def pixel(self, column: int, row: int) -> Cameras:
+        """A view of one pixel of an image: what is rendered of it is that pixel."""
+        corner = self.center_px.new_tensor([float(column), float(row)])
+        keys = self.key_poses
+        return replace(
+            self,
+            center_px=self.center_px - corner,
+            width=1,
+            height=1,
+            key_poses=None if keys is None else keys.with_heights(keys.heights - row),
+        )
+
+    def poses_at(self, camera_indices: Int[Tensor, " R"], y: Float[Tensor, " R"]) -> Float[Tensor, "R 3 4"]:
+        """Camera to world at heights in the images, px."""
+        if self.key_poses is None:
+            return self.camera_to_world[camera_indices]
+        return self.key_poses.at(camera_indices, y)
+
+    def is_line_camera(self, index: int) -> bool:
+        """Whether each row of an image has a pose of its own."""
+        return self.key_poses is not None and self.key_poses.counts[index] > 1
 
     def one_size(self) -> Cameras:
         """The same cameras with images as large as the largest, where sizes differ."""
@@ -115,13 +163,18 @@ class Cameras:
             pixel_coords: x, y in pixels; the centre of column c, row r is (c + 0.5, r + 0.5).
         """
         coords = (pixel_coords - self.center_px[camera_indices]) / self.focal_px[camera_indices]
+        if self.key_poses is not None:
+            on_axis = torch.stack([coords[:, 0], torch.zeros_like(coords[:, 1])], dim=-1)
+            coords = torch.where(self.key_poses.is_line[camera_indices][:, None], on_axis, coords)
         if self.is_distorted:
             coords = undistort(coords, self.distortion[camera_indices])
         local = torch.stack([coords[:, 0], -coords[:, 1], -torch.ones_like(coords[:, 0])], dim=-1)
-        poses = self.camera_to_world[camera_indices]
+        poses = self.poses_at(camera_indices, pixel_coords[:, 1])
         directions = (poses[:, :, :3] * local[:, None, :]).sum(dim=-1)
         directions = directions / directions.norm(dim=-1, keepdim=True)
-        return RayBundle(poses[:, :, 3].contiguous(), directions, camera_indices)
+        return RayBundle(
+            poses[:, :, 3].contiguous(), directions, camera_indices, -poses[:, :, 2], pixel_coords[:, 1]
+        )
 
     def image_rays(self, index: int, subpixel_offset: tuple[float, float] = (0.5, 0.5)) -> RayBundle:
         """One ray a pixel of a whole image, H * W of them, row after row.
@@ -148,8 +201,10 @@ class Cameras:
 
         Returns:
             Pixel coordinates x, y (meaningless where the depth is not positive) and depths along the optical axis in
-            scene units, positive in front of the camera.
+            scene units, positive in front of the camera. What no row of a line camera sees has depth -1.
         """
+        if self.is_line_camera(index):
+            return self._project_to_rows(points, index)
         pose = self.camera_to_world[index]
         local = (points - pose[:, 3]) @ pose[:, :3]
         depths = -local[:, 2]
@@ -159,6 +214,19 @@ class Cameras:
         if self.is_distorted:
             coords = distort(coords, self.distortion[index])
         return coords * self.focal_px[index] + self.center_px[index], depths
+
+    def _project_to_rows(
+        self, points: Float[Tensor, "P 3"], index: int
+    ) -> tuple[Float[Tensor, "P 2"], Float[Tensor, " P"]]:
+        assert self.key_poses is not None
+        y, local = project_by_row(points, self.key_poses.of(index), self.size(index)[1])
+        depths = -local[:, 2]
+        across = local[:, 0] / depths.clamp(min=1e-12)
+        coords = torch.stack([across, torch.zeros_like(across)], dim=-1)
+        if self.is_distorted:
+            coords = distort(coords, self.distortion[index])
+        x = coords[:, 0] * self.focal_px[index, 0] + self.center_px[index, 0]
+        return torch.stack([x, y], dim=-1), torch.where(depths > 0, depths, -1.0)
 
     def to_json(self) -> dict[str, Any]:
         """The cameras as numbers and lists; `from_json` gives back the same bits."""
@@ -170,6 +238,7 @@ class Cameras:
             "focal_px": self.focal_px.tolist(),
             "center_px": self.center_px.tolist(),
             "distortion": self.distortion.tolist(),
+            **({} if self.key_poses is None else {"key_poses": self.key_poses.to_json()}),
         }
 
     @staticmethod
@@ -198,6 +267,7 @@ class Cameras:
             width,
             height,
             tuple(sizes) or None,
+            KeyPoses.from_json(values["key_poses"], count) if "key_poses" in values else None,
         )
         if cameras.distortion.shape[1] not in (4, 6):
             raise ValueError(f"{cameras.distortion.shape[1]} coefficients of distortion; expected 4 or 6")

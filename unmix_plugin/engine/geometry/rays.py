@@ -5,6 +5,7 @@ Notation: `R` counts rays. A point on a ray is `origin + t * direction`, t in sc
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -22,14 +23,27 @@ class RayBundle:
     """Unit vectors."""
     camera_indices: Int[Tensor, " R"]
     """Index of the camera that sent each ray, int64."""
+    axes: Float[Tensor, "R 3"] | None = None
+    """Where the camera of each ray looked when it was taken, unit vectors; None where no camera is known."""
+    image_y: Float[Tensor, " R"] | None = None
+    """Height in the image that each ray passes, pixels; None where no image is known."""
 
     def __len__(self) -> int:
         return self.origins.shape[0]
 
     def __getitem__(self, index: slice | Tensor) -> RayBundle:
         """The rays at a slice, an index tensor (R',) or a boolean mask (R,)."""
-        return RayBundle(self.origins[index], self.directions[index], self.camera_indices[index])
+        return self._map(lambda values: values[index])
 
     def to(self, device: torch.device | str) -> RayBundle:
         """The same rays on another device."""
-        return RayBundle(self.origins.to(device), self.directions.to(device), self.camera_indices.to(device))
+        return self._map(lambda values: values.to(device))
+
+    def _map(self, change: Callable[[Tensor], Tensor]) -> RayBundle:
+        return RayBundle(
+            change(self.origins),
+            change(self.directions),
+            change(self.camera_indices),
+            None if self.axes is None else change(self.axes),
+            None if self.image_y is None else change(self.image_y),
+        )

@@ -15,10 +15,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int64
+from jaxtyping import Bool, Float, Float32, Int32, Int64
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.camera_distortion import distort, undistort
@@ -26,6 +27,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.scenes.geometry.foreground_rays import MIN_EXPLAINED, foreground_rays, share_through
+from unmix_plugin.scenes.geometry.line_footprints import LineView
 from unmix_plugin.scenes.geometry.world_carving import carve_world
 from unmix_plugin.scenes.scene import Scene
 
@@ -130,7 +132,7 @@ def carve_box(
     """
     if resolution < 1:
         raise ValueError(f"resolution must be at least 1; got {resolution}")
-    views = [_View(cameras, i, None if foreground is None else foreground[i]) for i in range(len(cameras))]
+    views = [_view(cameras, i, None if foreground is None else foreground[i]) for i in range(len(cameras))]
     near = NEAR_DEPTH * 0.5 * float(box.size.max())
     sizes = [resolution]
     while sizes[-1] % 2 == 0 and sizes[-1] > COARSEST_CELLS:
@@ -151,7 +153,7 @@ def carve_box(
 def _may_be_occupied(
     flat_cells: Int64[np.ndarray, " M"],
     cells: int,
-    views: list[_View],
+    views: list[_View | LineView],
     box: SceneBox,
     near: float,
     fewest_views: int,
@@ -167,14 +169,36 @@ def _may_be_occupied(
     for view in views:
         # With alpha every cell left is looked at by every view; without, only those too few have seen yet.
         looked_at = alive if view.covered is not None else alive[seen_by[alive] < fewest_views]
-        footprint = view.footprint(centres.take(looked_at, axis=1), half)
-        seen_by[looked_at] += view.sees(footprint, near)
-        if view.covered is not None:
-            looked_through[alive] += view.looks_through(footprint)
+        sees, looks_through = _judge(view, centres.take(looked_at, axis=1), half, near)
+        seen_by[looked_at] += sees
+        if looks_through is not None:
+            looked_through[alive] += looks_through
             alive = alive[looked_through[alive] < witnesses]
     result = np.zeros(len(flat_cells), dtype=bool)
     result[alive] = seen_by[alive] >= fewest_views
     return result
+
+
+def _view(cameras: Cameras, index: int, foreground: Bool[np.ndarray, "H W"] | None) -> _View | LineView:
+    covered = None
+    if foreground is not None:
+        height, width = foreground.shape
+        sums = np.zeros((height + 1, width + 1), dtype=np.int32)
+        np.cumsum(np.cumsum(foreground, axis=0, dtype=np.int32), axis=1, out=sums[1:, 1:])
+        covered = sums.reshape(-1)
+    kind = LineView if cameras.is_line_camera(index) else _View
+    return kind(cameras, index, covered)
+
+
+def _judge(
+    view: _View | LineView,
+    centres: Float32[np.ndarray, "3 M"],
+    half: Float32[np.ndarray, "3"],
+    near: float,
+) -> tuple[Bool[np.ndarray, " M"], Bool[np.ndarray, " M"] | None]:
+    """Which cells a view sees, and which it looks through, where that is known."""
+    footprint: Any = view.footprint(centres, half)
+    return view.sees(footprint, near), None if view.covered is None else view.looks_through(footprint)
 
 
 @dataclass(frozen=True)
@@ -190,7 +214,7 @@ class _Footprint:
 class _View:
     """One camera with the running sum of its foreground pixels, so that any rectangle is counted with four look-ups."""
 
-    def __init__(self, cameras: Cameras, index: int, foreground: Bool[np.ndarray, "H W"] | None) -> None:
+    def __init__(self, cameras: Cameras, index: int, covered: Int32[np.ndarray, " pixels"] | None) -> None:
         pose = cameras.camera_to_world[index].numpy()
         # OpenCV axes here (x right, y down, z forward), so that image and depth have the signs of pixels
         self._axes = (pose[:, :3] * np.array([1.0, -1.0, -1.0], dtype=np.float32)).T
@@ -200,11 +224,7 @@ class _View:
         self._distortion = cameras.distortion[index] if cameras.is_distorted else None
         self._columns, self._rows = cameras.size(index)
         self._low, self._high = self._ideal_bounds()
-        self.covered = None
-        if foreground is not None:
-            sums = np.zeros((self._rows + 1, self._columns + 1), dtype=np.int32)
-            np.cumsum(np.cumsum(foreground, axis=0, dtype=np.int32), axis=1, out=sums[1:, 1:])
-            self.covered = sums.reshape(-1)
+        self.covered = covered
 
     def footprint(self, centres: Float32[np.ndarray, "3 M"], half: Float32[np.ndarray, "3"]) -> _Footprint:
         local = self._axes @ (centres - self._position[:, None])

@@ -57,6 +57,8 @@ def check_scene_poses(scene: Scene) -> str | None:
     """A warning if the training views agree much better under another convention than the one expected."""
     sensors = [scene.frames[index].sensor for index in scene.train_indices]
     train = [scene.train_indices[row] for row in commonest(sensors)]
+    # Of a line camera no single pose tells what it saw.
+    train = [view for view in train if not scene.cameras.is_line_camera(view)]
     poses = scene.cameras.camera_to_world[train].double().numpy()
     placement = scene.placement  # conventions are those of the matrices in transforms.json
     rotations = placement.rotation @ scene.normalisation.rotation.T @ poses[:, :, :3]
@@ -77,10 +79,10 @@ def compare_conventions(poses: Poses, lenses: Cameras, read_view: ReadView) -> d
 
     Args:
         poses: As the scene gives them.
-        lenses: Cameras of these views; only their lenses count.
+        lenses: Cameras of these views; only their lenses count. Of line cameras nothing is said.
         read_view: Reads a part of a view.
     """
-    if len(poses) < NUM_AGREEING + 1:
+    if len(poses) < NUM_AGREEING + 1 or lenses.key_poses is not None:
         return {}
     neighbours = choose_neighbours(poses)
     generator = torch.Generator().manual_seed(0)

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Float32, Float64
 
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.geometry.bounds import find_bounds
@@ -54,6 +55,8 @@ def load_scene(root: Path, options: SceneOptions | None = None) -> Scene:
     truth = _read_truth(root, entry, options, faults)
     names = truth.material_names
     checked = check_files(entry, located, None if names is None else len(names), options, faults)
+    if checked is not None:
+        _check_line_poses(entry, checked.sizes, faults)
     split = split_frames(entry, options.eval_split, options.eval_interval, faults)
     if checked is not None and split.train and entry.wavelengths_nm is not None:
         used = {checked.sensor_indices[index] for index in split.train}
@@ -67,6 +70,13 @@ def load_scene(root: Path, options: SceneOptions | None = None) -> Scene:
     faults.raise_if_any()
     assert checked is not None
     return _assemble(root, entry, located, checked, truth, split, options)
+
+
+def _check_line_poses(entry: SceneEntry, sizes: list[Size], faults: Faults) -> None:
+    for frame, (height, _) in zip(entry.frames, sizes, strict=True):
+        fault = None if frame.line_poses is None else frame.line_poses.fault(height)
+        if fault is not None:
+            faults.add(frame.where, fault)
 
 
 @dataclass(frozen=True)
@@ -204,9 +214,6 @@ def make_cameras(entry: SceneEntry, sizes: list[Size], normalisation: Normalisat
     """
     lenses = [frame.intrinsics for frame in entry.frames if frame.intrinsics is not None]
     assert len(lenses) == len(entry.frames)
-    poses = _world_poses(entry)
-    rotations = normalisation.rotation @ poses[:, :, :3]
-    positions = normalisation.to_model(poses[:, :, 3])
     centers = [
         [
             0.5 * side if value is None else value
@@ -216,12 +223,34 @@ def make_cameras(entry: SceneEntry, sizes: list[Size], normalisation: Normalisat
     ]
     focal_px = [lens.focal_at(width) for lens, (_, width) in zip(lenses, sizes, strict=True)]
     return Cameras.of_sizes(
-        camera_to_world=torch.from_numpy(np.concatenate([rotations, positions[:, :, None]], axis=-1)).float(),
+        camera_to_world=_model_poses(_world_poses(entry), normalisation),
         focal_px=torch.tensor(focal_px, dtype=torch.float32),
         center_px=torch.tensor(centers, dtype=torch.float32),
         distortion=_distortion(lenses),
         sizes=[(width, height) for height, width in sizes],
+        key_poses=_key_poses(entry, normalisation),
     )
+
+
+def _model_poses(
+    poses: Float64[np.ndarray, "n 3 4"], normalisation: Normalisation
+) -> Float[torch.Tensor, "n 3 4"]:
+    rotations = normalisation.rotation @ poses[:, :, :3]
+    positions = normalisation.to_model(poses[:, :, 3])
+    return torch.from_numpy(np.concatenate([rotations, positions[:, :, None]], axis=-1)).float()
+
+
+def _key_poses(entry: SceneEntry, normalisation: Normalisation) -> KeyPoses | None:
+    """Poses by height in the image, where a frame is of a line camera; row r is taken at r + 0.5."""
+    if all(frame.line_poses is None for frame in entry.frames):
+        return None
+    parts = []
+    for frame, pose in zip(entry.frames, _world_poses(entry), strict=True):
+        lines = frame.line_poses
+        rows, poses = (np.zeros(1), pose[None]) if lines is None else (lines.rows, lines.poses)
+        heights = torch.from_numpy(rows + 0.5).float()
+        parts.append(KeyPoses(_model_poses(poses, normalisation), heights, (len(rows),)))
+    return KeyPoses.join(parts)
 
 
 def _distortion(lenses: list[Intrinsics]) -> Float[torch.Tensor, "N D"]:

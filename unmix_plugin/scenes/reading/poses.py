@@ -18,36 +18,38 @@ MAX_DISTANCE = 1e9
 """Camera positions beyond this are damage; squares of larger ones would leave float32."""
 
 
-def read_pose(matrix: Any, where: str, faults: Faults) -> Float64[np.ndarray, "3 4"] | None:
-    """Check a `transform_matrix` (4x4 or 3x4, OpenGL camera to world); None and a noted fault if it is no pose."""
+def read_pose(
+    matrix: Any, where: str, faults: Faults, name: str = "'transform_matrix'"
+) -> Float64[np.ndarray, "3 4"] | None:
+    """Check a `transform_matrix` (4x4 or 3x4, OpenGL camera to world); None and a noted fault if it is no pose.
+
+    Args:
+        name: What messages call it.
+    """
     rows = _read_rows(matrix)
     if rows is None:
         found = "is absent" if matrix is None else f"is {describe(matrix)}"
-        faults.add(
-            where, f"'transform_matrix' {found}; expected 4 (or 3) rows of 4 finite numbers, camera to world"
-        )
+        faults.add(where, f"{name} {found}; expected 4 (or 3) rows of 4 finite numbers, camera to world")
         return None
     if len(rows) == 4 and np.abs(rows[3] - np.array([0.0, 0.0, 0.0, 1.0])).max() > 1e-6:
         last = ", ".join(f"{value:g}" for value in rows[3])
-        faults.add(where, f"'transform_matrix' is not rigid: its last row is ({last}); expected (0, 0, 0, 1)")
+        faults.add(where, f"{name} is not rigid: its last row is ({last}); expected (0, 0, 0, 1)")
         return None
     rotation, position = rows[:3, :3], rows[:3, 3]
     with np.errstate(over="ignore", invalid="ignore"):
         deviation = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if not deviation <= RIGID_TOLERANCE:
         lengths = ", ".join(f"{math.hypot(*axis):.4g}" for axis in rotation.T)  # hypot does not overflow
-        message = f"'transform_matrix' is not rigid: its axes have lengths ({lengths}) and R^T R is off the identity"
+        message = f"{name} is not rigid: its axes have lengths ({lengths}) and R^T R is off the identity"
         faults.add(where, f"{message} by {deviation:.3g}; expected a rotation without scale or shear")
         return None
     if np.linalg.det(rotation) < 0.0:
-        faults.add(
-            where, "'transform_matrix' is a reflection (determinant -1); expected a rotation, flip one axis"
-        )
+        faults.add(where, f"{name} is a reflection (determinant -1); expected a rotation, flip one axis")
         return None
     if np.abs(position).max() > MAX_DISTANCE:
         faults.add(
             where,
-            f"'transform_matrix' puts the camera at {position.tolist()}; expected less than 1e9 units away",
+            f"{name} puts the camera at {position.tolist()}; expected less than 1e9 units away",
         )
         return None
     u, _, vt = np.linalg.svd(rotation)

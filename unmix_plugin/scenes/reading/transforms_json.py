@@ -17,6 +17,7 @@ from unmix_plugin.scenes.placement import Placement, read_placement
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.intrinsics import Intrinsics, read_intrinsics
 from unmix_plugin.scenes.reading.json_values import UnreadableJsonError, describe, read_json_file, read_number
+from unmix_plugin.scenes.reading.line_poses import LinePoses, read_line_poses
 from unmix_plugin.scenes.reading.poses import read_pose
 from unmix_plugin.scenes.reading.sensors import SensorEntry, read_sensor_entry
 from unmix_plugin.spectral.bands import require_nanometres
@@ -42,11 +43,13 @@ class FrameEntry:
     paths: dict[str, str]
     """The values of `FILE_KEYS` that are there."""
     pose: Float64[np.ndarray, "3 4"] | None
-    """Camera to world, rotation orthonormal."""
+    """Camera to world, rotation orthonormal; of a line camera in the middle of its image."""
     intrinsics: Intrinsics | None
     """Lens of this frame."""
     sensor: SensorEntry = SensorEntry()
     """What it was taken with."""
+    line_poses: LinePoses | None = None
+    """Poses by row, where it was taken by a line camera."""
 
     def name_of(self, key: str) -> str:
         """One of its files, for messages."""
@@ -138,12 +141,17 @@ def _read_frame(
         faults.add(where, "has no 'hyperspectral_file_path'; expected the path of its (H, W, B) .npy cube")
     if frame.get("hyperspectral_file_path") is None and frame.get("file_path") is None and not needs_cube:
         faults.add(where, "has no 'file_path'; expected the path of its picture")
+    noted = faults.noted
+    lines = read_line_poses(frame, where, faults)
+    is_frame_camera = lines is None and faults.noted == noted
+    pose = read_pose(frame.get("transform_matrix"), where, faults) if is_frame_camera else None
     return FrameEntry(
         where=where,
         paths={key: path for key, path in paths.items() if path is not None},
-        pose=read_pose(frame.get("transform_matrix"), where, faults),
+        pose=pose if lines is None else lines.middle,
         intrinsics=read_intrinsics(content, frame, where, faults),
         sensor=read_sensor_entry(frame, where, faults),
+        line_poses=lines,
     )
 
 

@@ -136,7 +136,8 @@ class MeasuredViews:
         inside = (depths > 0) & (columns >= 0) & (rows >= 0)
         inside &= (columns < camera.width) & (rows < camera.height)
         rows, columns = rows.clamp(0, camera.height - 1), columns.clamp(0, camera.width - 1)
-        distance = (points.cpu() - camera.camera_to_world[0, :, 3]).norm(dim=-1)
+        places = camera.poses_at(torch.zeros_like(rows), coords[:, 1].nan_to_num(0.0))[:, :, 3]
+        distance = (points.cpu() - places).norm(dim=-1)
         rendered = self._distance_of(index, lent)[rows, columns]
         return rows, columns, inside & ((distance - rendered).abs() < _TOLERANCE * distance)
 

@@ -1,0 +1,226 @@
+"""Demo scenes whose poses are off, or that are swept by line cameras, and how far refined poses are from the truth."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.key_poses import KeyPoses
+from unmix_plugin.engine.geometry.rotations import rotation_matrix
+from unmix_plugin.scenes.demo.materials import band_centers_nm, lamp_power, reflectances
+from unmix_plugin.scenes.demo.scene import make_demo_scene
+from unmix_plugin.scenes.demo.shading import render_view
+from unmix_plugin.scenes.demo.views import demo_cameras, radiance_cube
+
+_TRANSFORMS = "transforms.json"
+_NUM_POINTS = 300
+_POINTS_BOX = ((-0.7, -0.7, 0.0), (0.7, 0.7, 0.6))
+"""Where the demo scene's things are."""
+SWEEP_LENGTH = 2.4
+"""How far a line camera moves during a sweep, world units."""
+WOBBLES = (1.0, 2.0, 3.0)
+"""Waves of a line camera's wobble over a sweep."""
+
+
+@dataclass(frozen=True)
+class PosedScene:
+    """A scene folder, and the poses that it was rendered with."""
+
+    folder: Path
+    truth: Cameras
+    """Of all frames, world space."""
+    error_px: float
+    """Of the poses that the folder says, mean."""
+
+
+def scene_points(seed: int) -> Float[Tensor, "P 3"]:
+    """Points by which poses are compared."""
+    low, high = torch.tensor(_POINTS_BOX)
+    generator = torch.Generator().manual_seed(seed)
+    return low + torch.rand(_NUM_POINTS, 3, generator=generator) * (high - low)
+
+
+def frames_off(folder: Path, size: int, bands: int, views: int, error_px: float, seed: int) -> PosedScene:
+    """A demo scene whose frame cameras, all of them, are off by so many pixels in the mean; 0 leaves them."""
+    make_demo_scene(folder, size, bands, views)
+    truth = demo_cameras(size, views)
+    steps = np.random.default_rng(seed).normal(size=(views, 6))
+
+    def moved(scale: float) -> Cameras:
+        return replace(
+            truth, camera_to_world=stepped(truth.camera_to_world, torch.tensor(scale * steps).float())
+        )
+
+    scale = _scale_for(error_px, lambda x: pose_error(truth, moved(x)))
+    _write_poses(folder, moved(scale))
+    return PosedScene(folder, truth, pose_error(truth, moved(scale)))
+
+
+def sweeps(folder: Path, size: int, bands: int, num_sweeps: int, error_px: float, seed: int) -> PosedScene:
+    """The scene swept by line cameras with a smooth wobble that its poses don't know; evaluation views are frames."""
+    views = _views_for(num_sweeps)
+    make_demo_scene(folder, size, bands, views)
+    frames, truth = demo_cameras(size, views), line_cameras(size, views)
+    content = json.loads((folder / _TRANSFORMS).read_text())
+    is_train = [frame["file_path"].startswith("images/train") for frame in content["frames"]]
+    waves = _waves(size, views, seed)
+
+    def wobbling(scale: float) -> Cameras:
+        assert truth.key_poses is not None
+        poses = stepped(truth.key_poses.poses, scale * waves.flatten(0, 1))
+        return replace(truth, key_poses=replace(truth.key_poses, poses=poses))
+
+    chosen = [index for index, train in enumerate(is_train) if train]
+    scale = _scale_for(error_px, lambda x: pose_error(truth[chosen], wobbling(x)[chosen]))
+    _render_sweeps(folder, content["frames"], truth, chosen, bands)
+    _write_poses(folder, frames, {index: wobbling(scale) for index in chosen})
+    return PosedScene(folder, truth[chosen], pose_error(truth[chosen], wobbling(scale)[chosen]))
+
+
+def line_cameras(size: int, views: int) -> Cameras:
+    """The demo's cameras, each moving down its own y axis while it takes one row after the other."""
+    still = demo_cameras(size, views)
+    shares = 0.5 - (torch.arange(size) + 0.5) / size
+    poses = still.camera_to_world[:, None].repeat(1, size, 1, 1)
+    poses[..., 3] += SWEEP_LENGTH * shares[None, :, None] * still.camera_to_world[:, None, :, 1]
+    heights = (torch.arange(size) + 0.5).repeat(views)
+    return replace(still, key_poses=KeyPoses(poses.flatten(0, 1), heights, (size,) * views))
+
+
+def stepped(poses: Float[Tensor, "N 3 4"], steps: Float[Tensor, "N 6"]) -> Float[Tensor, "N 3 4"]:
+    """Poses turned about their cameras and moved, world axes."""
+    turned = rotation_matrix(steps[:, :3]) @ poses[:, :, :3]
+    return torch.cat([turned, (poses[:, :, 3] + steps[:, 3:])[:, :, None]], dim=-1)
+
+
+def pose_error(truth: Cameras, found: Cameras) -> float:
+    """By how many pixels cameras see the scene's points beside where they should, mean, after a similarity."""
+    mine, theirs = _anchors(truth), _anchors(found)
+    aligned = similarity(theirs, mine)
+    points = scene_points(0)
+    errors = []
+    for index in range(len(truth)):
+        coords, depths = truth.project(points, index)
+        size = torch.tensor(truth.size(index))
+        seen = (depths > 0) & (coords > 0).all(dim=1) & (coords < size).all(dim=1)
+        views = torch.full((int(seen.sum()),), index)
+        poses = aligned(found.poses_at(views, coords[seen, 1]))
+        right = truth.poses_at(views, coords[seen, 1])
+        # Where the same row sees the same point: across the line and along it, by the angle.
+        offsets = [_image_point(own, points[seen]) for own in (right, poses)]
+        focal = truth.focal_px[index] / found.focal_px[index]
+        errors.append(((offsets[1] / focal - offsets[0]) * truth.focal_px[index]).norm(dim=1))
+    return float(torch.cat(errors).mean())
+
+
+def similarity(source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> Any:
+    """The similarity that brings points nearest to others, as a change of poses.
+
+    Source: Umeyama 1991, Least-squares estimation of transformation parameters between two point patterns.
+    """
+    a, b = source.double(), target.double()
+    middle_a, middle_b = a.mean(dim=0), b.mean(dim=0)
+    u, s, vt = torch.linalg.svd((b - middle_b).T @ (a - middle_a))
+    sign = torch.tensor([1.0, 1.0, float(torch.sign(torch.linalg.det(u @ vt)))], dtype=torch.float64)
+    rotation = u @ torch.diag(sign) @ vt
+    scale = (s * sign).sum() / (a - middle_a).square().sum()
+
+    def change(poses: Float[Tensor, "N 3 4"]) -> Float[Tensor, "N 3 4"]:
+        position = scale * (poses[:, :, 3].double() - middle_a) @ rotation.T + middle_b
+        return torch.cat([rotation @ poses[:, :, :3].double(), position[:, :, None]], dim=-1).float()
+
+    return change
+
+
+def _anchors(cameras: Cameras) -> Float[Tensor, "n 3"]:
+    """Points that are fixed to the cameras, at the scene's distance: they hold positions and directions alike."""
+    found = []
+    for index in range(len(cameras)):
+        y = torch.linspace(0.5, cameras.size(index)[1] - 0.5, 24 if cameras.is_line_camera(index) else 1)
+        poses = cameras.poses_at(torch.full((len(y),), index), y)
+        axes = (
+            -4.0 * poses[:, :, 2],
+            1.0 * poses[:, :, 0] - 4.0 * poses[:, :, 2],
+            1.0 * poses[:, :, 1] - 4.0 * poses[:, :, 2],
+        )
+        found += [poses[:, :, 3], *(poses[:, :, 3] + axis for axis in axes)]
+    return torch.cat(found)
+
+
+def _image_point(poses: Float[Tensor, "P 3 4"], points: Float[Tensor, "P 3"]) -> Float[Tensor, "P 2"]:
+    local = torch.einsum("pi,pij->pj", points - poses[:, :, 3], poses[:, :, :3])
+    return local[:, :2] / -local[:, 2:]
+
+
+def _scale_for(error_px: float, error: Any) -> float:
+    """The scale at which an error that grows with it has a value, by bisection."""
+    if error_px == 0:
+        return 0.0
+    low, high = 0.0, 0.3
+    for _ in range(14):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if error(middle) < error_px else (low, middle)
+    return 0.5 * (low + high)
+
+
+def _views_for(num_sweeps: int) -> int:
+    """Views of a demo scene that has so many to train on: every 4th is for evaluation."""
+    return next(n for n in range(num_sweeps, 2 * num_sweeps + 4) if n - (n + 1) // 4 == num_sweeps)
+
+
+def _waves(size: int, views: int, seed: int) -> Float[Tensor, "V H 6"]:
+    """Random sums of slow waves over the rows."""
+    generator = torch.Generator().manual_seed(seed)
+    y = (torch.arange(size) + 0.5) / size
+    total = torch.zeros(views, size, 6)
+    for count in WOBBLES:
+        phases = 2 * torch.pi * torch.rand(views, 1, 6, generator=generator)
+        sizes = torch.randn(views, 1, 6, generator=generator) / count
+        total += sizes * torch.sin(2 * torch.pi * count * y[None, :, None] + phases)
+    return total
+
+
+def _render_sweeps(
+    folder: Path, frames: Sequence[dict[str, Any]], cameras: Cameras, chosen: Sequence[int], bands: int
+) -> None:
+    """Cubes and pictures with alpha of the line cameras, in place of the frames'."""
+    from PIL import Image
+
+    wavelengths = band_centers_nm(bands)
+    spectra, lamp = reflectances(wavelengths), lamp_power(wavelengths)
+    for index in chosen:
+        view = render_view(cameras, index)
+        np.save(
+            folder / frames[index]["hyperspectral_file_path"],
+            radiance_cube(view, spectra, lamp).astype(np.float16),
+        )
+        rgba = np.repeat(view.alpha[..., None], 4, axis=-1)
+        Image.fromarray((rgba * 255).round().astype(np.uint8)).save(folder / frames[index]["file_path"])
+
+
+def _write_poses(folder: Path, frames: Cameras, lines: dict[int, Cameras] | None = None) -> None:
+    content = json.loads((folder / _TRANSFORMS).read_text())
+    for index, frame in enumerate(content["frames"]):
+        frame["transform_matrix"] = _matrix(frames.camera_to_world[index])
+        if lines and index in lines:
+            keys = lines[index].key_poses
+            assert keys is not None
+            for gone in ("transform_matrix", "seg_file_path"):
+                frame.pop(gone, None)
+            frame["row_poses"] = [_matrix(pose) for pose in keys.of(index).poses]
+    (folder / _TRANSFORMS).write_text(json.dumps(content) + "\n")
+
+
+def _matrix(pose: Float[Tensor, "3 4"]) -> list[list[float]]:
+    u, _, vt = np.linalg.svd(pose[:, :3].double().numpy())
+    rigid = np.column_stack([u @ vt, pose[:, 3].double().numpy()])
+    return [*rigid.tolist(), [0.0, 0.0, 0.0, 1.0]]

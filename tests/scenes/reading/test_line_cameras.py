@@ -1,0 +1,121 @@
+"""Scenes of line cameras: what is read, what is refused, and that nothing behind them needs to know."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from tests.scenes.line_factory import make_line_scene, row_poses
+from tests.scenes.scene_factory import HEIGHT, fault_of, ring_poses, set_frame
+from unmix_plugin.scenes import load_scene
+from unmix_plugin.scenes.geometry.carving import carve
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return make_line_scene(tmp_path / "lines")
+
+
+def test_a_pose_a_row_and_key_poses_of_the_same_path_are_one_camera(folder):
+    expected = load_scene(folder.root)
+    for index in range(6):
+        matrices = [matrix.tolist() for matrix in row_poses(ring_poses(6)[index])]
+        ends = [{"row": row, "transform_matrix": matrices[row]} for row in (0, HEIGHT - 1)]
+        given = (
+            {"key_poses": None, "row_poses": matrices}
+            if index % 2
+            else {"row_poses": None, "key_poses": ends}
+        )
+        folder.edit(set_frame(index, **given))
+    found = load_scene(folder.root)
+    for index in range(6):
+        mine, theirs = expected.cameras.image_rays(index), found.cameras.image_rays(index)
+        assert_close(mine.origins, theirs.origins, atol=1e-5, rtol=0)
+        assert_close(mine.directions, theirs.directions, atol=1e-5, rtol=0)
+
+
+def test_rays_start_where_the_row_was_taken(folder):
+    scene = load_scene(folder.root)
+    poses = np.stack([matrix[:3, 3] for matrix in row_poses(ring_poses(6)[2])])
+    rays = scene.cameras.image_rays(2)
+    assert_close(
+        rays.origins[:: scene.cameras.width].double().numpy(),
+        scene.normalisation.to_model(poses),
+        atol=1e-5,
+        rtol=0,
+    )
+    middle = scene.normalisation.to_model(ring_poses(6)[2][:3, 3])
+    assert_close(scene.cameras.camera_to_world[2, :, 3].double().numpy(), middle, atol=1e-5, rtol=0)
+
+
+def test_the_box_and_the_hull_hold_what_the_sweeps_show(folder):
+    scene = load_scene(folder.root)
+    corners = scene.normalisation.to_world(scene.scene_box.aabb.double().numpy())
+    assert (corners[0] < -0.55).all()
+    assert (corners[1] > 0.55).all()
+    assert (np.abs(corners) < 2.0).all()
+    hull = carve(scene, 32)
+    steps = (np.arange(32) + 0.5) / 32
+    grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1)
+    distance = np.linalg.norm(corners[0] + grid * (corners[1] - corners[0]), axis=-1)
+    assert hull[distance < 0.5].all()
+    assert hull[distance > 0.9].mean() < 0.05
+
+
+def test_a_scene_may_mix_frame_cameras_and_line_cameras(folder):
+    lines = load_scene(folder.root)
+    pose = ring_poses(6)[4]
+    folder.edit(set_frame(4, row_poses=None, transform_matrix=pose.tolist()))
+    scene = load_scene(folder.root)
+    assert [scene.cameras.is_line_camera(index) for index in (3, 4, 5)] == [True, False, True]
+    assert torch.equal(
+        scene.cameras.image_rays(4).origins.unique(dim=0), scene.cameras.camera_to_world[[4], :, 3]
+    )
+    assert lines.cameras.is_line_camera(4)
+
+
+def turned(entries, row):
+    """The poses with one turned by half a circle."""
+    changed = copy.deepcopy(entries)
+    matrix = np.array(changed[row]["transform_matrix"])
+    matrix[:3, :3] = matrix[:3, :3] @ np.diag([-1.0, 1.0, -1.0])
+    changed[row]["transform_matrix"] = matrix.tolist()
+    return changed
+
+
+def test_poses_that_do_not_fit_the_rows_are_one_error(folder):
+    content = folder.content
+    few = content["frames"][2]["row_poses"][:-3]
+    keys = content["frames"][3]["key_poses"]
+    early = [keys[0], {**keys[1], "row": HEIGHT - 5}]
+    folder.edit(set_frame(2, row_poses=few)).edit(set_frame(3, key_poses=early))
+    message = fault_of(folder)
+    assert f"frames[2]: 'row_poses' has {HEIGHT - 3} poses, but the cube has {HEIGHT} rows" in message
+    assert f"frames[3]: 'key_poses' reach from row 0 to row {HEIGHT - 5}" in message
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda keys: {"key_poses": keys[::-1]}, "must increase; got 15 then 0"),
+        (lambda keys: {"key_poses": keys[:1]}, "at least two poses"),
+        (lambda _: {"key_poses": "a"}, "at least two poses"),
+        (lambda keys: {"key_poses": [keys[0], 7]}, "expected an object with 'row'"),
+        (lambda keys: {"key_poses": [keys[0], {**keys[1], "row": "x"}]}, "expected an object with 'row'"),
+        (lambda keys: {"key_poses": [keys[0], {"row": 15}]}, "'transform_matrix' is absent"),
+        (lambda keys: {"key_poses": turned(keys, 1)}, "turns by 180 degrees from row 0 to row 15"),
+        (lambda keys: {"row_poses": [k["transform_matrix"] for k in keys]}, "'row_poses' and 'key_poses'"),
+        (
+            lambda keys: {"transform_matrix": keys[0]["transform_matrix"]},
+            "'key_poses' and 'transform_matrix'",
+        ),
+        (lambda _: {"key_poses": None, "row_poses": [1, 2]}, "the pose is"),
+    ],
+)
+def test_poses_that_mean_nothing_are_refused(folder, change, expected):
+    folder.edit(set_frame(3, **change(folder.content["frames"][3]["key_poses"])))
+    message = fault_of(folder)
+    assert expected in message
+    assert "frames[3]" in message

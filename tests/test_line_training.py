@@ -1,0 +1,56 @@
+"""Training on line cameras: rays by row, a whole view rendered in all bands, and the run folder that gives it back."""
+
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+from torch.testing import assert_close
+
+from tests.method_factory import CONFIG
+from tests.scenes.line_factory import make_line_scene
+from unmix_plugin.datamanager import HyperspectralDataManagerConfig
+from unmix_plugin.engine.pipeline import PipelineConfig
+from unmix_plugin.engine.training.trainer import Trainer
+from unmix_plugin.method_config import unmix_nerf
+from unmix_plugin.trained.open_run import open_run
+
+
+@pytest.fixture(scope="module")
+def trainer(tmp_path_factory) -> Trainer:
+    folder: Path = tmp_path_factory.mktemp("lines")
+    data = HyperspectralDataManagerConfig(train_num_rays_per_batch=64, grid_resolution=16)
+    config = replace(
+        unmix_nerf.config,
+        data=make_line_scene(folder / "scene").root,
+        output_dir=folder / "runs",
+        max_num_iterations=12,
+        device="cpu",
+        pipeline=PipelineConfig(datamanager=data, model=replace(CONFIG, num_endmembers=1)),
+    )
+    trainer = Trainer(config, console=Console(file=io.StringIO()))
+    trainer.train()
+    return trainer
+
+
+def test_training_rays_start_where_their_row_was_taken(trainer):
+    manager = trainer.pipeline.datamanager
+    rays, _ = manager.next_train(0)
+    assert rays.image_y is not None
+    expected = manager.train_cameras.poses_at(rays.camera_indices, rays.image_y)
+    assert_close(rays.origins, expected[:, :, 3])
+    assert len(rays.origins.unique(dim=0)) > len(manager.train_cameras)
+
+
+def test_a_run_gives_back_its_line_cameras_and_renders_all_bands(trainer):
+    scene = open_run(trainer.run.path, "cpu")
+    view = scene.views[0]
+    assert view.camera.is_line_camera(0)
+    mine, theirs = view.camera.image_rays(0), trainer.pipeline.datamanager.train_cameras.image_rays(0)
+    assert torch.equal(mine.origins, theirs.origins)
+    found = scene.render(view.camera, ["spectral", "depth"])
+    assert found["spectral"].shape == (16, 20, 4)
+    assert bool(found["spectral"].isfinite().all())
+    assert float(found["spectral"].std()) > 0

@@ -1,0 +1,314 @@
+"""Poses corrected while training: rays and cameras agree, what can't be seen stays, what runs away is undone."""
+
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+from torch.testing import assert_close
+
+from tests.engine.test_resume import stop_at
+from tests.method_factory import BOX, CONFIG, initial_data, make_model
+from tests.scenes.scene_factory import make_scene
+from unmix_plugin.datamanager import HyperspectralDataManagerConfig
+from unmix_plugin.engine.configs import TrainerConfig
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.key_poses import KeyPoses
+from unmix_plugin.engine.geometry.rotations import rotation_matrix
+from unmix_plugin.engine.pipeline import PipelineConfig
+from unmix_plugin.engine.runs.load_run import load_config, load_model
+from unmix_plugin.engine.training.trainer import Trainer
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.field import CoefficientField
+from unmix_plugin.method_config import unmix_nerf
+from unmix_plugin.model import UnmixModel
+from unmix_plugin.pose_refinement import LARGEST_STEP, Knots, PoseConfig, PoseRefinement
+from unmix_plugin.trained.open_run import open_run
+
+WIDTH, HEIGHT = 12, 40
+MIDDLE = torch.tensor([0.1, -0.2, 0.3])
+
+
+def cameras() -> Cameras:
+    """Two frame cameras and between them a line camera, all looking at the origin from around it."""
+    turns = torch.tensor([[0.0, 0.2, 0.0], [0.1, 2.0, 0.0], [-0.3, -2.1, 0.2]])
+    rotations = rotation_matrix(turns)
+    poses = torch.cat([rotations, 4.0 * rotations[:, :, 2:]], dim=-1)
+    ends = poses[[1, 1]].clone()
+    ends[:, :, 3] += torch.tensor([[1.0], [-1.0]]) * poses[1, :, 1]
+    keys = KeyPoses(torch.cat([poses[:1], ends, poses[2:]]), torch.tensor([0.5, 0.5, 39.5, 0.5]), (1, 2, 1))
+    focal, center = torch.full((3, 2), 20.0), torch.tensor([[6.0, 20.0]]).repeat(3, 1)
+    return Cameras(poses, focal, center, torch.zeros(3, 4), WIDTH, HEIGHT, key_poses=keys)
+
+
+def refinement(lens: str = "fixed", size: float = 0.03) -> PoseRefinement:
+    own, knots = cameras(), Knots.of(cameras())
+    found = PoseRefinement(knots.rows, lens)  # type: ignore[arg-type]
+    found.begin(knots.positions(own), MIDDLE)
+    with torch.no_grad():
+        found.steps.copy_(size * torch.randn(found.steps.shape, generator=torch.Generator().manual_seed(1)))
+        found.lens[: found.num_lens] = torch.tensor([0.05, -0.08, 0.03])[: found.num_lens]
+    return found
+
+
+def some_pixels(view: int) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(view)
+    coords = torch.rand(50, 2, generator=generator) * torch.tensor([WIDTH, HEIGHT])
+    return torch.full((50,), view), coords
+
+
+def test_a_line_camera_has_knots_a_few_rows_apart_and_a_frame_camera_one():
+    knots = Knots.of(cameras())
+    assert knots.rows == (0, HEIGHT, 0)
+    assert knots.counts == [1, 6, 1]
+    assert_close(knots.heights(1), torch.linspace(0, 40, 6))
+    assert_close(knots.positions(cameras())[[0, 7]], cameras().camera_to_world[[0, 2], :, 3])
+
+
+def test_nothing_changes_before_a_step_is_taken():
+    views, coords = some_pixels(1)
+    rays = cameras().generate_rays(views, coords)
+    moved = refinement(size=0.0)(rays)
+    assert torch.equal(moved.origins, rays.origins)
+    assert torch.equal(moved.directions, rays.directions)
+
+
+@pytest.mark.parametrize("lens", ["fixed", "focal", "radial"])
+@pytest.mark.parametrize("view", [0, 1, 2])
+def test_corrected_cameras_send_the_rays_of_training(lens, view):
+    views, coords = some_pixels(view)
+    mine = refinement(lens)(cameras().generate_rays(views, coords))
+    theirs = refinement(lens).refined(cameras()).generate_rays(views, coords)
+    # Key poses turn about one axis between knots, corrections add up: they differ by products of small angles.
+    assert_close(mine.origins, theirs.origins, atol=2e-4, rtol=0)
+    assert_close(mine.directions, theirs.directions, atol=4e-4, rtol=0)
+    given = cameras().generate_rays(views, coords)
+    assert (mine.directions - given.directions).norm(dim=1).mean() > 0.01
+
+
+def test_gradients_of_moved_rays_are_those_of_finite_differences():
+    found = refinement("radial").double()
+    views = torch.tensor([0, 1, 1, 2])
+    rays = cameras().generate_rays(views, torch.tensor([[2.0, 3.0], [4.0, 11.0], [9.0, 39.0], [1.0, 30.0]]))
+    assert rays.axes is not None
+    rays = replace(
+        rays, origins=rays.origins.double(), directions=rays.directions.double(), axes=rays.axes.double()
+    )
+
+    def moved(steps: torch.Tensor, lens: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        out = torch.func.functional_call(found, {"steps": steps, "lens": lens}, (rays,))
+        return out.origins, out.directions
+
+    inputs = (found.steps.detach().requires_grad_(), found.lens.detach().requires_grad_())
+    assert torch.autograd.gradcheck(moved, inputs, eps=1e-6, atol=1e-5)
+
+
+def test_what_moves_all_views_alike_is_no_correction():
+    """Turning, moving and scaling the world about its middle leaves nothing; the rest stays."""
+    knots, own = Knots.of(cameras()), cameras()
+    found, offsets = refinement(), Knots.of(own).positions(own) - MIDDLE
+    before = found.corrections.detach()
+    turn, shift, growth = torch.tensor([0.1, -0.2, 0.3]), torch.tensor([0.3, 0.1, -0.2]), 0.2
+    moves = torch.linalg.cross(turn.expand_as(offsets), offsets) + shift + growth * offsets
+    similar = torch.cat([turn.expand_as(offsets), moves / offsets.norm(dim=1, keepdim=True)], dim=1)
+    with torch.no_grad():
+        found.steps.add_(similar)
+    assert_close(found.corrections.detach(), before, atol=1e-6, rtol=0)
+    assert before.norm() > 0.05
+    with torch.no_grad():
+        found.steps.copy_(before)
+    assert_close(found.corrections.detach(), before, atol=1e-6, rtol=0)
+    assert sum(knots.counts) == len(before)
+
+
+def test_a_view_that_runs_away_gets_its_pose_back_and_keeps_it():
+    rows = (0,) * 6
+    found = PoseRefinement(rows)
+    places = 4 * torch.nn.functional.normalize(
+        torch.randn(6, 3, generator=torch.Generator().manual_seed(0)), dim=1
+    )
+    found.begin(places, torch.zeros(3))
+    found.gauge.zero_()
+    with torch.no_grad():
+        found.steps.fill_(0.01)
+        found.steps[2, 0] = 2 * LARGEST_STEP
+    found.undo_runaways()
+    assert found.is_free.tolist() == [True, True, False, True, True, True]
+    assert found.num_undone == 1
+    with torch.no_grad():
+        found.steps[2, 1] = 0.1
+    assert torch.equal(found.corrections[2].detach(), torch.zeros(6))
+    assert bool((found.corrections[0] != 0).all())
+
+
+def test_when_most_views_run_away_all_are_undone():
+    found = PoseRefinement((0,) * 4)
+    with torch.no_grad():
+        found.steps.fill_(0.01)
+        found.steps[1:, 0] = 1.0
+    found.undo_runaways()
+    assert found.num_undone == 4
+    assert torch.equal(found.corrections.detach(), torch.zeros(4, 6))
+
+
+def refining_model() -> UnmixModel:
+    torch.manual_seed(0)
+    config = replace(CONFIG, poses="refine", pose_refinement=PoseConfig(start=0.0, coarse_until=0.5))
+    model: UnmixModel = config.setup(scene_box=BOX, metadata=make_model().metadata)
+    places = torch.tensor([[0.0, 0.0, 4.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0]])
+    with torch.no_grad():
+        model.initialise({**initial_data(), "knots": places.numpy()}, torch.Generator().manual_seed(0))
+        model.field.get_parameter("table").normal_(std=0.5)
+    return model
+
+
+class Blob(CoefficientField):
+    """A soft ball whose materials change smoothly; nothing of it reaches the box."""
+
+    def encode(self, positions: torch.Tensor, known: torch.Tensor | None = None) -> torch.Tensor:
+        return positions
+
+    def density_of(self, encoded: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return 20 * (-12 * encoded.square().sum(dim=1)).exp(), encoded
+
+    def abundances_of(self, features: torch.Tensor) -> torch.Tensor:
+        return torch.softmax(3 * torch.sin(4 * features + torch.arange(3)), dim=-1)
+
+    def get_outputs(
+        self, positions: torch.Tensor, directions: torch.Tensor, features: torch.Tensor
+    ) -> dict[str, torch.Tensor]:
+        abundances = self.abundances_of(features)
+        specular = 0.3 * (1 + directions[:, :1] * directions[:, 1:2])
+        return {
+            "abundances": abundances,
+            "scaled_abundances": 0.7 * abundances,
+            "specular_coefficients": specular,
+        }
+
+
+def test_the_gradient_of_a_picture_by_a_pose_is_that_of_finite_differences():
+    model: Any = refining_model().train()
+    model.field, model.step = Blob(), 0.01
+    model.config = replace(model.config, renderer=replace(model.config.renderer, coarse_samples=4096))
+    model.poses.gauge.zero_()
+    steps = model.poses.steps
+    pose = torch.tensor([[[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4.0]]])
+    camera = Cameras(pose, torch.full((1, 2), 40.0), torch.full((1, 2), 8.0), torch.zeros(1, 4), 16, 16)
+    rays = camera.image_rays(0)
+    weights = torch.randn(len(rays), 5, generator=torch.Generator().manual_seed(3))
+
+    def seen() -> torch.Tensor:
+        model.generator = torch.Generator().manual_seed(0)
+        return (model.get_outputs(rays)["spectral"] * weights).sum() / len(rays)
+
+    seen().backward()
+    expected = []
+    with torch.no_grad():
+        for number in range(6):
+            values = []
+            for side in (-1, 1):
+                steps[0, number] = side * 4e-3
+                values.append(float(seen()))
+            steps[0, number] = 0.0
+            expected.append((values[1] - values[0]) / 8e-3)
+    wanted = torch.tensor(expected)
+    assert float((steps.grad[0] - wanted).norm() / wanted.norm()) < 0.02
+    assert torch.equal(steps.grad[1:], torch.zeros(2, 6))
+
+
+def test_levels_of_the_grid_join_the_coarsest_first():
+    weights = [PoseConfig(coarse_until=0.4).level_weights(5, share) for share in np.linspace(0, 0.4, 9)]
+    assert weights[0] == [1.0, 0.0, 0.0, 0.0, 0.0]
+    assert weights[-1] == [1.0] * 5
+    assert (np.diff(np.array(weights), axis=0) >= 0).all()
+    assert (np.diff(np.array(weights), axis=1) <= 0).all()
+
+
+def test_levels_without_weight_change_nothing():
+    model = refining_model()
+    points = torch.rand(20, 3, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        whole = model.field.get_density(points)[1]
+        model._begin_step(1, 0.0)
+        coarse = model.field.get_density(points)[1]
+        field: Any = model.field
+        field.table[int(field.layout.levels[1, 1]) :] += 1.0
+        assert_close(model.field.get_density(points)[1], coarse)
+    assert float((whole - coarse).abs().max()) > 1e-2
+
+
+def test_impossible_settings_are_refused():
+    with pytest.raises(ConfigError, match="coarse-until in"):
+        PoseConfig(coarse_until=1.5)
+
+
+def config_for(
+    folder: Path, poses: Literal["fixed", "refine", "auto"] = "refine", steps: int = 12
+) -> TrainerConfig:
+    data = HyperspectralDataManagerConfig(train_num_rays_per_batch=64, grid_resolution=16)
+    model = replace(CONFIG, num_endmembers=1, poses=poses, pose_refinement=PoseConfig(start=0.0))
+    return replace(
+        unmix_nerf.config,
+        data=folder / "scene",
+        output_dir=folder / "runs",
+        max_num_iterations=steps,
+        device="cpu",
+        pipeline=PipelineConfig(datamanager=data, model=model),
+    )
+
+
+def trained(config: TrainerConfig) -> Trainer:
+    trainer = Trainer(config, console=Console(file=io.StringIO()))
+    trainer.train()
+    return trainer
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    place = tmp_path_factory.mktemp("refined")
+    make_scene(place / "scene")
+    return place
+
+
+def test_poses_that_are_taken_as_they_are_leave_training_as_it_was(folder):
+    model = trained(config_for(folder, "fixed")).pipeline.model
+    assert model.poses is None
+    assert not [name for name, _ in model.named_parameters() if name.startswith("poses")]
+    assert "field.level_weights" not in model.state_dict()
+    rays, _ = Trainer(
+        config_for(folder, "auto"), console=Console(file=io.StringIO())
+    ).pipeline.datamanager.next_train(0)
+    bare = replace(rays, axes=None, image_y=None)
+    model.generator = torch.Generator().manual_seed(0)
+    first = model.train().get_outputs(rays)["spectral"]
+    model.generator = torch.Generator().manual_seed(0)
+    assert torch.equal(first, model.get_outputs(bare)["spectral"])
+
+
+def test_a_resumed_refinement_is_the_one_that_was_never_stopped(folder):
+    straight = trained(config_for(folder))
+    stopped = stop_at(config_for(folder), 6)
+    resumed = trained(load_config(stopped.run))
+    expected, found = straight.pipeline.model.state_dict(), resumed.pipeline.model.state_dict()
+    assert float(expected["poses.steps"].abs().max()) > 0
+    for name, tensor in expected.items():
+        assert torch.equal(found[name], tensor), name
+
+
+def test_refined_poses_are_the_run_s_training_cameras(folder):
+    trainer = trained(config_for(folder))
+    loaded = load_model(trainer.run.path)
+    poses: Any = loaded.model.poses
+    expected = poses.refined(loaded.scene.train_cameras)
+    views = [view for view in open_run(trainer.run.path, "cpu").views if view.split == "train"]
+    found = torch.cat([view.camera.camera_to_world for view in views])
+    assert_close(found, expected.camera_to_world)
+    given = trainer.pipeline.datamanager.train_cameras.camera_to_world
+    assert float((found - given).abs().max()) > 1e-5
+    lines = (trainer.run.path / "metrics.jsonl").read_text().splitlines()
+    assert "poses" in json.loads(lines[-1])

@@ -1,0 +1,69 @@
+"""Evaluation views find the pose from which the field looks like what was measured."""
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from tests.method_factory import make_scene
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.key_poses import KeyPoses
+from unmix_plugin.pose_refinement import LARGEST_STEP
+from unmix_plugin.trained import pose_alignment
+from unmix_plugin.trained.evaluation import ViewTruth
+from unmix_plugin.trained.pose_alignment import align_pose, moved
+
+POSE = torch.tensor([[[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4.0]]])
+CAMERA = Cameras(POSE, torch.full((1, 2), 60.0), torch.full((1, 2), 16.0), torch.zeros(1, 4), 32, 32)
+OFF = torch.tensor([0.02, -0.015, 0.02, 0.01, 0.02, -0.01])
+
+
+def swept() -> Cameras:
+    """The same view taken row by row, while the camera turns."""
+    poses = moved(CAMERA, torch.tensor([0.2, 0.0, 0.0, 0.0, 0.0, 0.0]), make_scene()).camera_to_world
+    ends = moved(CAMERA, torch.tensor([-0.2, 0.0, 0.0, 0.0, 0.0, 0.0]), make_scene()).camera_to_world
+    keys = KeyPoses(torch.cat([poses, ends]), torch.tensor([0.5, 31.5]), (2,))
+    return Cameras(POSE, CAMERA.focal_px, CAMERA.center_px, CAMERA.distortion, 32, 32, key_poses=keys)
+
+
+def truth_of(scene, camera: Cameras) -> ViewTruth:
+    view = scene.look(camera, 2)
+    valid = torch.ones(32, 32, dtype=torch.bool)
+    valid[:3] = False
+    return ViewTruth("a", view["spectral"], valid, alpha=view.opacity)
+
+
+def points_seen(camera: Cameras) -> torch.Tensor:
+    points = 0.8 * torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) - 0.4
+    return camera.project(points, 0)[0]
+
+
+@pytest.mark.parametrize("camera", [CAMERA, swept()])
+def test_a_view_that_is_off_by_pixels_is_brought_back(camera):
+    scene = make_scene()
+    given = moved(camera, OFF, scene)
+    before = (points_seen(given) - points_seen(camera)).norm(dim=1).mean()
+    found = align_pose(scene, given, truth_of(scene, camera))
+    after = (points_seen(found) - points_seen(camera)).norm(dim=1).mean()
+    assert before > 1.0
+    assert after < 0.15 * before
+
+
+def test_a_view_that_is_right_stays():
+    scene = make_scene()
+    found = align_pose(scene, CAMERA, truth_of(scene, CAMERA))
+    assert float((points_seen(found) - points_seen(CAMERA)).norm(dim=1).mean()) < 0.05
+
+
+def test_a_view_of_something_else_does_not_leave_the_scene():
+    scene = make_scene()
+    noise = torch.rand(32, 32, 5, generator=torch.Generator().manual_seed(0))
+    found = align_pose(scene, CAMERA, ViewTruth("a", noise, torch.ones(32, 32, dtype=torch.bool)))
+    turn = found.camera_to_world[0, :, :3].diagonal().sum()
+    assert float(((turn - 1) / 2).arccos()) <= LARGEST_STEP * 3**0.5 + 1e-4
+
+
+def test_a_smaller_picture_shows_the_same_view():
+    small = pose_alignment._shrunk(swept(), 24)
+    assert (small.width, small.height) == (24, 24)
+    mine, theirs = points_seen(small) / 24, points_seen(swept()) / 32
+    assert_close(mine, theirs, atol=1e-3, rtol=0)

@@ -1,0 +1,281 @@
+"""Poses corrected while training: small tangent steps of rotation and position, and of the lens that all views share.
+
+A correction is a function of the view and of the row: one step for a frame camera, and for a line camera steps at knots
+a few rows apart, between which it is interpolated linearly. Given poses stay what they are; rays are moved.
+
+What moves all views alike (a similarity of the world about the scene's middle) can't be seen in pictures, so it is
+taken out of the corrections. A view that goes farther than `LARGEST_STEP` has lost its way: it gets its given pose back
+and keeps it.
+
+Notation: `V` training views, `M` knots of all views, `R` rays. A step is (w, m): the camera turns by the rotation
+vector w in world axes about itself, and moves by m times its distance to the scene's middle, so that equal numbers move
+a picture by about as much.
+
+Source: Lin et al. 2021, BARF (joint refinement, coarse to fine); Wang et al. 2021, NeRF-- (focal length).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from unmix_plugin.engine.geometry.camera_distortion import undistort
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.key_poses import KeyPoses
+from unmix_plugin.engine.geometry.rays import RayBundle
+from unmix_plugin.engine.geometry.rotations import rotation_matrix
+from unmix_plugin.errors import require
+
+KNOT_ROWS = 8
+"""Rows between the knots of a line camera."""
+LARGEST_STEP = 0.25
+"""Radians, or share of the distance to the scene's middle, beyond which a correction is undone."""
+MOST_UNDONE = 0.5
+"""Share of the views that may be undone before all are."""
+
+
+@dataclass(frozen=True)
+class PoseConfig:
+    """How poses are refined."""
+
+    lens: Literal["fixed", "focal", "radial"] = "fixed"
+    """What of the lens that all views share is refined too: nothing, its focal length, or also k1 and k2."""
+    coarse_until: float = 0.5
+    """Part of the training in which the levels of the field's grid join, the coarsest first: what is fine draws poses
+    to the nearest likeness."""
+    coarsest_resolution: int = 4
+    """Cells along the scene box on the coarsest level, if the field's own has more: a pose that is off by a cell still
+    finds its way."""
+    start: float = 0.03
+    """Part of the training before which poses stay: the field must show something first."""
+    penalty: float = 1e-3
+    """Weight of the mean squared correction."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible settings.
+
+        Raises:
+            ConfigError: a number out of its range.
+        """
+        rules = {
+            "coarse-until in [0, 1]": 0 <= self.coarse_until <= 1,
+            "coarsest-resolution of 2 to 4096": 2 <= self.coarsest_resolution <= 4096,
+            "start in [0, 1]": 0 <= self.start <= 1,
+            "a penalty of 0 to 1e6": 0 <= self.penalty <= 1e6,
+        }
+        require("pose refinement", rules)
+
+    def level_weights(self, num_levels: int, progress: float) -> list[float]:
+        """Weights in [0, 1] of a grid's levels when that part of the training is over.
+
+        >>> PoseConfig(coarse_until=0.5).level_weights(4, 0.125)
+        [1.0, 0.5, 0.0, 0.0]
+        """
+        share = 1.0 if progress >= self.coarse_until else progress / self.coarse_until
+        joined = [min(max(1 + share * (num_levels - 1) - level, 0.0), 1.0) for level in range(num_levels)]
+        return [1.0 if x == 1 else round(0.5 - 0.5 * math.cos(math.pi * x), 12) for x in joined]
+
+
+@dataclass(frozen=True)
+class Knots:
+    """Where the corrections of each view stand."""
+
+    rows: tuple[int, ...]
+    """Rows of each view's image; 0 for a frame camera, whose correction holds for all rows."""
+
+    @staticmethod
+    def of(cameras: Cameras) -> Knots:
+        """Those of some cameras."""
+        lines = [cameras.is_line_camera(index) for index in range(len(cameras))]
+        return Knots(tuple(cameras.size(i)[1] if is_line else 0 for i, is_line in enumerate(lines)))
+
+    @property
+    def counts(self) -> list[int]:
+        """Knots of each view."""
+        return [1 if rows == 0 else max(2, round(rows / KNOT_ROWS) + 1) for rows in self.rows]
+
+    def heights(self, view: int) -> Float[Tensor, " n"]:
+        """y of the knots of a view, pixels; the middle of the image counts for a frame camera."""
+        rows, count = self.rows[view], self.counts[view]
+        return torch.zeros(1) if rows == 0 else torch.linspace(0, rows, count)
+
+    def positions(self, cameras: Cameras) -> Float[Tensor, "M 3"]:
+        """Where the cameras stand at the knots."""
+        found = []
+        for view in range(len(self.rows)):
+            y = self.heights(view)
+            found.append(cameras.poses_at(torch.full((len(y),), view), y)[:, :, 3])
+        return torch.cat(found)
+
+
+class PoseRefinement(nn.Module):
+    """Corrections of the training views' poses, all 0 at first."""
+
+    reach: Tensor
+    gauge: Tensor
+    is_free: Tensor
+    counts: Tensor
+    first: Tensor
+    rows: Tensor
+
+    def __init__(self, rows: Sequence[int], lens: Literal["fixed", "focal", "radial"] = "fixed") -> None:
+        """`rows` as `Knots` has them."""
+        super().__init__()
+        self.knots, self.num_lens = Knots(tuple(rows)), {"fixed": 0, "focal": 1, "radial": 3}[lens]
+        counts = torch.tensor(self.knots.counts)
+        total = int(counts.sum())
+        self.steps = nn.Parameter(torch.zeros(total, 6))
+        self.lens = nn.Parameter(torch.zeros(3), requires_grad=self.num_lens > 0)
+        self.register_buffer("reach", torch.ones(total))
+        self.register_buffer("gauge", torch.zeros(6 * total, 7))
+        self.register_buffer("is_free", torch.ones(len(rows), dtype=torch.bool))
+        self.register_buffer("counts", counts, persistent=False)
+        self.register_buffer("first", counts.cumsum(0) - counts, persistent=False)
+        self.register_buffer("rows", torch.tensor(rows), persistent=False)
+
+    @torch.no_grad()
+    def begin(self, positions: Float[Tensor, "M 3"], middle: Float[Tensor, "3"]) -> None:
+        """Take in where the cameras stand at the knots, and the scene's middle."""
+        offsets = positions - middle
+        self.reach.copy_(offsets.norm(dim=1).clamp(min=1e-6))
+        self.gauge.copy_(_similarities(offsets, self.reach))
+
+    @property
+    def corrections(self) -> Float[Tensor, "M 6"]:
+        """Steps without what moves all views alike; 0 for views that were undone."""
+        free = self.is_free.repeat_interleave(self.counts)[:, None]
+        steps = (self.steps * free).flatten()
+        return (steps - self.gauge @ (self.gauge.T @ steps)).view(-1, 6) * free
+
+    @property
+    def num_undone(self) -> int:
+        """Views that were given their poses back."""
+        return int((~self.is_free).sum())
+
+    @torch.no_grad()
+    def figures(self) -> dict[str, Tensor]:
+        """`pose_turn_deg` and `pose_shift` (share of the distance to the scene's middle), means over knots, and
+        `poses_undone`."""
+        turns, shifts = self.corrections.view(-1, 2, 3).norm(dim=-1).mean(dim=0)
+        return {
+            "pose_turn_deg": turns.rad2deg(),
+            "pose_shift": shifts,
+            "poses_undone": (~self.is_free).sum().float(),
+        }
+
+    def penalty(self) -> Float[Tensor, ""]:
+        """Mean squared correction."""
+        return self.corrections.square().mean() + self.lens.square().sum()
+
+    def forward(self, rays: RayBundle) -> RayBundle:
+        """Rays of training views as their corrected cameras send them.
+
+        Args:
+            rays: As `Cameras.generate_rays` makes them.
+        """
+        assert rays.axes is not None
+        assert rays.image_y is not None
+        turns, moves = self._at(rays.camera_indices, rays.image_y)
+        directions, axes = ((turns @ x[:, :, None])[:, :, 0] for x in (rays.directions, rays.axes))
+        if self.num_lens:
+            directions = self._through_lens(directions, axes)
+        return replace(rays, origins=rays.origins + moves, directions=directions, axes=axes)
+
+    @torch.no_grad()
+    def refined(self, cameras: Cameras) -> Cameras:
+        """The training cameras, corrected: key poses of line cameras stand at the given heights and at the knots."""
+        own = cameras.to(self.steps.device)
+        change = own.distortion.new_zeros(own.distortion.shape[1])
+        change[:2] = self.lens[1:]
+        moved = replace(
+            own,
+            camera_to_world=self._moved(own, torch.arange(len(own)), self._middles(own)),
+            focal_px=own.focal_px * self.lens[0].exp(),
+            distortion=own.distortion + change,
+        )
+        if own.key_poses is not None:
+            moved = replace(
+                moved, key_poses=KeyPoses.join([self._keys(own, view) for view in range(len(own))])
+            )
+        return moved.to(cameras.camera_to_world.device)
+
+    @torch.no_grad()
+    def undo_runaways(self) -> None:
+        """Give views that went too far their poses back; where most did, all."""
+        sizes = self.corrections.view(-1, 2, 3).norm(dim=-1).amax(dim=-1)
+        views = torch.arange(len(self.is_free), device=sizes.device).repeat_interleave(self.counts)
+        largest = torch.zeros(len(self.is_free), device=sizes.device).scatter_reduce_(0, views, sizes, "amax")
+        self.is_free &= largest <= LARGEST_STEP
+        is_lost = (~self.is_free).float().mean() > MOST_UNDONE
+        self.is_free &= ~is_lost
+        self.steps.masked_fill_(~self.is_free[views][:, None], 0.0)
+
+    def _at(
+        self, views: Int[Tensor, " R"], y: Float[Tensor, " R"]
+    ) -> tuple[Float[Tensor, "R 3 3"], Float[Tensor, "R 3"]]:
+        """Rotation and shift of each ray's camera."""
+        place = y / self.rows[views].clamp(min=1) * (self.counts[views] - 1)
+        knot = torch.minimum(place.long(), (self.counts[views] - 2).clamp(min=0)).clamp(min=0)
+        share = torch.where(self.rows[views] > 0, place - knot, 0.0)[:, None]
+        low = self.first[views] + knot
+        high = torch.minimum(low + 1, self.first[views] + self.counts[views] - 1)
+        scaled = torch.cat([self.corrections[:, :3], self.corrections[:, 3:] * self.reach[:, None]], dim=1)
+        step = scaled.index_select(0, low) * (1 - share) + scaled.index_select(0, high) * share
+        return rotation_matrix(step[:, :3]), step[:, 3:]
+
+    def _through_lens(
+        self, directions: Float[Tensor, "R 3"], axes: Float[Tensor, "R 3"]
+    ) -> Float[Tensor, "R 3"]:
+        """Rays as a lens of another focal length and bending sends them."""
+        along = (directions * axes).sum(dim=1, keepdim=True)
+        across = directions / along - axes
+        scale = (-self.lens[0]).exp()
+        if self.num_lens > 1:
+            radius = across.norm(dim=1).clamp(min=1e-9) * scale
+            bent = torch.stack([radius, torch.zeros_like(radius)], dim=1)
+            bending = torch.cat([self.lens[1:], self.lens.new_zeros(2)])[None]
+            scale = scale * (undistort(bent, bending)[:, :1] / bent[:, :1])
+        return nn.functional.normalize(axes + across * scale, dim=1)
+
+    def _middles(self, cameras: Cameras) -> Float[Tensor, " V"]:
+        sizes = [cameras.size(index)[1] for index in range(len(cameras))]
+        return 0.5 * self.steps.new_tensor(sizes)
+
+    def _moved(
+        self, cameras: Cameras, views: Int[Tensor, " n"], y: Float[Tensor, " n"]
+    ) -> Float[Tensor, "n 3 4"]:
+        poses, (turns, moves) = cameras.poses_at(views, y), self._at(views, y)
+        return torch.cat([turns @ poses[:, :, :3], (poses[:, :, 3] + moves)[:, :, None]], dim=-1)
+
+    def _keys(self, cameras: Cameras, view: int) -> KeyPoses:
+        assert cameras.key_poses is not None
+        heights = cameras.key_poses.of(view).heights
+        if self.knots.rows[view]:
+            heights = torch.cat([heights, self.knots.heights(view).to(heights)]).unique()
+        poses = self._moved(cameras, torch.full((len(heights),), view, device=heights.device), heights)
+        return KeyPoses(poses, heights, (len(heights),))
+
+
+def _similarities(offsets: Float[Tensor, "M 3"], reach: Float[Tensor, " M"]) -> Float[Tensor, "6*M 7"]:
+    """Orthonormal steps that turn, move or scale the world as seen from cameras at these offsets from its middle."""
+    axes = torch.eye(3, dtype=torch.float64)
+    places, lengths = offsets.double().cpu(), reach.double().cpu()[:, None]
+    zero = torch.zeros_like(places)
+    turned = [
+        torch.cat([axis.expand_as(places), torch.linalg.cross(axis.expand_as(places), places) / lengths], 1)
+        for axis in axes
+    ]
+    moved = [torch.cat([zero, axis / lengths], dim=1) for axis in axes]
+    columns = torch.stack(
+        [x.flatten() for x in [*turned, *moved, torch.cat([zero, places / lengths], dim=1)]], dim=1
+    )
+    found, sizes, _ = torch.linalg.svd(columns, full_matrices=False)
+    basis = torch.zeros_like(columns)
+    basis[:, : found.shape[1]] = found * (sizes > 1e-6 * sizes[0])
+    return basis.to(offsets)
