@@ -225,7 +225,8 @@ class PoseRefinement(nn.Module):
         share = torch.where(self.rows[views] > 0, place - knot, 0.0)[:, None]
         low = self.first[views] + knot
         high = torch.minimum(low + 1, self.first[views] + self.counts[views] - 1)
-        scaled = torch.cat([self.corrections[:, :3], self.corrections[:, 3:] * self.reach[:, None]], dim=1)
+        turns, moves = self.corrections.split(3, dim=1)
+        scaled = torch.cat([turns, moves * self.reach[:, None]], dim=1)
         step = scaled.index_select(0, low) * (1 - share) + scaled.index_select(0, high) * share
         return rotation_matrix(step[:, :3]), step[:, 3:]
 
