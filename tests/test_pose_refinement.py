@@ -257,6 +257,7 @@ def config_for(
         data=folder / "scene",
         output_dir=folder / "runs",
         max_num_iterations=steps,
+        steps_per_log=4,
         device="cpu",
         pipeline=PipelineConfig(datamanager=data, model=model),
     )

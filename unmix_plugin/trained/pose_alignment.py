@@ -4,7 +4,8 @@ Corrected poses and field move together, so a given pose no longer says exactly 
 for fields that refine poses, each evaluation view is aligned before it is measured: one turn and one shift are found
 with which the field shows it best, coarse pictures first. Nothing of the field changes.
 
-Notation: `P` pixels of a coarse picture, `C` channels compared.
+Notation: `P` pixels of a coarse picture, `C` spectral channels compared, `D` those and
+opacity.
 
 Source: Lin et al. 2021, BARF (alignment of views at test time); here by Levenberg-Marquardt steps with differences of
 renders.
@@ -127,7 +128,7 @@ def _shrunk(camera: Cameras, side: int) -> Cameras:
 
 def _pooled(
     truth: ViewTruth, axes: Float[Tensor, "B C"], small: Cameras
-) -> tuple[Float[Tensor, "P C"], Float[Tensor, "P 1"]]:
+) -> tuple[Float[Tensor, "P D"], Float[Tensor, "P 1"]]:
     """What was measured in the pixels of a smaller picture, and which share of each counts."""
     alpha = truth.opacity.float()[..., None]
     values = torch.cat([truth.spectra.float() @ axes, alpha], dim=-1) * truth.valid[..., None]
@@ -138,7 +139,7 @@ def _pooled(
 
 def _shown(
     scene: TrainedScene, camera: Cameras, truth: ViewTruth, axes: Float[Tensor, "B C"]
-) -> Float[Tensor, "P C"]:
+) -> Float[Tensor, "P D"]:
     view = scene.look(camera, 2 if max(camera.width, camera.height) <= SIDES_PX[1] else 1)
     opacity = view.opacity if truth.alpha is not None else torch.ones_like(view.opacity)
     seen = truth.seen(view["spectral"]).float() @ axes.to(view.opacity)
