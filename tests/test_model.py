@@ -347,7 +347,7 @@ def test_settings_without_auto_read_no_data():
         raise AssertionError
 
     config = UnmixModelConfig(
-        num_endmembers=4, light="fixed", losses=LossConfig(exposure=1.0, band_weights=())
+        num_endmembers=4, light="fixed", poses="fixed", losses=LossConfig(exposure=1.0, band_weights=())
     )
     assert config.resolve_auto(unread, torch.Generator()) == (config, "")
 

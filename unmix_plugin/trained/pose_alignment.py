@@ -4,8 +4,7 @@ Corrected poses and field move together, so a given pose no longer says exactly 
 for fields that refine poses, each evaluation view is aligned before it is measured: one turn and one shift are found
 with which the field shows it best, coarse pictures first. Nothing of the field changes.
 
-Notation: `P` pixels of a coarse picture, `C` spectral channels compared, `D` those and
-opacity.
+Notation: `P` pixels of a coarse picture, `C` spectral channels compared, `D` those and opacity.
 
 Source: Lin et al. 2021, BARF (alignment of views at test time); here by Levenberg-Marquardt steps with differences of
 renders.

@@ -1,6 +1,7 @@
 """What a line camera sees of cells of space, and which it looks through: see `carving`.
 
-A cell's ball is looked up: its middle, and its ends across the line. Between them the camera moves evenly enough.
+The ball around a cell is looked up: where its middle is seen, and how far it reaches along the line and, as fast as the
+camera moves there, across it.
 
 Notation: `M` cells.
 """
@@ -12,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Int32
-from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 
@@ -35,24 +35,25 @@ class LineView:
         """`covered` holds sums over rectangles from the first pixel, (H + 1) x (W + 1) of them, row after row."""
         self._camera = cameras[index]
         self._columns, self._rows = cameras.size(index)
-        self._across = cameras.camera_to_world[index, :, 1]
         self.covered = covered
+        y = torch.arange(self._rows + 1, dtype=torch.float32)
+        poses = self._camera.poses_at(torch.zeros(len(y), dtype=torch.int64), y)
+        up, back, places = poses[1:, :, 1], poses[:-1, :, 2], poses[:, :, 3]
+        # From one row to the next, a point at depth d moves across the line by shift - d turn.
+        self._shift = ((places[:-1] - places[1:]) * up).sum(dim=1)
+        self._turn = (back * up).sum(dim=1)
 
     def footprint(self, centres: Float32[np.ndarray, "3 M"], half: Float32[np.ndarray, "3"]) -> LineFootprint:
         """Where cells of these half edges are seen."""
         points, radius = torch.from_numpy(np.ascontiguousarray(centres.T)), float(np.linalg.norm(half))
         middle, depths = self._camera.project(points, 0)
-        ends = [self._heights(points + side * radius * self._across) for side in (-1.0, 1.0)]
-        spread = torch.stack([*ends, middle[:, 1]])
-        reach = radius * self._camera.focal_px[0, 0] / depths.clamp(min=1e-6) + _MARGIN_PX
-        low = torch.stack([middle[:, 0] - reach, spread.amin(dim=0) - _MARGIN_PX])
-        high = torch.stack([middle[:, 0] + reach, spread.amax(dim=0) + _MARGIN_PX])
+        rows = middle[:, 1].long().clamp(0, self._rows - 1)
+        speed = (self._shift[rows] - depths * self._turn[rows]).abs().clamp(min=1e-9)
+        across = radius * self._camera.focal_px[0, 0] / depths.clamp(min=1e-6)
+        reach = torch.stack([across, radius / speed]) + _MARGIN_PX
         unseen = depths <= 0
-        return LineFootprint(
-            low.masked_fill(unseen, torch.nan).numpy(),
-            high.masked_fill(unseen, torch.nan).numpy(),
-            depths.numpy(),
-        )
+        low, high = ((middle.T + side * reach).masked_fill(unseen, torch.nan).numpy() for side in (-1, 1))
+        return LineFootprint(low, high, depths.numpy())
 
     def sees(self, footprint: LineFootprint, near: float) -> Bool[np.ndarray, " M"]:
         """Cells of which at least a part may be in the image and beyond the near plane."""
@@ -71,8 +72,3 @@ class LineView:
         empty = np.zeros(len(inside), dtype=bool)
         empty[chosen] = sums[y1, x1] - sums[y0, x1] - sums[y1, x0] + sums[y0, x0] == 0
         return empty
-
-    def _heights(self, points: Tensor) -> Tensor:
-        """y at which points are seen; infinite where no row sees them."""
-        coords, depths = self._camera.project(points, 0)
-        return coords[:, 1].masked_fill(depths <= 0, torch.inf)
