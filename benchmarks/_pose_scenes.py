@@ -67,7 +67,7 @@ def frames_off(folder: Path, size: int, bands: int, views: int, error_px: float,
 
 def sweeps(folder: Path, size: int, bands: int, num_sweeps: int, error_px: float, seed: int) -> PosedScene:
     """The scene swept by line cameras with a smooth wobble that its poses don't know; evaluation views are frames."""
-    views = _views_for(num_sweeps)
+    views = views_for(num_sweeps)
     make_demo_scene(folder, size, bands, views)
     frames, truth = demo_cameras(size, views), line_cameras(size, views)
     content = json.loads((folder / _TRANSFORMS).read_text())
@@ -172,7 +172,7 @@ def _scale_for(error_px: float, error: Any) -> float:
     return 0.5 * (low + high)
 
 
-def _views_for(num_sweeps: int) -> int:
+def views_for(num_sweeps: int) -> int:
     """Views of a demo scene that has so many to train on: every 4th is for evaluation."""
     return next(n for n in range(num_sweeps, 2 * num_sweeps + 4) if n - (n + 1) // 4 == num_sweeps)
 

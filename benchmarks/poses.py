@@ -20,7 +20,7 @@ import _common
 import _machine
 import torch
 import tyro
-from _pose_scenes import PosedScene, frames_off, pose_error, sweeps
+from _pose_scenes import PosedScene, frames_off, pose_error, sweeps, views_for
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 
@@ -99,8 +99,7 @@ def run_lines(options: Options, place: Path) -> dict[str, Any]:
     """As many frames with true poses; sweeps with a wobble, refined, and without it."""
     wobbling = sweeps(place / "wobble", *_size(options), NUM_SWEEPS, ERROR_PX, options.seed)
     steady = sweeps(place / "steady", *_size(options), NUM_SWEEPS, 0.0, options.seed)
-    num_views = len(json.loads((steady.folder / "transforms.json").read_text())["frames"])
-    frames = frames_off(place / "frames", *_size(options), num_views, 0.0, options.seed)
+    frames = frames_off(place / "frames", *_size(options), views_for(NUM_SWEEPS), 0.0, options.seed)
     return {
         "frames": measure(frames, (), options, place),
         "sweeps": measure(steady, (), options, place),
