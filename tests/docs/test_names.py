@@ -10,6 +10,7 @@ from tests.docs.pages import ROOT, text_of
 from unmix_plugin.commands.demo_scene import write_demo_scene
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import PRODUCTS, export
+from unmix_plugin.commands.method_products import own_products
 from unmix_plugin.commands.process import process
 from unmix_plugin.commands.process_inspect import inspect_command
 from unmix_plugin.commands.render import render
@@ -29,7 +30,9 @@ def flags():
     asked += [
         (train, [method, "--help-all"]) for method in ("unmix-nerf", "unmix-nerf-published", "neumatex")
     ]
-    asked += [(export, [product.name, "--help"]) for product in PRODUCTS]
+    own, _ = own_products(frozenset())
+    products = [*(product.name for product in PRODUCTS), *own]
+    asked += [(export, [name, "--help"]) for name in products]
     return {
         flag for command, argv in asked for flag in re.findall(r"--[a-z0-9][\w.-]*", run(command, *argv).out)
     }

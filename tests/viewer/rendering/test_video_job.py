@@ -5,8 +5,11 @@ import threading
 from dataclasses import replace
 
 import pytest
+import tyro
 
+from unmix_plugin.commands.render import RenderOptions
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.trained.relighting import LightChoice
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings
 from unmix_plugin.viewer.layers.layers import LAYERS
 from unmix_plugin.viewer.rendering import video_job
@@ -142,3 +145,13 @@ def test_stopping_ends_the_encoder_that_the_render_started(tmp_path, run_instead
 def test_the_command_is_run_by_this_python(tmp_path, run_instead):
     run_instead(WRITE.format(folder=str(tmp_path)) + f"; assert sys.executable == {sys.executable!r}")
     assert rendered(tmp_path).video is not None
+
+
+def test_another_light_is_rendered_by_the_command_as_the_page_shows_it(tmp_path):
+    paths = (tmp_path, tmp_path / "path.json", "rgb", tmp_path / "out", None)
+    words = render_argv(*paths, LightChoice("studio", rotation_deg=-30.0, exposure_stops=0.5))
+    options = tyro.cli(RenderOptions, args=words)
+    assert options.environment == "studio"
+    assert (options.environment_rotation, options.environment_exposure) == (-30.0, 0.5)
+    assert options.edits is None
+    assert render_argv(*paths) == render_argv(*paths, LightChoice())

@@ -224,11 +224,11 @@ class CapturePanel:
         check_size(width, height)
         cameras = self._save_path()
         recipe = None
-        if not session.view.edit.is_none:
+        if session.view.edit.has_recipe:
             text = recipe_to_yaml(session.view.edit.recipe).encode()
             recipe = write_file(cameras.with_suffix(".yml"), text)
         folder = cameras.with_suffix("")
-        argv = render_argv(services.source.run.path, cameras, output, folder, recipe)
+        argv = render_argv(services.source.run.path, cameras, output, folder, recipe, session.view.edit.light)
 
         def progress(fraction: float) -> None:
             if not session.is_closed:

@@ -46,7 +46,12 @@ class Edit:
     @property
     def is_none(self) -> bool:
         """Whether nothing is changed."""
-        return not self.recipe.operations and self.recipe.illuminant is None and self.light == LightChoice()
+        return not self.has_recipe and self.light == LightChoice()
+
+    @property
+    def has_recipe(self) -> bool:
+        """Whether materials, or the light of a scene of mixed materials, are changed."""
+        return bool(self.recipe.operations) or self.recipe.illuminant is not None
 
     @property
     def changes_geometry(self) -> bool:

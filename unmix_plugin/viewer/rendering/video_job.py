@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from unmix_plugin.trained.relighting import LightChoice
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings
 
@@ -139,8 +140,20 @@ def _end(process: subprocess.Popen[str]) -> None:
             continue
 
 
-def render_argv(run: Path, cameras: Path, output: str, folder: Path, recipe: Path | None) -> list[str]:
+def render_argv(
+    run: Path,
+    cameras: Path,
+    output: str,
+    folder: Path,
+    recipe: Path | None,
+    light: LightChoice = LightChoice(),  # noqa: B008 - a frozen value
+) -> list[str]:
     """Arguments of `unmix-render` for a video along a camera file."""
     argv = ["--run", str(run), "--cameras", str(cameras), "--outputs", output, "--formats", "mp4"]
     argv += ["--output", str(folder), "--overwrite"]
-    return argv if recipe is None else [*argv, "--edits", str(recipe)]
+    if recipe is not None:
+        argv += ["--edits", str(recipe)]
+    if light.name is not None:
+        argv += ["--environment", light.name]
+    numbers = {"--environment-rotation": light.rotation_deg, "--environment-exposure": light.exposure_stops}
+    return [*argv, *(f"{flag}={value:g}" for flag, value in numbers.items() if value != 0)]
