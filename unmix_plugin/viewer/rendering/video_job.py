@@ -13,8 +13,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from unmix_plugin.trained.relighting import LightChoice
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.trained.relighting import LightChoice
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings
 
 _LAUNCH = "from unmix_plugin.commands.render import main; main()"
