@@ -8,6 +8,7 @@ The views are those that lie farthest from each other, the first given. Evaluati
 from __future__ import annotations
 
 import json
+import shutil
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,7 +80,8 @@ def measure(
     data.mkdir()
     for path in scene.iterdir():
         if path.name != "transforms.json":
-            (data / path.name).symlink_to(path.resolve())
+            copy = shutil.copytree if path.is_dir() else shutil.copyfile
+            copy(path, data / path.name)
     left_out = set(content["train_filenames"]) - set(kept)
     frames = [frame for frame in content["frames"] if frame["file_path"] not in left_out]
     written = {**content, "train_filenames": kept, "frames": frames}

@@ -49,13 +49,14 @@ def main(options: Options) -> None:
     steps = 30 if options.quick else options.steps
     found: dict[str, np.ndarray] = {}
     with tempfile.TemporaryDirectory() as folder:
+        variant = options.scene.name if options.scene else ""
         scene = options.scene or demo(Path(folder) / "demo", QUICK_SIZE if options.quick else SIZE)
         for name, sensors in (("rig", ("rgb", "spectral")), ("spectral alone", ("spectral",))):
             data = write_rig(scene, Path(folder) / name.replace(" ", "-"), sensors)
             run = train(data, Path(folder) / "outputs", steps, options.device)
             found[name] = measure(run, options.device)
         found["enlarged"] = enlarged(data)
-    _common.publish(report(found, scene.name, steps, machine), _results(options))
+    _common.publish(report(found, scene.name, steps, machine, variant), _results(options))
 
 
 def demo(folder: Path, size: int) -> Path:
@@ -114,7 +115,9 @@ def psnr_of_bands(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return -10 * np.log10(error.mean(axis=(0, 1)))
 
 
-def report(found: dict[str, np.ndarray], scene: str, steps: int, machine: dict[str, Any]) -> _common.Report:
+def report(
+    found: dict[str, np.ndarray], scene: str, steps: int, machine: dict[str, Any], variant: str
+) -> _common.Report:
     """The least gain over bands, and all figures."""
     rig = found["rig"]
     figures = [
@@ -135,7 +138,7 @@ def report(found: dict[str, np.ndarray], scene: str, steps: int, machine: dict[s
     question = "Sharp spectra from a sharp RGB camera and a coarse spectral one"
     setting = {"scene": scene, "steps": steps, "coarser": FACTOR}
     measured = {name: psnr.tolist() for name, psnr in found.items()}
-    return _common.Report("rig", question, setting, machine, figures, measured, (table,))
+    return _common.Report("rig", question, setting, machine, figures, measured, (table,), variant)
 
 
 def _results(options: Options) -> Path | None:

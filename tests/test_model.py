@@ -467,14 +467,3 @@ def test_images_of_many_pixels_are_sampled_coarsely_at_first():
     assert 2.0 < counts[2] / counts[0] < 2.6  # 23 samples along an edge in the end
     assert counts[0] < counts[1] < counts[2] == counts[3]
     assert int(model.eval().get_outputs(make_rays(50))["num_samples"]) == counts[3]
-
-
-def test_space_that_was_not_trained_yet_stays_occupied_when_samples_get_closer():
-    renderer = replace(CONFIG.renderer, coarse_samples=4, coarse_until=0.5)
-    model = make_model(renderer=renderer)
-    with torch.no_grad():
-        model.field.get_parameter("table").zero_()
-    assert model._coarseness(0.0) > 2 * model._coarseness(1.0)
-    for update in range(8):
-        model._begin_step(16 * update, progress=1.0)
-    assert bool(model.grid.occupied.all())

@@ -52,7 +52,7 @@ _PROBED_CELLS = 32_768
 _GRID_DECAY = 0.5
 """Factor on the remembered density of a probed cell: lower forgets emptied space sooner."""
 _OCCUPIED_OPACITY = 0.03
-"""Opacity of one sample's interval, as samples lie at the start of training, from which a cell counts as occupied."""
+"""Opacity of one sample's interval from which a cell counts as occupied."""
 
 
 class UnmixModel(Model):
@@ -384,8 +384,7 @@ class UnmixModel(Model):
         self._share_observations()
         self.grid.update(
             lambda points: self.field.get_density(space.from_unit(points))[0],
-            # Not of the present samples: as these get closer, untrained cells would fall below the threshold.
-            threshold=-math.log1p(-_OCCUPIED_OPACITY) / (self.step * self._coarseness(0.0)),
+            threshold=-math.log1p(-_OCCUPIED_OPACITY) / self._training_step,
             decay=_GRID_DECAY,
             num_cells=_PROBED_CELLS,
             generator=torch.Generator().manual_seed(seed),
