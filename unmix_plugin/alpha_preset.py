@@ -63,7 +63,7 @@ WITHOUT_ALPHA = AlphaPreset(
 )
 
 
-UNBOUNDED = replace(WITHOUT_ALPHA, initial_opacity=0.005, opacity_loss_weight=0.0, coarse_samples=64)
+UNBOUNDED = replace(WITHOUT_ALPHA, initial_opacity=0.005, opacity_loss_weight=1e-3, coarse_samples=64)
 
 
 def preset_for(has_alpha: bool, is_unbounded: bool = False) -> AlphaPreset:

@@ -232,7 +232,7 @@ class VolumeRenderer:
 
         Source: Philip and Deschaintre 2023, Floaters No More.
         """
-        return (t / self.box.size.max()).square().clamp(max=1.0)
+        return (t / self.space.half_edge).square().clamp(max=1.0)
 
     def _march(self, ray_bundle: RayBundle, generator: torch.Generator | None) -> PackedSamples:
         origins, directions = ray_bundle.origins.detach(), ray_bundle.directions.detach()
