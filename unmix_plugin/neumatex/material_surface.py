@@ -5,16 +5,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from unmix_plugin.neumatex.materials.family import MaterialFamily
+from unmix_plugin.neumatex.materials.layered import LayeredFamily
 from unmix_plugin.neumatex.materials.neural import NeuralFamily
 from unmix_plugin.neumatex.materials.pbr import PbrFamily
 from unmix_plugin.neumatex.triplane import Triplane
 
 MaterialName = Literal["neural", "pbr"]
 """Families that can be trained."""
+_START_RANGE = (0.05, 0.95)
+"""Of parameters, away from where a sigmoid has no slope."""
+_START_PLANES = 0.2
+"""Of the planes' random values: texels that few pixels see keep theirs, which shows as grain."""
+_START_SPREAD = 0.3
+"""Of the last layer's random weights."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +45,30 @@ def material_family(name: MaterialName) -> MaterialFamily:
     """
     families: dict[MaterialName, type] = {"neural": NeuralFamily, "pbr": PbrFamily}
     return families[name]()
+
+
+def plain_parameters(family: MaterialFamily) -> Float[Tensor, "P"]:
+    """Parameters of a rough grey surface that is no metal and has no layers: where a fit without a prior starts.
+
+    From the middle of all parameters, which is half a metal, a fit puts the colours of what is diffuse into what the
+    metal reflects.
+    """
+    if isinstance(family, NeuralFamily):
+        layered = torch.zeros(1, LayeredFamily.num_parameters)
+        layered[0, :3], layered[0, 4:6] = 0.5, 0.5
+        return family.from_layered(layered)[0].clamp(*_START_RANGE)
+    return torch.tensor([0.5, 0.5, 0.5, 0.5, 0.0]).clamp(*_START_RANGE)
+
+
+def start_plain(triplane: Triplane, family: MaterialFamily) -> None:
+    """Make a new triplane give the plain material nearly everywhere."""
+    network = next(part for name, part in triplane.named_modules() if name.endswith("material_network"))
+    *_, last = network.children()
+    assert isinstance(last, nn.Linear)
+    with torch.no_grad():
+        triplane.planes.mul_(_START_PLANES)
+        last.weight.mul_(_START_SPREAD)
+        last.bias.copy_(plain_parameters(family).logit())
 
 
 def frozen_parts(family: MaterialFamily) -> dict[str, nn.Module]:

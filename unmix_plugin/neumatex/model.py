@@ -30,6 +30,7 @@ from unmix_plugin.neumatex.material_surface import (
     TriplaneSurface,
     frozen_parts,
     material_family,
+    start_plain,
 )
 from unmix_plugin.neumatex.object_record import ObjectRecord
 from unmix_plugin.neumatex.tone.curves import LightCurve, ToneMapping, psnr_db, tone_curve
@@ -110,9 +111,10 @@ class NeumatexModel(Model):
         self._traced = TracedObjectCache()
 
     def initialise(self, initial_data: Mapping[str, np.ndarray], generator: torch.Generator) -> None:
-        """Take mesh and environment over."""
+        """Take mesh and environment over, and begin with a plain material."""
         for name, array in initial_data.items():
             self.get_buffer(name).copy_(torch.from_numpy(array))
+        start_plain(self.triplane, self.family)
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Planes, networks, and the camera's response where there is one."""
