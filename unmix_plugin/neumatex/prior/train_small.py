@@ -116,6 +116,7 @@ def train_prior(settings: TrainPrior, console: Console) -> None:
 
     truth = truth_of(objects)
     steps = train(prior, objects, truth, settings.training, report)
+    final_loss = list(losses.values())[-1] if losses else None
     groups = [
         train_readers(prior, objects, truth, material, settings.readers, report)
         for material in ("neural", "pbr")
@@ -128,7 +129,7 @@ def train_prior(settings: TrainPrior, console: Console) -> None:
         "steps": steps,
         "reader_training": asdict(settings.readers),
         "reader_groups": groups,
-        "final_loss": list(losses.values())[-1] if losses else None,
+        "final_loss": final_loss,
         "processor_seconds": round(time.process_time() - started),
         "torch": torch.__version__,
         "processor": platform.machine(),
