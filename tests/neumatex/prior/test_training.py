@@ -14,7 +14,7 @@ from unmix_plugin.neumatex.lighting.environment import Environment
 from unmix_plugin.neumatex.prior.reader_training import ReaderTraining, train_readers
 from unmix_plugin.neumatex.prior.small import filled_triplane, predict, read_colours
 from unmix_plugin.neumatex.prior.small_network import NUM_PARAMETERS, SmallPrior
-from unmix_plugin.neumatex.prior.small_weights import read_small_prior, write_small_prior
+from unmix_plugin.neumatex.prior.small_weights import SHIPPED, read_small_prior, write_small_prior
 from unmix_plugin.neumatex.prior.training import (
     PriorTraining,
     Truth,
@@ -254,3 +254,8 @@ def test_damaged_weights_are_named(tmp_path):
         read_small_prior("pbr", tmp_path)
     with pytest.raises(RunError, match=r"small\.json can't be read"):
         read_small_prior("pbr", tmp_path / "elsewhere")
+
+
+def test_the_shipped_prior_belongs_to_the_shipped_decoder_and_is_small():
+    read_small_prior("neural")
+    assert (SHIPPED / "small.safetensors").stat().st_size < 10e6
