@@ -183,31 +183,41 @@ def _in_world(views: list[Cameras], frame: Any) -> Cameras:
 
 def judge_frames(found: dict[str, Any]) -> list[_common.Figure]:
     """What is asked of poses that are off."""
-    true, refined, given = found["true poses"], found["off, refined"], found["off, as they are"]
-    loss = {name: true[name] - refined[name] for name in ("psnr", "miou")}
+    given = _lost(found, "true poses", "off, as they are", "psnr")
     return [
-        _common.reported("poses off, as they are: PSNR lost", f"{true['psnr'] - given['psnr']:.2f} dB"),
-        _common.Limit(1.0, is_upper=True, unit=" dB").judge("poses off, refined: PSNR lost", loss["psnr"]),
-        _common.Limit(0.03, is_upper=True).judge("poses off, refined: mIoU lost", loss["miou"]),
+        _common.reported("poses off, as they are: PSNR lost", "" if given is None else f"{given:.2f} dB"),
+        _common.Limit(1.0, is_upper=True, unit=" dB").judge(
+            "poses off, refined: PSNR lost", _lost(found, "true poses", "off, refined", "psnr")
+        ),
+        _common.Limit(0.03, is_upper=True).judge(
+            "poses off, refined: mIoU lost", _lost(found, "true poses", "off, refined", "miou")
+        ),
         _common.Limit(1.0, is_upper=True, unit=" px").judge(
-            "poses off, refined: error left", refined["poses_px"]
+            "poses off, refined: error left", found.get("off, refined", {}).get("poses_px")
         ),
     ]
 
 
 def judge_lines(found: dict[str, Any]) -> list[_common.Figure]:
     """What is asked of line cameras."""
-    frames, refined = found["frames"], found["sweeps with wobble, refined"]
-    steady = frames["psnr"] - found["sweeps"]["psnr"]
+    refined = "sweeps with wobble, refined"
+    steady = _lost(found, "frames", "sweeps", "psnr")
     return [
-        _common.reported("sweeps without wobble: PSNR below frames", f"{steady:.2f} dB"),
+        _common.reported(
+            "sweeps without wobble: PSNR below frames", "" if steady is None else f"{steady:.2f} dB"
+        ),
         _common.Limit(1.5, is_upper=True, unit=" dB").judge(
-            "sweeps with wobble, refined: PSNR below frames", frames["psnr"] - refined["psnr"]
+            "sweeps with wobble, refined: PSNR below frames", _lost(found, "frames", refined, "psnr")
         ),
         _common.Limit(1.0, is_upper=True, unit=" px").judge(
-            "sweeps, refined: wobble left", refined["poses_px"]
+            "sweeps, refined: wobble left", found.get(refined, {}).get("poses_px")
         ),
     ]
+
+
+def _lost(found: dict[str, Any], best: str, other: str, figure: str) -> float | None:
+    """By how much one training is below another; None where one of them was not run."""
+    return found[best][figure] - found[other][figure] if best in found and other in found else None
 
 
 JUDGES = {"frames": judge_frames, "lines": judge_lines}
@@ -219,7 +229,7 @@ def _size(options: Options) -> tuple[int, int]:
 
 def _details(name: str, found: dict[str, Any]) -> _common.DetailTable:
     keys = (*SHOWN, "given_px", "poses_px", "aligned")
-    rows = [[key, *(_text(values[key]) for values in found.values())] for key in keys]
+    rows = [[key, *(_text(values.get(key)) for values in found.values())] for key in keys]
     return _common.DetailTable(name, ["metric", *found], rows)
 
 

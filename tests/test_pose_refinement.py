@@ -46,7 +46,7 @@ def cameras() -> Cameras:
     return Cameras(poses, focal, center, torch.zeros(3, 4), WIDTH, HEIGHT, key_poses=keys)
 
 
-def refinement(lens: str = "fixed", size: float = 0.03) -> PoseRefinement:
+def refinement(lens: str = "fixed", size: float = 0.04) -> PoseRefinement:
     own, knots = cameras(), Knots.of(cameras())
     found = PoseRefinement(knots.rows, lens)  # type: ignore[arg-type]
     found.begin(knots.positions(own), MIDDLE)
@@ -117,11 +117,11 @@ def test_what_moves_all_views_alike_is_no_correction():
     moves = torch.linalg.cross(turn.expand_as(offsets), offsets) + shift + growth * offsets
     similar = torch.cat([turn.expand_as(offsets), moves / offsets.norm(dim=1, keepdim=True)], dim=1)
     with torch.no_grad():
-        found.steps.add_(similar)
+        found.steps.add_(similar / found.scale)
     assert_close(found.corrections.detach(), before, atol=1e-6, rtol=0)
     assert before.norm() > 0.05
     with torch.no_grad():
-        found.steps.copy_(before)
+        found.steps.copy_(before / found.scale)
     assert_close(found.corrections.detach(), before, atol=1e-6, rtol=0)
     assert sum(knots.counts) == len(before)
 

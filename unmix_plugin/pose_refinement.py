@@ -122,6 +122,7 @@ class PoseRefinement(nn.Module):
     is_free: Tensor
     counts: Tensor
     first: Tensor
+    scale: Tensor
     rows: Tensor
 
     def __init__(self, rows: Sequence[int], lens: Literal["fixed", "focal", "radial"] = "fixed") -> None:
@@ -138,6 +139,9 @@ class PoseRefinement(nn.Module):
         self.register_buffer("counts", counts, persistent=False)
         self.register_buffer("first", counts.cumsum(0) - counts, persistent=False)
         self.register_buffer("rows", torch.tensor(rows), persistent=False)
+        # Fewer rays speak of a knot than of a view, so it takes smaller steps: else noise moves it more than pictures.
+        scale = counts.float().rsqrt().repeat_interleave(counts)[:, None]
+        self.register_buffer("scale", scale, persistent=False)
 
     @torch.no_grad()
     def begin(self, positions: Float[Tensor, "M 3"], middle: Float[Tensor, "3"]) -> None:
@@ -150,7 +154,7 @@ class PoseRefinement(nn.Module):
     def corrections(self) -> Float[Tensor, "M 6"]:
         """Steps without what moves all views alike; 0 for views that were undone."""
         free = self.is_free.repeat_interleave(self.counts)[:, None]
-        steps = (self.steps * free).flatten()
+        steps = (self.steps * self.scale * free).flatten()
         return (steps - self.gauge @ (self.gauge.T @ steps)).view(-1, 6) * free
 
     @property
