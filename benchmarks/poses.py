@@ -236,7 +236,7 @@ def _details(name: str, found: dict[str, Any]) -> _common.DetailTable:
 def _text(value: Any) -> str:
     if isinstance(value, list):
         return ", ".join(value) or "nothing"
-    return "no truth" if value is None else f"{value:.4g}"
+    return "not measured" if value is None else f"{value:.4g}"
 
 
 if __name__ == "__main__":

@@ -30,11 +30,13 @@ if TYPE_CHECKING:
 
 SIDES_PX = (24, 48, 96, 192)
 """Longest sides of the pictures compared, one after the other; none larger than the view."""
-STEPS = (5, 4, 3, 2)
+STEPS = (5, 3, 2, 1)
 """Steps taken on each."""
 _CHANNELS = 3
 _DAMPING = 1e-3
 _DIFFERENCE_PX = 0.5
+_SMALLEST_STEP_PX = 0.05
+"""Below which no further step is taken on a picture."""
 
 Residuals = Callable[[Float[Tensor, "6"]], Float[Tensor, " n"]]
 
@@ -94,7 +96,10 @@ def _fit(
             tried = tried.clamp(-LARGEST_STEP, LARGEST_STEP)
             seen = residuals(tried)
             if float(seen.square().sum()) < float(found.square().sum()):
+                change = float((tried - best).norm()) / difference * _DIFFERENCE_PX
                 best, found, damping = tried, seen, damping / 3
+                if change < _SMALLEST_STEP_PX:
+                    return best
                 break
             damping *= 10
         else:
@@ -139,7 +144,7 @@ def _pooled(
 def _shown(
     scene: TrainedScene, camera: Cameras, truth: ViewTruth, axes: Float[Tensor, "B C"]
 ) -> Float[Tensor, "P D"]:
-    view = scene.look(camera, 2 if max(camera.width, camera.height) <= SIDES_PX[1] else 1)
+    view = scene.look(camera, 2 if max(camera.width, camera.height) <= SIDES_PX[0] else 1)
     opacity = view.opacity if truth.alpha is not None else torch.ones_like(view.opacity)
     seen = truth.seen(view["spectral"]).float() @ axes.to(view.opacity)
     return torch.cat([seen, opacity[..., None]], dim=-1).flatten(0, 1).cpu()
