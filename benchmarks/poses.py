@@ -216,8 +216,9 @@ def judge_lines(found: dict[str, Any]) -> list[_common.Figure]:
 
 
 def _lost(found: dict[str, Any], best: str, other: str, figure: str) -> float | None:
-    """By how much one training is below another; None where one of them was not run."""
-    return found[best][figure] - found[other][figure] if best in found and other in found else None
+    """By how much one training is below another; None where one of them was not measured."""
+    values = [found.get(name, {}).get(figure) for name in (best, other)]
+    return None if None in values else values[0] - values[1]
 
 
 JUDGES = {"frames": judge_frames, "lines": judge_lines}
