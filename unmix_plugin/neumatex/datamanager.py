@@ -28,6 +28,7 @@ from unmix_plugin.engine import (
 from unmix_plugin.errors import require
 from unmix_plugin.neumatex.lighting.environment import Environment
 from unmix_plugin.neumatex.object_record import ObjectRecord
+from unmix_plugin.neumatex.prior_anchor import view_arrays
 from unmix_plugin.neumatex.scene.load_object import load_object
 from unmix_plugin.neumatex.scene.pixel_list import PixelList
 from unmix_plugin.neumatex.scene.posed_pictures import PosedPictures, opacity
@@ -135,11 +136,13 @@ class ObjectDataManager(DataManager):
         return ObjectRecord.of(self.object).to_json()
 
     def initial_data(self) -> Mapping[str, np.ndarray]:
-        """Mesh and environment, which become buffers of the model: a run renders without its data."""
+        """Mesh and environment, which become buffers of the model, so that a run renders without its data; and some
+        training views for a prior, as `prior_anchor.views_of` puts them together."""
         mesh, light = self.object.mesh, self.object.environment
         arrays = {"vertices": mesh.vertices, "faces": mesh.faces, "normals": mesh.normals, "uv": mesh.uv}
         arrays["light_map"] = light.image
-        return {name: array.numpy() for name, array in arrays.items() if array is not None}
+        buffers = {name: array.numpy() for name, array in arrays.items() if array is not None}
+        return {**buffers, **view_arrays(self.object)}
 
     def summary(self) -> dict[str, Any]:
         """Files, splits, normalisation, hashes."""

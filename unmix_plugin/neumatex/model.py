@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
@@ -33,10 +33,12 @@ from unmix_plugin.neumatex.material_surface import (
     start_plain,
 )
 from unmix_plugin.neumatex.object_record import ObjectRecord
+from unmix_plugin.neumatex.prior_anchor import PriorAnchor, views_of
 from unmix_plugin.neumatex.tone.curves import LightCurve, ToneMapping, psnr_db, tone_curve
 from unmix_plugin.neumatex.traced_object import SeenPoints, TracedObject, TracedObjectCache
 from unmix_plugin.neumatex.triplane import Triplane
 
+PriorName = Literal["small", "none"]
 _START_SEED = 0
 """Of networks and planes before training; the run's own seed draws all else."""
 
@@ -57,6 +59,11 @@ class NeumatexModelConfig(ModelConfig):
     """How often light may be reflected between parts of the object before it reaches the point that is seen."""
     eval_samples: Annotated[int, Common] = 64
     """Paths a pixel in renders and evaluation."""
+    prior: Annotated[PriorName, Common] = "none"
+    """Where the fit starts and what it is held to: small is the prior of the package, then only the planes are fitted;
+    none fits networks too, from a random start."""
+    regularisation: float = 2.0
+    """Weight of the distance from the prior, over its expected squared error."""
     plane_resolution: int = 128
     """Texels along an edge of each of the three planes."""
     light_curve: LightCurve = "agx"
@@ -73,6 +80,7 @@ class NeumatexModelConfig(ModelConfig):
             "samples of 2 to 1024": 2 <= self.samples <= 1024,
             "bounces of 0 to 8": 0 <= self.bounces <= 8,
             "eval-samples of 1 to 65536": 1 <= self.eval_samples <= 65536,
+            "regularisation of at least 0": 0 <= self.regularisation < float("inf"),
             "plane-resolution of 2 to 2048": 2 <= self.plane_resolution <= 2048,
         }
         require("the model", rules)
@@ -104,6 +112,11 @@ class NeumatexModel(Model):
                 f"{record.num_colours}; give pictures of 3 colours"
             )
         self.light_curve = tone_curve(self.config.light_curve)
+        self.anchor = None
+        if self.config.prior != "none":
+            self.anchor = PriorAnchor(Triplane(parameters, resolution, generator=generator))
+            for network in self.triplane.parameter_groups()["networks"]:
+                network.requires_grad_(False)
         is_light = record.tone_mapping == "linear"
         self.curve: nn.Module = self.light_curve if is_light else tone_curve(record.tone_mapping)
         for name, buffer in _empty_buffers(record).items():
@@ -111,14 +124,30 @@ class NeumatexModel(Model):
         self._traced = TracedObjectCache()
 
     def initialise(self, initial_data: Mapping[str, np.ndarray], generator: torch.Generator) -> None:
-        """Take mesh and environment over, and begin with a plain material."""
-        for name, array in initial_data.items():
-            self.get_buffer(name).copy_(torch.from_numpy(array))
-        start_plain(self.triplane, self.family)
+        """Take mesh and environment over, and begin with the prior's material, or a plain one."""
+        for name in _empty_buffers(self.record):
+            self.get_buffer(name).copy_(torch.from_numpy(initial_data[name]))
+        if self.anchor is None:
+            start_plain(self.triplane, self.family)
+        else:
+            from unmix_plugin.neumatex.prior.small import predict
+
+            found = predict(
+                views_of(initial_data),
+                self.traced.ray_mesh,
+                self.environment,
+                self.config.material,
+                resolution=self.config.plane_resolution,
+                generator=generator,
+            )
+            self.triplane.load_state_dict(found.state_dict())
+            self.anchor.adopt(found)
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Planes, networks, and the camera's response where there is one."""
+        """Planes, networks unless they are a prior's, and the camera's response where there is one."""
         groups = self.triplane.parameter_groups()
+        if self.anchor is not None:
+            groups["networks"] = []
         return {**groups, "response": list(self.curve.parameters())}
 
     @property
@@ -152,7 +181,7 @@ class NeumatexModel(Model):
             twice = SeenPoints.cat([seen, seen])
             light = traced.light(twice, samples, self.config.bounces, self._random())
             halves = torch.stack([seen.scatter(part) for part in light.unflatten(0, (2, -1)).unbind()])
-            return {"halves": halves, "found": seen.found}
+            return {"halves": halves, "found": seen.found, "positions": seen.points.positions}
         light = traced.light(seen, self.config.eval_samples, self.config.bounces, self._random())
         base = self.family.base_colour(self.surface.parameters(seen.points.positions))
         found = seen.found[:, None]
@@ -168,8 +197,14 @@ class NeumatexModel(Model):
         batch: dict[str, Tensor],
         metrics_dict: dict[str, Tensor] | None = None,
     ) -> dict[str, Tensor]:
-        """`picture`: the squared error of tone-mapped light, from two independent estimates."""
-        return {"picture": _squared_error(self._residuals(outputs, batch), outputs["found"])}
+        """`picture`: the squared error of tone-mapped light, from two independent estimates; `prior`: the distance
+        from the prior's material."""
+        losses = {"picture": _squared_error(self._residuals(outputs, batch), outputs["found"])}
+        if self.anchor is not None and self.config.regularisation > 0:
+            positions = outputs["positions"]
+            distance = self.anchor.distance(self.surface.parameters(positions), positions)
+            losses["prior"] = self.config.regularisation * distance
+        return losses
 
     def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """PSNR of the batch, the noise of its few samples left out."""
