@@ -26,6 +26,6 @@ def test_a_fit_begins_at_the_prior_and_only_its_planes_are_fitted(tmp_path):
         pipeline.model.triplane.planes += 0.1
     _, losses, _ = pipeline.get_train_loss_dict(0)
     assert float(losses["prior"].detach()) > 0
-    sum(losses.values()).backward()
+    torch.stack(list(losses.values())).sum().backward()
     moved = {name for name, parameter in pipeline.model.named_parameters() if parameter.grad is not None}
     assert moved == {"triplane.planes"}
