@@ -19,7 +19,14 @@ from unmix_plugin.commands.view import view
 
 PAGES = ["README.md", *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md")))]
 OF_OTHERS = {"--debug", "--constraint", "--help-all", "--pipeline", "--pipeline.model.resolution", "--seeds"}
+OF_SCRIPTS = {"--folder", "--start"}
+"""Of the scripts that train what the package ships."""
 """Taken before a command sees them, of pip, a beginning, of an example's method, of benchmarks."""
+OF_LAUNCHERS = {
+    *("--nnodes", "--nproc-per-node", "--rdzv-backend", "--rdzv-endpoint"),
+    *("--nodes", "--ntasks-per-node", "--gpus-per-node"),
+}
+"""Of torchrun and Slurm."""
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +48,7 @@ def flags():
 @pytest.mark.parametrize("page", PAGES)
 def test_flags_are_those_of_the_commands(page, flags):
     named = {flag.rstrip(".-") for flag in re.findall(r"(?<![\w-])--[a-z0-9][\w.-]*", text_of(page))}
-    assert named - flags - OF_OTHERS == set()
+    assert named - flags - OF_OTHERS - OF_SCRIPTS - OF_LAUNCHERS == set()
 
 
 @pytest.mark.parametrize("page", PAGES)
