@@ -50,9 +50,8 @@ def join_parts(
     joined["sensor_rays"] = torch.tensor(
         [len(bundle) // count for bundle, count in zip(bundles, counts, strict=True)]
     )
-    rays = RayBundle(
-        *(torch.cat([getattr(b, name) for b in bundles]) for name in RayBundle.__dataclass_fields__)
-    )
+    columns = [[getattr(bundle, name) for bundle in bundles] for name in RayBundle.__dataclass_fields__]
+    rays = RayBundle(*(None if any(x is None for x in column) else torch.cat(column) for column in columns))
     return rays, joined
 
 
