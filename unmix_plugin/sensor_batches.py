@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -50,8 +51,11 @@ def join_parts(
     joined["sensor_rays"] = torch.tensor(
         [len(bundle) // count for bundle, count in zip(bundles, counts, strict=True)]
     )
-    columns = [[getattr(bundle, name) for bundle in bundles] for name in RayBundle.__dataclass_fields__]
-    rays = RayBundle(*(None if any(x is None for x in column) else torch.cat(column) for column in columns))
+    columns: list[Any] = []
+    for name in RayBundle.__dataclass_fields__:
+        column = [getattr(bundle, name) for bundle in bundles]
+        columns.append(None if any(x is None for x in column) else torch.cat(column))
+    rays = RayBundle(*columns)
     return rays, joined
 
 
