@@ -60,6 +60,7 @@ def test_a_wheel_declares_commands_and_methods(wheel):
         "unmix-view": "unmix_plugin.commands.view:main",
     }
     assert dict(entry_points["unmix_plugin.method_configs"]) == {
+        "neumatex": "unmix_plugin.neumatex.method_config:neumatex",
         "unmix-nerf": "unmix_plugin.method_config:unmix_nerf",
         "unmix-nerf-published": "unmix_plugin.method_config:unmix_nerf_published",
     }

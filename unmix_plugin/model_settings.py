@@ -62,8 +62,8 @@ class UnmixModelConfig(ModelConfig):
     light: Annotated[Light | Auto, Common, short("light")] = "auto"
     """Light that is fixed, that moves with the camera (objects turned before camera and lamp), or that differs from
     view to view (also exposure). Auto finds which it is, and takes fixed without alpha."""
-    poses: Annotated[Literal["fixed", "refine"] | Auto, Common, short("poses")] = "auto"
-    """Whether training takes the poses as they are, or corrects them with the field; auto takes them as they are."""
+    poses: Annotated[Literal["fixed", "refine"], Common, short("poses")] = "fixed"
+    """Whether training takes the poses as they are, or corrects them with the field."""
     pose_refinement: PoseConfig = PoseConfig()
     """How poses are corrected."""
     segmentation: SegmentationMethod = "abundances"
@@ -139,8 +139,6 @@ class UnmixModelConfig(ModelConfig):
             found = replace(found, light=light)
             if light != "fixed":
                 reasons.append(_WHY_LIGHT[light])
-        if self.poses == "auto":
-            found = replace(found, poses="fixed")
         return found, "\n".join(reasons)
 
 

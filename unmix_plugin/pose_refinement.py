@@ -75,7 +75,7 @@ class PoseConfig:
         """Weights in [0, 1] of a grid's levels when that part of the training is over.
 
         >>> PoseConfig(coarse_until=0.5).level_weights(4, 0.125)
-        [1.0, 0.5, 0.0, 0.0]
+        [1.0, 0.853553390593, 0.0, 0.0]
         """
         share = 1.0 if progress >= self.coarse_until else progress / self.coarse_until
         joined = [min(max(1 + share * (num_levels - 1) - level, 0.0), 1.0) for level in range(num_levels)]

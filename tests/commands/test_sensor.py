@@ -145,7 +145,10 @@ def test_products_that_compare_in_the_runs_own_bands_refuse(solid, camera, tmp_p
     assert ended.status == 2
     said = " ".join(ended.err.split())
     assert f"{words[0]} compares with what is known in the run's own bands" in said
-    assert "It goes with abundances, cubes, endmembers, mesh, pca, point-cloud, segmentation, volume" in said
+    assert (
+        "It goes with abundances, cubes, endmembers, mesh, pca, point-cloud, poses, segmentation, volume"
+        in said
+    )
     assert not (tmp_path / "out").exists()
 
 

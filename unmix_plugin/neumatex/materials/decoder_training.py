@@ -45,7 +45,7 @@ def train(settings: DecoderTraining, report: Callable[[int, float], None]) -> tu
         report: Called now and then with the step and the PSNR in dB of tone-mapped light, of materials as they come.
     """
     generator = torch.Generator().manual_seed(settings.seed)
-    with torch.random.fork_rng():
+    with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         decoder, encoder = Decoder(), Encoder()
     parameters = [*decoder.parameters(), *encoder.parameters()]

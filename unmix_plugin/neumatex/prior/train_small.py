@@ -100,7 +100,7 @@ def train_prior(settings: TrainPrior, console: Console) -> None:
     """Train, and write the weights with the record of how they were made."""
     decoder = shipped_decoder_sha256()
     objects = read_objects(sorted(settings.folder.glob("objects-*.safetensors")))
-    with torch.random.fork_rng():
+    with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.training.seed)
         prior = SmallPrior()
     before: dict[str, Any] = {}

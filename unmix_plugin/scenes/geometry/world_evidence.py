@@ -107,13 +107,17 @@ def find_world_evidence(box: SceneBox, cameras: Cameras, read_view: ReadView) ->
 
 
 def _spread_pixels(image: Float[Tensor, "H W F"]) -> Tensor:
-    """Of each of `TILES` x `TILES` parts of an image the pixel where it changes most; row-major numbers (P,)."""
+    """Of each of `TILES` x `TILES` parts of an image the pixel where it changes most; row-major numbers (P,).
+
+    An image of fewer pixels along an edge has as many parts there as pixels.
+    """
     change = local_change(image)
-    height, width = (side // TILES * TILES for side in change.shape)
-    tiles = change[:height, :width].reshape(TILES, height // TILES, TILES, width // TILES)
+    down, across = (min(TILES, side) for side in change.shape)
+    height, width = change.shape[0] // down, change.shape[1] // across
+    tiles = change[: down * height, : across * width].reshape(down, height, across, width)
     best = tiles.permute(0, 2, 1, 3).flatten(2).argmax(dim=-1)
-    rows = torch.arange(TILES)[:, None] * (height // TILES) + best // (width // TILES)
-    columns = torch.arange(TILES)[None, :] * (width // TILES) + best % (width // TILES)
+    rows = torch.arange(down)[:, None] * height + best // width
+    columns = torch.arange(across)[None, :] * width + best % width
     return (rows * change.shape[1] + columns).flatten()
 
 
