@@ -17,8 +17,8 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from unmix_plugin.rendering.grid_cells import cells_at
-from unmix_plugin.rendering.launching import as_warp, launch, vector_type
-from unmix_plugin.rendering.marching import PackedSamples, check_step
+from unmix_plugin.rendering.launching import as_warp, vector_type
+from unmix_plugin.rendering.marching import PackedSamples, check_step, count_and_write
 
 FAR_RADIUS = 512.0
 LINEAR_RADIUS = 2.0
@@ -52,17 +52,7 @@ def march_contracted(
         step,
         as_warp(occupied.contiguous()),
     ]
-    counts = torch.empty(len(origins), dtype=torch.int64, device=device)
-    launch(count_kernel, len(origins), [*rays, as_warp(counts)], device)
-    ends = counts.cumsum(0)
-    packed_info = torch.stack([ends - counts, counts], dim=-1)
-    total = int(ends[-1]) if len(ends) else 0
-    t_samples = torch.empty(total, dtype=torch.float32, device=device)
-    ray_indices = torch.empty(total, dtype=torch.int64, device=device)
-    if total:
-        written = [as_warp(packed_info), as_warp(ray_indices), as_warp(t_samples)]
-        launch(write_kernel, len(origins), [*rays, *written], device)
-    return PackedSamples(t_samples, ray_indices, packed_info, step)
+    return PackedSamples(*count_and_write(count_kernel, write_kernel, rays, len(origins), device), step)
 
 
 def march_contracted_twin(

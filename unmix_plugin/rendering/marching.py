@@ -6,14 +6,16 @@ Notation: `R` rays, `S` samples in all, stored packed: the samples of a ray are 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from unmix_plugin.rendering.grid_cells import cells_at
-from unmix_plugin.rendering.launching import as_warp, launch, vector_type
+from unmix_plugin.rendering.launching import KernelArray, as_warp, launch, vector_type
 
 
 @dataclass(frozen=True)
@@ -74,8 +76,25 @@ def march(
         step,
         as_warp(occupied.contiguous()),
     ]
-    counts = torch.empty(len(origins), dtype=torch.int64, device=device)
-    launch(count_kernel, len(origins), [*rays, as_warp(counts)], device)
+    return PackedSamples(*count_and_write(count_kernel, write_kernel, rays, len(origins), device), step)
+
+
+def count_and_write(
+    count_kernel: Any,
+    write_kernel: Any,
+    rays: Sequence[KernelArray | float],
+    num_rays: int,
+    device: torch.device,
+) -> tuple[Float[Tensor, "S"], Int[Tensor, "S"], Int[Tensor, "R 2"]]:
+    """Samples of rays by two launches: one counts them, the other writes them where there is then room.
+
+    Args:
+        rays: Arguments of both kernels.
+    Returns:
+        Distances and rays of the samples, and each ray's first sample and number of samples.
+    """
+    counts = torch.empty(num_rays, dtype=torch.int64, device=device)
+    launch(count_kernel, num_rays, [*rays, as_warp(counts)], device)
     ends = counts.cumsum(0)
     packed_info = torch.stack([ends - counts, counts], dim=-1)
     total = int(ends[-1]) if len(ends) else 0
@@ -83,8 +102,8 @@ def march(
     ray_indices = torch.empty(total, dtype=torch.int64, device=device)
     if total:
         written = [as_warp(packed_info), as_warp(ray_indices), as_warp(t_samples)]
-        launch(write_kernel, len(origins), [*rays, *written], device)
-    return PackedSamples(t_samples, ray_indices, packed_info, step)
+        launch(write_kernel, num_rays, [*rays, *written], device)
+    return t_samples, ray_indices, packed_info
 
 
 def march_twin(
