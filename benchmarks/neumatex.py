@@ -30,6 +30,10 @@ MAIN, BASELINE = "neural", "pbr"
 VARIANTS: dict[str, tuple[str, ...]] = {
     MAIN: ("--pipeline.model.material", "neural"),
     BASELINE: ("--pipeline.model.material", "pbr"),
+    "neural, no prior": ("--pipeline.model.prior", "none"),
+    "neural, not held to the prior": ("--pipeline.model.regularisation", "0"),
+    "neural, planes alone": ("--pipeline.model.no-fit-networks",),
+    "neural, as published": ("--pipeline.model.no-fit-networks", "--pipeline.model.regularisation", "2"),
 }
 COLUMNS = {
     "relit_psnr": "relit PSNR",

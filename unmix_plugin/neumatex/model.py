@@ -59,11 +59,14 @@ class NeumatexModelConfig(ModelConfig):
     """How often light may be reflected between parts of the object before it reaches the point that is seen."""
     eval_samples: Annotated[int, Common] = 64
     """Paths a pixel in renders and evaluation."""
-    prior: Annotated[PriorName, Common] = "none"
-    """Where the fit starts and what it is held to: small is the prior of the package, then only the planes are fitted;
-    none fits networks too, from a random start."""
-    regularisation: float = 2.0
-    """Weight of the distance from the prior, over its expected squared error."""
+    prior: Annotated[PriorName, Common] = "small"
+    """Where the fit starts and what it is held to: small is the prior of the package; none starts from a plain grey
+    material."""
+    fit_networks: bool = True
+    """Fit the networks that read the planes, too. Published with a prior: the planes alone."""
+    regularisation: float = 1e-4
+    """Weight of the distance from the prior, over its expected squared error. About the squared error of a fitted
+    pixel: then picture and prior each count by what they know."""
     plane_resolution: int = 128
     """Texels along an edge of each of the three planes."""
     light_curve: LightCurve = "agx"
@@ -115,6 +118,7 @@ class NeumatexModel(Model):
         self.anchor = None
         if self.config.prior != "none":
             self.anchor = PriorAnchor(Triplane(parameters, resolution, generator=generator))
+        if not self.config.fit_networks:
             for network in self.triplane.parameter_groups()["networks"]:
                 network.requires_grad_(False)
         is_light = record.tone_mapping == "linear"
@@ -144,9 +148,9 @@ class NeumatexModel(Model):
             self.anchor.adopt(found)
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Planes, networks unless they are a prior's, and the camera's response where there is one."""
+        """Planes, networks unless they stay as they are, and the camera's response where there is one."""
         groups = self.triplane.parameter_groups()
-        if self.anchor is not None:
+        if not self.config.fit_networks:
             groups["networks"] = []
         return {**groups, "response": list(self.curve.parameters())}
 
