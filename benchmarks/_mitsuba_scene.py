@@ -29,8 +29,8 @@ class Scene:
         Args:
             parameters: Of `_reference_materials.ConductorBlend`.
         """
-        import drjit
-        import mitsuba
+        import drjit  # pyright: ignore[reportMissingImports] - of the extra "reference"
+        import mitsuba  # pyright: ignore[reportMissingImports]
 
         mitsuba.set_variant("scalar_rgb")
         drjit.set_thread_count(1)

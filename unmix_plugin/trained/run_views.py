@@ -66,9 +66,13 @@ def views_of(views: Sequence[RunView], choice: ViewChoice) -> list[RunView]:
 def cameras_of(views: Sequence[RunView], choice: ViewChoice) -> Cameras:
     """The cameras of the views chosen, as one."""
     chosen = [view.camera for view in views_of(views, choice)]
-    names = ("camera_to_world", "focal_px", "center_px", "distortion")
-    tensors = {name: torch.cat([getattr(camera, name) for camera in chosen]) for name in names}
-    return Cameras.of_sizes(**tensors, sizes=[camera.size(0) for camera in chosen])
+    return Cameras.of_sizes(
+        torch.cat([camera.camera_to_world for camera in chosen]),
+        torch.cat([camera.focal_px for camera in chosen]),
+        torch.cat([camera.center_px for camera in chosen]),
+        torch.cat([camera.distortion for camera in chosen]),
+        [camera.size(0) for camera in chosen],
+    )
 
 
 def resized_views(views: Sequence[RunView], size: tuple[int, int] | None = None) -> tuple[RunView, ...]:
