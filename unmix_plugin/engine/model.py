@@ -123,9 +123,14 @@ class Model(nn.Module, ABC):
     def evaluate_image(
         self, camera: Cameras, batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """`get_image_metrics_and_images` of a rendered image; a model whose images need more than a camera, such as
+        """Render a view as `get_evaluation_outputs` does, and measure it: `get_image_metrics_and_images`."""
+        return self.get_image_metrics_and_images(self.get_evaluation_outputs(camera, batch), batch)
+
+    @torch.no_grad()
+    def get_evaluation_outputs(self, camera: Cameras, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """What is measured of a view: `get_outputs_for_camera`; a model whose images need more than a camera, such as
         another light that the batch holds, renders them itself here."""
-        return self.get_image_metrics_and_images(self.get_outputs_for_camera(camera), batch)
+        return self.get_outputs_for_camera(camera)
 
     def warnings(self) -> list[str]:
         """What a user should know of the model on this scene before a training."""

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeVar
+
+from unmix_plugin.errors import ConfigError, did_you_mean
 
 OutputKind = Literal["channels", "shares", "srgb", "linear", "picture", "grey", "map", "labels", "vectors"]
 """What an output's numbers are, (height, width, ...): any channels, on black; a share or score of each class; sRGB on
@@ -26,3 +29,29 @@ class Output:
     """Values at the ends of a colour map; None where only the views tell."""
     colour_map: str = "viridis"
     """As matplotlib names it."""
+
+
+AnyOutput = TypeVar("AnyOutput", bound=Output)
+
+
+def named_output(outputs: Iterable[AnyOutput], name: str) -> AnyOutput:
+    """The output of that name.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    named = {output.name: output for output in outputs}
+    if name in named:
+        return named[name]
+    raise no_output(name, named, named)
+
+
+def no_output(name: str, similar: Iterable[str], known: Collection[str]) -> ConfigError:
+    """The error that there is no output of that name; an argument after a colon is no part of what is looked for.
+
+    Args:
+        similar: Names of which some may have been meant.
+        known: What the message lists.
+    """
+    hint = did_you_mean(name.partition(":")[0], similar, likeness=0.5, form=" ({})")
+    return ConfigError(f"there is no output named {name!r}{hint}; known are {', '.join(known)}")

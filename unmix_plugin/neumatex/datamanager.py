@@ -5,6 +5,7 @@ Notation: `R` pixels of a batch, `C` colours or bands, `H x W` pixels of a view.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -204,9 +205,14 @@ def batch_environment(batch: Mapping[str, Tensor]) -> Environment | None:
     return Environment(batch["environment"], rotation_deg, exposure_stops)
 
 
+def _tell(line: str) -> None:
+    """A line about the progress, beside the command's own output."""
+    sys.stderr.write(f"{line}\n")
+
+
 def _object_folder(data: Path) -> Path:
     if data == DEMO_OBJECT:
         from unmix_plugin.neumatex.demo.demo_object import demo_object_path
 
-        return demo_object_path()
+        return demo_object_path(say=_tell)
     return data

@@ -30,16 +30,19 @@ SUBPIXELS = 2
 
 
 def evaluate_object_image(
-    model: NeumatexModel, traced: TracedObject, camera: Cameras, batch: dict[str, Tensor]
+    model: NeumatexModel, outputs: dict[str, Tensor], batch: dict[str, Tensor]
 ) -> tuple[dict[str, float], dict[str, Tensor]]:
     """Metrics and pictures, truth left and prediction right; pictures of light are compared as AgX shows them.
 
     Without a light of its own in the batch: `psnr`, `base_colour_psnr` (linear, as it is), `base_colour_psnr_scaled`
     (after the best factor for each colour). With one: `relit_psnr`. `psnr_image` and `relit_psnr_image` count the
     background too, black on both sides.
+
+    Args:
+        outputs: Of `evaluation_outputs`.
     """
     shown = batch["alpha"] >= OPAQUE
-    light, base = render_pixels(model, traced, camera, shown)
+    light, base = outputs["light"][shown], outputs["base_colour"][shown]
     tone = TONE_MAPPINGS[int(batch["tone"])]
     predicted, true = model.compared(light, batch["numbers"][shown], tone, tone_curve("agx"))
     error = (predicted - true).square()
@@ -61,10 +64,11 @@ def evaluate_object_image(
     return {**metrics, **_base_colour_metrics(base, colour)}, pictures
 
 
-def render_pixels(
-    model: NeumatexModel, traced: TracedObject, camera: Cameras, shown: Bool[Tensor, "H W"]
-) -> tuple[Float[Tensor, "M C"], Float[Tensor, "M C"]]:
-    """Light and base colour of some pixels of a view; black where the mesh is not."""
+def evaluation_outputs(
+    model: NeumatexModel, traced: TracedObject, camera: Cameras, batch: dict[str, Tensor]
+) -> dict[str, Float[Tensor, "H W C"]]:
+    """`light` and `base_colour`, both linear, of the pixels that count; black elsewhere."""
+    shown = batch["alpha"] >= OPAQUE
     hits = pixel_hits(traced.ray_mesh, camera, 0, SUBPIXELS)
     hits = hits.select(shown.flatten()[hits.pixels])
     light = rays_radiance(
@@ -77,7 +81,7 @@ def render_pixels(
         generator=torch.Generator(model.device).manual_seed(0),
     )
     base = model.family.base_colour(traced.surface.parameters(hits.points.positions))
-    return hits.image(light)[shown], hits.image(base)[shown]
+    return {"light": hits.image(light), "base_colour": hits.image(base)}
 
 
 def _base_colour_metrics(base: Float[Tensor, "M C"], true: Float[Tensor, "M C"]) -> dict[str, float]:

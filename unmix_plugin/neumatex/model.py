@@ -23,7 +23,7 @@ from unmix_plugin.engine.instantiate import Common
 from unmix_plugin.errors import ConfigError, require
 from unmix_plugin.neumatex.datamanager import batch_environment
 from unmix_plugin.neumatex.geometry.mesh import Mesh
-from unmix_plugin.neumatex.image_evaluation import evaluate_object_image
+from unmix_plugin.neumatex.image_evaluation import evaluate_object_image, evaluation_outputs
 from unmix_plugin.neumatex.lighting.environment import Environment
 from unmix_plugin.neumatex.material_surface import (
     MaterialName,
@@ -216,20 +216,18 @@ class NeumatexModel(Model):
             error = _squared_error(self._residuals(outputs, batch), outputs["found"])
         return {"psnr": psnr_db(error)}
 
+    @torch.no_grad()
+    def get_evaluation_outputs(self, camera: Cameras, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Light and base colour of the pixels that count, under the light that the batch may hold."""
+        light = batch_environment(batch)
+        traced = self.traced if light is None else self.traced.under(light)
+        return evaluation_outputs(self, traced, camera.to(self.device), batch)
+
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """See `evaluate_image`, which needs more than one render."""
-        raise NotImplementedError("images of an object are evaluated with evaluate_image")
-
-    @torch.no_grad()
-    def evaluate_image(
-        self, camera: Cameras, batch: dict[str, Tensor]
-    ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Figures and pictures of one view, under the light that the batch may hold: see `image_evaluation`."""
-        light = batch_environment(batch)
-        traced = self.traced if light is None else self.traced.under(light)
-        return evaluate_object_image(self, traced, camera.to(self.device), batch)
+        """Figures and pictures of one view: see `image_evaluation`."""
+        return evaluate_object_image(self, outputs, batch)
 
     def warm_up(self) -> None:
         """Compile the kernels, forward and backward, on a few rays that meet the mesh."""

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
-from unmix_plugin.engine.outputs import Output
+from unmix_plugin.engine.outputs import Output, named_output
 from unmix_plugin.errors import ConfigError, did_you_mean
 from unmix_plugin.neumatex.geometry.mesh import Mesh
 from unmix_plugin.neumatex.geometry.ray_mesh import RayMesh
@@ -86,11 +86,7 @@ class TrainedObject:
         Raises:
             ConfigError: there is none.
         """
-        named = {output.name: output for output in self.outputs}
-        if name in named:
-            return named[name]
-        hint = did_you_mean(name, named, likeness=0.5, form=" ({})")
-        raise ConfigError(f"there is no output named {name!r}{hint}; known are {', '.join(named)}")
+        return named_output(self.outputs, name)
 
     @property
     def lights(self) -> tuple[str, ...]:

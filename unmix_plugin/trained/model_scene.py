@@ -12,9 +12,9 @@ from torch import Tensor, nn
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.engine.model import Model
-from unmix_plugin.engine.outputs import Output
+from unmix_plugin.engine.outputs import Output, named_output
 from unmix_plugin.engine.runs.load_run import SceneRecord
-from unmix_plugin.errors import ConfigError, did_you_mean
+from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.trained.probe import one_pixel
 from unmix_plugin.trained.protocol import Probe
@@ -82,11 +82,7 @@ class ModelScene:
         Raises:
             ConfigError: there is none.
         """
-        named = {output.name: output for output in self.outputs}
-        if name in named:
-            return named[name]
-        hint = did_you_mean(name, named, likeness=0.5, form=" ({})")
-        raise ConfigError(f"there is no output named {name!r}{hint}; known are {', '.join(named)}")
+        return named_output(self.outputs, name)
 
     def look(self, camera: Cameras, subpixels: int | None = None) -> ModelView:
         """Render all outputs of a view, one ray a pixel."""

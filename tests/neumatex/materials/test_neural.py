@@ -18,7 +18,7 @@ def test_encoded_materials_look_like_the_layered_ones():
     generator = torch.Generator().manual_seed(77)
     layered = draw_materials(2000, generator)
     neural = FAMILY.from_layered(layered)
-    truth, found = LayeredFamily.stack(layered), FAMILY.stack(neural)
+    truth, found = LayeredFamily().stack(layered), FAMILY.stack(neural)
     error = response_error(truth, found, layered[:, :3].T, 16, generator)
     assert -10 * math.log10(float(error.mean())) > 36
     assert -10 * float(torch.log10(error).mean()) > 39

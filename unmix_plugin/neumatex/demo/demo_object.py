@@ -22,7 +22,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.errors import SceneError
 from unmix_plugin.formats.exr import write_exr
 from unmix_plugin.formats.glb import write_glb
 from unmix_plugin.neumatex.demo.layered_surface import LayeredSurface
@@ -33,7 +32,7 @@ from unmix_plugin.neumatex.lighting.built_in import NAMES, built_in_environment
 from unmix_plugin.neumatex.lighting.environment import Environment
 from unmix_plugin.neumatex.tracing.primary_hits import pixel_hits
 from unmix_plugin.neumatex.tracing.render_view import render_view
-from unmix_plugin.scenes.demo.folders import check_bounds, staging_beside, staging_for
+from unmix_plugin.scenes.demo.folders import check_bounds, staging_for, written_once
 from unmix_plugin.scenes.demo.scene import user_cache
 from unmix_plugin.scenes.demo.views import lens_entries, transform_matrix
 
@@ -144,22 +143,12 @@ def demo_object_path(cache_dir: Path | None = None, say: Say | None = None) -> P
         SceneError: the cache can't be written.
     """
     target = (cache_dir or user_cache()) / f"demo-object-{_generator_hash()}" / "object"
-    if _is_complete(target):
-        return target
-    try:
-        with staging_beside(target) as staging:
-            _write_object(staging / "object", 0, DEFAULT_SIZE, DEFAULT_VIEWS, DEFAULT_LIGHTS, say)
-            if target.exists() and not _is_complete(target):
-                target.rename(staging / "incomplete")
-            (staging / "object").rename(target)
-    except OSError as error:
-        # Another process may have been quicker; its object is as good.
-        if not _is_complete(target):
-            raise SceneError(
-                f"can't write the demo object to {target}: {error.strerror or error}; set XDG_CACHE_HOME to a folder "
-                "that can be written"
-            ) from error
-    return target
+    return written_once(
+        target,
+        "the demo object",
+        lambda folder: _write_object(folder, 0, DEFAULT_SIZE, DEFAULT_VIEWS, DEFAULT_LIGHTS, say),
+        _is_complete,
+    )
 
 
 def _write_object(folder: Path, seed: int, size: int, views: int, lights: int, say: Say | None) -> None:

@@ -71,7 +71,7 @@ def _loss(
     decoder: Decoder, encoder: Encoder, settings: DecoderTraining, generator: torch.Generator
 ) -> Tensor:
     materials = draw_materials(settings.materials, generator)
-    truth = LayeredFamily.stack(materials)
+    truth = LayeredFamily().stack(materials)
     latents = encoder(truth)
     noise = torch.randn(latents.shape, generator=generator)
     latents = (latents + settings.latent_noise * noise).clamp(0.0, 1.0)

@@ -15,10 +15,10 @@ from unmix_plugin.neumatex.materials.layer_stack import (
     LARGEST_SHEEN,
     LayerStack,
 )
-from unmix_plugin.neumatex.materials.stack_family import density_of_stack, evaluate_stack, sample_stack
+from unmix_plugin.neumatex.materials.stack_family import StackFamily
 
 
-class LayeredFamily:
+class LayeredFamily(StackFamily):
     """Dust over sheen over clear coat over a surface with haze over a base that is diffuse or metal.
 
     Parameters, each in [0, 1]:
@@ -44,34 +44,8 @@ class LayeredFamily:
         "coat roughness", "sheen weight", "sheen roughness", "sheen tint", "haze weight", "haze spread", "dust",
     )  # fmt: skip
     num_parameters = len(PARAMETERS)
-    num_colours = 3
 
-    def evaluate(
-        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, "N C"]:
-        """Reflectance, 1/sr, without the cosine; 0 where a direction is below the surface."""
-        return evaluate_stack(self.stack(parameters), parameters[:, :3], wi, wo)
-
-    @torch.no_grad()
-    def sample(
-        self, parameters: Float[Tensor, "N P"], wo: Float[Tensor, "N 3"], uniforms: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, "N 3"]:
-        """Directions to the light, drawn from a cosine lobe and three GGX lobes."""
-        return sample_stack(self.stack(parameters), parameters[:, :3], wo, uniforms)
-
-    @torch.no_grad()
-    def density(
-        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, " N"]:
-        """Probability density of `sample`, 1/sr."""
-        return density_of_stack(self.stack(parameters), parameters[:, :3], wi, wo)
-
-    def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
-        """Linear base colour; of metals, the colour of what they reflect."""
-        return parameters[:, :3]
-
-    @staticmethod
-    def stack(parameters: Float[Tensor, "N P"]) -> LayerStack:
+    def stack(self, parameters: Float[Tensor, "N P"]) -> LayerStack:
         """The layers that the parameters stand for."""
         base, scalars = parameters.T.contiguous().split([3, parameters.shape[1] - 3])
         metallicity, roughness, level, coat, coat_roughness, *others = scalars.unbind(0)

@@ -18,10 +18,10 @@ from unmix_plugin.neumatex.materials.decoder import NUM_LATENTS, Decoder, Encode
 from unmix_plugin.neumatex.materials.decoder_weights import shipped_weights
 from unmix_plugin.neumatex.materials.layer_stack import LayerStack
 from unmix_plugin.neumatex.materials.layered import LayeredFamily
-from unmix_plugin.neumatex.materials.stack_family import density_of_stack, evaluate_stack, sample_stack
+from unmix_plugin.neumatex.materials.stack_family import StackFamily
 
 
-class NeuralFamily:
+class NeuralFamily(StackFamily):
     """Parameters: base colour (0 to 2, linear), latents (3 to 8, in [0, 1]); the decoder is frozen."""
 
     PARAMETERS = (
@@ -29,7 +29,6 @@ class NeuralFamily:
         "latent A R", "latent A G", "latent A B", "latent B R", "latent B G", "latent B B",
     )  # fmt: skip
     num_parameters = 3 + NUM_LATENTS
-    num_colours = 3
 
     def __init__(
         self, device: torch.device | str = "cpu", weights: tuple[Decoder, Encoder] | None = None
@@ -42,31 +41,6 @@ class NeuralFamily:
         decoder, encoder = weights if weights is not None else shipped_weights()
         self.decoder, self.encoder = deepcopy(decoder).to(device), deepcopy(encoder).to(device)
 
-    def evaluate(
-        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, "N C"]:
-        """Reflectance, 1/sr, without the cosine; 0 where a direction is below the surface."""
-        base, latents = parameters.split([3, NUM_LATENTS], 1)
-        return evaluate_stack(self.decoder(latents), base, wi, wo)
-
-    @torch.no_grad()
-    def sample(
-        self, parameters: Float[Tensor, "N P"], wo: Float[Tensor, "N 3"], uniforms: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, "N 3"]:
-        """Directions to the light, drawn from a cosine lobe and the decoded GGX lobes."""
-        return sample_stack(self.stack(parameters), parameters[:, :3], wo, uniforms)
-
-    @torch.no_grad()
-    def density(
-        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, " N"]:
-        """Probability density of `sample`, 1/sr."""
-        return density_of_stack(self.stack(parameters), parameters[:, :3], wi, wo)
-
-    def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
-        """Diffuse base colour, linear."""
-        return parameters[:, :3]
-
     def stack(self, parameters: Float[Tensor, "N P"]) -> LayerStack:
         """The layers that the latents are decoded to."""
         return self.decoder(parameters[:, 3:])
@@ -74,5 +48,5 @@ class NeuralFamily:
     @torch.no_grad()
     def from_layered(self, parameters: Float[Tensor, "N L"]) -> Float[Tensor, "N P"]:
         """The neural material that the encoder finds for each of `LayeredFamily`; the base colours are the same."""
-        latents = self.encoder(LayeredFamily.stack(parameters))
+        latents = self.encoder(LayeredFamily().stack(parameters))
         return torch.cat([parameters[:, :3], latents], -1)

@@ -1,32 +1,55 @@
-"""Reflectance, sampling and density of a layer stack over a diffuse base, in the shapes that `family` asks for."""
+"""Materials that are a stack of layers over a diffuse base.
+
+Notation as in `family`.
+"""
+
+from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.neumatex.materials.layer_stack import LayerStack
 
 
-def evaluate_stack(
-    stack: LayerStack, base: Float[Tensor, "N C"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
-) -> Float[Tensor, "N C"]:
-    """Reflectance, 1/sr: what passes the layers times the base over pi, and what they reflect."""
-    passed, specular = stack.reflectance(wi.T.contiguous(), wo.T.contiguous())
-    return ((passed / math.pi) * base.T + specular).T
+class StackFamily(ABC):
+    """Parameters of a material, of which the first three are its base colour, linear; all of them give its layers."""
 
+    num_colours = 3
 
-def sample_stack(
-    stack: LayerStack, base: Float[Tensor, "N C"], wo: Float[Tensor, "N 3"], uniforms: Float[Tensor, "N 3"]
-) -> Float[Tensor, "N 3"]:
-    """Directions to the light, drawn from the stack's mixture of lobes."""
-    wo = wo.T.contiguous()
-    return stack.mixture(wo, base.T).sample(wo, uniforms.T.contiguous()).T.contiguous()
+    @abstractmethod
+    def stack(self, parameters: Float[Tensor, "N P"]) -> LayerStack:
+        """The layers that the parameters stand for."""
 
+    def evaluate(
+        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N C"]:
+        """Reflectance, 1/sr, without the cosine: what passes the layers times the base over pi, and what they
+        reflect; 0 where a direction is below the surface."""
+        passed, specular = self.stack(parameters).reflectance(wi.T.contiguous(), wo.T.contiguous())
+        return ((passed / math.pi) * self.base_colour(parameters).T + specular).T
 
-def density_of_stack(
-    stack: LayerStack, base: Float[Tensor, "N C"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
-) -> Float[Tensor, " N"]:
-    """Density of `sample_stack`, 1/sr."""
-    wo = wo.T.contiguous()
-    return stack.mixture(wo, base.T).density(wi.T.contiguous(), wo)
+    @torch.no_grad()
+    def sample(
+        self, parameters: Float[Tensor, "N P"], wo: Float[Tensor, "N 3"], uniforms: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N 3"]:
+        """Directions to the light, drawn from a cosine lobe and three GGX lobes."""
+        wo = wo.T.contiguous()
+        mixture = self.stack(parameters).mixture(wo, self.base_colour(parameters).T)
+        return mixture.sample(wo, uniforms.T.contiguous()).T.contiguous()
+
+    @torch.no_grad()
+    def density(
+        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, " N"]:
+        """Probability density of `sample`, 1/sr."""
+        wo = wo.T.contiguous()
+        mixture = self.stack(parameters).mixture(wo, self.base_colour(parameters).T)
+        return mixture.density(wi.T.contiguous(), wo)
+
+    def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
+        """Linear base colour."""
+        return parameters[:, :3]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -56,3 +56,38 @@ def staging_beside(directory: Path) -> Iterator[Path]:
     directory.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{directory.name}-", dir=directory.parent) as folder:
         yield Path(folder)
+
+
+def written_once(
+    target: Path,
+    what: str,
+    write: Callable[[Path], None],
+    is_complete: Callable[[Path], bool],
+    remedy: str = "set XDG_CACHE_HOME to a folder that can be written",
+) -> Path:
+    """A folder of a cache, written on first use and again if a file of it is missing.
+
+    Args:
+        target: The folder.
+        what: What is made, for the message.
+        write: Makes it in a folder that is not there yet.
+        is_complete: Whether a folder holds all of it.
+        remedy: What to do where the folder can't be written, for the message.
+    Raises:
+        SceneError: the cache can't be written.
+    """
+    if is_complete(target):
+        return target
+    try:
+        with staging_beside(target) as staging:
+            write(staging / target.name)
+            if target.exists() and not is_complete(target):
+                target.rename(staging / "incomplete")
+            (staging / target.name).rename(target)
+    except OSError as error:
+        # Another process may have been quicker; what it wrote is as good.
+        if not is_complete(target):
+            raise SceneError(
+                f"can't write {what} to {target}: {error.strerror or error}; {remedy}"
+            ) from error
+    return target

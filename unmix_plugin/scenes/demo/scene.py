@@ -20,8 +20,7 @@ import torch
 from jaxtyping import Float
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.errors import SceneError
-from unmix_plugin.scenes.demo.folders import check_bounds, staging_beside, staging_for
+from unmix_plugin.scenes.demo.folders import check_bounds, staging_for, written_once
 from unmix_plugin.scenes.demo.materials import LAMP, MATERIALS, band_centers_nm, lamp_power, reflectances
 from unmix_plugin.scenes.demo.places import TABLE, Place
 from unmix_plugin.scenes.demo.shading import ViewCoefficients, render_view
@@ -53,22 +52,14 @@ def demo_scene_path(cache_dir: Path | None = None) -> Path:
         SceneError: the cache can't be written.
     """
     target = (cache_dir or user_cache()) / f"demo-{_generator_hash()}" / "demo"
-    if is_complete(target):
-        return target
-    try:
-        with staging_beside(target) as staging:
-            _write_scene(staging / "scene", DEFAULT_SIZE, DEFAULT_BANDS, DEFAULT_VIEWS)
-            if target.exists() and not is_complete(target):
-                target.rename(staging / "incomplete")
-            (staging / "scene").rename(target)
-    except OSError as error:
-        # Another process may have been quicker; its scene is as good.
-        if not is_complete(target):
-            raise SceneError(
-                f"can't write the demo scene to {target}: {error.strerror or error}; set XDG_CACHE_HOME to a folder "
-                "that can be written, or write the scene elsewhere with unmix-demo-scene DIR and train on that"
-            ) from error
-    return target
+    return written_once(
+        target,
+        "the demo scene",
+        lambda folder: _write_scene(folder, DEFAULT_SIZE, DEFAULT_BANDS, DEFAULT_VIEWS),
+        is_complete,
+        "set XDG_CACHE_HOME to a folder that can be written, or write the scene elsewhere with unmix-demo-scene DIR "
+        "and train on that",
+    )
 
 
 def make_demo_scene(

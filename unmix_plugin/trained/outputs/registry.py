@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from unmix_plugin.engine.outputs import Output
-from unmix_plugin.errors import ConfigError, did_you_mean
+from unmix_plugin.engine.outputs import Output, no_output
+from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.pca import PcaColours
@@ -133,8 +133,7 @@ def find_output(name: str, materials: Materials) -> MaterialOutput:
     prefix, _, argument = name.partition(":")
     family = FAMILIES.get(prefix)
     if family is None:
-        hint = did_you_mean(prefix, [*OUTPUTS, *FAMILIES], likeness=0.5, form=" ({})")
-        raise ConfigError(f"there is no output named {name!r}{hint}; known are {', '.join(output_names())}")
+        raise no_output(name, [*OUTPUTS, *FAMILIES], output_names())
     if not argument:
         raise ConfigError(f"the output {prefix} needs {family.needs}, as in {family.example}")
     made = family.make(name, argument, materials)
