@@ -23,36 +23,26 @@ from torch import Tensor, nn
 from unmix_plugin.abundance_guide import AbundanceGuide
 from unmix_plugin.alpha_preset import choose, preset_for
 from unmix_plugin.band_balance import BandBalance
+from unmix_plugin.batch_comparison import BatchComparison
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.model import Model
 from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
-from unmix_plugin.errors import ConfigError
 from unmix_plugin.field import CoefficientField, UnmixField
 from unmix_plugin.first_endmembers import first_endmembers
-from unmix_plugin.model_settings import UnmixModelConfig, usual_num_endmembers
+from unmix_plugin.grid_upkeep import is_due, record_seen, update_grid
+from unmix_plugin.model_settings import UnmixModelConfig
 from unmix_plugin.pose_refinement import PoseRefinement
 from unmix_plugin.renderer import VolumeRenderer
 from unmix_plugin.rendering.occupancy import OccupancyGrid
-from unmix_plugin.sensor_batches import SensorPart, mean_over_parts, split_parts
 from unmix_plugin.sensor_views import SensorViews
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.coefficients import Coefficients
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.metrics import psnr
-from unmix_plugin.training_losses import compare_pixels, pixel_mean, spectral_losses
 from unmix_plugin.view_gains import ViewGains
 
 _FEWEST_RAYS, _MOST_RAYS = 64, 8192
-_GRID_INTERVAL = 16
-"""Steps between updates of the occupancy grid."""
-_PROBED_CELLS = 32_768
-"""Cells of the grid that an update probes."""
-_GRID_DECAY = 0.5
-"""Factor on the remembered density of a probed cell: lower forgets emptied space sooner."""
-_OCCUPIED_OPACITY = 0.03
-"""Opacity of one sample's interval from which a cell counts as occupied."""
 
 
 class UnmixModel(Model):
@@ -73,10 +63,10 @@ class UnmixModel(Model):
         self.bands = Bands.of(metadata["wavelengths_nm"])
         self.is_unbounded = bool(metadata.get("is_unbounded", False))
         self.preset = preset_for(metadata["has_alpha"], self.is_unbounded)
-        self.num_endmembers = self._checked_num_endmembers()
+        self.num_endmembers = config.checked_num_endmembers(len(self.bands))
         shape = (self.num_endmembers, len(self.bands))
         self.endmembers = nn.Parameter(torch.zeros(shape), requires_grad=config.train_endmembers)
-        num_dictionary = self._num_dictionary_spectra()
+        num_dictionary = config.num_dictionary_spectra(self.preset, self.num_endmembers)
         self.specular_spectra = nn.Parameter(torch.zeros(num_dictionary, len(self.bands)))
         self.grid = OccupancyGrid(torch.ones((metadata["grid_resolution"],) * 3, dtype=torch.bool))
         self._renderer: VolumeRenderer | None = None
@@ -106,6 +96,15 @@ class UnmixModel(Model):
         self.seen_by = SensorViews(metadata.get("sensors", ()), self.rgb_weights)
         weights = () if config.losses.band_weights == "auto" else config.losses.band_weights
         self.balance = BandBalance(weights, self.bands, self.seen_by)
+        self.comparison = BatchComparison(
+            config.losses,
+            self.preset,
+            self.seen_by,
+            self.balance,
+            self.guide,
+            self.view_gains,
+            self.num_endmembers,
+        )
         self._progress = 0.0
 
     def initialise(self, initial_data: Mapping[str, np.ndarray], generator: torch.Generator) -> None:
@@ -185,7 +184,7 @@ class UnmixModel(Model):
         )
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
-        """`spectral` (R, B) on black (of a rig `coefficients`, from which `_parts` makes what its sensors see),
+        """`spectral` (R, B) on black (of a rig `coefficients`, from which follows what its sensors see),
         `abundances` (R, K) with those of the sky, `accumulation` (R), `spread` and `num_samples`, one number each, and
         of the samples that carry weight `positions`, `weights` and `views` (S)."""
         generator = self.generator if self.training else None
@@ -221,72 +220,19 @@ class UnmixModel(Model):
         """Weighted losses by name; those of no weight are left out. See training_losses.py."""
         config = self.config.losses
         weights = {name: x for name, x in config.weights(self.preset, self._progress).items() if x > 0}
-        losses = mean_over_parts(
-            self._parts(outputs, batch), lambda part: self._pixel_losses(part, set(weights))
-        )
+        parts = self.comparison.parts(outputs, batch, self.materials)
+        losses = self.comparison.losses(parts, set(weights), self.generator)
         if "spread" in weights:
             losses["spread"] = outputs["spread"]
         if self.poses is not None:
             weights["poses"], losses["poses"] = self.config.pose_refinement.penalty, self.poses.penalty()
         return {name: weights[name] * losses[name] for name in weights if name in losses}
 
-    def _pixel_losses(self, part: SensorPart, wanted: set[str]) -> dict[str, Tensor]:
-        """Losses that compare rendered with measured pixels, not yet weighted."""
-        config, outputs, batch = self.config.losses, part.outputs, part.batch
-        measured = batch["spectra"]
-        background = choose(config.background, self.preset.background)
-        pixels = compare_pixels(
-            outputs["spectral"],
-            outputs["accumulation"],
-            batch,
-            background,
-            self.generator,
-            choose(config.exposure, 1.0),
-            config.outlier,
-        )
-        exposed = choose(config.exposure, 1.0) * measured
-        colours, weights = self.seen_by.rgb_weights(part.sensor), self.balance.of(part.sensor)
-        losses = spectral_losses(pixels, exposed, colours, wanted, weights)
-        if "abundances" in wanted and self.seen_by.tells_materials(part.sensor, self.num_endmembers):
-            abundances = pixel_mean(outputs["abundances"], len(measured))
-            losses["abundances"] = self.guide.error(abundances, *self._guided(part))
-        return losses
-
-    def _guided(self, part: SensorPart) -> tuple[dict[str, Tensor], Tensor]:
-        """A part's pixels and the guide's endmembers (K, b), both as they are unmixed."""
-        endmembers = self.seen_by.project(self.guide.endmembers, part.sensor)
-        return self.balance.batch(part.batch, part.sensor), self.balance.scaled(endmembers, part.sensor)
-
-    def _parts(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> list[SensorPart]:
-        """A batch by sensor, each part with the `spectral` (R, b) that its sensor sees."""
-        parts = split_parts(outputs, batch, self.seen_by.num_channels)
-        for part in parts:
-            if part.sensor is not None:
-                seen = Coefficients(part.outputs["coefficients"], self.num_endmembers)
-                part.outputs["spectral"] = self.materials.through(seen, self.seen_by.matrix(part.sensor).T)
-        return (
-            parts if self.view_gains is None else [self._with_gain(part, self.view_gains) for part in parts]
-        )
-
-    def _with_gain(self, part: SensorPart, view_gains: ViewGains) -> SensorPart:
-        terms = self.seen_by.project(view_gains.terms, part.sensor)
-        gains = view_gains(part.outputs["cameras"], terms / terms[:1])
-        return replace(part, outputs={**part.outputs, "spectral": part.outputs["spectral"] * gains})
-
     def observe(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> None:
         """Note which cells the views see, and how far margins of abundances are from those of measured spectra."""
-        num_rays = len(outputs["accumulation"])
-        threshold = choose(self.config.renderer.visible_weight, self.preset.visible_weight)
-        if threshold < 1:
-            is_seen = outputs["weights"] > threshold
-            in_all = num_rays * self.processes.count
-            self.grid.visibility.record(outputs["positions"], outputs["views"], is_seen, in_all)
-        if self.config.losses.abundances == 0:
-            return
-        for part in split_parts(outputs, batch, self.seen_by.num_channels):
-            if self.seen_by.tells_materials(part.sensor, self.num_endmembers):
-                abundances = pixel_mean(part.outputs["abundances"], len(part.batch["spectra"]))
-                self.guide.observe(abundances, *self._guided(part))
+        visible_weight = choose(self.config.renderer.visible_weight, self.preset.visible_weight)
+        record_seen(self.grid, outputs, visible_weight, self.processes)
+        self.comparison.observe(outputs, batch)
 
     def warnings(self) -> list[str]:
         """Sensors whose pixels can't be unmixed into so many endmembers one by one."""
@@ -294,14 +240,8 @@ class UnmixModel(Model):
 
     def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """`psnr` of the batch in dB, on black; of poses that are corrected by how much, and how many were undone."""
-
-        def error(part: SensorPart) -> dict[str, Tensor]:
-            measured = part.batch["spectra"]
-            spectra = pixel_mean(part.outputs["spectral"], len(measured))
-            return {"psnr": (spectra.detach().clamp(0, 1) - measured).square().mean()}
-
-        errors = mean_over_parts(self._parts(outputs, batch), error)
-        found = {"psnr": -10 * torch.log10(errors["psnr"].clamp(min=1e-12))}
+        parts = self.comparison.parts(outputs, batch, self.materials)
+        found = {"psnr": self.comparison.psnr(parts)}
         return found if self.poses is None else {**found, **self.poses.figures()}
 
     @torch.no_grad()
@@ -376,31 +316,10 @@ class UnmixModel(Model):
         ):
             levels = self.config.pose_refinement.level_weights(len(self.field.level_weights), progress)
             self.field.level_weights.copy_(torch.tensor(levels))
-        if step % _GRID_INTERVAL:
-            return
-        space = self.renderer.space
-        drawn = torch.randint(2**62, (1,), generator=self.generator, device=self._generator_device)
-        seed = int(self.processes.of_first(drawn))  # each process probes the same cells
-        self._share_observations()
-        self.grid.update(
-            lambda points: self.field.get_density(space.from_unit(points))[0],
-            threshold=-math.log1p(-_OCCUPIED_OPACITY) / self._training_step,
-            decay=_GRID_DECAY,
-            num_cells=_PROBED_CELLS,
-            generator=torch.Generator().manual_seed(seed),
-        )
-
-    def _share_observations(self) -> None:
-        """Take in what the processes that train together observed; twice is as good as once."""
-        visibility = self.grid.visibility
-        self.processes.smallest(visibility.lowest_view)
-        self.processes.largest(visibility.highest_view)
-        self.processes.largest(visibility.num_rays)
-        self.processes.mean(self.guide.margin_variance)
-
-    @property
-    def _generator_device(self) -> torch.device:
-        return torch.device("cpu") if self.generator is None else self.generator.device
+        if is_due(step):
+            renderer = replace(self.renderer, step=self._training_step)
+            update_grid(self.grid, self.field, renderer, self.processes, self.generator)
+            self.processes.mean(self.guide.margin_variance)
 
     @torch.no_grad()
     def _bound_spectra(self, step: int, progress: float) -> None:
@@ -408,19 +327,6 @@ class UnmixModel(Model):
         self.specular_spectra.clamp_(0, 1)
         if self.poses is not None:
             self.poses.undo_runaways()
-
-    def _checked_num_endmembers(self) -> int:
-        count = self.config.num_endmembers
-        if count is None:
-            return usual_num_endmembers(len(self.bands))
-        if count == "auto":
-            raise ConfigError("num-endmembers is auto: call resolve_auto first")
-        if count > len(self.bands):
-            raise ConfigError(
-                f"num-endmembers is {count} but the scene has {len(self.bands)} bands; "
-                f"choose at most {len(self.bands)}"
-            )
-        return count
 
     def _make_view_gains(self) -> ViewGains | None:
         if self.config.light != "per-view":
@@ -432,10 +338,3 @@ class UnmixModel(Model):
             return None
         rows = self.metadata.get("line_rows") or [0] * self.metadata["num_train_views"]
         return PoseRefinement(rows, self.config.pose_refinement.lens)
-
-    def _num_dictionary_spectra(self) -> int:
-        if self.config.specular != "dictionary":
-            return 0
-        if self.config.num_specular_spectra == "auto":
-            return 1 + self.num_endmembers if self.preset.specular_endmembers else 1
-        return self.config.num_specular_spectra

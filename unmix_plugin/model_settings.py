@@ -10,10 +10,10 @@ from typing import Annotated, Literal
 import numpy as np
 import torch
 
-from unmix_plugin.alpha_preset import Auto
+from unmix_plugin.alpha_preset import AlphaPreset, Auto
 from unmix_plugin.engine.instantiate import Common, Target, short
 from unmix_plugin.engine.model import Model, ModelConfig
-from unmix_plugin.errors import require
+from unmix_plugin.errors import ConfigError, require
 from unmix_plugin.field import UnmixFieldConfig
 from unmix_plugin.pose_refinement import PoseConfig
 from unmix_plugin.renderer import RendererConfig
@@ -140,6 +140,31 @@ class UnmixModelConfig(ModelConfig):
             if light != "fixed":
                 reasons.append(_WHY_LIGHT[light])
         return found, "\n".join(reasons)
+
+    def checked_num_endmembers(self, num_bands: int) -> int:
+        """K.
+
+        Raises:
+            ConfigError: more endmembers than bands.
+        """
+        count = self.num_endmembers
+        if count is None:
+            return usual_num_endmembers(num_bands)
+        if count == "auto":
+            raise ConfigError("num-endmembers is auto: call resolve_auto first")
+        if count > num_bands:
+            raise ConfigError(
+                f"num-endmembers is {count} but the scene has {num_bands} bands; choose at most {num_bands}"
+            )
+        return count
+
+    def num_dictionary_spectra(self, preset: AlphaPreset, num_endmembers: int) -> int:
+        """Spectra of the specular dictionary."""
+        if self.specular != "dictionary":
+            return 0
+        if self.num_specular_spectra == "auto":
+            return 1 + num_endmembers if preset.specular_endmembers else 1
+        return self.num_specular_spectra
 
 
 def usual_num_endmembers(num_bands: int) -> int:

@@ -1,0 +1,76 @@
+"""Keeps the occupancy grid up to date while training: which cells are probed, and which count as occupied."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from unmix_plugin.engine.processes.processes import Processes
+from unmix_plugin.field import CoefficientField
+from unmix_plugin.renderer import VolumeRenderer
+from unmix_plugin.rendering.occupancy import OccupancyGrid
+
+_GRID_INTERVAL = 16
+"""Steps between updates of the occupancy grid."""
+_PROBED_CELLS = 32_768
+"""Cells of the grid that an update probes."""
+_GRID_DECAY = 0.5
+"""Factor on the remembered density of a probed cell: lower forgets emptied space sooner."""
+_OCCUPIED_OPACITY = 0.03
+"""Opacity of one sample's interval from which a cell counts as occupied."""
+
+
+def is_due(step: int) -> bool:
+    """Whether the grid is updated before this training step."""
+    return step % _GRID_INTERVAL == 0
+
+
+def update_grid(
+    grid: OccupancyGrid,
+    field: CoefficientField,
+    renderer: VolumeRenderer,
+    processes: Processes,
+    generator: torch.Generator | None,
+) -> None:
+    """Probe the field in some cells, the same in each process, and decide anew what is occupied.
+
+    Args:
+        grid: What is updated in place.
+        field: Whose densities are probed.
+        renderer: With the distance of samples of the present training step.
+        processes: That train together; they share which cells their rays saw.
+        generator: Source of the cells.
+    """
+    device = torch.device("cpu") if generator is None else generator.device
+    drawn = torch.randint(2**62, (1,), generator=generator, device=device)
+    seed = int(processes.of_first(drawn))
+    share_visibility(grid, processes)
+    space = renderer.space
+    grid.update(
+        lambda points: field.get_density(space.from_unit(points))[0],
+        threshold=-math.log1p(-_OCCUPIED_OPACITY) / renderer.step,
+        decay=_GRID_DECAY,
+        num_cells=_PROBED_CELLS,
+        generator=torch.Generator().manual_seed(seed),
+    )
+
+
+def share_visibility(grid: OccupancyGrid, processes: Processes) -> None:
+    """Take in which cells the rays of all processes saw; twice is as good as once."""
+    visibility = grid.visibility
+    processes.smallest(visibility.lowest_view)
+    processes.largest(visibility.highest_view)
+    processes.largest(visibility.num_rays)
+
+
+def record_seen(
+    grid: OccupancyGrid, outputs: dict[str, Tensor], visible_weight: float, processes: Processes
+) -> None:
+    """Note which cells the rays of a batch saw, from the model's outputs; nothing where all cells stay visible."""
+    if visible_weight >= 1:
+        return
+    is_seen = outputs["weights"] > visible_weight
+    num_rays = len(outputs["accumulation"]) * processes.count
+    grid.visibility.record(outputs["positions"], outputs["views"], is_seen, num_rays)
