@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ from unmix_plugin.engine import (
     TrainingCallback,
     step_generator,
 )
+from unmix_plugin.engine.instantiate import Common
 from unmix_plugin.errors import require
 from unmix_plugin.neumatex.lighting.environment import Environment
 from unmix_plugin.neumatex.object_record import ObjectRecord
@@ -33,11 +34,14 @@ from unmix_plugin.neumatex.prior_anchor import view_arrays
 from unmix_plugin.neumatex.scene.load_object import load_object
 from unmix_plugin.neumatex.scene.pixel_list import PixelList
 from unmix_plugin.neumatex.scene.posed_pictures import PosedPictures, opacity
+from unmix_plugin.neumatex.spectral_start import pixel_arrays
 from unmix_plugin.neumatex.tone.curves import TONE_MAPPINGS
 from unmix_plugin.scenes.scene import Normalisation
 
 DEMO_OBJECT = Path("demo-object")
 """`--data demo-object` stands for the built-in object."""
+DEMO_SPECTRAL_OBJECT = Path("demo-spectral-object")
+"""And this for the one with spectral pictures."""
 _THINNEST = 1e-3
 """Least half edge of the scene box: a mesh may be flat."""
 
@@ -51,6 +55,9 @@ class ObjectDataManagerConfig(DataManagerConfig):
     """Pixels of a training step, drawn from all training views where they show the mesh."""
     max_pixels: int = 8_000_000
     """Training pixels kept in memory; of more, these are drawn evenly."""
+    lamp: Annotated[str | None, Common] = None
+    """For pictures of many bands: spectrum of the light, a .csv (wavelength,power), an ENVI spectral library or a name
+    (D65, A, ...); None takes 'illuminant_path' of transforms.json."""
 
     def __post_init__(self) -> None:
         """Refuse impossible settings.
@@ -67,7 +74,8 @@ class ObjectDataManager(DataManager):
 
     A training batch has `numbers` (R, C) as pictures hold them; rays pass through random places of their pixels. An
     image batch has `numbers` (H, W, C), `alpha` (H, W), `tone` (which of `TONE_MAPPINGS`), `lights` (how many are
-    held out) and, where it is known, `base_colour` (H, W, 3). Images under a held-out light follow the evaluation
+    held out) and, where it is known, `base_colour` (H, W, 3), or of spectral pictures `true_abundances` (H, W, M) and
+    `true_endmembers` (M, B). Images under a held-out light follow the evaluation
     views and have `environment` (h, w, C) and `environment_placement` (degrees, stops) too.
     """
 
@@ -80,7 +88,7 @@ class ObjectDataManager(DataManager):
         """
         super().__init__(config, data=data, device=device, seed=seed)
         self.options = config
-        self.object = load_object(_object_folder(data))
+        self.object = load_object(_object_folder(data), config.lamp)
         pictures, split = self.object.pictures, self.object.split
         self.train_cameras = pictures.cameras[list(split.train)]
         self.eval_cameras = pictures.cameras[list(split.evaluation)]
@@ -104,8 +112,7 @@ class ObjectDataManager(DataManager):
         place = self._find_image(index)
         if isinstance(place, int):
             camera, batch = self._image(self.object.pictures, place)
-            truth = self.object.base_colour(place)
-            return camera, batch if truth is None else {**batch, "base_colour": self._tensor(truth)}
+            return camera, {**batch, **self._truth(place)}
         light, view = place
         held_out = self.object.lights[light]
         camera, batch = self._image(held_out.pictures, view)
@@ -138,11 +145,14 @@ class ObjectDataManager(DataManager):
 
     def initial_data(self) -> Mapping[str, np.ndarray]:
         """Mesh and environment, which become buffers of the model, so that a run renders without its data; and some
-        training views for a prior, as `prior_anchor.views_of` puts them together."""
+        training views for a prior, as `prior_anchor.views_of` puts them together, or of spectral pictures some pixels
+        to start from."""
         mesh, light = self.object.mesh, self.object.environment
         arrays = {"vertices": mesh.vertices, "faces": mesh.faces, "normals": mesh.normals, "uv": mesh.uv}
         arrays["light_map"] = light.image
         buffers = {name: array.numpy() for name, array in arrays.items() if array is not None}
+        if self.object.bands is not None:
+            return {**buffers, **pixel_arrays(self.object, self.train_cameras, self._pixels, self.seed)}
         return {**buffers, **view_arrays(self.object)}
 
     def summary(self) -> dict[str, Any]:
@@ -188,6 +198,18 @@ class ObjectDataManager(DataManager):
             "lights": torch.tensor(len(self.object.lights)),
         }
 
+    def _truth(self, view: int) -> dict[str, Tensor]:
+        """What is known of a view's materials."""
+        if self.object.bands is None:
+            colours = self.object.base_colour(view)
+            return {} if colours is None else {"base_colour": self._tensor(colours)}
+        materials = self.object.true_materials
+        abundances = None if materials is None else materials.abundances(view)
+        if materials is None or abundances is None:
+            return {}
+        endmembers = self._tensor(materials.endmembers.astype(np.float32))
+        return {"true_abundances": self._tensor(abundances), "true_endmembers": endmembers}
+
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(self.device)
 
@@ -211,6 +233,10 @@ def _tell(line: str) -> None:
 
 
 def _object_folder(data: Path) -> Path:
+    if data == DEMO_SPECTRAL_OBJECT:
+        from unmix_plugin.neumatex.demo.spectral_object import demo_spectral_object_path
+
+        return demo_spectral_object_path()
     if data == DEMO_OBJECT:
         from unmix_plugin.neumatex.demo.demo_object import demo_object_path
 

@@ -52,7 +52,7 @@ def evaluate_object_image(
         f"{prefix}psnr_image": float(psnr_db(error.sum() / (shown.numel() * error.shape[-1]))),
         "lights": float(batch["lights"]),
     }
-    pictures = {f"{prefix}rgb": _side_by_side(shown, true, predicted)}
+    pictures = {f"{prefix}rgb": side_by_side(shown, true, predicted)}
     if prefix:
         return metrics, pictures
     metrics["relit_psnr"] = float("nan")  # of images under other lights, where there are any
@@ -60,7 +60,7 @@ def evaluate_object_image(
         unknown = dict.fromkeys(("base_colour_psnr", "base_colour_psnr_scaled"), float("nan"))
         return {**metrics, **unknown}, pictures
     colour = batch["base_colour"][shown]
-    pictures["base_colour"] = _side_by_side(shown, linear_to_srgb(colour), linear_to_srgb(base))
+    pictures["base_colour"] = side_by_side(shown, linear_to_srgb(colour), linear_to_srgb(base))
     return {**metrics, **_base_colour_metrics(base, colour)}, pictures
 
 
@@ -92,7 +92,7 @@ def _base_colour_metrics(base: Float[Tensor, "M C"], true: Float[Tensor, "M C"])
     }
 
 
-def _side_by_side(
+def side_by_side(
     shown: Bool[Tensor, "H W"], true: Float[Tensor, "M 3"], predicted: Float[Tensor, "M 3"]
 ) -> Float[Tensor, "H W2 3"]:
     pictures = []

@@ -13,10 +13,13 @@ from unmix_plugin.neumatex.materials.family import MaterialFamily
 from unmix_plugin.neumatex.materials.layered import LayeredFamily
 from unmix_plugin.neumatex.materials.neural import NeuralFamily
 from unmix_plugin.neumatex.materials.pbr import PbrFamily
+from unmix_plugin.neumatex.materials.spectral import SpectralFamily
 from unmix_plugin.neumatex.triplane import Triplane
 
-MaterialName = Literal["neural", "pbr"]
+MaterialName = Literal["neural", "pbr", "spectral"]
 """Families that can be trained."""
+PLAIN_GLOSS = (0.5, 0.2)
+"""Roughness and specular level of a common dielectric, half rough."""
 _START_RANGE = (0.05, 0.95)
 """Of parameters, away from where a sigmoid has no slope."""
 _START_PLANES = 0.2
@@ -37,12 +40,14 @@ class TriplaneSurface:
         return self.triplane.parameters_at(positions)
 
 
-def material_family(name: MaterialName) -> MaterialFamily:
-    """The family of that name; the neural one with the shipped decoder.
+def material_family(name: MaterialName, endmembers: Float[Tensor, "K B"] | None = None) -> MaterialFamily:
+    """The family of that name; the neural one with the shipped decoder, the spectral one with these endmembers.
 
     Raises:
         ConfigError: the shipped decoder can't be read.
     """
+    if endmembers is not None:
+        return SpectralFamily(endmembers)
     families: dict[MaterialName, type] = {"neural": NeuralFamily, "pbr": PbrFamily}
     return families[name]()
 
@@ -57,6 +62,9 @@ def plain_parameters(family: MaterialFamily) -> Float[Tensor, "P"]:
         layered = torch.zeros(1, LayeredFamily.num_parameters)
         layered[0, :3], layered[0, 4:6] = 0.5, 0.5
         return family.from_layered(layered)[0].clamp(*_START_RANGE)
+    if isinstance(family, SpectralFamily):
+        shares = torch.full((family.num_endmembers,), 1 / family.num_endmembers)
+        return torch.cat([shares, torch.tensor(PLAIN_GLOSS)])
     return torch.tensor([0.5, 0.5, 0.5, 0.5, 0.0]).clamp(*_START_RANGE)
 
 
@@ -68,7 +76,11 @@ def start_plain(triplane: Triplane, family: MaterialFamily) -> None:
     with torch.no_grad():
         triplane.planes.mul_(_START_PLANES)
         last.weight.mul_(_START_SPREAD)
-        last.bias.copy_(plain_parameters(family).logit())
+        plain = plain_parameters(family)
+        raw = plain.logit()
+        if triplane.num_shares:
+            raw[: triplane.num_shares] = plain[: triplane.num_shares].log()
+        last.bias.copy_(raw)
 
 
 def frozen_parts(family: MaterialFamily) -> dict[str, nn.Module]:

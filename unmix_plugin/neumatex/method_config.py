@@ -6,7 +6,7 @@ from typing import Any
 
 from unmix_plugin.engine import MethodSpecification, OptimizerConfig, PipelineConfig, TrainerConfig
 from unmix_plugin.neumatex.datamanager import ObjectDataManagerConfig
-from unmix_plugin.neumatex.model import NeumatexModelConfig
+from unmix_plugin.neumatex.model_settings import NeumatexModelConfig
 
 
 def _scene(*arguments: Any) -> Any:
@@ -35,6 +35,7 @@ neumatex = MethodSpecification(
             "planes": OptimizerConfig(lr=5e-3, final_factor=0.2),
             "networks": OptimizerConfig(lr=5e-3, final_factor=0.2),
             "response": OptimizerConfig(lr=2e-2, final_factor=0.1),
+            "endmembers": OptimizerConfig(lr=2e-3, final_factor=0.1),
         },
     ),
     description="relightable materials on a known mesh, from posed pictures under a known environment",

@@ -10,83 +10,43 @@ where the tone curve is linear over the spread of the estimates, and nearly so w
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Annotated, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from unmix_plugin.engine import Cameras, Model, ModelConfig, Output, RayBundle, Target
-from unmix_plugin.engine.instantiate import Common
-from unmix_plugin.errors import ConfigError, require
+from unmix_plugin.engine import (
+    Cameras,
+    Model,
+    Output,
+    RayBundle,
+    TrainingCallback,
+    TrainingCallbackLocation,
+)
+from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.datamanager import batch_environment
 from unmix_plugin.neumatex.geometry.mesh import Mesh
 from unmix_plugin.neumatex.image_evaluation import evaluate_object_image, evaluation_outputs
 from unmix_plugin.neumatex.lighting.environment import Environment
 from unmix_plugin.neumatex.material_surface import (
-    MaterialName,
     TriplaneSurface,
     frozen_parts,
     material_family,
     start_plain,
 )
+from unmix_plugin.neumatex.model_settings import NeumatexModelConfig
 from unmix_plugin.neumatex.object_record import ObjectRecord
 from unmix_plugin.neumatex.prior_anchor import PriorAnchor, views_of
-from unmix_plugin.neumatex.tone.curves import LightCurve, ToneMapping, psnr_db, tone_curve
+from unmix_plugin.neumatex.spectral_evaluation import evaluate_spectral_image
+from unmix_plugin.neumatex.spectral_start import start_spectral
+from unmix_plugin.neumatex.tone.curves import ToneMapping, psnr_db, tone_curve
+from unmix_plugin.neumatex.tone.spectral import LampLog, SpectralDisplay
 from unmix_plugin.neumatex.traced_object import SeenPoints, TracedObject, TracedObjectCache
 from unmix_plugin.neumatex.triplane import Triplane
 
-PriorName = Literal["small", "none"]
 _START_SEED = 0
 """Of networks and planes before training; the run's own seed draws all else."""
-
-
-@dataclass(frozen=True)
-class NeumatexModelConfig(ModelConfig):
-    """What is fitted, and how it is rendered meanwhile."""
-
-    _target: Target = field(default_factory=lambda: NeumatexModel)
-    eval_num_rays_per_chunk: int = 4096
-    """Pixels rendered at once for a whole image; fewer take less memory."""
-    material: Annotated[MaterialName, Common] = "neural"
-    """Family of materials: neural (base colour and latents of a shared decoder) or pbr (base colour, roughness,
-    metallicity)."""
-    samples: Annotated[int, Common] = 8
-    """Paths a pixel in training, in two independent halves; more is slower and less noisy."""
-    bounces: Annotated[int, Common] = 1
-    """How often light may be reflected between parts of the object before it reaches the point that is seen."""
-    eval_samples: Annotated[int, Common] = 64
-    """Paths a pixel in renders and evaluation."""
-    prior: Annotated[PriorName, Common] = "small"
-    """Where the fit starts and what it is held to: small is the prior of the package; none starts from a plain grey
-    material."""
-    fit_networks: bool = True
-    """Fit the networks that read the planes, too. Published with a prior: the planes alone."""
-    regularisation: float = 1e-4
-    """Weight of the distance from the prior, over its expected squared error. About the squared error of a fitted
-    pixel: then picture and prior each count by what they know."""
-    plane_resolution: int = 128
-    """Texels along an edge of each of the three planes."""
-    light_curve: LightCurve = "agx"
-    """Tone curve through which pictures of linear light are compared in training; others are compared as they are."""
-
-    def __post_init__(self) -> None:
-        """Refuse impossible settings.
-
-        Raises:
-            ConfigError: a number out of its range.
-        """
-        super().__post_init__()
-        rules = {
-            "samples of 2 to 1024": 2 <= self.samples <= 1024,
-            "bounces of 0 to 8": 0 <= self.bounces <= 8,
-            "eval-samples of 1 to 65536": 1 <= self.eval_samples <= 65536,
-            "regularisation of at least 0": 0 <= self.regularisation < float("inf"),
-            "plane-resolution of 2 to 2048": 2 <= self.plane_resolution <= 2048,
-        }
-        require("the model", rules)
 
 
 class NeumatexModel(Model):
@@ -103,26 +63,25 @@ class NeumatexModel(Model):
         """Modules and buffers in the shapes that config and object ask for."""
         record = ObjectRecord.from_json(self.metadata)
         self.record = record
-        self.family = material_family(self.config.material)
+        self.endmembers: nn.Parameter | None = self._empty_endmembers()
+        self.family = material_family(self.config.material, self.endmembers)
         # A run keeps the decoder that it was fitted with.
         self.family_parts = nn.ModuleDict(frozen_parts(self.family))
         generator = torch.Generator().manual_seed(_START_SEED)
         parameters, resolution = self.family.num_parameters, self.config.plane_resolution
-        self.triplane = Triplane(parameters, resolution, generator=generator)
-        if self.family.num_colours != record.num_colours:
-            raise ConfigError(
-                f"the material {self.config.material} has {self.family.num_colours} colours, the pictures have "
-                f"{record.num_colours}; give pictures of 3 colours"
-            )
-        self.light_curve = tone_curve(self.config.light_curve)
+        shares = 0 if self.endmembers is None else len(self.endmembers)
+        self.triplane = Triplane(parameters, resolution, generator=generator, num_shares=shares)
+        self.light_curve = self._light_curve()
         self.anchor = None
-        if self.config.prior != "none":
+        if self.config.prior != "none" and not record.is_spectral:
             self.anchor = PriorAnchor(Triplane(parameters, resolution, generator=generator))
         if not self.config.fit_networks:
             for network in self.triplane.parameter_groups()["networks"]:
                 network.requires_grad_(False)
         is_light = record.tone_mapping == "linear"
         self.curve: nn.Module = self.light_curve if is_light else tone_curve(record.tone_mapping)
+        if record.bands is not None:
+            self.curve = SpectralDisplay(record.bands)
         for name, buffer in _empty_buffers(record).items():
             self.register_buffer(name, buffer)
         self._traced = TracedObjectCache()
@@ -131,7 +90,9 @@ class NeumatexModel(Model):
         """Take mesh and environment over, and begin with the prior's material, or a plain one."""
         for name in _empty_buffers(self.record):
             self.get_buffer(name).copy_(torch.from_numpy(initial_data[name]))
-        if self.anchor is None:
+        if self.endmembers is not None:
+            start_spectral(self, initial_data, generator)
+        elif self.anchor is None:
             start_plain(self.triplane, self.family)
         else:
             from unmix_plugin.neumatex.prior.small import predict
@@ -152,7 +113,14 @@ class NeumatexModel(Model):
         groups = self.triplane.parameter_groups()
         if not self.config.fit_networks:
             groups["networks"] = []
-        return {**groups, "response": list(self.curve.parameters())}
+        spectra = [] if self.endmembers is None else [self.endmembers]
+        return {**groups, "response": list(self.curve.parameters()), "endmembers": spectra}
+
+    def get_training_callbacks(self) -> list[TrainingCallback]:
+        """Keep endmembers what reflectances can be."""
+        if self.endmembers is None:
+            return []
+        return [TrainingCallback(TrainingCallbackLocation.AFTER_TRAIN_ITERATION, self._bound_endmembers)]
 
     @property
     def mesh(self) -> Mesh:
@@ -188,6 +156,8 @@ class NeumatexModel(Model):
             return {"halves": halves, "found": seen.found, "positions": seen.points.positions}
         light = traced.light(seen, self.config.eval_samples, self.config.bounces, self._random())
         base = self.family.base_colour(self.surface.parameters(seen.points.positions))
+        if isinstance(self.curve, SpectralDisplay):
+            base = self.curve.rgb(base)
         found = seen.found[:, None]
         return {
             "rgb": torch.where(found, self.curve(seen.scatter(light)), 0.0),
@@ -226,8 +196,23 @@ class NeumatexModel(Model):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
+<<<<<<< HEAD
         """Figures and pictures of one view: see `image_evaluation`."""
         return evaluate_object_image(self, outputs, batch)
+=======
+        """See `evaluate_image`, which needs more than one render."""
+        raise NotImplementedError("images of an object are evaluated with evaluate_image")
+
+    @torch.no_grad()
+    def evaluate_image(
+        self, camera: Cameras, batch: dict[str, Tensor]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Figures and pictures of one view, under the light that the batch may hold: see `image_evaluation`."""
+        light = batch_environment(batch)
+        traced = self.traced if light is None else self.traced.under(light)
+        evaluate = evaluate_spectral_image if self.record.is_spectral else evaluate_object_image
+        return evaluate(self, traced, camera.to(self.device), batch)
+>>>>>>> 7041d30 (Mix endmember reflectances on a known mesh under a known lamp)
 
     def warm_up(self) -> None:
         """Compile the kernels, forward and backward, on a few rays that meet the mesh."""
@@ -265,6 +250,40 @@ class NeumatexModel(Model):
         tone = self.record.tone_mapping
         shown, wanted = self.compared(outputs["halves"], batch["numbers"], tone, self.light_curve)
         return shown - wanted
+
+    def _empty_endmembers(self) -> nn.Parameter | None:
+        """Endmembers (K, B) of a spectral material, not yet filled; None for materials in colours.
+
+        Raises:
+            ConfigError: the material does not fit the pictures.
+        """
+        count, bands = self.config.num_endmembers, self.record.num_colours
+        if self.record.is_spectral != (self.config.material == "spectral"):
+            fitting = "spectral" if self.record.is_spectral else "neural or pbr"
+            raise ConfigError(
+                f"the material {self.config.material} does not fit pictures of {bands} "
+                f"{'bands' if self.record.is_spectral else 'colours'}; choose {fitting}"
+            )
+        if not self.record.is_spectral:
+            return None
+        if not isinstance(count, int):
+            raise ConfigError("num-endmembers is not settled: call resolve_auto first")
+        if count > bands:
+            raise ConfigError(f"num-endmembers is {count} but the pictures have {bands} bands; choose fewer")
+        return nn.Parameter(torch.zeros(count, bands))
+
+    def _light_curve(self) -> nn.Module:
+        name = self.config.light_curve
+        if self.record.is_spectral:
+            if name == "agx":
+                raise ConfigError("light-curve is agx, which is for 3 colours; choose auto, srgb or linear")
+            return LampLog(self.record.lamp) if name == "auto" else tone_curve(name)
+        return tone_curve("agx" if name == "auto" else name)
+
+    @torch.no_grad()
+    def _bound_endmembers(self, step: int, progress: float) -> None:
+        assert self.endmembers is not None
+        self.endmembers.clamp_(0, 1)
 
     def _random(self) -> torch.Generator:
         """The step's source of random numbers; outside training always the same."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from unmix_plugin.engine.runs.config_json import config_from_json
 from unmix_plugin.neumatex.tone.curves import ToneMapping
+from unmix_plugin.spectral.bands import Bands
 
 if TYPE_CHECKING:
     from unmix_plugin.neumatex.scene.object_scene import ObjectScene
@@ -33,6 +34,18 @@ class ObjectRecord:
     """What the pictures' numbers are of light."""
     wavelengths_nm: tuple[float, ...] = ()
     """Of spectral pictures; empty for RGB."""
+    lamp: tuple[float, ...] = ()
+    """Relative power of the light of spectral pictures, greatest band 1; empty for RGB."""
+
+    @property
+    def is_spectral(self) -> bool:
+        """Whether the pictures have bands, not colours."""
+        return bool(self.lamp)
+
+    @property
+    def bands(self) -> Bands | None:
+        """Of spectral pictures."""
+        return Bands.of(self.wavelengths_nm) if self.is_spectral else None
 
     @staticmethod
     def of(scene: ObjectScene) -> ObjectRecord:
@@ -49,7 +62,8 @@ class ObjectRecord:
             exposure_stops=light.exposure_stops,
             num_colours=scene.pictures.num_colours,
             tone_mapping=scene.pictures.tone,
-            wavelengths_nm=scene.wavelengths_nm,
+            wavelengths_nm=() if scene.bands is None else tuple(scene.bands.centers_nm.tolist()),
+            lamp=() if scene.lamp is None else tuple(scene.lamp.tolist()),
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -69,4 +83,9 @@ class ObjectRecord:
         counts = (record.num_vertices, record.num_faces, *record.environment_size, record.num_colours)
         if min(counts) < 1 or record.num_light_colours < 1:
             raise ValueError(f"an object needs sizes of at least 1; found {counts}")
+        if record.is_spectral and {len(record.lamp), len(record.wavelengths_nm)} != {record.num_colours}:
+            raise ValueError(
+                f"an object of {record.num_colours} bands needs as many wavelengths and powers of its lamp; found "
+                f"{len(record.wavelengths_nm)} and {len(record.lamp)}"
+            )
         return record

@@ -35,22 +35,29 @@ class Readers(nn.Module):
         num_parameters: int,
         num_channels: int = NUM_CHANNELS,
         generator: torch.Generator | None = None,
+        num_shares: int = 0,
     ) -> None:
         """Random networks.
 
         Args:
             num_parameters: P.
             generator: Draws the weights.
+            num_shares: How many of the first parameters are shares, which sum to 1.
         """
         super().__init__()
         inputs = 3 * num_channels + 3 + 6 * NUM_FREQUENCIES
         self.num_parameters = num_parameters
+        self.num_shares = num_shares
         self.material_network = _network(inputs, num_parameters, generator)
         self.variance_network = _network(inputs, num_parameters, generator)
 
     def material(self, features: Float[Tensor, "N F"]) -> Float[Tensor, "N P"]:
         """Parameters in (0, 1) of points whose `point_features` are given."""
-        return torch.sigmoid(self.material_network(features))
+        raw = self.material_network(features)
+        if not self.num_shares:
+            return torch.sigmoid(raw)
+        shares, others = raw.tensor_split([self.num_shares], dim=-1)
+        return torch.cat([torch.softmax(shares, dim=-1), torch.sigmoid(others)], dim=-1)
 
     def log_variance(self, features: Float[Tensor, "N F"]) -> Float[Tensor, "N P"]:
         """Log-variances within `LOG_VARIANCE_RANGE` of points whose `point_features` are given."""
@@ -66,6 +73,7 @@ class Triplane(nn.Module):
         resolution: int = 128,
         num_channels: int = NUM_CHANNELS,
         generator: torch.Generator | None = None,
+        num_shares: int = 0,
     ) -> None:
         """A random material, nearly the same everywhere.
 
@@ -73,16 +81,22 @@ class Triplane(nn.Module):
             num_parameters: P; 9 for the neural material, 5 for base colour, roughness and metallicity.
             resolution: R, at least 2.
             generator: Draws the planes and the networks.
+            num_shares: How many of the first parameters are shares, which sum to 1.
         """
         super().__init__()
         texels = (3, num_channels, resolution, resolution)
         self.planes = nn.Parameter(0.1 * torch.randn(texels, generator=generator))
-        self.readers = Readers(num_parameters, num_channels, generator)
+        self.readers = Readers(num_parameters, num_channels, generator, num_shares)
 
     @property
     def num_parameters(self) -> int:
         """P."""
         return self.readers.num_parameters
+
+    @property
+    def num_shares(self) -> int:
+        """How many of the first parameters sum to 1."""
+        return self.readers.num_shares
 
     def parameters_at(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N P"]:
         """Parameters of the material in (0, 1); differentiable by planes and networks."""

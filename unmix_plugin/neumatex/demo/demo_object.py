@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,9 +27,11 @@ from unmix_plugin.formats.glb import write_glb
 from unmix_plugin.neumatex.demo.layered_surface import LayeredSurface
 from unmix_plugin.neumatex.demo.shapes import demo_mesh
 from unmix_plugin.neumatex.demo.viewpoints import viewpoints
+from unmix_plugin.neumatex.geometry.mesh import Mesh
 from unmix_plugin.neumatex.geometry.ray_mesh import RayMesh
 from unmix_plugin.neumatex.lighting.built_in import NAMES, built_in_environment
 from unmix_plugin.neumatex.lighting.environment import Environment
+from unmix_plugin.neumatex.surface import Surface
 from unmix_plugin.neumatex.tracing.primary_hits import pixel_hits
 from unmix_plugin.neumatex.tracing.render_view import render_view
 from unmix_plugin.scenes.demo.folders import check_bounds, staging_for, written_once
@@ -58,11 +60,11 @@ Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class _Object:
+class Subject:
     """What pictures are taken of."""
 
     ray_mesh: RayMesh
-    surface: LayeredSurface
+    surface: Surface
     generator: torch.Generator
     size: int
 
@@ -72,7 +74,7 @@ class _Object:
 
     def picture(
         self, light: Environment, cameras: Cameras, index: int, samples: int
-    ) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]:
+    ) -> tuple[Float[Tensor, "H W C"], Float[Tensor, "H W"]]:
         """Radiance multiplied by alpha, and alpha."""
         return render_view(
             self.surface,
@@ -88,10 +90,14 @@ class _Object:
 
     def exposed(self, light: Environment) -> Environment:
         """A light scaled so that the object's mean radiance is `_MEAN_RADIANCE`."""
+        return Environment(light.image * self.exposure(light, _MEAN_RADIANCE))
+
+    def exposure(self, light: Environment, mean_radiance: float) -> Float[Tensor, ""]:
+        """Factor of a light that gives the object a mean radiance."""
         cameras = self.cameras(4, 0).resized(24, 24)
         pictures = [self.picture(light, cameras, index, 16) for index in range(len(cameras))]
         radiance, alpha = (torch.stack(parts).sum() for parts in zip(*pictures, strict=True))
-        return Environment(light.image * (_MEAN_RADIANCE * 3 * alpha / radiance))
+        return mean_radiance * light.num_colours * alpha / radiance
 
 
 def demo_object(
@@ -142,21 +148,30 @@ def demo_object_path(cache_dir: Path | None = None, say: Say | None = None) -> P
     Raises:
         SceneError: the cache can't be written.
     """
-    target = (cache_dir or user_cache()) / f"demo-object-{_generator_hash()}" / "object"
-    return written_once(
-        target,
-        "the demo object",
+    return cached_object(
+        "demo-object",
         lambda folder: _write_object(folder, 0, DEFAULT_SIZE, DEFAULT_VIEWS, DEFAULT_LIGHTS, say),
-        _is_complete,
+        cache_dir,
     )
+
+
+def cached_object(name: str, write: Callable[[Path], None], cache_dir: Path | None) -> Path:
+    """The folder of an object that is written once for each version of the generator; see `demo_object_path`.
+
+    Args:
+        name: Of its folder in the cache.
+        write: Writes it into a folder.
+    """
+    target = (cache_dir or user_cache()) / f"{name}-{_generator_hash()}" / "object"
+    return written_once(target, f"the {name.replace('-', ' ')}", write, _is_complete)
 
 
 def _write_object(folder: Path, seed: int, size: int, views: int, lights: int, say: Say | None) -> None:
-    names = _light_names(seed, lights)
-    subject = _Object(
-        RayMesh(demo_mesh(seed)), LayeredSurface(seed), torch.Generator().manual_seed(seed), size
-    )
-    _write_mesh(folder / "mesh.glb", subject)
+    names = light_names(seed, lights)
+    surface = LayeredSurface(seed)
+    subject = Subject(RayMesh(demo_mesh(seed)), surface, torch.Generator().manual_seed(seed), size)
+    colours = surface.family.base_colour(surface.parameters(subject.ray_mesh.mesh.vertices))
+    write_mesh(folder / "mesh.glb", subject.ray_mesh.mesh, colours, surface.kinds)
     for number, name in enumerate(names):
         if say is not None:
             say(f"demo object: rendering light {number + 1} of {len(names)} ({name})")
@@ -170,7 +185,7 @@ def _write_object(folder: Path, seed: int, size: int, views: int, lights: int, s
             _write_pictures(folder / "relit" / name, subject, light, cameras, 1)
 
 
-def _light_names(seed: int, lights: int) -> list[str]:
+def light_names(seed: int, lights: int) -> list[str]:
     """The light of training, one of `_TRAINING_LIGHTS`, and others after it."""
     rng = np.random.default_rng([3, seed])
     chosen = str(rng.choice(_TRAINING_LIGHTS))
@@ -178,7 +193,7 @@ def _light_names(seed: int, lights: int) -> list[str]:
 
 
 def _write_pictures(
-    folder: Path, subject: _Object, light: Environment, cameras: Cameras, evaluation_interval: int
+    folder: Path, subject: Subject, light: Environment, cameras: Cameras, evaluation_interval: int
 ) -> None:
     """Pictures under one light with transforms.json and the light itself."""
     frames: list[dict[str, Any]] = []
@@ -188,7 +203,7 @@ def _write_pictures(
         radiance, alpha = subject.picture(light, cameras, index, samples)
         _write_straight(folder / path, radiance, alpha)
         frames.append({"file_path": path, "transform_matrix": transform_matrix(cameras, index)})
-    _write_channels(folder / "environment.exr", light.image)
+    write_channels(folder / "environment.exr", light.image)
     content = {
         **lens_entries(cameras),
         "environment_path": "environment.exr",
@@ -198,7 +213,7 @@ def _write_pictures(
     (folder / "transforms.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
-def _write_base_colours(folder: Path, subject: _Object, cameras: Cameras) -> None:
+def _write_base_colours(folder: Path, subject: Subject, cameras: Cameras) -> None:
     """Base colours of evaluation views."""
     for index in range(0, len(cameras), EVALUATION_INTERVAL):
         hits = pixel_hits(subject.ray_mesh, cameras, index, _SUBPIXELS)
@@ -210,19 +225,19 @@ def _write_base_colours(folder: Path, subject: _Object, cameras: Cameras) -> Non
 def _write_straight(path: Path, premultiplied: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W"]) -> None:
     """RGBA whose colours are not multiplied by alpha; 0 where it is 0."""
     straight = premultiplied / alpha.clamp(min=1e-6)[..., None]
-    _write_channels(path, torch.cat([straight, alpha[..., None]], dim=-1))
+    write_channels(path, torch.cat([straight, alpha[..., None]], dim=-1))
 
 
-def _write_channels(path: Path, image: Float[Tensor, "H W c"]) -> None:
+def write_channels(path: Path, image: Float[Tensor, "H W c"]) -> None:
+    """Channels R, G, B, A as far as there are."""
     names = "RGBA"[: image.shape[-1]]
     write_exr(path, {name: image[..., index].numpy() for index, name in enumerate(names)}, {})
 
 
-def _write_mesh(path: Path, subject: _Object) -> None:
-    mesh = subject.ray_mesh.mesh
-    colours = subject.surface.family.base_colour(subject.surface.parameters(mesh.vertices))
+def write_mesh(path: Path, mesh: Mesh, colours: Float[Tensor, "V 3"], kinds: Sequence[str]) -> None:
+    """A glTF mesh with linear colours at its vertices, and the names of its materials."""
     parts = (mesh.vertices.numpy(), mesh.normals.numpy(), colours.numpy(), mesh.faces.numpy())
-    write_glb(path, *parts, {}, {"materials": list(subject.surface.kinds)})
+    write_glb(path, *parts, {}, {"materials": list(kinds)})
 
 
 def _name(index: int) -> str:
@@ -243,7 +258,7 @@ def _generator_hash() -> str:
     """Changes with the generator's code, so that a cached object is never one of another version."""
     digest = hashlib.sha256()
     rooms = Path(__file__).parent.parent
-    for room in ("demo", "geometry", "lighting", "tracing"):
+    for room in ("demo", "geometry", "lighting", "materials", "tracing"):
         for path in sorted((rooms / room).glob("*.py")):
             digest.update(path.read_bytes())
     return digest.hexdigest()[:12]

@@ -36,7 +36,7 @@ def read_environment(path: Path, rotation_deg: float = 0.0, exposure_stops: floa
     if reader is None:
         raise SceneError(f"{path}: is no environment map; convert it to one of {', '.join(SUFFIXES)}")
     image = reader(path)
-    _check(path, image)
+    check_environment(path, image)
     return Environment(torch.from_numpy(np.ascontiguousarray(image)), rotation_deg, exposure_stops)
 
 
@@ -54,7 +54,7 @@ def _read_exr(path: Path) -> np.ndarray:
     return np.stack([channels[name].astype(np.float32) for name in names], axis=-1)
 
 
-def _check(path: Path, image: np.ndarray) -> None:
+def check_environment(path: Path, image: np.ndarray) -> None:
     height, width = image.shape[:2]
     if width != 2 * height:
         raise SceneError(

@@ -18,11 +18,14 @@ from unmix_plugin.neumatex.geometry.ray_mesh import RayMesh
 from unmix_plugin.neumatex.geometry.read_mesh import SUFFIXES as MESH_SUFFIXES
 from unmix_plugin.neumatex.geometry.read_mesh import read_mesh
 from unmix_plugin.neumatex.lighting.environment import Environment
+from unmix_plugin.neumatex.lighting.lamp import read_environment_of_bands
 from unmix_plugin.neumatex.lighting.read_environment import SUFFIXES as ENVIRONMENT_SUFFIXES
 from unmix_plugin.neumatex.lighting.read_environment import read_environment
 from unmix_plugin.neumatex.scene.mesh_check import check_mesh_place
 from unmix_plugin.neumatex.scene.object_scene import HeldOutLight, ObjectScene
 from unmix_plugin.neumatex.scene.posed_pictures import PosedPictures, has_alpha, read_posed_pictures
+from unmix_plugin.neumatex.scene.spectral_light import SpectralLight, spectral_light
+from unmix_plugin.neumatex.scene.true_materials import read_true_materials
 from unmix_plugin.neumatex.tone.curves import TONE_MAPPINGS, ToneMapping
 from unmix_plugin.scenes.placement import Placement
 from unmix_plugin.scenes.reading.faults import Faults
@@ -37,9 +40,12 @@ EVAL_INTERVAL = 8
 MOST_STOPS = 20.0
 
 
-def load_object(root: Path) -> ObjectScene:
+def load_object(root: Path, lamp: str | None = None) -> ObjectScene:
     """Read and check an object's folder.
 
+    Args:
+        root: The folder.
+        lamp: For pictures of many bands: what lit them, as `read_lamp` takes it, instead of what the folder says.
     Raises:
         SceneError: the folder is no sound object; the message says what is wrong with it.
     """
@@ -52,9 +58,10 @@ def load_object(root: Path) -> ObjectScene:
     faults.raise_if_any()
     assert light is not None
     assert mesh_path is not None
-    environment = light.environment()
     frame, mesh = _model_space(read_mesh(mesh_path, notes))
     pictures = read_posed_pictures(root, entry, _from_poses(frame, entry.placement), light.tone, faults)
+    spectral = spectral_light(root, entry, pictures, lamp)
+    environment = light.environment(spectral)
     alphas = [_alpha(pictures, index) for index in range(len(pictures))]
     check_mesh_place(RayMesh(mesh), pictures.cameras, alphas, frame, mesh_path.name)
     files = {mesh_path.name: mesh_path, light.environment_path.name: light.environment_path}
@@ -66,9 +73,11 @@ def load_object(root: Path) -> ObjectScene:
         frame=frame,
         pictures=pictures,
         split=split,
-        lights=tuple(_read_held_out(path, frame) for path in _held_out_folders(root)),
-        wavelengths_nm=() if entry.wavelengths_nm is None else tuple(entry.wavelengths_nm.tolist()),
+        lights=tuple(_read_held_out(path, frame, spectral) for path in _held_out_folders(root)),
+        bands=None if spectral is None else spectral.bands,
+        lamp=None if spectral is None else spectral.lamp_of(environment),
         truth=truth if truth.is_dir() else None,
+        true_materials=read_true_materials(root, entry, spectral),
         input_hashes={**{name: sha256_of(path) for name, path in files.items()}, **pictures.hashes},
         notes=tuple(notes),
     )
@@ -83,8 +92,12 @@ class _Light:
     exposure_stops: float
     tone: ToneMapping | None
 
-    def environment(self) -> Environment:
-        return read_environment(self.environment_path, self.rotation_deg, self.exposure_stops)
+    def environment(self, spectral: SpectralLight | None) -> Environment:
+        """In the bands of spectral pictures, or else in colours."""
+        placement = (self.rotation_deg, self.exposure_stops)
+        if spectral is None:
+            return read_environment(self.environment_path, *placement)
+        return read_environment_of_bands(self.environment_path, spectral.bands, spectral.lamp, *placement)
 
 
 def _read_light(root: Path, faults: Faults) -> _Light | None:
@@ -155,7 +168,7 @@ def _held_out_folders(root: Path) -> list[Path]:
     return sorted(path for path in relit.iterdir() if path.is_dir()) if relit.is_dir() else []
 
 
-def _read_held_out(folder: Path, frame: Normalisation) -> HeldOutLight:
+def _read_held_out(folder: Path, frame: Normalisation, spectral: SpectralLight | None) -> HeldOutLight:
     faults = Faults(folder)
     entry: SceneEntry = read_transforms(folder, faults, needs_cubes=False)
     light = _read_light(folder, faults)
@@ -163,4 +176,6 @@ def _read_held_out(folder: Path, frame: Normalisation) -> HeldOutLight:
     if light is None:
         raise SceneError(f"{folder} has no environment map")
     pictures = read_posed_pictures(folder, entry, _from_poses(frame, entry.placement), light.tone, faults)
-    return HeldOutLight(folder.name, light.environment(), pictures)
+    if spectral is not None:
+        spectral = spectral.of_held_out(folder, entry, pictures)
+    return HeldOutLight(folder.name, light.environment(spectral), pictures)

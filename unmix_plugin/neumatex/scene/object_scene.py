@@ -11,14 +11,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Float64
 
 from unmix_plugin.neumatex.geometry.mesh import Mesh
 from unmix_plugin.neumatex.lighting.environment import Environment
 from unmix_plugin.neumatex.scene.picture_files import read_picture
 from unmix_plugin.neumatex.scene.posed_pictures import PosedPictures
+from unmix_plugin.neumatex.scene.true_materials import TrueMaterials
 from unmix_plugin.scenes.reading.splits import Split
 from unmix_plugin.scenes.scene import Normalisation
+from unmix_plugin.spectral.bands import Bands
 
 
 @dataclass(frozen=True)
@@ -48,10 +50,14 @@ class ObjectScene:
     split: Split
     """Views to train on and views to evaluate, at least one each."""
     lights: tuple[HeldOutLight, ...]
-    wavelengths_nm: tuple[float, ...]
-    """Of spectral pictures, a band each; empty for RGB."""
+    bands: Bands | None
+    """Of spectral pictures; None for RGB."""
+    lamp: Float64[np.ndarray, " B"] | None
+    """Relative power of the light of spectral pictures, greatest band 1."""
     truth: Path | None
     """Folder of true base colours; None where there is none."""
+    true_materials: TrueMaterials | None
+    """Of spectral pictures, where they are known."""
     input_hashes: dict[str, str]
     """SHA-256 of mesh, environment and pictures."""
     notes: tuple[str, ...]

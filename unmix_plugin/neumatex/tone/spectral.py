@@ -1,0 +1,53 @@
+"""Spectra as numbers that are compared or shown.
+
+Notation: `B` bands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.colour.agx import agx
+from unmix_plugin.spectral.colour.conversion import rgb_matrix
+
+
+class LampLog(nn.Module):
+    """Logarithm of 1 + light over the lamp's power: all bands count by their reflectance, highlights count less."""
+
+    lamp: Tensor
+
+    def __init__(self, lamp: Sequence[float]) -> None:
+        """
+        Args:
+            lamp: Power of each band, above 0.
+        """
+        super().__init__()
+        self.register_buffer("lamp", torch.tensor(lamp, dtype=torch.float32), persistent=False)
+
+    def forward(self, light: Float[Tensor, "*pixels B"]) -> Float[Tensor, "*pixels B"]:
+        """Numbers of at least 0."""
+        return torch.log1p(light / self.lamp)
+
+
+class SpectralDisplay(nn.Module):
+    """Spectra as AgX shows their colour; the flat spectrum 1 is white."""
+
+    matrix: Tensor
+
+    def __init__(self, bands: Bands) -> None:
+        """For spectra of these bands."""
+        super().__init__()
+        self.register_buffer("matrix", rgb_matrix(bands), persistent=False)
+
+    def rgb(self, spectra: Float[Tensor, "*pixels B"]) -> Float[Tensor, "*pixels 3"]:
+        """Linear colour, at least 0."""
+        return (spectra @ self.matrix).clamp(min=0)
+
+    def forward(self, light: Float[Tensor, "*pixels B"]) -> Float[Tensor, "*pixels 3"]:
+        """sRGB numbers in [0, 1]."""
+        return agx(self.rgb(light)).clamp(0, 1)
