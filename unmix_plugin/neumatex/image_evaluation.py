@@ -67,7 +67,7 @@ def evaluate_object_image(
 def evaluation_outputs(
     model: NeumatexModel, traced: TracedObject, camera: Cameras, batch: dict[str, Tensor]
 ) -> dict[str, Float[Tensor, "H W C"]]:
-    """`light` and `base_colour`, both linear, of the pixels that count; black elsewhere."""
+    """`light` and `base_colour`, both linear, and `parameters` of the material, where pixels count; 0 elsewhere."""
     shown = batch["alpha"] >= OPAQUE
     hits = pixel_hits(traced.ray_mesh, camera, 0, SUBPIXELS)
     hits = hits.select(shown.flatten()[hits.pixels])
@@ -80,8 +80,13 @@ def evaluation_outputs(
         bounces=model.config.bounces,
         generator=torch.Generator(model.device).manual_seed(0),
     )
-    base = model.family.base_colour(traced.surface.parameters(hits.points.positions))
-    return {"light": hits.image(light), "base_colour": hits.image(base)}
+    parameters = traced.surface.parameters(hits.points.positions)
+    base = model.family.base_colour(parameters)
+    return {
+        "light": hits.image(light),
+        "base_colour": hits.image(base),
+        "parameters": hits.image(parameters),
+    }
 
 
 def _base_colour_metrics(base: Float[Tensor, "M C"], true: Float[Tensor, "M C"]) -> dict[str, float]:
@@ -95,6 +100,7 @@ def _base_colour_metrics(base: Float[Tensor, "M C"], true: Float[Tensor, "M C"])
 def side_by_side(
     shown: Bool[Tensor, "H W"], true: Float[Tensor, "M 3"], predicted: Float[Tensor, "M 3"]
 ) -> Float[Tensor, "H W2 3"]:
+    """Two pictures, black where nothing counts."""
     pictures = []
     for values in (true, predicted):
         picture = values.new_zeros((*shown.shape, 3))

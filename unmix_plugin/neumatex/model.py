@@ -196,23 +196,9 @@ class NeumatexModel(Model):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-<<<<<<< HEAD
-        """Figures and pictures of one view: see `image_evaluation`."""
-        return evaluate_object_image(self, outputs, batch)
-=======
-        """See `evaluate_image`, which needs more than one render."""
-        raise NotImplementedError("images of an object are evaluated with evaluate_image")
-
-    @torch.no_grad()
-    def evaluate_image(
-        self, camera: Cameras, batch: dict[str, Tensor]
-    ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Figures and pictures of one view, under the light that the batch may hold: see `image_evaluation`."""
-        light = batch_environment(batch)
-        traced = self.traced if light is None else self.traced.under(light)
+        """Figures and pictures of one view: see `image_evaluation` and `spectral_evaluation`."""
         evaluate = evaluate_spectral_image if self.record.is_spectral else evaluate_object_image
-        return evaluate(self, traced, camera.to(self.device), batch)
->>>>>>> 7041d30 (Mix endmember reflectances on a known mesh under a known lamp)
+        return evaluate(self, outputs, batch)
 
     def warm_up(self) -> None:
         """Compile the kernels, forward and backward, on a few rays that meet the mesh."""

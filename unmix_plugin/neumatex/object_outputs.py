@@ -15,7 +15,10 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.outputs import Output
 from unmix_plugin.neumatex.materials.family import MaterialFamily
 from unmix_plugin.neumatex.materials.pbr import PbrFamily
+from unmix_plugin.neumatex.materials.spectral import SpectralFamily
+from unmix_plugin.neumatex.tone.spectral import SpectralDisplay
 from unmix_plugin.neumatex.tracing.primary_hits import PixelHits
+from unmix_plugin.spectral.segmentation import material_ids
 
 if TYPE_CHECKING:
     from unmix_plugin.neumatex.trained_object import TrainedObject
@@ -37,6 +40,16 @@ _LATENTS = (
     Output("latents_a", "picture", "latents A", "the decoder's latents 1 to 3 as red, green, blue"),
     Output("latents_b", "picture", "latents B", "the decoder's latents 4 to 6 as red, green, blue"),
 )
+_SPECTRAL = (
+    Output("spectral", "channels", "radiance", "radiance in every band, on black"),
+    Output("reflectance", "channels", "reflectance", "diffuse reflectance in every band, 0 to 1, on black"),
+    Output("abundances", "shares", "abundances", "share of each endmember, summing to opacity", (0.0, 1.0)),
+    Output("segmentation", "labels", "segmentation", "endmember of the largest share; 255 where nothing is"),
+    Output("roughness", "map", "roughness", "roughness of the gloss, 0 to 1", (0.0, 1.0)),
+    Output(
+        "specular_level", "map", "specular level", "root of what the gloss reflects straight on", (0.0, 1.0)
+    ),
+)
 _UNCERTAINTY = Output(
     "uncertainty", "map", "uncertainty", "expected error of the material's parameters, mean", None, "magma"
 )
@@ -55,7 +68,11 @@ def has_latents(family: MaterialFamily) -> bool:
 
 def object_outputs(family: MaterialFamily, has_variance: bool) -> tuple[Output, ...]:
     """The outputs of objects with materials of a family, in the order in which they are offered."""
-    own = _LATENTS if has_latents(family) else _PBR if isinstance(family, PbrFamily) else ()
+    own: tuple[Output, ...] = ()
+    if isinstance(family, SpectralFamily):
+        own = _SPECTRAL
+    elif has_latents(family) or isinstance(family, PbrFamily):
+        own = _LATENTS if has_latents(family) else _PBR
     return (*_COMMON, *own, *((_UNCERTAINTY,) if has_variance else ()), *_GEOMETRY)
 
 
@@ -74,18 +91,25 @@ def view_outputs(
         return hits.image(values) / seen
 
     linear = hits.image(light)
+    in_colours = scene.curve.rgb if isinstance(scene.curve, SpectralDisplay) else _as_it_is
     rgb = torch.where(alpha[..., None] > 0, scene.curve(linear / seen), 0.0) * alpha[..., None]
     found = {
         "rgb": rgb,
-        "linear_rgb": linear,
-        "base_colour": hits.image(base),
-        "shading": hits.image(light / base.clamp(min=_DARKEST)),
+        "linear_rgb": in_colours(linear),
+        "base_colour": in_colours(hits.image(base)),
+        "shading": hits.image(in_colours(light) / in_colours(base).clamp(min=_DARKEST)),
         "normals": _world_normals(scene, mean(hits.points.normals)) * (alpha > 0)[..., None],
         "depth": mean(_depths(scene, camera, positions)[:, None])[..., 0],
         "accumulation": alpha,
     }
     family = scene.surface.family
-    if has_latents(family):
+    if isinstance(family, SpectralFamily):
+        shares = hits.image(family.abundances(parameters))
+        found |= {"spectral": linear, "reflectance": hits.image(base), "abundances": shares}
+        found["segmentation"] = material_ids(shares, alpha)
+        gloss = mean(parameters[:, family.num_endmembers :])
+        found["roughness"], found["specular_level"] = gloss.unbind(dim=-1)
+    elif has_latents(family):
         found["latents_a"], found["latents_b"] = mean(parameters[:, 3:6]), mean(parameters[:, 6:9])
     elif isinstance(family, PbrFamily):
         found["roughness"], found["metallicity"] = mean(parameters[:, 3:5]).unbind(dim=-1)
@@ -93,6 +117,10 @@ def view_outputs(
         spread = (_in_chunks(scene.log_variance, positions, family.num_parameters) / 2).exp()
         found["uncertainty"] = mean(spread.mean(dim=1, keepdim=True))[..., 0]
     return found
+
+
+def _as_it_is(values: Tensor) -> Tensor:
+    return values
 
 
 def _in_chunks(look_up, positions: Float[Tensor, "K 3"], width: int) -> Tensor:  # noqa: ANN001

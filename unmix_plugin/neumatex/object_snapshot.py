@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor
 
 from unmix_plugin.engine.runs.load_run import SceneRecord
@@ -33,15 +34,18 @@ def trained_object(
     frozen = frozen_parameters(model, averages)
     triplane = copy.deepcopy(model.triplane, dict(frozen)).eval()  # type: ignore[arg-type]
     curve = copy.deepcopy(model.curve, dict(frozen)).eval()  # type: ignore[arg-type]
+    family = copy.deepcopy(model.family, dict(frozen))  # type: ignore[arg-type]
     return TrainedObject(
         model.traced.ray_mesh,
-        replace(model.surface, triplane=triplane),
+        replace(model.surface, family=family, triplane=triplane),
         model.environment,
         world_frame(record),
         recorded_views(record),
         record.scene_box,
         curve,
-        triplane.log_variance,
+        None if model.record.is_spectral else triplane.log_variance,
         model.config.eval_samples,
         model.config.bounces,
+        bands=model.record.bands,
+        lamp=torch.tensor(model.record.lamp) if model.record.is_spectral else None,
     )

@@ -45,9 +45,7 @@ _DARKEST = 0.1
 _STEPS, _POINTS, _RATE = 200, 4096, 5e-3
 
 
-def pixel_arrays(
-    scene: ObjectScene, cameras: Cameras, pixels: PixelList, seed: int
-) -> dict[str, np.ndarray]:
+def pixel_arrays(scene: ObjectScene, cameras: Cameras, pixels: PixelList, seed: int) -> dict[str, np.ndarray]:
     """Rays and spectra of some pixels of the training views, the lamp, and where the world is, as arrays by name."""
     assert scene.lamp is not None
     drawn = pixels.draw(NUM_PIXELS, step_generator(seed, 0, stream=_STREAM))

@@ -21,12 +21,14 @@ from unmix_plugin.neumatex.geometry.mesh import Mesh
 from unmix_plugin.neumatex.geometry.ray_mesh import RayMesh
 from unmix_plugin.neumatex.lighting.built_in import NAMES, built_in_environment
 from unmix_plugin.neumatex.lighting.environment import Environment
+from unmix_plugin.neumatex.lighting.lamp import of_lamp, read_environment_of_bands
 from unmix_plugin.neumatex.lighting.read_environment import SUFFIXES, read_environment
 from unmix_plugin.neumatex.object_outputs import object_outputs, view_outputs
 from unmix_plugin.neumatex.surface import Surface
 from unmix_plugin.neumatex.tracing.primary_hits import pixel_hits
 from unmix_plugin.neumatex.tracing.render_view import rays_radiance
 from unmix_plugin.scenes.scene import Normalisation
+from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.trained.model_scene import ModelView
 from unmix_plugin.trained.probe import one_pixel
 from unmix_plugin.trained.protocol import Probe
@@ -64,6 +66,10 @@ class TrainedObject:
     notes: tuple[str, ...] = ()
     own_light: Environment | None = None
     """The light of the pictures, once another one is in use."""
+    bands: Bands | None = None
+    """Of light and base reflectance; None for colours."""
+    lamp: Float[Tensor, " B"] | None = None
+    """Spectrum that environments in colours get; None for colours."""
 
     @property
     def mesh(self) -> Mesh:
@@ -101,7 +107,7 @@ class TrainedObject:
             SceneError: the file of an environment map is missing, damaged or of no use.
         """
         own = self.own_light or self.environment
-        light = own if choice.name in (None, OWN_LIGHT) else _named_light(str(choice.name), self.lights)
+        light = own if choice.name in (None, OWN_LIGHT) else self._named_light(str(choice.name))
         turned = Environment(
             light.image.to(self.device),
             light.rotation_deg + choice.rotation_deg,
@@ -110,9 +116,25 @@ class TrainedObject:
         return replace(self, environment=turned, own_light=own)
 
     def with_environment(self, environment: Environment) -> TrainedObject:
-        """The object under any light."""
-        own = self.own_light or self.environment
-        return replace(self, environment=environment.to(self.device), own_light=own)
+        """The object under any light; one in colours gets the lamp's spectrum where the material has bands."""
+        own, light = self.own_light or self.environment, environment.to(self.device)
+        if self.lamp is not None and light.num_colours != len(self.lamp):
+            light = of_lamp(light, self.lamp)
+        return replace(self, environment=light, own_light=own)
+
+    def _named_light(self, name: str) -> Environment:
+        if name in self.lights:
+            light = built_in_environment(name)
+            return light if self.lamp is None else of_lamp(light, self.lamp.cpu())
+        if not name.lower().endswith(SUFFIXES):
+            hint = did_you_mean(name, self.lights, likeness=0.5, form=" ({})")
+            raise ConfigError(
+                f"there is no environment {name!r}{hint}; known are {', '.join(self.lights)}, and the path of an "
+                f"environment map ({', '.join(SUFFIXES)})"
+            )
+        if self.bands is None or self.lamp is None:
+            return read_environment(Path(name))
+        return read_environment_of_bands(Path(name), self.bands, self.lamp.cpu().double().numpy())
 
     def look(self, camera: Cameras, subpixels: int | None = None) -> ModelView:
         """All outputs of a view; `subpixels` squared rays a pixel."""
@@ -172,15 +194,3 @@ class TrainedObject:
 def _seed(camera: Cameras, number: int) -> int:
     """Of the samples of one view: another one for each strip of rows of a picture, always the same for the same one."""
     return 7919 * number + round(abs(float(camera.center_px[0, 1]))) % 7907
-
-
-def _named_light(name: str, known: tuple[str, ...]) -> Environment:
-    if name in known:
-        return built_in_environment(name)
-    if not name.lower().endswith(SUFFIXES):
-        hint = did_you_mean(name, known, likeness=0.5, form=" ({})")
-        raise ConfigError(
-            f"there is no environment {name!r}{hint}; known are {', '.join(known)}, and the path of an environment map "
-            f"({', '.join(SUFFIXES)})"
-        )
-    return read_environment(Path(name))

@@ -28,7 +28,9 @@ class SpectralSurface:
         self.family = SpectralFamily(torch.tensor(endmembers, dtype=torch.float32))
         self._regions = [Noise.draw(rng, rng.uniform(1.8, 3.2)) for _ in self.names]
         self._sharpness = float(np.exp(rng.uniform(np.log(4.0), np.log(16.0))))
-        gloss = np.stack([rng.uniform(0.25, 0.7, NUM_MATERIALS), rng.uniform(0.1, 0.3, NUM_MATERIALS)], axis=1)
+        gloss = np.stack(
+            [rng.uniform(0.25, 0.7, NUM_MATERIALS), rng.uniform(0.1, 0.3, NUM_MATERIALS)], axis=1
+        )
         self._gloss = torch.tensor(gloss, dtype=torch.float32)
 
     def parameters(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N P"]:

@@ -125,5 +125,7 @@ def _read_wavelengths(path: Path, bands: Bands) -> np.ndarray | None:
     try:
         found = resample_spectra(values[..., order], Bands(file.bands.wavelengths_nm[order]), bands)
     except SpectrumError as error:
-        raise SceneError(f"{path}: its wavelengths and those of the pictures do not match: {error}") from error
+        raise SceneError(
+            f"{path}: its wavelengths and those of the pictures do not match: {error}"
+        ) from error
     return np.ascontiguousarray(found, dtype=np.float32)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from unmix_plugin.neumatex.materials.family import MaterialFamily
     from unmix_plugin.neumatex.surface import Surface
     from unmix_plugin.scenes.scene import Normalisation
+    from unmix_plugin.spectral.bands import Bands
 
 _SIZES = (16, 8192)
 
@@ -44,7 +45,7 @@ class MaterialProduct(RunProduct):
         job.claim(material_paths(job.folder, scene.surface.family))
         with job.working("unwrapping the mesh and baking its material"):
             written, error = write_material(
-                job.folder, scene.mesh, scene.surface, scene.frame, self.texture_size
+                job.folder, scene.mesh, scene.surface, scene.frame, self.texture_size, bands=scene.bands
             )
         job.say(
             f"the glTF material differs from the trained one by {100 * error:.1f} % of the reflected light"
@@ -67,17 +68,27 @@ def material_paths(folder: Path, family: MaterialFamily) -> list[Path]:
     """Files that `write_material` makes."""
     from unmix_plugin.neumatex.material_export.files import texture_paths
     from unmix_plugin.neumatex.material_export.shader import shader_paths
+    from unmix_plugin.neumatex.material_export.spectral_files import spectral_paths
     from unmix_plugin.neumatex.materials.neural import NeuralFamily
+    from unmix_plugin.neumatex.materials.spectral import SpectralFamily
 
     names = ["base_colour", "gltf_base_colour", "gltf_metallic_roughness"]
     single = [folder / name for name in ("parameters.exr", "material.glb", "material.json")]
+    if isinstance(family, SpectralFamily):
+        return [*texture_paths(folder, names), *single, *spectral_paths(folder)]
     if not isinstance(family, NeuralFamily):
         return [*texture_paths(folder, names), *single]
     return [*texture_paths(folder, [*names, "latents_a", "latents_b"]), *single, *shader_paths(folder)]
 
 
 def write_material(
-    folder: Path, mesh: Mesh, surface: Surface, frame: Normalisation, texture_size: int, seed: int = 0
+    folder: Path,
+    mesh: Mesh,
+    surface: Surface,
+    frame: Normalisation,
+    texture_size: int,
+    seed: int = 0,
+    bands: Bands | None = None,
 ) -> tuple[list[Path], float]:
     """Write a material on a mesh.
 
@@ -88,6 +99,7 @@ def write_material(
         frame: From the world to model space; files are in the world.
         texture_size: Width and height of the textures, texels.
         seed: Of the fit of the glTF material.
+        bands: Of a spectral material.
     Returns:
         The files, and the mean error of the glTF material as a part of the reflected light.
     Raises:
@@ -99,11 +111,17 @@ def write_material(
     from unmix_plugin.neumatex.material_export.baking import bake
     from unmix_plugin.neumatex.material_export.pbr_fit import fit_pbr
     from unmix_plugin.neumatex.material_export.shader import write_shader
+    from unmix_plugin.neumatex.material_export.spectral_files import InColours, write_spectral_files
     from unmix_plugin.neumatex.materials.neural import NeuralFamily
+    from unmix_plugin.neumatex.materials.spectral import SpectralFamily
 
     family, baked = surface.family, bake(mesh, surface, texture_size)
-    fit = fit_pbr(family, baked.parameters, torch.Generator().manual_seed(seed))
-    textures = textures_of(family, baked.parameters, fit.parameters)
+    seen = family
+    if isinstance(family, SpectralFamily) and bands is not None:
+        family = SpectralFamily(family.endmembers.detach().cpu())  # where the baked parameters are
+        seen = InColours(family, bands)
+    fit = fit_pbr(seen, baked.parameters, torch.Generator().manual_seed(seed))
+    textures = textures_of(seen, baked.parameters, fit.parameters)
     written, pictures = [], {}
     for texture in textures:
         paths, pictures[texture.name] = files.write_texture(folder, baked, texture)
@@ -116,6 +134,8 @@ def write_material(
     written.append(write_file(folder / "material.json", report))
     if isinstance(family, NeuralFamily):
         written += write_shader(folder, family)
+    if isinstance(family, SpectralFamily) and bands is not None:
+        written += write_spectral_files(folder, baked, family, bands)
     return written, fit.mean_error
 
 

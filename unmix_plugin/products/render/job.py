@@ -32,6 +32,7 @@ from unmix_plugin.products.render.files import (
 from unmix_plugin.products.render.formats import FormattedOutput
 from unmix_plugin.products.render.pictures import Palette
 from unmix_plugin.products.render.survey import Survey
+from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION
 from unmix_plugin.trained.probe import one_pixel
 from unmix_plugin.trained.protocol import RenderableScene
@@ -83,7 +84,7 @@ class RenderJob:
             folder,
             cameras.size,
             Palette.of(materials, survey.scales),
-            None if materials is None else materials.bands,
+            scene_bands(scene),
             channel_names(scene, cameras.views[0].camera, [one.output for one in outputs]),
             cameras.frames_per_second,
         )
@@ -198,16 +199,23 @@ def channel_names(
 ) -> dict[str, tuple[str, ...]]:
     """Names of the channels of outputs that have several; a scene without materials is asked how many."""
     names: dict[str, tuple[str, ...]] = {}
+    bands = scene_bands(scene)
     for output in outputs:
         if output.kind in ("grey", "map", "labels"):
             continue
         if output.kind not in ("channels", "shares"):
             names[output.name] = ("x", "y", "z") if output.kind == "vectors" else ("red", "green", "blue")
+        elif output.kind == "channels" and bands is not None:
+            names[output.name] = tuple(f"{wavelength:g} nm" for wavelength in bands.centers_nm)
         elif not isinstance(scene, TrainedScene):
             pixel = scene.render(one_pixel(camera, 0, 0), [output.name])[output.name]
             names[output.name] = tuple(f"{output.title} {index}" for index in range(pixel.shape[-1]))
-        elif output.kind == "shares":
-            names[output.name] = scene.materials.names
         else:
-            names[output.name] = tuple(f"{wavelength:g} nm" for wavelength in scene.bands.centers_nm)
+            names[output.name] = scene.materials.names
     return names
+
+
+def scene_bands(scene: RenderableScene) -> Bands | None:
+    """Of outputs of kind `channels`; None where a scene has no spectra."""
+    bands = getattr(scene, "bands", None)
+    return bands if isinstance(bands, Bands) else None

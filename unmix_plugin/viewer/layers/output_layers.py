@@ -22,6 +22,7 @@ from unmix_plugin.viewer.layers.painting import (
     ColourMapLegend,
     Legend,
     Picture,
+    SwatchLegend,
     TextLegend,
     colour_table,
     over_background,
@@ -86,9 +87,25 @@ def _paint_map(
 def _paint_labels(
     values: Tensor, frame: RenderedView, settings: LayerSettings, output: Output
 ) -> tuple[Picture, Legend]:
-    palette = colour_table("turbo")[torch.arange(256) * 389 % 1024].to(frame.opacity)  # neighbours far apart
+    palette = _palette().to(frame.opacity)
     is_something = (values != NOTHING_ID).to(palette)
     return over_background(palette[values.long()], is_something, settings), TextLegend(output.what)
+
+
+def _paint_shares(
+    values: Tensor, frame: RenderedView, settings: LayerSettings, output: Output
+) -> tuple[Picture, Legend]:
+    """The colours that labels have, mixed by the shares."""
+    palette = _palette()[: values.shape[-1]].to(values)
+    shares = values / values.sum(dim=-1, keepdim=True).clamp(min=1e-6)
+    names = (f"{output.title} {number}" for number in range(len(palette)))
+    legend = SwatchLegend(tuple(zip(names, map(tuple, palette.tolist()), strict=True)))
+    return over_background(shares @ palette, frame.opacity, settings), legend
+
+
+def _palette() -> Tensor:
+    """A colour for each id, (256, 3); those of neighbours are far apart."""
+    return colour_table("turbo")[torch.arange(256) * 389 % 1024]
 
 
 _PAINTERS: dict[OutputKind, tuple[_Paint, frozenset[str]]] = {
@@ -98,6 +115,7 @@ _PAINTERS: dict[OutputKind, tuple[_Paint, frozenset[str]]] = {
     "grey": (_paint_map, frozenset({"scale"})),
     "map": (_paint_map, frozenset({"scale"})),
     "labels": (_paint_labels, frozenset()),
+    "shares": (_paint_shares, frozenset()),
     "vectors": (_paint_vectors, frozenset()),
 }
 
