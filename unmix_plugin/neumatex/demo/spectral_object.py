@@ -38,7 +38,7 @@ from unmix_plugin.neumatex.demo.demo_object import (
 from unmix_plugin.neumatex.demo.shapes import demo_mesh
 from unmix_plugin.neumatex.demo.spectral_surface import SpectralSurface
 from unmix_plugin.neumatex.geometry.ray_mesh import RayMesh
-from unmix_plugin.neumatex.lighting.built_in import built_in_environment
+from unmix_plugin.neumatex.lighting.built_in import NAMES, built_in_environment
 from unmix_plugin.neumatex.lighting.environment import Environment
 from unmix_plugin.neumatex.lighting.lamp import of_lamp, read_lamp
 from unmix_plugin.neumatex.tracing.primary_hits import pixel_hits
@@ -53,6 +53,9 @@ DEFAULT_BANDS, DEFAULT_LIGHTS = 16, 2
 BANDS_BOUNDS = (4, 512)
 LAMP, OTHER_LAMP = "D50", "A"
 """That light the object in training, and elsewhere."""
+
+TRAINING_LIGHT = "clear-sky"
+"""Environment of training, whose sun casts shadows."""
 
 _SAMPLES, _EVALUATION_SAMPLES = 64, 160
 _SUBPIXELS = 2
@@ -69,6 +72,7 @@ def demo_spectral_object(
     lights: int = DEFAULT_LIGHTS,
     overwrite: bool = False,
     say: Say | None = None,
+    light: str = TRAINING_LIGHT,
 ) -> None:
     """Write an object. It is built beside the folder and moved in when complete.
 
@@ -81,8 +85,9 @@ def demo_spectral_object(
         lights: Other lights, each with `VIEWS_A_LIGHT` pictures.
         overwrite: Whether a folder with something in it is accepted, which is then replaced.
         say: Gets a line for each light.
+        light: Built-in environment of training.
     Raises:
-        ConfigError: a number out of bounds; a folder with something in it, or no folder at all.
+        ConfigError: a number out of bounds; no such light; a folder with something in it, or no folder at all.
         SceneError: the folder can't be written, or the disk is full.
     """
     bounds = {
@@ -93,7 +98,7 @@ def demo_spectral_object(
     }
     check_bounds("a demo object", bounds)
     with staging_for(folder, "the demo object", overwrite) as staging:
-        _write_object(staging / "object", seed, size, views, bands, lights, say)
+        _write_object(staging / "object", seed, (size, views, bands, lights), light, say)
         if folder.exists():
             folder.rename(staging / "replaced")
         (staging / "object").rename(folder)
@@ -103,15 +108,18 @@ def demo_spectral_object_path(cache_dir: Path | None = None, say: Say | None = N
     """The folder of the default spectral demo object, written on first use; see `demo_object_path`."""
 
     def write(folder: Path) -> None:
-        _write_object(folder, 0, DEFAULT_SIZE, DEFAULT_VIEWS, DEFAULT_BANDS, DEFAULT_LIGHTS, say)
+        numbers = (DEFAULT_SIZE, DEFAULT_VIEWS, DEFAULT_BANDS, DEFAULT_LIGHTS)
+        _write_object(folder, 0, numbers, TRAINING_LIGHT, say)
 
     return cached_object("demo-spectral-object", write, cache_dir)
 
 
 def _write_object(
-    folder: Path, seed: int, size: int, views: int, num_bands: int, lights: int, say: Say | None
+    folder: Path, seed: int, numbers: tuple[int, int, int, int], light_name: str, say: Say | None
 ) -> None:
-    bands, names = Bands.of(band_centers_nm(num_bands)), light_names(seed, lights)
+    size, views, num_bands, lights = numbers
+    others = [name for name in light_names(seed, len(NAMES) - 1) if name != light_name]
+    bands, names = Bands.of(band_centers_nm(num_bands)), [light_name, *others[:lights]]
     surface = SpectralSurface(seed, bands.centers_nm)
     subject = Subject(RayMesh(demo_mesh(seed)), surface, torch.Generator().manual_seed(seed), size)
     mesh, to_rgb = subject.ray_mesh.mesh, rgb_matrix(bands)

@@ -44,9 +44,9 @@ class SpectralLight:
         own = entry.wavelengths_nm
         if pictures.num_colours != len(self.bands) or (own is not None and Bands(own) != self.bands):
             raise SceneError(
-                f"{folder}: pictures have {pictures.num_colours} bands"
-                + ("" if own is None else f" at {Bands(own)}")
-                + f"; the object's are {self.bands}: give the same"
+                f"{folder}: pictures of {pictures.num_colours} bands"
+                + ("" if own is None else f", wavelengths of {Bands(own)}")
+                + f"; the object has {self.bands}: give the same"
             )
         lamp = _own_lamp(folder, entry, self.bands)
         return self if lamp is None else replace(self, lamp=lamp)

@@ -1,0 +1,149 @@
+"""Spectral materials from the command line on a ball of two materials: train, evaluate, show, export, refuse."""
+
+import json
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+import torch
+
+from tests.commands.running import picture_size, run
+from tests.neumatex.object_factory import write_object
+from tests.neumatex.spectral_factory import ENDMEMBERS, LAMP, write_spectral_object
+from unmix_plugin.commands.eval import evaluate
+from unmix_plugin.commands.export import export
+from unmix_plugin.commands.train import train
+from unmix_plugin.engine import load_model, registry
+from unmix_plugin.neumatex.trained_object import TrainedObject
+from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
+from unmix_plugin.trained.open_run import load_run
+from unmix_plugin.trained.relighting import LightChoice
+
+ENTRY = EntryPoint("neumatex", "unmix_plugin.neumatex.method_config:neumatex", registry.METHOD_GROUP)
+SMALL = [
+    "--pipeline.datamanager.train-num-rays-per-batch=256",
+    "--pipeline.model.plane-resolution=16",
+    "--pipeline.model.eval-samples=16",
+    "--pipeline.model.samples=4",
+    "--device=cpu",
+]
+SPECTRAL = ["--pipeline.model.material=spectral", "--pipeline.model.num-endmembers=2"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def registered():
+    """The method found as an installed one, also where the package was installed before it had one."""
+    patch = pytest.MonkeyPatch()
+    patch.setattr(registry, "entry_points", lambda group: [ENTRY] * (group == ENTRY.group))
+    yield
+    patch.undo()
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of 30 steps."""
+    folder = tmp_path_factory.mktemp("neumatex")
+    write_spectral_object(folder / "ball")
+    words = ["--data", folder / "ball", "--output-dir", folder / "outputs", "--max-num-iterations", 30]
+    ended = run(train, "neumatex", *words, *SPECTRAL, *SMALL)
+    assert ended.status == 0, ended.err
+    return Path(ended.last_line.removeprefix("run: "))
+
+
+@pytest.fixture(scope="module")
+def scene(trained) -> TrainedObject:
+    found = load_run(trained, "cpu").scene
+    assert isinstance(found, TrainedObject)
+    return found
+
+
+def test_evaluation_finds_reflectances_and_shares_again_and_the_light_of_another_environment(trained):
+    ended = run(evaluate, "--run", trained, "--device", "cpu")
+    assert ended.status == 0, ended.err
+    figures = json.loads((trained / "eval" / "metrics.json").read_text())
+    assert (figures["views"], figures["lights"]) == (1, 1)
+    assert figures["psnr"] > 22
+    assert figures["relit_psnr"] > 25
+    assert figures["base_colour_psnr"] > 20
+    assert figures["endmember_angle"] < 0.15
+    assert figures["abundance_rmse"] < 0.2
+    assert figures["sam"] < 0.15
+    assert picture_size(trained / "eval" / "base_colour" / "000.png") == (48, 24)
+
+
+def test_endmembers_are_reflectances_and_shares_sum_to_one(trained):
+    model = load_model(trained, "cpu").model
+    endmembers = model.get_parameter("endmembers").detach()
+    assert endmembers.shape == (2, 5)
+    assert endmembers.min() >= 0
+    assert endmembers.max() <= 1
+    positions = 2 * torch.rand(500, 3) - 1
+    parameters = model.surface.parameters(positions)
+    torch.testing.assert_close(parameters[:, :2].sum(dim=1), torch.ones(500))
+
+
+def test_every_output_is_shown_from_the_run_folder_alone(scene):
+    view = scene.look(scene.views[0].camera)
+    channels = {"spectral": 5, "reflectance": 5, "abundances": 2}
+    for output in scene.outputs:
+        expected = () if output.kind in ("map", "labels") else (channels.get(output.name, 3),)
+        assert view[output.name].shape == (24, 24, *expected), output.name
+    middle, corner = (12, 12), (0, 0)
+    assert float(view["abundances"][middle].sum()) == pytest.approx(1, abs=1e-5)
+    assert set(view["segmentation"][[6, 18], [12, 12]].tolist()) == {0, 1}
+    assert view["segmentation"][corner] == 255
+    assert view["spectral"][corner].abs().max() == 0
+
+
+def test_another_light_in_colours_gets_the_lamps_spectrum(scene):
+    relit = scene.with_light(LightChoice("overcast", 0.0, 0.0))
+    spectrum = relit.environment.image[3, 5].double().numpy()
+    np.testing.assert_allclose(spectrum / spectrum.max(), LAMP, rtol=1e-5)
+    back = relit.with_light(LightChoice(None, 0.0, 0.0))
+    assert torch.equal(back.environment.image, scene.environment.image)
+
+
+def test_the_export_has_abundance_textures_and_endmembers(trained):
+    ended = run(export, "material", "--run", trained, "--device", "cpu", "--texture-size", 64)
+    assert ended.status == 0, ended.err
+    folder = trained / "exports" / "material"
+    table = read_spectra_csv(folder / "endmembers.csv")
+    assert table.names == ("endmember_0", "endmember_1")
+    found = table.spectra / np.linalg.norm(table.spectra, axis=1, keepdims=True)
+    true = ENDMEMBERS / np.linalg.norm(ENDMEMBERS, axis=1, keepdims=True)
+    assert np.sort((found @ true.T).max(axis=1)).min() > 0.98
+    channels = OpenEXR.File(str(folder / "abundances.exr"), separate_channels=True).channels()
+    total = np.sum([channel.pixels for channel in channels.values()], axis=0)
+    assert total.shape == (64, 64)
+    np.testing.assert_allclose(total[total > 0], 1, atol=1e-5)
+    assert (folder / "material.glb").stat().st_size > 1000
+
+
+def test_the_number_of_materials_is_proposed_where_it_is_asked_for(tmp_path):
+    write_spectral_object(tmp_path / "ball")
+    words = ["--data", tmp_path / "ball", "--output-dir", tmp_path / "out", "--max-num-iterations", 1]
+    settings = ["--pipeline.model.material=spectral", "--pipeline.model.num-endmembers=auto"]
+    ended = run(train, "neumatex", *words, *settings, *SMALL)
+    assert ended.status == 0, ended.err
+    model = load_model(Path(ended.last_line.removeprefix("run: ")), "cpu").model
+    assert len(model.get_parameter("endmembers")) == 2
+
+
+@pytest.mark.parametrize(
+    ("material", "is_spectral", "expected"),
+    [
+        ("pbr", True, "does not fit pictures of 5 bands; choose spectral"),
+        ("spectral", False, "does not fit pictures of 3 colours; choose neural or pbr"),
+    ],
+)
+def test_a_material_that_does_not_fit_the_pictures_ends_with_status_2(
+    tmp_path, material, is_spectral, expected
+):
+    write = write_spectral_object if is_spectral else write_object
+    folder = write(tmp_path / "ball")
+    words = ["--data", folder, "--output-dir", tmp_path / "out", f"--pipeline.model.material={material}"]
+    ended = run(train, "neumatex", *words, *SMALL)
+    assert ended.status == 2
+    assert expected in ended.err
