@@ -10,7 +10,16 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from tests.neumatex.object_factory import CENTRE, LENS_PX, NUM_VIEWS, RADIUS, SIZE, pose, write_light, write_picture
+from tests.neumatex.object_factory import (
+    CENTRE,
+    LENS_PX,
+    NUM_VIEWS,
+    RADIUS,
+    SIZE,
+    pose,
+    write_light,
+    write_picture,
+)
 
 WAVELENGTHS = [450.0, 500.0, 550.0, 600.0, 650.0]
 LAMP = np.array([0.4, 0.6, 0.8, 1.0, 0.9])

@@ -120,9 +120,10 @@ def _write_object(
     size, views, num_bands, lights = numbers
     others = [name for name in light_names(seed, len(NAMES) - 1) if name != light_name]
     bands, names = Bands.of(band_centers_nm(num_bands)), [light_name, *others[:lights]]
-    surface = SpectralSurface(seed, bands.centers_nm)
-    subject = Subject(RayMesh(demo_mesh(seed)), surface, torch.Generator().manual_seed(seed), size)
-    mesh, to_rgb = subject.ray_mesh.mesh, rgb_matrix(bands)
+    ray_mesh = RayMesh(demo_mesh(seed))
+    surface = SpectralSurface(seed, bands.centers_nm, ray_mesh.mesh.vertices)
+    subject = Subject(ray_mesh, surface, torch.Generator().manual_seed(seed), size)
+    mesh, to_rgb = ray_mesh.mesh, rgb_matrix(bands)
     colours = surface.family.base_colour(surface.parameters(mesh.vertices)) @ to_rgb
     write_mesh(folder / "mesh.glb", mesh, colours.clamp(0, 1), surface.names)
     table = SpectraTable(bands, surface.names, surface.family.endmembers.double().numpy())
