@@ -16,6 +16,7 @@ from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.train import train
 from unmix_plugin.engine import load_model, registry
+from unmix_plugin.neumatex.model import NeumatexModel
 from unmix_plugin.neumatex.trained_object import TrainedObject
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 from unmix_plugin.trained.open_run import load_run
@@ -75,6 +76,7 @@ def test_evaluation_finds_reflectances_and_shares_again_and_the_light_of_another
 
 def test_endmembers_are_reflectances_and_shares_sum_to_one(trained):
     model = load_model(trained, "cpu").model
+    assert isinstance(model, NeumatexModel)
     endmembers = model.get_parameter("endmembers").detach()
     assert endmembers.shape == (2, 5)
     assert endmembers.min() >= 0

@@ -97,6 +97,8 @@ class NeumatexModel(Model):
         else:
             from unmix_plugin.neumatex.prior.small import predict
 
+            assert self.config.material != "spectral"  # which has no prior
+
             found = predict(
                 views_of(initial_data),
                 self.traced.ray_mesh,

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from unmix_plugin.engine import step_generator
 from unmix_plugin.neumatex.material_surface import PLAIN_GLOSS, start_plain
 from unmix_plugin.neumatex.materials.family import MaterialFamily
-from unmix_plugin.neumatex.materials.spectral import SpectralFamily
+from unmix_plugin.neumatex.materials.spectral import NUM_GLOSS, SpectralFamily
 from unmix_plugin.neumatex.run_start import RunMaterials
 from unmix_plugin.neumatex.scene.object_scene import ObjectScene
 from unmix_plugin.neumatex.scene.pixel_list import PixelList
@@ -80,6 +80,15 @@ def resolved_num_endmembers(
     return count.number, count.evidence()
 
 
+@dataclass(frozen=True)
+class SeenPixels:
+    """Pixels that are lit well enough to tell reflectance."""
+
+    positions: Float[Tensor, "N 3"]
+    normals: Float[Tensor, "N 3"]
+    reflectance: Float[Tensor, "N B"]
+
+
 def start_spectral(
     model: NeumatexModel, arrays: Mapping[str, np.ndarray], generator: torch.Generator
 ) -> None:
@@ -91,32 +100,42 @@ def start_spectral(
     """
     assert model.endmembers is not None
     found = _seen_pixels(model, arrays)
-    count = len(model.endmembers)
-    if model.config.from_run is None:
-        method = model.config.endmember_init
-        first = initialise_endmembers(found.reflectance, count, method, generator)
-        ids = (found.reflectance @ torch.nn.functional.normalize(first, dim=1).T).argmax(dim=1)
-    else:
-        run = RunMaterials.open(model.config.from_run)
-        first = run.reflectances(model.record.bands, arrays["lamp"], count).to(found.reflectance)
-        shares = run.abundances(found.positions, found.normals, arrays["world_corners"])
-        ids = shares.argmax(dim=1)
-    # In known light a pixel is as bright as its material; the usual one, since highlights are brighter.
-    endmembers = scale_to_lit_pixels(first, found.reflectance, ids, brightness_quantile=0.5)
-    model.endmembers.copy_(endmembers.clamp(0, 1))
-    if model.config.from_run is None:
-        shares = fcls(found.reflectance, model.endmembers.detach())
+    start = _from_pixels if model.config.from_run is None else _from_run
+    endmembers, shares = start(model, found, arrays, generator)
+    model.endmembers.copy_(endmembers)
     start_plain(model.triplane, model.family)
     fit_shares(model.triplane, found.positions, shares, generator)
 
 
-@dataclass(frozen=True)
-class SeenPixels:
-    """Pixels that are lit well enough to tell reflectance."""
+def _from_pixels(
+    model: NeumatexModel, found: SeenPixels, _: Mapping[str, np.ndarray], generator: torch.Generator
+) -> tuple[Float[Tensor, "K B"], Float[Tensor, "N K"]]:
+    """Endmembers and abundances by unmixing the pixels' reflectances."""
+    pixels = found.reflectance
+    count = model.family.num_parameters - NUM_GLOSS
+    first = initialise_endmembers(pixels, count, model.config.endmember_init, generator)
+    ids = (pixels @ torch.nn.functional.normalize(first, dim=1).T).argmax(dim=1)
+    endmembers = _as_bright(first, pixels, ids)
+    return endmembers, fcls(pixels, endmembers)
 
-    positions: Float[Tensor, "N 3"]
-    normals: Float[Tensor, "N 3"]
-    reflectance: Float[Tensor, "N B"]
+
+def _from_run(
+    model: NeumatexModel, found: SeenPixels, arrays: Mapping[str, np.ndarray], _: torch.Generator
+) -> tuple[Float[Tensor, "K B"], Float[Tensor, "N K"]]:
+    """Endmembers and abundances of a run of unmix-nerf."""
+    assert model.config.from_run is not None
+    run = RunMaterials.open(model.config.from_run)
+    count = model.family.num_parameters - NUM_GLOSS
+    first = run.reflectances(model.record.bands, arrays["lamp"], count).to(found.reflectance)
+    shares = run.abundances(found.positions, found.normals, arrays["world_corners"])
+    return _as_bright(first, found.reflectance, shares.argmax(dim=1)), shares
+
+
+def _as_bright(
+    spectra: Float[Tensor, "K B"], pixels: Float[Tensor, "N B"], ids: Int[Tensor, " N"]
+) -> Float[Tensor, "K B"]:
+    """Spectra as bright as the usual one of their pixels: in known light a pixel is as bright as its material."""
+    return scale_to_lit_pixels(spectra, pixels, ids, brightness_quantile=0.5).clamp(0, 1)
 
 
 def _seen_pixels(model: NeumatexModel, arrays: Mapping[str, np.ndarray]) -> SeenPixels:

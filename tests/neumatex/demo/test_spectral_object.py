@@ -29,6 +29,8 @@ def folder(tmp_path_factory):
 def test_pictures_can_be_rendered_again_from_the_files_under_both_lights(folder):
     scene = load_object(folder)
     mesh = demo_mesh(3)
+    assert scene.bands is not None
+    assert scene.lamp is not None
     surface = SpectralSurface(3, scene.bands.centers_nm, mesh.vertices)
     held_out = scene.lights[0]
     assert not np.allclose(
@@ -40,6 +42,7 @@ def test_pictures_can_be_rendered_again_from_the_files_under_both_lights(folder)
             surface, RayMesh(mesh), light, pictures.cameras, 0, samples=160, bounces=2, generator=generator
         )
         picture = pictures.read(0)
+        assert picture.alpha is not None
         found, seen = torch.from_numpy(picture.numbers), alpha > 0.99
         assert_close(torch.from_numpy(picture.alpha), alpha, atol=1 / 255, rtol=0)
         error = (found[seen] - radiance[seen]).abs().mean() / radiance[seen].mean()
@@ -50,9 +53,11 @@ def test_truth_fits_the_surface_and_every_material_covers_a_part(folder):
     scene = load_object(folder)
     truth = scene.true_materials
     assert truth is not None
+    assert scene.bands is not None
     shares = truth.abundances(0)
     assert shares is not None
     alpha = scene.pictures.read(0).alpha
+    assert alpha is not None
     np.testing.assert_allclose(shares.sum(axis=-1)[alpha > 0.5], 1, atol=2e-3)
     assert truth.abundances(1) is None
     vertices = demo_mesh(3).vertices
@@ -64,7 +69,9 @@ def test_truth_fits_the_surface_and_every_material_covers_a_part(folder):
 
 def test_it_is_a_spectral_scene_like_any_other(folder):
     scene = load_scene(folder)
-    assert scene.material_names == load_object(folder).true_materials.names
+    truth = load_object(folder).true_materials
+    assert truth is not None
+    assert scene.material_names == truth.names
     assert len(scene.eval_indices) == 2
     assert scene.has_alpha
     assert scene.has_abundances

@@ -41,6 +41,7 @@ def test_light_has_the_lamps_spectrum_here_and_where_it_is_held_out(made):
     scene = load_object(made)
     assert scene.bands is not None
     assert scene.bands.centers_nm.tolist() == WAVELENGTHS
+    assert scene.lamp is not None
     assert_allclose(scene.lamp, LAMP)
     assert_allclose(scene.environment.image[0, 0], LAMP, rtol=1e-6)
     assert_allclose(scene.lights[0].environment.image[0, 0], 0.5 * LAMP, rtol=1e-6)
@@ -50,7 +51,9 @@ def test_a_held_out_light_may_have_its_own_lamp_and_an_option_replaces_the_objec
     write_table(folder / "relit" / "dim" / "lamp.csv", ("power",), LAMP[None, ::-1])
     change(folder / "relit" / "dim", illuminant_path="lamp.csv")
     assert_allclose(load_object(folder).lights[0].environment.image[0, 0], 0.5 * LAMP[::-1], rtol=1e-6)
-    assert_allclose(load_object(folder, "E").lamp, np.ones(5))
+    lamp = load_object(folder, "E").lamp
+    assert lamp is not None
+    assert_allclose(lamp, np.ones(5))
 
 
 def test_true_materials_are_read(made):
