@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -63,11 +62,10 @@ def evaluate(argv: list[str]) -> None:
     """
     options = tyro.cli(EvalOptions, prog="unmix-eval", args=argv)
 
-    from unmix_plugin.engine.processes.joining import are_started, joined
-    from unmix_plugin.engine.processes.launching import run_processes
+    from unmix_plugin.engine.processes.joining import joined
+    from unmix_plugin.engine.processes.launching import start_together
 
-    if options.num_devices > 1 and not are_started():
-        sys.exit(run_processes("unmix_plugin.commands.eval", argv, options.num_devices))
+    start_together("unmix_plugin.commands.eval", argv, options.num_devices)
     with joined(options.device) as processes:
         _evaluate(options, processes)
 
@@ -79,7 +77,7 @@ def _evaluate(options: EvalOptions, processes: Processes) -> None:
     from unmix_plugin.editing.edited_run import requested_recipe
     from unmix_plugin.engine.runs.load_run import load_pipeline
 
-    console = CommandConsole()
+    console = CommandConsole(quiet=not processes.is_first)
     with processes.together():
         path = chosen_run(options.run, options.output_dir)
         recipe = requested_recipe(options.edits, options.illuminant)

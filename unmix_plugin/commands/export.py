@@ -14,6 +14,7 @@ import tyro
 
 from unmix_plugin.commands.entry import run_command
 from unmix_plugin.commands.method_products import OwnProduct, own_products
+from unmix_plugin.errors import ConfigError
 from unmix_plugin.products.abundances import Abundances
 from unmix_plugin.products.cubes import Cubes
 from unmix_plugin.products.endmembers import Endmembers
@@ -22,13 +23,14 @@ from unmix_plugin.products.metamerism import Metamerism
 from unmix_plugin.products.pca import Pca
 from unmix_plugin.products.point_cloud import PointCloud
 from unmix_plugin.products.poses import Poses
-from unmix_plugin.products.product import Job, Product, RunProduct
+from unmix_plugin.products.product import Job, Product, RunProduct, ViewProduct
 from unmix_plugin.products.report.report import Report
 from unmix_plugin.products.segmentation import Segmentation
 from unmix_plugin.products.spectrum import Spectrum
 from unmix_plugin.products.volume import Volume
 
 if TYPE_CHECKING:
+    from unmix_plugin.engine.processes.processes import Processes
     from unmix_plugin.trained.open_run import LoadedRun
 
 PRODUCTS: tuple[Product, ...] = (
@@ -72,14 +74,29 @@ def export(argv: list[str]) -> None:
     product: RunProduct = tyro.cli(
         choices, prog="unmix-export", description="Write products of a run as files.", args=argv
     )
-    job = _open(product, own)
+    from unmix_plugin.engine.processes.joining import joined
+    from unmix_plugin.engine.processes.launching import start_together
+
+    count = product.num_devices if isinstance(product, ViewProduct) else 1
+    start_together("unmix_plugin.commands.export", argv, count)
+    with joined(product.device) as processes:
+        _write(product, own, processes)
+
+
+def _write(product: RunProduct, own: dict[str, OwnProduct], processes: Processes) -> None:
+    if not isinstance(product, ViewProduct) and processes.count > 1:
+        raise ConfigError(f"unmix-export {product.name} runs in one process; start it once")
+    with processes.together():
+        job = _open(product, own, processes)
     written = product.write(job)
+    if not processes.is_first:
+        return
     for file in written:
         print(file)
     print(f"{len(written)} files written to {job.folder}")
 
 
-def _open(product: RunProduct, own: dict[str, OwnProduct]) -> Job:
+def _open(product: RunProduct, own: dict[str, OwnProduct], processes: Processes) -> Job:
     """Load the run that a product is of."""
     from functools import partial
 
@@ -88,7 +105,7 @@ def _open(product: RunProduct, own: dict[str, OwnProduct]) -> Job:
 
     if isinstance(product, Product):
         _refuse_sensor(product)
-    console = CommandConsole()
+    console = CommandConsole(quiet=not processes.is_first)
     path = chosen_run(product.run, product.output_dir)
     with working(console, f"reading {path}"):
         loaded = _loaded(path, product)
@@ -104,6 +121,7 @@ def _open(product: RunProduct, own: dict[str, OwnProduct]) -> Job:
         partial(say, console),
         partial(working, console),
         partial(follow, console),
+        processes,
     )
 
 
@@ -119,8 +137,6 @@ def _loaded(path: Path, product: RunProduct) -> LoadedRun:
 
 def _refuse_sensor(product: Product) -> None:
     """Refuse a sensor where it would mix bands."""
-    from unmix_plugin.errors import ConfigError
-
     if product.sensor is not None and product.name in _IN_THE_RUNS_BANDS:
         able = ", ".join(one.name for one in PRODUCTS if one.name not in _IN_THE_RUNS_BANDS)
         raise ConfigError(
@@ -132,3 +148,7 @@ def _refuse_sensor(product: Product) -> None:
 def main() -> None:
     """Console script."""
     run_command(export)
+
+
+if __name__ == "__main__":
+    main()

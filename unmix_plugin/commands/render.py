@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from unmix_plugin.engine.outputs import Output
+    from unmix_plugin.engine.processes.processes import Processes
     from unmix_plugin.products.render.cameras import CameraRequest, RenderCameras
     from unmix_plugin.products.render.formats import FormattedOutput
     from unmix_plugin.products.render.pictures import Palette
@@ -72,6 +73,8 @@ class RenderOptions:
     """Folder in which to look for the newest run."""
     device: DeviceName = "auto"
     """Where to compute; auto takes CUDA where there is one."""
+    num_devices: int = 1
+    """Processes that share the views, on CUDA each on a device of its own."""
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Replace files of an earlier render."""
 
@@ -90,22 +93,32 @@ def render(argv: list[str]) -> None:
     options = tyro.cli(RenderOptions, prog="unmix-render", args=argv)
     request = _camera_request(options)
 
+    from unmix_plugin.engine.processes.joining import joined
+    from unmix_plugin.engine.processes.launching import start_together
+
+    start_together("unmix_plugin.commands.render", argv, options.num_devices)
+    with joined(options.device) as processes:
+        _render_run(options, request, processes)
+
+
+def _render_run(options: RenderOptions, request: CameraRequest, processes: Processes) -> None:
     from unmix_plugin.commands.reporting import CommandConsole, say, working
     from unmix_plugin.commands.run_choice import chosen_run
     from unmix_plugin.editing.edited_run import load_edited_run
     from unmix_plugin.products.render.cameras import choose_cameras
     from unmix_plugin.products.render.formats import choose_formats
 
-    console = CommandConsole()
-    path = chosen_run(options.run, options.output_dir)
-    with working(console, f"reading {path}"):
-        loaded = load_edited_run(path, options.device, options.edits, options.illuminant, options.sensor)
-        loaded = _relit(loaded, options)
-        cameras = choose_cameras(loaded.scene, request)
-    for line in loaded.scene.notes:
-        say(console, line)
-    outputs = choose_formats(options.outputs, options.formats, loaded.scene, cameras.is_path)
-    _render(options, loaded, cameras, outputs, console)
+    console = CommandConsole(quiet=not processes.is_first)
+    with processes.together():
+        path = chosen_run(options.run, options.output_dir)
+        with working(console, f"reading {path}"):
+            loaded = load_edited_run(path, options.device, options.edits, options.illuminant, options.sensor)
+            loaded = _relit(loaded, options)
+            cameras = choose_cameras(loaded.scene, request)
+        for line in loaded.scene.notes:
+            say(console, line)
+        outputs = choose_formats(options.outputs, options.formats, loaded.scene, cameras.is_path)
+    _render(options, loaded, cameras, outputs, console, processes)
 
 
 def _camera_request(options: RenderOptions) -> CameraRequest:
@@ -144,6 +157,7 @@ def _render(
     cameras: RenderCameras,
     outputs: tuple[FormattedOutput, ...],
     console: Console,
+    processes: Processes,
 ) -> None:
     """Render block by block, then list what was written."""
     from unmix_plugin.commands.reporting import follow, say
@@ -158,13 +172,21 @@ def _render(
     paths += legends
     if not camera_path.is_file() or camera_path.read_bytes() != camera_bytes:
         paths.append(camera_path)
-    refuse_to_overwrite(paths, options.overwrite)
-    write_file(camera_path, camera_bytes)  # first, so that a folder that can't be written is noticed early
+    with processes.together():
+        if processes.is_first:
+            refuse_to_overwrite(paths, options.overwrite)
+            write_file(
+                camera_path, camera_bytes
+            )  # first, so that a folder that can't be written is noticed early
     say(console, _announcement(cameras, outputs))
-    survey = _survey(loaded, cameras, outputs, console)
-    with RenderJob(loaded.scene, cameras, outputs, survey, folder) as job:
+    with processes.together():
+        survey = _survey(loaded, cameras, outputs, console)
+    with RenderJob(loaded.scene, cameras, outputs, survey, folder, processes) as job:
         for block in follow(console, "rendering", job.blocks()):
             job.render(block)
+        job.finish()
+    if not processes.is_first:
+        return
     for path, output in legends.items():
         write_file(path, draw_legend(output, job.palette))
     _list(folder, outputs, cameras, job.palette)
@@ -237,3 +259,7 @@ def _list(
 def main() -> None:
     """Console script."""
     run_command(render)
+
+
+if __name__ == "__main__":
+    main()

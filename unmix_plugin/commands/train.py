@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 from unmix_plugin.commands.entry import INTERRUPTED, run_command
 from unmix_plugin.commands.train_arguments import PROGRAM, overview, parse_all
 from unmix_plugin.engine.configs import TrainerConfig
-from unmix_plugin.engine.processes.joining import are_started
 from unmix_plugin.engine.registry import discover_methods
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.viewer.options import TrainingViewerOptions
@@ -31,6 +30,7 @@ def train(argv: list[str]) -> None:
         ConfigError: no or an unknown method, or impossible settings.
         SystemExit: help was asked for (0), arguments that do not parse (2), or a stop on request (130).
     """
+    from unmix_plugin.engine.processes.launching import start_together
     from unmix_plugin.engine.training.progress import ProgressConsole
     from unmix_plugin.engine.training.training_steps import follow_training, joined_training
 
@@ -41,10 +41,7 @@ def train(argv: list[str]) -> None:
         print(overview(methods))
         return
     config, viewing = parse_all(argv)
-    if config.machine.num_devices > 1 and not are_started():
-        from unmix_plugin.engine.processes.launching import run_processes
-
-        sys.exit(run_processes("unmix_plugin.commands.train", argv, config.machine.num_devices))
+    start_together("unmix_plugin.commands.train", argv, config.machine.num_devices)
     with joined_training(config) as processes:
         if not processes.is_first:
             follow_training(config, processes)

@@ -10,6 +10,7 @@ import tyro
 
 from unmix_plugin.engine.instantiate import Common, InstantiateConfig, Target, require_in_range
 from unmix_plugin.engine.pipeline import PipelineConfig
+from unmix_plugin.engine.processes.launching import MOST_PROCESSES
 from unmix_plugin.engine.training.optimizers import OptimizerConfig
 from unmix_plugin.errors import ConfigError
 
@@ -33,7 +34,7 @@ class MachineConfig:
         Raises:
             ConfigError: out of range.
         """
-        require_in_range("machine.num_devices", self.num_devices, 1, 1024)
+        require_in_range("machine.num_devices", self.num_devices, 1, MOST_PROCESSES)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import tyro
 
 from unmix_plugin.engine.configs import DeviceName
+from unmix_plugin.engine.processes.processes import ALONE, Processes
 from unmix_plugin.formats.files import refuse_to_overwrite
 from unmix_plugin.trained.run_views import RunView, ViewChoice, resized_views, views_of
 
@@ -71,6 +72,8 @@ class ViewProduct(Product):
 
     views: ViewChoice = "eval"
     """Which of the scene's views to render."""
+    num_devices: int = 1
+    """Processes that share the views, on CUDA each on a device of its own."""
 
     @abstractmethod
     def paths(self, folder: Path, view: str) -> list[Path]:
@@ -85,14 +88,15 @@ class ViewProduct(Product):
         """
 
     def write(self, job: Job) -> list[Path]:
-        """Render the views, one after the other, and write each."""
-        views = resized_views(job.views(self.views))
-        job.claim([path for view in views for path in self.paths(job.folder, view.name)])
-        return [
-            path
-            for view in job.follow("rendering views", views)
-            for path in self.write_view(job.folder, view.name, job.render(view), job.materials)
-        ]
+        """Render the views, one after the other, and write each; several processes share them."""
+        views, processes = resized_views(job.views(self.views)), job.processes
+        paths = [path for view in views for path in self.paths(job.folder, view.name)]
+        with processes.together():
+            job.claim(paths)
+        with processes.together():
+            for view in job.follow("rendering views", views[processes.rank :: processes.count]):
+                self.write_view(job.folder, view.name, job.render(view), job.materials)
+        return paths
 
 
 @dataclass(frozen=True)
@@ -109,6 +113,8 @@ class Job:
     """Context that shows that something of unknown length is under way."""
     follow: Callable[[str, Sequence[Any]], Iterator[Any]]
     """The items given, while it is shown how many are done."""
+    processes: Processes = ALONE
+    """That share the views."""
 
     @property
     def scene(self) -> TrainedScene:

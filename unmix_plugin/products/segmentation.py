@@ -50,7 +50,10 @@ class Segmentation(ViewProduct):
         path, legend = job.folder / "legend.csv", legend_bytes(job.materials)
         if not (path.is_file() and path.read_bytes() == legend):  # other views of the same run have the same
             job.claim([path])
-        return [*super().write(job), write_file(path, legend)]
+        written = super().write(job)
+        if job.processes.is_first:
+            write_file(path, legend)
+        return [*written, path]
 
 
 def legend_bytes(materials: Materials) -> bytes:

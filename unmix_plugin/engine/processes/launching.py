@@ -12,10 +12,28 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from types import FrameType
 
+from unmix_plugin.engine.instantiate import require_in_range
+from unmix_plugin.engine.processes.joining import are_started
 from unmix_plugin.errors import RunError
 
+MOST_PROCESSES = 1024
 _GRACE_SECONDS = 10.0
 """For the processes that are left to say what is wrong and to save, once one has ended."""
+
+
+def start_together(module: str, argv: Sequence[str], count: int) -> None:
+    """Run a command in several processes and end this one, unless it is one of them or one is enough.
+
+    Args:
+        module, argv: As `run_processes` takes them.
+        count: Processes asked for.
+    Raises:
+        ConfigError: fewer than one.
+        SystemExit: the processes have ended; their exit code.
+    """
+    require_in_range("num-devices", count, 1, MOST_PROCESSES)
+    if count > 1 and not are_started():
+        sys.exit(run_processes(module, argv, count))
 
 
 def run_processes(module: str, argv: Sequence[str], count: int) -> int:

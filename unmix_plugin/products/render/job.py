@@ -2,6 +2,8 @@
 
 Of a view, a block of rows is in memory at a time, and what a format needs as a whole: nothing for ENVI and .npy, the
 picture for PNG and video, the output itself for EXR.
+
+Several processes share the views in rounds, one view each.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ import numpy as np
 from unmix_plugin.engine.geometry.camera_paths import rows_of
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.outputs import Output
-from unmix_plugin.formats.video import FrameSink
+from unmix_plugin.engine.processes.processes import ALONE, Processes
 from unmix_plugin.products.render.cameras import RenderCameras
 from unmix_plugin.products.render.files import (
     RenderSetting,
@@ -30,6 +32,7 @@ from unmix_plugin.products.render.files import (
     video_path,
 )
 from unmix_plugin.products.render.formats import FormattedOutput
+from unmix_plugin.products.render.frame_exchange import FrameExchange
 from unmix_plugin.products.render.pictures import Palette
 from unmix_plugin.products.render.survey import Survey
 from unmix_plugin.spectral.bands import Bands
@@ -68,6 +71,7 @@ class RenderJob:
         outputs: Sequence[FormattedOutput],
         survey: Survey,
         folder: Path,
+        processes: Processes = ALONE,
     ) -> None:
         """
         Args:
@@ -76,8 +80,10 @@ class RenderJob:
             outputs: What to write.
             survey: Of these cameras and outputs.
             folder: Where to write.
+            processes: That share the views, each with a job like this one.
         """
         self._scene, self._cameras, self._survey = scene, cameras, survey
+        self._processes, self._num_rounds = processes, 0
         materials = scene.materials if isinstance(scene, TrainedScene) else None
         self._materials = materials
         self._setting = RenderSetting(
@@ -92,7 +98,7 @@ class RenderJob:
         self._still = [one for one in outputs if one not in self._moving]
         self._asked = self._asked_of_scene([one.output.name for one in outputs])
         self._files, self._view = ExitStack(), ExitStack()
-        self._frame_sinks: list[FrameSink] = []
+        self._exchange = FrameExchange(processes, len(self._moving), ())
         self._sinks: list[RowsSink] = []
 
     @property
@@ -101,7 +107,7 @@ class RenderJob:
         return self._setting.palette
 
     def blocks(self, pixels: int | None = None) -> list[Block]:
-        """All that is to be rendered.
+        """All that this process is to render.
 
         Args:
             pixels: Most of a block; None: what keeps a block's numbers small.
@@ -111,11 +117,12 @@ class RenderJob:
             most = max((len(names) for names in self._setting.channels.values()), default=1)
             pixels = min(_BLOCK_PIXELS, _BLOCK_NUMBERS // most)
         rows = max(1, pixels // width)
+        own = list(enumerate(self._cameras.views))[self._processes.rank :: self._processes.count]
         return [
             Block(
                 index, first, rows_of(view.camera, first, min(first + rows, height)), first + rows >= height
             )
-            for index, view in enumerate(self._cameras.views)
+            for index, view in own
             for first in range(0, height, rows)
         ]
 
@@ -123,9 +130,12 @@ class RenderJob:
         usual = _PATH_FPS if self._cameras.is_path else _VIEWS_FPS
         frames_per_second = self._cameras.frames_per_second or usual
         with ExitStack() as opening:
-            self._frame_sinks = [
-                opening.enter_context(video(one, self._setting, frames_per_second)) for one in self._moving
+            videos = [
+                opening.enter_context(video(one, self._setting, frames_per_second))
+                for one in self._moving
+                if self._processes.is_first
             ]
+            self._exchange = FrameExchange(self._processes, len(self._moving), videos)
             self._view = opening.enter_context(ExitStack())
             self._files = opening.pop_all()
         return self
@@ -139,7 +149,8 @@ class RenderJob:
         """Render a block and hand it to the files.
 
         Raises:
-            RunError: the disk is full or refuses.
+            RunError: the disk is full or refuses, or another process failed.
+            Follower: this is not the first process, and one failed.
         """
         if block.first_row == 0:
             self._open_view(block.view)
@@ -148,16 +159,35 @@ class RenderJob:
             sink(rows)
         if block.is_last:
             self._view.close()
+            self._end_round()
+
+    def finish(self) -> None:
+        """Wait for the views of the other processes, where they have one more.
+
+        Raises:
+            RunError, Follower: as `render`.
+        """
+        while self._num_rounds * self._processes.count < len(self._cameras.views):
+            with self._processes.together():
+                pass
+            self._end_round()
+
+    def _end_round(self) -> None:
+        self._num_rounds += 1
+        self._exchange.end_round()
 
     def _open_view(self, index: int) -> None:
         views = self._cameras.views
         progress = index / max(1, len(views) - 1)
+        self._view.enter_context(self._processes.together())
         self._sinks = [
             self._view.enter_context(still(one, views[index].name, self._setting)) for one in self._still
         ]
         self._sinks += [
-            self._view.enter_context(frame(one.output, progress, self._setting, add))
-            for one, add in zip(self._moving, self._frame_sinks, strict=True)
+            self._view.enter_context(
+                frame(one.output, progress, self._setting, self._exchange.sink(video_index))
+            )
+            for video_index, one in enumerate(self._moving)
         ]
 
     def _asked_of_scene(self, names: Sequence[str]) -> tuple[str, ...]:
