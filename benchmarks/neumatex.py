@@ -1,16 +1,18 @@
 """How well does an object look under light that it was never photographed in?
 
-    python benchmarks/neumatex.py [--objects 8] [--size 256] [--lights 4]
+    python benchmarks/neumatex.py [--objects 8] [--size 64] [--steps 150] [--lights 4]
 
-Writes procedural objects of layered materials whose seeds were not used while settings were chosen, fits each by the
-commands that a user would give, and evaluates on held-out views, under held-out lights and against the true base
-colour. A variant is a family of materials with or without the prior.
+Writes procedural objects of layered materials whose seeds were not used while settings were chosen, fits each as
+`unmix-train` does it, and evaluates on held-out views, under held-out lights and against the true base colour. A
+variant is a family of materials with or without the prior; one is held to it by the prior's true error.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +22,7 @@ from typing import Any, Literal
 import _common
 import _machine
 import tyro
+from _neumatex_fit import measured_fit
 
 RELIT = _common.Limit(30.0, unit=" dB")
 ABOVE_PBR = _common.Limit(3.0, unit=" dB")
@@ -27,11 +30,15 @@ BASE_COLOUR = _common.Limit(25.0, unit=" dB")
 SECONDS = _common.Limit(600.0, is_upper=True, unit=" s")
 PEAK_MEMORY = _common.Limit(4.0, is_upper=True, unit=" GiB")
 MAIN, BASELINE = "neural", "pbr"
+ORACLE = "neural, oracle's uncertainty"
+"""Held to the prior by its true squared error, of which only an object's maker knows."""
 VARIANTS: dict[str, tuple[str, ...]] = {
     MAIN: ("--pipeline.model.material", "neural"),
     BASELINE: ("--pipeline.model.material", "pbr"),
     "neural, no prior": ("--pipeline.model.prior", "none"),
+    "pbr, no prior": ("--pipeline.model.material", "pbr", "--pipeline.model.prior", "none"),
     "neural, not held to the prior": ("--pipeline.model.regularisation", "0"),
+    ORACLE: (),
     "neural, planes alone": ("--pipeline.model.no-fit-networks",),
     "neural, as published": ("--pipeline.model.no-fit-networks", "--pipeline.model.regularisation", "2"),
 }
@@ -42,6 +49,8 @@ COLUMNS = {
     "base_colour_psnr_scaled": "base colour PSNR, scaled",
     "relit_psnr_image": "relit PSNR, whole image",
     "train_seconds": "training, s",
+    "train_cpu_seconds": "training, s of CPU",
+    "training_peak_gib": "peak memory, GiB",
 }
 
 
@@ -51,22 +60,24 @@ class Options:
 
     objects: int = 8
     """How many objects, of seeds 0, 1, ..."""
-    size: int = 256
+    size: int = 64
     """Rows and columns of the pictures."""
     views: int = 24
     """Pictures of an object under the light of training."""
     lights: int = 4
     """Held-out lights."""
-    steps: int = 300
+    steps: int = 150
     """Training steps."""
-    pixels: int = 4096
+    pixels: int = 2048
     """Pixels a step."""
     variants: tuple[str, ...] = tuple(VARIANTS)
     """Which ways of fitting."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to train."""
+    processes: int = 1
+    """Fits at once, each with one thread if there are several; seconds are then not those of one alone."""
     runs: Path | None = None
-    """Keep objects and run folders here."""
+    """Keep objects, run folders and figures here; what is there already is not measured again."""
     results: Path | None = None
     """Folder for neumatex.json and neumatex.md; None: beside the benchmarks."""
     quick: bool = False
@@ -74,7 +85,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """Measure every object and variant, and publish."""
+    """Measure every variant on every object, and publish."""
     size = (32, 8, 1) if options.quick else (options.size, options.views, options.lights)
     seeds = range(1 if options.quick else options.objects)
     steps = 3 if options.quick else options.steps
@@ -83,24 +94,26 @@ def main(options: Options) -> None:
         "pictures": f"{size[1]} of {size[0]} x {size[0]} pixels, and {size[2]} held-out lights",
         "steps": f"{steps} of {options.pixels} pixels",
         "device": options.device,
+        "fits at once": str(options.processes),
         "variants": {name: " ".join(VARIANTS[name]) for name in options.variants},
     }
     machine = _machine.describe_machine(options.device)
-    measured: dict[str, list[dict[str, Any]]] = {name: [] for name in options.variants}
     with ExitStack() as stack:
         root = options.runs or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="neumatex-")))
-        for seed in seeds:
-            folder = written_object(root / f"object-{seed}", seed, *size)
-            for name in options.variants:
-                words = [*VARIANTS[name], "--max-num-iterations", str(steps), "--device", options.device]
-                words += ["--pipeline.datamanager.train-num-rays-per-batch", str(options.pixels)]
-                found = measure(folder, words, options.device, root / "runs" / name)
-                measured[name].append({"seed": seed, **found})
-                print(f"object {seed}, {name}: relit {found['relit_psnr']:.2f} dB", flush=True)
-    question = f"Unseen objects under unseen lights after {steps} steps"
+        workers = stack.enter_context(ThreadPoolExecutor(options.processes))
+        folders = dict(
+            zip(seeds, workers.map(lambda seed: written_object(root, seed, *size), seeds), strict=True)
+        )
+        words = ["--max-num-iterations", str(steps), "--device", options.device]
+        words += ["--pipeline.datamanager.train-num-rays-per-batch", str(options.pixels)]
+        fits = [_Fit(folders[seed], seed, name, tuple(words)) for name in options.variants for seed in seeds]
+        found = list(workers.map(lambda fit: measure(fit, root, options.processes), fits))
+    measured: dict[str, list[dict[str, Any]]] = {name: [] for name in options.variants}
+    for fit, figures in zip(fits, found, strict=True):
+        measured[fit.variant].append({"seed": fit.seed, **figures})
     report = _common.Report(
         "neumatex",
-        question,
+        f"Unseen objects under unseen lights after {steps} steps",
         setting,
         machine,
         judge(measured),
@@ -110,30 +123,46 @@ def main(options: Options) -> None:
     _common.publish(report, _common.results_folder(options.results, options.quick))
 
 
-def written_object(folder: Path, seed: int, size: int, views: int, lights: int) -> Path:
+@dataclass(frozen=True)
+class _Fit:
+    """One object in one way."""
+
+    folder: Path
+    seed: int
+    variant: str
+    words: tuple[str, ...]
+
+
+def written_object(root: Path, seed: int, size: int, views: int, lights: int) -> Path:
     """An object's folder, made if it is not there."""
     from unmix_plugin.neumatex.demo.demo_object import demo_object
 
+    folder = root / f"object-{seed}"
     if not folder.exists():
         print(f"object {seed}: rendering its pictures ...", flush=True)
         demo_object(folder, seed, size=size, views=views, lights=lights)
     return folder
 
 
-def measure(folder: Path, words: list[str], device: str, runs: Path) -> dict[str, Any]:
-    """Train and evaluate one object in one way."""
-    load_average = _machine.load_average()
-    common = ["neumatex", "--data", str(folder), "--output-dir", str(runs)]
-    trained = _common.run_command([_common.console_script("unmix-train"), *common, *words])
-    evaluate = [_common.console_script("unmix-eval"), "--run", str(trained.run), "--device", device]
-    evaluated = _common.run_command(evaluate)
-    figures = json.loads((trained.run / "eval" / "metrics.json").read_text(encoding="utf-8"))
-    return {
-        **figures,
-        "training_peak_gib": trained.peak_bytes / 2**30,
-        "evaluation_command_seconds": evaluated.seconds,
-        "load_average_at_start": load_average,
-    }
+def measure(fit: _Fit, root: Path, processes: int) -> dict[str, Any]:
+    """Train and evaluate one object in one way, unless that was measured before in the same folder."""
+    words = [*VARIANTS[fit.variant], *fit.words]
+    kept = (
+        root
+        / "measured"
+        / f"{fit.seed}-{hashlib.sha256(repr((fit.variant, words)).encode()).hexdigest()[:12]}.json"
+    )
+    if not kept.exists():
+        load_average = _machine.load_average()
+        common = ["neumatex", "--data", str(fit.folder), "--output-dir", str(root / "runs" / fit.variant)]
+        oracle_seed = fit.seed if fit.variant == ORACLE else None
+        figures = measured_fit([*common, *words], oracle_seed, processes)
+        figures["load_average_at_start"] = load_average
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        kept.write_text(json.dumps(figures), encoding="utf-8")
+    figures = json.loads(kept.read_text(encoding="utf-8"))
+    print(f"object {fit.seed}, {fit.variant}: relit {figures['relit_psnr']:.2f} dB", flush=True)
+    return figures
 
 
 def judge(measured: dict[str, list[dict[str, Any]]]) -> list[_common.Figure]:

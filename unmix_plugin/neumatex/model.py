@@ -156,7 +156,7 @@ class NeumatexModel(Model):
             light = traced.light(twice, samples, self.config.bounces, self._random())
             halves = torch.stack([seen.scatter(part) for part in light.unflatten(0, (2, -1)).unbind()])
             return {"halves": halves, "found": seen.found, "positions": seen.points.positions}
-        light = traced.light(seen, self.config.eval_samples, self.config.bounces, self._random())
+        light = traced.light(seen, self.config.render_samples, self.config.bounces, self._random())
         base = self.family.base_colour(self.surface.parameters(seen.points.positions))
         if isinstance(self.curve, SpectralDisplay):
             base = self.curve.rgb(base)

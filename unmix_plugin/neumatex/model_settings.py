@@ -48,8 +48,11 @@ class NeumatexModelConfig(ModelConfig):
     """Paths a pixel in training, in two independent halves; more is slower and less noisy."""
     bounces: Annotated[int, Common] = 1
     """How often light may be reflected between parts of the object before it reaches the point that is seen."""
-    eval_samples: Annotated[int, Common] = 64
-    """Paths a pixel in renders and evaluation."""
+    render_samples: Annotated[int, Common] = 64
+    """Paths a pixel in renders and in the viewer."""
+    eval_samples: Annotated[int, Common] = 256
+    """Paths a pixel in evaluation, where noise would count as an error of the material: with 64 a good fit measures
+    1.4 dB worse than it is, with 256 0.2 dB."""
     prior: Annotated[PriorName, Common] = "small"
     """Where the fit starts and what it is held to: small is the prior of the package; none starts from a plain grey
     material. Spectral materials have no prior: they start from the pictures or from a run."""
@@ -74,6 +77,7 @@ class NeumatexModelConfig(ModelConfig):
         rules = {
             "samples of 2 to 1024": 2 <= self.samples <= 1024,
             "bounces of 0 to 8": 0 <= self.bounces <= 8,
+            "render-samples of 1 to 65536": 1 <= self.render_samples <= 65536,
             "eval-samples of 1 to 65536": 1 <= self.eval_samples <= 65536,
             "regularisation of at least 0": 0 <= self.regularisation < float("inf"),
             "plane-resolution of 2 to 2048": 2 <= self.plane_resolution <= 2048,

@@ -44,7 +44,7 @@ def trained_object(
         record.scene_box,
         curve,
         None if model.record.is_spectral else triplane.log_variance,
-        model.config.eval_samples,
+        model.config.render_samples,
         model.config.bounces,
         bands=model.record.bands,
         lamp=torch.tensor(model.record.lamp) if model.record.is_spectral else None,

@@ -1,11 +1,12 @@
 """Where the path tracer gets materials from: one family, and its parameters at points of a mesh."""
 
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
 
-from unmix_plugin.neumatex.materials.family import MaterialFamily
+from unmix_plugin.neumatex.materials.family import DecodableFamily, MaterialFamily
 
 
 @runtime_checkable
@@ -24,3 +25,28 @@ class Surface(Protocol):
             positions: Model space, where the mesh fits in [-1, 1]^3.
         """
         ...
+
+
+@dataclass(frozen=True)
+class DecodedSurface:
+    """The same materials, their parameters decoded where they are looked up; see `Surface`."""
+
+    encoded: Surface
+    decodable: DecodableFamily
+    """Of `encoded`."""
+
+    @property
+    def family(self) -> MaterialFamily:
+        """Of the decoded parameters."""
+        return self.decodable.decoded_family
+
+    def parameters(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N P"]:
+        """Decoded parameters at surface points."""
+        return self.decodable.decoded(self.encoded.parameters(positions))
+
+
+def decoded_once(surface: Surface) -> Surface:
+    """The same materials so that a network, where the family has one, is evaluated once a point, not once a
+    direction."""
+    family = surface.family
+    return DecodedSurface(surface, family) if isinstance(family, DecodableFamily) else surface

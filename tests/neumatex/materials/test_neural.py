@@ -32,6 +32,16 @@ def test_encoding_keeps_base_colours_and_gives_latents_in_range():
     assert neural.max() <= 1
 
 
+def test_decoded_parameters_reflect_and_are_drawn_alike():
+    rows, wi, wo = numbers(200, 9), eye_directions(200, seed=5), eye_directions(200, seed=6)
+    uniforms = torch.rand(200, 3, generator=torch.Generator().manual_seed(7))
+    decoded, family = FAMILY.decoded(rows), FAMILY.decoded_family
+    assert_close(family.evaluate(decoded, wi, wo), FAMILY.evaluate(rows, wi, wo))
+    assert_close(family.density(decoded, wi, wo), FAMILY.density(rows, wi, wo))
+    assert_close(family.sample(decoded, wo, uniforms), FAMILY.sample(rows, wo, uniforms))
+    assert torch.equal(family.base_colour(decoded), FAMILY.base_colour(rows))
+
+
 def test_latents_of_any_value_never_brighten_a_white_furnace():
     uniforms = torch.quasirandom.SobolEngine(3, scramble=True, seed=0).draw(1 << 14)
     white = numbers(40, 9)

@@ -48,7 +48,7 @@ EVALUATION_INTERVAL = 8
 _TRAINING_LIGHTS = ("studio", "softbox-strips", "clear-sky", "window-room", "overcast")
 """Lights that show all colours of a material; an object is captured under one of them."""
 
-_SAMPLES, _EVALUATION_SAMPLES = 64, 160
+_SAMPLES, _EVALUATION_SAMPLES = 64, 384
 """Paths a pixel."""
 _BOUNCES = 2
 _SUBPIXELS = 2

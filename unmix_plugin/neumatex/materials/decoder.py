@@ -21,7 +21,8 @@ from unmix_plugin.neumatex.materials.layer_stack import (
 )
 
 NUM_LATENTS = 6
-_NUM_OUTPUTS = 15
+NUM_NUMBERS = 15
+"""That name the layers: L."""
 _NUM_FEATURES = 23
 
 
@@ -31,32 +32,40 @@ class Decoder(nn.Module):
     def __init__(self, width: int = 48) -> None:
         super().__init__()
         self.hidden = nn.ModuleList([nn.Linear(NUM_LATENTS, width), nn.Linear(width, width)])
-        self.last = nn.Linear(width, _NUM_OUTPUTS)
+        self.last = nn.Linear(width, NUM_NUMBERS)
 
     def forward(self, latents: Float[Tensor, "N 6"]) -> LayerStack:
         """The layers of latents in [0, 1]."""
+        return layers_of(self.numbers(latents))
+
+    def numbers(self, latents: Float[Tensor, "N 6"]) -> Float[Tensor, "L N"]:
+        """Numbers in [0, 1] that name the layers of latents; `layers_of` reads them."""
         x = 2.0 * latents - 1.0
         for layer in self.hidden:
             x = nn.functional.silu(layer(x))
-        numbers = torch.sigmoid(torch.addmm(self.last.bias[:, None], self.last.weight, x.T))
-        # Gradients of a split are joined once; each index into `numbers` would fill zeros for all of them.
-        dust, sheen, sheen_roughness, coat, roughness, haze, metallicity, metal, level = numbers.split(
-            [1, 3, 1, 1, 3, 1, 1, 3, 1]
-        )
-        of_coat, surface, beyond = roughness.unbind(0)
-        return LayerStack(
-            dust_cover=LARGEST_COVER * dust[0],
-            sheen_colour=LARGEST_SHEEN * sheen,
-            sheen_roughness=sheen_roughness[0],
-            coat_weight=coat[0],
-            roughness=torch.stack(
-                [LARGEST_COAT_ROUGHNESS * of_coat, surface, surface + (1.0 - surface) * beyond]
-            ),
-            haze_weight=LARGEST_HAZE * haze[0],
-            metallicity=metallicity[0],
-            metal_colour=metal,
-            dielectric_f0=LARGEST_DIELECTRIC_F0 * level[0],
-        )
+        return torch.sigmoid(torch.addmm(self.last.bias[:, None], self.last.weight, x.T))
+
+
+def layers_of(numbers: Float[Tensor, "L N"]) -> LayerStack:
+    """The layers that a decoder's numbers name."""
+    # Gradients of a split are joined once; each index into `numbers` would fill zeros for all of them.
+    dust, sheen, sheen_roughness, coat, roughness, haze, metallicity, metal, level = numbers.split(
+        [1, 3, 1, 1, 3, 1, 1, 3, 1]
+    )
+    of_coat, surface, beyond = roughness.unbind(0)
+    return LayerStack(
+        dust_cover=LARGEST_COVER * dust[0],
+        sheen_colour=LARGEST_SHEEN * sheen,
+        sheen_roughness=sheen_roughness[0],
+        coat_weight=coat[0],
+        roughness=torch.stack(
+            [LARGEST_COAT_ROUGHNESS * of_coat, surface, surface + (1.0 - surface) * beyond]
+        ),
+        haze_weight=LARGEST_HAZE * haze[0],
+        metallicity=metallicity[0],
+        metal_colour=metal,
+        dielectric_f0=LARGEST_DIELECTRIC_F0 * level[0],
+    )
 
 
 class Encoder(nn.Module):

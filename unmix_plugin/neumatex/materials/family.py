@@ -49,3 +49,17 @@ class MaterialFamily(Protocol):
     def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
         """Diffuse base colour, linear, [0, 1]."""
         ...
+
+
+@runtime_checkable
+class DecodableFamily(MaterialFamily, Protocol):
+    """A family whose parameters are decoded by a network, once for all directions at a point."""
+
+    @property
+    def decoded_family(self) -> MaterialFamily:
+        """The same reflectances by decoded parameters, which need no network."""
+        ...
+
+    def decoded(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N D"]:
+        """Parameters of `decoded_family`; differentiable."""
+        ...

@@ -14,11 +14,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from unmix_plugin.neumatex.materials.decoder import NUM_LATENTS, Decoder, Encoder
+from unmix_plugin.neumatex.materials.decoder import NUM_LATENTS, NUM_NUMBERS, Decoder, Encoder, layers_of
 from unmix_plugin.neumatex.materials.decoder_weights import shipped_weights
 from unmix_plugin.neumatex.materials.layer_stack import LayerStack
 from unmix_plugin.neumatex.materials.layered import LayeredFamily
 from unmix_plugin.neumatex.materials.stack_family import StackFamily
+
+
+class DecodedFamily(StackFamily):
+    """Parameters: base colour (0 to 2, linear), then the numbers that a decoder made of latents."""
+
+    num_parameters = 3 + NUM_NUMBERS
+
+    def stack(self, parameters: Float[Tensor, "N P"]) -> LayerStack:
+        """The layers that the numbers name."""
+        return layers_of(parameters[:, 3:].T.contiguous())
 
 
 class NeuralFamily(StackFamily):
@@ -44,6 +54,15 @@ class NeuralFamily(StackFamily):
     def stack(self, parameters: Float[Tensor, "N P"]) -> LayerStack:
         """The layers that the latents are decoded to."""
         return self.decoder(parameters[:, 3:])
+
+    @property
+    def decoded_family(self) -> DecodedFamily:
+        """The family of what `decoded` gives: the same reflectances, without a network for each direction."""
+        return DecodedFamily()
+
+    def decoded(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N D"]:
+        """Parameters of `decoded_family`; differentiable."""
+        return torch.cat([parameters[:, :3], self.decoder.numbers(parameters[:, 3:]).T], -1)
 
     @torch.no_grad()
     def from_layered(self, parameters: Float[Tensor, "N L"]) -> Float[Tensor, "N P"]:

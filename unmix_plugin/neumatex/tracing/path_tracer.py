@@ -23,7 +23,7 @@ from torch import Tensor
 from unmix_plugin.neumatex.geometry.ray_mesh import Hits, RayMesh, SurfacePoints
 from unmix_plugin.neumatex.lighting.environment import Environment
 from unmix_plugin.neumatex.materials.shading_frame import frames, to_local, to_world
-from unmix_plugin.neumatex.surface import Surface
+from unmix_plugin.neumatex.surface import Surface, decoded_once
 from unmix_plugin.neumatex.tracing.sample_points import SamplePoints
 
 
@@ -94,7 +94,7 @@ def reflected_radiance(
             f"the environment has {environment.num_colours} colours, the materials have "
             f"{surface.family.num_colours}; they must be the same"
         )
-    world = _World(surface, ray_mesh, environment)
+    world = _World(decoded_once(surface), ray_mesh, environment)
     device, num_points = to_eye.device, len(to_eye)
     numbers = SamplePoints.draw(num_points, samples, bounces + 1, generator, device)
     vertices = _first_vertices(world, points, to_eye, samples)
