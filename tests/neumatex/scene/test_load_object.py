@@ -73,6 +73,20 @@ def test_poses_that_nerfstudio_turned_and_scaled_find_the_mesh_in_the_world(made
     np.testing.assert_allclose(found.camera_to_world, expected.camera_to_world, atol=1e-5)
 
 
+def test_a_mesh_with_y_upwards_is_turned_and_that_is_said(made, folder):
+    expected, mesh = load_object(made), trimesh.load(folder / "mesh.ply")
+    assert isinstance(mesh, trimesh.Trimesh)
+    x, y, z = np.asarray(mesh.vertices).T
+    mesh.vertices = np.stack([x, z, -y], axis=1)
+    mesh.export(folder / "mesh.ply")
+    found = load_object(folder)
+    np.testing.assert_allclose(found.mesh.vertices, expected.mesh.vertices, atol=1e-5)
+    np.testing.assert_allclose(found.mesh.normals, expected.mesh.normals, atol=1e-3)
+    assert found.notes[len(expected.notes) :] == (
+        "mesh.ply has y as its upward axis, the poses have z: the mesh was turned",
+    )
+
+
 def test_display_pictures_get_a_learnt_response_unless_the_folder_says_otherwise(tmp_path):
     folder = write_object(tmp_path / "ball", suffix=".png")
     assert load_object(folder).pictures.tone == "camera"

@@ -29,6 +29,13 @@ class Mesh:
         """The mesh with vertices `scale * (vertices + offset)`, scale > 0."""
         return replace(self, vertices=scale * (self.vertices + offset.to(self.vertices)))
 
+    def with_y_upwards(self) -> Mesh:
+        """The mesh turned by 90 degrees about x, so that its y axis points along z, as the world's upward axis does."""
+        vertices, normals = (
+            torch.stack([v[:, 0], -v[:, 2], v[:, 1]], dim=1) for v in (self.vertices, self.normals)
+        )
+        return replace(self, vertices=vertices.contiguous(), normals=normals.contiguous())
+
     def to(self, device: torch.device | str) -> Mesh:
         """The same mesh on another device."""
         uv = None if self.uv is None else self.uv.to(device)

@@ -21,7 +21,7 @@ from unmix_plugin.neumatex.lighting.environment import Environment
 from unmix_plugin.neumatex.lighting.lamp import read_environment_of_bands
 from unmix_plugin.neumatex.lighting.read_environment import SUFFIXES as ENVIRONMENT_SUFFIXES
 from unmix_plugin.neumatex.lighting.read_environment import read_environment
-from unmix_plugin.neumatex.scene.mesh_check import check_mesh_place
+from unmix_plugin.neumatex.scene.mesh_check import misplacement
 from unmix_plugin.neumatex.scene.object_scene import HeldOutLight, ObjectScene
 from unmix_plugin.neumatex.scene.posed_pictures import PosedPictures, has_alpha, read_posed_pictures
 from unmix_plugin.neumatex.scene.spectral_light import SpectralLight, spectral_light
@@ -58,12 +58,11 @@ def load_object(root: Path, lamp: str | None = None) -> ObjectScene:
     faults.raise_if_any()
     assert light is not None
     assert mesh_path is not None
-    frame, mesh = _model_space(read_mesh(mesh_path, notes))
-    pictures = read_posed_pictures(root, entry, _from_poses(frame, entry.placement), light.tone, faults)
+    frame, mesh, pictures = _placed(
+        read_mesh(mesh_path, notes), mesh_path.name, root, entry, light, notes, faults
+    )
     spectral = spectral_light(root, entry, pictures, lamp)
     environment = light.environment(spectral)
-    alphas = [_alpha(pictures, index) for index in range(len(pictures))]
-    check_mesh_place(RayMesh(mesh), pictures.cameras, alphas, frame, mesh_path.name)
     files = {mesh_path.name: mesh_path, light.environment_path.name: light.environment_path}
     truth = root / "truth" / "base_colour"
     return ObjectScene(
@@ -143,6 +142,29 @@ def _find_file(root: Path, key: str, what: str, suffixes: tuple[str, ...], fault
 def _content(root: Path) -> dict[str, Any]:
     """What transforms.json holds, which `read_transforms` has checked to be an object."""
     return read_json_file(root / FILE_NAME)
+
+
+def _placed(
+    given: Mesh, name: str, root: Path, entry: SceneEntry, light: _Light, notes: list[str], faults: Faults
+) -> tuple[Normalisation, Mesh, PosedPictures]:
+    """The mesh and the pictures in model space; a mesh that fits only with its y axis upwards is turned.
+
+    Raises:
+        SceneError: it fits neither way; the message says how far off it is as it was given.
+    """
+    found: list[str] = []
+    for placed in (given, given.with_y_upwards()):
+        frame, mesh = _model_space(placed)
+        pictures = read_posed_pictures(root, entry, _from_poses(frame, entry.placement), light.tone, faults)
+        alphas = [_alpha(pictures, index) for index in range(len(pictures))]
+        wrong = misplacement(RayMesh(mesh), pictures.cameras, alphas, frame, name)
+        if wrong is None:
+            notes += (
+                [f"{name} has y as its upward axis, the poses have z: the mesh was turned"] if found else []
+            )
+            return frame, mesh, pictures
+        found.append(wrong)
+    raise SceneError(found[0])
 
 
 def _model_space(mesh: Mesh) -> tuple[Normalisation, Mesh]:

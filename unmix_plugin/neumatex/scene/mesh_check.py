@@ -13,7 +13,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.errors import SceneError
 from unmix_plugin.neumatex.geometry.ray_mesh import RayMesh
 from unmix_plugin.scenes.scene import Normalisation
 
@@ -24,14 +23,14 @@ LEAST_OVERLAP = 0.5
 MOST_VIEWS = 24
 
 
-def check_mesh_place(
+def misplacement(
     ray_mesh: RayMesh,
     cameras: Cameras,
     alphas: Sequence[Float[np.ndarray, "_ _"] | None],
     frame: Normalisation,
     where: str,
-) -> None:
-    """Refuse a mesh that most views do not see where their pictures show the object.
+) -> str | None:
+    """How far off a mesh is that most views do not see where their pictures show the object; None if it is right.
 
     Args:
         ray_mesh: The mesh in model space.
@@ -39,22 +38,20 @@ def check_mesh_place(
         alphas: Opacity of each picture, None where it has none: then the mesh has only to be in the view.
         frame: To give places in the world.
         where: What the message calls the mesh.
-    Raises:
-        SceneError: it is elsewhere; the message says how far off.
     """
     step = max(1, -(-len(cameras) // MOST_VIEWS))
     views = range(0, len(cameras), step)
     overlaps = [_overlap(ray_mesh, cameras[view], alphas[view]) for view in views]
     wrong = sum(overlap < LEAST_OVERLAP for overlap in overlaps)
     if 2 * wrong <= len(overlaps):
-        return
+        return None
     middle, target = frame.to_world(np.zeros(3)), frame.to_world(looked_at(cameras).numpy())
     distance, edge = float(np.linalg.norm(target - middle)), 2 / frame.scale
-    raise SceneError(
+    return (
         f"{where} is not where the pictures show the object: in {wrong} of {len(overlaps)} views it covers less than "
         f"half of what alpha shows, or is not in the view (median overlap {np.median(overlaps):.0%}). Its box is "
         f"centred at {_place(middle)} and {edge:.4g} long; the cameras look at {_place(target)}, {distance:.4g} away. "
-        "Bring it into the world of the poses: the same origin, unit and axes (z up; glTF often has y up)"
+        "Bring it into the world of the poses: the same origin, unit and axes. With y upwards it does not fit either"
     )
 
 
