@@ -6,10 +6,16 @@ import torch
 
 from tests.neumatex.test_trained_object import RECORD, make_object
 from tests.viewer.pages import decoded, has_control, opened, serving, show_layer
+from tests.viewer.view_factory import make_source, no_scene
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.training.device_share import DeviceShare
+from unmix_plugin.errors import ConfigError, SceneError
+from unmix_plugin.formats.exr import write_exr
 from unmix_plugin.trained.model_scene import ModelView
+from unmix_plugin.trained.relighting import LightChoice
+from unmix_plugin.viewer.rendering.edits import Edit
 from unmix_plugin.viewer.rendering.scene_source import SceneSource
+from unmix_plugin.viewer.services import Services
 
 
 @pytest.fixture
@@ -48,6 +54,26 @@ def test_every_output_is_a_layer_and_the_picture_becomes_as_fine_as_a_finished_v
         estimates = [scene.estimate(frame.camera, 1, number) for number in range(4)]
         assert torch.allclose(frame["base_colour"], estimates[0]["base_colour"])
         assert frame["rgb"].shape == estimates[0]["rgb"].shape
+
+
+def test_a_users_environment_is_offered_and_lights_the_object(source, tmp_path):
+    path = tmp_path / "lamp.exr"
+    write_exr(
+        path, {name: np.full((4, 8), value, np.float32) for name, value in zip("RGB", (2, 0, 0), strict=True)}
+    )
+    services = Services(source, no_scene, environments=[path])
+    assert services.lights[-1] == str(path)
+    red = services.maker.edited(Edit(light=LightChoice(services.lights[-1])))
+    seen = red.render(RECORD.train_cameras[0], ["linear_rgb"])["linear_rgb"]
+    assert float(seen[..., 0].max()) > 0.05
+    assert float(seen[..., 1:].max()) == 0
+
+
+def test_an_environment_that_is_missing_or_of_no_use_to_the_method_is_refused_at_once(source, tmp_path):
+    with pytest.raises(SceneError, match=r"none.exr"):
+        Services(source, no_scene, environments=[tmp_path / "none.exr"])
+    with pytest.raises(ConfigError, match="no environment that could be exchanged"):
+        Services(make_source(tmp_path), no_scene, environments=[tmp_path / "none.exr"])
 
 
 def test_light_is_exchanged_and_turned_for_this_page_alone_and_kept_when_it_is_loaded_again(source):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import torch
@@ -132,9 +133,10 @@ class TrainedObject:
                 f"there is no environment {name!r}{hint}; known are {', '.join(self.lights)}, and the path of an "
                 f"environment map ({', '.join(SUFFIXES)})"
             )
+        path = Path(name)
         if self.bands is None or self.lamp is None:
-            return read_environment(Path(name))
-        return read_environment_of_bands(Path(name), self.bands, self.lamp.cpu().double().numpy())
+            return _environment_file(path, path.stat().st_mtime_ns if path.exists() else 0)
+        return read_environment_of_bands(path, self.bands, self.lamp.cpu().double().numpy())
 
     def look(self, camera: Cameras, subpixels: int | None = None) -> ModelView:
         """All outputs of a view; `subpixels` squared rays a pixel."""
@@ -189,6 +191,12 @@ class TrainedObject:
             generator=generator,
         )
         return ModelView(camera, view_outputs(self, camera, hits, light))
+
+
+@lru_cache(maxsize=2)
+def _environment_file(path: Path, changed_ns: int) -> Environment:  # noqa: ARG001 - a changed file is another one
+    """An environment map, kept while it stays as it is: a slider that turns it asks for it again and again."""
+    return read_environment(path)
 
 
 def _seed(camera: Cameras, number: int) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from unmix_plugin.engine.training.device_share import SHARE_BOUNDS
 from unmix_plugin.errors import ConfigError
@@ -20,6 +21,9 @@ class ViewerOptions:
     """Port to listen at; if it is taken the next free one is used, and said."""
     token: str | None = None
     """Word that the page asks for before it shows anything."""
+    environments: tuple[Path, ...] = ()
+    """Environment maps (.exr, .hdr) to offer beside the built-in ones, for methods that know light and material
+    apart."""
 
     def __post_init__(self) -> None:
         """Refuse impossible settings.

@@ -58,7 +58,8 @@ class Viewer:
             say: Prints a line on the user's terminal.
             recipe: Edits that every page starts with.
         Raises:
-            ConfigError: the recipe does not fit the run.
+            ConfigError: the recipe does not fit the run, or environments were given and its method has none.
+            SceneError: an environment map is missing, damaged or of no use.
         """
         self._options = options
         self._say = say
@@ -66,7 +67,7 @@ class Viewer:
         self._prompts = TokenPrompts(self._gate, self._open)
         self._sites_warned_of: set[str] = set()
         self._kept_pages = KeptPages()
-        self._services = Services(source, read_scene, recipe)
+        self._services = Services(source, read_scene, recipe, options.environments)
         self._sessions: dict[int, Session] = {}
         self._lock = threading.Lock()
         self._stopped = threading.Event()

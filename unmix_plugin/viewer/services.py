@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -18,7 +18,8 @@ from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.colour.illuminants import illuminant_names
-from unmix_plugin.trained.relighting import RelightableScene
+from unmix_plugin.trained.protocol import RenderableScene
+from unmix_plugin.trained.relighting import LightChoice, RelightableScene, relit
 from unmix_plugin.trained.run_views import RunView, recorded_views
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.failures import failures_said
@@ -48,15 +49,23 @@ Raises:
 class Services:
     """Shared by the sessions of all clients."""
 
-    def __init__(self, source: SceneSource, read_scene: SceneReader, recipe: Recipe | None = None) -> None:
+    def __init__(
+        self,
+        source: SceneSource,
+        read_scene: SceneReader,
+        recipe: Recipe | None = None,
+        environments: Sequence[Path] = (),
+    ) -> None:
         """Computes nothing yet; the scene is read beside everything else once `start` is called.
 
         Args:
             source: The model.
             read_scene: Reads the scene.
             recipe: What every client sees the scene with at first.
+            environments: Files of lights to offer beside those that the scene knows.
         Raises:
-            ConfigError: the recipe does not fit the run.
+            ConfigError: the recipe does not fit the run, or its method has no environments.
+            SceneError: an environment map is missing, damaged or of no use.
         """
         self.source = source
         self.views = recorded_views(source.record)
@@ -70,7 +79,7 @@ class Services:
         with source.borrowed() as scene:
             self.layers = layers_of(scene)
             self.has_materials = isinstance(scene, TrainedScene)
-            self.lights: tuple[str, ...] = scene.lights if isinstance(scene, RelightableScene) else ()
+            self.lights = _lights(scene, environments)
             channels = (
                 num_channels(scene.materials) if isinstance(scene, TrainedScene) else 4 * len(scene.outputs)
             )
@@ -162,3 +171,11 @@ def thumbnail(scene: Scene, name: str) -> Thumbnail | None:
     weights = rgb_matrix(Bands.of(scene.wavelengths_nm)) if sensor.sees_all_bands else false_colours
     linear = (spectra @ weights).clamp(0, 1)
     return (linear_to_srgb(linear) * 255 + 0.5).to(torch.uint8).numpy()
+
+
+def _lights(scene: RenderableScene, environments: Sequence[Path]) -> tuple[str, ...]:
+    """Names of the lights that a scene knows, and the paths of those that a user brings."""
+    paths = tuple(str(path.resolve()) for path in environments)
+    for path in paths:
+        relit(scene, LightChoice(path), "of this run")
+    return (*scene.lights, *paths) if isinstance(scene, RelightableScene) else ()
