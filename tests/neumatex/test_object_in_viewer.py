@@ -58,9 +58,8 @@ def test_every_output_is_a_layer_and_the_picture_becomes_as_fine_as_a_finished_v
 
 def test_a_users_environment_is_offered_and_lights_the_object(source, tmp_path):
     path = tmp_path / "lamp.exr"
-    write_exr(
-        path, {name: np.full((4, 8), value, np.float32) for name, value in zip("RGB", (2, 0, 0), strict=True)}
-    )
+    colours = {name: np.full((4, 8), value, np.float32) for name, value in zip("RGB", (2, 0, 0), strict=True)}
+    write_exr(path, colours, {})
     services = Services(source, no_scene, environments=[path])
     assert services.lights[-1] == str(path)
     red = services.maker.edited(Edit(light=LightChoice(services.lights[-1])))
