@@ -12,8 +12,7 @@ from unmix_plugin.engine.training.device_share import DeviceShare
 from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.formats.exr import write_exr
 from unmix_plugin.trained.model_scene import ModelView
-from unmix_plugin.trained.relighting import LightChoice
-from unmix_plugin.viewer.rendering.edits import Edit
+from unmix_plugin.trained.relighting import LightChoice, relit
 from unmix_plugin.viewer.rendering.scene_source import SceneSource
 from unmix_plugin.viewer.services import Services
 
@@ -62,7 +61,8 @@ def test_a_users_environment_is_offered_and_lights_the_object(source, tmp_path):
     write_exr(path, colours, {})
     services = Services(source, no_scene, environments=[path])
     assert services.lights[-1] == str(path)
-    red = services.maker.edited(Edit(light=LightChoice(services.lights[-1])))
+    with source.borrowed() as scene:
+        red = relit(scene, LightChoice(services.lights[-1]), "neumatex")
     seen = red.render(RECORD.train_cameras[0], ["linear_rgb"])["linear_rgb"]
     assert float(seen[..., 0].max()) > 0.05
     assert float(seen[..., 1:].max()) == 0
