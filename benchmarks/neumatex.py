@@ -68,7 +68,7 @@ class Options:
     """Held-out lights."""
     steps: int = 150
     """Training steps."""
-    pixels: int = 2048
+    pixels: int = 1024
     """Pixels a step."""
     variants: tuple[str, ...] = tuple(VARIANTS)
     """Which ways of fitting."""
