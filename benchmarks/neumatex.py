@@ -1,6 +1,6 @@
 """How well does an object look under light that it was never photographed in?
 
-    python benchmarks/neumatex.py [--objects 8] [--size 64] [--steps 150] [--lights 4]
+    python benchmarks/neumatex.py [--objects 8] [--size 64] [--steps 300] [--lights 4]
 
 Writes procedural objects of layered materials whose seeds were not used while settings were chosen, fits each as
 `unmix-train` does it, and evaluates on held-out views, under held-out lights and against the true base colour. A
@@ -66,9 +66,9 @@ class Options:
     """Pictures of an object under the light of training."""
     lights: int = 4
     """Held-out lights."""
-    steps: int = 150
+    steps: int = 300
     """Training steps."""
-    pixels: int = 1024
+    pixels: int = 512
     """Pixels a step."""
     variants: tuple[str, ...] = tuple(VARIANTS)
     """Which ways of fitting."""
