@@ -133,16 +133,27 @@ def rig_manager(root, **settings) -> HyperspectralDataManager:
     return config.setup(data=make_rig(root).root, device=torch.device("cpu"))
 
 
-def test_pixels_of_a_coarse_sensor_get_more_rays_and_all_lie_within_them(tmp_path):
+def test_each_view_gets_as_many_pixels_and_each_pixel_as_many_rays_whatever_their_size(tmp_path):
+    """A batch of few coarse pixels with many rays each taught little, and saw the same cells again and again."""
     manager = rig_manager(tmp_path / "rig", subpixels=1)
+    manager.set_train_rays_per_batch(4000)
+    rays, batch = manager.next_train(0)
+    assert batch["sensor_rays"].tolist() == [1, 1, 1]
+    assert len(rays) == manager.get_train_rays_per_batch() == 4000
+    drawn = torch.bincount(rays.camera_indices)
+    expected = 4000 / len(manager.train_cameras)
+    assert float((drawn - expected).abs().max()) < 5 * expected**0.5
+
+
+def test_rays_of_a_coarse_pixel_lie_within_it(tmp_path):
+    manager = rig_manager(tmp_path / "rig", subpixels=2)
     rays, batch = manager.next_train(0)
     assert batch["sensors"].tolist() == [0, 1, 2]
-    assert batch["sensor_rays"].tolist() == [1, 4, 1]
-    assert len(rays) == int((batch["sensor_pixels"] * batch["sensor_rays"]).sum())
-    assert 0.8 < len(rays) / manager.get_train_rays_per_batch() < 1.25
+    assert batch["sensor_rays"].tolist() == [4, 4, 4]
+    assert len(rays) == manager.get_train_rays_per_batch() == 400
     assert int(rays.camera_indices.max()) == 4
     start, count = int(batch["sensor_pixels"][0]), int(batch["sensor_pixels"][1])
-    own = rays[slice(start, start + 4 * count)]
+    own = rays[slice(4 * start, 4 * (start + count))]
     for pixel in range(count):
         four = own[slice(4 * pixel, 4 * pixel + 4)]
         camera = int(four.camera_indices[0])

@@ -137,7 +137,7 @@ class HyperspectralDataManager(DataManager):
         """Random valid pixels of the training views; the draw depends on (seed, step) only."""
         generator = step_generator(self.seed, step)
         parts = []
-        for drawn in self._pixels.draw(self._pixels_for(self._num_rays), generator, step):
+        for drawn in self._pixels.draw(self._pixels_for(self._num_rays), generator, step, self._shares):
             measured = {
                 "spectra": drawn.spectra,
                 "alpha": drawn.alpha,
@@ -169,7 +169,7 @@ class HyperspectralDataManager(DataManager):
 
     def get_train_rays_per_batch(self) -> int:
         """Rays of the next training batch."""
-        return round(self._pixels_for(self._num_rays) * self._rays_a_pixel)
+        return self._pixels_for(self._num_rays) * self._subpixels**2
 
     def set_train_rays_per_batch(self, num_rays: int) -> None:
         """Let the next training batches have `num_rays` rays, but whole pixels and at least one."""
@@ -274,11 +274,12 @@ class HyperspectralDataManager(DataManager):
         return AlphaEvidence(self._pixels, self.scene.has_alpha and not self.options.trust_alpha)
 
     def _pixels_for(self, num_rays: int) -> int:
-        return max(1, int(num_rays // self._rays_a_pixel))
+        return max(1, num_rays // self._subpixels**2)
 
-    @property
-    def _rays_a_pixel(self) -> float | int:
-        return self._rays.rays_a_pixel(self._subpixels, self._pixels.shares if self.scene.is_rig else {})
+    @cached_property
+    def _shares(self) -> dict[int, float] | None:
+        """Of the pixels of a batch, by sensor of a rig."""
+        return self._rays.shares(self._pixels.shares) if self.scene.is_rig else None
 
     def _choose_subpixels(self, step: int, progress: float) -> None:
         until = choose(self.options.single_ray_until, self._preset.single_ray_until)

@@ -53,6 +53,16 @@ def test_every_valid_pixel_comes_up_equally_often(rig):
     assert float((drawn - 200).abs().max()) < 6 * 200**0.5
 
 
+def test_pixels_are_drawn_by_the_shares_that_are_asked_for(rig):
+    table = PixelTable(rig, CPU, (1, 3, 4, 5))
+    shares = {0: 0.2, 1: 0.8, 2: 0.0}
+    groups = table.draw(5000, torch.Generator().manual_seed(0), shares=shares)
+    assert [group.sensor for group in groups] == [0, 1]
+    assert abs(len(groups[0].cameras) - 1000) < 5 * 1000**0.5
+    assert len(groups[0].cameras) + len(groups[1].cameras) == 5000
+    assert len(groups[1].numbers.unique()) == 140
+
+
 def test_opaque_pixels_are_sampled_of_one_sensor(rig):
     pixels = PixelTable(rig, CPU, (1, 3, 4, 5)).sample_opaque(1, 12, seed=0)
     assert pixels.shape == (12, 2)

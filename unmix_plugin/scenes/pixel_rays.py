@@ -1,4 +1,8 @@
-"""From pixels of any size to rays: a coarse sensor's pixel is a mean over the area of several fine ones.
+"""From pixels of any size to rays: as many through the pixels of a coarse sensor as through those of a sharp one.
+
+A coarse pixel is the mean of many fine ones, but one ray through each of those would leave a batch with a few coarse
+pixels: too few to learn from, and all their rays end in the same cells, so that the other cells seem to be seen by no
+view.
 
 Notation: `R` pixels, `P` rays through each.
 """
@@ -16,9 +20,6 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.scenes.pixel_table import DrawnPixels
 from unmix_plugin.scenes.scene import Scene
-
-MOST_SENSOR_SUBPIXELS = 4
-"""Along an edge of a coarse sensor's pixel, in multiples of the finest sensor's."""
 
 
 class PixelRays:
@@ -40,27 +41,22 @@ class PixelRays:
         sensors = torch.tensor([self._scene.frames[view].sensor for view in self._scene.train_indices])
         return {sensor: float(edges[sensors == sensor].median()) for sensor in set(sensors.tolist())}
 
-    @cached_property
-    def factors(self) -> dict[int, int]:
-        """Of each sensor, by how many times more rays its pixels are wide: as many as fine pixels lie along an edge."""
-        finest = min(self.pixel_sizes.values())
-        return {
-            sensor: min(max(1, round(size / finest)), MOST_SENSOR_SUBPIXELS)
-            for sensor, size in self.pixel_sizes.items()
-        }
+    def shares(self, valid: Mapping[int, float]) -> dict[int, float]:
+        """Of the pixels of a batch, by sensor: in proportion to the area that the pixels of its views cover.
 
-    def rays_a_pixel(self, subpixels: int, shares: Mapping[int, float]) -> float | int:
-        """In the mean over the pixels of all sensors; `subpixels` along an edge of the finest."""
-        if not self._scene.is_rig:
-            return subpixels**2
-        return sum(share * (subpixels * self.factors[sensor]) ** 2 for sensor, share in shares.items())
+        Drawn evenly, the pixels of a sharp sensor, which are many, would leave hardly any of a coarse one.
+
+        Args:
+            valid: Of all valid pixels, the share of each sensor.
+        """
+        areas = {sensor: share * self.pixel_sizes[sensor] ** 2 for sensor, share in valid.items()}
+        return {sensor: area / sum(areas.values()) for sensor, area in areas.items()}
 
     def through(self, pixels: DrawnPixels, subpixels: int, generator: torch.Generator) -> RayBundle:
         """Rays scattered over pixels of one sensor, those of a pixel one after the other."""
-        edge = subpixels * self.factors[pixels.sensor]
-        offsets = _scattered_offsets(len(pixels.cameras), edge, generator).to(pixels.corners.device)
+        offsets = _scattered_offsets(len(pixels.cameras), subpixels, generator).to(pixels.corners.device)
         points = (pixels.corners[:, None] + offsets).flatten(0, 1)
-        return self._device_cameras.generate_rays(pixels.cameras.repeat_interleave(edge**2), points)
+        return self._device_cameras.generate_rays(pixels.cameras.repeat_interleave(subpixels**2), points)
 
 
 def _scattered_offsets(num_pixels: int, subpixels: int, generator: torch.Generator) -> Float[Tensor, "R P 2"]:

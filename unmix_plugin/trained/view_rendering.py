@@ -11,13 +11,16 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.figures.picture_grid import Picture, premultiplied_over_neutral
-from unmix_plugin.scenes.pixel_rays import MOST_SENSOR_SUBPIXELS
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
 
 if TYPE_CHECKING:
     from unmix_plugin.scenes.scene import Scene
     from unmix_plugin.trained.trained_scene import TrainedScene
+
+
+MOST_SENSOR_SUBPIXELS = 4
+"""Along an edge of a coarse sensor's pixel, in multiples of the finest sensor's."""
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property
 from itertools import accumulate
 
@@ -60,43 +61,48 @@ class PixelTable:
         return {sensor: count / sum(counts.values()) for sensor, count in counts.items()}
 
     @cached_property
-    def _valid(self) -> Int[Tensor, " valid"] | None:
-        """Numbers of the valid pixels; None if all are."""
-        valid = torch.cat([block.valid for block in self.blocks])
-        return None if bool(valid.all()) else valid.nonzero()[:, 0]
+    def _valid(self) -> list[Int[Tensor, " valid"] | None]:
+        """Of each block, the indices of its valid pixels; None if all are."""
+        return [None if bool(b.valid.all()) else b.valid.nonzero()[:, 0] for b in self.blocks]
 
-    def draw(self, count: int, generator: torch.Generator, step: int = 0) -> tuple[DrawnPixels, ...]:
+    def draw(
+        self,
+        count: int,
+        generator: torch.Generator,
+        step: int = 0,
+        shares: Mapping[int, float] | None = None,
+    ) -> tuple[DrawnPixels, ...]:
         """Random valid pixels, in one group for each sensor that some of them are of.
 
         Args:
             step: Of the training; what pixels on disk are drawn from moves on with it.
+            shares: Of the pixels drawn, by sensor; None draws all valid ones evenly.
         """
-        if self.note is not None:
-            return self._draw_from_disk(count, generator, step)
-        pool = len(self) if self._valid is None else len(self._valid)
-        drawn = torch.randint(pool, (count,), generator=generator)
-        chosen = drawn if self._valid is None else self._valid[drawn]
-        if len(self.blocks) == 1:
-            return (self.blocks[0].take(chosen, 0),)
-        chosen = chosen.sort().values
-        bounds = torch.searchsorted(chosen, torch.tensor(self._firsts)).tolist()
-        return tuple(
-            block.take(chosen[start:end] - first, first)
-            for block, first, start, end in zip(self.blocks, self._firsts, bounds, bounds[1:], strict=False)
-            if end > start
-        )
-
-    def _draw_from_disk(self, count: int, generator: torch.Generator, step: int) -> tuple[DrawnPixels, ...]:
-        """As many of each sensor as chance gives it, from what its pool holds at a step."""
-        bounds = torch.tensor(list(self.shares.values())).cumsum(0)
-        places = torch.rand(count, generator=generator).clamp(max=float(bounds[-1]) - 1e-6)
-        counts = torch.bincount(torch.searchsorted(bounds, places), minlength=len(self.blocks)).tolist()
+        if self.note is None and len(self.blocks) == 1:
+            return (self.blocks[0].take(self._drawn(0, count, generator), 0),)
+        counts = self._counts(count, generator, self.shares if shares is None else shares)
         groups = []
-        for block, first, number in zip(self.blocks, self._firsts, counts, strict=False):
-            if block.pool is not None and number > 0:
+        for index, (block, number) in enumerate(zip(self.blocks, counts, strict=True)):
+            if number == 0:
+                continue
+            if self.note is None:
+                groups.append(block.take(self._drawn(index, number, generator), self._firsts[index]))
+            elif block.pool is not None:
                 pixels, stored = block.pool.draw(number, step, generator)
-                groups.append(block.take(pixels, first, stored))
+                groups.append(block.take(pixels, self._firsts[index], stored))
         return tuple(groups)
+
+    def _drawn(self, block: int, count: int, generator: torch.Generator) -> Int[Tensor, " R"]:
+        """Random valid pixels of a block held in memory, by their index in it."""
+        valid = self._valid[block]
+        drawn = torch.randint(len(self.blocks[block]) if valid is None else len(valid), (count,), generator=generator)
+        return drawn if valid is None else valid[drawn]
+
+    def _counts(self, count: int, generator: torch.Generator, shares: Mapping[int, float]) -> list[int]:
+        """As many pixels of each block as chance gives its sensor."""
+        bounds = torch.tensor([shares.get(block.sensor, 0.0) for block in self.blocks]).cumsum(0)
+        places = torch.rand(count, generator=generator).clamp(max=float(bounds[-1]) - 1e-6)
+        return torch.bincount(torch.searchsorted(bounds, places), minlength=len(self.blocks)).tolist()
 
     def mend(self, scene: Scene, seed: int) -> float:
         """Replace stripes and spikes in memory (see `spectral.bad_values`); share of the values that were bad."""
