@@ -95,7 +95,9 @@ class PixelTable:
     def _drawn(self, block: int, count: int, generator: torch.Generator) -> Int[Tensor, " R"]:
         """Random valid pixels of a block held in memory, by their index in it."""
         valid = self._valid[block]
-        drawn = torch.randint(len(self.blocks[block]) if valid is None else len(valid), (count,), generator=generator)
+        drawn = torch.randint(
+            len(self.blocks[block]) if valid is None else len(valid), (count,), generator=generator
+        )
         return drawn if valid is None else valid[drawn]
 
     def _counts(self, count: int, generator: torch.Generator, shares: Mapping[int, float]) -> list[int]:
