@@ -97,7 +97,9 @@ def main(options: Options) -> None:
                 field = run if name == FIELD else field
                 measured[name].append({"seed": seed, **found})
                 print(f"object {seed}, {name}: {found}", flush=True)
-    question = f"Reflectance and shadows after {seconds:g} s of training, with and without known mesh and light"
+    question = (
+        f"Reflectance and shadows after {seconds:g} s of training, with and without known mesh and light"
+    )
     report = _common.Report(
         "neumatex_spectral",
         question,
