@@ -7,7 +7,7 @@ ways, by the commands that a user would give and for the same time: neumatex wit
 from a run of unmix-nerf; and unmix-nerf on the same pictures, which knows neither mesh nor environment but the lamp's
 spectrum. All are told the number of materials.
 
-Albedo is what a method says of the diffuse reflectance of what a pixel of an evaluation view shows, mean over the bands,
+Albedo is what a method says of the diffuse reflectance in a pixel of an evaluation view, mean over the bands,
 after one factor for the object; of unmix-nerf abundances times endmembers over the lamp, which leaves its shading out.
 What is left of shadows in it is the correlation of its relative error, estimate over truth less 1, with the light that
 falls on the surface. The error, since the true albedo may correlate by chance, which the table says.
