@@ -158,19 +158,21 @@ def seconds_of_training(run: Path) -> float:
 @torch.no_grad()
 def materials(run: Path, folder: Path) -> dict[str, float]:
     """Angle of the endmembers as reflectances, and what of the albedo's error follows the light."""
+    from unmix_plugin.neumatex.materials.spectral import SpectralFamily
     from unmix_plugin.neumatex.scene.load_object import load_object
     from unmix_plugin.neumatex.trained_object import TrainedObject
     from unmix_plugin.spectral.metrics import endmember_angle
-    from unmix_plugin.trained.open_run import load_run
+    from unmix_plugin.trained.open_run import load_run, require_materials
 
     truth, scene = load_object(folder), load_run(run, "cpu").scene
     assert truth.lamp is not None
     assert truth.true_materials is not None
     lamp = torch.from_numpy(truth.lamp).float()
     if isinstance(scene, TrainedObject):
+        assert isinstance(scene.surface.family, SpectralFamily)
         endmembers = scene.surface.family.endmembers
     else:
-        endmembers = scene.materials.endmembers.detach() / lamp
+        endmembers = require_materials(scene, FIELD).materials.endmembers.detach() / lamp
     true_endmembers = torch.from_numpy(truth.true_materials.endmembers).float()
     pixels = [seen_pixels(truth, scene, endmembers, lamp, index) for index in truth.split.evaluation]
     light, true, found, shaded = (torch.cat(parts).double().numpy() for parts in zip(*pixels, strict=True))

@@ -21,6 +21,9 @@ from unmix_plugin.neumatex.trained_object import TrainedObject
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 from unmix_plugin.trained.open_run import load_run
 from unmix_plugin.trained.relighting import LightChoice
+from unmix_plugin.viewer.layers.layer_settings import LayerSettings
+from unmix_plugin.viewer.layers.layers import layers_of
+from unmix_plugin.viewer.layers.painting import SwatchLegend
 
 ENTRY = EntryPoint("neumatex", "unmix_plugin.neumatex.method_config:neumatex", registry.METHOD_GROUP)
 SMALL = [
@@ -97,6 +100,19 @@ def test_every_output_is_shown_from_the_run_folder_alone(scene):
     assert set(view["segmentation"][[6, 18], [12, 12]].tolist()) == {0, 1}
     assert view["segmentation"][corner] == 255
     assert view["spectral"][corner].abs().max() == 0
+
+
+def test_the_viewer_paints_abundances_as_a_mixture_of_the_colours_of_the_segmentation(scene):
+    view, layers = scene.look(scene.views[0].camera), layers_of(scene)
+    mixed, legend = layers["abundances"].paint(view, LayerSettings(), None)  # type: ignore[arg-type]
+    labelled, _ = layers["segmentation"].paint(view, LayerSettings(), None)  # type: ignore[arg-type]
+    assert isinstance(legend, SwatchLegend)
+    assert [name for name, _ in legend.entries] == ["abundances 0", "abundances 1"]
+    colours = torch.tensor([colour for _, colour in legend.entries])
+    for row, column in ((6, 12), (18, 12)):
+        shares = view["abundances"][row, column]
+        torch.testing.assert_close(mixed[row, column], shares @ colours, atol=1e-4, rtol=0)
+        torch.testing.assert_close(labelled[row, column], colours[shares.argmax()], atol=1e-4, rtol=0)
 
 
 def test_another_light_in_colours_gets_the_lamps_spectrum(scene):
