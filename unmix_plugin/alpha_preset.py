@@ -30,6 +30,7 @@ class AlphaPreset:
     rgb_loss_weight: float
     opacity_loss_weight: float
     spread_loss_weight: float
+    surface_loss_weight: float
     coarse_samples: int
     specular_endmembers: bool
     """Whether the specular dictionary has the endmembers' spectra too: in rooms, walls colour the light."""
@@ -45,6 +46,7 @@ WITH_ALPHA = AlphaPreset(
     rgb_loss_weight=0.2,
     opacity_loss_weight=0.0,
     spread_loss_weight=0.0,
+    surface_loss_weight=0.0,
     coarse_samples=256,
     specular_endmembers=False,
 )
@@ -58,12 +60,19 @@ WITHOUT_ALPHA = AlphaPreset(
     rgb_loss_weight=0.0,
     opacity_loss_weight=0.01,
     spread_loss_weight=1e-3,
+    surface_loss_weight=0.0,
     coarse_samples=256,
     specular_endmembers=True,
 )
 
 
-UNBOUNDED = replace(WITHOUT_ALPHA, initial_opacity=0.005, opacity_loss_weight=1e-3, coarse_samples=64)
+UNBOUNDED = replace(
+    WITHOUT_ALPHA,
+    initial_opacity=0.005,
+    opacity_loss_weight=1e-3,
+    surface_loss_weight=0.3,
+    coarse_samples=64,
+)
 
 
 def preset_for(has_alpha: bool, is_unbounded: bool = False) -> AlphaPreset:

@@ -36,6 +36,7 @@ from unmix_plugin.scenes.pixel_table import PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.recorded_scene import check_recorded_scene
 from unmix_plugin.scenes.scene import Scene, SceneOptions
+from unmix_plugin.scenes.surface_evidence import SurfaceEvidence
 from unmix_plugin.scenes.training_evidence import (
     band_weights,
     judge_sensors,
@@ -144,6 +145,8 @@ class HyperspectralDataManager(DataManager):
                 "alpha_trust": self._evidence.trust(drawn),
                 "pixels": drawn.numbers,
             }
+            if self._surfaces.is_known:
+                measured["surfaces"] = self._surfaces.points(drawn)
             parts.append((drawn.sensor, self._rays.through(drawn, self._subpixels, generator), measured))
         return join_parts(parts) if self.scene.is_rig else parts[0][1:]
 
@@ -215,7 +218,7 @@ class HyperspectralDataManager(DataManager):
         shares = self._pixels.shares
         chosen = max(shares, key=lambda sensor: (sensors[sensor].num_channels, shares[sensor]))
         foreground = self._evidence.foreground() if self.scene.has_alpha else None
-        reachable = carve(self.scene, self._grid_resolution, foreground)
+        reachable = self._surfaces.carved(carve(self.scene, self._grid_resolution, foreground))
         found = {
             "knots": self._knots.positions(self.train_cameras).numpy(),
             "pixels": self._pixels.sample_opaque(chosen, most, seed),
@@ -272,6 +275,10 @@ class HyperspectralDataManager(DataManager):
     @cached_property
     def _evidence(self) -> AlphaEvidence:
         return AlphaEvidence(self._pixels, self.scene.has_alpha and not self.options.trust_alpha)
+
+    @cached_property
+    def _surfaces(self) -> SurfaceEvidence:
+        return SurfaceEvidence(self.scene)
 
     def _pixels_for(self, num_rays: int) -> int:
         return max(1, num_rays // self._subpixels**2)

@@ -59,6 +59,7 @@ unmix_nerf_published = MethodSpecification(
                     rgb=1.0,
                     opacity=0.0,
                     spread=0.0,
+                    surface=0.0,
                     abundances=0.0,
                     exposure=1.0,
                     band_weights=(),

@@ -40,6 +40,7 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.metrics import psnr
+from unmix_plugin.surface_guide import surface_loss
 from unmix_plugin.view_gains import ViewGains
 
 _FEWEST_RAYS, _MOST_RAYS = 64, 8192
@@ -186,7 +187,7 @@ class UnmixModel(Model):
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
         """`spectral` (R, B) on black (of a rig `coefficients`, from which follows what its sensors see),
         `abundances` (R, K) with those of the sky, `accumulation` (R), `spread` and `num_samples`, one number each, and
-        of the samples that carry weight `positions`, `weights` and `views` (S)."""
+        of the samples that carry weight `positions`, `weights`, `rays` and `views` (S)."""
         generator = self.generator if self.training else None
         if self.poses is not None and self.training and self._progress >= self.config.pose_refinement.start:
             ray_bundle = self.poses(ray_bundle)
@@ -208,6 +209,7 @@ class UnmixModel(Model):
             "num_samples": torch.tensor(rendered.num_samples),
             "positions": rendered.positions,
             "weights": rendered.weights,
+            "rays": rendered.ray_indices,
             "views": ray_bundle.camera_indices.index_select(0, rendered.ray_indices),
         }
 
@@ -224,6 +226,8 @@ class UnmixModel(Model):
         losses = self.comparison.losses(parts, set(weights), self.generator)
         if "spread" in weights:
             losses["spread"] = outputs["spread"]
+        if "surface" in weights and "surfaces" in batch:
+            losses["surface"] = surface_loss(outputs, batch["surfaces"], self.renderer.space)
         if self.poses is not None:
             weights["poses"], losses["poses"] = self.config.pose_refinement.penalty, self.poses.penalty()
         return {name: weights[name] * losses[name] for name in weights if name in losses}

@@ -164,7 +164,7 @@ class VolumeRenderer:
             len(samples),
             torch.log1p(depths / _SPREAD_DEPTH).sum() / max(len(ray_bundle), 1),
             self.space.to_unit(positions).detach(),
-            weights.detach(),
+            weights,
             kept.ray_indices,
         )
 

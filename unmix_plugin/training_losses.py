@@ -50,6 +50,11 @@ class LossConfig:
     `spread_until`. Auto is 0.001 where alpha is unknown, else 0."""
     spread_until: float = 0.25
     """Part of the training in which spread density is penalised: later it would thin out surfaces."""
+    surface: float | Auto = "auto"
+    """Weight, at the start of training, of light from elsewhere than the surface that the views agree on, where they do
+    clearly; falls to 0 at `surface_until`. Auto is 0.3 in an unbounded world, else 0."""
+    surface_until: float = 0.5
+    """Part of the training in which known surfaces guide it: later they would hold back what is finer."""
     abundances: float = 0.1
     """Weight of the mean squared distance of composited abundances to those of the measured spectra, unmixed one by
     one with the first endmembers; 0 as published."""
@@ -73,7 +78,8 @@ class LossConfig:
         Raises:
             ConfigError: a number out of its range.
         """
-        weights = (self.spectral, self.rgb, self.opacity, self.spread, self.abundances, self.mixing_penalty)
+        weights = (self.spectral, self.rgb, self.opacity, self.spread, self.surface, self.abundances)
+        weights = (*weights, self.mixing_penalty)
         rules = {
             "weights of at least 0": all(weight == "auto" or weight >= 0 for weight in weights),
             "band-weights above 0, auto or none": self.band_weights == "auto"
@@ -81,20 +87,27 @@ class LossConfig:
             "an exposure above 0 or auto": self.exposure == "auto" or self.exposure > 0,
             "outlier above 0": self.outlier > 0,
             "spread-until in (0, 1]": 0 < self.spread_until <= 1,
+            "surface-until in (0, 1]": 0 < self.surface_until <= 1,
             "abundances-final-factor in (0, 1]": 0 < self.abundances_final_factor <= 1,
         }
         require("the losses", rules)
 
     def weights(self, preset: AlphaPreset, progress: float) -> dict[str, float]:
         """Weight of each loss when that part of the training is over, by name."""
-        left = max(1 - progress / self.spread_until, 0.0)
         return {
             "spectral": self.spectral,
             "rgb": choose(self.rgb, preset.rgb_loss_weight),
             "opacity": choose(self.opacity, preset.opacity_loss_weight),
-            "spread": choose(self.spread, preset.spread_loss_weight) * left**2,
+            "spread": choose(self.spread, preset.spread_loss_weight) * fading(progress, self.spread_until),
+            "surface": choose(self.surface, preset.surface_loss_weight)
+            * fading(progress, self.surface_until),
             "abundances": self.abundances * self.abundances_final_factor**progress,
         }
+
+
+def fading(progress: float, until: float) -> float:
+    """From 1 at the start of training to 0 at `until`, slower and slower."""
+    return max(1 - progress / until, 0.0) ** 2
 
 
 @dataclass(frozen=True)

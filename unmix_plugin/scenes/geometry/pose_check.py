@@ -12,6 +12,7 @@ with OpenGL axes, in world units, float64.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -139,7 +140,9 @@ def _meanings(poses: Poses) -> dict[str, Poses]:
     }
 
 
-def choose_neighbours(poses: Poses) -> dict[int, list[int]]:
+def choose_neighbours(
+    poses: Poses, num_references: int = NUM_REFERENCES, num_neighbours: int = NUM_NEIGHBOURS
+) -> dict[int, list[int]]:
     """For some views the others that are turned least against them; the same under every convention."""
     rotations, positions = poses[:, :, :3], poses[:, :, 3]
     cosines = (np.einsum("iab,jab->ij", rotations, rotations) - 1.0) / 2.0
@@ -148,8 +151,8 @@ def choose_neighbours(poses: Poses) -> dict[int, list[int]]:
     ranks = turns + 0.1 * distances / max(float(distances.max()), 1e-30)
     ranks[turns < SMALLEST_TURN_DEG] += 360.0
     np.fill_diagonal(ranks, np.inf)
-    chosen = np.linspace(0, len(poses) - 1, min(NUM_REFERENCES, len(poses))).round().astype(int)
-    count = min(NUM_NEIGHBOURS, len(poses) - 1)
+    chosen = np.linspace(0, len(poses) - 1, min(num_references, len(poses))).round().astype(int)
+    count = min(num_neighbours, len(poses) - 1)
     return {int(view): np.argsort(ranks[view])[:count].tolist() for view in chosen}
 
 
@@ -192,11 +195,18 @@ def thinned_cameras(poses: Poses, lenses: Cameras, image: Float[Tensor, "H W F"]
     poses = poses.copy()
     poses[:, :, 3] -= poses[:, :, 3].mean(axis=0)
     poses[:, :, 3] /= max(float(np.linalg.norm(poses[:, :, 3], axis=-1).max()), 1e-30)
+    matrices = torch.from_numpy(poses).float()
+    return thinned_lenses(replace(lenses, camera_to_world=matrices), image, stride)
+
+
+def thinned_lenses(cameras: Cameras, image: Float[Tensor, "H W F"], stride: int) -> Cameras:
+    """The same poses with lenses of thinned-out views."""
     height, width = image.shape[:2]
     # Pixel (c, r) of a thinned-out view is pixel (c stride, r stride) of the whole one; centres are at + 0.5.
-    center = (lenses.center_px - 0.5) / stride + 0.5
-    matrices = torch.from_numpy(poses).float()
-    return Cameras(matrices, lenses.focal_px / stride, center, lenses.distortion, width, height)
+    center = (cameras.center_px - 0.5) / stride + 0.5
+    return Cameras(
+        cameras.camera_to_world, cameras.focal_px / stride, center, cameras.distortion, width, height
+    )
 
 
 def _disagreement(

@@ -25,6 +25,7 @@ from unmix_plugin.scenes.geometry.pose_check import (
     ReadView,
     choose_neighbours,
     local_change,
+    thinned_lenses,
     view_differences,
     view_features,
 )
@@ -91,7 +92,7 @@ def find_world_evidence(box: SceneBox, cameras: Cameras, read_view: ReadView) ->
     chance = float((drawn - drawn[torch.randperm(len(drawn), generator=generator)]).norm(dim=-1).median())
     if chance <= 0.0:  # nothing in the views changes
         return WorldEvidence(0, 0, 0, 0)
-    own = _thinned(cameras, features[used[0]], stride)
+    own = thinned_lenses(cameras, features[used[0]], stride)
     found = [
         _least_disagreements(box, own, features, pixels[view], view, others)
         for view, others in neighbours.items()
@@ -119,15 +120,6 @@ def _spread_pixels(image: Float[Tensor, "H W F"]) -> Tensor:
     rows = torch.arange(down)[:, None] * height + best // width
     columns = torch.arange(across)[None, :] * width + best % width
     return (rows * change.shape[1] + columns).flatten()
-
-
-def _thinned(cameras: Cameras, image: Float[Tensor, "H W F"], stride: int) -> Cameras:
-    """The same poses with lenses of thinned-out views."""
-    height, width = image.shape[:2]
-    center = (cameras.center_px - 0.5) / stride + 0.5
-    return Cameras(
-        cameras.camera_to_world, cameras.focal_px / stride, center, cameras.distortion, width, height
-    )
 
 
 def _least_disagreements(

@@ -1,0 +1,118 @@
+"""Distances that views agree on, and the cells that views look through."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+
+from tests.scenes.geometry.test_carving import make_cameras
+from tests.scenes.scene_factory import look_at
+from unmix_plugin.engine.geometry.contraction import UnitSpace
+from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.scenes import SceneOptions, carve, load_scene
+from unmix_plugin.scenes.demo import scene as demo_scene
+from unmix_plugin.scenes.demo.places import WORLD
+from unmix_plugin.scenes.demo.scene import make_demo_scene
+from unmix_plugin.scenes.demo.shading import render_view
+from unmix_plugin.scenes.demo.shapes import first_hits
+from unmix_plugin.scenes.geometry.seen_through import seen_through
+from unmix_plugin.scenes.geometry.swept_depths import SweptDepths, sweep_depths
+from unmix_plugin.scenes.pixel_table import PixelTable
+from unmix_plugin.scenes.surface_evidence import SurfaceEvidence
+
+BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Objects on a ground under a sky."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demo_scene, "render_view", partial(render_view, subpixels=1))
+        folder = tmp_path_factory.mktemp("world") / "scene"
+        make_demo_scene(folder, 64, 3, 24, place=WORLD)
+    return folder
+
+
+def true_distances(scene, rays):
+    """To the first surface, model units; inf where there is the sky."""
+    origins = scene.normalisation.to_world(rays.origins.double().numpy()).astype(np.float32)
+    directions = (rays.directions.numpy() @ scene.normalisation.rotation).astype(np.float32)
+    found, _ = first_hits([thing.placement for thing in WORLD.things], origins, directions)
+    return torch.from_numpy(found) * scene.normalisation.scale
+
+
+def test_drawn_pixels_are_shown_where_their_true_surfaces_are(folder):
+    scene = load_scene(folder, SceneOptions(world="unbounded"))
+    evidence = SurfaceEvidence(scene)
+    (pixels,) = PixelTable(scene, CPU, scene.train_indices, None).draw(
+        4000, torch.Generator().manual_seed(0), 0
+    )
+    points = evidence.points(pixels)
+    known = ~points.isnan().any(dim=-1)
+    assert 0.2 < known.float().mean() < 0.9
+    rays = scene.cameras[list(scene.train_indices)].generate_rays(pixels.cameras, pixels.corners + 0.5)
+    distances = true_distances(scene, rays).clamp(max=1e4)
+    space = UnitSpace(scene.scene_box, is_unbounded=True)
+    true = space.to_unit(rays.origins + distances[:, None] * rays.directions)
+    cells_off = 64 * (space.to_unit(points) - true).norm(dim=-1)[known]
+    assert (cells_off < 3).float().mean() > 0.85
+
+
+def test_cells_that_views_look_through_are_carved_and_those_with_surfaces_are_not(folder):
+    scene = load_scene(folder, SceneOptions(world="unbounded"))
+    before = carve(scene, 64)
+    after = SurfaceEvidence(scene).carved(before)
+    assert (after <= before).all()
+    assert after.sum() < 0.97 * before.sum()
+    rays = scene.cameras.image_rays(scene.eval_indices[0])
+    distances = true_distances(scene, rays)
+    hit = torch.isfinite(distances)
+    points = (rays.origins + distances[:, None] * rays.directions)[hit]
+    cells = (UnitSpace(scene.scene_box, is_unbounded=True).to_unit(points) * 64).long().clamp(0, 63)
+    kept = [grid[tuple(cells.T.numpy())].mean() for grid in (before, after)]
+    assert kept[1] > kept[0] - 0.02
+
+
+def test_a_bounded_scene_has_no_evidence_of_surfaces(folder):
+    scene = load_scene(folder, SceneOptions(world="bounded"))
+    evidence = SurfaceEvidence(scene)
+    assert not evidence.is_known
+    reachable = carve(scene, 16)
+    assert evidence.carved(reachable) is reachable
+
+
+def test_nothing_is_known_of_views_that_show_one_colour_or_are_too_few():
+    cameras = make_cameras([look_at(np.array([3.0, y, 0.3]), np.zeros(3)) for y in (-1.0, -0.4, 0.4, 1.0)])
+    size = (cameras.height, cameras.width, 3)
+
+    def plain(_, part):
+        return np.full(size, 0.5, np.float32)[part]
+
+    def noisy(view, part):
+        return np.random.default_rng(view).random(size, np.float32)[part]
+
+    assert sweep_depths(cameras, BOX, plain) is None
+    assert sweep_depths(cameras[[0, 1, 2]], BOX, noisy) is None
+    unrelated = sweep_depths(cameras, BOX, noisy)
+    assert unrelated is not None
+    assert torch.isfinite(unrelated.distances).float().mean() < 0.05
+
+
+@pytest.mark.parametrize("num_views", [2, 3])
+def test_three_views_must_look_through_a_cell(num_views):
+    positions = [np.array([2.5, side, 0.3]) for side in (-0.4, 0.0, 0.4)]
+    cameras = make_cameras([look_at(position, np.array([-20.0, 0.0, 0.0])) for position in positions])
+    shape = (num_views, cameras.height, cameras.width)
+    depths = SweptDepths(tuple(range(num_views)), torch.full(shape, 3.0), 1)
+    empty = seen_through(depths, cameras, BOX, 32)
+    space = UnitSpace(BOX, is_unbounded=True)
+
+    def is_empty(*point: float) -> bool:
+        return bool(empty[tuple((space.to_unit(torch.tensor(point)) * 32).long())])
+
+    assert is_empty(0.5, 0.0, 0.3) == (num_views == 3)
+    assert not is_empty(-0.5, 0.0, 0.3)  # the surface
+    assert not is_empty(-1.5, 0.0, 0.3)  # behind it
+    assert not is_empty(4.0, 0.0, 0.3)  # behind the cameras

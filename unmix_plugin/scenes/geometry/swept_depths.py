@@ -1,0 +1,142 @@
+"""How far away the pixels of the training views are, where the views tell it clearly: a plane sweep.
+
+Points along the rays of a coarse grid of pixels are projected into neighbouring views. A pixel's distance is where
+these agree best with it. It is known only where they agree well, and nowhere else nearly as well: on plain surfaces,
+in mirrors and in what one view alone shows it stays unknown.
+
+Notation: `N` views, `h x w` pixels of a view that are asked, `P` = h w, `D` distances along a ray, `F` features.
+
+Source: Collins 1996, A Space-Sweep Approach to True Multi-Image Matching.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.scenes.geometry.pose_check import (
+    LONGEST_SIDE_PX,
+    MOST_BANDS,
+    NUM_AGREEING,
+    ReadView,
+    choose_neighbours,
+    thinned_lenses,
+    view_differences,
+    view_features,
+)
+
+MOST_VIEWS = 64
+"""Of a scene with more, so many are swept."""
+NUM_NEIGHBOURS = 5
+PIXEL_STRIDE = 2
+"""Of the thinned-out view, pixels from one that is asked to the next."""
+STEP = 1 / 32
+"""Distance of the planes within the box, in half edges of the box; outside they lie farther apart, as samples do."""
+FARTHEST = 64.0
+"""The last plane, in half edges of the box from its middle."""
+MOST_DISAGREEMENT = 0.3
+"""Of a pixel whose distance is known, against that of unrelated pixels."""
+CLEARLY = 0.7
+"""Most disagreement there, over the least at planes that are not beside it."""
+BESIDE = 3
+"""Planes that count as beside one."""
+_CHANCE_PIXELS = 4000
+
+
+@dataclass(frozen=True)
+class SweptDepths:
+    """Distances of some pixels of some views."""
+
+    views: tuple[int, ...]
+    """Which of the given cameras were swept."""
+    distances: Float[Tensor, "N h w"]
+    """Along the rays, model units; inf where unknown."""
+    stride: int
+    """Pixels of the whole view from one that is asked to the next; the first stands at `stride` / 2."""
+
+
+def sweep_depths(cameras: Cameras, box: SceneBox, read_view: ReadView) -> SweptDepths | None:
+    """Distances of the pixels of all views, or of `MOST_VIEWS`; None if views are too few or too plain to compare.
+
+    Args:
+        cameras: Of the training views, all of one size, each with one pose.
+        box: In the cameras' space.
+        read_view: Reads a part of a view.
+    """
+    count = min(len(cameras), MOST_VIEWS)
+    views = np.linspace(0, len(cameras) - 1, count).round().astype(int).tolist()
+    if count < NUM_AGREEING + 1:
+        return None
+    stride = -(-max(cameras.width, cameras.height) // LONGEST_SIDE_PX)
+    bands = read_view(views[0], (slice(1), slice(1))).shape[2]
+    part = (slice(None, None, stride), slice(None, None, stride), slice(None, None, -(-bands // MOST_BANDS)))
+    generator = torch.Generator().manual_seed(0)
+    features = view_features([read_view(view, part) for view in views], generator)
+    pixels = torch.cat([image.flatten(0, 1) for image in features])
+    drawn = pixels[torch.randperm(len(pixels), generator=generator)[:_CHANCE_PIXELS]]
+    chance = float((drawn - drawn.roll(1, 0)).norm(dim=-1).median())
+    if chance <= 0.0:
+        return None
+    lenses = thinned_lenses(cameras[views], features[0], stride)
+    poses = lenses.camera_to_world.double().numpy()
+    neighbours = choose_neighbours(poses, count, NUM_NEIGHBOURS)
+    swept = [_sweep(view, neighbours[view], lenses, box, features, chance) for view in range(count)]
+    return SweptDepths(tuple(views), torch.stack(swept), stride * PIXEL_STRIDE)
+
+
+def _sweep(
+    view: int,
+    others: list[int],
+    cameras: Cameras,
+    box: SceneBox,
+    features: list[Float[Tensor, "H W F"]],
+    chance: float,
+) -> Float[Tensor, "h w"]:
+    """Distances of one view's pixels, inf where unknown."""
+    first = PIXEL_STRIDE // 2
+    own = features[view][first::PIXEL_STRIDE, first::PIXEL_STRIDE]
+    rows, columns = (torch.arange(side) * PIXEL_STRIDE + first + 0.5 for side in own.shape[:2])
+    coords = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=-1).flatten(0, 1)
+    rays = cameras.generate_rays(torch.full((len(coords),), view), coords)
+    pose = cameras.camera_to_world[view]
+    along = rays.directions @ -pose[:, 2]
+    distances = _planes(box, pose[:, 3], -pose[:, 2]) / along[:, None]
+    points = (rays.origins[:, None] + rays.directions[:, None] * distances[..., None]).flatten(0, 1)
+    seen = [
+        _patch_means(view_differences(points, own.flatten(0, 1), features[other], cameras, other), own)
+        for other in others
+    ]
+    costs = torch.stack(seen, dim=-1).sort(dim=-1).values[..., :NUM_AGREEING].mean(dim=-1) / chance
+    least, plane = costs.min(dim=1)
+    is_beside = (torch.arange(costs.shape[1]) - plane[:, None]).abs() <= BESIDE
+    next_best = costs.masked_fill(is_beside, torch.inf).min(dim=1).values
+    is_known = (least < MOST_DISAGREEMENT) & (least < CLEARLY * next_best)
+    found = distances.gather(1, plane[:, None])[:, 0]
+    return found.masked_fill(~is_known, torch.inf).view(own.shape[:2])
+
+
+def _planes(box: SceneBox, origin: Float[Tensor, "3"], axis: Float[Tensor, "3"]) -> Float[Tensor, " D"]:
+    """Depths along an optical axis, as far apart as samples in contracted space."""
+    half, middle, found, depth = float(box.size.max()) / 2, box.aabb.mean(dim=0), [], 0.0
+    while (radius := float((origin + depth * axis - middle).abs().max()) / half) <= FARTHEST:
+        near = max(radius, 1.0)
+        length = STEP * half * near * max(near / 2, 1.0)
+        found.append(depth + length / 2)
+        depth += length
+    return torch.tensor(found)
+
+
+def _patch_means(differences: Float[Tensor, "P D"], own: Float[Tensor, "h w F"]) -> Float[Tensor, "P D"]:
+    """Means over 3 x 3 pixels on the same plane; inf where most of them are not seen."""
+    height, width = own.shape[:2]
+    is_seen = torch.isfinite(differences)
+    images = torch.stack([differences.masked_fill(~is_seen, 0.0), is_seen.float()]).transpose(1, 2)
+    total, share = torch.nn.functional.avg_pool2d(images.unflatten(2, (height, width)), 3, 1, 1)
+    means = torch.where(share > 0.5, total / share.clamp(min=0.1), torch.inf)
+    return means.flatten(1).T
