@@ -57,17 +57,16 @@ def main(options: Options) -> None:
         place = options.runs or Path(folder)
         size, views = ("32", "16") if options.quick else ("64", "32")
         place.mkdir(parents=True, exist_ok=True)
-        for name in {"table", *(RUNS[run][0] for run in options.only)}:
-            if (place / name).exists():
-                continue
+        steps = 10 if options.quick else options.steps
+        for name in {RUNS[run][0] for run in options.only}:
             words = ["--place", name, "--size", size, "--views", views, "--overwrite"]
             _common.run_command([_common.console_script("unmix-demo-scene"), str(place / name), *words])
         for run in options.only:
-            figures = place / f"{run}.json"
+            figures = place / f"{run}, {steps} steps, {size} px.json"
             if not figures.exists():
-                figures.write_text(json.dumps(measure(run, options, place)), encoding="utf-8")
+                figures.write_text(json.dumps(measure(run, steps, place)), encoding="utf-8")
             measured[run] = json.loads(figures.read_text(encoding="utf-8"))
-    setting = {"steps": options.steps, "pixels": f"{size} x {size}", "views": views, "defaults": "all others"}
+    setting = {"steps": steps, "pixels": f"{size} x {size}", "views": views, "defaults": "all others"}
     rows = [[run, *(f"{value:.3f}" for value in found.values())] for run, found in measured.items()]
     details = _common.DetailTable("All runs", ["run", *next(iter(measured.values()))], rows)
     question = "Objects in a world without end against the same objects alone, at equal steps"
@@ -75,11 +74,11 @@ def main(options: Options) -> None:
     _common.publish(report, _common.results_folder(options.results, options.quick))
 
 
-def measure(run: str, options: Options, place: Path) -> dict[str, float]:
+def measure(run: str, steps: int, place: Path) -> dict[str, float]:
     """Train, evaluate, and look at what stands before the surfaces."""
     name, world = RUNS[run]
     print(f"{run}: training ...", flush=True)
-    words = ["--max-num-iterations", str(10 if options.quick else options.steps)]
+    words = ["--max-num-iterations", str(steps)]
     words += ["--world", world, "--device", "cpu", "--output-dir", str(place / "runs")]
     train, evaluate = (_common.console_script(f"unmix-{word}") for word in ("train", "eval"))
     folder = _common.run_command([train, "unmix-nerf", "--data", str(place / name), *words]).run
