@@ -41,7 +41,7 @@ from unmix_plugin.neumatex.prior_anchor import PriorAnchor, views_of
 from unmix_plugin.neumatex.spectral_evaluation import evaluate_spectral_image
 from unmix_plugin.neumatex.spectral_start import start_spectral
 from unmix_plugin.neumatex.tone.curves import ToneMapping, psnr_db, tone_curve
-from unmix_plugin.neumatex.tone.spectral import LampLog, SpectralDisplay
+from unmix_plugin.neumatex.tone.spectral import LampRatio, SpectralDisplay
 from unmix_plugin.neumatex.traced_object import SeenPoints, TracedObject, TracedObjectCache
 from unmix_plugin.neumatex.triplane import Triplane
 
@@ -265,7 +265,7 @@ class NeumatexModel(Model):
         if self.record.is_spectral:
             if name == "agx":
                 raise ConfigError("light-curve is agx, which is for 3 colours; choose auto, srgb or linear")
-            return LampLog(self.record.lamp) if name == "auto" else tone_curve(name)
+            return LampRatio(self.record.lamp) if name == "auto" else tone_curve(name)
         return tone_curve("agx" if name == "auto" else name)
 
     @torch.no_grad()

@@ -66,7 +66,7 @@ class NeumatexModelConfig(ModelConfig):
     """Texels along an edge of each of the three planes."""
     light_curve: LightCurve | Auto = "auto"
     """Tone curve through which pictures of linear light are compared in training; others are compared as they are. Auto
-    is agx for colours; for bands the logarithm of 1 + light over the lamp's power, so that dim bands count too."""
+    is agx for colours; for bands light over the lamp's power, its logarithm above 1, so that dim bands count too."""
 
     def __post_init__(self) -> None:
         """Refuse impossible settings.

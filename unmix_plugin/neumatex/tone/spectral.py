@@ -16,8 +16,13 @@ from unmix_plugin.spectral.colour.agx import agx
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
 
 
-class LampLog(nn.Module):
-    """Logarithm of 1 + light over the lamp's power: all bands count by their reflectance, highlights count less."""
+class LampRatio(nn.Module):
+    """Light over the lamp's power, so that all bands count by their reflectance; above 1 its logarithm, plus 1, so that
+    highlights do not outweigh all else.
+
+    It is straight where nearly all light is: a curve that bends makes noisy estimates look too dark on average, and
+    materials, dark ones most, would be fitted too bright.
+    """
 
     lamp: Tensor
 
@@ -31,7 +36,8 @@ class LampLog(nn.Module):
 
     def forward(self, light: Float[Tensor, "*pixels B"]) -> Float[Tensor, "*pixels B"]:
         """Numbers of at least 0."""
-        return torch.log1p(light / self.lamp)
+        ratio = light / self.lamp
+        return torch.where(ratio < 1, ratio, 1 + ratio.clamp(min=1).log())
 
 
 class SpectralDisplay(nn.Module):
