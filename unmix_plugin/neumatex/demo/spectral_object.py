@@ -173,6 +173,7 @@ def _write_pictures(
         "illuminant_path": "illuminant.csv",
         "environment_path": "environment.exr",
         "tone_mapping": "linear",
+        "value_scale": 1.0,
         **({"mesh_path": "mesh.glb", **truth, **_splits(frames)} if truth else {}),
         "frames": frames,
     }
