@@ -32,7 +32,7 @@ from unmix_plugin.scenes.geometry.lighting import judge_light
 from unmix_plugin.scenes.geometry.pose_check import check_scene_poses
 from unmix_plugin.scenes.identity import scene_identity
 from unmix_plugin.scenes.pixel_rays import PixelRays
-from unmix_plugin.scenes.pixel_table import PixelTable
+from unmix_plugin.scenes.pixel_table import Components, PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.recorded_scene import check_recorded_scene
 from unmix_plugin.scenes.scene import Scene, SceneOptions
@@ -83,6 +83,11 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
     """GiB of memory for training pixels. Auto is most of what the device has left. Pixels that need more stay in the
     scene's files, and a part of them is held that is renewed while training goes on."""
 
+    target_components: Components = "auto"
+    """Numbers to keep of each training pixel instead of one a band: its components in the subspace that the scene's
+    spectra lie in. Auto is none where all bands fit into the memory for training pixels, else, from 100 bands on, as
+    many as leave out no more than noise. What training compares are spectra on all bands in any case."""
+
     def __post_init__(self) -> None:
         """Refuse impossible settings.
 
@@ -97,6 +102,8 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
             or 0 <= self.single_ray_until <= 1,
             "grid-resolution of 8 to 512 or auto": self.grid_resolution == "auto"
             or 8 <= self.grid_resolution <= 512,
+            "target-components of at least 1, auto or none": isinstance(self.target_components, str)
+            or self.target_components >= 1,
             "max-initial-pixels of at least 1": self.max_initial_pixels >= 1,
         }
         require("the data manager", rules)
@@ -131,7 +138,6 @@ class HyperspectralDataManager(DataManager):
         self._rays = PixelRays(self.scene, device)
         self._preset = preset_for(self.scene.has_alpha, self.scene.is_unbounded)
         self._num_rays = config.train_num_rays_per_batch
-        self._bad_share = 0.0
         self._choose_subpixels(step=0, progress=0.0)
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
@@ -246,8 +252,8 @@ class HyperspectralDataManager(DataManager):
     def warnings(self) -> list[str]:
         """Poses that seem to follow another convention, sensors that share no band or no place with another, and bad
         bands and values."""
-        found = [check_scene_poses(self.scene), self._pixels.note]
-        found += noise_warnings(self.scene, self._noise, self._bad_share)
+        found = [check_scene_poses(self.scene), *self._pixels.notes]
+        found += noise_warnings(self.scene, self._noise, self._pixels.bad_share)
         found += rig_warnings(self.scene, self._initial_data["reachable"]) if self.scene.is_rig else []
         return [warning for warning in found if warning is not None]
 
@@ -264,9 +270,15 @@ class HyperspectralDataManager(DataManager):
     def _pixels(self) -> PixelTable:
         """Read when training asks: evaluation needs none of it."""
         memory_gb = None if self.options.memory_gb == "auto" else self.options.memory_gb
-        table = PixelTable(self.scene, self.device, self.scene.train_indices, memory_gb)
-        self._bad_share = table.mend(self.scene, self.seed) if self.options.mend_values else 0.0
-        return table
+        return PixelTable(
+            self.scene,
+            self.device,
+            self.scene.train_indices,
+            memory_gb,
+            components=self.options.target_components,
+            mends=self.options.mend_values,
+            seed=self.seed,
+        )
 
     @cached_property
     def _noise(self) -> dict[int, BandNoise]:

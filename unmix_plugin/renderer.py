@@ -26,6 +26,8 @@ from unmix_plugin.rendering.grid_cells import cells_at
 from unmix_plugin.rendering.marching import PackedSamples, march
 from unmix_plugin.spectral.coefficients import Coefficients
 
+_FIRST_SAMPLES = 8
+"""Of each ray, that are looked at before it is known whether light gets farther."""
 _SPREAD_DEPTH = 0.03
 """Optical depth of a sample from which on its part of the spread grows slower than the depth."""
 
@@ -131,7 +133,7 @@ class VolumeRenderer:
             generator: Shifts the samples of each ray at random, as training wants it; None takes them as they are.
         """
         samples = self._march(ray_bundle, generator)
-        kept, encoded = self._carrying_weight(field, samples, ray_bundle)
+        kept, encoded, num_seen = self._carrying_weight(field, samples, ray_bundle)
         positions, along = _points(kept, ray_bundle)
         densities, features = field.density_of(field.encode(positions, encoded))
         outputs = field.get_outputs(positions, along, features)
@@ -161,7 +163,7 @@ class VolumeRenderer:
         return RenderedRays(
             coefficients,
             mixtures,
-            len(samples),
+            num_seen,
             torch.log1p(depths / _SPREAD_DEPTH).sum() / max(len(ray_bundle), 1),
             self.space.to_unit(positions).detach(),
             weights,
@@ -249,12 +251,32 @@ class VolumeRenderer:
     @torch.no_grad()
     def _carrying_weight(
         self, field: CoefficientField, samples: PackedSamples, ray_bundle: RayBundle
-    ) -> tuple[PackedSamples, Float[Tensor, "kept LF"]]:
-        """The samples that contribute enough of their ray's light, and their encodings."""
-        encoded = field.encode(_points(samples, ray_bundle)[0])
-        densities, _ = field.density_of(encoded)
-        keep = volume_weights(densities * self.step, samples.packed_info) > self.smallest_weight
-        return samples.select(keep), encoded.index_select(0, keep.nonzero()[:, 0])
+    ) -> tuple[PackedSamples, Float[Tensor, "kept LF"], int]:
+        """The samples that contribute enough of their ray's light, their encodings, and how many were looked at.
+
+        The first samples of all rays are looked at first, then twice as many of the rays that still let light
+        through, and so on: what lies behind can't contribute enough, whatever it is.
+        """
+        starts, counts = samples.packed_info.unbind(-1)
+        depths, rows = torch.zeros_like(samples.t), torch.zeros_like(samples.ray_indices)
+        encoded: list[Tensor] = []
+        first, num_seen, left = 0, 0, torch.ones_like(counts, dtype=samples.t.dtype)
+        while True:
+            wanted = (counts - first).clamp(0, max(first, _FIRST_SAMPLES)) * (left > self.smallest_weight)
+            ends = wanted.cumsum(0)
+            size = int(ends[-1]) if len(ends) else 0
+            if size == 0 and encoded:
+                break
+            shifts = torch.repeat_interleave(starts + first - ends + wanted, wanted, output_size=size)
+            chosen = shifts + torch.arange(size, device=shifts.device)
+            part = samples if size == len(samples) else samples.rows(chosen)
+            encoded.append(field.encode(_points(part, ray_bundle)[0]))
+            found = field.density_of(encoded[-1])[0] * self.step
+            depths[chosen], rows[chosen] = found, torch.arange(num_seen, num_seen + size, device=rows.device)
+            totals = torch.zeros_like(left).index_add_(0, part.ray_indices, found)
+            left, first, num_seen = left * torch.exp(-totals), first + max(first, _FIRST_SAMPLES), num_seen + size
+        keep = volume_weights(depths, samples.packed_info) > self.smallest_weight
+        return samples.select(keep), torch.cat(encoded).index_select(0, rows[keep]), num_seen
 
 
 def scale_gradient(values: Float[Tensor, "*S"], factors: Float[Tensor, "*#S"]) -> Float[Tensor, "*S"]:

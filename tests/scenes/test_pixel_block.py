@@ -15,7 +15,8 @@ CPU = torch.device("cpu")
 
 def read_block(scene, views: tuple[int, ...]) -> PixelBlock:
     block = PixelBlock(scene, views, tuple(range(len(views))))
-    block.read(CPU)
+    block.read_alpha(CPU)
+    block.hold()
     return block
 
 
@@ -75,7 +76,8 @@ def test_pixels_on_disk_are_the_same_as_those_in_memory(tmp_path, stored, scale,
     )
     scene = load_scene(folder.root, SceneOptions(value_scale=scale))
     held, mapped = read_block(scene, (1, 3, 4)), PixelBlock(scene, (1, 3, 4), (0, 1, 2))
-    mapped.read(CPU, pool_bytes=1)
+    mapped.read_alpha(CPU)
+    mapped.hold_part(1)
     assert torch.equal(mapped._read_range(250, 700), held._values[250:700])
     assert mapped.pool is not None
     pixels, values = mapped.pool.draw(200, 3, torch.Generator().manual_seed(0))
@@ -91,13 +93,12 @@ def test_pixels_are_held_unless_they_need_more_than_the_budget(tmp_path, monkeyp
     scene = load_scene(make_scene(tmp_path / "scene").root)
     needed = 5 * 320 * (4 * 2 + 5)
     monkeypatch.setattr(memory, "available_bytes", lambda _: 2 * needed)
-    assert PixelTable(scene, CPU, scene.train_indices).note is None
-    assert PixelTable(scene, CPU, scene.train_indices, memory_gb=(needed + 1) / 2**30).note is None
-    note = PixelTable(scene, CPU, scene.train_indices, memory_gb=(needed - 1) / 2**30).note
-    assert note is not None
+    assert PixelTable(scene, CPU, scene.train_indices).notes == []
+    assert PixelTable(scene, CPU, scene.train_indices, memory_gb=(needed + 1) / 2**30).notes == []
+    [note] = PixelTable(scene, CPU, scene.train_indices, memory_gb=(needed - 1) / 2**30).notes
     assert "5 views x 16 x 20 pixels x 4 bands x 2 bytes are 1.94e-05 GiB" in note
     monkeypatch.setattr(memory, "available_bytes", lambda _: needed)
-    assert PixelTable(scene, CPU, scene.train_indices).note is not None
+    assert PixelTable(scene, CPU, scene.train_indices).notes != []
 
 
 def test_the_memory_left_is_known_on_this_machine():
@@ -124,9 +125,9 @@ def test_mended_pixels_are_kept_as_small_as_others(tmp_path, stored, scale):
     for index in range(6):
         folder.edit_cube(index, lambda cube, index=index: write(cube, bad=index == 3))
     scene = load_scene(folder.root, SceneOptions(value_scale=scale))
-    table = PixelTable(scene, CPU, (1, 3))
-    size = table.blocks[0]._values.element_size()
-    assert table.mend(scene, seed=0) == pytest.approx(1 / (2 * 320 * 10))
+    size = PixelTable(scene, CPU, (1, 3)).blocks[0]._values.element_size()
+    table = PixelTable(scene, CPU, (1, 3), mends=True)
+    assert table.bad_share == pytest.approx(1 / (2 * 320 * 10))
     mended = table.blocks[0].spectra(torch.tensor([320 + 8 * 20 + 10]))[0]
     expected = torch.from_numpy(scene.cube(1)[8, 10])
     assert torch.allclose(mended, expected, atol=0.01)

@@ -33,6 +33,12 @@ class PackedSamples:
     def __len__(self) -> int:
         return len(self.t)
 
+    def rows(self, chosen: Int[Tensor, "some"]) -> PackedSamples:
+        """Some samples by their places, with no regard to which belong to one ray: `packed_info` stays as it is."""
+        return PackedSamples(
+            self.t.index_select(0, chosen), self.ray_indices.index_select(0, chosen), self.packed_info, self.step
+        )
+
     def select(self, keep: Bool[Tensor, "S"]) -> PackedSamples:
         """Only the samples marked in `keep`, still packed."""
         kept_before = torch.cat([keep.new_zeros(1, dtype=torch.int64), keep.cumsum(0)])

@@ -17,8 +17,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from unmix_plugin.scenes.pixel_table.pool import PixelPool
+from unmix_plugin.scenes.pixel_table.projection import ProjectedPixels
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bad_values import repaired
+from unmix_plugin.spectral.subspace import SpectralSubspace
 
 COMPACT_TYPES = ("f2", "u1", "i1", "i2", "u2")
 """Of NumPy, at most half as large as float32."""
@@ -44,11 +46,13 @@ class DrawnPixels:
 
 
 class PixelBlock:
-    """All pixels of some views of one sensor, view after view, row after row. Nothing is read before `read`."""
+    """All pixels of some views of one sensor, view after view, row after row. Nothing is read before `read_alpha`."""
 
     alpha: Float[Tensor, " pixels"]
     valid: Bool[Tensor, " pixels"]
     """Pixels that count, on the CPU."""
+    num_bad: int
+    """Values that were replaced by what is around them."""
 
     def __init__(self, scene: Scene, views: tuple[int, ...], cameras: tuple[int, ...]) -> None:
         """
@@ -64,7 +68,11 @@ class PixelBlock:
         self._is_compact = kind in COMPACT_TYPES
         self._is_unsigned = kind == "u2"  # PyTorch can't index these, but the same bits as int16
         self._kept = np.dtype("i2" if self._is_unsigned else kind if self._is_compact else "f4")
-        self._num_channels = scene.sensors[self.sensor].num_channels
+        self.num_channels = scene.sensors[self.sensor].num_channels
+        self.num_bad = 0
+        self.pool: PixelPool | None = None
+        self._projected: ProjectedPixels | None = None
+        self._values: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self._views) * self._width * self._height
@@ -77,64 +85,89 @@ class PixelBlock:
     @property
     def num_bytes(self) -> int:
         """Memory that the pixels take."""
-        return len(self) * (self._num_channels * self.value_bytes + 5)
+        return len(self) * (self.num_channels * self.value_bytes + 5)
 
     @property
     def description(self) -> str:
         """What makes it so large."""
         return (
-            f"{len(self._views)} views x {self._height} x {self._width} pixels x {self._num_channels} bands x "
+            f"{len(self._views)} views x {self._height} x {self._width} pixels x {self.num_channels} bands x "
             f"{self.value_bytes} bytes"
         )
 
-    def read(self, device: torch.device, pool_bytes: int | None = None) -> None:
-        """Read the pixels to a device; with `pool_bytes` values stay on disk, and so much of them is held for draws."""
+    def read_alpha(self, device: torch.device) -> None:
+        """Read to a device what is known of all pixels beside their spectra, which are then read from disk."""
         scene, num_pixels = self._scene, self._width * self._height
-        shape = (len(self._views), num_pixels)
-        blank = torch.from_numpy(np.empty(0, self._kept))
-        size = 0 if pool_bytes is not None else num_pixels
-        values = torch.empty(shape[0], size, self._num_channels, dtype=blank.dtype, device=device)
         ones = torch.ones(1, device=device)
         alpha = ones.repeat(len(self)) if scene.has_alpha else ones.expand(len(self))  # which takes no memory
-        valid = torch.empty(shape, dtype=torch.bool)
+        valid = torch.empty(len(self._views), num_pixels, dtype=torch.bool)
         for row, view in enumerate(self._views):
-            if pool_bytes is None:
-                values[row] = self._stored(view, ())
             valid[row] = torch.from_numpy(scene.valid_mask(view)).flatten()
             opacity = scene.alpha(view)
             if opacity is not None:
                 alpha[row * num_pixels :][:num_pixels] = torch.from_numpy(opacity).flatten()
-        self._values, self.alpha, self.valid = values.flatten(0, 1), alpha, valid.flatten()
+        self.alpha, self.valid = alpha, valid.flatten()
         self._camera_of = torch.tensor(self.cameras, device=device)
-        pixel_bytes = self._num_channels * self.value_bytes
-        self.pool = (
-            None
-            if pool_bytes is None or not self.valid.any()
-            else PixelPool(self.valid, pixel_bytes, pool_bytes, self._read_range)
-        )
 
-    def mend(self, limits: Float[Tensor, " b"]) -> int:
-        """Replace stripes and spikes by what is around them, of values held in memory; how many there were.
+    def hold(self) -> None:
+        """Read all values into the memory of the device."""
+        num_pixels = self._width * self._height
+        blank = torch.from_numpy(np.empty(0, self._kept))
+        values = blank.new_empty(
+            len(self._views), num_pixels, self.num_channels, device=self._camera_of.device
+        )
+        for row, view in enumerate(self._views):
+            values[row] = self._stored(view, ())
+        self._values = values.flatten(0, 1)
+
+    def hold_part(self, num_bytes: int) -> None:
+        """Leave the values on disk, and hold so much of them for draws."""
+        if self.valid.any():
+            pixel_bytes = self.num_channels * self.value_bytes
+            self.pool = PixelPool(self.valid, pixel_bytes, num_bytes, self._read_range)
+
+    def hold_projected(self, subspace: SpectralSubspace, limits: Float[Tensor, " b"] | None) -> None:
+        """Read all values, and hold of each pixel its components in a subspace.
+
+        Args:
+            limits: As `mend` takes them; None replaces nothing.
+        """
+        num_pixels = self._width * self._height
+        projected = ProjectedPixels(subspace, len(self), self.num_channels, self._camera_of.device)
+        for row, view in enumerate(self._views):
+            spectra = self._scaled(self._stored(view, ()))
+            if limits is not None:
+                image = spectra.view(self._height, self._width, self.num_channels)
+                is_bad, values = repaired(image, limits)
+                image[is_bad] = values
+                self.num_bad += len(values)
+            projected.put(row * num_pixels, spectra)
+        self._projected = projected
+
+    def mend(self, limits: Float[Tensor, " b"]) -> None:
+        """Replace stripes and spikes by what is around them, of values held in memory.
 
         Args:
             limits: As `deviation_limits` gives them.
         """
-        size, count = self._width * self._height, 0
-        shape = (self._height, self._width, self._num_channels)
+        assert self._values is not None
+        size = self._width * self._height
+        shape = (self._height, self._width, self.num_channels)
         for first in range(0, len(self), size):
             image = self._scaled(self._values[first : first + size]).cpu().view(shape)
             is_bad, values = repaired(image, limits.cpu())
             if len(values):
                 view = self._values[first : first + size].view(shape)
-                view[is_bad.to(view.device)] = self._as_stored(values).to(view.device)
-                count += len(values)
-        return count
+                view[is_bad.to(view.device)] = self._as_stored(values).to(view)
+                self.num_bad += len(values)
 
     def spectra(self, pixels: Int[Tensor, " R"]) -> Float[Tensor, "R b"]:
         """Spectra of some pixels in [0, 1], the numbers of `Scene.cube`; only of valid ones."""
-        if self.pool is not None:
-            return self._scaled(self._gathered(pixels.cpu())).to(self.alpha.device)
-        return self._scaled(self._values[pixels])
+        if self._projected is not None:
+            return self._projected.spectra(pixels)
+        if self._values is not None:
+            return self._scaled(self._values[pixels])
+        return self._scaled(self._gathered(pixels.cpu())).to(self.alpha.device)
 
     def _scaled(self, values: Tensor) -> Float[Tensor, "R b"]:
         if not self._is_compact:
@@ -145,15 +178,15 @@ class PixelBlock:
         return (values if scale is None else values / scale).clamp(0.0, 1.0)
 
     def _as_stored(self, values: Float[Tensor, " values"]) -> Tensor:
-        """Spectra as `_scaled` takes them."""
+        """Spectra as `_scaled` takes them, not yet of the type that is stored."""
         if not self._is_compact:
             return values
         scale = self._scene.options.value_scale
         values = values if scale is None else values * scale
         if self._kept.kind == "f":
-            return values.to(self._values.dtype)
+            return values
         whole = values.round().to(torch.int32)
-        return torch.where(whole > _LARGEST_INT16, whole - _UINT16_VALUES, whole).to(self._values.dtype)
+        return torch.where(whole > _LARGEST_INT16, whole - _UINT16_VALUES, whole)
 
     def images(self) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         """Of each view spectra (H, W, b), alpha and which pixels are valid (H, W); on the CPU."""
@@ -186,7 +219,7 @@ class PixelBlock:
     def _stored(self, view: int, part: tuple[slice | np.ndarray, ...]) -> Tensor:
         """Values (pixels, b) of a part of a view."""
         cube = self._scene.stored_cube(view, part) if self._is_compact else self._scene.cube(view, part)
-        return torch.from_numpy(cube.reshape(-1, self._num_channels).view(self._kept))
+        return torch.from_numpy(cube.reshape(-1, self.num_channels).view(self._kept))
 
     def _read_range(self, first: int, last: int) -> Tensor:
         """Values of neighbouring pixels of the block, whole rows at a time."""
@@ -202,7 +235,7 @@ class PixelBlock:
         """Values of any pixels of the block, from disk."""
         size = self._width * self._height
         rows = torch.div(pixels, size, rounding_mode="floor")
-        found = torch.empty(len(pixels), self._num_channels, dtype=self._values.dtype)
+        found = torch.from_numpy(np.empty((len(pixels), self.num_channels), self._kept))
         for row in rows.unique().tolist():
             chosen = (rows == row).nonzero()[:, 0]
             lines, columns = np.divmod((pixels[chosen] - row * size).numpy(), self._width)

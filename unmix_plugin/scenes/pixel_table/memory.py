@@ -37,29 +37,28 @@ def available_bytes(device: torch.device) -> int | None:
     return min(free, max(0, limit - used))
 
 
-def pool_bytes(blocks: tuple[PixelBlock, ...], device: torch.device, memory_gb: float | None) -> int | None:
-    """How much of the pixels' values to hold at a time; None if all of them fit.
+def budget_bytes(device: torch.device, memory_gb: float | None) -> int | None:
+    """Memory that pixels may take; None where nothing limits it.
 
     Args:
-        memory_gb: What pixels may take, in GiB; None: most of what the device has left.
+        memory_gb: In GiB; None: most of what the device has left.
     """
-    needed = sum(block.num_bytes for block in blocks)
     if memory_gb is not None:
-        budget = int(memory_gb * _GIB)
-        return None if needed <= budget else budget
+        return int(memory_gb * _GIB)
     available = available_bytes(device)
     if available is not None and device.type == "cpu":
         available //= processes_here()
-    if available is None or needed <= _USABLE_SHARE * available:
-        return None
-    return min(_LARGEST_POOL, int(_USABLE_SHARE * available))
+    return None if available is None else int(_USABLE_SHARE * available)
 
 
-def describe_pool(blocks: tuple[PixelBlock, ...]) -> str | None:
-    """What stays on disk, in words; None if nothing does."""
+def pool_bytes(budget: int, memory_gb: float | None) -> int:
+    """How much of pixels on disk to hold at a time; arguments as above."""
+    return budget if memory_gb is not None else min(_LARGEST_POOL, budget)
+
+
+def describe_pool(blocks: tuple[PixelBlock, ...]) -> str:
+    """What stays on disk, in words."""
     held = sum(block.pool.num_bytes for block in blocks if block.pool is not None)
-    if held == 0:
-        return None
     what, needed = " and ".join(block.description for block in blocks), sum(b.num_bytes for b in blocks)
     return (
         f"the training pixels stay on disk: {what} are {needed / _GIB:.3g} GiB; {held / _GIB:.3g} GiB of them are in "

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cached_property
 from itertools import accumulate
+from typing import Literal, TypeAlias
 
 import numpy as np
 import torch
@@ -15,11 +16,13 @@ from unmix_plugin.engine.training.seeding import step_generator
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.pixel_table import memory
 from unmix_plugin.scenes.pixel_table.block import DrawnPixels, PixelBlock
+from unmix_plugin.scenes.pixel_table.projection import FEWEST_CHANNELS, Projection
 from unmix_plugin.scenes.scene import Scene
-from unmix_plugin.spectral.bad_values import FEWEST_BANDS, deviation_limits
+from unmix_plugin.spectral.bad_values import FEWEST_BANDS, deviation_limits, deviations
 
+Components: TypeAlias = int | Literal["auto", "none"]
 OPAQUE_ALPHA = 0.99
-_PIXELS_TO_MEND_BY = 20_000
+_PIXELS_TO_JUDGE_BY = 20_000
 MOST_LISTED = 1 << 24
 """Pixels of a block that are listed one by one to sample from; of larger blocks some are."""
 
@@ -28,12 +31,25 @@ class PixelTable:
     """What training draws from; a draw is a function of its generator and the step alone."""
 
     def __init__(
-        self, scene: Scene, device: torch.device, views: tuple[int, ...], memory_gb: float | None = None
+        self,
+        scene: Scene,
+        device: torch.device,
+        views: tuple[int, ...],
+        memory_gb: float | None = None,
+        *,
+        components: Components = "none",
+        mends: bool = False,
+        seed: int = 0,
     ) -> None:
         """Read the pixels, or what of them `memory_gb` GiB hold; None for most of the memory that is left.
 
+        Args:
+            components: Numbers a pixel to keep instead of its channels. Auto is none where all channels fit.
+            mends: Whether to replace stripes and spikes in memory (see `spectral.bad_values`).
+            seed: Of the pixels by which the scene is judged.
         Raises:
             ConfigError: no pixel is valid.
+            SpectrumError: too few pixels for so many components.
         """
         cameras_of: dict[int, list[int]] = {}
         for camera, view in enumerate(views):
@@ -42,14 +58,66 @@ class PixelTable:
             PixelBlock(scene, tuple(views[camera] for camera in cameras), tuple(cameras))
             for _, cameras in sorted(cameras_of.items())
         )
-        held, total = memory.pool_bytes(self.blocks, device, memory_gb), sum(b.num_bytes for b in self.blocks)
-        for block in self.blocks:
-            block.read(device, None if held is None else held * block.num_bytes // total)
-        self.note = memory.describe_pool(self.blocks)
-        """What a user should know of pixels that stay on disk; None if none does."""
         self._firsts = list(accumulate((len(block) for block in self.blocks), initial=0))
+        for block in self.blocks:
+            block.read_alpha(device)
         if not any(bool(block.valid.any()) for block in self.blocks):
             raise ConfigError("no valid pixel is left in the training views: masks leave out every one")
+        self._scene, self._seed, self._mends = scene, seed, mends
+        self.notes = self._read(memory.budget_bytes(device, memory_gb), memory_gb, components)
+        """What a user should know of pixels that are not held as they were stored."""
+
+    def _read(self, budget: int | None, memory_gb: float | None, components: Components) -> list[str]:
+        needed = {block.sensor: block.num_bytes for block in self.blocks}
+        fits = budget is None or sum(needed.values()) <= budget
+        found = {} if components == "none" or (components == "auto" and fits) else self._projected(components)
+        for sensor, (projection, block) in found.items():
+            needed[sensor] = int(len(block) * (5 + projection.pixel_bytes(block.num_channels)))
+        if budget is not None and sum(needed.values()) > budget:
+            held, total = memory.pool_bytes(budget, memory_gb), sum(block.num_bytes for block in self.blocks)
+            for block in self.blocks:
+                block.hold_part(held * block.num_bytes // total)
+            return [memory.describe_pool(self.blocks)]
+        for block in self.blocks:
+            limits = self._limits(block)
+            if block.sensor in found:
+                block.hold_projected(found[block.sensor][0].subspace, limits)
+                continue
+            block.hold()
+            if limits is not None:
+                block.mend(limits)
+        return [projection.describe(block.num_channels) for projection, block in found.values()]
+
+    def _projected(self, components: Components) -> dict[int, tuple[Projection, PixelBlock]]:
+        """By sensor, of blocks whose pixels are to be kept as components."""
+        number = None if isinstance(components, str) else components
+        found = {}
+        for block in self.blocks:
+            if block.num_channels > (number or FEWEST_CHANNELS - 1):
+                pixels = torch.from_numpy(self.sample_opaque(block.sensor, _PIXELS_TO_JUDGE_BY, self._seed))
+                limits = self._limits(block)
+                if limits is not None:
+                    pixels = pixels[(deviations(pixels).abs() <= limits).all(dim=1)]
+                projection = Projection.of(pixels, number) if len(pixels) > 2 * block.num_channels else None
+                whole = block.num_channels * block.value_bytes
+                if projection is not None and (number is not None or projection.pays(whole)):
+                    found[block.sensor] = projection, block
+        return found
+
+    def _limits(self, block: PixelBlock) -> Float[Tensor, " b"] | None:
+        """From which on deviations in a block may be bad values; None where they are not looked for."""
+        bands = self._scene.sensors[block.sensor].bands
+        if not self._mends or bands is None or len(bands) < FEWEST_BANDS or list(bands) != sorted(bands):
+            return None
+        pixels = torch.from_numpy(self.sample_opaque(block.sensor, _PIXELS_TO_JUDGE_BY, self._seed))
+        return deviation_limits(pixels) if len(pixels) else None
+
+    @property
+    def bad_share(self) -> float:
+        """Share of the values in memory that were replaced by what is around them."""
+        return sum(block.num_bad for block in self.blocks) / sum(
+            len(block) * block.num_channels for block in self.blocks
+        )
 
     def __len__(self) -> int:
         return self._firsts[-1]
@@ -78,14 +146,15 @@ class PixelTable:
             step: Of the training; what pixels on disk are drawn from moves on with it.
             shares: Of the pixels drawn, by sensor; None draws all valid ones evenly.
         """
-        if self.note is None and len(self.blocks) == 1:
+        is_held = all(block.pool is None for block in self.blocks)
+        if is_held and len(self.blocks) == 1:
             return (self.blocks[0].take(self._drawn(0, count, generator), 0),)
         counts = self._counts(count, generator, self.shares if shares is None else shares)
         groups = []
         for index, (block, number) in enumerate(zip(self.blocks, counts, strict=True)):
             if number == 0:
                 continue
-            if self.note is None:
+            if is_held:
                 groups.append(block.take(self._drawn(index, number, generator), self._firsts[index]))
             elif block.pool is not None:
                 pixels, stored = block.pool.draw(number, step, generator)
@@ -105,24 +174,6 @@ class PixelTable:
         bounds = torch.tensor([shares.get(block.sensor, 0.0) for block in self.blocks]).cumsum(0)
         places = torch.rand(count, generator=generator).clamp(max=float(bounds[-1]) - 1e-6)
         return torch.bincount(torch.searchsorted(bounds, places), minlength=len(self.blocks)).tolist()
-
-    def mend(self, scene: Scene, seed: int) -> float:
-        """Replace stripes and spikes in memory (see `spectral.bad_values`); share of the values that were bad."""
-        bad = total = 0
-        for block in self.blocks:
-            bands = scene.sensors[block.sensor].bands
-            if (
-                block.pool is not None
-                or bands is None
-                or len(bands) < FEWEST_BANDS
-                or list(bands) != sorted(bands)
-            ):
-                continue
-            pixels = torch.from_numpy(self.sample_opaque(block.sensor, _PIXELS_TO_MEND_BY, seed))
-            if len(pixels):
-                bad += block.mend(deviation_limits(pixels))
-                total += len(block) * len(bands)
-        return bad / max(total, 1)
 
     def sample_opaque(self, sensor: int, count: int, seed: int) -> Float[np.ndarray, "pixels b"]:
         """Spectra of at most `count` random valid pixels of a sensor that are opaque."""

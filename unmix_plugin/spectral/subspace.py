@@ -1,0 +1,88 @@
+"""A few spectra of which all spectra of a scene are sums but for noise, so that pixels can be kept as few numbers.
+
+Bands are weighted so that noise is alike in all of them; then the leading eigenvectors of the weighted spectra's second
+moments are an orthonormal basis of which no other of its size misses less. There is no mean spectrum: black stays
+black, and a pixel half as bright has half the numbers.
+
+Notation: `N` pixels, `B` bands, `P` components.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from unmix_plugin.errors import SpectrumError
+from unmix_plugin.spectral.evidence import brightness
+from unmix_plugin.spectral.unmixing.num_materials import estimate_noise
+
+LEAST_NOISE = 0.005
+"""Noise that is assumed at least, as a share of the median brightness: what any model misses is more."""
+_SHARE, _SIGMAS_OF_SHARE = 0.95, 1.96
+"""Of normal errors, so many are within so many standard deviations; spikes are among the others."""
+
+
+@dataclass(frozen=True)
+class SpectralSubspace:
+    """Where the spectra of a scene lie but for noise."""
+
+    weights: Float[Tensor, "B"]
+    """Of the bands, in (0, 1]: the least noise of a band over its own."""
+    basis: Float[Tensor, "P B"]
+    """Orthonormal rows, of weighted bands."""
+    noise: float
+    """Standard deviation of the noise in every weighted band."""
+
+    def __len__(self) -> int:
+        return len(self.basis)
+
+    def to(self, device: torch.device) -> SpectralSubspace:
+        """The same on a device."""
+        return SpectralSubspace(self.weights.to(device), self.basis.to(device), self.noise)
+
+    def components(self, spectra: Float[Tensor, "N B"]) -> Float[Tensor, "N P"]:
+        """Spectra as sums of the basis; of spectra in [0, 1] none is larger than the root of B."""
+        return (spectra * self.weights) @ self.basis.T
+
+    def spectra(self, components: Float[Tensor, "N P"]) -> Float[Tensor, "N B"]:
+        """The spectra that components stand for."""
+        return components @ (self.basis / self.weights)
+
+    def residuals(
+        self, spectra: Float[Tensor, "N B"], components: Float[Tensor, "N P"]
+    ) -> Float[Tensor, "N"]:
+        """What components miss of spectra: root mean square over weighted bands, in multiples of the noise."""
+        return brightness((spectra - self.spectra(components)) * self.weights) / self.noise
+
+
+def find_subspace(pixels: Float[Tensor, "N B"], num_components: int | None = None) -> SpectralSubspace:
+    """The subspace of pixels; with the fewest components that miss no more than the noise, unless a number is given.
+
+    Args:
+        pixels: Spectra of a scene, background left out.
+        num_components: P; None finds it.
+    Raises:
+        SpectrumError: not more pixels than bands, or more components than bands.
+    """
+    num_pixels, num_bands = pixels.shape
+    if num_pixels <= num_bands or not 1 <= (num_components or 1) <= num_bands:
+        raise SpectrumError(
+            f"a subspace of {num_components or 'some'} components needs at least as many bands, and more pixels than "
+            f"bands; found {num_pixels} pixels of {num_bands} bands"
+        )
+    least = max(LEAST_NOISE * float(brightness(pixels).median()), 1e-6)
+    rank = max(1, round(_SHARE * num_pixels))
+    sigmas = estimate_noise(pixels).abs().kthvalue(rank, dim=0).values.double() / _SIGMAS_OF_SHARE
+    sigmas = sigmas.clamp(min=least)
+    noise = float(sigmas.min())
+    weights = noise / sigmas
+    weighted = pixels.double() * weights
+    strengths, vectors = torch.linalg.eigh(weighted.T @ weighted / num_pixels)
+    missed = strengths.cumsum(0).flip(0) - strengths.flip(0)  # with one component, with two, ...
+    if num_components is None:
+        num_components = int((missed > num_bands * noise**2).sum()) + 1
+    basis = vectors.flip(1)[:, :num_components].T
+    return SpectralSubspace(weights.float(), basis.contiguous().float(), noise)
