@@ -68,10 +68,11 @@ def find_subspace(pixels: Float[Tensor, "N B"], num_components: int | None = Non
         SpectrumError: not more pixels than bands, or more components than bands.
     """
     num_pixels, num_bands = pixels.shape
-    if num_pixels <= num_bands or not 1 <= (num_components or 1) <= num_bands:
+    if num_pixels <= num_bands or (num_components is not None and not 1 <= num_components <= num_bands):
+        asked = "any components" if num_components is None else f"{num_components} components"
         raise SpectrumError(
-            f"a subspace of {num_components or 'some'} components needs at least as many bands, and more pixels than "
-            f"bands; found {num_pixels} pixels of {num_bands} bands"
+            f"a subspace of {asked} needs 1 to as many components as bands, and more pixels than bands; found "
+            f"{num_pixels} pixels of {num_bands} bands"
         )
     least = max(LEAST_NOISE * float(brightness(pixels).median()), 1e-6)
     rank = max(1, round(_SHARE * num_pixels))

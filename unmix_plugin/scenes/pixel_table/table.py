@@ -98,9 +98,10 @@ class PixelTable:
                 limits = self._limits(block)
                 if limits is not None:
                     pixels = pixels[(deviations(pixels).abs() <= limits).all(dim=1)]
-                projection = Projection.of(pixels, number) if len(pixels) > 2 * block.num_channels else None
-                whole = block.num_channels * block.value_bytes
-                if projection is not None and (number is not None or projection.pays(whole)):
+                if number is None and len(pixels) < 2 * (block.num_channels + 1):
+                    continue
+                projection = Projection.of(pixels, number)
+                if number is not None or projection.pays(block.num_channels * block.value_bytes):
                     found[block.sensor] = projection, block
         return found
 

@@ -1,0 +1,117 @@
+"""Pixels kept as few numbers are what they were but for noise; what they can't hold is kept whole."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.scenes.scene_factory import make_scene
+from unmix_plugin.errors import SpectrumError
+from unmix_plugin.scenes import load_scene
+from unmix_plugin.scenes.pixel_table import PixelTable, memory
+from unmix_plugin.scenes.pixel_table import table as table_module
+from unmix_plugin.scenes.pixel_table.projection import ProjectedPixels, Projection
+from unmix_plugin.scenes.scene import Scene
+from unmix_plugin.spectral.subspace import find_subspace
+
+CPU = torch.device("cpu")
+BANDS = 48
+VIEWS = (0, 1, 2, 3, 4)
+WHOLE = 5 * 320 * (2 * BANDS + 5)
+"""Bytes of all pixels of these views with all of their bands."""
+
+
+@pytest.fixture(autouse=True)
+def few_bands_are_enough(monkeypatch):
+    """So that the few opaque pixels of a tiny scene tell their subspace."""
+    monkeypatch.setattr(table_module, "FEWEST_CHANNELS", BANDS)
+
+
+def spectra_of(cube: np.ndarray, change=None) -> np.ndarray:
+    """From four bands to `BANDS` that mix three smooth spectra."""
+    nm = np.linspace(0, 1, BANDS)
+    smooth = np.stack([np.exp(-(((nm - centre) / 0.3) ** 2)) for centre in (0.1, 0.5, 0.9)])
+    wide = cube[..., :3].astype(np.float64) @ smooth
+    height, width = cube.shape[:2]
+    wide *= 1 + 0.3 * np.sin(np.arange(width))[:, None] * np.cos(np.arange(height))[:, None, None] * smooth[1]
+    if change is not None:
+        change(wide)
+    return wide.clip(0, 1).astype("<f2")
+
+
+def make(folder, change=None) -> Scene:
+    scene = make_scene(folder)
+    scene.edit(lambda content: content.update(wavelengths=[450.0 + 2 * band for band in range(BANDS)]))
+    scene.edit(lambda content: [content.pop(key, None) for key in ("endmembers_path", "illuminant_path")])
+    for index in range(6):
+        scene.edit_cube(index, lambda cube, i=index: spectra_of(cube, change if i == 3 else None))
+    return load_scene(scene.root)
+
+
+def test_odd_and_saturated_pixels_are_kept_whole():
+    generator = torch.Generator().manual_seed(0)
+    nm = torch.linspace(0, 1, BANDS)
+    smooth = torch.stack([torch.exp(-(((nm - centre) / 0.3) ** 2)) for centre in (0.1, 0.5, 0.9)])
+    pixels = torch.rand(2000, 3, generator=generator) @ smooth / 3
+    subspace = find_subspace(pixels[:1000], 3)
+    pixels[700], pixels[1700, 4:7] = torch.rand(BANDS, generator=generator), 1.0
+    held = ProjectedPixels(subspace, 2000, BANDS, CPU)
+    for first in (0, 1000):
+        held.put(first, pixels[first : first + 1000])
+    assert torch.equal(held.spectra(torch.tensor([1700, 3, 700]))[[0, 2]], pixels[[1700, 700]].half().float())
+    others = torch.tensor([index for index in range(2000) if index not in (700, 1700)])
+    torch.testing.assert_close(held.spectra(others), pixels[others], atol=1e-3, rtol=0)
+    assert held.num_bytes == 2000 * 3 * 2 + 2 * (8 + 2 * BANDS)
+    assert Projection.of(pixels, 3).whole_share == pytest.approx(0.002)
+
+
+def test_pixels_that_do_not_fit_are_projected_and_drawn_as_if_they_were_held(tmp_path, monkeypatch):
+    scene = make(tmp_path / "scene")
+    plain = PixelTable(scene, CPU, VIEWS)
+    monkeypatch.setattr(memory, "available_bytes", lambda _: WHOLE)
+    few = PixelTable(scene, CPU, VIEWS, components="auto")
+    [note] = few.notes
+    assert f"instead of {BANDS} (target-components)" in note
+    [found], [expected] = (
+        table.draw(300, torch.Generator().manual_seed(1), step=7) for table in (few, plain)
+    )
+    for name in ("numbers", "cameras", "corners", "alpha"):
+        assert torch.equal(getattr(found, name), getattr(expected, name))
+    assert float((found.spectra - expected.spectra).square().mean().sqrt()) < 0.004
+    assert torch.equal(found.spectra[expected.alpha == 0], expected.spectra[expected.alpha == 0])
+
+
+def test_auto_projects_neither_what_fits_nor_what_has_no_subspace(tmp_path, monkeypatch):
+    def rough(cube: np.ndarray) -> None:
+        cube += 0.4 * np.random.default_rng(0).random(cube.shape)
+
+    scene = make(tmp_path / "scene")
+    fits = PixelTable(scene, CPU, VIEWS, components="auto")
+    assert fits.notes == []
+    assert torch.equal(
+        fits.blocks[0].spectra(torch.arange(1600)),
+        PixelTable(scene, CPU, VIEWS).blocks[0].spectra(torch.arange(1600)),
+    )
+    monkeypatch.setattr(memory, "available_bytes", lambda _: WHOLE)
+    [note] = PixelTable(make(tmp_path / "rough", rough), CPU, VIEWS, components="auto").notes
+    assert "stay on disk" in note
+
+
+def test_a_given_number_is_taken_and_its_residual_said(tmp_path):
+    scene = make(tmp_path / "scene")
+    [note] = PixelTable(scene, CPU, VIEWS, components=2).notes
+    assert f"kept as 2 numbers instead of {BANDS}" in note
+    assert PixelTable(scene, CPU, VIEWS, components=BANDS).notes == []
+    with pytest.raises(SpectrumError, match="more pixels than bands"):
+        PixelTable(scene, CPU, (1,), components=2)
+
+
+def test_bad_values_are_replaced_before_pixels_are_projected(tmp_path):
+    def spike(cube: np.ndarray) -> None:
+        cube[8, 10, 40] = 0.0
+
+    scene, clean = make(tmp_path / "bad", spike), make(tmp_path / "clean")
+    table = PixelTable(scene, CPU, VIEWS, components=5, mends=True)
+    assert len(table.notes) == 1
+    assert table.bad_share == pytest.approx(1 / (5 * 320 * BANDS))
+    found = table.blocks[0].spectra(torch.tensor([3 * 320 + 8 * 20 + 10]))[0]
+    torch.testing.assert_close(found, torch.from_numpy(clean.cube(3)[8, 10]), atol=0.01, rtol=0)
