@@ -88,6 +88,15 @@ class PixelBlock:
         return len(self) * (self.num_channels * self.value_bytes + 5)
 
     @property
+    def held_bytes(self) -> int:
+        """Memory that spectra take once they are read."""
+        if self._projected is not None:
+            return self._projected.num_bytes
+        if self._values is not None:
+            return self._values.numel() * self._values.element_size()
+        return 0 if self.pool is None else self.pool.num_bytes
+
+    @property
     def description(self) -> str:
         """What makes it so large."""
         return (
