@@ -59,7 +59,10 @@ def main(options: Options) -> None:
         make_demo_scene(folder / "scene", size, options.bands, views)
         whole = prepared(folder, steps, "4")
         needed = held_bytes(whole)
-        trainers = {"all bands": whole, "components": prepared(folder, steps, str(max(0.01, needed / 3 / _GIB)))}
+        trainers = {
+            "all bands": whole,
+            "components": prepared(folder, steps, str(max(0.01, needed / 3 / _GIB))),
+        }
         notes = manager_of(trainers["components"]).warnings()
         seconds = train_in_turn(list(trainers.values()), steps)
         measured = {

@@ -274,7 +274,11 @@ class VolumeRenderer:
             found = field.density_of(encoded[-1])[0] * self.step
             depths[chosen], rows[chosen] = found, torch.arange(num_seen, num_seen + size, device=rows.device)
             totals = torch.zeros_like(left).index_add_(0, part.ray_indices, found)
-            left, first, num_seen = left * torch.exp(-totals), first + max(first, _FIRST_SAMPLES), num_seen + size
+            left, first, num_seen = (
+                left * torch.exp(-totals),
+                first + max(first, _FIRST_SAMPLES),
+                num_seen + size,
+            )
         keep = volume_weights(depths, samples.packed_info) > self.smallest_weight
         return samples.select(keep), torch.cat(encoded).index_select(0, rows[keep]), num_seen
 

@@ -102,7 +102,7 @@ class ProjectedPixels:
         """Spectra of some pixels in [0, 1]."""
         found = self._subspace.spectra(self._components[pixels].float()).clamp_(0, _UNSATURATED)
         if len(self._whole):
-            places = torch.searchsorted(self._whole, pixels).clamp_(max=len(self._whole) - 1)
+            places = torch.searchsorted(self._whole, pixels.contiguous()).clamp_(max=len(self._whole) - 1)
             rows = (self._whole[places] == pixels).nonzero()[:, 0]
             found[rows] = self._spectra[places[rows]].float()
         return found

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,8 @@ from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.transforms_json import FrameEntry, SceneEntry
 from unmix_plugin.scenes.scene import SceneOptions
 
+_MOST_READERS = 8
+"""Cubes read at once: hashing and comparing take longer than a disk, and don't hold each other up."""
 Size = tuple[int, int]
 """Height and width in pixels."""
 
@@ -71,12 +75,14 @@ def check_cube_values(
     faults: Faults,
 ) -> list[CubeValues | None]:
     """Read and check every value of the cubes that have a header; returns what each frame's cube holds."""
-    measured = [
-        None
-        if header is None
-        else measure_cube(paths["hyperspectral_file_path"], options.value_scale, options.invalid_pixels)
-        for paths, header in zip(located, headers, strict=True)
-    ]
+
+    def measure(paths: dict[str, Path], header: ArrayHeader | None) -> CubeValues | None:
+        if header is None:
+            return None
+        return measure_cube(paths["hyperspectral_file_path"], options.value_scale, options.invalid_pixels)
+
+    with ThreadPoolExecutor(min(_MOST_READERS, os.cpu_count() or 1)) as readers:
+        measured = list(readers.map(measure, located, headers))
     named = [
         (frame.name_of("hyperspectral_file_path"), values)
         for frame, values in zip(entry.frames, measured, strict=True)

@@ -1,0 +1,92 @@
+"""A scene whose cubes are larger than memory, written in moments: where nothing is, its files are holes.
+
+The table of the built-in scene, seen through a wide lens, so that most of each picture is black. Rays are cast for each
+fourth pixel and each stands for a block of them: cheap, and as large to read and to train on as any other scene.
+
+Notation: `B` bands, `H`, `W` rows and columns.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float16
+from PIL import Image
+
+from unmix_plugin.scenes.demo.materials import band_centers_nm, lamp_power, reflectances
+from unmix_plugin.scenes.demo.shading import render_view
+from unmix_plugin.scenes.demo.views import (
+    demo_cameras,
+    frame_name,
+    lens_entries,
+    radiance_cube,
+    transform_matrix,
+)
+
+BLOCK = 4
+"""Pixels along an edge that look alike."""
+WIDE = 0.35
+"""Focal length in parts of the built-in scene's."""
+
+
+def write_large_scene(folder: Path, size: int, bands: int, views: int) -> int:
+    """Write a scene into a new folder; `size` is a multiple of 4. Returns how many bytes lie on the disk."""
+    for name in ("images", "cubes"):
+        (folder / name).mkdir(parents=True)
+    nm = band_centers_nm(bands)
+    spectra, lamp = reflectances(nm), lamp_power(nm)
+    cameras = demo_cameras(size, views)
+    cameras = replace(cameras, focal_px=cameras.focal_px * WIDE)
+    coarse = demo_cameras(size // BLOCK, views)
+    coarse = replace(coarse, focal_px=coarse.focal_px * WIDE)
+    frames: list[dict[str, Any]] = []
+    for index in range(views):
+        view, name = render_view(coarse, index, subpixels=1), frame_name(index)
+        alpha = (255 * view.alpha.repeat(BLOCK, 0).repeat(BLOCK, 1)).astype(np.uint8)
+        Image.fromarray(np.stack([alpha] * 4, axis=-1)).save(folder / f"images/{name}.png", compress_level=1)
+        _write_sparse(folder / f"cubes/{name}.npy", radiance_cube(view, spectra, lamp).astype(np.float16))
+        frames.append(
+            {
+                "file_path": f"images/{name}.png",
+                "hyperspectral_file_path": f"cubes/{name}.npy",
+                "transform_matrix": transform_matrix(cameras, index),
+            }
+        )
+    content = {**lens_entries(cameras), "wavelengths": nm.tolist(), "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(content), encoding="utf-8")
+    return sum(512 * path.stat().st_blocks for path in folder.rglob("*") if path.is_file())
+
+
+def few_views(folder: Path, whole: Path, count: int) -> None:
+    """A scene of the first views of another, with the same files."""
+    for name in ("images", "cubes"):
+        (folder / name).mkdir(parents=True)
+    content = json.loads((whole / "transforms.json").read_text(encoding="utf-8"))
+    content["frames"] = content["frames"][:count]
+    for frame in content["frames"]:
+        for key in ("file_path", "hyperspectral_file_path"):
+            (folder / frame[key]).hardlink_to(whole / frame[key])
+    (folder / "transforms.json").write_text(json.dumps(content), encoding="utf-8")
+
+
+def _write_sparse(path: Path, coarse: Float16[np.ndarray, "h w B"]) -> None:
+    """An (H, W, B) array of blocks, with holes where it is black."""
+    height, width, bands = (BLOCK * coarse.shape[0], BLOCK * coarse.shape[1], coarse.shape[2])
+    with path.open("wb") as file:
+        header = {"descr": "<f2", "fortran_order": False, "shape": (height, width, bands)}
+        np.lib.format.write_array_header_1_0(file, header)
+        start = file.tell()
+        for row, values in enumerate(coarse):
+            lit = np.flatnonzero(values.any(axis=-1))
+            if len(lit) == 0:
+                continue
+            first, last = lit[0], lit[-1] + 1
+            line = values[first:last].repeat(BLOCK, axis=0).tobytes()
+            for below in range(BLOCK):
+                file.seek(start + 2 * bands * ((BLOCK * row + below) * width + BLOCK * int(first)))
+                file.write(line)
+        file.truncate(start + 2 * bands * width * height)
