@@ -139,7 +139,7 @@ def resumed(work: Path, steps: int) -> dict[str, Any]:
     [run] = work.glob("killed/*/*/*")
     killed_at = newest_complete_checkpoint(run / "checkpoints")
     assert killed_at is not None
-    _common.run_command([_common.console_script("unmix-train"), "--load-run", str(run)])
+    _common.run_command([_common.console_script("unmix-train"), "unmix-nerf", "--load-run", str(run)])
     ends = [newest_complete_checkpoint(path / "checkpoints") for path in (straight.run, run)]
     assert ends[0] is not None
     assert ends[1] is not None
