@@ -44,7 +44,7 @@ class Options:
     """Of the errors of poses."""
     views: int = 32
     """Of the scene of frames; three quarters are trained on."""
-    samples_per_step: int = 30_000
+    samples_per_step: int = 25_000
     """Samples marched in a training step."""
     only: tuple[str, ...] = ()
     """Which parts to run, frames and lines; both if none is given."""

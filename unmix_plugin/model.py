@@ -279,11 +279,11 @@ class UnmixModel(Model):
         return [TrainingCallback(before, self._begin_step), TrainingCallback(after, self._bound_spectra)]
 
     def num_samples(self, outputs: dict[str, Tensor]) -> int:
-        """Samples marched for `outputs`."""
+        """Samples looked at for `outputs`."""
         return int(outputs["num_samples"])
 
     def next_num_rays(self, outputs: dict[str, Tensor], current: int) -> int | None:
-        """Half of the way to the rays with which a step would march `samples_per_step`."""
+        """Half of the way to the rays with which a step would look at `samples_per_step`."""
         samples_a_ray = max(self.num_samples(outputs) / current, 1.0)
         wanted = self.config.samples_per_step / self.processes.count / samples_a_ray
         return int(min(max((current + wanted) / 2, _FEWEST_RAYS), _MOST_RAYS))

@@ -68,8 +68,8 @@ class UnmixModelConfig(ModelConfig):
     """How poses are corrected."""
     segmentation: SegmentationMethod = "abundances"
     """Material of a ray: its largest abundance, or the endmember of smallest angle to its spectrum as published."""
-    samples_per_step: int = 30_000
-    """Samples marched in a training step; the number of rays adapts to it."""
+    samples_per_step: int = 25_000
+    """Samples of rays that a training step looks at; the number of rays adapts to it."""
     initial_opacity: float | Auto = "auto"
     """Opacity of one sample's interval in the untrained field. Auto is 0.05 where alpha is known, else 0.01: space
     between cameras and walls must stay clear."""

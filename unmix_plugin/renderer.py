@@ -89,7 +89,7 @@ class RenderedRays:
     mixtures: Float[Tensor, "R K"]
     """Abundances of all that a ray sees, the sky included."""
     num_samples: int
-    """Samples marched for all rays."""
+    """Samples looked at of all rays: those that light may reach."""
     spread: Float[Tensor, ""]
     """Sum of log(1 + tau / 0.03) over the samples of a ray that carry weight, tau their optical depth; mean over rays.
     The same light stopped by few samples gives less of it than by many: surfaces little, floaters much."""

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from tests.scenes.scene_factory import make_scene
+from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes import SceneOptions, load_scene
 from unmix_plugin.scenes.pixel_table import PixelTable, memory
 from unmix_plugin.scenes.pixel_table.block import PixelBlock
@@ -132,3 +133,18 @@ def test_mended_pixels_are_kept_as_small_as_others(tmp_path, stored, scale):
     expected = torch.from_numpy(scene.cube(1)[8, 10])
     assert torch.allclose(mended, expected, atol=0.01)
     assert table.blocks[0]._values.element_size() == size
+
+
+def test_a_cube_that_is_cut_short_while_training_goes_on_is_named(tmp_path):
+    folder = make_scene(tmp_path / "scene")
+    scene = load_scene(folder.root)
+    block = PixelBlock(scene, (1, 3), (0, 1))
+    block.read_alpha(CPU)
+    block.hold_part(1)
+    path = folder.root / "cubes/view_3.npy"
+    path.write_bytes(path.read_bytes()[:-100])
+    assert block.pool is not None
+    with pytest.raises(
+        SceneError, match=r"view_3\.npy: the cube can't be read any more .*must stay as it is"
+    ):
+        block.pool.draw(10, 0, torch.Generator().manual_seed(0))

@@ -36,7 +36,10 @@ class PackedSamples:
     def rows(self, chosen: Int[Tensor, "some"]) -> PackedSamples:
         """Some samples by their places, with no regard to which belong to one ray: `packed_info` stays as it is."""
         return PackedSamples(
-            self.t.index_select(0, chosen), self.ray_indices.index_select(0, chosen), self.packed_info, self.step
+            self.t.index_select(0, chosen),
+            self.ray_indices.index_select(0, chosen),
+            self.packed_info,
+            self.step,
         )
 
     def select(self, keep: Bool[Tensor, "S"]) -> PackedSamples:

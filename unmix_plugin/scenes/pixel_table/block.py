@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.pixel_table.pool import PixelPool
 from unmix_plugin.scenes.pixel_table.projection import ProjectedPixels
 from unmix_plugin.scenes.scene import Scene
@@ -226,8 +227,18 @@ class PixelBlock:
         )
 
     def _stored(self, view: int, part: tuple[slice | np.ndarray, ...]) -> Tensor:
-        """Values (pixels, b) of a part of a view."""
-        cube = self._scene.stored_cube(view, part) if self._is_compact else self._scene.cube(view, part)
+        """Values (pixels, b) of a part of a view.
+
+        Raises:
+            SceneError: the file has changed since the scene was checked.
+        """
+        try:
+            cube = self._scene.stored_cube(view, part) if self._is_compact else self._scene.cube(view, part)
+        except (OSError, ValueError) as error:
+            raise SceneError(
+                f"{self._scene.frames[view].cube_path}: the cube can't be read any more ({error}); a scene must stay "
+                "as it is while it is trained on"
+            ) from error
         return torch.from_numpy(cube.reshape(-1, self.num_channels).view(self._kept))
 
     def _read_range(self, first: int, last: int) -> Tensor:
