@@ -43,7 +43,7 @@ def test_pixels_are_those_of_the_scene_at_the_size_they_were_stored_in(tmp_path,
     everything = torch.arange(len(block))
     expected = np.concatenate([scene.cube(view).reshape(-1, 4) for view in (1, 3)])
     assert torch.equal(block.spectra(everything), torch.from_numpy(expected))
-    assert block._values.element_size() == num_bytes
+    assert block.held_bytes == len(block) * 4 * num_bytes
     for row, view in enumerate((1, 3)):
         alpha = scene.alpha(view)
         assert alpha is not None
@@ -79,6 +79,7 @@ def test_pixels_on_disk_are_the_same_as_those_in_memory(tmp_path, stored, scale,
     held, mapped = read_block(scene, (1, 3, 4)), PixelBlock(scene, (1, 3, 4), (0, 1, 2))
     mapped.read_alpha(CPU)
     mapped.hold_part(1)
+    assert held._values is not None
     assert torch.equal(mapped._read_range(250, 700), held._values[250:700])
     assert mapped.pool is not None
     pixels, values = mapped.pool.draw(200, 3, torch.Generator().manual_seed(0))
@@ -126,13 +127,13 @@ def test_mended_pixels_are_kept_as_small_as_others(tmp_path, stored, scale):
     for index in range(6):
         folder.edit_cube(index, lambda cube, index=index: write(cube, bad=index == 3))
     scene = load_scene(folder.root, SceneOptions(value_scale=scale))
-    size = PixelTable(scene, CPU, (1, 3)).blocks[0]._values.element_size()
+    size = PixelTable(scene, CPU, (1, 3)).blocks[0].held_bytes
     table = PixelTable(scene, CPU, (1, 3), mends=True)
     assert table.bad_share == pytest.approx(1 / (2 * 320 * 10))
     mended = table.blocks[0].spectra(torch.tensor([320 + 8 * 20 + 10]))[0]
     expected = torch.from_numpy(scene.cube(1)[8, 10])
     assert torch.allclose(mended, expected, atol=0.01)
-    assert table.blocks[0]._values.element_size() == size
+    assert table.blocks[0].held_bytes == size
 
 
 def test_a_cube_that_is_cut_short_while_training_goes_on_is_named(tmp_path):
