@@ -8,6 +8,7 @@ import torch
 
 from tests.scenes.geometry.test_carving import make_cameras
 from tests.scenes.scene_factory import look_at
+from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.contraction import UnitSpace
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.scenes import SceneOptions, carve, load_scene
@@ -35,6 +36,18 @@ def folder(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module")
+def scene(folder):
+    """Those objects, read as an unbounded world."""
+    return load_scene(folder, SceneOptions(world="unbounded"))
+
+
+@pytest.fixture(scope="module")
+def evidence(scene):
+    """Where its surfaces are."""
+    return SurfaceEvidence(scene)
+
+
 def true_distances(scene, rays):
     """To the first surface, model units; inf where there is the sky."""
     origins = scene.normalisation.to_world(rays.origins.double().numpy()).astype(np.float32)
@@ -43,9 +56,7 @@ def true_distances(scene, rays):
     return torch.from_numpy(found) * scene.normalisation.scale
 
 
-def test_drawn_pixels_are_shown_where_their_true_surfaces_are(folder):
-    scene = load_scene(folder, SceneOptions(world="unbounded"))
-    evidence = SurfaceEvidence(scene)
+def test_drawn_pixels_are_shown_where_their_true_surfaces_are(scene, evidence):
     (pixels,) = PixelTable(scene, CPU, scene.train_indices, None).draw(
         4000, torch.Generator().manual_seed(0), 0
     )
@@ -60,10 +71,58 @@ def test_drawn_pixels_are_shown_where_their_true_surfaces_are(folder):
     assert (cells_off < 3).float().mean() > 0.85
 
 
-def test_cells_that_views_look_through_are_carved_and_those_with_surfaces_are_not(folder):
-    scene = load_scene(folder, SceneOptions(world="unbounded"))
+def share_right(scene, cameras, views, depths):
+    """Pixels whose distance is known, and of these the share with at most 3 cells of error."""
+    space, right, known = UnitSpace(scene.scene_box, is_unbounded=True), [], []
+    for view, found in zip(views, depths.distances[views], strict=True):
+        at = [(torch.arange(side) + 0.5) * depths.stride for side in found.shape]
+        coords = torch.stack(torch.meshgrid(at[1], at[0], indexing="xy"), dim=-1).flatten(0, 1)
+        rays = cameras.generate_rays(torch.full((len(coords),), view), coords)
+        is_known = torch.isfinite(found).flatten()
+        true = true_distances(scene, rays).clamp(max=1e4)
+        places = [
+            space.to_unit(rays.origins + t[:, None] * rays.directions)[is_known]
+            for t in (found.flatten().nan_to_num(posinf=0.0), true)
+        ]
+        right.append(64 * (places[0] - places[1]).norm(dim=-1) < 3)
+        known.append(is_known)
+    return float(torch.cat(known).float().mean()), float(torch.cat(right).float().mean())
+
+
+@pytest.mark.parametrize(("edge", "spread"), [(1, 0.2), (5, 0.0)])
+def test_views_of_differing_exposure_and_large_noisy_views_are_swept_too(scene, edge, spread):
+    """`edge`: by how many times larger the pictures are, with noise in each pixel that means over pixels remove."""
+    train = list(scene.train_indices)
+    cameras = scene.cameras[train]
+    large = Cameras(
+        cameras.camera_to_world,
+        edge * cameras.focal_px,
+        edge * cameras.center_px,
+        cameras.distortion,
+        edge * cameras.width,
+        edge * cameras.height,
+    )
+    generator = np.random.default_rng(0)
+    gains = np.exp(generator.uniform(-spread, spread, len(train))).astype(np.float32)
+
+    def read_view(view, part):
+        cube = scene.cube(train[view]).repeat(edge, axis=0).repeat(edge, axis=1)
+        noise = (
+            0.0 if edge == 1 else 0.15 * np.random.default_rng(view).standard_normal(cube.shape, np.float32)
+        )
+        return (gains[view] * cube + noise)[part]
+
+    depths = sweep_depths(large, scene.scene_box, read_view)
+    assert depths is not None
+    assert depths.stride == 2 * (1 if edge == 1 else 3)
+    share, right = share_right(scene, large, [0, 5, 10], depths)
+    assert share > 0.3
+    assert right > 0.85
+
+
+def test_cells_that_views_look_through_are_carved_and_those_with_surfaces_are_not(scene, evidence):
     before = carve(scene, 64)
-    after = SurfaceEvidence(scene).carved(before)
+    after = evidence.carved(before)
     assert (after <= before).all()
     assert after.sum() < 0.97 * before.sum()
     rays = scene.cameras.image_rays(scene.eval_indices[0])

@@ -199,11 +199,13 @@ def thinned_cameras(poses: Poses, lenses: Cameras, image: Float[Tensor, "H W F"]
     return thinned_lenses(replace(lenses, camera_to_world=matrices), image, stride)
 
 
-def thinned_lenses(cameras: Cameras, image: Float[Tensor, "H W F"], stride: int) -> Cameras:
-    """The same poses with lenses of thinned-out views."""
+def thinned_lenses(
+    cameras: Cameras, image: Float[Tensor, "H W F"], stride: int, first: float = 0.0
+) -> Cameras:
+    """The same poses with lenses of thinned-out views: every `stride`-th pixel from `first` on."""
     height, width = image.shape[:2]
-    # Pixel (c, r) of a thinned-out view is pixel (c stride, r stride) of the whole one; centres are at + 0.5.
-    center = (cameras.center_px - 0.5) / stride + 0.5
+    # Pixel (c, r) of a thinned-out view is pixel (c stride, r stride) + first of the whole; centres are at + 0.5.
+    center = (cameras.center_px - 0.5 - first) / stride + 0.5
     return Cameras(
         cameras.camera_to_world, cameras.focal_px / stride, center, cameras.distortion, width, height
     )

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
@@ -46,7 +46,13 @@ CLEARLY = 0.7
 """Most disagreement there, over the least at planes that are not beside it."""
 BESIDE = 3
 """Planes that count as beside one."""
+LEAST_KNOWN = 0.35
+"""Of all pixels. Where fewer are known views may differ in exposure, and brightness is taken over that around it."""
+SURROUNDINGS = 21
+"""Edge of what is around a pixel, in pixels of the thinned-out view."""
 _CHANCE_PIXELS = 4000
+_POOLED = 4
+"""Pixels along an edge that are averaged when a view is thinned out, if there are so many."""
 
 
 @dataclass(frozen=True)
@@ -74,20 +80,50 @@ def sweep_depths(cameras: Cameras, box: SceneBox, read_view: ReadView) -> SweptD
     if count < NUM_AGREEING + 1:
         return None
     stride = -(-max(cameras.width, cameras.height) // LONGEST_SIDE_PX)
+    fine = max(1, stride // _POOLED)
+    pooled = stride // fine
     bands = read_view(views[0], (slice(1), slice(1))).shape[2]
-    part = (slice(None, None, stride), slice(None, None, stride), slice(None, None, -(-bands // MOST_BANDS)))
+    part = (slice(None, None, fine), slice(None, None, fine), slice(None, None, -(-bands // MOST_BANDS)))
+    images = [_pooled(read_view(view, part), pooled) for view in views]
+    lenses = thinned_lenses(cameras[views], images[0], fine * pooled, fine * (pooled - 1) / 2)
+    found = _sweep_all(images, lenses, box)
+    if found is None:
+        return None
+    if torch.isfinite(found).float().mean() < LEAST_KNOWN:
+        relative = _sweep_all([_over_surroundings(image) for image in images], lenses, box)
+        found = found if relative is None else torch.where(torch.isfinite(found), found, relative)
+    return SweptDepths(tuple(views), found, fine * pooled * PIXEL_STRIDE)
+
+
+def _pooled(view: Float32[np.ndarray, "H W B"], width: int) -> Float[Tensor, "h w B"]:
+    """Means over squares of pixels."""
+    image = torch.from_numpy(np.ascontiguousarray(view)).permute(2, 0, 1)
+    return torch.nn.functional.avg_pool2d(image, width).permute(1, 2, 0)
+
+
+def _over_surroundings(image: Float[Tensor, "H W B"]) -> Float[Tensor, "H W B"]:
+    """Spectra over the mean brightness around them: the same whatever the exposure."""
+    brightness = image.mean(dim=-1)[None]
+    width = SURROUNDINGS
+    around = torch.nn.functional.avg_pool2d(brightness, width, 1, width // 2, count_include_pad=False)[0]
+    return image / (around + 0.02 * float(brightness.mean()) + 1e-9)[..., None]
+
+
+def _sweep_all(
+    images: list[Float[Tensor, "H W B"]], cameras: Cameras, box: SceneBox
+) -> Float[Tensor, "N h w"] | None:
+    """Distances in all views, inf where unknown; None if the views are plain."""
     generator = torch.Generator().manual_seed(0)
-    features = view_features([read_view(view, part) for view in views], generator)
+    features = view_features([image.numpy() for image in images], generator)
     pixels = torch.cat([image.flatten(0, 1) for image in features])
     drawn = pixels[torch.randperm(len(pixels), generator=generator)[:_CHANCE_PIXELS]]
     chance = float((drawn - drawn.roll(1, 0)).norm(dim=-1).median())
     if chance <= 0.0:
         return None
-    lenses = thinned_lenses(cameras[views], features[0], stride)
-    poses = lenses.camera_to_world.double().numpy()
-    neighbours = choose_neighbours(poses, count, NUM_NEIGHBOURS)
-    swept = [_sweep(view, neighbours[view], lenses, box, features, chance) for view in range(count)]
-    return SweptDepths(tuple(views), torch.stack(swept), stride * PIXEL_STRIDE)
+    poses = cameras.camera_to_world.double().numpy()
+    neighbours = choose_neighbours(poses, len(images), NUM_NEIGHBOURS)
+    swept = [_sweep(view, neighbours[view], cameras, box, features, chance) for view in range(len(images))]
+    return torch.stack(swept)
 
 
 def _sweep(
