@@ -1,6 +1,7 @@
 """Spectral materials from the command line on a ball of two materials: train, evaluate, show, export, refuse."""
 
 import json
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -10,14 +11,18 @@ import pytest
 import torch
 
 from tests.commands.running import picture_size, run
-from tests.neumatex.object_factory import write_object
+from tests.neumatex.object_factory import CENTRE, RADIUS, write_object
 from tests.neumatex.spectral_factory import ENDMEMBERS, LAMP, write_spectral_object
+from tests.products.ball_model import RADIUS as RUN_RADIUS
+from tests.products.ball_model import ball_scene
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.train import train
 from unmix_plugin.engine import load_model, registry
+from unmix_plugin.neumatex import run_start
 from unmix_plugin.neumatex.model import NeumatexModel
 from unmix_plugin.neumatex.trained_object import TrainedObject
+from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 from unmix_plugin.trained.open_run import load_run
 from unmix_plugin.trained.relighting import LightChoice
@@ -147,6 +152,27 @@ def test_the_number_of_materials_is_proposed_where_it_is_asked_for(tmp_path):
     assert ended.status == 0, ended.err
     model = load_model(Path(ended.last_line.removeprefix("run: ")), "cpu").model
     assert len(model.get_parameter("endmembers")) == 2
+
+
+def test_a_fit_starts_from_the_endmembers_and_abundances_of_a_run(tmp_path, monkeypatch):
+    there = Normalisation(np.eye(3), -CENTRE, RUN_RADIUS / RADIUS)
+    of_run = replace(ball_scene(), frame=there)
+    monkeypatch.setattr(run_start, "_scene", lambda _: of_run)
+    folder = write_spectral_object(tmp_path / "ball")
+    words = ["--data", folder, "--output-dir", tmp_path / "out", "--max-num-iterations", 1]
+    settings = ["--pipeline.model.material=spectral", "--pipeline.model.from-run=run"]
+    ended = run(train, "neumatex", *words, *settings, "--pipeline.datamanager.lamp=E", *SMALL)
+    assert ended.status == 0, ended.err
+    model = load_model(Path(ended.last_line.removeprefix("run: ")), "cpu").model
+    assert isinstance(model, NeumatexModel)
+    assert model.endmembers is not None
+    unit = torch.nn.functional.normalize
+    light = torch.ones(5) if of_run.light is None else of_run.light
+    expected = unit(of_run.materials.endmembers.detach() / light, dim=1)
+    found = unit(model.endmembers.detach(), dim=1)
+    assert float((found * expected).sum(dim=1).min()) > 0.999
+    poles = torch.tensor([[0.0, 0.1, 0.99], [0.1, 0.0, -0.99]])
+    assert model.surface.parameters(poles)[:, :3].argmax(dim=1).tolist() == [0, 1]
 
 
 @pytest.mark.parametrize(
