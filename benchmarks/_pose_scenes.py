@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.optimize import least_squares
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
@@ -103,23 +104,39 @@ def stepped(poses: Float[Tensor, "N 3 4"], steps: Float[Tensor, "N 6"]) -> Float
 
 
 def pose_error(truth: Cameras, found: Cameras) -> float:
-    """By how many pixels cameras see the scene's points beside where they should, mean, after a similarity."""
-    mine, theirs = _anchors(truth), _anchors(found)
-    aligned = similarity(theirs, mine)
+    """By how many pixels cameras see the scene's points beside where they should, mean.
+
+    After the similarity under which the pixels are off by least: what moves the whole world shows in no picture. One
+    that brings the cameras themselves together would not do: a shift of a camera can hardly be told from a turn, so
+    the places of refined cameras are far less certain than what they see.
+    """
+    first = similarity(_anchors(found), _anchors(truth))
+    seen = [_sightings(truth, found, index, first) for index in range(len(truth))]
+    right, poses, points, focal, ratio = (torch.cat(column).double() for column in zip(*seen, strict=True))
+    wanted = _image_point(right, points)
+
+    def errors(step: Float[np.ndarray, "7"]) -> Float[Tensor, "P 2"]:
+        turn, shift, growth = torch.as_tensor(step).split([3, 3, 1])
+        rotation = rotation_matrix(turn[None])[0]
+        places = growth.exp() * poses[:, :, 3] @ rotation.T + shift
+        moved = torch.cat([rotation @ poses[:, :, :3], places[:, :, None]], dim=-1)
+        return (_image_point(moved, points) * ratio - wanted) * focal
+
+    best = least_squares(lambda step: errors(step).flatten().numpy(), np.zeros(7))
+    return float(errors(best.x).norm(dim=1).mean())
+
+
+def _sightings(truth: Cameras, found: Cameras, index: int, change: Any) -> tuple[Tensor, ...]:
+    """Of each point that a view sees: the true pose and the found one, the point, the true focal length (pixels), and
+    by what the found one is larger. Poses are those of the row that sees the point in truth."""
     points = scene_points(0)
-    errors = []
-    for index in range(len(truth)):
-        coords, depths = truth.project(points, index)
-        size = torch.tensor(truth.size(index))
-        seen = (depths > 0) & (coords > 0).all(dim=1) & (coords < size).all(dim=1)
-        views = torch.full((int(seen.sum()),), index)
-        poses = aligned(found.poses_at(views, coords[seen, 1]))
-        right = truth.poses_at(views, coords[seen, 1])
-        # Where the same row sees the same point: across the line and along it, by the angle.
-        offsets = [_image_point(own, points[seen]) for own in (right, poses)]
-        focal = truth.focal_px[index] / found.focal_px[index]
-        errors.append(((offsets[1] / focal - offsets[0]) * truth.focal_px[index]).norm(dim=1))
-    return float(torch.cat(errors).mean())
+    coords, depths = truth.project(points, index)
+    size = torch.tensor(truth.size(index))
+    seen = (depths > 0) & (coords > 0).all(dim=1) & (coords < size).all(dim=1)
+    views, y = torch.full((int(seen.sum()),), index), coords[seen, 1]
+    focal = truth.focal_px[index].expand(len(y), 2)
+    ratio = (found.focal_px[index] / truth.focal_px[index]).expand(len(y), 2)
+    return truth.poses_at(views, y), change(found.poses_at(views, y)), points[seen], focal, ratio
 
 
 def similarity(source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> Any:
