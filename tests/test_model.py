@@ -18,9 +18,9 @@ from tests.method_factory import (
 )
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.errors import ConfigError, SpectrumError
+from unmix_plugin.lit_samples import points_of
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.model_settings import UnmixModelConfig
-from unmix_plugin.renderer import _points
 from unmix_plugin.rendering.compositing import volume_weights_twin
 from unmix_plugin.training_losses import LossConfig
 
@@ -28,7 +28,7 @@ from unmix_plugin.training_losses import LossConfig
 def naive_spectra(model: UnmixModel, rays) -> torch.Tensor:
     """The paper's sum: a spectrum of B bands at every sample, composited ray by ray."""
     samples = model.renderer._march(rays, None)
-    positions, along = _points(samples, rays)
+    positions, along = points_of(samples, rays)
     densities, features = model.field.get_density(positions)
     outputs = model.field.get_outputs(positions, along, features)
     per_sample = torch.einsum("sk,kb->sb", outputs["scaled_abundances"], model.endmembers)

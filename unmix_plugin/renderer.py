@@ -20,14 +20,13 @@ from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.errors import require
 from unmix_plugin.field import CoefficientField
+from unmix_plugin.lit_samples import points_of, samples_carrying_weight
 from unmix_plugin.rendering.compositing import accumulate, volume_weights
 from unmix_plugin.rendering.contracted_marching import march_contracted
 from unmix_plugin.rendering.grid_cells import cells_at
 from unmix_plugin.rendering.marching import PackedSamples, march
 from unmix_plugin.spectral.coefficients import Coefficients
 
-_FIRST_SAMPLES = 8
-"""Of each ray, that are looked at before it is known whether light gets farther."""
 _SPREAD_DEPTH = 0.03
 """Optical depth of a sample from which on its part of the spread grows slower than the depth."""
 
@@ -133,9 +132,13 @@ class VolumeRenderer:
             generator: Shifts the samples of each ray at random, as training wants it; None takes them as they are.
         """
         samples = self._march(ray_bundle, generator)
-        kept, encoded, num_seen = self._carrying_weight(field, samples, ray_bundle)
-        positions, along = _points(kept, ray_bundle)
-        densities, features = field.density_of(field.encode(positions, encoded))
+        seen = samples_carrying_weight(field, samples, ray_bundle, self.step, self.smallest_weight)
+        kept = seen.samples
+        positions, along = points_of(kept, ray_bundle)
+        if torch.is_grad_enabled():
+            densities, features = field.density_of(field.encode(positions, seen.encoded()))
+        else:
+            densities, features = seen.densities, seen.features()
         outputs = field.get_outputs(positions, along, features)
         if self.is_unbounded:
             near = self._near_cameras(kept.t)
@@ -163,7 +166,7 @@ class VolumeRenderer:
         return RenderedRays(
             coefficients,
             mixtures,
-            num_seen,
+            seen.num_looked_at,
             torch.log1p(depths / _SPREAD_DEPTH).sum() / max(len(ray_bundle), 1),
             self.space.to_unit(positions).detach(),
             weights,
@@ -248,56 +251,11 @@ class VolumeRenderer:
         unit_origins, unit_directions = self.box.normalise(origins), directions / self.box.size
         return march(unit_origins, unit_directions, t_near, t_far, jitter, self.occupied, self.step)
 
-    @torch.no_grad()
-    def _carrying_weight(
-        self, field: CoefficientField, samples: PackedSamples, ray_bundle: RayBundle
-    ) -> tuple[PackedSamples, Float[Tensor, "kept LF"], int]:
-        """The samples that contribute enough of their ray's light, their encodings, and how many were looked at.
-
-        The first samples of all rays are looked at first, then twice as many of the rays that still let light
-        through, and so on: what lies behind can't contribute enough, whatever it is.
-        """
-        starts, counts = samples.packed_info.unbind(-1)
-        depths, rows = torch.zeros_like(samples.t), torch.zeros_like(samples.ray_indices)
-        encoded: list[Tensor] = []
-        first, num_seen, left = 0, 0, torch.ones_like(counts, dtype=samples.t.dtype)
-        while True:
-            wanted = (counts - first).clamp(0, max(first, _FIRST_SAMPLES)) * (left > self.smallest_weight)
-            ends = wanted.cumsum(0)
-            size = int(ends[-1]) if len(ends) else 0
-            if size == 0 and encoded:
-                break
-            shifts = torch.repeat_interleave(starts + first - ends + wanted, wanted, output_size=size)
-            chosen = shifts + torch.arange(size, device=shifts.device)
-            part = samples if size == len(samples) else samples.rows(chosen)
-            encoded.append(field.encode(_points(part, ray_bundle)[0]))
-            found = field.density_of(encoded[-1])[0] * self.step
-            depths[chosen], rows[chosen] = found, torch.arange(num_seen, num_seen + size, device=rows.device)
-            totals = torch.zeros_like(left).index_add_(0, part.ray_indices, found)
-            left, first, num_seen = (
-                left * torch.exp(-totals),
-                first + max(first, _FIRST_SAMPLES),
-                num_seen + size,
-            )
-        keep = volume_weights(depths, samples.packed_info) > self.smallest_weight
-        return samples.select(keep), torch.cat(encoded).index_select(0, rows[keep]), num_seen
-
 
 def scale_gradient(values: Float[Tensor, "*S"], factors: Float[Tensor, "*#S"]) -> Float[Tensor, "*S"]:
     """The same values; gradients that reach them are multiplied with `factors`."""
     constant = values.detach()
     return constant + factors * (values - constant)
-
-
-def _points(
-    samples: PackedSamples, ray_bundle: RayBundle
-) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3"]]:
-    """Positions of samples and the directions they are seen along."""
-    # index_select: a third of the time of indexing by a tensor, and this is done for every sample.
-    origins, along = (
-        x.index_select(0, samples.ray_indices) for x in (ray_bundle.origins, ray_bundle.directions)
-    )
-    return origins + samples.t[:, None] * along, along
 
 
 def _residual_transmittance(
