@@ -1,4 +1,4 @@
-"""Samples found from the front are those that looking at every sample finds; what light can't reach is not looked at."""
+"""Samples found from the front are those that looking at all finds; what light can't reach is not looked at."""
 
 import math
 

@@ -8,6 +8,7 @@ from tests.scenes.scene_factory import make_scene
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes import SceneOptions, load_scene
 from unmix_plugin.scenes.pixel_table import PixelTable, memory
+from unmix_plugin.scenes.pixel_table import block as block_module
 from unmix_plugin.scenes.pixel_table.block import PixelBlock
 from unmix_plugin.scenes.pixel_table.memory import available_bytes
 
@@ -70,7 +71,7 @@ def test_clipped_pixels_come_out_clipped(tmp_path):
     ("stored", "scale"), [("<f2", None), (">f4", None), ("<f8", None), ("u1", 255.0), (">u2", 65535.0)]
 )
 @pytest.mark.parametrize("order", ["C", "F"])
-def test_pixels_on_disk_are_the_same_as_those_in_memory(tmp_path, stored, scale, order):
+def test_pixels_on_disk_are_the_same_as_those_in_memory(tmp_path, monkeypatch, stored, scale, order):
     folder = make_scene(tmp_path / "scene")
     folder.edit_cubes(
         lambda cube: np.asarray((cube.astype(np.float64) * (scale or 1.0)).round(5), stored, order=order)
@@ -87,8 +88,17 @@ def test_pixels_on_disk_are_the_same_as_those_in_memory(tmp_path, stored, scale,
     for name in ("numbers", "cameras", "corners", "spectra", "alpha"):
         assert torch.equal(getattr(found, name), getattr(expected, name))
     assert torch.equal(mapped.spectra(pixels), expected.spectra)
-    for one, other in zip(mapped.images(), held.images(), strict=True):
-        assert all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
+    monkeypatch.setattr(block_module, "_CHUNK_VALUES", 3 * 20 * 4)
+
+    def sums(spectra: torch.Tensor, alpha: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
+        return spectra.sum(dim=1) + 10 * alpha + 100 * valid
+
+    for view, one, other in zip((1, 3, 4), mapped.pictures(sums), held.pictures(sums), strict=True):
+        assert torch.equal(one, other)
+        opacity = scene.alpha(view)
+        assert opacity is not None
+        expected = scene.cube(view).sum(axis=-1) + 10 * opacity + 100 * scene.valid_mask(view)
+        torch.testing.assert_close(one, torch.from_numpy(expected))
 
 
 def test_pixels_are_held_unless_they_need_more_than_the_budget(tmp_path, monkeypatch):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from unmix_plugin.scenes.geometry.hull_places import local_log_brightness
 from unmix_plugin.scenes.pixel_table import DrawnPixels, PixelTable
 from unmix_plugin.scenes.pixel_table.block import PixelBlock
-from unmix_plugin.spectral.evidence import alpha_trust, background_level, may_show_matter
+from unmix_plugin.spectral.evidence import alpha_trust, background_level, brightness, may_show_matter
 
 _PIXELS_OF_BACKGROUND = 100_000
 """Pixels of a sensor by which the brightness of its background is judged."""
@@ -32,10 +33,13 @@ class AlphaEvidence:
         """For each training view True on pixels that may show something, or are not valid."""
         found: dict[int, np.ndarray] = {}
         for block in self._blocks:
-            for camera, (spectra, alpha, valid) in zip(block.cameras, block.images(), strict=True):
-                level = self._levels[block.sensor]
-                shows = may_show_matter(spectra.flatten(0, 1), alpha.flatten(), level).view(alpha.shape)
-                found[camera] = (shows | ~valid).numpy()
+            level = self._levels[block.sensor]
+
+            def shows(spectra: Tensor, alpha: Tensor, valid: Tensor, level: float | None = level) -> Tensor:
+                return may_show_matter(spectra, alpha, level) | ~valid
+
+            for camera, picture in zip(block.cameras, block.pictures(shows), strict=True):
+                found[camera] = picture.numpy()
         return [found[camera] for camera in sorted(found)]
 
     def log_brightness(self) -> tuple[list[int], list[Float[np.ndarray, "H W"]]]:
@@ -44,14 +48,20 @@ class AlphaEvidence:
         NaN where a pixel is not opaque, not valid or saturated.
         """
         block = max(self._blocks, key=lambda block: len(block.cameras))
-        seen = [
-            local_log_brightness(spectra, (alpha > _OPAQUE_ALPHA) & valid & (spectra.amax(dim=-1) < 1))
-            for spectra, alpha, valid in block.images()
-        ]
-        return list(block.cameras), seen
+        return list(block.cameras), [local_log_brightness(seen) for seen in block.pictures(_clear_brightness)]
+
+
+def _clear_brightness(spectra: Tensor, alpha: Tensor, valid: Tensor) -> Tensor:
+    """Of pixels that are opaque, valid and not saturated; 0 for others."""
+    is_clear = (alpha > _OPAQUE_ALPHA) & valid & (spectra.amax(dim=-1) < 1)
+    return torch.where(is_clear, brightness(spectra), 0.0)
 
 
 def _level(block: PixelBlock) -> float | None:
-    pixels = block.valid.nonzero()[:, 0]
-    chosen = pixels[:: max(1, len(pixels) // _PIXELS_OF_BACKGROUND)].to(block.alpha.device)
+    stride = max(1, int(block.valid.sum()) // _PIXELS_OF_BACKGROUND)
+    if bool(block.valid.all()):
+        pixels = torch.arange(0, len(block), stride)
+    else:
+        pixels = block.valid.nonzero()[::stride, 0]
+    chosen = pixels.to(block.alpha.device)
     return background_level(block.spectra(chosen), block.alpha[chosen])

@@ -37,8 +37,7 @@ def ball_views(follows_camera: bool, noise: float = 0.0, log_gains: np.ndarray |
         lamp = pose[:3, :3] @ LAMP if follows_camera else LAMP
         seen = ball_brightness(pose, lamp) * np.exp(noise * generator.normal(size=(SIDE, SIDE)))
         seen *= 1.0 if log_gains is None else np.exp(log_gains[index])
-        spectra = torch.from_numpy(np.repeat(seen[..., None], 3, axis=-1)).float()
-        images.append(local_log_brightness(spectra, torch.from_numpy(seen > 0)))
+        images.append(local_log_brightness(torch.from_numpy(seen).float()))
     cameras = make_cameras(poses)
     return cameras, images, carve_box(cameras, ball_matter(poses, RADIUS), BOX, 32), BOX
 

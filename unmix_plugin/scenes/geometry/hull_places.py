@@ -14,7 +14,6 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
-from unmix_plugin.spectral.evidence import brightness
 
 NUM_PLACES = 2000
 """Places that are followed."""
@@ -85,14 +84,11 @@ def _coarse(hull: Bool[np.ndarray, "R R R"]) -> Bool[np.ndarray, "r r r"]:
     return np.asarray(joined.any(axis=(1, 3, 5)))
 
 
-def local_log_brightness(
-    spectra: Float[Tensor, "H W B"], counts: Bool[Tensor, "H W"]
-) -> Float[np.ndarray, "H W"]:
-    """Logarithm of the mean brightness of 3 x 3 pixels, of those that count; NaN where the middle one doesn't."""
+def local_log_brightness(seen: Float[Tensor, "H W"]) -> Float[np.ndarray, "H W"]:
+    """Logarithm of the mean brightness of 3 x 3 pixels, of those that are above 0; NaN where the middle one isn't."""
     from scipy import ndimage  # slow to import
 
-    seen = brightness(spectra.flatten(0, 1)).view(counts.shape)
-    known = (counts & (seen > 0)).numpy()
+    known = (seen > 0).numpy()
     weights = ndimage.uniform_filter(known.astype(np.float32), 3)
     means = ndimage.uniform_filter(np.where(known, seen.numpy(), 0.0), 3) / np.maximum(weights, 1e-6)
     return np.where(known, np.log(np.where(known, means, 1.0)), np.nan)

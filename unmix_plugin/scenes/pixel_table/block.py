@@ -8,7 +8,7 @@ Notation: `b` channels of the sensor, `R` drawn pixels.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +25,8 @@ from unmix_plugin.spectral.subspace import SpectralSubspace
 
 COMPACT_TYPES = ("f2", "u1", "i1", "i2", "u2")
 """Of NumPy, at most half as large as float32."""
+_CHUNK_VALUES = 1 << 23
+"""Values of a view in single precision at a time: a view of many bands takes a GB."""
 _LARGEST_INT16, _UINT16_VALUES = 2**15 - 1, 2**16
 
 
@@ -198,14 +200,24 @@ class PixelBlock:
         whole = values.round().to(torch.int32)
         return torch.where(whole > _LARGEST_INT16, whole - _UINT16_VALUES, whole)
 
-    def images(self) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Of each view spectra (H, W, b), alpha and which pixels are valid (H, W); on the CPU."""
-        shape = (self._height, self._width)
-        for first in range(0, len(self), self._width * self._height):
-            pixels = torch.arange(first, first + self._width * self._height)
-            chosen = pixels.to(self.alpha.device)
-            spectra = self.spectra(chosen).cpu().unflatten(0, shape)
-            yield spectra, self.alpha[chosen].cpu().view(shape), self.valid[pixels].view(shape)
+    def pictures(self, of: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Iterator[Tensor]:
+        """What a function makes of each view, (H, W), a few rows at a time; on the CPU.
+
+        Args:
+            of: From spectra (n, b), alpha and which pixels are valid (n) to n values.
+        """
+        size = self._width * self._height
+        step = self._width * max(1, _CHUNK_VALUES // (self._width * self.num_channels))
+        for first in range(0, len(self), size):
+            parts = []
+            for start in range(first, first + size, step):
+                end = min(start + step, first + size)
+                if self.pool is None:
+                    spectra = self.spectra(torch.arange(start, end, device=self.alpha.device)).cpu()
+                else:
+                    spectra = self._scaled(self._read_range(start, end))
+                parts.append(of(spectra, self.alpha[start:end].cpu(), self.valid[start:end]))
+            yield torch.cat(parts).view(self._height, self._width)
 
     def take(self, pixels: Int[Tensor, " R"], first: int, stored: Tensor | None = None) -> DrawnPixels:
         """Some pixels by their index in the block, on any device.
