@@ -59,9 +59,7 @@ def _clear_brightness(spectra: Tensor, alpha: Tensor, valid: Tensor) -> Tensor:
 
 def _level(block: PixelBlock) -> float | None:
     stride = max(1, int(block.valid.sum()) // _PIXELS_OF_BACKGROUND)
-    if bool(block.valid.all()):
-        pixels = torch.arange(0, len(block), stride)
-    else:
-        pixels = block.valid.nonzero()[::stride, 0]
+    is_whole = bool(block.valid.all())  # then a list of all of them would take eight bytes a pixel
+    pixels = torch.arange(0, len(block), stride) if is_whole else block.valid.nonzero()[::stride, 0]
     chosen = pixels.to(block.alpha.device)
     return background_level(block.spectra(chosen), block.alpha[chosen])
