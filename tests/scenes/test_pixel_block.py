@@ -98,7 +98,7 @@ def test_pixels_on_disk_are_the_same_as_those_in_memory(tmp_path, monkeypatch, s
         opacity = scene.alpha(view)
         assert opacity is not None
         expected = scene.cube(view).sum(axis=-1) + 10 * opacity + 100 * scene.valid_mask(view)
-        torch.testing.assert_close(one, torch.from_numpy(expected))
+        torch.testing.assert_close(one, torch.from_numpy(expected).float())
 
 
 def test_pixels_are_held_unless_they_need_more_than_the_budget(tmp_path, monkeypatch):
