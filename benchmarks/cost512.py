@@ -122,7 +122,8 @@ def judge(measured: dict[str, Any]) -> list[_common.Figure]:
     return [
         PSNR.judge("PSNR of evaluation views", measured["psnr"]),
         SECONDS.judge(
-            "processor time of the training to 34 dB", measured["training_cpu_seconds"] if is_reached else None
+            "processor time of the training to 34 dB",
+            measured["training_cpu_seconds"] if is_reached else None,
         ),
         _common.reported(
             "wall time of the training on this machine", f"{measured['training_wall_seconds']:.0f} s"

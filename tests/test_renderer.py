@@ -23,7 +23,7 @@ def make(
     torch.manual_seed(0)
     field = UnmixField(UnmixFieldConfig(log2_rows_per_level=8), box, 3, 1, 1.0, PIXEL)
     cells = torch.ones(8, 8, 8)
-    step = pixel / RendererConfig().samples_per_pixel
+    step = pixel / 1.5
     return VolumeRenderer(
         box, cells.to(torch.uint8), cells > 0, step, smallest_weight, rays_per_chunk=7
     ), field
@@ -119,7 +119,7 @@ def test_points_are_asked_cell_by_cell_and_outside_the_box_is_nothing():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"samples_per_pixel": 0.0}, "samples-per-pixel of 0.01 to 100"),
+        ({"samples_per_pixel": 0.0}, "samples-per-pixel of 0.01 to 100 or auto"),
         ({"smallest_weight": 1.0}, r"smallest-weight in \[0, 1\) or auto"),
         ({"visible_weight": 0.0}, r"visible-weight in \(0, 1\] or auto"),
     ],

@@ -71,7 +71,9 @@ class UnmixModel(Model):
         self.specular_spectra = nn.Parameter(torch.zeros(num_dictionary, len(self.bands)))
         self.grid = OccupancyGrid(torch.ones((metadata["grid_resolution"],) * 3, dtype=torch.bool))
         self._renderer: VolumeRenderer | None = None
-        self.step = metadata["pixel_size"] / config.renderer.samples_per_pixel
+        self.step = config.renderer.sample_distance(
+            metadata["pixel_size"], float(self.scene_box.size.max()), metadata["has_alpha"]
+        )
         opacity = choose(config.initial_opacity, self.preset.initial_opacity)
         refines, field = config.poses == "refine", config.field
         if refines:

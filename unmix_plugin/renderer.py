@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from unmix_plugin.alpha_preset import Auto
+from unmix_plugin.alpha_preset import Auto, choose
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.contraction import UnitSpace
 from unmix_plugin.engine.geometry.rays import RayBundle
@@ -27,6 +27,8 @@ from unmix_plugin.rendering.grid_cells import cells_at
 from unmix_plugin.rendering.marching import PackedSamples, march
 from unmix_plugin.spectral.coefficients import Coefficients
 
+_LARGE_BOX = 300
+"""Pixels along the scene box from which on fewer samples a pixel do."""
 _SPREAD_DEPTH = 0.03
 """Optical depth of a sample from which on its part of the spread grows slower than the depth."""
 
@@ -35,8 +37,9 @@ _SPREAD_DEPTH = 0.03
 class RendererConfig:
     """How finely rays are sampled and what is left out."""
 
-    samples_per_pixel: float = 1.5
-    """Samples of a ray along the length of a pixel's edge where it meets the middle of the scene box."""
+    samples_per_pixel: float | Auto = "auto"
+    """Samples of a ray along the length of a pixel's edge where it meets the middle of the scene box. Auto is 1.5, but
+    1 where alpha is known and the box is more than 300 pixels long: more rays teach more than closer samples."""
     coarse_samples: int | Auto = "auto"
     """Samples along the longest edge of the scene box at the start of training, if there are more in the end: what is
     coarse must be found first, by many rays of few samples. Auto is 256, but 64 in an unbounded world, where rays go
@@ -57,7 +60,8 @@ class RendererConfig:
             ConfigError: a number out of its range.
         """
         rules = {
-            "samples-per-pixel of 0.01 to 100": 0.01 <= self.samples_per_pixel <= 100,
+            "samples-per-pixel of 0.01 to 100 or auto": self.samples_per_pixel == "auto"
+            or 0.01 <= self.samples_per_pixel <= 100,
             "coarse-samples of at least 1 or auto": self.coarse_samples == "auto" or self.coarse_samples >= 1,
             "coarse-until in [0, 1]": 0 <= self.coarse_until <= 1,
             "smallest-weight in [0, 1) or auto": self.smallest_weight == "auto"
@@ -65,6 +69,15 @@ class RendererConfig:
             "visible-weight in (0, 1] or auto": self.visible_weight == "auto" or 0 < self.visible_weight <= 1,
         }
         require("the renderer", rules)
+
+    def sample_distance(self, pixel_size: float, longest_edge: float, has_alpha: bool) -> float:
+        """Distance of samples in the unit of a pixel's edge and of the scene box's longest one.
+
+        >>> [RendererConfig().sample_distance(1.0, edge, has_alpha=True) for edge in (270.0, 480.0)]
+        [0.6666666666666666, 1.0]
+        """
+        is_large = has_alpha and longest_edge > _LARGE_BOX * pixel_size
+        return pixel_size / choose(self.samples_per_pixel, 1.0 if is_large else 1.5)
 
     def coarseness(self, samples: float, coarse_samples: int, progress: float) -> float:
         """Factor on the distance of samples when that part of the training is over.
