@@ -8,8 +8,9 @@ import torch
 from torch.testing import assert_close
 
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.neumatex.demo import spectral_object as module
 from unmix_plugin.neumatex.demo.shapes import demo_mesh
-from unmix_plugin.neumatex.demo.spectral_object import demo_spectral_object
+from unmix_plugin.neumatex.demo.spectral_object import demo_spectral_object, demo_spectral_object_path
 from unmix_plugin.neumatex.demo.spectral_surface import SpectralSurface
 from unmix_plugin.neumatex.geometry.ray_mesh import RayMesh
 from unmix_plugin.neumatex.scene.load_object import load_object
@@ -84,3 +85,15 @@ def test_impossible_numbers_are_refused(tmp_path):
         demo_spectral_object(tmp_path / "object", bands=3)
     with pytest.raises(ConfigError, match="no environment 'clear-sy'"):
         demo_spectral_object(tmp_path / "object", size=16, views=2, light="clear-sy")
+
+
+def test_the_default_object_is_written_once(tmp_path, monkeypatch):
+    for name, number in {"SIZE": 16, "VIEWS": 2, "BANDS": 4, "LIGHTS": 0}.items():
+        monkeypatch.setattr(module, f"DEFAULT_{name}", number)
+    said = []
+    folder = demo_spectral_object_path(tmp_path, said.append)
+    assert demo_spectral_object_path(tmp_path, said.append) == folder
+    assert len(said) == 1
+    bands = load_object(folder).bands
+    assert bands is not None
+    assert len(bands) == 4
