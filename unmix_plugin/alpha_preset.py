@@ -69,7 +69,6 @@ WITHOUT_ALPHA = AlphaPreset(
 UNBOUNDED = replace(
     WITHOUT_ALPHA,
     initial_opacity=0.005,
-    opacity_loss_weight=1e-3,
     surface_loss_weight=0.3,
     coarse_samples=64,
 )
