@@ -12,7 +12,8 @@ from PIL import Image
 from torch.testing import assert_close
 
 from tests.scenes.scene_factory import make_scene
-from unmix_plugin.datamanager import HyperspectralDataManager, HyperspectralDataManagerConfig
+from unmix_plugin.datamanager import HyperspectralDataManager
+from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.runs.scene_record import SceneRecord, check_same_scene, scene_record_to_json
 from unmix_plugin.errors import ConfigError, RunError, SceneError

@@ -11,7 +11,7 @@ from torch.testing import assert_close
 
 from tests.method_factory import CONFIG
 from tests.scenes.line_factory import make_line_scene
-from unmix_plugin.datamanager import HyperspectralDataManagerConfig
+from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
 from unmix_plugin.engine.pipeline import PipelineConfig
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.method_config import unmix_nerf

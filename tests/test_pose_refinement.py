@@ -15,7 +15,7 @@ from torch.testing import assert_close
 from tests.engine.test_resume import stop_at
 from tests.method_factory import BOX, CONFIG, initial_data, make_model
 from tests.scenes.scene_factory import make_scene
-from unmix_plugin.datamanager import HyperspectralDataManagerConfig
+from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses

@@ -9,7 +9,8 @@ from torch.testing import assert_close
 
 from tests.method_factory import BOX, CONFIG, NUM_BANDS, WAVELENGTHS_NM, initial_data, make_rays
 from tests.scenes.rig_factory import make_rig
-from unmix_plugin.datamanager import HyperspectralDataManager, HyperspectralDataManagerConfig
+from unmix_plugin.datamanager import HyperspectralDataManager
+from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.sensor_batches import join_parts, split_parts
 from unmix_plugin.training_losses import LossConfig

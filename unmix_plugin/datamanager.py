@@ -7,7 +7,7 @@ its area, so several rays are cast through it, one in each cell of a grid on it;
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,14 +17,14 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from unmix_plugin.alpha_preset import Auto, choose, preset_for
-from unmix_plugin.engine.data_manager import DataManager, DataManagerConfig
+from unmix_plugin.alpha_preset import choose, preset_for
+from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
+from unmix_plugin.engine.data_manager import DataManager
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
-from unmix_plugin.engine.instantiate import Target
 from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.engine.training.seeding import step_generator
-from unmix_plugin.errors import SceneError, require
+from unmix_plugin.errors import SceneError
 from unmix_plugin.pose_refinement import Knots
 from unmix_plugin.scenes.alpha_evidence import AlphaEvidence
 from unmix_plugin.scenes.geometry.carving import carve
@@ -32,7 +32,7 @@ from unmix_plugin.scenes.geometry.lighting import judge_light
 from unmix_plugin.scenes.geometry.pose_check import check_scene_poses
 from unmix_plugin.scenes.identity import scene_identity
 from unmix_plugin.scenes.pixel_rays import PixelRays
-from unmix_plugin.scenes.pixel_table import Components, PixelTable
+from unmix_plugin.scenes.pixel_table import PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.recorded_scene import check_recorded_scene
 from unmix_plugin.scenes.scene import Scene, SceneOptions
@@ -51,62 +51,6 @@ _MANY_PIXELS = 4_000_000
 """Pixels of all training views beyond which one ray a pixel is enough."""
 DEMO = Path("demo")
 """`--data demo` stands for the built-in scene."""
-
-
-@dataclass(frozen=True)
-class HyperspectralDataManagerConfig(DataManagerConfig):
-    """How a scene of spectral images is read and sampled."""
-
-    _target: Target = field(default_factory=lambda: HyperspectralDataManager)
-    train_num_rays_per_batch: int = 2048
-    """Rays of the first training step; the model adapts the number to its budget of samples."""
-    scene: SceneOptions = SceneOptions()
-    """How the files are read and split."""
-    subpixels: int | Auto = "auto"
-    """Rays cast through a pixel, along each of its edges; their mean is the pixel, in training and in rendering. Auto
-    is 2, but 1 where the training views have more than 4 million pixels: more pixels teach more than exact ones."""
-    single_ray_until: float | Auto = "auto"
-    """Part of the training in which one ray a pixel has to do: coarse shape needs many pixels, not exact ones. Auto is
-    0.4 where alpha is known, else 0.8."""
-    grid_resolution: int | Auto = "auto"
-    """Cells along an edge of the occupancy grid, from which space is carved that the views show to be empty. Auto is
-    128 where alpha is known, else 64: only what few cameras see can be carved then."""
-    trust_alpha: bool = False
-    """Believe alpha even where the light of a pixel contradicts it."""
-    mend_values: bool = True
-    """Replace stripes and spikes in training views by what is around them: values that stand out from the bands
-    beside them and from the pixels around them in that. From 8 bands on, for pixels that memory holds."""
-    max_initial_pixels: int = 50_000
-    """Pixels, drawn from all training views, from which the endmembers are initialised."""
-
-    memory_gb: float | Auto = "auto"
-    """GiB of memory for training pixels. Auto is most of what the device has left. Pixels that need more stay in the
-    scene's files, and a part of them is held that is renewed while training goes on."""
-
-    target_components: Components = "auto"
-    """Numbers to keep of each training pixel instead of one a band: its components in the subspace that the scene's
-    spectra lie in. Auto is none where all bands fit into the memory for training pixels, else, from 100 bands on, as
-    many as leave out no more than noise. What training compares are spectra on all bands in any case."""
-
-    def __post_init__(self) -> None:
-        """Refuse impossible settings.
-
-        Raises:
-            ConfigError: a number out of its range.
-        """
-        super().__post_init__()
-        rules = {
-            "memory-gb of at least 0.01 or auto": self.memory_gb == "auto" or self.memory_gb >= 0.01,
-            "subpixels of 1 to 8 or auto": self.subpixels == "auto" or 1 <= self.subpixels <= 8,
-            "single-ray-until in [0, 1] or auto": self.single_ray_until == "auto"
-            or 0 <= self.single_ray_until <= 1,
-            "grid-resolution of 8 to 512 or auto": self.grid_resolution == "auto"
-            or 8 <= self.grid_resolution <= 512,
-            "target-components of at least 1, auto or none": isinstance(self.target_components, str)
-            or self.target_components >= 1,
-            "max-initial-pixels of at least 1": self.max_initial_pixels >= 1,
-        }
-        require("the data manager", rules)
 
 
 class HyperspectralDataManager(DataManager):

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from unmix_plugin.datamanager import HyperspectralDataManagerConfig
+from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.pipeline import PipelineConfig
 from unmix_plugin.engine.registry import MethodSpecification

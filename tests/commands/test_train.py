@@ -18,7 +18,7 @@ from tests.commands.running import SMALL_METHOD, run
 from unmix_plugin.commands import train_arguments
 from unmix_plugin.commands.train import train
 from unmix_plugin.commands.train_arguments import parse
-from unmix_plugin.datamanager import HyperspectralDataManagerConfig
+from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
 from unmix_plugin.engine import registry
 from unmix_plugin.engine.runs.load_run import load_model
 from unmix_plugin.engine.training.trainer import Trainer
