@@ -7,10 +7,10 @@ mean just this.
 
 import math
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from unmix_plugin.neumatex.materials.lobe_family import LobeFamily
 from unmix_plugin.neumatex.materials.lobe_mixture import LobeMixture
 from unmix_plugin.neumatex.materials.microfacet import (
     alpha_of,
@@ -24,7 +24,7 @@ from unmix_plugin.neumatex.materials.microfacet import (
 _DIELECTRIC_F0 = 0.04
 
 
-class PbrFamily:
+class PbrFamily(LobeFamily):
     """Parameters: base colour (0 to 2, linear), roughness (3), metallicity (4).
 
     Source:
@@ -48,22 +48,6 @@ class PbrFamily:
         lobe = distribution(alpha, half) * visibility(alpha, wi[2], wo[2])
         diffuse = (1.0 - fresnel) * ((1.0 - metallicity) / math.pi) * base
         return ((diffuse + fresnel * lobe) * ((wi[2] > 0) & (wo[2] > 0))).T
-
-    @torch.no_grad()
-    def sample(
-        self, parameters: Float[Tensor, "N P"], wo: Float[Tensor, "N 3"], uniforms: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, "N 3"]:
-        """Directions to the light, drawn from a cosine lobe and visible GGX normals."""
-        wo = wo.T.contiguous()
-        return self._mixture(parameters, wo).sample(wo, uniforms.T.contiguous()).T.contiguous()
-
-    @torch.no_grad()
-    def density(
-        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, " N"]:
-        """Probability density of `sample`, 1/sr."""
-        wo = wo.T.contiguous()
-        return self._mixture(parameters, wo).density(wi.T.contiguous(), wo)
 
     def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
         """Linear base colour; of metals, the colour of what they reflect."""

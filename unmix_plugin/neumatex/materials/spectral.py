@@ -13,11 +13,11 @@ from __future__ import annotations
 
 import math
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.neumatex.materials.albedos import ggx_albedo, mean_ggx_albedo
+from unmix_plugin.neumatex.materials.lobe_family import LobeFamily
 from unmix_plugin.neumatex.materials.lobe_mixture import LobeMixture
 from unmix_plugin.neumatex.materials.microfacet import (
     alpha_of,
@@ -32,7 +32,7 @@ NUM_GLOSS = 2
 """Parameters of the gloss."""
 
 
-class SpectralFamily:
+class SpectralFamily(LobeFamily):
     """Parameters: abundances (0 to K - 1, at least 0, sum 1), roughness (K), specular level (K + 1).
 
     The gloss reflects the square of the specular level at normal incidence: 0.2 is a common dielectric's 4 %.
@@ -85,22 +85,6 @@ class SpectralFamily:
         above = (wi[2] > 0) & (wo[2] > 0)
         base = self.base_colour(parameters)
         return (passed * above / math.pi).T * base + (gloss * above).T
-
-    @torch.no_grad()
-    def sample(
-        self, parameters: Float[Tensor, "N P"], wo: Float[Tensor, "N 3"], uniforms: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, "N 3"]:
-        """Directions to the light, drawn from a cosine lobe and visible GGX normals."""
-        wo = wo.T.contiguous()
-        return self._mixture(parameters, wo).sample(wo, uniforms.T.contiguous()).T.contiguous()
-
-    @torch.no_grad()
-    def density(
-        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, " N"]:
-        """Probability density of `sample`, 1/sr."""
-        wo = wo.T.contiguous()
-        return self._mixture(parameters, wo).density(wi.T.contiguous(), wo)
 
     def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
         """Diffuse reflectance of each band, [0, 1]."""
