@@ -8,7 +8,8 @@ import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tests.fuzz.readers import READERS, Reader
+from tests.fuzz.reader import Reader
+from tests.fuzz.readers import READERS
 
 
 @dataclass

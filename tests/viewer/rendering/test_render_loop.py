@@ -1,93 +1,24 @@
 """When is rendered, and how finely: movements are answered at once, rest brings finer pictures, layers cost nothing.
 
-The loop is driven by hand, piece by piece; its own thread is the subject of two tests at the end.
+The loop is driven by hand, piece by piece.
 """
 
 import threading
-import time
-from contextlib import contextmanager
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from tests.method_factory import make_model
-from tests.viewer.view_factory import Screen, some_pose, source_of_model
+from tests.viewer.rendering.loop_driver import LARGEST, finest, finish, make_loop
+from tests.viewer.view_factory import Screen, some_pose
 from unmix_plugin.editing import Light, Recipe, Remove, Scale
-from unmix_plugin.engine.training.training_control import TrainingControl
-from unmix_plugin.errors import ConfigError
-from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings
 from unmix_plugin.viewer.rendering.edits import Edit
 from unmix_plugin.viewer.rendering.frames import FrameRender, num_channels
-from unmix_plugin.viewer.rendering.pacing import Speedometer
 from unmix_plugin.viewer.rendering.picture_maker import PictureMaker
-from unmix_plugin.viewer.rendering.render_loop import RenderLoop
 from unmix_plugin.viewer.rendering.scene_aids import SceneAids
 from unmix_plugin.viewer.rendering.view import Capture
 from unmix_plugin.viewer.view_cameras import camera_of
-
-LARGEST = 96
-
-
-class FixedSpeed(Speedometer):
-    """Believes what it is told, and no measurement."""
-
-    def add(self, rays, seconds):
-        pass
-
-
-def make_loop(source, slow_speed=None):
-    """A loop that waits to be driven; with `slow_speed` it believes to be so slow that moving pictures are small."""
-    with source.borrowed() as scene:
-        channels = num_channels(scene.materials)
-    maker = PictureMaker(source, SceneAids(source, has_materials=True), channels)
-    if slow_speed is not None:
-        maker.speed = FixedSpeed(slow_speed)
-    return RenderLoop(maker)
-
-
-def finish(loop):
-    """Drive a loop until nothing is left to do."""
-    for _ in range(10_000):
-        if not loop.step():
-            return
-    raise AssertionError("there is always more to do")
-
-
-def finest(loop, screen):
-    """The picture that a screen has in the end."""
-    finish(loop)
-    assert not screen.shown[-1].is_moving
-    return screen.shown[-1]
-
-
-@pytest.fixture
-def loop(source):
-    return make_loop(source, slow_speed=5000.0)
-
-
-@pytest.fixture
-def screen(loop):
-    shown = Screen()
-    shown.view.largest_height = LARGEST
-    loop.add(shown.view)
-    return shown
-
-
-@pytest.fixture
-def rendered(monkeypatch):
-    """How many rays were rendered since the list was cleared."""
-    counts = []
-    original = FrameRender.render_block
-
-    def counting(self, scene, num_rays):
-        counts.append(done := original(self, scene, num_rays))
-        return done
-
-    monkeypatch.setattr(FrameRender, "render_block", counting)
-    return counts
 
 
 def test_a_movement_is_answered_with_a_small_picture_and_rest_with_finer_ones(loop, screen):
@@ -190,56 +121,6 @@ def test_those_at_rest_are_refined_in_turn(loop):
     assert blocks == [0, 1, 2, 3] * 2
 
 
-def test_a_layer_that_cannot_be_shown_is_said_and_the_next_one_works(loop, screen):
-    loop.move(screen.view, some_pose())
-    finish(loop)
-    loop.restyle(screen.view, LayerSettings(layer="error"))
-    finish(loop)
-    assert screen.reports[-1].startswith("no error to show")
-    count = len(screen.shown)
-    loop.restyle(screen.view, LayerSettings(layer="rgb"))
-    finish(loop)
-    assert len(screen.shown) == count + 1
-    assert screen.reports[-1] == ""
-
-
-def test_a_defect_in_a_picture_is_said_logged_and_ends_nothing(loop, screen, monkeypatch, caplog):
-    original = FrameRender.render_block
-    monkeypatch.setattr(FrameRender, "render_block", lambda *_: 1 / 0)
-    loop.move(screen.view, some_pose())
-    finish(loop)
-    assert len(screen.reports) == 1  # not tried again and again
-    assert "ZeroDivisionError" in screen.reports[0]
-    assert "Traceback" in caplog.text
-    monkeypatch.setattr(FrameRender, "render_block", original)
-    loop.move(screen.view, some_pose(1))
-    finest(loop, screen)
-
-
-def test_a_client_that_cannot_be_shown_anything_does_not_end_the_loop(loop, screen, caplog):
-    gone = Screen()
-    gone.view.show = lambda _: (_ for _ in ()).throw(ConnectionError("gone"))
-    gone.view.report = lambda _: (_ for _ in ()).throw(ConnectionError("gone"))
-    loop.add(gone.view)
-    loop.move(gone.view, some_pose())
-    loop.move(screen.view, some_pose())
-    finest(loop, screen)
-    assert "ConnectionError" in caplog.text
-
-
-def test_a_view_that_is_removed_in_mid_render_is_shown_nothing_more(loop, screen):
-    screen.view.largest_height = 512
-    loop.move(screen.view, some_pose())
-    assert loop.step()
-    assert loop.step()
-    loop.remove(screen.view)
-    count = len(screen.shown)
-    finish(loop)
-    assert len(screen.shown) == count
-    assert screen.view.frame is None
-    assert loop.num_views == 0
-
-
 def test_other_light_is_shown_without_rendering_and_other_shapes_with(loop, screen, rendered):
     loop.move(screen.view, some_pose())
     before = finest(loop, screen).picture
@@ -286,14 +167,6 @@ def test_removed_materials_leave_no_faint_specks(loop, screen):
     assert (shown[opacity > 0.3] != round(0.92 * 255)).any()
 
 
-def test_an_edit_that_does_not_fit_is_said(loop, screen):
-    loop.move(screen.view, some_pose())
-    finish(loop)
-    loop.change_edit(screen.view, Edit(Recipe((Scale(99, 2.0),))))
-    finish(loop)
-    assert "there is no endmember 99" in screen.reports[-1]
-
-
 def test_depth_is_sent_only_where_it_is_wanted(loop, screen):
     loop.move(screen.view, some_pose())
     assert finest(loop, screen).depth is None
@@ -313,17 +186,6 @@ def test_a_capture_is_rendered_beside_the_views(loop, screen):
     assert (frame.camera.height, reason) == (40, "")
     assert parts == sorted(parts)
     assert parts[-1] == 1.0
-
-
-def test_a_capture_that_is_cancelled_or_left_is_told_so(loop):
-    reasons = []
-    for _ in range(2):
-        render = FrameRender(camera_of(some_pose(), 400))
-        loop.capture(Capture(render, Edit(), lambda _, reason: reasons.append(reason)))
-    loop._captures[0].is_cancelled = True
-    assert loop.step()
-    loop.stop()
-    assert reasons == ["cancelled", "the viewer was stopped"]
 
 
 def test_more_rays_a_pixel_are_cast_for_the_finest_picture_only(loop, screen, monkeypatch):
@@ -352,64 +214,3 @@ def test_a_picture_never_takes_more_memory_than_is_set_aside(source, monkeypatch
     with source.borrowed() as scene:
         channels = num_channels(scene.materials)
     assert picture.shape[0] * picture.shape[1] * channels * 4 <= 40_000
-
-
-def test_an_error_of_ours_in_a_report_is_a_sentence(loop, screen, monkeypatch):
-    def refuse(*_):
-        raise ConfigError("the scene has gone")
-
-    monkeypatch.setattr(FrameRender, "render_block", refuse)
-    loop.move(screen.view, replace(some_pose(), fov=0.5))
-    finish(loop)
-    assert screen.reports == ["the scene has gone"]
-
-
-@contextmanager
-def running_loop(source, slow_speed=None):
-    """A loop in a thread of its own."""
-    loop = make_loop(source, slow_speed)
-    loop.start()
-    try:
-        yield loop
-    finally:
-        loop.stop()
-    assert not loop._thread.is_alive()
-
-
-def test_while_training_runs_pictures_follow_it(tmp_path, monkeypatch):
-    monkeypatch.setattr("unmix_plugin.viewer.rendering.picture_maker.REFRESH_S", 0.05)
-    control, model = TrainingControl(), make_model()
-    source = source_of_model(model, tmp_path, control)
-    with running_loop(source) as loop, control.running():
-        screen = Screen()
-        screen.view.largest_height = LARGEST
-        loop.add(screen.view)
-        loop.move(screen.view, some_pose())
-        until = time.monotonic() + 60
-        while len(screen.shown) < 6:
-            assert time.monotonic() < until
-            with control.device.training_turn(), torch.no_grad():
-                model.endmembers.add_(0.01)
-                screen.wait(0.01)  # a step that takes time earns the viewer its share
-        means = [shown.picture.mean() for shown in screen.shown]
-        assert max(means) - min(means) > 1
-    assert not screen.reports
-
-
-def test_when_training_ends_the_finest_picture_shows_its_last_step(tmp_path):
-    control, model = TrainingControl(), make_model()
-    source = source_of_model(model, tmp_path, control)
-    with running_loop(source) as loop:
-        screen = Screen()
-        screen.view.largest_height = LARGEST
-        loop.add(screen.view)
-        with control.running():
-            for _ in range(5):
-                loop.move(screen.view, some_pose())
-                with control.device.training_turn(), torch.no_grad():
-                    model.endmembers.mul_(0.5)
-        version = source.version
-        screen.wait_until(lambda: screen.view.frame_version == version and not screen.shown[-1].is_moving)
-        assert isinstance(screen.view.frame, MaterialView)
-        shown = screen.view.frame.materials.endmembers
-        torch.testing.assert_close(shown, model.endmembers.detach())

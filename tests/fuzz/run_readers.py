@@ -1,0 +1,167 @@
+"""Readers of what a run holds, with valid samples: config, scene record, checkpoints, metrics; and of recipes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import safetensors.torch
+import torch
+
+from tests.fuzz.mutation import mutate_json
+from tests.fuzz.reader import Reader
+from tests.scenes.scene_factory import look_at
+from unmix_plugin.datamanager import HyperspectralDataManager
+from unmix_plugin.editing import read_recipe, recipe_from_yaml, recipe_to_yaml
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.registry import find_method
+from unmix_plugin.engine.runs.checkpoints import newest_complete_checkpoint
+from unmix_plugin.engine.runs.config_json import config_to_json
+from unmix_plugin.engine.runs.load_run import load_config
+from unmix_plugin.engine.runs.run_files import RUN_FORMAT
+from unmix_plugin.engine.runs.run_folder import RunFolder
+from unmix_plugin.engine.runs.scene_record import read_scene_record
+from unmix_plugin.engine.training.training_state import TrainingRecord
+from unmix_plugin.engine.training.writers import _keep_until
+from unmix_plugin.errors import ConfigError, RunError
+from unmix_plugin.scenes.scene import Normalisation, SceneOptions
+from unmix_plugin.trained.run_views import recorded_views
+from unmix_plugin.trained.world_frame import world_frame
+
+
+def config_reader() -> Reader:
+    content = {"format_version": RUN_FORMAT, "config": config_to_json(find_method("unmix-nerf").config)}
+    samples = (json.dumps(content).encode(),)
+    beside = (("scene.json", b"{}"),)
+    return Reader(samples, "config.json", _read_config, (RunError,), mutate_json, beside)
+
+
+def _read_config(path: Path) -> None:
+    config = load_config(path.parent)
+    assert config.pipeline.model.eval_num_rays_per_chunk > 0
+
+
+def scene_record_reader() -> Reader:
+    pose = torch.tensor(look_at(np.array([3.0, 1.0, 1.5]), np.zeros(3))[:3], dtype=torch.float32)
+    ones = torch.ones(2, 2)
+    cameras = Cameras(torch.stack([pose, pose]), 28 * ones, 8 * ones, torch.zeros(2, 4), 20, 16).to_json()
+    metadata = {
+        "wavelengths_nm": [450.0, 520.0, 680.0],
+        "illuminant": [1.0, 0.9, 0.8],
+        "has_alpha": True,
+        "grid_resolution": 16,
+        "pixel_size": 0.02,
+        "subpixels": 2,
+    }
+    summary = {
+        "root": "/scenes/pots",
+        "wavelengths_nm": metadata["wavelengths_nm"],
+        "frames": ["a", "b", "c", "d"],
+        "train_indices": [0, 2],
+        "eval_indices": [1, 3],
+        "normalisation": Normalisation(np.eye(3), np.array([0.1, 0.2, 0.3]), 0.5).to_json(),
+        "material_names": ["leaf", "clay"],
+        "endmembers": [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]],
+        "input_hashes": {"transforms.json": "00"},
+        "options": asdict(SceneOptions()),
+    }
+    content = {
+        "format_version": RUN_FORMAT,
+        "scene_box": [[-1, -1, -1], [1, 1, 1.5]],
+        "metadata": metadata,
+        "train_cameras": cameras,
+        "eval_cameras": cameras,
+        "summary": summary,
+    }
+    samples = (json.dumps(content).encode(),)
+    return Reader(samples, "scene.json", _read_scene_record, (RunError,), mutate_json)
+
+
+def _read_scene_record(path: Path) -> None:
+    scene = read_scene_record(RunFolder(path.parent), HyperspectralDataManager)
+    world_frame(scene)
+    for view in recorded_views(scene):
+        assert (path.parent / view.name).parent == path.parent
+
+
+def _checkpoint() -> dict[str, bytes]:
+    """Files of a checkpoint by suffix."""
+    tensors = safetensors.torch.save({"model/a": torch.ones(2, 3), "model/n": torch.tensor(2)})
+    record = TrainingRecord(2, 0.5, 100, 0, 50, 1, 0.2, {"grid": 0.01}).to_json()
+    record = {
+        "format_version": RUN_FORMAT,
+        **record,
+        "step": 2,
+        "sha256": hashlib.sha256(tensors).hexdigest(),
+    }
+    return {".json": json.dumps(record).encode(), ".safetensors": tensors}
+
+
+def checkpoint_record_reader() -> Reader:
+    files = _checkpoint()
+    beside = (("step-000002.safetensors", files[".safetensors"]),)
+    read = _read_checkpoint
+    return Reader((files[".json"],), "step-000002.json", read, (RunError,), mutate_json, beside)
+
+
+def checkpoint_tensors_reader() -> Reader:
+    return Reader((_checkpoint()[".safetensors"],), "step-000002.safetensors", _read_tensors, (RunError,))
+
+
+def _read_tensors(path: Path) -> None:
+    """With the right hash, as only malice makes it."""
+    record = {**json.loads(_checkpoint()[".json"]), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+    path.with_suffix(".json").write_text(json.dumps(record))
+    _read_checkpoint(path)
+
+
+def _read_checkpoint(path: Path) -> None:
+    found = newest_complete_checkpoint(path.parent)
+    if found is None:
+        raise RunError("none")
+    TrainingRecord.from_json(found.record)
+
+
+def metrics_reader() -> Reader:
+    lines = [json.dumps({"step": step, "split": "train", "loss": 0.5}) + "\n" for step in range(3)]
+    return Reader(("".join(lines).encode(),), "metrics.jsonl", _read_metrics, (RunError,))
+
+
+def _read_metrics(path: Path) -> None:
+    before = path.read_bytes()
+    _keep_until(path, 2)  # the part of MetricsWriter that reads; TensorBoard's would start a thread a case
+    for line in path.read_text(encoding="utf-8").splitlines():
+        assert json.loads(line)["step"] <= 2
+    if path.read_bytes() != before:
+        raise RunError("lines were dropped")
+
+
+_RECIPE = b"""\
+illuminant: {light: D65, extrapolate: true}
+edits:
+- swap: &both [0, wood]
+- replace: {endmember: 2, library: checker/red}
+- replace: {endmember: 3, file: paints.csv, spectrum: ochre, extrapolate: yes}
+- retint: {endmember: 4, colour: '#3366cc', match: spectrum}
+- scale: {endmember: 0, factor: 1.5}
+- remove: *both
+- isolate: [7]
+- rename: {endmember: 1, name: red brick}
+- gloss: {endmember: 1, scale: 0, colour: [1, .5, 0]}
+"""
+
+
+def recipe_reader() -> Reader:
+    recipe_from_yaml("illuminant: A")  # imports colour-science: seconds that no case is to blame for
+    samples = (_RECIPE, b"illuminant: lamp.csv\n", b"%YAML 1.1\n---\nedits: [remove: !!int '0x1f']\n...\n")
+    return Reader(samples, "edits.yml", _read_recipe, (ConfigError,))
+
+
+def _read_recipe(path: Path) -> None:
+    recipe = read_recipe(path)
+    written = recipe_to_yaml(recipe)
+    written.encode()
+    assert recipe_from_yaml(written, folder=path.parent) == recipe

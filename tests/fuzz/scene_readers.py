@@ -1,0 +1,234 @@
+"""Readers of what a scene holds, with valid samples: poses, cubes, pictures, spectra, camera files, formulas."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from tests.fuzz.mutation import mutate_json, mutate_png
+from tests.fuzz.reader import Reader
+from tests.scenes.scene_factory import look_at
+from unmix_plugin.errors import ConfigError, SceneError, SpectrumError
+from unmix_plugin.scenes.reading.arrays import UnreadableArrayError, read_array_header
+from unmix_plugin.scenes.reading.cube_values import measure_cube
+from unmix_plugin.scenes.reading.faults import Faults
+from unmix_plugin.scenes.reading.frame_files import locate_files
+from unmix_plugin.scenes.reading.images import UnreadableImageError, read_colour, read_labels, read_mask
+from unmix_plugin.scenes.reading.splits import split_frames
+from unmix_plugin.scenes.reading.transforms_json import read_transforms
+from unmix_plugin.scenes.scene import Normalisation, SceneOptions
+from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
+from unmix_plugin.spectral.library.spectra_envi import read_spectra_envi
+from unmix_plugin.spectral.maps.index_formula import parse_formula
+from unmix_plugin.trained.camera_files.camera_files import read_camera_file
+
+_SIZE = (16, 20)
+
+
+_ENVI = """ENVI
+description = {
+  Two spectra, with a comment}
+samples = 3
+lines = 2
+bands = 1
+header offset = 0
+file type = ENVI Spectral Library
+data type = 4
+byte order = 0
+reflectance scale factor = 10000
+; a comment
+wavelength units = Micrometers
+data ignore value = -9999
+spectra names = {oak, fir
+ tree}
+wavelength = {0.45, 0.55, 0.65}
+"""
+
+
+def transforms_reader() -> Reader:
+    pose = look_at(np.array([3.0, 1.0, 1.5]), np.zeros(3)).tolist()
+    frames = [
+        {
+            "hyperspectral_file_path": f"cubes/{split}_{i}.npy",
+            "file_path": f"{split}_{i}.png",
+            "transform_matrix": pose,
+        }
+        for i, split in enumerate(("train", "eval", "train"))
+    ]
+    frames[0].update(
+        mask_path="mask.png", seg_file_path="s.png", abundance_file_path="a.npy", k1=0.1, fl_x=20
+    )
+    whole = {
+        "camera_model": "OPENCV",
+        "w": 20,
+        "h": 16,
+        "fl_x": 28.0,
+        "fl_y": 28.5,
+        "cx": 10.0,
+        "cy": 8.0,
+        "p1": 0.0,
+        "wavelengths": [450.0, 520.0, 600.5, 680],
+        "materials": ["leaf", "clay"],
+        "illuminant_path": "illuminant.csv",
+        "endmembers_path": "endmembers.csv",
+        "train_filenames": ["train_0.png", "train_2.png"],
+        "test_filenames": ["eval_1.png"],
+        "frames": frames,
+    }
+    bare = {
+        "camera_angle_x": 0.7,
+        "distortion_params": [0.1, 0, 0, 0, 0, 0.2],
+        "wavelengths": [400, 500],
+        "frames": frames[1:],
+    }
+    samples = tuple(json.dumps(content).encode() for content in (whole, bare))
+    named = {path for frame in frames for key, path in frame.items() if key.endswith("_path")}
+    beside = tuple((str(path), b"") for path in sorted(named))
+    return Reader(samples, "transforms.json", _read_transforms, (SceneError,), mutate_json, beside)
+
+
+def _read_transforms(path: Path) -> None:
+    faults = Faults(path.parent)
+    entry = read_transforms(path.parent, faults)
+    locate_files(path.parent, entry, SceneOptions(), faults)
+    for method in ("auto", "filename", "interval"):
+        split_frames(entry, method, 2, faults)
+    for frame in entry.frames:
+        if frame.intrinsics is not None:
+            focal = np.array(frame.intrinsics.focal_at(20), dtype=np.float32)
+            assert np.isfinite(focal).all()
+            assert focal.min() > 0
+    faults.raise_if_any()
+
+
+def cube_reader() -> Reader:
+    values = np.random.default_rng(0).uniform(0, 1, (6, 5, 4))
+    arrays = [values.astype(kind) for kind in ("<f2", ">f4", "<f8")]
+    arrays += [(values * 4095).astype(kind) for kind in ("<u2", ">i4")]
+    arrays += [np.asfortranarray(values, np.float32), np.where(values < 0.1, -values, values).astype("f4")]
+    return Reader(tuple(_npy(array) for array in arrays), "cube.npy", _read_cube, (UnreadableArrayError,))
+
+
+def _npy(array: np.ndarray) -> bytes:
+    file = io.BytesIO()
+    np.save(file, array)
+    return file.getvalue()
+
+
+def _read_cube(path: Path) -> None:
+    header = read_array_header(path)
+    if len(header.shape) == 3 and 0 not in header.shape:
+        values = measure_cube(path, None, "refuse")
+        assert 0 <= values.num_invalid_pixels <= values.num_pixels
+
+
+def picture_reader() -> Reader:
+    rgba = np.random.default_rng(0).integers(0, 256, (*_SIZE, 4), dtype=np.uint8)
+    samples = []
+    for mode in ("RGBA", "RGB", "L", "P", "LA", "1", "I;16"):
+        image = Image.fromarray(rgba[..., 0].astype(np.uint16)) if mode == "I;16" else Image.fromarray(rgba)
+        samples.append(_encoded(image if mode == "I;16" else image.convert(mode), "PNG"))
+    colour = Image.fromarray(rgba[..., :3])
+    samples += [_encoded(colour, "JPEG"), _encoded(colour, "TIFF")]
+    samples += [_encoded(colour, name) for name in ("BMP", "GIF", "PPM", "EPS")]
+    return Reader(tuple(samples), "picture.png", _read_picture, (UnreadableImageError,), mutate_png)
+
+
+def _encoded(image: Image.Image, form: str) -> bytes:
+    file = io.BytesIO()
+    image.save(file, form)
+    return file.getvalue()
+
+
+def _read_picture(path: Path) -> None:
+    for read in (read_mask, read_colour):
+        assert read(path, _SIZE).shape[:2] == _SIZE
+
+
+def labels_reader() -> Reader:
+    colour = picture_reader()
+    return replace(colour, file_name="labels.png", read=lambda path: read_labels(path, _SIZE))
+
+
+def envi_header_reader() -> Reader:
+    other = _ENVI.replace("data type = 4", "data type = 12").replace("Micrometers", "nm").replace("0.", "1")
+    plain = "\n".join(line for line in other.splitlines() if "factor" not in line and "ignore" not in line)
+    samples = tuple(text.encode() for text in (_ENVI, other, plain, _ENVI.replace("\n", "\r\n")))
+    beside = (("library.sli", np.linspace(0, 9000, 6).astype("<f4").tobytes()),)
+    return Reader(samples, "library.hdr", read_spectra_envi, (SpectrumError,), companions=beside)
+
+
+def envi_values_reader() -> Reader:
+    samples = (np.linspace(0, 9000, 6).astype("<f4").tobytes(),)
+    return Reader(
+        samples,
+        "library.sli",
+        read_spectra_envi,
+        (SpectrumError,),
+        companions=(("library.hdr", _ENVI.encode()),),
+    )
+
+
+def spectra_csv_reader() -> Reader:
+    samples = (
+        b"wavelength,leaf,clay\n450,0.1,0.2\n520,0.3,0.5\n600,0.1,0.8\n",
+        b'\xef\xbb\xbfwavelength_nm,"power, relative"\r\n\r\n400.5,1\r\n500,2e-3\r\n',
+    )
+    return Reader(samples, "spectra.csv", read_spectra_csv, (SpectrumError,))
+
+
+def cameras_reader() -> Reader:
+    pose = look_at(np.array([3.0, 1.0, 1.5]), np.zeros(3))
+    path = {
+        "camera_type": "perspective",
+        "render_width": 64,
+        "render_height": 48,
+        "fps": 24,
+        "seconds": 2.0,
+        "crop": None,
+        "camera_path": [{"camera_to_world": pose.reshape(-1).tolist(), "fov": 50.0, "aspect": 1.3}] * 2,
+    }
+    views = {
+        "format_version": 1,
+        "space": "world",
+        "camera_model": "OPENCV",
+        "w": 20,
+        "h": 16,
+        "fl_x": 28.0,
+        "k1": 0.01,
+        "fps": 12.5,
+        "frames": [
+            {"name": name, "transform_matrix": pose.tolist(), "cx": 9.0} for name in ("left", "right")
+        ],
+    }
+    frame = Normalisation(np.eye(3), np.array([0.1, 0.2, 0.3]), 0.5)
+    samples = tuple(json.dumps(content).encode() for content in (path, views))
+    return Reader(samples, "camera.json", partial(_read_cameras, frame), (ConfigError,), mutate_json)
+
+
+def _read_cameras(frame: Normalisation, path: Path) -> None:
+    for view in read_camera_file(path, frame).views:
+        assert bool(view.camera.focal_px.isfinite().all() and (view.camera.focal_px > 0).all())
+        assert bool(view.camera.camera_to_world.isfinite().all())
+
+
+def index_formula_reader() -> Reader:
+    samples = (
+        b"(r800-r670)/(r800+r670)",
+        b"2.5 * (R860.5 - r650) / (r860.5 + 6*r650 - 7.5e0*r470 + 1)",
+        b"max(sqrt(r550), -log(r700) ^ 2, min(r400, abs(exp(r500)))) ** -.5",
+    )
+    return Reader(samples, "formula.txt", _read_formula, (ConfigError,))
+
+
+def _read_formula(path: Path) -> None:
+    formula = parse_formula(path.read_bytes().decode("utf-8", "replace"))
+    value = formula.evaluate(lambda nm: torch.tensor([0.5, 0.0, 1.0]) / nm, torch.zeros(1))
+    assert not bool(value.isinf().any())
