@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ import pytest
 import torch
 
 from tests.commands.running import picture_size, run
+from tests.neumatex.fast_training import SMALL
 from tests.neumatex.object_factory import CENTRE, RADIUS, write_object
 from tests.neumatex.spectral_factory import ENDMEMBERS, LAMP, write_spectral_object
 from tests.products.ball_model import RADIUS as RUN_RADIUS
@@ -18,7 +18,7 @@ from tests.products.ball_model import ball_scene
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.train import train
-from unmix_plugin.engine import load_model, registry
+from unmix_plugin.engine import load_model
 from unmix_plugin.neumatex import run_start
 from unmix_plugin.neumatex.model import NeumatexModel
 from unmix_plugin.neumatex.trained_object import TrainedObject
@@ -30,24 +30,7 @@ from unmix_plugin.viewer.layers.layer_settings import LayerSettings
 from unmix_plugin.viewer.layers.layers import layers_of
 from unmix_plugin.viewer.layers.painting import SwatchLegend
 
-ENTRY = EntryPoint("neumatex", "unmix_plugin.neumatex.method_config:neumatex", registry.METHOD_GROUP)
-SMALL = [
-    "--pipeline.datamanager.train-num-rays-per-batch=256",
-    "--pipeline.model.plane-resolution=16",
-    "--pipeline.model.eval-samples=16",
-    "--pipeline.model.samples=4",
-    "--device=cpu",
-]
-SPECTRAL = ["--pipeline.model.material=spectral", "--pipeline.model.num-endmembers=2"]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def registered():
-    """The method found as an installed one, also where the package was installed before it had one."""
-    patch = pytest.MonkeyPatch()
-    patch.setattr(registry, "entry_points", lambda group: [ENTRY] * (group == ENTRY.group))
-    yield
-    patch.undo()
+SPECTRAL = [*SMALL, "--pipeline.model.material=spectral", "--pipeline.model.num-endmembers=2"]
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +39,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("neumatex")
     write_spectral_object(folder / "ball")
     words = ["--data", folder / "ball", "--output-dir", folder / "outputs", "--max-num-iterations", 30]
-    ended = run(train, "neumatex", *words, *SPECTRAL, *SMALL)
+    ended = run(train, "neumatex", *words, *SPECTRAL)
     assert ended.status == 0, ended.err
     return Path(ended.last_line.removeprefix("run: "))
 

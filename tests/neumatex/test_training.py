@@ -2,37 +2,20 @@
 
 import json
 import shutil
-from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 import torch
 
 from tests.commands.running import picture_size, run
+from tests.neumatex.fast_training import SMALL
 from tests.neumatex.object_factory import write_object
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.train import train
-from unmix_plugin.engine import load_model, registry
+from unmix_plugin.engine import load_model
 from unmix_plugin.neumatex.model import NeumatexModel, _squared_error
 
-ENTRY = EntryPoint("neumatex", "unmix_plugin.neumatex.method_config:neumatex", registry.METHOD_GROUP)
-SMALL = [
-    "--pipeline.datamanager.train-num-rays-per-batch=256",
-    "--pipeline.model.plane-resolution=16",
-    "--pipeline.model.eval-samples=16",
-    "--pipeline.model.material=pbr",
-    "--pipeline.model.samples=4",
-    "--device=cpu",
-]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def registered():
-    """The method found as an installed one, also where the package was installed before it had one."""
-    patch = pytest.MonkeyPatch()
-    patch.setattr(registry, "entry_points", lambda group: [ENTRY] * (group == ENTRY.group))
-    yield
-    patch.undo()
+PBR = [*SMALL, "--pipeline.model.material=pbr"]
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +24,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("neumatex")
     write_object(folder / "ball")
     words = ["--data", folder / "ball", "--output-dir", folder / "outputs", "--max-num-iterations", 30]
-    ended = run(train, "neumatex", *words, *SMALL)
+    ended = run(train, "neumatex", *words, *PBR)
     assert ended.status == 0, ended.err
     assert ended.last_line.startswith("run: ")
     return Path(ended.last_line.removeprefix("run: "))
@@ -79,7 +62,7 @@ def test_a_run_renders_from_its_folder_alone(trained):
 def test_a_resumed_run_ends_where_a_straight_one_does(tmp_path):
     write_object(tmp_path / "ball")
     words = ["--data", tmp_path / "ball", "--output-dir", tmp_path / "out", "--max-num-iterations", 6]
-    ended = run(train, "neumatex", *words, "--steps-per-save", 3, *SMALL)
+    ended = run(train, "neumatex", *words, "--steps-per-save", 3, *PBR)
     straight = Path(ended.last_line.removeprefix("run: "))
     begun = Path(shutil.copytree(straight, tmp_path / "begun"))
     for path in begun.glob("checkpoints/step-000006*"):
@@ -101,7 +84,7 @@ def test_a_resumed_run_ends_where_a_straight_one_does(tmp_path):
 def test_bad_input_ends_with_status_2_and_one_message(tmp_path, spoil, expected):
     folder = write_object(tmp_path / "ball")
     spoil(folder)
-    ended = run(train, "neumatex", "--data", folder, "--output-dir", tmp_path / "out", *SMALL)
+    ended = run(train, "neumatex", "--data", folder, "--output-dir", tmp_path / "out", *PBR)
     assert ended.status == 2
     assert expected in ended.err
     assert len(ended.err.strip().splitlines()) == 1
@@ -111,7 +94,7 @@ def test_bad_input_ends_with_status_2_and_one_message(tmp_path, spoil, expected)
 def test_display_pictures_train_their_response(tmp_path):
     write_object(tmp_path / "ball", suffix=".png")
     words = ["--data", tmp_path / "ball", "--output-dir", tmp_path / "out", "--max-num-iterations", 3]
-    ended = run(train, "neumatex", *words, *SMALL)
+    ended = run(train, "neumatex", *words, *PBR)
     assert ended.status == 0, ended.err
     model = load_model(Path(ended.last_line.removeprefix("run: ")), "cpu").model
     assert float(model.get_parameter("curve.coefficients").detach().abs().max()) > 0

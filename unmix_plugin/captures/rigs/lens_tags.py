@@ -76,7 +76,7 @@ def _perspective_lens(
     focal_px = (focal[0] * resolution[0], focal[0] * resolution[1]) if unit == "mm" else (focal[0], focal[0])
     distortion = tag_numbers(tags, "PerspectiveDistortion") or []
     k1, k2, k3, p1, p2 = distortion if len(distortion) == 5 else [0.0] * 5
-    return _lens(file, focal_px, centre, (k1, k2, k3), (p1, p2))
+    return _lens(file, focal_px, centre, (k1, k2, k3), (p1, p2)), ()
 
 
 def _dji_lens(file: SpectralFile, tags: XmpTags) -> tuple[Lens | None, tuple[str, ...]]:
@@ -88,7 +88,7 @@ def _dji_lens(file: SpectralFile, tags: XmpTags) -> tuple[Lens | None, tuple[str
         return None, ("no lens in the file's tags: DewarpData or CalibratedOpticalCenter is incomplete",)
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = numbers
     centre = (middle[0] + cx + HALF_PIXEL, middle[1] + cy + HALF_PIXEL)
-    return _lens(file, (fx, fy), centre, (k1, k2, k3), (p1, p2))
+    return _lens(file, (fx, fy), centre, (k1, k2, k3), (p1, p2)), ()
 
 
 def _lens(
@@ -97,13 +97,17 @@ def _lens(
     centre: tuple[float, float],
     radial: tuple[float, float, float],
     tangential: tuple[float, float],
-) -> tuple[Lens, tuple[str, ...]]:
-    """A lens of the file's size; nothing to say of it."""
+) -> Lens:
+    """A lens of the file's size.
+
+    Raises:
+        CaptureError: its distortion folds the image over.
+    """
     height, width = file.shape[:2]
     lens = Lens(width, height, focal_px, centre, (*radial[:2], *tangential), (radial[2], 0.0))
     if lens.higher_radial[0]:
         require_unfolded(lens, f"{file.path}, {TAGS}")
-    return lens, ()
+    return lens
 
 
 def _fisheye_lens(
