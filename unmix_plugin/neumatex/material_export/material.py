@@ -78,7 +78,11 @@ def material_paths(folder: Path, family: MaterialFamily) -> list[Path]:
         return [*texture_paths(folder, names), *single, *spectral_paths(folder)]
     if not isinstance(family, NeuralFamily):
         return [*texture_paths(folder, names), *single]
-    return [*texture_paths(folder, [*names, "latents_a", "latents_b"]), *single, *shader_paths(folder)]
+    return [
+        *texture_paths(folder, [*names, "diffuse_colour", "latents_a", "latents_b"]),
+        *single,
+        *shader_paths(folder),
+    ]
 
 
 def write_material(
@@ -166,6 +170,7 @@ def textures_of(
         ),
     ]
     if isinstance(family, NeuralFamily):
+        textures.append(Texture("diffuse_colour", family.diffuse_colour(parameters), colours, True))
         for letter, first in (("a", 0), ("b", 3)):
             channels = (f"latent {first + 1}", f"latent {first + 2}", f"latent {first + 3}")
             values = parameters[:, 3 + first : 6 + first]

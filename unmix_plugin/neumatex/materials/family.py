@@ -47,7 +47,7 @@ class MaterialFamily(Protocol):
         ...
 
     def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
-        """Diffuse base colour, linear, [0, 1]."""
+        """Base colour, linear, [0, 1]: what a metal reflects, and the diffuse albedo of all else."""
         ...
 
 

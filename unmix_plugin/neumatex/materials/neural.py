@@ -5,7 +5,7 @@ Notation as in `family`. With `passed` and `specular` decoded from the latents l
     f = passed(l, wi, wo) base / pi + specular(l, wi, wo)
 
 as in NeuMatEx, whose `T_neu` depends on `wi` alone; here it is a product of the same function of either direction, so
-that light and eye can change places. The colour of a metal is in its latents.
+that light and eye can change places. The colour of a metal is in its latents: `base_colour` reads it from there.
 """
 
 from copy import deepcopy
@@ -22,7 +22,7 @@ from unmix_plugin.neumatex.materials.stack_family import StackFamily
 
 
 class DecodedFamily(StackFamily):
-    """Parameters: base colour (0 to 2, linear), then the numbers that a decoder made of latents."""
+    """Parameters: diffuse colour (0 to 2, linear), then the numbers that a decoder made of latents."""
 
     num_parameters = 3 + NUM_NUMBERS
 
@@ -32,7 +32,7 @@ class DecodedFamily(StackFamily):
 
 
 class NeuralFamily(StackFamily):
-    """Parameters: base colour (0 to 2, linear), latents (3 to 8, in [0, 1]); the decoder is frozen."""
+    """Parameters: diffuse colour (0 to 2, linear), latents (3 to 8, in [0, 1]); the decoder is frozen."""
 
     PARAMETERS = (
         "base colour R", "base colour G", "base colour B",

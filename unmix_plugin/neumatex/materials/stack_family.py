@@ -16,7 +16,7 @@ from unmix_plugin.neumatex.materials.layer_stack import LayerStack
 
 
 class StackFamily(ABC):
-    """Parameters of a material, of which the first three are its base colour, linear; all of them give its layers."""
+    """Parameters of a material; the first three are its diffuse colour, linear, and all of them give its layers."""
 
     num_colours = 3
 
@@ -30,7 +30,7 @@ class StackFamily(ABC):
         """Reflectance, 1/sr, without the cosine: what passes the layers times the base over pi, and what they
         reflect; 0 where a direction is below the surface."""
         passed, specular = self.stack(parameters).reflectance(wi.T.contiguous(), wo.T.contiguous())
-        return ((passed / math.pi) * self.base_colour(parameters).T + specular).T
+        return ((passed / math.pi) * self.diffuse_colour(parameters).T + specular).T
 
     @torch.no_grad()
     def sample(
@@ -38,7 +38,7 @@ class StackFamily(ABC):
     ) -> Float[Tensor, "N 3"]:
         """Directions to the light, drawn from a cosine lobe and three GGX lobes."""
         wo = wo.T.contiguous()
-        mixture = self.stack(parameters).mixture(wo, self.base_colour(parameters).T)
+        mixture = self.stack(parameters).mixture(wo, self.diffuse_colour(parameters).T)
         return mixture.sample(wo, uniforms.T.contiguous()).T.contiguous()
 
     @torch.no_grad()
@@ -47,9 +47,14 @@ class StackFamily(ABC):
     ) -> Float[Tensor, " N"]:
         """Probability density of `sample`, 1/sr."""
         wo = wo.T.contiguous()
-        mixture = self.stack(parameters).mixture(wo, self.base_colour(parameters).T)
+        mixture = self.stack(parameters).mixture(wo, self.diffuse_colour(parameters).T)
         return mixture.density(wi.T.contiguous(), wo)
 
-    def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
-        """Linear base colour."""
+    def diffuse_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
+        """Linear albedo of what is below the layers; a metal has nothing there, and the colour says nothing."""
         return parameters[:, :3]
+
+    def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
+        """Linear base colour: what a metal reflects, and the diffuse albedo of all else."""
+        layers = self.stack(parameters)
+        return torch.lerp(self.diffuse_colour(parameters), layers.metal_colour.T, layers.metallicity[:, None])
