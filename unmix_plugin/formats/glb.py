@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -53,19 +53,8 @@ def write_glb(
     for name, values in numbers.items():
         attributes[name] = builder.add(values, "SCALAR", FLOAT, VERTEX_BUFFER)
     indices = builder.add(faces.astype("<u4").ravel(), "SCALAR", UNSIGNED_INT, INDEX_BUFFER)
-    primitive = {"attributes": attributes, "indices": indices, "material": 0}
-    content = {
-        "asset": {"version": "2.0", "generator": f"unmix-nerf {__version__}"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": "surface"}],
-        "meshes": [{"primitives": [primitive], "extras": dict(extras)}],
-        "materials": [{"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0}}],
-        "accessors": builder.accessors,
-        "bufferViews": builder.views,
-        "buffers": [{"byteLength": len(builder.data)}],
-    }
-    return write_file(path, glb_container(json.dumps(content).encode(), bytes(builder.data)))
+    material = {"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0}}
+    return builder.write(path, attributes, indices, material, extras)
 
 
 class GlbBuilder:
@@ -101,8 +90,44 @@ class GlbBuilder:
         self.data += content + b"\0" * (-len(content) % 4)
         return len(self.views) - 1
 
+    def write(
+        self,
+        path: Path,
+        attributes: Mapping[str, int],
+        indices: int,
+        material: Mapping[str, Any],
+        extras: Mapping[str, Any],
+        **textures: Sequence[Mapping[str, Any]],
+    ) -> Path:
+        """Write a file of one mesh in one material.
 
-def glb_container(text: bytes, data: bytes) -> bytes:
+        Args:
+            path: File; its folder is made.
+            attributes: Accessor of each attribute of the vertices.
+            indices: Accessor of the faces.
+            material: As glTF has it.
+            extras: What else the file says of the mesh, as JSON has it.
+            textures: What the material points to: `textures`, `samplers`, `images`.
+        Raises:
+            RunError: the disk is full or refuses.
+        """
+        primitive = {"attributes": dict(attributes), "indices": indices, "material": 0}
+        content = {
+            "asset": {"version": "2.0", "generator": f"unmix-nerf {__version__}"},
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"mesh": 0, "name": "surface"}],
+            "meshes": [{"primitives": [primitive], "extras": dict(extras)}],
+            "materials": [material],
+            **textures,
+            "accessors": self.accessors,
+            "bufferViews": self.views,
+            "buffers": [{"byteLength": len(self.data)}],
+        }
+        return write_file(path, _container(json.dumps(content).encode(), bytes(self.data)))
+
+
+def _container(text: bytes, data: bytes) -> bytes:
     """Header and two chunks, padded to multiples of four bytes."""
     text += b" " * (-len(text) % 4)
     data += b"\0" * (-len(data) % 4)

@@ -7,7 +7,6 @@ Notation: `P` vertices, `F` faces.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,15 +15,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Int
 
-from unmix_plugin import __version__
-from unmix_plugin.formats.files import write_file
 from unmix_plugin.formats.glb import (
     FLOAT,
     INDEX_BUFFER,
     UNSIGNED_INT,
     VERTEX_BUFFER,
     GlbBuilder,
-    glb_container,
 )
 
 _LINEAR, _LINEAR_MIPMAPS, _CLAMP = 9729, 9987, 33071
@@ -70,22 +66,17 @@ def write_textured_glb(path: Path, mesh: TexturedMesh, extras: Mapping[str, Any]
             ("metallic_roughness", mesh.metallic_roughness_png),
         )
     ]
-    primitive = {"attributes": attributes, "indices": indices, "material": 0}
-    content = {
-        "asset": {"version": "2.0", "generator": f"unmix-nerf {__version__}"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": "surface"}],
-        "meshes": [{"primitives": [primitive], "extras": dict(extras)}],
-        "materials": [_MATERIAL],
-        "textures": [{"sampler": 0, "source": 0}, {"sampler": 0, "source": 1}],
-        "samplers": [{"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAPS, "wrapS": _CLAMP, "wrapT": _CLAMP}],
-        "images": images,
-        "accessors": builder.accessors,
-        "bufferViews": builder.views,
-        "buffers": [{"byteLength": len(builder.data)}],
-    }
-    return write_file(path, glb_container(json.dumps(content).encode(), bytes(builder.data)))
+    sampler = {"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAPS, "wrapS": _CLAMP, "wrapT": _CLAMP}
+    return builder.write(
+        path,
+        attributes,
+        indices,
+        _MATERIAL,
+        extras,
+        textures=[{"sampler": 0, "source": 0}, {"sampler": 0, "source": 1}],
+        samplers=[sampler],
+        images=images,
+    )
 
 
 _MATERIAL = {

@@ -6,9 +6,9 @@ Notation: `N` views.
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.upright_cameras import upright_cameras
 
 _DISTANCE = 4.2
 _ELEVATIONS_DEG = (-40.0, 70.0)
@@ -33,14 +33,5 @@ def viewpoints(views: int, size: int, radius: float, first: int = 0) -> Cameras:
     z = low + (high - low) * shares
     flat = np.sqrt(1 - z**2)
     backward = np.stack([flat * np.cos(azimuths), flat * np.sin(azimuths), z], axis=1)
-    right = np.stack([-np.sin(azimuths), np.cos(azimuths), np.zeros(views)], axis=1)
-    poses = np.stack([right, np.cross(backward, right), backward, _DISTANCE * backward], axis=2)
     half_angle = np.arcsin(min(_MARGIN * radius / _DISTANCE, 0.95))
-    return Cameras(
-        torch.tensor(poses, dtype=torch.float32),
-        torch.full((views, 2), float(size / 2 / np.tan(half_angle))),
-        torch.full((views, 2), size / 2),
-        torch.zeros(views, 4),
-        size,
-        size,
-    )
+    return upright_cameras(_DISTANCE * backward, backward, size, 2 * half_angle)

@@ -9,10 +9,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Float
 
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.upright_cameras import upright_cameras
 from unmix_plugin.scenes.demo.materials import MATERIALS, Blend, Surface, plain, smooth_step
 from unmix_plugin.scenes.demo.shading import THINGS, Sky, Thing
 from unmix_plugin.scenes.demo.shapes import Placement
@@ -125,18 +125,7 @@ def room_cameras(size: int, views: int, seed: int = 11) -> Cameras:
     targets = np.array([0.0, 1.2, 0.9]) + generator.uniform(-1, 1, (views, 3)) * (1.0, 0.3, 0.4)
     backward = positions - targets
     backward /= np.linalg.norm(backward, axis=1, keepdims=True)
-    right = np.cross([0.0, 0.0, 1.0], backward)
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    poses = np.stack([right, np.cross(backward, right), backward, positions], axis=2)
-    focal_px = size / 2 / np.tan(np.deg2rad(_PHONE_ANGLE_DEG / 2))
-    return Cameras(
-        torch.tensor(poses, dtype=torch.float32),
-        torch.full((views, 2), focal_px),
-        torch.full((views, 2), size / 2),
-        torch.zeros(views, 4),
-        size,
-        size,
-    )
+    return upright_cameras(positions, backward, size, np.deg2rad(_PHONE_ANGLE_DEG))
 
 
 TABLE = Place(THINGS, demo_cameras)

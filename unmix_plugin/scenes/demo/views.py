@@ -8,10 +8,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float, Float32, UInt8
 
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.upright_cameras import upright_cameras
 from unmix_plugin.scenes.demo.shading import ViewCoefficients
 
 UNLABELLED = 255
@@ -33,19 +33,8 @@ def demo_cameras(size: int, views: int) -> Cameras:
     heights = low + (high - low) * shares
     flat = np.sqrt(1 - heights**2)
     backward = np.stack([flat * np.cos(azimuths), flat * np.sin(azimuths), heights], axis=1)
-    right = np.stack([-np.sin(azimuths), np.cos(azimuths), np.zeros(views)], axis=1)
-    up = np.cross(backward, right)
     positions = np.asarray(LOOK_AT) + CAMERA_DISTANCE * backward
-    poses = np.stack([right, up, backward, positions], axis=2)
-    focal_px = size / 2 / np.tan(np.deg2rad(VIEW_ANGLE_DEG / 2))
-    return Cameras(
-        torch.tensor(poses, dtype=torch.float32),
-        torch.full((views, 2), focal_px),
-        torch.full((views, 2), size / 2),
-        torch.zeros(views, 4),
-        size,
-        size,
-    )
+    return upright_cameras(positions, backward, size, np.deg2rad(VIEW_ANGLE_DEG))
 
 
 def lens_entries(cameras: Cameras) -> dict[str, Any]:
