@@ -59,9 +59,9 @@ class NeumatexModelConfig(ModelConfig):
     material. Spectral materials have no prior: they start from the pictures or from a run."""
     fit_networks: bool = True
     """Fit the networks that read the planes, too. Published with a prior: the planes alone."""
-    regularisation: float = 1e-4
-    """Weight of the distance from the prior, over its expected squared error. About the squared error of a fitted
-    pixel: then picture and prior each count by what they know."""
+    regularisation: float = 1e-5
+    """Weight of the distance from the prior, over its expected squared error. Less than the squared error of a fitted
+    pixel: what the prior has wrong it has wrong in whole regions, so that many of its points count as few."""
     plane_resolution: int = 128
     """Texels along an edge of each of the three planes."""
     light_curve: LightCurve | Auto = "auto"

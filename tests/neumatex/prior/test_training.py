@@ -178,6 +178,30 @@ def test_a_view_that_sees_nothing_changes_nothing(objects):
         assert_close(prior(replace(observations, visible=hidden, colours=spoiled)), expected)
 
 
+def test_a_point_learns_from_those_that_are_seen_alone(objects):
+    prior, observations = make_prior(), objects.select([0]).observations
+    hidden = observations.visible.clone()
+    hidden[:, 1:3] = False
+    hidden[:, 0] = True
+    brighter = observations.colours.clone()
+    brighter[:, 2] *= 3
+    of_hidden, of_seen = (
+        replace(observations, visible=visible, colours=brighter) for visible in (hidden, hidden | True)
+    )
+    with torch.no_grad():
+        base = prior(replace(observations, visible=hidden))[:, 0]
+        assert_close(prior(of_hidden)[:, 0], base)
+        seen = prior(replace(observations, visible=hidden | True))[:, 0]
+        assert (prior(of_seen)[:, 0] - seen).abs().max() > 1e-4
+
+
+def test_objects_of_which_nothing_is_seen_get_numbers_too(objects):
+    prior, observations = make_prior(), objects.select([0]).observations
+    with torch.no_grad():
+        found = prior(replace(observations, visible=torch.zeros_like(observations.visible)))
+    assert torch.isfinite(found).all()
+
+
 class Scene(NamedTuple):
     views: PosedViews
     ray_mesh: RayMesh

@@ -11,6 +11,7 @@ from typing import Literal
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
+from torch.nn import functional
 
 from unmix_plugin.neumatex.prior.observations import (
     NUM_POINT_FEATURES,
@@ -25,7 +26,10 @@ MaterialName = Literal["neural", "pbr"]
 TaskName = Literal["neural", "pbr", "layers"]
 """What the embeddings are trained to tell; the layers are there for the training alone."""
 NUM_PARAMETERS: dict[TaskName, int] = {"neural": 9, "pbr": 5, "layers": 14}
-_VIEW_WIDTH, _POINT_WIDTH = 48, 128
+_VIEW_WIDTH, _POINT_WIDTH, _NUM_HEADS = 64, 128, 4
+_NUM_EXCHANGES = 3
+MOST_ASKED = 640
+"""Points of an object that the others learn from: the first ones, which are as random as all."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +70,8 @@ class SmallPrior(nn.Module):
         super().__init__()
         self.view_encoder = _perceptron(NUM_VIEW_FEATURES, _VIEW_WIDTH, _VIEW_WIDTH)
         self.point_encoder = _perceptron(3 * _VIEW_WIDTH + NUM_POINT_FEATURES, _POINT_WIDTH, _POINT_WIDTH)
-        self.object_encoder = _perceptron(_POINT_WIDTH, 64, _POINT_WIDTH)
-        self.mixer = _perceptron(_POINT_WIDTH, _POINT_WIDTH, _POINT_WIDTH)
+        self.exchanges = nn.ModuleList([PointExchange(_POINT_WIDTH) for _ in range(_NUM_EXCHANGES)])
+        self.last_norm = nn.LayerNorm(_POINT_WIDTH)
         self.heads = nn.ModuleDict(
             {name: nn.Linear(_POINT_WIDTH, 2 * p) for name, p in NUM_PARAMETERS.items()}
         )
@@ -79,12 +83,12 @@ class SmallPrior(nn.Module):
         return self.neural_readers if material == "neural" else self.pbr_readers
 
     def forward(self, observations: Observations) -> Float[Tensor, "B N W"]:
-        """Embeddings of points: what all their views show, and what the object is like as a whole."""
-        o = observations
-        seen = o.visible.any(dim=-1).float()
-        points = self._points(o)
-        whole = (points * seen[..., None]).sum(dim=1) / seen.sum(dim=1, keepdim=True).clamp(min=1)
-        return self.mixer(points + self.object_encoder(whole)[:, None])
+        """Embeddings of points: what their views show, and what other points of the object are like."""
+        seen = observations.visible.any(dim=-1)
+        points = self._points(observations)
+        for exchange in self.exchanges:
+            points = exchange(points, seen)
+        return self.last_norm(points)
 
     def estimate(
         self, embeddings: Float[Tensor, "B N W"], task: TaskName
@@ -108,6 +112,35 @@ class SmallPrior(nn.Module):
             o.positions, o.colours, o.visible, o.mirrored, o.mirror_open, o.irradiance, o.unshadowed
         )
         return self.point_encoder(torch.cat([mean, (spread + 1e-6).sqrt(), largest, known], dim=-1))
+
+
+class PointExchange(nn.Module):
+    """Attention of points to others of the same object, then a perceptron for each.
+
+    One point is seen under one light from a few sides; others of the same material show it under more.
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.first_norm, self.second_norm = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.queries, self.keys_and_values = nn.Linear(width, width), nn.Linear(width, 2 * width)
+        self.joined = nn.Linear(width, width)
+        self.perceptron = nn.Sequential(nn.Linear(width, 3 * width), nn.SiLU(), nn.Linear(3 * width, width))
+
+    def forward(self, points: Float[Tensor, "B N W"], seen: Bool[Tensor, "B N"]) -> Float[Tensor, "B N W"]:
+        """Points after one exchange; those that no view sees ask, but are not asked."""
+        normed = self.first_norm(points)
+        asked, known = normed[:, :MOST_ASKED], seen[:, :MOST_ASKED]
+        known = known | ~known.any(dim=-1, keepdim=True)
+        keys, values = self.keys_and_values(asked).chunk(2, dim=-1)
+        heads = [_in_heads(part) for part in (self.queries(normed), keys, values)]
+        found = functional.scaled_dot_product_attention(*heads, attn_mask=known[:, None, None])
+        points = points + self.joined(found.transpose(1, 2).flatten(2))
+        return points + self.perceptron(self.second_norm(points))
+
+
+def _in_heads(values: Float[Tensor, "B N W"]) -> Float[Tensor, "B H N w"]:
+    return values.unflatten(-1, (_NUM_HEADS, -1)).transpose(1, 2)
 
 
 def _perceptron(*sizes: int) -> nn.Sequential:

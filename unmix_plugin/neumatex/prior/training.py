@@ -33,13 +33,13 @@ class PriorTraining:
 
     seconds: float = 1500.0
     """How long to train; the learning rate follows the clock, so that it ends at 0 on any machine."""
-    batch: int = 16
+    batch: int = 12
     """Objects a step."""
-    points: int = 96
+    points: int = 128
     """Points of an object."""
     views: int = 8
     """Views of an object that the prior sees at most."""
-    learning_rate: float = 2e-3
+    learning_rate: float = 1.5e-3
     nll_weight: float = 1.0
     nll_from: float = 0.15
     """Part of the training after which the likelihood counts, first a little."""
