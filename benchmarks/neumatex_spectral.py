@@ -10,7 +10,9 @@ spectrum. All are told the number of materials.
 Albedo is what a method says of the diffuse reflectance in a pixel of an evaluation view, mean over the bands,
 after one factor for the object; of unmix-nerf abundances times endmembers over the lamp, which leaves its shading out.
 What is left of shadows in it is the correlation of its relative error, estimate over truth less 1, with the light that
-falls on the surface. The error, since the true albedo may correlate by chance, which the table says.
+falls on the surface. The error, since the true albedo may correlate by chance. Materials may lie in the shade by chance
+too; with a material that is too bright all over, the error then follows the light. So the table says beside it what
+correlation is left within materials: that of what linear functions of the true abundances leave of error and light.
 """
 
 from __future__ import annotations
@@ -37,6 +39,7 @@ COLUMNS = {
     "endmember_angle": "endmember angle, rad",
     "error_correlation": "error of albedo with light",
     "shaded_correlation": "the same with shading",
+    "within_correlation": "within materials",
     "albedo_error": "error of albedo",
     "abundance_rmse": "abundance RMSE",
     "psnr": "PSNR",
@@ -175,13 +178,16 @@ def materials(run: Path, folder: Path) -> dict[str, float]:
         endmembers = require_materials(scene, FIELD).materials.endmembers.detach() / lamp
     true_endmembers = torch.from_numpy(truth.true_materials.endmembers).float()
     pixels = [seen_pixels(truth, scene, endmembers, lamp, index) for index in truth.split.evaluation]
-    light, true, found, shaded = (torch.cat(parts).double().numpy() for parts in zip(*pixels, strict=True))
+    parts = (torch.cat(part).double().numpy() for part in zip(*pixels, strict=True))
+    light, true, found, shaded, abundances = parts
+    error = relative_error(found, true)
     return {
         "endmember_angle": endmember_angle(endmembers, true_endmembers, torch.ones_like(lamp)),
-        "error_correlation": correlation(relative_error(found, true), light),
+        "error_correlation": correlation(error, light),
         "shaded_correlation": correlation(relative_error(shaded, true), light),
+        "within_correlation": correlation(left_over(error, abundances), left_over(light, abundances)),
         "true_albedo_correlation": correlation(true, light),
-        "albedo_error": float(np.abs(relative_error(found, true)).mean()),
+        "albedo_error": float(np.abs(error).mean()),
         "pixels": float(len(true)),
     }
 
@@ -189,7 +195,7 @@ def materials(run: Path, folder: Path) -> dict[str, float]:
 def seen_pixels(
     truth: Any, scene: Any, endmembers: torch.Tensor, lamp: torch.Tensor, index: int
 ) -> tuple[torch.Tensor, ...]:
-    """Direct light on a view's pixels that count, and of each the true albedo, the one found and that with shading."""
+    """Of a view's pixels that count: direct light, the true albedo, the one found, that with shading, true abundances."""
     from unmix_plugin.neumatex.scene.pixel_list import OPAQUE
 
     light, alpha = direct_light(truth, index)
@@ -204,9 +210,9 @@ def seen_pixels(
     if hasattr(scene, "materials"):
         diffuse = scene.materials.diffuse(view.coefficients)[shown] / opacity[shown][:, None]
         with_shading = (diffuse / lamp).mean(dim=1)
-    abundances = truth.true_materials.abundances(index)
-    true = torch.from_numpy(abundances)[shown] @ torch.from_numpy(truth.true_materials.endmembers).float()
-    return light[shown], true.mean(dim=1), found, with_shading
+    abundances = torch.from_numpy(truth.true_materials.abundances(index))[shown]
+    true = abundances @ torch.from_numpy(truth.true_materials.endmembers).float()
+    return light[shown], true.mean(dim=1), found, with_shading, abundances
 
 
 def direct_light(truth: Any, index: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -243,6 +249,11 @@ def relative_error(found: np.ndarray, true: np.ndarray) -> np.ndarray:
 def correlation(a: np.ndarray, b: np.ndarray) -> float:
     """Pearson's."""
     return float(np.corrcoef(a, b)[0, 1])
+
+
+def left_over(values: np.ndarray, abundances: np.ndarray) -> np.ndarray:
+    """What the linear function of the abundances that fits best leaves of the values."""
+    return values - abundances @ np.linalg.lstsq(abundances, values, rcond=None)[0]
 
 
 def judge(measured: dict[str, list[dict[str, Any]]]) -> list[_common.Figure]:
