@@ -195,7 +195,7 @@ def materials(run: Path, folder: Path) -> dict[str, float]:
 def seen_pixels(
     truth: Any, scene: Any, endmembers: torch.Tensor, lamp: torch.Tensor, index: int
 ) -> tuple[torch.Tensor, ...]:
-    """Of a view's pixels that count: direct light, the true albedo, the one found, that with shading, true abundances."""
+    """Of pixels that count: direct light, the true albedo, the one found, that with shading, the true abundances."""
     from unmix_plugin.neumatex.scene.pixel_list import OPAQUE
 
     light, alpha = direct_light(truth, index)
