@@ -28,6 +28,7 @@ from unmix_plugin.errors import SceneError
 from unmix_plugin.pose_refinement import Knots
 from unmix_plugin.scenes.alpha_evidence import AlphaEvidence
 from unmix_plugin.scenes.geometry.carving import carve
+from unmix_plugin.scenes.geometry.lamp_search import find_lamp
 from unmix_plugin.scenes.geometry.lighting import judge_light
 from unmix_plugin.scenes.geometry.pose_check import check_scene_poses
 from unmix_plugin.scenes.identity import scene_identity
@@ -155,6 +156,7 @@ class HyperspectralDataManager(DataManager):
     def initial_data(self) -> Mapping[str, np.ndarray]:
         """`pixels`: spectra pooled over all training views; `reachable`: where something may be; `knots`: where cameras
         stand whose poses may be corrected; `light`: fixed, camera or per-view, as far as pictures with alpha tell;
+        `lamp`: numbers of the lamp that moves with the camera, none if it is not known;
         `band_weights`, of squared errors, mean 1.
 
         Of a rig, pixels of the sensor with most channels, and of those the one with most pixels; `sensor`, which that
@@ -174,7 +176,7 @@ class HyperspectralDataManager(DataManager):
             "pixels": self._pixels.sample_opaque(chosen, most, seed),
             "reachable": reachable,
             "band_weights": band_weights(self.scene, self._noise),
-            "light": np.array(self._light(reachable) if self.scene.has_alpha else "fixed"),
+            **self._light(reachable),
         }
         if not self.scene.is_rig:
             return found
@@ -258,10 +260,17 @@ class HyperspectralDataManager(DataManager):
     def _grid_resolution(self) -> int:
         return choose(self.options.grid_resolution, self._preset.grid_resolution)
 
-    def _light(self, reachable: Bool[np.ndarray, "R R R"]) -> str:
-        """Judged by the views of the sensor that took most."""
+    def _light(self, reachable: Bool[np.ndarray, "R R R"]) -> dict[str, np.ndarray]:
+        """Judged by the views of the sensor that took most; and where the lamp stands if it moves with the camera."""
+        if not self.scene.has_alpha:
+            return {"light": np.array("fixed")}
         views, seen = self._evidence.log_brightness()
-        return judge_light(self.train_cameras[views], seen, reachable, self.scene_box)
+        cameras = self.train_cameras[views]
+        light = judge_light(cameras, seen, reachable, self.scene_box)
+        lamp = None
+        if light == "camera":
+            lamp = find_lamp(cameras, self._evidence.log_shading(), reachable, self.scene_box)
+        return {"light": np.array(light), "lamp": np.array(() if lamp is None else lamp.numbers())}
 
 
 def _load(folder: Path, options: SceneOptions) -> Scene:

@@ -19,11 +19,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from unmix_plugin.directions import (
+    NUM_DIRECTION_FEATURES,
+    NUM_SKY_FEATURES,
+    direction_features,
+    sky_features,
+)
 from unmix_plugin.engine.field import Field
 from unmix_plugin.engine.geometry.contraction import contracted_unit
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.engine.instantiate import InstantiateConfig, Target
 from unmix_plugin.errors import require
+from unmix_plugin.lamp import Lamp, LampLight, MovingLamp, lamp_shading
 from unmix_plugin.rendering.hash_encoding import HashGridLayout, hash_encode
 
 _LARGEST_LOG_DENSITY = 15.0
@@ -85,6 +92,25 @@ class UnmixFieldConfig(InstantiateConfig):
 class CoefficientField(Field):
     """What the renderer asks of a field: densities by way of an encoding, and the coefficients of spectra."""
 
+    @property
+    def moving_lamp(self) -> MovingLamp | None:
+        """The lamp that moves with the camera; None where light is fixed or its place is not known."""
+        return None
+
+    @abstractmethod
+    def get_outputs(
+        self,
+        positions: Float[Tensor, "S 3"],
+        directions: Float[Tensor, "S 3"],
+        features: Float[Tensor, "S G"],
+        lit: LampLight | None = None,
+    ) -> dict[str, Tensor]:
+        """`abundances` (S, K), `scaled_abundances` (S, K) and `specular_coefficients` (S, J) along `directions`.
+
+        Args:
+            lit: What reaches the samples from `moving_lamp`; None where there is none.
+        """
+
     @abstractmethod
     def encode(
         self, positions: Float[Tensor, "S 3"], known: Float[Tensor, "S LF"] | None = None
@@ -125,6 +151,7 @@ class UnmixField(CoefficientField):
         pixel_size: float,
         exposure: float = 1.0,
         lit_by_camera: bool = False,
+        lamp: Lamp | None = None,
         is_unbounded: bool = False,
         coarse_to_fine: bool = False,
     ) -> None:
@@ -138,12 +165,14 @@ class UnmixField(CoefficientField):
             pixel_size: Edge of a pixel in the middle of the scene, scene units.
             exposure: How dark the scene is: the view-dependent part starts so many times darker.
             lit_by_camera: Whether the light moves with the camera, so that scales depend on the direction of view.
+            lamp: Where its lamp stands at the start of training; None if that is not known.
             is_unbounded: Whether the field is defined in all of space, contracted around the box, with a sky behind.
             coarse_to_fine: Whether the grid's levels have weights, as refining poses needs them.
         """
         super().__init__()
         self.config = config
         self.lit_by_camera = lit_by_camera
+        self.lamp = MovingLamp(lamp) if lamp is not None and lit_by_camera else None
         self.specular_bias = config.specular_bias - math.log(exposure)
         self.num_endmembers, self.num_specular = num_endmembers, num_specular
         self.num_encoded = config.num_levels * config.features_per_level
@@ -174,7 +203,13 @@ class UnmixField(CoefficientField):
         if self.num_specular:
             self.specular_network = bias_free_network(seen, width, self.num_specular + 1)
         if self.lit_by_camera:
-            self.shading_network = bias_free_network(num_features, width, NUM_DIRECTION_FEATURES)
+            num_shading = NUM_DIRECTION_FEATURES + (self.lamp is not None)
+            self.shading_network = bias_free_network(num_features, width, num_shading)
+
+    @property
+    def moving_lamp(self) -> MovingLamp | None:
+        """The lamp that moves with the camera; None where light is fixed or its place is not known."""
+        return self.lamp
 
     def encode(
         self, positions: Float[Tensor, "S 3"], known: Float[Tensor, "S LF"] | None = None
@@ -208,13 +243,14 @@ class UnmixField(CoefficientField):
         positions: Float[Tensor, "S 3"],
         directions: Float[Tensor, "S 3"],
         features: Float[Tensor, "S G"],
+        lit: LampLight | None = None,
     ) -> dict[str, Tensor]:
         """`abundances` (S, K), `scaled_abundances` S a (S, K) and `specular_coefficients` h u (S, J)."""
-        abundances, scales = self._material(features, directions)
+        abundances, scales = self._material(features, directions, lit)
         return {
             "abundances": abundances,
             "scaled_abundances": scales * abundances,
-            "specular_coefficients": self._specular(directions, features),
+            "specular_coefficients": self._specular(directions, features, lit),
         }
 
     def abundances_of(self, features: Float[Tensor, "S G"]) -> Float[Tensor, "S K"]:
@@ -222,65 +258,32 @@ class UnmixField(CoefficientField):
         return self._material(features)[0]
 
     def _material(
-        self, features: Float[Tensor, "S G"], directions: Float[Tensor, "S 3"] | None = None
+        self,
+        features: Float[Tensor, "S G"],
+        directions: Float[Tensor, "S 3"] | None = None,
+        lit: LampLight | None = None,
     ) -> tuple[Float[Tensor, "S K"], Float[Tensor, "S C"]]:
         """Abundances and scales; C is 1 or K. Only scales depend on directions, and only in a moving light."""
         material = self.material_network(features)
         abundances = torch.softmax(material[:, : self.num_endmembers] / self.config.temperature, dim=-1)
         scales = material[:, self.num_endmembers :]
-        if self.lit_by_camera and directions is not None:
+        if self.lamp is not None and directions is not None:
+            scales = scales + lamp_shading(self.shading_network(features), lit)
+        elif self.lit_by_camera and directions is not None:
             # A sum over harmonics rather than a network of both: that took textures for shading.
             changes = self.shading_network(features) * direction_features(directions)
             scales = scales + changes.sum(dim=-1, keepdim=True)
         return abundances, torch.sigmoid(scales)
 
     def _specular(
-        self, directions: Float[Tensor, "S 3"], features: Float[Tensor, "S G"]
+        self, directions: Float[Tensor, "S 3"], features: Float[Tensor, "S G"], lit: LampLight | None
     ) -> Float[Tensor, "S J"]:
         if self.num_specular == 0:
             return features.new_zeros(len(features), 0)
-        seen = torch.cat([features, direction_features(directions)], dim=-1)
+        mirrored = direction_features(directions) if lit is None else lit.mirrored(directions)
+        seen = torch.cat([features, mirrored], dim=-1)
         factors = torch.sigmoid(self.specular_network(seen) + self.specular_bias / 2)
         return factors[:, :1] * factors[:, 1:]
-
-
-NUM_DIRECTION_FEATURES = 15
-
-
-def direction_features(directions: Float[Tensor, "S 3"]) -> Float[Tensor, "S 15"]:
-    """Real spherical harmonics of degrees 1 to 3 of unit directions (the constant carries nothing), up to scale."""
-    x, y, z = directions.unbind(-1)
-    xx, yy, zz = x * x, y * y, z * z
-    return torch.stack(
-        [
-            x,
-            y,
-            z,
-            1.7320508 * x * y,
-            1.7320508 * y * z,
-            0.5 * (3 * zz - 1),
-            1.7320508 * x * z,
-            0.8660254 * (xx - yy),
-            0.7905694 * y * (3 * xx - yy),
-            3.8729833 * x * y * z,
-            0.6123724 * y * (5 * zz - 1),
-            0.5 * z * (5 * zz - 3),
-            0.6123724 * x * (5 * zz - 1),
-            1.9364917 * z * (xx - yy),
-            0.7905694 * x * (xx - 3 * yy),
-        ],
-        dim=-1,
-    )
-
-
-_SKY_OCTAVES = 4
-NUM_SKY_FEATURES = NUM_DIRECTION_FEATURES + 6 * _SKY_OCTAVES
-
-
-def sky_features(directions: Float[Tensor, "R 3"]) -> Float[Tensor, "R 39"]:
-    """Harmonics of unit directions, and sines and cosines of 1, 2, 4 and 8 times their components."""
-    angles = torch.cat([2.0**octave * directions for octave in range(_SKY_OCTAVES)], dim=-1)
-    return torch.cat([direction_features(directions), angles.sin(), angles.cos()], dim=-1)
 
 
 def bounded_exp(raw: Float[Tensor, "S"]) -> Float[Tensor, "S"]:

@@ -69,7 +69,8 @@ class UnmixModel(Model):
         self.endmembers = nn.Parameter(torch.zeros(shape), requires_grad=config.train_endmembers)
         num_dictionary = config.num_dictionary_spectra(self.preset, self.num_endmembers)
         self.specular_spectra = nn.Parameter(torch.zeros(num_dictionary, len(self.bands)))
-        self.grid = OccupancyGrid(torch.ones((metadata["grid_resolution"],) * 3, dtype=torch.bool))
+        reachable = torch.ones((metadata["grid_resolution"],) * 3, dtype=torch.bool)
+        self.grid = OccupancyGrid(reachable, config.moving_lamp is not None)
         self._renderer: VolumeRenderer | None = None
         self.step = config.renderer.sample_distance(
             metadata["pixel_size"], float(self.scene_box.size.max()), metadata["has_alpha"]
@@ -87,6 +88,7 @@ class UnmixModel(Model):
             pixel_size=metadata["pixel_size"],
             exposure=choose(config.losses.exposure, 1.0),
             lit_by_camera=config.light == "camera",
+            lamp=config.moving_lamp,
             is_unbounded=self.is_unbounded,
             coarse_to_fine=refines,
         )
@@ -142,7 +144,7 @@ class UnmixModel(Model):
         if self.poses is not None:
             self.poses.begin(torch.from_numpy(initial_data["knots"]), self.scene_box.aabb.mean(dim=0))
             reachable = torch.ones_like(reachable)  # poses that are off carve away what is there
-        self.grid = OccupancyGrid(reachable).to(self.device)
+        self.grid = OccupancyGrid(reachable, self.config.moving_lamp is not None).to(self.device)
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """The hash table, the networks and the spectra."""
@@ -170,6 +172,7 @@ class UnmixModel(Model):
                 self.is_unbounded,
                 config.losses.background == "last",
                 config.eval_num_rays_per_chunk,
+                self.grid.opaque,
             )
         return self._renderer
 

@@ -15,6 +15,7 @@ from unmix_plugin.engine.instantiate import Common, Target, short
 from unmix_plugin.engine.model import Model, ModelConfig
 from unmix_plugin.errors import ConfigError, require
 from unmix_plugin.field import UnmixFieldConfig
+from unmix_plugin.lamp import NUM_LAMP_NUMBERS, Lamp
 from unmix_plugin.pose_refinement import PoseConfig
 from unmix_plugin.renderer import RendererConfig
 from unmix_plugin.spectral.evidence import exposure_of
@@ -30,6 +31,10 @@ _PIXELS_TO_COUNT_BY = 20_000
 _WHY_LIGHT = {
     "camera": "the light moves with the camera: brightness depends on the direction of view",
     "per-view": "views differ in exposure: training finds a gain for each (--light fixed leaves them out)",
+}
+_WHERE_LAMP = {
+    True: "the place of its lamp was found: shadows that move are shadows",
+    False: "the place of its lamp was not found: shadows that move are blurred",
 }
 
 
@@ -62,6 +67,11 @@ class UnmixModelConfig(ModelConfig):
     light: Annotated[Light | Auto, Common, short("light")] = "auto"
     """Light that is fixed, that moves with the camera (objects turned before camera and lamp), or that differs from
     view to view (also exposure). Auto finds which it is, and takes fixed without alpha."""
+    lamp: tuple[float, ...] | Auto = "auto"
+    """Where the lamp stands that moves with the camera, when training starts: 0 if it turns with the turntable or 1 if
+    it also goes up and down with the camera, the turntable's middle and axis, and the way from the middle to the lamp
+    (right, up, towards the camera), in model space. Auto finds it where light is `auto` too; no numbers: not known, so
+    shading is a smooth function of direction and shadows that move are blurred."""
     poses: Annotated[Literal["fixed", "refine"], Common, short("poses")] = "fixed"
     """Whether training takes the poses as they are, or corrects them with the field."""
     pose_refinement: PoseConfig = PoseConfig()
@@ -95,6 +105,8 @@ class UnmixModelConfig(ModelConfig):
             "samples-per-step of 1 to 100 million": 1 <= self.samples_per_step <= 100_000_000,
             "eval-num-rays-per-chunk of at least 1": self.eval_num_rays_per_chunk >= 1,
             "initial-opacity in (0, 1) or auto": opacity == "auto" or 0 < opacity < 1,
+            "a lamp of no or ten numbers, the first 0 or 1, or auto": self.lamp in ("auto", ())
+            or (len(self.lamp) == NUM_LAMP_NUMBERS and self.lamp[0] in (0, 1)),
             "endmember-file exactly when endmember-init is file": (self.endmember_init == "file")
             == (self.endmember_file is not None),
         }
@@ -139,7 +151,18 @@ class UnmixModelConfig(ModelConfig):
             found = replace(found, light=light)
             if light != "fixed":
                 reasons.append(_WHY_LIGHT[light])
+        if self.lamp == "auto" and found.light == "camera":
+            numbers = initial_data().get("lamp", np.zeros(0))
+            found = replace(found, lamp=tuple(round(float(x), 6) for x in numbers))
+            reasons.append(_WHERE_LAMP[bool(found.lamp)])
         return found, "\n".join(reasons)
+
+    @property
+    def moving_lamp(self) -> Lamp | None:
+        """The lamp that moves with the camera; None where light does not, or its place is not known."""
+        if self.light != "camera" or self.lamp in ("auto", ()):
+            return None
+        return Lamp.of_numbers([float(x) for x in self.lamp])
 
     def checked_num_endmembers(self, num_bands: int) -> int:
         """K.

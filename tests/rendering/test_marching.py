@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from unmix_plugin.rendering.marching import PackedSamples, march, march_twin
+from unmix_plugin.rendering.marching import PackedSamples, count_samples, march, march_twin
 
 
 def make_rays(num_rays: int, seed: int = 0):
@@ -122,3 +122,15 @@ def test_selecting_samples_keeps_them_packed_by_ray():
 def test_a_step_of_no_length_is_refused():
     with pytest.raises(ValueError, match="step must be positive; got 0"):
         march(*make_rays(2), torch.ones(2, 2, 2).byte(), 0.0)
+
+
+@pytest.mark.parametrize("num_rays", [0, 300])
+def test_samples_are_counted_as_they_are_taken(num_rays, device):
+    occupied = (torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(3)) < 0.3).byte()
+    rays = [x.to(device) for x in make_rays(num_rays)[:4]]
+    cells = occupied.to(device)
+    taken = march_twin(*rays, torch.full((num_rays,), 0.5, device=device), cells, 0.013)
+    counts = count_samples(*rays, cells, 0.013)
+    # A sample within rounding of a cell's face may fall to either side.
+    assert_close(counts, taken.packed_info[:, 1], rtol=0, atol=2)
+    assert int(counts.sum()) == pytest.approx(int(taken.packed_info[:, 1].sum()), rel=1e-3)

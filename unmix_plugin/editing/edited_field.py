@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from unmix_plugin.field import CoefficientField
+from unmix_plugin.lamp import LampLight, MovingLamp
 
 _GONE_SHARE, _WHOLE_SHARE = 0.25, 0.75
 """Kept share of a point up to which nothing of it is left, and from which it is as dense as before."""
@@ -41,6 +42,11 @@ class EditedField(CoefficientField):
         self.register_buffer("is_kept", is_kept.clone(), persistent=False)
         self.register_buffer("gloss", gloss.clone(), persistent=False)
         self._removes = not bool(is_kept.all())
+
+    @property
+    def moving_lamp(self) -> MovingLamp | None:
+        """That of the edited field; what is removed keeps its shadow."""
+        return self.field.moving_lamp
 
     @classmethod
     def over(
@@ -87,9 +93,10 @@ class EditedField(CoefficientField):
         positions: Float[Tensor, "S 3"],
         directions: Float[Tensor, "S 3"],
         features: Float[Tensor, "S G"],
+        lit: LampLight | None = None,
     ) -> dict[str, Tensor]:
         """`abundances`, `scaled_abundances` (S, K) of what is left, and `specular_coefficients` (S, G J)."""
-        outputs = self.field.get_outputs(positions, directions, features)
+        outputs = self.field.get_outputs(positions, directions, features, lit)
         factors = self._renormalising(outputs["abundances"])
         abundances = outputs["abundances"] * factors
         shine = abundances @ self.gloss.T.to(abundances)

@@ -88,6 +88,28 @@ def march(
     return PackedSamples(*count_and_write(count_kernel, write_kernel, rays, len(origins), device), step)
 
 
+def count_samples(
+    origins: Float[Tensor, "R 3"],
+    directions: Float[Tensor, "R 3"],
+    t_near: Float[Tensor, "R"],
+    t_far: Float[Tensor, "R"],
+    occupied: UInt8[Tensor, "X Y Z"],
+    step: float,
+) -> Int[Tensor, "R"]:
+    """How many samples of each ray lie in occupied cells: of those that `march` takes at t_near + (i + 1/2) step."""
+    from unmix_plugin.rendering._marching_kernels import count_kernel
+
+    check_step(step)
+    device, point = origins.device, vector_type(3, torch.float32)
+    jitter = torch.full_like(t_near, 0.5)
+    counts = torch.empty(len(origins), dtype=torch.int64, device=device)
+    rays = [as_warp(x.contiguous(), point) for x in (origins, directions)]
+    bounds = [as_warp(values.contiguous()) for values in (t_near, t_far, jitter)]
+    arrays = [*rays, *bounds, step, as_warp(occupied.contiguous()), as_warp(counts)]
+    launch(count_kernel, len(origins), arrays, device)
+    return counts
+
+
 def count_and_write(
     count_kernel: Any,
     write_kernel: Any,

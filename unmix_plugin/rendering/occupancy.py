@@ -16,6 +16,9 @@ from torch import Tensor, nn
 
 from unmix_plugin.rendering.visibility import VisibleCells
 
+_OPAQUE = 3.0
+"""Density from which a cell casts shadows, in that from which it counts as occupied."""
+
 DensityFn = Callable[[Float[Tensor, "S 3"]], Float[Tensor, "S"]]
 
 
@@ -26,14 +29,21 @@ class OccupancyGrid(nn.Module):
     occupied: Tensor
     reachable: Tensor
     reachable_cells: Tensor
+    opaque: Tensor | None
 
-    def __init__(self, reachable: Bool[Tensor, "X Y Z"]) -> None:
-        """Start with every cell occupied that `reachable` allows; the others always stay empty."""
+    def __init__(self, reachable: Bool[Tensor, "X Y Z"], casts_shadows: bool = False) -> None:
+        """Start with every cell occupied that `reachable` allows; the others always stay empty.
+
+        Args:
+            casts_shadows: Whether to keep the cells that are opaque, none at the start.
+        """
         super().__init__()
         self.visibility = VisibleCells(reachable.shape)
         self.register_buffer("reachable", reachable.clone())
         self.register_buffer("peak_densities", torch.full(reachable.shape, torch.inf))
         self.register_buffer("occupied", reachable.to(torch.uint8))
+        opaque = torch.zeros(reachable.shape, dtype=torch.uint8) if casts_shadows else None
+        self.register_buffer("opaque", opaque)
         self.register_buffer("reachable_cells", _flat_indices(reachable), persistent=False)
         self.register_load_state_dict_post_hook(_find_reachable_cells)
 
@@ -69,6 +79,9 @@ class OccupancyGrid(nn.Module):
         self.visibility.update()
         is_visible = self.visibility.visible.view(-1)[self.reachable_cells]
         self.occupied.view(-1)[self.reachable_cells] = ((reachable_peaks > limit) & is_visible).byte()
+        if self.opaque is not None:
+            is_opaque = is_known & is_visible & (reachable_peaks > _OPAQUE * limit)
+            self.opaque.view(-1)[self.reachable_cells] = is_opaque.byte()
 
     def _choose_cells(self, num_cells: int | None, generator: torch.Generator) -> Int[Tensor, "N"]:
         reachable = self.reachable_cells

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from unmix_plugin.scenes.geometry.hull_places import local_log_brightness
 from unmix_plugin.scenes.pixel_table import DrawnPixels, PixelTable
@@ -15,6 +18,10 @@ from unmix_plugin.spectral.evidence import alpha_trust, background_level, bright
 _PIXELS_OF_BACKGROUND = 100_000
 """Pixels of a sensor by which the brightness of its background is judged."""
 _OPAQUE_ALPHA = 0.99
+_PIXELS_TO_GROUP = 20_000
+_COLOUR_GROUPS = 24
+_LIT_BEST = 0.9
+"""Quantile of a group's brightness that stands for full light."""
 
 
 class AlphaEvidence:
@@ -50,11 +57,57 @@ class AlphaEvidence:
         block = max(self._blocks, key=lambda block: len(block.cameras))
         return list(block.cameras), [local_log_brightness(seen) for seen in block.pictures(_clear_brightness)]
 
+    def log_shading(self) -> list[Float[np.ndarray, "H W"]]:
+        """The same without the brightness of what pixels show, by groups of pixels of like spectra."""
+        block = max(self._blocks, key=lambda block: len(block.cameras))
+        colours = ColourGroups.of(block)
+        return [local_log_brightness(seen) for seen in block.pictures(colours.shading)]
+
+
+@dataclass(frozen=True)
+class ColourGroups:
+    """Groups of pixels whose spectra are multiples of each other, more or less."""
+
+    middles: Float[Tensor, "G B"]
+    """Spectra of length 1."""
+    brightest: Float[Tensor, " G"]
+    """Brightness of those of each group that are lit best."""
+
+    @staticmethod
+    def of(block: PixelBlock) -> ColourGroups:
+        """From some of a block's opaque pixels."""
+        from scipy.cluster.vq import kmeans2  # slow to import
+
+        stride = max(1, len(block) // _PIXELS_TO_GROUP)
+        chosen = torch.arange(0, len(block), stride)
+        valid, on_device = block.valid[chosen], chosen.to(block.alpha.device)
+        spectra = block.spectra(on_device)
+        spectra = spectra[_is_clear(spectra, block.alpha[on_device], valid.to(spectra.device))]
+        if len(spectra) < _COLOUR_GROUPS:
+            return ColourGroups(spectra.new_zeros(0, spectra.shape[1]), spectra.new_zeros(0))
+        middles, group = kmeans2(normalize(spectra, dim=-1).cpu().numpy(), _COLOUR_GROUPS, seed=0, minit="++")
+        bright = brightness(spectra)
+        best = [
+            torch.quantile(bright[mask], _LIT_BEST) if bool((mask := torch.from_numpy(group == k)).any()) else 1.0
+            for k in range(_COLOUR_GROUPS)
+        ]
+        return ColourGroups(torch.from_numpy(middles).to(spectra), torch.tensor(best).to(spectra))
+
+    def shading(self, spectra: Tensor, alpha: Tensor, valid: Tensor) -> Tensor:
+        """Brightness in that of the best lit pixels of the same group; 0 for pixels that say nothing."""
+        if len(self.middles) == 0:
+            return torch.zeros_like(alpha)
+        group = torch.cdist(normalize(spectra, dim=-1), self.middles).argmin(dim=-1)
+        return _clear_brightness(spectra, alpha, valid) / self.brightest[group].clamp(min=1e-6)
+
+
+def _is_clear(spectra: Tensor, alpha: Tensor, valid: Tensor) -> Tensor:
+    return (alpha > _OPAQUE_ALPHA) & valid & (spectra.amax(dim=-1) < 1)
+
 
 def _clear_brightness(spectra: Tensor, alpha: Tensor, valid: Tensor) -> Tensor:
     """Of pixels that are opaque, valid and not saturated; 0 for others."""
-    is_clear = (alpha > _OPAQUE_ALPHA) & valid & (spectra.amax(dim=-1) < 1)
-    return torch.where(is_clear, brightness(spectra), 0.0)
+    return torch.where(_is_clear(spectra, alpha, valid), brightness(spectra), 0.0)
 
 
 def _level(block: PixelBlock) -> float | None:

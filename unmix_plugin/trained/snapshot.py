@@ -37,7 +37,12 @@ def unmix_scene(
         own = copy.deepcopy(model.poses, frozen)  # type: ignore[arg-type]
         record = replace(record, train_cameras=own.refined(record.train_cameras))
     materials = replace(materials, endmembers=frozen[id(model.endmembers)], specular_spectra=specular)
-    renderer = replace(renderer, occupied=renderer.occupied.clone(), reachable=renderer.reachable.clone())
+    renderer = replace(
+        renderer,
+        occupied=renderer.occupied.clone(),
+        reachable=renderer.reachable.clone(),
+        opaque=None if renderer.opaque is None else renderer.opaque.clone(),
+    )
     return TrainedScene(
         copy.deepcopy(model.field, frozen).eval(),  # type: ignore[arg-type]
         renderer,

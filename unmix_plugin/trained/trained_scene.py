@@ -132,6 +132,7 @@ class TrainedScene:
             box=self.renderer.box.to(device),
             occupied=self.renderer.occupied.to(device),
             reachable=self.renderer.reachable.to(device),
+            opaque=None if self.renderer.opaque is None else self.renderer.opaque.to(device),
         )
         field = copy.deepcopy(self.field).to(device)
         return replace(self, field=field, renderer=renderer, materials=self.materials.to(device))

@@ -8,6 +8,7 @@ from tests.scenes.geometry.test_carving import BOX, FOCAL, SIDE, ball_matter, ma
 from tests.scenes.scene_factory import ring_poses
 from unmix_plugin.scenes.geometry.carving import carve_box
 from unmix_plugin.scenes.geometry.hull_places import hull_places, local_log_brightness, seen_places
+from unmix_plugin.scenes.geometry.lamp_search import find_lamp, turning_axis
 from unmix_plugin.scenes.geometry.lighting import foretold_share, gain_spread, judge_light, view_gains
 
 RADIUS = 0.6
@@ -95,3 +96,21 @@ def test_too_few_views_say_nothing():
     dark = (make_cameras(poses), [image * np.nan for image in blank])
     for shape in (hull, np.zeros((32, 32, 32), bool)):
         assert judge_light(*dark, shape, BOX) == "fixed"
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_the_lamp_of_a_turned_ball_is_found(noise):
+    lamp = find_lamp(*ball_views(True, noise))
+    assert lamp is not None
+    place = np.array(lamp.place) / np.linalg.norm(lamp.place)
+    assert np.degrees(np.arccos(place @ LAMP / np.linalg.norm(LAMP))) < 12
+
+
+def test_no_lamp_is_found_where_the_light_is_fixed():
+    assert find_lamp(*ball_views(False)) is None
+
+
+def test_the_axis_is_what_cameras_stand_upright_to():
+    middle, axis = turning_axis(make_cameras(ring_poses(9)))
+    np.testing.assert_allclose(middle, (0, 0, 0), atol=1e-4)
+    np.testing.assert_allclose(axis, (0, 0, 1), atol=1e-4)

@@ -66,7 +66,7 @@ def seen_places(
         log_brightness: Of each view, NaN on pixels that say nothing: background, saturated ones.
         hull: Cells that may be occupied, of the box.
     """
-    hull = _coarse(hull)
+    hull = coarse_hull(hull)
     places = hull_places(hull, box)
     seen = [
         _looked_up(cameras, index, image, places, hull, box) for index, image in enumerate(log_brightness)
@@ -74,7 +74,7 @@ def seen_places(
     return places, torch.stack(seen, dim=1)
 
 
-def _coarse(hull: Bool[np.ndarray, "R R R"]) -> Bool[np.ndarray, "r r r"]:
+def coarse_hull(hull: Bool[np.ndarray, "R R R"]) -> Bool[np.ndarray, "r r r"]:
     """The hull in fewer cells, each occupied if one of its parts is."""
     factor = hull.shape[0] // LARGEST_HULL
     if factor < 2 or hull.shape[0] % factor:
