@@ -180,7 +180,11 @@ class Blob(CoefficientField):
         return torch.softmax(3 * torch.sin(4 * features + torch.arange(3)), dim=-1)
 
     def get_outputs(
-        self, positions: torch.Tensor, directions: torch.Tensor, features: torch.Tensor
+        self,
+        positions: torch.Tensor,
+        directions: torch.Tensor,
+        features: torch.Tensor,
+        visible: torch.Tensor | None = None,
     ) -> dict[str, torch.Tensor]:
         abundances = self.abundances_of(features)
         specular = 0.3 * (1 + directions[:, :1] * directions[:, 1:2])

@@ -30,7 +30,7 @@ from unmix_plugin.engine.geometry.contraction import contracted_unit
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.engine.instantiate import InstantiateConfig, Target
 from unmix_plugin.errors import require
-from unmix_plugin.lamp import Lamp, LampLight, MovingLamp, lamp_shading
+from unmix_plugin.lamp import SHADOW_LOGIT, Lamp, MovingLamp
 from unmix_plugin.rendering.hash_encoding import HashGridLayout, hash_encode
 
 _LARGEST_LOG_DENSITY = 15.0
@@ -103,12 +103,12 @@ class CoefficientField(Field):
         positions: Float[Tensor, "S 3"],
         directions: Float[Tensor, "S 3"],
         features: Float[Tensor, "S G"],
-        lit: LampLight | None = None,
+        visible: Float[Tensor, "S"] | None = None,
     ) -> dict[str, Tensor]:
         """`abundances` (S, K), `scaled_abundances` (S, K) and `specular_coefficients` (S, J) along `directions`.
 
         Args:
-            lit: What reaches the samples from `moving_lamp`; None where there is none.
+            visible: Part of the light of `moving_lamp` that reaches each sample; None where there is no such lamp.
         """
 
     @abstractmethod
@@ -170,8 +170,7 @@ class UnmixField(CoefficientField):
             coarse_to_fine: Whether the grid's levels have weights, as refining poses needs them.
         """
         super().__init__()
-        self.config = config
-        self.lit_by_camera = lit_by_camera
+        self.config, self.lit_by_camera = config, lit_by_camera
         self.lamp = MovingLamp(lamp) if lamp is not None and lit_by_camera else None
         self.specular_bias = config.specular_bias - math.log(exposure)
         self.num_endmembers, self.num_specular = num_endmembers, num_specular
@@ -203,7 +202,7 @@ class UnmixField(CoefficientField):
         if self.num_specular:
             self.specular_network = bias_free_network(seen, width, self.num_specular + 1)
         if self.lit_by_camera:
-            num_shading = NUM_DIRECTION_FEATURES + (self.lamp is not None)
+            num_shading = NUM_DIRECTION_FEATURES + (self.lamp is not None)  # the last is for its shadow
             self.shading_network = bias_free_network(num_features, width, num_shading)
 
     @property
@@ -243,14 +242,14 @@ class UnmixField(CoefficientField):
         positions: Float[Tensor, "S 3"],
         directions: Float[Tensor, "S 3"],
         features: Float[Tensor, "S G"],
-        lit: LampLight | None = None,
+        visible: Float[Tensor, "S"] | None = None,
     ) -> dict[str, Tensor]:
         """`abundances` (S, K), `scaled_abundances` S a (S, K) and `specular_coefficients` h u (S, J)."""
-        abundances, scales = self._material(features, directions, lit)
+        abundances, scales = self._material(features, directions, visible)
         return {
             "abundances": abundances,
             "scaled_abundances": scales * abundances,
-            "specular_coefficients": self._specular(directions, features, lit),
+            "specular_coefficients": self._specular(directions, features),
         }
 
     def abundances_of(self, features: Float[Tensor, "S G"]) -> Float[Tensor, "S K"]:
@@ -261,27 +260,28 @@ class UnmixField(CoefficientField):
         self,
         features: Float[Tensor, "S G"],
         directions: Float[Tensor, "S 3"] | None = None,
-        lit: LampLight | None = None,
+        visible: Float[Tensor, "S"] | None = None,
     ) -> tuple[Float[Tensor, "S K"], Float[Tensor, "S C"]]:
         """Abundances and scales; C is 1 or K. Only scales depend on directions, and only in a moving light."""
         material = self.material_network(features)
         abundances = torch.softmax(material[:, : self.num_endmembers] / self.config.temperature, dim=-1)
         scales = material[:, self.num_endmembers :]
-        if self.lamp is not None and directions is not None:
-            scales = scales + lamp_shading(self.shading_network(features), lit)
-        elif self.lit_by_camera and directions is not None:
+        if self.lit_by_camera and directions is not None:
             # A sum over harmonics rather than a network of both: that took textures for shading.
-            changes = self.shading_network(features) * direction_features(directions)
+            shading = self.shading_network(features)
+            changes = shading[:, :NUM_DIRECTION_FEATURES] * direction_features(directions)
             scales = scales + changes.sum(dim=-1, keepdim=True)
+            if visible is not None:
+                shadow = SHADOW_LOGIT + shading[:, NUM_DIRECTION_FEATURES:]
+                scales = scales - (1 - visible[:, None]) * shadow
         return abundances, torch.sigmoid(scales)
 
     def _specular(
-        self, directions: Float[Tensor, "S 3"], features: Float[Tensor, "S G"], lit: LampLight | None
+        self, directions: Float[Tensor, "S 3"], features: Float[Tensor, "S G"]
     ) -> Float[Tensor, "S J"]:
         if self.num_specular == 0:
             return features.new_zeros(len(features), 0)
-        mirrored = direction_features(directions) if lit is None else lit.mirrored(directions)
-        seen = torch.cat([features, mirrored], dim=-1)
+        seen = torch.cat([features, direction_features(directions)], dim=-1)
         factors = torch.sigmoid(self.specular_network(seen) + self.specular_bias / 2)
         return factors[:, :1] * factors[:, 1:]
 

@@ -2,8 +2,8 @@
 
 Where an object is turned before a fixed camera and lamp, the middle of the turntable, its axis and the camera span a
 frame in which the lamp keeps its place. The frame follows from where a ray starts, so any new camera has its lamp too.
-What stands between a sample and the lamp is asked of a grid of opaque cells, at two points beside the lamp's middle:
-their mean is a soft shadow, and their difference tells training where to move the lamp.
+What stands between a sample and the lamp is looked up in a grid of opaque cells, for two points beside the lamp's
+middle: the mean of both is a soft shadow, and their difference tells training where to move the lamp.
 
 Notation: `R` rays, `S` samples, `X Y Z` cells of a grid over the scene box.
 """
@@ -19,7 +19,6 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from unmix_plugin.directions import direction_features
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.rendering.marching import count_samples
 
@@ -31,9 +30,8 @@ _SPREAD = 0.05
 """Standard deviation of the points beside the lamp's middle along each axis, in its distance."""
 _PACE = 0.4
 """Shift of the lamp, in its first distance, for a change of its parameter by 1."""
-_LIT = 2.0
-"""Logit that the lamp adds to brightness at the start: shadows are dark before anything is learnt."""
-
+SHADOW_LOGIT = 2.0
+"""What a shadow takes off the logit of brightness before training learns it for each place."""
 LampFrame = Literal["turntable", "camera"]
 _FRAMES: tuple[LampFrame, ...] = ("turntable", "camera")
 NUM_LAMP_NUMBERS = 10
@@ -94,44 +92,15 @@ class MovingLamp(nn.Module):
         return self.middle + place[0] * right + place[1] * up + place[2] * back
 
 
-@dataclass(frozen=True)
-class LampLight:
-    """What reaches samples from the lamp."""
-
-    directions: Float[Tensor, "S 3"]
-    """Unit vectors from samples to the lamp."""
-    visible: Float[Tensor, "S"]
-    """Part of its light that nothing stops on the way, [0, 1]."""
-
-    def mirrored(self, directions: Float[Tensor, "S 3"]) -> Float[Tensor, "S 15"]:
-        """Harmonics of the normal that would mirror the lamp along rays of these directions; 0 in shadow."""
-        halfway = normalize(self.directions - directions, dim=-1)
-        return self.visible[:, None] * direction_features(halfway)
-
-
-def lamp_shading(coefficients: Float[Tensor, "S 16"], lit: LampLight | None) -> Float[Tensor, "S 1"]:
-    """What the lamp adds to the logit of brightness: a sum over harmonics of its direction, where it is visible.
-
-    Args:
-        coefficients: Of 1 and the harmonics.
-        lit: None for light from nowhere in particular.
-    """
-    direct = _LIT + coefficients[:, :1]
-    if lit is None:
-        return direct
-    turned = (coefficients[:, 1:] * direction_features(lit.directions)).sum(dim=-1, keepdim=True)
-    return lit.visible[:, None] * (direct + turned)
-
-
-def lamp_light(
+def lamp_visibility(
     lamp: MovingLamp,
     origins: Float[Tensor, "S 3"],
     positions: Float[Tensor, "S 3"],
     box: SceneBox,
     opaque: UInt8[Tensor, "X Y Z"],
     generator: torch.Generator | None = None,
-) -> LampLight:
-    """What reaches samples of rays that start at `origins`; differentiable in the lamp's place.
+) -> Float[Tensor, "S"]:
+    """Part of the lamp's light that reaches samples of rays from `origins`, [0, 1]; differentiable in the lamp's place.
 
     Args:
         opaque: Cells of the box that cast shadows.
@@ -139,18 +108,17 @@ def lamp_light(
     """
     origins, positions = origins.detach(), positions.detach()
     middle = lamp.positions(origins)
-    directions = normalize(middle - positions, dim=-1)
-    spread = _SPREAD * float(lamp.first_place.norm())
+    fixed, spread = middle.detach(), _SPREAD * float(lamp.first_place.norm())
     if generator is None:
         corners = spread * positions.new_tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
-        seen = [visible_part(positions, middle + corner, box, opaque) for corner in corners]
-        return LampLight(directions, torch.stack(seen).mean(dim=0))
+        parts = [visible_part(positions, fixed + corner, box, opaque) for corner in corners]
+        return torch.stack(parts).mean(dim=0)
     drawn = torch.randn(positions.shape, generator=generator, device=generator.device)
     offsets = spread * drawn.to(positions)
-    one, other = (visible_part(positions, middle.detach() + x, box, opaque) for x in (offsets, -offsets))
+    one, other = (visible_part(positions, fixed + shift, box, opaque) for shift in (offsets, -offsets))
     # Stein's identity: the mean of these slopes is the gradient of the visible part, blurred over the points.
     slopes = ((one - other) / (2 * spread**2))[:, None] * offsets
-    return LampLight(directions, (one + other) / 2 + (slopes * (middle - middle.detach())).sum(dim=-1))
+    return (one + other) / 2 + (slopes * (middle - fixed)).sum(dim=-1)
 
 
 @torch.no_grad()

@@ -33,8 +33,8 @@ _WHY_LIGHT = {
     "per-view": "views differ in exposure: training finds a gain for each (--light fixed leaves them out)",
 }
 _WHERE_LAMP = {
-    True: "the place of its lamp was found: shadows that move are shadows",
-    False: "the place of its lamp was not found: shadows that move are blurred",
+    True: "the place of its lamp follows from shadows: training models them, and refines the place",
+    False: "no shadows tell the place of its lamp: shadows that move are blurred",
 }
 
 

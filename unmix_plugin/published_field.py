@@ -25,7 +25,6 @@ from unmix_plugin.field import (
     bias_free_network,
     direction_features,
 )
-from unmix_plugin.lamp import LampLight
 
 _NUM_FREQUENCIES = 2
 _NUM_POSITION_FEATURES = 3 * 2 * _NUM_FREQUENCIES
@@ -77,7 +76,7 @@ class PublishedField(UnmixField):
         positions: Float[Tensor, "S 3"],
         directions: Float[Tensor, "S 3"],
         features: Float[Tensor, "S G"],
-        lit: LampLight | None = None,
+        visible: Float[Tensor, "S"] | None = None,
     ) -> dict[str, Tensor]:
         """As `UnmixField.get_outputs`, with the tint from the network of the abundances."""
         logits = self.material_network(features)

@@ -20,7 +20,7 @@ from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.errors import require
 from unmix_plugin.field import CoefficientField
-from unmix_plugin.lamp import LampLight, lamp_light
+from unmix_plugin.lamp import lamp_visibility
 from unmix_plugin.lit_samples import points_of, samples_carrying_weight
 from unmix_plugin.rendering.compositing import accumulate, volume_weights
 from unmix_plugin.rendering.contracted_marching import march_contracted
@@ -155,8 +155,8 @@ class VolumeRenderer:
             densities, features = field.density_of(field.encode(positions, seen.encoded()))
         else:
             densities, features = seen.densities, seen.features()
-        lit = self._lit(field, kept, positions, ray_bundle, generator)
-        outputs = field.get_outputs(positions, along, features, *([] if lit is None else [lit]))
+        visible = self._visible(field, kept, positions, ray_bundle, generator)
+        outputs = field.get_outputs(positions, along, features, visible)
         if self.is_unbounded:
             near = self._near_cameras(kept.t)
             densities = scale_gradient(densities, near)
@@ -256,18 +256,18 @@ class VolumeRenderer:
         """
         return (t / self.space.half_edge).square().clamp(max=1.0)
 
-    def _lit(
+    def _visible(
         self,
         field: CoefficientField,
         samples: PackedSamples,
         positions: Float[Tensor, "S 3"],
         ray_bundle: RayBundle,
         generator: torch.Generator | None,
-    ) -> LampLight | None:
+    ) -> Float[Tensor, "S"] | None:
         if field.moving_lamp is None or self.opaque is None:
             return None
         origins = ray_bundle.origins.index_select(0, samples.ray_indices)
-        return lamp_light(field.moving_lamp, origins, positions, self.box, self.opaque, generator)
+        return lamp_visibility(field.moving_lamp, origins, positions, self.box, self.opaque, generator)
 
     def _march(self, ray_bundle: RayBundle, generator: torch.Generator | None) -> PackedSamples:
         origins, directions = ray_bundle.origins.detach(), ray_bundle.directions.detach()

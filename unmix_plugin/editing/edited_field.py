@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from unmix_plugin.field import CoefficientField
-from unmix_plugin.lamp import LampLight, MovingLamp
+from unmix_plugin.lamp import MovingLamp
 
 _GONE_SHARE, _WHOLE_SHARE = 0.25, 0.75
 """Kept share of a point up to which nothing of it is left, and from which it is as dense as before."""
@@ -93,10 +93,10 @@ class EditedField(CoefficientField):
         positions: Float[Tensor, "S 3"],
         directions: Float[Tensor, "S 3"],
         features: Float[Tensor, "S G"],
-        lit: LampLight | None = None,
+        visible: Float[Tensor, "S"] | None = None,
     ) -> dict[str, Tensor]:
         """`abundances`, `scaled_abundances` (S, K) of what is left, and `specular_coefficients` (S, G J)."""
-        outputs = self.field.get_outputs(positions, directions, features, lit)
+        outputs = self.field.get_outputs(positions, directions, features, visible)
         factors = self._renormalising(outputs["abundances"])
         abundances = outputs["abundances"] * factors
         shine = abundances @ self.gloss.T.to(abundances)

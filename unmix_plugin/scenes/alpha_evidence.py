@@ -88,7 +88,9 @@ class ColourGroups:
         middles, group = kmeans2(normalize(spectra, dim=-1).cpu().numpy(), _COLOUR_GROUPS, seed=0, minit="++")
         bright = brightness(spectra)
         best = [
-            torch.quantile(bright[mask], _LIT_BEST) if bool((mask := torch.from_numpy(group == k)).any()) else 1.0
+            torch.quantile(bright[mask], _LIT_BEST)
+            if bool((mask := torch.from_numpy(group == k)).any())
+            else 1.0
             for k in range(_COLOUR_GROUPS)
         ]
         return ColourGroups(torch.from_numpy(middles).to(spectra), torch.tensor(best).to(spectra))
