@@ -25,10 +25,10 @@ from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.engine.training.seeding import step_generator
 from unmix_plugin.errors import SceneError
+from unmix_plugin.lamp_search import find_lamp
 from unmix_plugin.pose_refinement import Knots
 from unmix_plugin.scenes.alpha_evidence import AlphaEvidence
 from unmix_plugin.scenes.geometry.carving import carve
-from unmix_plugin.scenes.geometry.lamp_search import find_lamp
 from unmix_plugin.scenes.geometry.lighting import judge_light
 from unmix_plugin.scenes.geometry.pose_check import check_scene_poses
 from unmix_plugin.scenes.identity import scene_identity
