@@ -11,7 +11,8 @@ from torch.testing import assert_close
 from tests.method_factory import BOX, CAMERA, CONFIG, initial_data, make_model, make_rays, scene_of
 from unmix_plugin.editing.edited_field import EditedField
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.lamp import Lamp, MovingLamp, lamp_visibility, visible_part
+from unmix_plugin.lamp import Lamp, MovingLamp
+from unmix_plugin.lamp_shadows import lamp_visibility, visible_part
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.model_settings import UnmixModelConfig
 

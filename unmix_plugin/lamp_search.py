@@ -6,7 +6,8 @@ A place is as bright as a matt surface in the light of a lamp and of its surroun
 
 with a number a for each place, the cosine c between its normal and the direction to the lamp, and V = 0 where the hull
 stands in the way. Lamps in all directions are tried in two frames, one that turns about the turntable's axis with the
-camera and the camera's own; the one that explains most of the changes is moved until no other explains more.
+camera and the camera's own; the one that explains most of the changes is moved until no other explains more. Both
+halves of the places must find the same lamp, and need its shadows to explain what they see.
 
 Notation: `P` places, `N` views, `R` cells along an edge, `S` pairs of a place and a view that sees it.
 """
@@ -23,14 +24,13 @@ from torch.nn.functional import normalize
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
-from unmix_plugin.lamp import Lamp, LampFrame, MovingLamp, Triple, visible_part
+from unmix_plugin.lamp import Lamp, LampFrame, MovingLamp, Triple
 from unmix_plugin.scenes.geometry.hull_places import Places, coarse_hull, seen_places
 
 LEAST_SHARE = 0.15
 """Of the changes of brightness within places, that a lamp must explain to be believed."""
 LEAST_SHADOWS = 0.005
-"""Part of the changes that its shadows must explain beside. The demo scene in such a light has 0.016; a turntable with
-one soft shadow -0.004, and a wrong lamp costs more than no lamp there."""
+"""Part of the changes that its shadows must explain beside, in either half of the places."""
 NUM_DIRECTIONS, NUM_KEPT = 300, 6
 """Directions that are tried in each frame without shadows, and the best of each that are tried with shadows."""
 FEWEST_VIEWS, FEWEST_PLACES = 4, 50
@@ -42,8 +42,10 @@ FIRST_DISTANCE, LEAST_DISTANCE, LARGEST_DISTANCE = 2.0, 1.0, 3.0
 """Of the lamp from the turntable's middle, in the box's longest edge."""
 FIRST_MOVE, LEAST_MOVE = 0.15, 0.02
 """Of the lamp, in its distance."""
-CLEAR_CELLS, DARK_CELLS = 3.0, 2.0
-"""As `visible_part` takes them, for cells of the hull."""
+CLEAR_CELLS, DARK_CELLS = 3, 2.0
+"""Way from a place to the lamp, in cells of the hull, that casts no shadow; and cells that leave 1 / e of its light."""
+LEAST_AGREEMENT = 0.94
+"""Cosine between the directions that either half of the places finds."""
 
 Candidate = tuple[float, Lamp]
 """Share of the changes that a lamp explains, and the lamp."""
@@ -89,14 +91,28 @@ class LampEvidence:
         """Part of the squared changes that the light of a lamp explains."""
         with torch.no_grad():
             stands = MovingLamp(lamp).positions(self.origins)
-        light = (normalize(stands - self.positions, dim=-1) * self.normals).sum(dim=-1).clamp(min=0)
+        towards = normalize(stands - self.positions, dim=-1)
+        light = (towards * self.normals).sum(dim=-1).clamp(min=0)
         if with_shadows:
-            hull = self.hull.byte()
-            light = light * visible_part(self.positions, stands, self.box, hull, CLEAR_CELLS, DARK_CELLS)
+            light = light * self._visible(towards)
         expected = _within(torch.log(AMBIENT + light), self.place)
         slope = (expected * self.changes).sum() / expected.square().sum().clamp(min=1e-12)
         left = (self.changes - slope.clamp(min=0) * expected).square().sum()
         return float(1 - left / self.changes.square().sum().clamp(min=1e-12))
+
+    def _visible(self, towards: Float[Tensor, "S 3"]) -> Float[Tensor, " S"]:
+        """Part of the light from these directions that the hull lets through to each place."""
+        cells = len(self.hull)
+        place, step = self.box.normalise(self.positions) * cells, normalize(towards / self.box.size, dim=-1)
+        counts = torch.zeros(len(place))
+        for i in range(CLEAR_CELLS, 2 * cells):
+            at = place + i * step
+            inside = ((at >= 0) & (at < cells)).all(dim=-1)
+            if not bool(inside.any()):
+                break
+            x, y, z = at.long().clamp(0, cells - 1).unbind(-1)
+            counts += inside & self.hull[x, y, z]
+        return torch.exp(-(counts / DARK_CELLS).square())
 
 
 def find_lamp(
@@ -105,20 +121,29 @@ def find_lamp(
     hull: Bool[np.ndarray, "R R R"],
     box: SceneBox,
 ) -> Lamp | None:
-    """The lamp that explains most of the changes of brightness; None where none explains enough, or its shadows
-    explain nothing.
+    """The lamp that explains most of the changes of brightness; None where none explains enough, its
+    shadows explain nothing, or halves of the places find different lamps.
 
     Args:
         cameras, hull, box: As of `seen_places`.
         log_shading: Log brightness of each view, as far as it is not that of a pixel's colour.
     """
     places, seen = seen_places(cameras, log_shading, hull, box)
-    evidence = LampEvidence.of(cameras, places, seen.clamp(min=DARKEST_LOG), hull, box)
-    if len(evidence.place.unique()) < FEWEST_PLACES:
-        return None
-    share, lamp = best_lamp(evidence, cameras)
-    by_shadows = share - evidence.share(lamp, with_shadows=False)
-    return lamp if share >= LEAST_SHARE and by_shadows >= LEAST_SHADOWS else None
+    seen, is_even = seen.clamp(min=DARKEST_LOG), torch.arange(len(seen)) % 2 == 0
+    found: list[Candidate] = []
+    for half in (is_even, ~is_even):
+        part = Places(places.positions[half], places.normals[half])
+        evidence = LampEvidence.of(cameras, part, seen[half], hull, box)
+        if len(evidence.place.unique()) < FEWEST_PLACES:
+            return None
+        share, lamp = best_lamp(evidence, cameras)
+        by_shadows = share - evidence.share(lamp, with_shadows=False)
+        if share < LEAST_SHARE or by_shadows < LEAST_SHADOWS:
+            return None
+        found.append((share, lamp))
+    one, other = (normalize(torch.tensor(lamp.place), dim=0) for _, lamp in found)
+    agree = found[0][1].frame == found[1][1].frame and float(one @ other) > LEAST_AGREEMENT
+    return max(found, key=lambda candidate: candidate[0])[1] if agree else None
 
 
 def best_lamp(evidence: LampEvidence, cameras: Cameras) -> Candidate:

@@ -20,7 +20,7 @@ from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.errors import require
 from unmix_plugin.field import CoefficientField
-from unmix_plugin.lamp import lamp_visibility
+from unmix_plugin.lamp_shadows import lamp_visibility
 from unmix_plugin.lit_samples import points_of, samples_carrying_weight
 from unmix_plugin.rendering.compositing import accumulate, volume_weights
 from unmix_plugin.rendering.contracted_marching import march_contracted

@@ -127,10 +127,10 @@ def test_a_step_of_no_length_is_refused():
 @pytest.mark.parametrize("num_rays", [0, 300])
 def test_samples_are_counted_as_they_are_taken(num_rays, device):
     occupied = (torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(3)) < 0.3).byte()
-    rays = [x.to(device) for x in make_rays(num_rays)[:4]]
+    o, d, t_near, t_far, _ = (x.to(device) for x in make_rays(num_rays))
     cells = occupied.to(device)
-    taken = march_twin(*rays, torch.full((num_rays,), 0.5, device=device), cells, 0.013)
-    counts = count_samples(*rays, cells, 0.013)
+    taken = march_twin(o, d, t_near, t_far, torch.full((num_rays,), 0.5, device=device), cells, 0.013)
+    counts = count_samples(o, d, t_near, t_far, cells, 0.013)
     # A sample within rounding of a cell's face may fall to either side.
     assert_close(counts, taken.packed_info[:, 1], rtol=0, atol=2)
     assert int(counts.sum()) == pytest.approx(int(taken.packed_info[:, 1].sum()), rel=1e-3)

@@ -85,7 +85,10 @@ class ColourGroups:
         spectra = spectra[_is_clear(spectra, block.alpha[on_device], valid.to(spectra.device))]
         if len(spectra) < _COLOUR_GROUPS:
             return ColourGroups(spectra.new_zeros(0, spectra.shape[1]), spectra.new_zeros(0))
-        middles, group = kmeans2(normalize(spectra, dim=-1).cpu().numpy(), _COLOUR_GROUPS, seed=0, minit="++")
+        rng = np.random.default_rng(0)
+        middles, group = kmeans2(
+            normalize(spectra, dim=-1).cpu().numpy(), _COLOUR_GROUPS, minit="++", rng=rng
+        )
         bright = brightness(spectra)
         best = [
             torch.quantile(bright[mask], _LIT_BEST)

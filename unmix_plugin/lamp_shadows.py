@@ -1,0 +1,70 @@
+"""What of a lamp's light reaches samples, past what stands in its way.
+
+It is looked up in a grid of opaque cells, for two points beside the lamp's middle: the mean of both is a soft shadow,
+and their difference tells training where to move the lamp.
+
+Notation: `S` samples, `X Y Z` cells of a grid over the scene box.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.lamp import MovingLamp
+from unmix_plugin.rendering.marching import count_samples
+
+CLEAR_CELLS = 8.0
+"""Way from a place towards the lamp, in cells, that casts no shadow: surfaces are as thick as that while they form."""
+DARK_CELLS = 5.0
+"""Opaque cells on the way to the lamp that leave 1 / e of its light."""
+_SPREAD = 0.05
+"""Standard deviation of the points beside the lamp's middle along each axis, in its distance."""
+
+
+def lamp_visibility(
+    lamp: MovingLamp,
+    origins: Float[Tensor, "S 3"],
+    positions: Float[Tensor, "S 3"],
+    box: SceneBox,
+    opaque: UInt8[Tensor, "X Y Z"],
+    generator: torch.Generator | None = None,
+) -> Float[Tensor, "S"]:
+    """Part of the lamp's light that reaches samples of rays from `origins`, [0, 1]; differentiable in the lamp's place.
+
+    Args:
+        opaque: Cells of the box that cast shadows.
+        generator: Draws two points beside the lamp's middle for each sample; None takes four fixed ones.
+    """
+    origins, positions = origins.detach(), positions.detach()
+    middle = lamp.positions(origins)
+    fixed, spread = middle.detach(), _SPREAD * float(lamp.first_place.norm())
+    if generator is None:
+        corners = spread * positions.new_tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+        parts = [visible_part(positions, fixed + corner, box, opaque) for corner in corners]
+        return torch.stack(parts).mean(dim=0)
+    drawn = torch.randn(positions.shape, generator=generator, device=generator.device)
+    offsets = spread * drawn.to(positions)
+    one, other = (visible_part(positions, fixed + shift, box, opaque) for shift in (offsets, -offsets))
+    # Stein's identity: the mean of these slopes is the gradient of the visible part, blurred over the points.
+    slopes = ((one - other) / (2 * spread**2))[:, None] * offsets
+    return (one + other) / 2 + (slopes * (middle - fixed)).sum(dim=-1)
+
+
+@torch.no_grad()
+def visible_part(
+    positions: Float[Tensor, "S 3"],
+    lamps: Float[Tensor, "S 3"],
+    box: SceneBox,
+    opaque: UInt8[Tensor, "X Y Z"],
+) -> Float[Tensor, "S"]:
+    """Part of the light from points outside the box that the opaque cells of the box let through to each position."""
+    towards = normalize(lamps - positions, dim=-1)
+    cell = float((box.size / torch.tensor(opaque.shape, device=box.size.device)).max())
+    t_far = box.intersect(positions, towards)[1]
+    t_near = torch.full_like(t_far, CLEAR_CELLS * cell)
+    counts = count_samples(box.normalise(positions), towards / box.size, t_near, t_far, opaque, cell)
+    return torch.exp(-(counts / DARK_CELLS).square())
