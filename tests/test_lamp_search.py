@@ -7,6 +7,7 @@ import torch
 from tests.scenes.geometry.test_carving import make_cameras
 from tests.scenes.geometry.test_lighting import LAMP, ball_views
 from tests.scenes.scene_factory import ring_poses
+from unmix_plugin import lamp_search
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.lamp_search import LampEvidence, best_lamp, find_lamp, turning_axis
 from unmix_plugin.scenes.demo.shading import LAMP_POSITION, render_view
@@ -25,11 +26,22 @@ def test_the_brightness_of_a_turned_ball_tells_the_direction_of_its_lamp(noise):
     assert np.degrees(np.arccos(place @ LAMP / np.linalg.norm(LAMP))) < 12
 
 
-def test_without_shadows_no_lamp_is_told():
+def test_a_lamp_whose_shadows_explain_nothing_is_not_believed(monkeypatch):
+    views = ball_views(True)
+    assert find_lamp(*views) is None
+    monkeypatch.setattr(lamp_search, "LEAST_SHADOWS", -1.0)
+    lamp = find_lamp(*views)
+    assert lamp is not None
+    assert np.dot(lamp.place, LAMP) / np.linalg.norm(lamp.place) / np.linalg.norm(LAMP) > 0.97
+
+
+def test_a_lamp_that_halves_of_the_places_disagree_about_is_not_believed(monkeypatch):
+    monkeypatch.setattr(lamp_search, "LEAST_SHADOWS", -1.0)
+    monkeypatch.setattr(lamp_search, "LEAST_AGREEMENT", 1.01)
     assert find_lamp(*ball_views(True)) is None
 
 
-def test_things_on_a_table_tell_by_their_shadows_where_a_lamp_stands_that_turns_with_the_camera():
+def test_things_on_a_table_tell_in_which_frame_the_lamp_stands():
     cameras = demo_cameras(96, 24)
     shading, matter = [], []
     for index in range(24):
@@ -40,8 +52,9 @@ def test_things_on_a_table_tell_by_their_shadows_where_a_lamp_stands_that_turns_
         shading.append(local_log_brightness(torch.from_numpy(view.diffuse.sum(axis=-1)).float()))
         matter.append(view.alpha > 0)
     box = SceneBox(torch.tensor([[-1.4, -1.4, -0.15], [1.4, 1.4, 1.2]]))
-    found = find_lamp(cameras, shading, carve_box(cameras, matter, box, 64), box)
-    assert found is not None
+    hull = carve_box(cameras, matter, box, 64)
+    evidence = LampEvidence.of(cameras, *seen_places(cameras, shading, hull, box), hull, box)
+    found = best_lamp(evidence, cameras)[1]
     true = np.array([LAMP_POSITION[1], LAMP_POSITION[2] - LOOK_AT[2], LAMP_POSITION[0]])
     cosine = np.dot(found.place, true) / np.linalg.norm(found.place) / np.linalg.norm(true)
     assert found.frame == "turntable"

@@ -29,7 +29,7 @@ from unmix_plugin.scenes.geometry.hull_places import Places, coarse_hull, seen_p
 
 LEAST_SHARE = 0.15
 """Of the changes of brightness within places, that a lamp must explain to be believed."""
-LEAST_SHADOWS = 0.005
+LEAST_SHADOWS = 0.003
 """Part of the changes that its shadows must explain beside, in either half of the places."""
 NUM_DIRECTIONS, NUM_KEPT = 300, 6
 """Directions that are tried in each frame without shadows, and the best of each that are tried with shadows."""
