@@ -156,7 +156,7 @@ class VolumeRenderer:
         else:
             densities, features = seen.densities, seen.features()
         visible = self._visible(field, kept, positions, ray_bundle, generator)
-        outputs = field.get_outputs(positions, along, features, visible)
+        outputs = field.get_outputs(positions, along, features, *(() if visible is None else (visible,)))
         if self.is_unbounded:
             near = self._near_cameras(kept.t)
             densities = scale_gradient(densities, near)

@@ -96,7 +96,8 @@ class EditedField(CoefficientField):
         visible: Float[Tensor, "S"] | None = None,
     ) -> dict[str, Tensor]:
         """`abundances`, `scaled_abundances` (S, K) of what is left, and `specular_coefficients` (S, G J)."""
-        outputs = self.field.get_outputs(positions, directions, features, visible)
+        known = () if visible is None else (visible,)
+        outputs = self.field.get_outputs(positions, directions, features, *known)
         factors = self._renormalising(outputs["abundances"])
         abundances = outputs["abundances"] * factors
         shine = abundances @ self.gloss.T.to(abundances)
