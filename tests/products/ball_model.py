@@ -49,7 +49,9 @@ class BallField(CoefficientField):
         above = (features[:, 2] > 0).float()
         return torch.stack([above, 1 - above, torch.zeros_like(above)], dim=-1)
 
-    def get_outputs(self, positions: Tensor, directions: Tensor, features: Tensor) -> dict[str, Tensor]:
+    def get_outputs(
+        self, positions: Tensor, directions: Tensor, features: Tensor, visible: Tensor | None = None
+    ) -> dict[str, Tensor]:
         """The same shade everywhere, and no gloss."""
         abundances = self.abundances_of(features)
         return {
