@@ -161,11 +161,11 @@ class UnmixModel(Model):
     @property
     def renderer(self) -> VolumeRenderer:
         """How rays are rendered at present; its grid follows the training."""
-        if self._renderer is None or self._renderer.occupied is not self.grid.occupied:
+        if self._renderer is None or self._renderer.clearance is not self.grid.clearance:
             config = self.config
             self._renderer = VolumeRenderer(
                 self.scene_box.to(self.device),
-                self.grid.occupied,
+                self.grid.clearance,
                 self.grid.reachable,
                 self.step,
                 choose(config.renderer.smallest_weight, self.preset.smallest_weight),

@@ -20,6 +20,7 @@ from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.errors import require
 from unmix_plugin.field import CoefficientField
+from unmix_plugin.front_to_back import composite_front_to_back
 from unmix_plugin.lamp_shadows import lamp_visibility
 from unmix_plugin.lit_samples import points_of, samples_carrying_weight
 from unmix_plugin.rendering.compositing import accumulate, volume_weights
@@ -120,8 +121,8 @@ class VolumeRenderer:
 
     box: SceneBox
     """What is rendered, model space."""
-    occupied: UInt8[Tensor, "X Y Z"]
-    """Cells of the box that rays are sampled in; others are empty."""
+    clearance: UInt8[Tensor, "X Y Z"]
+    """0 in the cells of the box that rays are sampled in; others are empty, and have what `clearance_of` says."""
     reachable: Bool[Tensor, "X Y Z"]
     """Cells that were not carved away before training."""
     step: float
@@ -132,7 +133,7 @@ class VolumeRenderer:
     """Whether rays go on outside the box, through contracted space, and end on the sky."""
     residual_on_last_sample: bool = False
     """Whether the last sample of a ray takes all the light that is left."""
-    rays_per_chunk: int = 8192
+    rays_per_chunk: int = 32_768
     """Rays rendered at once for a whole image; fewer take less memory."""
     opaque: UInt8[Tensor, "X Y Z"] | None = None
     """Cells that cast shadows in the light of a lamp that moves with the camera; None without one."""
@@ -155,7 +156,8 @@ class VolumeRenderer:
             densities, features = field.density_of(field.encode(positions, seen.encoded()))
         else:
             densities, features = seen.densities, seen.features()
-        visible = self._visible(field, kept, positions, ray_bundle, generator)
+        origins = ray_bundle.origins.index_select(0, kept.ray_indices)
+        visible = self._visible(field, origins, positions, generator)
         outputs = field.get_outputs(positions, along, features, *(() if visible is None else (visible,)))
         if self.is_unbounded:
             near = self._near_cameras(kept.t)
@@ -174,12 +176,8 @@ class VolumeRenderer:
         totals = accumulate(weights, values.packed, kept.packed_info)
         if self.residual_on_last_sample:
             totals = totals + _residual_transmittance(totals[:, 0], values.packed, kept)
-        coefficients = Coefficients(totals, values.num_endmembers)
-        mixtures, sky = coefficients.abundances, field.sky(ray_bundle.directions)
-        if sky is not None:
-            left = (1 - coefficients.accumulation)[:, None]
-            mixtures = mixtures + left * sky[:, :-1]
-            coefficients = coefficients.with_light(left * sky[:, -1:] * sky[:, :-1])
+        matter = Coefficients(totals, values.num_endmembers)
+        coefficients, mixtures = _before_sky(matter, field.sky(ray_bundle.directions))
         return RenderedRays(
             coefficients,
             mixtures,
@@ -192,11 +190,25 @@ class VolumeRenderer:
 
     @torch.no_grad()
     def composite(self, field: CoefficientField, ray_bundle: RayBundle) -> Coefficients:
-        """Coefficients (R, ...) of each ray, few rays at a time in memory."""
+        """Coefficients (R, ...) of each ray, few rays at a time in memory.
+
+        Those of `render` but for what front_to_back.py says, in less time.
+        """
         chunk = self.rays_per_chunk
         starts = range(0, max(len(ray_bundle), 1), chunk)
-        parts = [self.render(field, ray_bundle[i : i + chunk]).coefficients for i in starts]
-        return Coefficients.concatenate(parts)
+        return Coefficients.concatenate([self._composite(field, ray_bundle[i : i + chunk]) for i in starts])
+
+    def _composite(self, field: CoefficientField, ray_bundle: RayBundle) -> Coefficients:
+        samples = self._march(ray_bundle, None)
+        found = composite_front_to_back(
+            field,
+            samples,
+            ray_bundle,
+            self.smallest_weight,
+            lambda origins, positions: self._visible(field, origins, positions),
+            self.residual_on_last_sample,
+        )
+        return _before_sky(found, field.sky(ray_bundle.directions))[0]
 
     @torch.no_grad()
     def composite_view(self, field: CoefficientField, camera: Cameras, subpixels: int = 1) -> Coefficients:
@@ -207,7 +219,7 @@ class VolumeRenderer:
             camera: One camera.
             subpixels: Rays through a pixel along each of its edges, averaged: all outputs but ratios are linear.
         """
-        camera = camera.to(self.occupied.device)
+        camera = camera.to(self.clearance.device)
         centres = [(i + 0.5) / subpixels for i in range(subpixels)]
         total: Coefficients | None = None
         for offset in [(x, y) for y in centres for x in centres]:
@@ -231,9 +243,14 @@ class VolumeRenderer:
             parts.append(torch.nn.functional.normalize(-gradient, dim=-1))
         return torch.cat(parts)
 
+    @property
+    def occupied(self) -> Bool[Tensor, "X Y Z"]:
+        """Cells of the box that rays are sampled in."""
+        return self.clearance == 0
+
     def is_occupied(self, positions: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
         """Points in the box, in cells that rays are sampled in."""
-        return self._lie_in(self.occupied > 0, positions)
+        return self._lie_in(self.occupied, positions)
 
     def is_reachable(self, positions: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
         """Points in the box, in cells that were not carved away before training."""
@@ -259,14 +276,12 @@ class VolumeRenderer:
     def _visible(
         self,
         field: CoefficientField,
-        samples: PackedSamples,
+        origins: Float[Tensor, "S 3"],
         positions: Float[Tensor, "S 3"],
-        ray_bundle: RayBundle,
-        generator: torch.Generator | None,
+        generator: torch.Generator | None = None,
     ) -> Float[Tensor, "S"] | None:
         if field.moving_lamp is None or self.opaque is None:
             return None
-        origins = ray_bundle.origins.index_select(0, samples.ray_indices)
         return lamp_visibility(field.moving_lamp, origins, positions, self.box, self.opaque, generator)
 
     def _march(self, ray_bundle: RayBundle, generator: torch.Generator | None) -> PackedSamples:
@@ -276,16 +291,27 @@ class VolumeRenderer:
             jitter = torch.rand(jitter.shape, generator=generator, device=generator.device).to(jitter)
         if self.is_unbounded:
             inner_origins, inner_directions = self.space.centred(origins), directions / self.space.half_edge
-            return march_contracted(inner_origins, inner_directions, jitter, self.occupied, self.step)
+            return march_contracted(inner_origins, inner_directions, jitter, self.clearance, self.step)
         t_near, t_far = self.box.intersect(origins, directions)
         unit_origins, unit_directions = self.box.normalise(origins), directions / self.box.size
-        return march(unit_origins, unit_directions, t_near, t_far, jitter, self.occupied, self.step)
+        return march(unit_origins, unit_directions, t_near, t_far, jitter, self.clearance, self.step)
 
 
 def scale_gradient(values: Float[Tensor, "*S"], factors: Float[Tensor, "*#S"]) -> Float[Tensor, "*S"]:
     """The same values; gradients that reach them are multiplied with `factors`."""
     constant = values.detach()
     return constant + factors * (values - constant)
+
+
+def _before_sky(
+    matter: Coefficients, sky: Float[Tensor, "R C"] | None
+) -> tuple[Coefficients, Float[Tensor, "R K"]]:
+    """With the light of what is infinitely far away, as `CoefficientField.sky` gives it; and abundances with its."""
+    if sky is None:
+        return matter, matter.abundances
+    left = (1 - matter.accumulation)[:, None]
+    mixtures = matter.abundances + left * sky[:, :-1]
+    return matter.with_light(left * sky[:, -1:] * sky[:, :-1]), mixtures
 
 
 def _residual_transmittance(

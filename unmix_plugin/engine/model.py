@@ -26,7 +26,7 @@ class ModelConfig(InstantiateConfig):
     """Settings that every model has."""
 
     _target: Target = field(default_factory=lambda: Model)
-    eval_num_rays_per_chunk: int = 8192
+    eval_num_rays_per_chunk: int = 32_768
     """Rays rendered at once for a whole image; fewer take less memory."""
 
     def __post_init__(self) -> None:

@@ -24,14 +24,14 @@ def stride_at(radius: float, step: float):
 
 @wp.func
 @no_type_check
-def is_occupied(point: wp.vec3f, occupied: wp.array3d(dtype=wp.uint8)):
+def is_occupied(point: wp.vec3f, clearance: wp.array3d(dtype=wp.uint8)):
     """1 in an occupied cell, else 0."""
     radius = wp.max(radius_at(point), 1.0)
     unit = point * ((2.0 - 1.0 / radius) / radius) / 4.0 + wp.vec3f(0.5, 0.5, 0.5)
-    x = wp.clamp(int(unit[0] * float(occupied.shape[0])), 0, occupied.shape[0] - 1)
-    y = wp.clamp(int(unit[1] * float(occupied.shape[1])), 0, occupied.shape[1] - 1)
-    z = wp.clamp(int(unit[2] * float(occupied.shape[2])), 0, occupied.shape[2] - 1)
-    return wp.min(int(occupied[x, y, z]), 1)
+    x = wp.clamp(int(unit[0] * float(clearance.shape[0])), 0, clearance.shape[0] - 1)
+    y = wp.clamp(int(unit[1] * float(clearance.shape[1])), 0, clearance.shape[1] - 1)
+    z = wp.clamp(int(unit[2] * float(clearance.shape[2])), 0, clearance.shape[2] - 1)
+    return 1 - wp.min(int(clearance[x, y, z]), 1)
 
 
 @wp.kernel(enable_backward=False)
@@ -44,7 +44,7 @@ def count_kernel(
     directions: wp.array(dtype=wp.vec3f),
     jitter: wp.array(dtype=float),
     step: float,
-    occupied: wp.array3d(dtype=wp.uint8),
+    clearance: wp.array3d(dtype=wp.uint8),
     counts: wp.array(dtype=wp.int64),
 ):
     index = first + wp.tid()
@@ -54,7 +54,7 @@ def count_kernel(
         radius = radius_at(origins[index])
         while radius <= 512.0:
             length = stride_at(radius, step)
-            count += is_occupied(origins[index] + (t + jitter[index] * length) * directions[index], occupied)
+            count += is_occupied(origins[index] + (t + jitter[index] * length) * directions[index], clearance)
             t += length
             radius = radius_at(origins[index] + t * directions[index])
         counts[index] = wp.int64(count)
@@ -71,7 +71,7 @@ def write_kernel(
     directions: wp.array(dtype=wp.vec3f),
     jitter: wp.array(dtype=float),
     step: float,
-    occupied: wp.array3d(dtype=wp.uint8),
+    clearance: wp.array3d(dtype=wp.uint8),
     packed_info: wp.array2d(dtype=wp.int64),
     ray_indices: wp.array(dtype=wp.int64),
     t_samples: wp.array(dtype=float),
@@ -88,7 +88,7 @@ def write_kernel(
             # An empty point's entry is overwritten by the next point's.
             ray_indices[slot] = wp.int64(index)
             t_samples[slot] = middle
-            slot += is_occupied(origins[index] + middle * directions[index], occupied)
+            slot += is_occupied(origins[index] + middle * directions[index], clearance)
             t += length
             radius = radius_at(origins[index] + t * directions[index])
         index += stride

@@ -28,7 +28,7 @@ def march_contracted(
     origins: Float[Tensor, "R 3"],
     directions: Float[Tensor, "R 3"],
     jitter: Float[Tensor, "R"],
-    occupied: UInt8[Tensor, "X Y Z"],
+    clearance: UInt8[Tensor, "X Y Z"],
     step: float,
 ) -> PackedSamples:
     """Samples of each ray from its origin to r = 512, in occupied cells of contracted space.
@@ -36,7 +36,7 @@ def march_contracted(
     Args:
         origins, directions: Rays in units of the inner cube's half edge.
         jitter: Where in its interval a ray's samples lie, [0, 1).
-        occupied: Non-zero in occupied cells of the cube from -2 to 2.
+        clearance: 0 in occupied cells of the cube from -2 to 2, whatever else it is in others.
         step: Distance of samples in the inner cube, in the ray parameter, > 0.
     Raises:
         ValueError: step isn't positive.
@@ -50,7 +50,7 @@ def march_contracted(
         as_warp(directions.contiguous(), point),
         as_warp(jitter.contiguous()),
         step,
-        as_warp(occupied.contiguous()),
+        as_warp(clearance.contiguous()),
     ]
     return PackedSamples(*count_and_write(count_kernel, write_kernel, rays, len(origins), device), step)
 
@@ -59,7 +59,7 @@ def march_contracted_twin(
     origins: Float[Tensor, "R 3"],
     directions: Float[Tensor, "R 3"],
     jitter: Float[Tensor, "R"],
-    occupied: UInt8[Tensor, "X Y Z"],
+    clearance: UInt8[Tensor, "X Y Z"],
     step: float,
 ) -> PackedSamples:
     """The same as `march_contracted` in plain PyTorch: walks all rays at once."""
@@ -75,7 +75,7 @@ def march_contracted_twin(
         stride = step * near * (near / LINEAR_RADIUS).clamp(min=1.0)
         at = t + jitter * stride
         unit = unit_points(origins + at[:, None] * directions)
-        hit = is_inside & (occupied[tuple(cells_at(unit, occupied.shape).unbind(-1))] != 0)
+        hit = is_inside & (clearance[tuple(cells_at(unit, clearance.shape).unbind(-1))] == 0)
         found.append((hit, at))
         t = torch.where(is_inside, t + stride, t)
     nothing = torch.zeros(len(origins), 0, device=origins.device)

@@ -60,7 +60,7 @@ def march(
     t_near: Float[Tensor, "R"],
     t_far: Float[Tensor, "R"],
     jitter: Float[Tensor, "R"],
-    occupied: UInt8[Tensor, "X Y Z"],
+    clearance: UInt8[Tensor, "X Y Z"],
     step: float,
 ) -> PackedSamples:
     """Samples at t_near + (i + jitter) step that lie in occupied cells.
@@ -69,7 +69,7 @@ def march(
         origins, directions: Rays in unit-cube coordinates; directions need not have unit length.
         t_near, t_far: Where each ray enters and leaves the unit cube; t_far <= t_near marks a miss.
         jitter: Offset of each ray's lattice in steps, [0, 1).
-        occupied: Non-zero in occupied cells; cell (x, y, z) is [x/X, (x+1)/X] and so on.
+        clearance: 0 in occupied cells, as `clearance_of` says; cell (x, y, z) is [x/X, (x+1)/X] and so on.
         step: Distance of neighbouring samples in the ray parameter, > 0.
     Raises:
         ValueError: step isn't positive.
@@ -83,7 +83,7 @@ def march(
         as_warp(directions.contiguous(), point),
         *(as_warp(values.contiguous()) for values in (t_near, t_far, jitter)),
         step,
-        as_warp(occupied.contiguous()),
+        as_warp(clearance.contiguous()),
     ]
     return PackedSamples(*count_and_write(count_kernel, write_kernel, rays, len(origins), device), step)
 
@@ -105,7 +105,8 @@ def count_samples(
     counts = torch.empty(len(origins), dtype=torch.int64, device=device)
     rays = [as_warp(x.contiguous(), point) for x in (origins, directions)]
     bounds = [as_warp(values.contiguous()) for values in (t_near, t_far, jitter)]
-    arrays = [*rays, *bounds, step, as_warp(occupied.contiguous()), as_warp(counts)]
+    clearance = (occupied == 0).to(torch.uint8)
+    arrays = [*rays, *bounds, step, as_warp(clearance.contiguous()), as_warp(counts)]
     launch(count_kernel, len(origins), arrays, device)
     return counts
 
@@ -143,7 +144,7 @@ def march_twin(
     t_near: Float[Tensor, "R"],
     t_far: Float[Tensor, "R"],
     jitter: Float[Tensor, "R"],
-    occupied: UInt8[Tensor, "X Y Z"],
+    clearance: UInt8[Tensor, "X Y Z"],
     step: float,
 ) -> PackedSamples:
     """The same as `march` in plain PyTorch: tests every lattice point of every ray."""
@@ -153,8 +154,8 @@ def march_twin(
     index = torch.arange(max(int(longest / step) + 2, 1), device=origins.device)
     t = t_first[:, None] + index * step
     points = origins[:, None] + t[..., None] * directions[:, None]
-    cells = cells_at(points, occupied.shape)
-    hit = (t < t_far[:, None]) & (occupied[tuple(cells.unbind(-1))] != 0)
+    cells = cells_at(points, clearance.shape)
+    hit = (t < t_far[:, None]) & (clearance[tuple(cells.unbind(-1))] == 0)
     counts = hit.sum(dim=1)
     starts = counts.cumsum(0) - counts
     ray_indices, _ = hit.nonzero(as_tuple=True)

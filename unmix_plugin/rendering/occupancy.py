@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from unmix_plugin.rendering.grid_cells import clearance_of
 from unmix_plugin.rendering.visibility import VisibleCells
 
 _OPAQUE = 3.0
@@ -27,6 +28,8 @@ class OccupancyGrid(nn.Module):
 
     peak_densities: Tensor
     occupied: Tensor
+    clearance: Tensor
+    """As `clearance_of` says, of the occupied cells."""
     reachable: Tensor
     reachable_cells: Tensor
     opaque: Tensor | None
@@ -44,8 +47,9 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("occupied", reachable.to(torch.uint8))
         opaque = torch.zeros(reachable.shape, dtype=torch.uint8) if casts_shadows else None
         self.register_buffer("opaque", opaque)
+        self.register_buffer("clearance", clearance_of(reachable), persistent=False)
         self.register_buffer("reachable_cells", _flat_indices(reachable), persistent=False)
-        self.register_load_state_dict_post_hook(_find_reachable_cells)
+        self.register_load_state_dict_post_hook(_after_loading)
 
     @torch.no_grad()
     def update(
@@ -82,6 +86,7 @@ class OccupancyGrid(nn.Module):
         if self.opaque is not None:
             is_opaque = is_known & is_visible & (reachable_peaks > _OPAQUE * limit)
             self.opaque.view(-1)[self.reachable_cells] = is_opaque.byte()
+        self.clearance.copy_(clearance_of(self.occupied != 0))
 
     def _choose_cells(self, num_cells: int | None, generator: torch.Generator) -> Int[Tensor, "N"]:
         reachable = self.reachable_cells
@@ -105,6 +110,7 @@ def _flat_indices(reachable: Bool[Tensor, "X Y Z"]) -> Int[Tensor, "N"]:
     return reachable.view(-1).nonzero()[:, 0]
 
 
-def _find_reachable_cells(grid: OccupancyGrid, _: object) -> None:
-    """Which cells are reachable is kept as indices too: searching the whole grid takes longer than an update."""
+def _after_loading(grid: OccupancyGrid, _: object) -> None:
+    """Find anew what follows from what was loaded: searching the whole grid takes longer than an update."""
     grid.reachable_cells = _flat_indices(grid.reachable)
+    grid.clearance = clearance_of(grid.occupied != 0)

@@ -39,7 +39,7 @@ def unmix_scene(
     materials = replace(materials, endmembers=frozen[id(model.endmembers)], specular_spectra=specular)
     renderer = replace(
         renderer,
-        occupied=renderer.occupied.clone(),
+        clearance=renderer.clearance.clone(),
         reachable=renderer.reachable.clone(),
         opaque=None if renderer.opaque is None else renderer.opaque.clone(),
     )

@@ -130,7 +130,7 @@ class TrainedScene:
         renderer = replace(
             self.renderer,
             box=self.renderer.box.to(device),
-            occupied=self.renderer.occupied.to(device),
+            clearance=self.renderer.clearance.to(device),
             reachable=self.renderer.reachable.to(device),
             opaque=None if self.renderer.opaque is None else self.renderer.opaque.to(device),
         )

@@ -78,7 +78,7 @@ class FrameRender:
         # Spread over the picture, so that every block has its share of what is empty and of what is costly.
         pixels = torch.arange(start, end, device=scene.device) * self._stride % self._num_pixels
         bundle = pixel_rays(self.camera.to(scene.device), pixels, self._offsets[turn])
-        block = scene.renderer.render(scene.field, bundle).coefficients
+        block = scene.renderer.composite(scene.field, bundle)
         if self._coefficients is None:
             self._coefficients = block.map(lambda packed: packed.new_zeros(self._num_pixels, packed.shape[1]))
         self._coefficients.packed[pixels] += block.packed / len(self._offsets)

@@ -1,0 +1,153 @@
+"""What rays sum to, without gradients: looked at from the front until hardly any light is left.
+
+For pictures of a trained field. `VolumeRenderer.render` is the careful way, which training takes: it evaluates every
+sample that carries weight, and goes on farther. Here neighbouring samples are merged where together they carry little
+of their ray's light, and what lies behind the place where a ray ends is taken to look like what lies before it.
+
+Notation: `R` rays, `A` rays that still have light, `C` coefficients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from unmix_plugin.engine.geometry.rays import RayBundle
+from unmix_plugin.field import CoefficientField
+from unmix_plugin.rendering.compositing import accumulate
+from unmix_plugin.rendering.marching import PackedSamples
+from unmix_plugin.rendering.merging import MergedSamples, MergeLimits, merge_samples
+from unmix_plugin.spectral.coefficients import Coefficients
+
+_ENDING_LIGHT = 2.0
+"""Share of its light at which a ray ends, in multiples of the smallest weight of a sample."""
+_MERGED_WEIGHT = 50.0
+"""Most of a ray's light that merged samples carry together, in the same unit."""
+_SAMPLES_AT_ONCE = 4
+"""Of each ray, that are looked at before it is known whether light gets farther."""
+
+_Visible = Callable[[Float[Tensor, "S 3"], Float[Tensor, "S 3"]], Float[Tensor, "S"] | None]
+
+
+@dataclass(frozen=True)
+class _Front:
+    """How far rays that still have light were looked at."""
+
+    rays: Int[Tensor, "A"]
+    at: Int[Tensor, "A"]
+    """Next sample of each."""
+    todo: Int[Tensor, "A"]
+    """Samples of each from there on."""
+    left: Float[Tensor, "A"]
+    """Share of its light that each still has."""
+
+    @property
+    def wanted(self) -> Int[Tensor, "A"]:
+        """Samples of each that are looked at next."""
+        return self.todo.clamp(max=_SAMPLES_AT_ONCE)
+
+    def after(self, left: Float[Tensor, "A"], ending_light: float) -> _Front:
+        """Behind these samples, where there are more and enough light is left."""
+        values = (self.rays, self.at + self.wanted, self.todo - self.wanted, left)
+        alive = ((left > ending_light) & (values[2] > 0)).nonzero()[:, 0]
+        return _Front(*(value.index_select(0, alive) for value in values))
+
+
+@torch.no_grad()
+def composite_front_to_back(
+    field: CoefficientField,
+    samples: PackedSamples,
+    ray_bundle: RayBundle,
+    smallest_weight: float,
+    visible: _Visible,
+    residual_on_last_sample: bool = False,
+) -> Coefficients:
+    """Coefficients (R, ...) of each ray.
+
+    Args:
+        field: What is rendered.
+        samples: Of the rays of the bundle, each `samples.step` long.
+        ray_bundle: R rays.
+        smallest_weight: Samples that contribute no more of their ray's light are left out.
+        visible: From origins of rays and positions on them to the part of a moving lamp's light that reaches them, as
+            `CoefficientField.get_outputs` takes it.
+        residual_on_last_sample: Whether the last sample of a ray takes all the light that is left.
+    """
+    starts, counts = samples.packed_info.unbind(-1)
+    left = torch.ones_like(counts, dtype=samples.t.dtype)
+    ending_light = _ENDING_LIGHT * smallest_weight
+    limits = MergeLimits(samples.step, smallest_weight, _MERGED_WEIGHT * smallest_weight)
+    rays = counts.nonzero()[:, 0]
+    front = _Front(rays, *(value.index_select(0, rays) for value in (starts, counts, left)))
+    totals = last = torch.zeros(0)
+    while True:
+        merged = _look(field, samples, ray_bundle, front, limits)
+        values = _values(field, ray_bundle, front.rays, merged, visible)
+        if totals.dim() == 1:
+            totals = values.packed.new_zeros(len(counts), values.packed.shape[1])
+            last = torch.zeros_like(totals)
+        totals.index_add_(0, front.rays, accumulate(merged.weights, values.packed, merged.packed_info))
+        if residual_on_last_sample:
+            found = merged.packed_info[:, 1].nonzero()[:, 0]
+            last[front.rays[found]] = values.packed[merged.packed_info[found].sum(dim=1) - 1]
+        left[front.rays] = merged.left
+        front = front.after(merged.left, ending_light)
+        if len(front.rays) == 0:
+            break
+    if residual_on_last_sample:
+        totals = totals + (1 - totals[:, :1]) * last
+    else:
+        totals *= torch.where(left > ending_light, 1.0, 1 / (1 - left))[:, None]
+    return Coefficients(totals, values.num_endmembers)
+
+
+def _look(
+    field: CoefficientField,
+    samples: PackedSamples,
+    ray_bundle: RayBundle,
+    front: _Front,
+    limits: MergeLimits,
+) -> MergedSamples:
+    """The next samples of rays, merged."""
+    wanted = front.wanted
+    ends = wanted.cumsum(0)
+    size = int(ends[-1]) if len(ends) else 0
+    packed_info = torch.stack([ends - wanted, wanted], dim=-1)
+    owners = torch.repeat_interleave(wanted, output_size=size)
+    chosen = (front.at - packed_info[:, 0]).index_select(0, owners)
+    t = samples.t.index_select(0, chosen.add_(torch.arange(size, device=chosen.device)))
+    origins, along = _lines(ray_bundle, front.rays.index_select(0, owners))
+    densities, features = field.density_of(field.encode(torch.addcmul(origins, along, t[:, None])))
+    return merge_samples(densities * limits.step, t, features, packed_info, front.left, limits)
+
+
+def _values(
+    field: CoefficientField,
+    ray_bundle: RayBundle,
+    rays: Int[Tensor, "A"],
+    merged: MergedSamples,
+    visible: _Visible,
+) -> Coefficients:
+    """What groups of samples look like."""
+    origins, along = _lines(ray_bundle, rays.index_select(0, merged.ray_indices))
+    positions = torch.addcmul(origins, along, merged.t[:, None])
+    lit = visible(origins, positions)
+    outputs = field.get_outputs(positions, along, merged.features, *(() if lit is None else (lit,)))
+    return Coefficients.of(
+        torch.ones_like(merged.t),
+        merged.t,
+        outputs["abundances"],
+        outputs["scaled_abundances"],
+        outputs["specular_coefficients"],
+    )
+
+
+def _lines(
+    ray_bundle: RayBundle, rays: Int[Tensor, "S"]
+) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3"]]:
+    """Origins and directions of some rays."""
+    return ray_bundle.origins.index_select(0, rays), ray_bundle.directions.index_select(0, rays)
