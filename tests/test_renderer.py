@@ -1,6 +1,7 @@
 """The renderer of coefficients, apart from the model that owns it."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.field import UnmixField, UnmixFieldConfig
 from unmix_plugin.renderer import RendererConfig, VolumeRenderer
+from unmix_plugin.rendering.grid_cells import clearance_of
 
 BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 PIXEL = 0.1
@@ -25,7 +27,7 @@ def make(
     cells = torch.ones(8, 8, 8)
     step = pixel / 1.5
     return VolumeRenderer(
-        box, cells.to(torch.uint8), cells > 0, step, smallest_weight, rays_per_chunk=7
+        box, clearance_of(cells > 0), cells > 0, step, smallest_weight, rays_per_chunk=7
     ), field
 
 
@@ -89,8 +91,8 @@ def test_without_alpha_an_untrained_scene_can_grow_dense_along_the_whole_of_a_ra
 def test_rays_rendered_in_chunks_are_those_rendered_together():
     renderer, field = make()
     bundle = rays(20)
-    together = renderer.render(field, bundle).coefficients
-    assert_close(renderer.composite(field, bundle).packed, together.packed.detach())
+    together = replace(renderer, rays_per_chunk=20).composite(field, bundle)
+    assert_close(renderer.composite(field, bundle).packed, together.packed)
 
 
 def test_rendering_changes_nothing_and_draws_nothing_from_the_global_generator():
@@ -110,7 +112,7 @@ def test_rendering_changes_nothing_and_draws_nothing_from_the_global_generator()
 
 def test_points_are_asked_cell_by_cell_and_outside_the_box_is_nothing():
     renderer, _ = make()
-    renderer.occupied[:4] = 0
+    renderer.clearance[:4] = 1
     points = torch.tensor([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0], [1.5, 0.0, 0.0]])
     assert renderer.is_occupied(points).tolist() == [False, True, False]
     assert renderer.is_reachable(points).tolist() == [True, True, False]

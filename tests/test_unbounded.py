@@ -12,6 +12,7 @@ from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.field import UnmixField, UnmixFieldConfig
 from unmix_plugin.renderer import VolumeRenderer, scale_gradient
+from unmix_plugin.rendering.grid_cells import clearance_of
 
 BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 
@@ -23,7 +24,7 @@ def make(density: float = 1e-6) -> tuple[VolumeRenderer, UnmixField]:
     with torch.no_grad():
         field.table.zero_()
     cells = torch.ones(16, 16, 16)
-    return VolumeRenderer(BOX, cells.byte(), cells > 0, 0.05, 0.0, is_unbounded=True), field
+    return VolumeRenderer(BOX, clearance_of(cells > 0), cells > 0, 0.05, 0.0, is_unbounded=True), field
 
 
 def rays(num_rays: int) -> RayBundle:
@@ -77,8 +78,8 @@ def test_rays_end_on_what_stands_outside_the_box():
     inner = renderer.is_occupied(torch.tensor([[3.0, 0.0, 0.0]]))
     assert bool(inner)
     occupied = renderer.occupied.clone()
-    occupied[4:12, 4:12, 4:12] = 0  # nothing in the box
-    shell = VolumeRenderer(BOX, occupied, occupied > 0, 0.05, 0.0, is_unbounded=True)
+    occupied[4:12, 4:12, 4:12] = False  # nothing in the box
+    shell = VolumeRenderer(BOX, clearance_of(occupied), occupied, 0.05, 0.0, is_unbounded=True)
     with torch.no_grad():
         found = shell.render(field, rays(30)).coefficients
     assert (found.accumulation > 0.99).all()

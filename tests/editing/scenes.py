@@ -71,6 +71,6 @@ def tensors_of(scene: TrainedScene) -> dict[str, Tensor]:
         "endmembers": materials.endmembers,
         "specular_spectra": materials.specular_spectra,
         "light": materials.light,
-        "occupied": renderer.occupied,
+        "clearance": renderer.clearance,
         "reachable": renderer.reachable,
     }

@@ -12,6 +12,7 @@ from unmix_plugin.rendering.contracted_marching import (
     march_contracted_twin,
     unit_points,
 )
+from unmix_plugin.rendering.grid_cells import clearance_of
 
 
 def make_rays(num_rays: int, seed: int = 0):
@@ -25,10 +26,11 @@ def make_rays(num_rays: int, seed: int = 0):
 @pytest.mark.parametrize("num_rays", [0, 1, 300])
 @pytest.mark.parametrize("sides", [(8, 8, 8), (3, 5, 7), (1, 1, 1)])
 def test_kernel_and_twin_take_the_same_samples(num_rays, sides, device):
-    occupied = (torch.rand(sides, generator=torch.Generator().manual_seed(3)) < 0.3).to(device, torch.uint8)
+    occupied = torch.rand(sides, generator=torch.Generator().manual_seed(3)) < 0.3
+    clearance = clearance_of(occupied).to(device)
     origins, directions, jitter = (values.to(device) for values in make_rays(num_rays))
     found, expected = (
-        function(origins, directions, jitter, occupied, 0.05)
+        function(origins, directions, jitter, clearance, 0.05)
         for function in (march_contracted, march_contracted_twin)
     )
     # A sample within rounding of a cell's face may fall to either side.
@@ -43,7 +45,7 @@ def test_kernel_and_twin_take_the_same_samples(num_rays, sides, device):
 
 
 def test_samples_are_a_step_apart_in_the_inner_cube_and_then_farther_up_to_the_far_end():
-    step, full = 0.05, torch.ones(4, 4, 4, dtype=torch.uint8)
+    step, full = 0.05, torch.zeros(4, 4, 4, dtype=torch.uint8)
     origins, directions = torch.tensor([[0.0, 0.1, 0.0]]), torch.tensor([[1.0, 0.0, 0.0]])
     samples = march_contracted(origins, directions, torch.zeros(1), full, step)
     gaps = samples.t.diff()
@@ -56,7 +58,7 @@ def test_samples_are_a_step_apart_in_the_inner_cube_and_then_farther_up_to_the_f
 
 
 def test_a_ray_from_beyond_the_far_end_has_no_samples():
-    full = torch.ones(4, 4, 4, dtype=torch.uint8)
+    full = torch.zeros(4, 4, 4, dtype=torch.uint8)
     origins, directions = torch.tensor([[600.0, 0.0, 0.0]]), torch.tensor([[-1.0, 0.0, 0.0]])
     assert len(march_contracted(origins, directions, torch.zeros(1), full, 0.05)) == 0
 
@@ -67,6 +69,6 @@ def test_grids_and_fields_contract_space_alike():
 
 
 def test_steps_of_no_length_are_refused():
-    full = torch.ones(4, 4, 4, dtype=torch.uint8)
+    full = torch.zeros(4, 4, 4, dtype=torch.uint8)
     with pytest.raises(ValueError, match="step must be positive"):
         march_contracted(*make_rays(3), full, 0.0)

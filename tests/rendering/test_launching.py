@@ -8,6 +8,7 @@ import warp as wp
 from torch.testing import assert_close
 
 from unmix_plugin.rendering.compositing import accumulate, volume_weights
+from unmix_plugin.rendering.grid_cells import clearance_of
 from unmix_plugin.rendering.hash_encoding import HashGridLayout, hash_encode
 from unmix_plugin.rendering.launching import as_warp, launch, vector_type
 from unmix_plugin.rendering.marching import march
@@ -81,9 +82,9 @@ def everything_from(generator: torch.Generator) -> tuple[torch.Tensor, ...]:
     num_rays = 1500
     origins = torch.rand(num_rays, 3, generator=generator)
     directions = torch.rand(num_rays, 3, generator=generator) - origins
-    occupied = (torch.rand(8, 8, 8, generator=generator) < 0.5).byte()
+    clearance = clearance_of(torch.rand(8, 8, 8, generator=generator) < 0.5)
     zeros, ones = torch.zeros(num_rays), torch.ones(num_rays)
-    samples = march(origins, directions, zeros, ones, 0.5 * ones, occupied, 0.05)
+    samples = march(origins, directions, zeros, ones, 0.5 * ones, clearance, 0.05)
     positions = origins[samples.ray_indices] + samples.t[:, None] * directions[samples.ray_indices]
     table = torch.randn(layout.num_rows, 4, generator=generator).requires_grad_()
     encoded = hash_encode(positions, table, layout)

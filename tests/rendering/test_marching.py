@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from unmix_plugin.rendering.grid_cells import clearance_of
 from unmix_plugin.rendering.marching import PackedSamples, count_samples, march, march_twin
 
 
@@ -28,7 +29,7 @@ def test_kernel_and_twin_take_the_same_samples(num_rays, sides, device):
     lattice = (t_near + jitter * step)[:, None] + torch.arange(int(longest / step) + 2, device=device) * step
     taken = []
     for function in (march, march_twin):
-        samples = function(o, d, t_near, t_far, jitter, occupied.to(device, torch.uint8), step)
+        samples = function(o, d, t_near, t_far, jitter, clearance_of(occupied).to(device), step)
         ray, count = samples.ray_indices, samples.packed_info[:, 1]
         indices = ((samples.t - lattice[ray, 0]) / step).round().long()
         assert_close(samples.t, lattice[ray, indices], rtol=0, atol=2e-6)
@@ -54,7 +55,7 @@ def test_a_full_grid_is_sampled_at_every_step():
         torch.ones(1),
         2 * torch.ones(1),
         torch.tensor([0.5]),
-        torch.ones(4, 4, 4).byte(),
+        torch.zeros(4, 4, 4).byte(),
         0.1,
     )
     assert_close(samples.t, torch.arange(10) * 0.1 + 1.05)
@@ -72,27 +73,34 @@ def test_every_lattice_point_in_front_of_the_far_end_is_taken_and_none_at_it(ste
     t_far = t_near + jitter * step + torch.arange(n) * step
     t_far[1::3] = torch.nextafter(t_far[1::3], torch.tensor(torch.inf))
     t_far[2::3] += torch.rand(len(t_far[2::3]), generator=g) * step
-    samples = march(origins, directions, t_near, t_far, jitter, torch.ones(2, 2, 2).byte(), step)
+    samples = march(origins, directions, t_near, t_far, jitter, torch.zeros(2, 2, 2).byte(), step)
     lattice = (t_near + jitter * step)[:, None] + torch.arange(n + 3) * step
     assert torch.equal(samples.packed_info[:, 1], (lattice < t_far[:, None]).sum(dim=1))
 
 
-def test_a_grid_may_mark_occupied_cells_with_any_number():
-    rays = make_rays(50)
-    marked = (torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(1)) < 0.4).byte()
-    once, many = march(*rays, marked, 0.03), march(*rays, marked * 255, 0.03)
-    assert torch.equal(once.packed_info, many.packed_info)
-    assert torch.equal(once.t, many.t)
+@pytest.mark.parametrize("share", [1e-3, 5e-3, 0.05])
+@pytest.mark.parametrize("step", [0.002, 0.03, 0.3])
+def test_what_is_passed_over_by_clearance_is_empty(share, step):
+    rays = make_rays(2000)
+    occupied = torch.rand(40, 30, 50, generator=torch.Generator().manual_seed(1)) < share
+    clearance = clearance_of(occupied)
+    passing, looking = (march(*rays, grid, step) for grid in (clearance, clearance.clamp(max=1)))
+    assert clearance.max() > 2
+    assert len(looking) > 0
+    assert torch.equal(passing.packed_info, looking.packed_info)
+    assert torch.equal(passing.t, looking.t)
+    assert torch.equal(passing.ray_indices, looking.ray_indices)
 
 
 def test_only_the_occupied_slab_is_sampled_and_its_samples_measure_it():
-    occupied = torch.zeros(8, 1, 1).byte()
-    occupied[2:5] = 1
+    occupied = torch.zeros(8, 1, 1, dtype=torch.bool)
+    occupied[2:5] = True
     n = 64
     origins = torch.tensor([[-1.0, 0.5, 0.5]]).repeat(n, 1)
     directions = torch.tensor([[1.0, 0.0, 0.0]]).repeat(n, 1)
+    clearance = clearance_of(occupied)
     samples = march(
-        origins, directions, torch.ones(n), 2 * torch.ones(n), torch.arange(n) / n, occupied, 0.03
+        origins, directions, torch.ones(n), 2 * torch.ones(n), torch.arange(n) / n, clearance, 0.03
     )
     x = samples.t - 1
     assert (x >= 0.25 - 1e-6).all()
@@ -103,8 +111,9 @@ def test_only_the_occupied_slab_is_sampled_and_its_samples_measure_it():
 
 def test_rays_that_miss_or_meet_nothing_have_no_samples():
     origins, directions, t_near, t_far, jitter = make_rays(6)
-    empty = march(origins, directions, t_near, t_far, jitter, torch.zeros(4, 4, 4).byte(), 0.05)
-    missed = march(origins, directions, t_near, t_near, jitter, torch.ones(4, 4, 4).byte(), 0.05)
+    nothing = clearance_of(torch.zeros(4, 4, 4, dtype=torch.bool))
+    empty = march(origins, directions, t_near, t_far, jitter, nothing, 0.05)
+    missed = march(origins, directions, t_near, t_near, jitter, torch.zeros(4, 4, 4).byte(), 0.05)
     assert len(empty) == len(missed) == 0
     assert empty.packed_info[:, 1].tolist() == [0] * 6
 
@@ -121,7 +130,7 @@ def test_selecting_samples_keeps_them_packed_by_ray():
 
 def test_a_step_of_no_length_is_refused():
     with pytest.raises(ValueError, match="step must be positive; got 0"):
-        march(*make_rays(2), torch.ones(2, 2, 2).byte(), 0.0)
+        march(*make_rays(2), torch.zeros(2, 2, 2).byte(), 0.0)
 
 
 @pytest.mark.parametrize("num_rays", [0, 300])
@@ -129,7 +138,8 @@ def test_samples_are_counted_as_they_are_taken(num_rays, device):
     occupied = (torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(3)) < 0.3).byte()
     o, d, t_near, t_far, _ = (x.to(device) for x in make_rays(num_rays))
     cells = occupied.to(device)
-    taken = march_twin(o, d, t_near, t_far, torch.full((num_rays,), 0.5, device=device), cells, 0.013)
+    half = torch.full((num_rays,), 0.5, device=device)
+    taken = march_twin(o, d, t_near, t_far, half, 1 - cells, 0.013)
     counts = count_samples(o, d, t_near, t_far, cells, 0.013)
     # A sample within rounding of a cell's face may fall to either side.
     assert_close(counts, taken.packed_info[:, 1], rtol=0, atol=2)
