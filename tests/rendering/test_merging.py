@@ -23,10 +23,11 @@ def make(counts: list[int], depth: float = 0.5):
 @pytest.mark.parametrize("counts", BATCHES)
 @pytest.mark.parametrize(("smallest", "most"), [(0.0, 0.0), (0.01, 0.2), (0.05, 0.1), (0.0, 2.0)])
 def test_kernel_and_twin_agree(counts, smallest, most, device):
-    inputs = [value.to(device) for value in make(counts)]
-    limits = MergeLimits(STEP, smallest, most)
-    found = merge_samples(*inputs, limits)
-    expected = merge_samples_twin(*(value.cpu() for value in inputs), limits)
+    inputs, limits = make(counts), MergeLimits(STEP, smallest, most)
+    depths, t, features, packed_info, left = (value.to(device) for value in inputs)
+    found = merge_samples(depths, t, features, packed_info, left, limits)
+    depths, t, features, packed_info, left = inputs
+    expected = merge_samples_twin(depths, t, features, packed_info, left, limits)
     for name in ("ray_indices", "packed_info"):
         assert torch.equal(getattr(found, name).cpu(), getattr(expected, name))
     for name in ("weights", "t", "features", "left"):
