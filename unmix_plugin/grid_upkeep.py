@@ -46,7 +46,7 @@ def update_grid(
     device = torch.device("cpu") if generator is None else generator.device
     drawn = torch.randint(2**62, (1,), generator=generator, device=device)
     seed = int(processes.of_first(drawn))
-    share_visibility(grid, processes)
+    share_sights(grid, processes)
     space = renderer.space
     grid.update(
         lambda points: field.get_density(space.from_unit(points))[0],
@@ -57,12 +57,14 @@ def update_grid(
     )
 
 
-def share_visibility(grid: OccupancyGrid, processes: Processes) -> None:
-    """Take in which cells the rays of all processes saw; twice is as good as once."""
+def share_sights(grid: OccupancyGrid, processes: Processes) -> None:
+    """Take in which cells the rays of all processes saw, and what they met; twice is as good as once."""
     visibility = grid.visibility
     processes.smallest(visibility.lowest_view)
     processes.largest(visibility.highest_view)
     processes.largest(visibility.num_rays)
+    if grid.met is not None:
+        processes.largest(grid.met)
 
 
 def record_seen(

@@ -35,6 +35,10 @@ class LitSamples:
     """Encodings of the samples looked at, in parts."""
     all_features: Sequence[Float[Tensor, "_ G"]]
     """Their geometry features."""
+    all_positions: Sequence[Float[Tensor, "_ 3"]]
+    """Where they lie, model space."""
+    all_densities: Sequence[Float[Tensor, "_"]]
+    """Their densities."""
 
     def encoded(self) -> Float[Tensor, "S LF"]:
         """Encodings of the samples."""
@@ -66,6 +70,8 @@ def samples_carrying_weight(
     depths, rows = torch.zeros_like(samples.t), torch.zeros_like(samples.ray_indices)
     all_encoded: list[Tensor] = []
     all_features: list[Tensor] = []
+    all_positions: list[Tensor] = []
+    all_densities: list[Tensor] = []
     first, num_seen, left = 0, 0, torch.ones_like(counts, dtype=samples.t.dtype)
     while True:
         wanted = (counts - first).clamp(0, max(first, _FIRST_SAMPLES)) * (left > smallest_weight)
@@ -76,16 +82,25 @@ def samples_carrying_weight(
         shifts = torch.repeat_interleave(starts + first - ends + wanted, wanted, output_size=size)
         chosen = shifts + torch.arange(size, device=shifts.device)
         part = samples.rows(chosen)
-        all_encoded.append(field.encode(points_of(part, ray_bundle)[0]))
+        all_positions.append(points_of(part, ray_bundle)[0])
+        all_encoded.append(field.encode(all_positions[-1]))
         densities, features = field.density_of(all_encoded[-1])
         all_features.append(features)
+        all_densities.append(densities)
         depths[chosen] = densities * step
         rows[chosen] = torch.arange(num_seen, num_seen + size, device=rows.device)
         left = left * torch.exp(-torch.zeros_like(left).index_add_(0, part.ray_indices, densities * step))
         first, num_seen = first + max(first, _FIRST_SAMPLES), num_seen + size
     keep = volume_weights(depths, samples.packed_info) > smallest_weight
     return LitSamples(
-        samples.select(keep), depths[keep] / step, num_seen, rows[keep], all_encoded, all_features
+        samples.select(keep),
+        depths[keep] / step,
+        num_seen,
+        rows[keep],
+        all_encoded,
+        all_features,
+        all_positions,
+        all_densities,
     )
 
 

@@ -70,7 +70,7 @@ class UnmixModel(Model):
         num_dictionary = config.num_dictionary_spectra(self.preset, self.num_endmembers)
         self.specular_spectra = nn.Parameter(torch.zeros(num_dictionary, len(self.bands)))
         reachable = torch.ones((metadata["grid_resolution"],) * 3, dtype=torch.bool)
-        self.grid = OccupancyGrid(reachable, config.moving_lamp is not None)
+        self.grid = OccupancyGrid(reachable, config.moving_lamp is not None, self.is_unbounded)
         self._renderer: VolumeRenderer | None = None
         self.step = config.renderer.sample_distance(
             metadata["pixel_size"], float(self.scene_box.size.max()), metadata["has_alpha"]
@@ -144,7 +144,8 @@ class UnmixModel(Model):
         if self.poses is not None:
             self.poses.begin(torch.from_numpy(initial_data["knots"]), self.scene_box.aabb.mean(dim=0))
             reachable = torch.ones_like(reachable)  # poses that are off carve away what is there
-        self.grid = OccupancyGrid(reachable, self.config.moving_lamp is not None).to(self.device)
+        casts_shadows = self.config.moving_lamp is not None
+        self.grid = OccupancyGrid(reachable, casts_shadows, self.is_unbounded).to(self.device)
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """The hash table, the networks and the spectra."""
@@ -192,7 +193,8 @@ class UnmixModel(Model):
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
         """`spectral` (R, B) on black (of a rig `coefficients`, from which follows what its sensors see),
         `abundances` (R, K) with those of the sky, `accumulation` (R), `spread` and `num_samples`, one number each, and
-        of the samples that carry weight `positions`, `weights`, `rays` and `views` (S)."""
+        of the samples that carry weight `positions`, `weights`, `rays` and `views` (S). Where the grid records it,
+        `met_positions` and `met_densities` (N) of all samples looked at."""
         generator = self.generator if self.training else None
         if self.poses is not None and self.training and self._progress >= self.config.pose_refinement.start:
             ray_bundle = self.poses(ray_bundle)
@@ -206,6 +208,10 @@ class UnmixModel(Model):
         )
         if self.view_gains is not None:
             seen["cameras"] = ray_bundle.camera_indices
+        if self.training and self.grid.met is not None:
+            positions = self.renderer.space.to_unit(torch.cat(list(rendered.looked_at.all_positions)).detach())
+            seen["met_positions"] = positions
+            seen["met_densities"] = torch.cat(list(rendered.looked_at.all_densities))
         return {
             **seen,
             "accumulation": coefficients.accumulation,
@@ -241,6 +247,8 @@ class UnmixModel(Model):
         """Note which cells the views see, and how far margins of abundances are from those of measured spectra."""
         visible_weight = choose(self.config.renderer.visible_weight, self.preset.visible_weight)
         record_seen(self.grid, outputs, visible_weight, self.processes)
+        if "met_densities" in outputs:
+            self.grid.record_met(outputs["met_positions"], outputs["met_densities"])
         self.comparison.observe(outputs, batch)
 
     def warnings(self) -> list[str]:

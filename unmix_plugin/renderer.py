@@ -22,7 +22,7 @@ from unmix_plugin.errors import require
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.front_to_back import composite_front_to_back
 from unmix_plugin.lamp_shadows import lamp_visibility
-from unmix_plugin.lit_samples import points_of, samples_carrying_weight
+from unmix_plugin.lit_samples import LitSamples, points_of, samples_carrying_weight
 from unmix_plugin.rendering.compositing import accumulate, volume_weights
 from unmix_plugin.rendering.contracted_marching import march_contracted
 from unmix_plugin.rendering.grid_cells import cells_at
@@ -113,6 +113,8 @@ class RenderedRays:
     """Share of its ray's light that each contributes."""
     ray_indices: Int[Tensor, "S"]
     """Ray of each."""
+    looked_at: LitSamples
+    """What is known of all samples that light may reach."""
 
 
 @dataclass(frozen=True)
@@ -186,6 +188,7 @@ class VolumeRenderer:
             self.space.to_unit(positions).detach(),
             weights,
             kept.ray_indices,
+            seen,
         )
 
     @torch.no_grad()

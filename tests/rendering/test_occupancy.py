@@ -74,3 +74,40 @@ def test_a_grid_that_was_loaded_goes_on_like_the_one_that_was_saved():
     assert torch.equal(loaded.peak_densities, saved.peak_densities)
     assert torch.equal(loaded.occupied, saved.occupied)
     assert not loaded.occupied[~reachable].any()
+
+
+def met_by_rays(grid: OccupancyGrid, density_fn, num_points: int, generator: torch.Generator) -> None:
+    points = torch.rand(num_points, 3, generator=generator)
+    grid.record_met(points, density_fn(points))
+
+
+def test_cells_in_which_rays_met_nothing_are_empty_without_being_probed():
+    generator = torch.Generator().manual_seed(3)
+    known, unknown = OccupancyGrid(torch.ones(8, 8, 8) > 0, records_met=True), full()
+    for _ in range(8):
+        for grid in (known, unknown):
+            met_by_rays(grid, ball, 4000, generator)
+            updated(grid, ball, num_cells=2)
+    reference = updated(full(), ball, times=10)
+    assert unknown.occupied.float().mean() > 0.9
+    assert (known.occupied != reference.occupied).float().mean() < 0.05
+
+
+def test_what_rays_met_counts_once_and_the_largest_in_a_cell():
+    grid = OccupancyGrid(torch.ones(2, 2, 2) > 0, records_met=True)
+    updated(grid, lambda points: torch.zeros(len(points)))
+    points = torch.tensor([[0.1, 0.1, 0.1], [0.2, 0.3, 0.1], [0.9, 0.9, 0.9]])
+    grid.record_met(points, torch.tensor([3.0, 8.0, 0.5]))
+    updated(grid, lambda points: torch.zeros(len(points)), num_cells=0)
+    assert float(grid.peak_densities[0, 0, 0]) == 8.0
+    assert float(grid.peak_densities[1, 1, 1]) == 0.5
+    updated(grid, lambda points: torch.zeros(len(points)), num_cells=0)
+    assert float(grid.peak_densities[0, 0, 0]) == 8.0
+
+
+def test_a_grid_that_was_saved_without_what_rays_met_can_be_loaded():
+    loaded, saved = OccupancyGrid(torch.ones(6, 6, 6) > 0, records_met=True), updated(full(6), ball, times=3)
+    loaded.load_state_dict(saved.state_dict())
+    for grid in (saved, loaded):
+        updated(grid, ball, times=3, num_cells=40, seed=1)
+    assert torch.equal(loaded.peak_densities, saved.peak_densities)

@@ -14,13 +14,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from unmix_plugin.rendering.grid_cells import clearance_of
+from unmix_plugin.rendering.grid_cells import cells_at, clearance_of
 from unmix_plugin.rendering.visibility import VisibleCells
 
 _OPAQUE = 3.0
 """Density from which a cell casts shadows, in that from which it counts as occupied."""
 
 DensityFn = Callable[[Float[Tensor, "S 3"]], Float[Tensor, "S"]]
+_NOTHING_MET = -1.0
 
 
 class OccupancyGrid(nn.Module):
@@ -30,15 +31,20 @@ class OccupancyGrid(nn.Module):
     occupied: Tensor
     clearance: Tensor
     """As `clearance_of` says, of the occupied cells."""
+    met: Tensor | None
+    """Largest density met in each cell since the last update."""
     reachable: Tensor
     reachable_cells: Tensor
     opaque: Tensor | None
 
-    def __init__(self, reachable: Bool[Tensor, "X Y Z"], casts_shadows: bool = False) -> None:
+    def __init__(
+        self, reachable: Bool[Tensor, "X Y Z"], casts_shadows: bool = False, records_met: bool = False
+    ) -> None:
         """Start with every cell occupied that `reachable` allows; the others always stay empty.
 
         Args:
             casts_shadows: Whether to keep the cells that are opaque, none at the start.
+            records_met: Whether densities that rays meet are noted, so that updates need not probe those cells.
         """
         super().__init__()
         self.visibility = VisibleCells(reachable.shape)
@@ -47,9 +53,11 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("occupied", reachable.to(torch.uint8))
         opaque = torch.zeros(reachable.shape, dtype=torch.uint8) if casts_shadows else None
         self.register_buffer("opaque", opaque)
+        self.register_buffer("met", torch.full(reachable.shape, _NOTHING_MET) if records_met else None)
         self.register_buffer("clearance", clearance_of(reachable), persistent=False)
         self.register_buffer("reachable_cells", _flat_indices(reachable), persistent=False)
         self.register_load_state_dict_post_hook(_after_loading)
+        self.register_load_state_dict_pre_hook(_add_nothing_met)
 
     @torch.no_grad()
     def update(
@@ -69,13 +77,13 @@ class OccupancyGrid(nn.Module):
             num_cells: Cells to probe: half drawn from the occupied ones, half from all reachable ones; None for all.
             generator: Source of the points and cells.
         """
+        self._take_in_met(decay)
         cells = self._choose_cells(num_cells, generator)
         sides = torch.tensor(self.occupied.shape, device=cells.device)
         offsets = torch.rand(len(cells), 3, generator=generator).to(cells.device)
         densities = density_fn((self._coordinates(cells) + offsets) / sides)
         peaks = self.peak_densities.view(-1)
-        known = torch.where(torch.isinf(peaks[cells]), 0.0, peaks[cells] * decay)
-        peaks[cells] = torch.maximum(known, densities)
+        peaks[cells] = torch.maximum(_decayed(peaks[cells], decay), densities)
         reachable_peaks = peaks[self.reachable_cells]
         is_known = torch.isfinite(reachable_peaks)
         known_peaks = reachable_peaks if bool(is_known.all()) else reachable_peaks[is_known]
@@ -87,6 +95,21 @@ class OccupancyGrid(nn.Module):
             is_opaque = is_known & is_visible & (reachable_peaks > _OPAQUE * limit)
             self.opaque.view(-1)[self.reachable_cells] = is_opaque.byte()
         self.clearance.copy_(clearance_of(self.occupied != 0))
+
+    @torch.no_grad()
+    def record_met(self, points: Float[Tensor, "S 3"], densities: Float[Tensor, "S"]) -> None:
+        """Note the densities of points in the unit cube, as far as this grid records what rays meet."""
+        if self.met is not None:
+            _, side_y, side_z = self.met.shape
+            x, y, z = cells_at(points, self.met.shape).unbind(-1)
+            self.met.view(-1).scatter_reduce_(0, (x * side_y + y) * side_z + z, densities, "amax")
+
+    def _take_in_met(self, decay: float) -> None:
+        """Treat each cell in which rays met a density as one that was probed, and forget what was met."""
+        if self.met is not None:
+            peaks = torch.maximum(_decayed(self.peak_densities, decay), self.met)
+            self.peak_densities.copy_(torch.where(self.met > _NOTHING_MET, peaks, self.peak_densities))
+            self.met.fill_(_NOTHING_MET)
 
     def _choose_cells(self, num_cells: int | None, generator: torch.Generator) -> Int[Tensor, "N"]:
         reachable = self.reachable_cells
@@ -106,8 +129,19 @@ class OccupancyGrid(nn.Module):
         return torch.stack([x, rest // side_z, rest % side_z], dim=-1).float()
 
 
+def _decayed(peaks: Float[Tensor, "*cells"], decay: float) -> Float[Tensor, "*cells"]:
+    """Remembered maxima of cells that are looked at once more; 0 where nothing was known."""
+    return torch.where(torch.isinf(peaks), 0.0, peaks * decay)
+
+
 def _flat_indices(reachable: Bool[Tensor, "X Y Z"]) -> Int[Tensor, "N"]:
     return reachable.view(-1).nonzero()[:, 0]
+
+
+def _add_nothing_met(grid: OccupancyGrid, values: dict[str, Tensor], prefix: str, *_: object) -> None:
+    """Grids that were saved before they recorded what rays meet are taken to have met nothing."""
+    if grid.met is not None:
+        values.setdefault(f"{prefix}met", torch.full_like(grid.met, _NOTHING_MET))
 
 
 def _after_loading(grid: OccupancyGrid, _: object) -> None:
