@@ -7,6 +7,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from tests.method_factory import BOX as SMALL_BOX
+from tests.method_factory import CONFIG, initial_data, make_model, make_rays
 from unmix_plugin.editing.edited_field import EditedField
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
@@ -110,3 +112,24 @@ def test_what_is_near_a_camera_learns_more_slowly_but_looks_the_same():
     scaled.sum().backward()
     assert values.grad is not None
     assert values.grad.tolist() == [0.25, 1.0]
+
+
+def test_training_tells_the_grid_what_rays_meet_in_a_world_without_end_and_only_there():
+    boxed = make_model(has_alpha=False).train()
+    metadata = {**boxed.metadata, "is_unbounded": True}
+    world = CONFIG.setup(scene_box=SMALL_BOX, metadata=metadata).train()
+    with torch.no_grad():
+        world.initialise(initial_data(), torch.Generator().manual_seed(0))
+    rays = make_rays(200)
+    batch = {"spectra": torch.rand(200, 5), "alpha": torch.ones(200), "pixels": torch.arange(200)}
+    for model in (boxed, world):
+        model.generator = torch.Generator().manual_seed(0)
+        model.observe(model.get_outputs(rays), batch)
+    assert boxed.grid.met is None
+    assert world.grid.met is not None
+    is_met = world.grid.met >= 0
+    centre = world.renderer.space.to_unit(torch.zeros(1, 3))
+    assert 0.5 < is_met.float().mean() < 1
+    assert bool(is_met[tuple((centre[0] * 8).long())])
+    density = world.field.get_density(torch.zeros(1, 3))[0]
+    assert_close(world.grid.met[is_met].mean(), density[0], rtol=0.5, atol=0)
