@@ -28,7 +28,6 @@ class AlphaPreset:
     background: Literal["random", "black"]
     """Random greys would reward floaters before the cameras where alpha is unknown."""
     rgb_loss_weight: float
-    """Dark colours count more by it: not where a dark pixel may show nothing at all."""
     opacity_loss_weight: float
     spread_loss_weight: float
     surface_loss_weight: float
@@ -69,10 +68,7 @@ WITHOUT_ALPHA = AlphaPreset(
 
 UNBOUNDED = replace(
     WITHOUT_ALPHA,
-    grid_resolution=128,
-    single_ray_until=0.4,
     initial_opacity=0.005,
-    rgb_loss_weight=0.2,
     surface_loss_weight=0.3,
     coarse_samples=64,
 )

@@ -41,7 +41,7 @@ class LossConfig:
     much noisier than the others, or dead: the reciprocal of their noise's variance. The mean is 1."""
     rgb: float | Auto = "auto"
     """Weight of the mean squared error of their sRGB colours, in which dark pixels count more. Auto is 0.2 where alpha
-    is known or the world is unbounded, else 0: where black may be the void, it costs quality."""
+    is known, else 0: where black may be the void, it costs quality."""
     opacity: float | Auto = "auto"
     """Weight of the mean squared transparency of pixels that are not dark: light comes from something solid. Auto is
     0.01 where alpha is unknown, else 0."""
