@@ -209,7 +209,9 @@ class UnmixModel(Model):
         if self.view_gains is not None:
             seen["cameras"] = ray_bundle.camera_indices
         if self.training and self.grid.met is not None:
-            positions = self.renderer.space.to_unit(torch.cat(list(rendered.looked_at.all_positions)).detach())
+            positions = self.renderer.space.to_unit(
+                torch.cat(list(rendered.looked_at.all_positions)).detach()
+            )
             seen["met_positions"] = positions
             seen["met_densities"] = torch.cat(list(rendered.looked_at.all_densities))
         return {
