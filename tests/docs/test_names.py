@@ -19,9 +19,12 @@ from unmix_plugin.commands.view import view
 
 PAGES = ["README.md", *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md")))]
 OF_OTHERS = {"--debug", "--constraint", "--help-all", "--pipeline", "--pipeline.model.resolution", "--seeds"}
-OF_SCRIPTS = {"--folder", "--start"}
-"""Of the scripts that train what the package ships."""
 """Taken before a command sees them, of pip, a beginning, of an example's method, of benchmarks."""
+OF_SCRIPTS = {
+    *("--folder", "--start", "--count", "--first-seed", "--demo-share"),
+    *("--training.nll-from", "--training.nll-full-from"),
+}
+"""Of the scripts that train what the package ships."""
 OF_LAUNCHERS = {
     *("--nnodes", "--nproc-per-node", "--rdzv-backend", "--rdzv-endpoint"),
     *("--nodes", "--ntasks-per-node", "--gpus-per-node"),
