@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from tests.commands.running import run
+from tests.neumatex.fast_training import SMALL
 from tests.neumatex.object_factory import write_light, write_object
-from tests.neumatex.test_training import SMALL, registered  # noqa: F401 (fixture)
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.render import render
 from unmix_plugin.commands.train import train

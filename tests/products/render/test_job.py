@@ -167,7 +167,7 @@ def test_maps_have_one_known_range_in_all_views(tmp_path):
         fraction = np.clip((values["depth"] - scale.low) / (scale.high - scale.low), 0, 1)
         shown = rgba[..., 3] > 0
         colours = np.round(255 * colormaps["viridis"](fraction)[..., :3])
-        np.testing.assert_array_equal(rgba[shown][:, :3], colours[shown])
+        np.testing.assert_allclose(rgba[shown][:, :3], colours[shown], atol=1)  # a half is rounded either way
         with Image.open(path) as picture:
             assert f"viridis from {scale.low:.6g} to {scale.high:.6g}" in picture.info["Description"]
 
