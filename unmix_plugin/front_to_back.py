@@ -28,7 +28,8 @@ _ENDING_LIGHT = 2.0
 _MERGED_WEIGHT = 50.0
 """Most of a ray's light that merged samples carry together, in the same unit."""
 _SAMPLES_AT_ONCE = 4
-"""Of each ray, that are looked at before it is known whether light gets farther."""
+"""Of each ray, that are looked at before it is known whether light gets farther; later as many as were looked at so far,
+since light that gets through those gets through more."""
 
 _Visible = Callable[[Float[Tensor, "S 3"], Float[Tensor, "S 3"]], Float[Tensor, "S"] | None]
 
@@ -44,17 +45,24 @@ class _Front:
     """Samples of each from there on."""
     left: Float[Tensor, "A"]
     """Share of its light that each still has."""
+    num_seen: int = 0
+    """Samples of each that were looked at."""
 
     @property
     def wanted(self) -> Int[Tensor, "A"]:
         """Samples of each that are looked at next."""
-        return self.todo.clamp(max=_SAMPLES_AT_ONCE)
+        return self.todo.clamp(max=self._at_once)
+
+    @property
+    def _at_once(self) -> int:
+        return max(_SAMPLES_AT_ONCE, self.num_seen)
 
     def after(self, left: Float[Tensor, "A"], ending_light: float) -> _Front:
         """Behind these samples, where there are more and enough light is left."""
         values = (self.rays, self.at + self.wanted, self.todo - self.wanted, left)
         alive = ((left > ending_light) & (values[2] > 0)).nonzero()[:, 0]
-        return _Front(*(value.index_select(0, alive) for value in values))
+        kept = (value.index_select(0, alive) for value in values)
+        return _Front(*kept, num_seen=self.num_seen + self._at_once)
 
 
 @torch.no_grad()
