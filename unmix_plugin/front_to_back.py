@@ -28,8 +28,8 @@ _ENDING_LIGHT = 2.0
 _MERGED_WEIGHT = 50.0
 """Most of a ray's light that merged samples carry together, in the same unit."""
 _SAMPLES_AT_ONCE = 4
-"""Of each ray, that are looked at before it is known whether light gets farther; later as many as were looked at so far,
-since light that gets through those gets through more."""
+"""Of each ray, that are looked at before it is known whether light gets farther; later as many as so far, since light
+that gets through those gets through more."""
 
 _Visible = Callable[[Float[Tensor, "S 3"], Float[Tensor, "S 3"]], Float[Tensor, "S"] | None]
 
