@@ -61,8 +61,8 @@ class _Front:
         """Behind these samples, where there are more and enough light is left."""
         values = (self.rays, self.at + self.wanted, self.todo - self.wanted, left)
         alive = ((left > ending_light) & (values[2] > 0)).nonzero()[:, 0]
-        kept = (value.index_select(0, alive) for value in values)
-        return _Front(*kept, num_seen=self.num_seen + self._at_once)
+        rays, at, todo, left = (value.index_select(0, alive) for value in values)
+        return _Front(rays, at, todo, left, self.num_seen + self._at_once)
 
 
 @torch.no_grad()
@@ -90,7 +90,8 @@ def composite_front_to_back(
     ending_light = _ENDING_LIGHT * smallest_weight
     limits = MergeLimits(samples.step, smallest_weight, _MERGED_WEIGHT * smallest_weight)
     rays = counts.nonzero()[:, 0]
-    front = _Front(rays, *(value.index_select(0, rays) for value in (starts, counts, left)))
+    at, todo, light = (value.index_select(0, rays) for value in (starts, counts, left))
+    front = _Front(rays, at, todo, light)
     totals = last = torch.zeros(0)
     while True:
         merged = _look(field, samples, ray_bundle, front, limits)
