@@ -8,7 +8,7 @@ from unmix_plugin.viewer.rendering.picture_maker import PictureMaker
 from unmix_plugin.viewer.rendering.render_loop import RenderLoop
 from unmix_plugin.viewer.rendering.scene_aids import SceneAids
 
-LARGEST = 96
+LARGEST = 64
 
 
 class FixedSpeed(Speedometer):
