@@ -54,12 +54,17 @@ class AlphaEvidence:
 
         NaN where a pixel is not opaque, not valid or saturated.
         """
-        block = max(self._blocks, key=lambda block: len(block.cameras))
+        block = self._largest_block
         return list(block.cameras), [local_log_brightness(seen) for seen in block.pictures(_clear_brightness)]
+
+    @property
+    def _largest_block(self) -> PixelBlock:
+        """Of the sensor that took most views."""
+        return max(self._blocks, key=lambda block: len(block.cameras))
 
     def log_shading(self) -> list[Float[np.ndarray, "H W"]]:
         """The same without the brightness of what pixels show, by groups of pixels of like spectra."""
-        block = max(self._blocks, key=lambda block: len(block.cameras))
+        block = self._largest_block
         colours = ColourGroups.of(block)
         return [local_log_brightness(seen) for seen in block.pictures(colours.shading)]
 
