@@ -162,3 +162,22 @@ def test_shares_stay_within_bounds(asked, kept):
     assert device.guest_share == kept
     device.guest_share = math.nan
     assert device.guest_share == SHARE_BOUNDS[0]
+
+
+def test_a_turn_of_training_that_has_not_begun_comes_after_the_guests_turn_under_way():
+    device, order = DeviceShare(), []
+
+    def warm_up():
+        with device.training_turn():
+            order.append("training")
+
+    training = threading.Thread(target=warm_up)
+    with device.guest_turn():
+        training.start()
+        while not device._is_training_waiting:
+            time.sleep(0)
+    for _ in range(3):
+        with device.guest_turn():
+            order.append("guest")
+    training.join(20)
+    assert order == ["training", "guest", "guest", "guest"]

@@ -20,7 +20,8 @@ class DeviceShare:
     Turns do not nest.
 
     While training runs, each second of it earns the guest share / (1 - share) seconds of credit. A guest with credit
-    goes before the next training step, one without waits; with no training it never waits.
+    goes before the next training step, one without waits. Before training runs, and while it is paused, a guest needs
+    no credit, and a turn of training is the next after the guest's turn under way.
     """
 
     def __init__(self, guest_share: float = 0.3) -> None:
@@ -33,6 +34,8 @@ class DeviceShare:
         self._owner: int | None = None
         self._is_training = False
         self._num_waiting = 0
+        self._is_training_waiting = False
+        self._was_guests_turn = False
         self._credit_s = _LARGEST_CREDIT_S
         self.guest_share = guest_share
         self.training_turns = 0
@@ -64,8 +67,13 @@ class DeviceShare:
         """Context in which training has the device; earns the guest credit."""
         with self._turn:
             self._refuse_nesting()
-            self._turn.wait_for(lambda: self._owner is None and not self._guest_goes_first)
+            self._is_training_waiting = True
+            try:
+                self._turn.wait_for(lambda: self._owner is None and not self._guest_goes_first)
+            finally:
+                self._is_training_waiting = False
             self._owner = threading.get_ident()
+            self._was_guests_turn = False
         started = time.perf_counter()
         try:
             yield
@@ -84,10 +92,13 @@ class DeviceShare:
             self._refuse_nesting()
             self._num_waiting += 1
             try:
-                self._turn.wait_for(lambda: self._owner is None and self.guest_may_go)
+                self._turn.wait_for(
+                    lambda: self._owner is None and self.guest_may_go and not self._training_goes_first
+                )
             finally:
                 self._num_waiting -= 1
             self._owner = threading.get_ident()
+            self._was_guests_turn = True
         started = time.perf_counter()
         try:
             yield
@@ -107,7 +118,11 @@ class DeviceShare:
 
     @property
     def _guest_goes_first(self) -> bool:
-        return self._num_waiting > 0 and self.guest_may_go
+        return self._num_waiting > 0 and self.guest_may_go and not self._training_goes_first
+
+    @property
+    def _training_goes_first(self) -> bool:
+        return self._is_training_waiting and self._was_guests_turn and not self._is_training
 
     def _refuse_nesting(self) -> None:
         """A thread that has the device would wait for itself for ever."""
