@@ -38,9 +38,9 @@ class Ended:
         return self.out.splitlines()[-1]
 
 
-def run(command: Callable[[list[str]], object], *words: object) -> Ended:
-    """Run a command with its words to its exit."""
-    out, err = io.StringIO(), io.StringIO()
+def run(command: Callable[[list[str]], object], *words: object, out: io.StringIO | None = None) -> Ended:
+    """Run a command with its words to its exit; `out`, if given, takes its standard output for a thread to read."""
+    out, err = out or io.StringIO(), io.StringIO()
     with redirect_stdout(out), redirect_stderr(err), pytest.raises(SystemExit) as stop:
         run_command(command, [str(word) for word in words])
     status = stop.value.code

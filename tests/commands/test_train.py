@@ -207,7 +207,11 @@ def test_ctrl_c_saves_exits_130_and_says_how_to_go_on_which_then_works(trained, 
 def test_training_into_a_pipe_that_closes_saves_and_exits_141(trained, tmp_path):
     """As `unmix-train ... | head -2`."""
     argv = [str(word) for word in small_training(trained, tmp_path / "out", "--max-num-iterations", 10**6)]
-    code = "import sys; from unmix_plugin.commands.train import main; main()"
+    code = (
+        "from unmix_plugin.engine.training.progress import ProgressDisplay\n"
+        "ProgressDisplay.__init__.__defaults__ = (0.2, 0.2)  # seconds between lines\n"
+        "from unmix_plugin.commands.train import main\nmain()"
+    )
     with subprocess.Popen(
         [sys.executable, "-c", code, *argv], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:

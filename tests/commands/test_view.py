@@ -2,11 +2,13 @@
 
 import io
 import json
+import os
 import re
 import signal
 import subprocess
 import sys
 import threading
+import time
 from contextlib import contextmanager
 
 import numpy as np
@@ -19,7 +21,9 @@ from tests.formats.video_reading import read_video
 from unmix_plugin.commands import train as train_module
 from unmix_plugin.commands.train import parse_all, train
 from unmix_plugin.commands.view import ViewOptions, prepared, view
+from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
+from unmix_plugin.viewer import server
 from unmix_plugin.viewer.options import ViewerOptions
 
 START_S = 90.0
@@ -97,6 +101,43 @@ def started(command, *words):
         one.close()
 
 
+def visited(visit, command, *words):
+    """How a command ended that ran in this process, while `visit(printed)` in a thread looked at its pages.
+
+    `printed(pattern)` waits for such a line; `visit` is what ends the command.
+    """
+    out, is_over, failures = io.StringIO(), threading.Event(), []
+
+    def printed(pattern):
+        until = time.monotonic() + START_S
+        while (match := re.search(pattern, out.getvalue())) is None:
+            assert time.monotonic() < until, out.getvalue()
+            time.sleep(0.01)
+        return match
+
+    def visit_and_note_failures():
+        try:
+            visit(printed)
+        except BaseException as error:  # noqa: BLE001 - raised again below, once the command has ended
+            failures.append(error)
+            if not is_over.is_set():
+                os.kill(os.getpid(), signal.SIGINT)
+
+    visitor = threading.Thread(target=visit_and_note_failures)
+    visitor.start()
+    ended = run(command, *words, out=out)
+    is_over.set()
+    visitor.join(START_S)
+    if failures:
+        raise failures[0]
+    return ended
+
+
+def address(printed):
+    """Of the websocket of a viewer."""
+    return "ws://" + printed(r"viewer: http://(\S+)")[1]
+
+
 @contextmanager
 def looking(address):
     """A page with its first picture."""
@@ -131,12 +172,25 @@ def test_an_address_that_is_none_is_refused(trained, words, message):
     assert message in ended.err
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_run_is_served_until_it_is_asked_to_end(trained, number):
+    def visit(printed):
+        printed("stop with Ctrl-C")
+        with looking(address(printed)) as page:
+            page.wait_until(lambda: any(one.get("label") == "layer" for one in page.controls.values()))
+            os.kill(os.getpid(), number)
+            page.wait_until(lambda: page.is_closed)
+
+    ended = visited(visit, view, "--run", trained.run, "--device", "cpu", "--viewer.port", "0")
+    assert (ended.status, ended.err) == (0, "")
+    assert ended.out.splitlines()[-2:] == ["stop with Ctrl-C", "stopped"]
+
+
+def test_a_run_is_served_by_a_process_of_its_own_until_ctrl_c(trained):
     with started("view", "--run", trained.run, "--device", "cpu", "--viewer.port", "0") as command:
         with looking(command.address) as page:
             page.wait_until(lambda: any(one.get("label") == "layer" for one in page.controls.values()))
-            command.process.send_signal(number)
+            command.process.send_signal(signal.SIGINT)
             page.wait_until(lambda: page.is_closed)
         assert command.end() == 0
         assert command.lines[-2:] == ["stop with Ctrl-C", "stopped"]
@@ -282,41 +336,60 @@ def test_without_keep_open_the_process_ends_with_the_training(trained, tmp_path)
     assert not [thread for thread in threading.enumerate() if "viewer" in thread.name]
 
 
-def test_the_viewer_stays_as_long_as_a_page_is_open_and_the_run_is_printed_last(trained, tmp_path):
-    words = training_argv(trained, tmp_path, "--max-seconds", "8")
-    with started("train", *words) as command:
-        with looking(command.address) as page:
-            command.wait_for_line("the viewer stays open while a page is; end it with Ctrl-C")
+def test_the_viewer_stays_as_long_as_a_page_is_open_and_the_run_is_printed_last(
+    trained, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(server, "_UNWATCHED_S", 1)
+    train_step, is_page_open = Trainer._train_step, threading.Event()
+
+    def step_once_a_page_is_open(self):
+        assert is_page_open.wait(START_S)
+        return train_step(self)
+
+    monkeypatch.setattr(Trainer, "_train_step", step_once_a_page_is_open)
+
+    def visit(printed):
+        with Page(address(printed)) as page:
+            page.look_from(0.3)
+            page.wait_until(lambda: bool(page.controls))
+            is_page_open.set()
+            printed("the viewer stays open while a page is; end it with Ctrl-C")
             page.wait_until(lambda: ">done<" in page.texts, START_S)
-            assert command.process.poll() is None
-        assert command.end() == 0
-        assert command.lines[-1].startswith("run: ")
+            with pytest.raises(AssertionError):  # for longer than the viewer stays without a page
+                page.wait_until(lambda: page.is_closed, 3.0)
+
+    ended = visited(visit, train, *training_argv(trained, tmp_path, "--max-num-iterations", 3))
+    assert ended.status == 0
+    assert ended.last_line.startswith("run: ")
 
 
 def test_a_training_that_is_stopped_from_the_page_can_go_on(trained, tmp_path):
-    with started("train", *training_argv(trained, tmp_path, "--max-seconds", "300")) as command:
-        with looking(command.address) as page:
+    def visit(printed):
+        with looking(address(printed)) as page:
             page.wait_until(lambda: any(one.get("label") == "really stop" for one in page.controls.values()))
             page.set("really stop", True)
             page.set("stop training", True)
-            assert command.end() == 130
+            page.wait_until(lambda: page.is_closed, START_S)
             assert "stopped, and saved" in page.texts
-        assert any("go on with: unmix-train unmix-nerf --load-run" in line for line in command.lines)
-        path = type(trained.run)(command.lines[-1].removeprefix("run: "))
+
+    stopped = visited(visit, train, *training_argv(trained, tmp_path, "--max-seconds", "300"))
+    assert stopped.status == 130
+    assert "go on with: unmix-train unmix-nerf --load-run" in stopped.err
+    path = stopped.last_line.removeprefix("run: ")
     resumed = run(train, "unmix-nerf", "--load-run", path, "--max-num-iterations", 2)
     assert resumed.status == 0
 
 
 def test_a_page_that_is_loaded_again_while_training_goes_on(trained, tmp_path):
-    with started("train", *training_argv(trained, tmp_path, "--max-seconds", "300")) as command:
-        for _ in range(4):
-            with looking(command.address):
+    def visit(printed):
+        for _ in range(3):
+            with looking(address(printed)):
                 pass
-        with looking(command.address):
-            assert command.process.poll() is None
-        command.process.send_signal(signal.SIGINT)
-        assert command.end() == 130
-        assert not any("Traceback" in line for line in command.lines)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    ended = visited(visit, train, *training_argv(trained, tmp_path, "--max-seconds", "300"))
+    assert ended.status == 130
+    assert "Traceback" not in ended.out + ended.err
 
 
 def test_the_viewer_is_off_where_the_output_is_no_terminal_and_on_where_it_is(tmp_path, monkeypatch):

@@ -18,7 +18,7 @@ def test_direct_light_follows_the_cosine_where_nothing_is_in_the_way():
     point = row(1.1, -0.3, 0)
     towards = LAMP - point[0]
     expected = LAMP_IRRADIANCE * towards[2] / np.linalg.norm(towards)
-    assert_allclose(direct_light(point, row(0, 0, 1), LAMP), expected, rtol=1e-5)
+    assert_allclose(direct_light(point, row(0, 0, 1), LAMP[None]), expected, rtol=1e-5)
 
 
 def test_a_point_behind_the_apple_lies_in_its_shadow():
@@ -26,7 +26,7 @@ def test_a_point_behind_the_apple_lies_in_its_shadow():
     along = center - LAMP
     shadow = (LAMP + along * (LAMP[2] / -along[2])).astype(np.float32)
     assert np.hypot(shadow[0], shadow[1]) < 1.3, "the shadow's middle falls on the table"
-    assert direct_light(shadow[None], row(0, 0, 1), LAMP) == 0
+    assert direct_light(shadow[None], row(0, 0, 1), LAMP[None]) == 0
 
 
 def test_the_sky_is_darker_beside_a_thing_than_in_the_open():

@@ -15,7 +15,7 @@ def hits():
     """The same rays at the plain and at the speckled scene."""
     rays = demo_cameras(96, 4).image_rays(1)
     origins, directions = rays.origins.numpy(), rays.directions.numpy()
-    return trace(origins, directions, LAMP), trace(origins, directions, LAMP, speckled_things())
+    return trace(origins, directions, LAMP[None]), trace(origins, directions, LAMP[None], speckled_things())
 
 
 def test_speckles_change_abundances_and_nothing_else(hits):

@@ -43,12 +43,12 @@ def test_what_a_highlight_adds_to_the_same_point_has_the_lamps_colour():
     spectra, lamp = spectra_of(31)
     rays = demo_cameras(64, 8).image_rays(2)
     origins, directions = rays.origins.numpy(), rays.directions.numpy()
-    brightest = trace(origins, directions, LAMP).specular.argmax()
+    brightest = trace(origins, directions, LAMP[None]).specular.argmax()
     distances, _ = first_hits(PLACEMENTS, origins, directions)
     point = origins[brightest] + distances[brightest] * directions[brightest]
     eyes = np.stack([origins[brightest], point + 2 * np.array([0, 0.3, 1], dtype=np.float32)])
     towards = (point - eyes) / np.linalg.norm(point - eyes, axis=1, keepdims=True)
-    seen = trace(eyes, towards.astype(np.float32), LAMP)
+    seen = trace(eyes, towards.astype(np.float32), LAMP[None])
     assert seen.specular[0] > 0.5
     assert seen.specular[1] < 0.1
     radiances = (seen.diffuse @ spectra + seen.specular[:, None]) * lamp
@@ -62,14 +62,14 @@ def test_two_cameras_see_the_same_diffuse_light_at_the_same_point():
     origins, directions = rays.origins.numpy(), rays.directions.numpy()
     distances, _ = first_hits(PLACEMENTS, origins, directions)
     points = (origins + distances[:, None] * directions)[np.isfinite(distances)]
-    seen = trace(origins, directions, LAMP)
+    seen = trace(origins, directions, LAMP[None])
     eye = cameras.camera_to_world[5, :, 3].numpy()
     lengths = np.linalg.norm(points - eye, axis=1)
     towards = (points - eye) / lengths[:, None]
     others, _ = first_hits(PLACEMENTS, np.broadcast_to(eye, points.shape), towards)
     common = np.abs(others - lengths) < 1e-4
     assert common.sum() > 50
-    again = trace(np.broadcast_to(eye, points.shape)[common], towards[common], LAMP)
+    again = trace(np.broadcast_to(eye, points.shape)[common], towards[common], LAMP[None])
     first = seen.diffuse[seen.is_hit][common]
     # A shadow's border can fall to either side by rounding.
     assert np.mean(np.abs(again.diffuse - first).max(axis=1) < 2e-3) > 0.98

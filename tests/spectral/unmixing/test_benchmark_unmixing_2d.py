@@ -15,10 +15,29 @@ from tests.spectral.mixtures import seeded, smooth_endmembers
 SCRIPT = Path(__file__).parents[3] / "benchmarks" / "unmixing_2d.py"
 
 
-def run(*arguments):
-    return subprocess.run(
-        [sys.executable, str(SCRIPT), *map(str, arguments)], capture_output=True, text=True, check=False
-    )
+EACH = """
+import contextlib, io, json, runpy, sys
+script, calls = sys.argv[1], json.loads(sys.argv[2])
+sys.path.insert(0, script.rpartition("/")[0])
+ended = []
+for arguments in calls:
+    out, err, code, sys.argv = io.StringIO(), io.StringIO(), 0, [script, *arguments]
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            runpy.run_path(script, run_name="__main__")
+        except SystemExit as stop:
+            code = stop.code
+    ended.append((code, out.getvalue(), err.getvalue()))
+print(json.dumps(ended))
+"""
+"""Runs the script once for each list of arguments, in one process, which imports everything once."""
+
+
+def run(*calls):
+    """Exit code, output and errors of the script for each tuple of arguments."""
+    words = json.dumps([[str(word) for word in arguments] for arguments in calls])
+    each = [sys.executable, "-c", EACH, str(SCRIPT), words]
+    return json.loads(subprocess.run(each, capture_output=True, text=True, check=True).stdout)
 
 
 @pytest.fixture
@@ -31,22 +50,12 @@ def image():
 
 
 def test_medians_and_spreads_are_printed_as_json_whatever_is_transposed(tmp_path, image):
-    reports = []
-    for name, content in (("plain", image), ("turned", {key: image[key].T for key in image})):
-        savemat(tmp_path / f"{name}.mat", content)
-        ended = run(
-            tmp_path / f"{name}.mat",
-            "--endmembers",
-            3,
-            "--seeds",
-            2,
-            "--json",
-            "--rows",
-            "pairs, NNLS",
-            "VCA, FCLS",
-        )
-        assert ended.returncode == 0, ended.stderr
-        reports.append(json.loads(ended.stdout))
+    words = ("--endmembers", 3, "--seeds", 2, "--json", "--rows", "pairs, NNLS", "VCA, FCLS")
+    savemat(tmp_path / "plain.mat", image)
+    savemat(tmp_path / "turned.mat", {key: image[key].T for key in image})
+    ended = run((tmp_path / "plain.mat", *words), (tmp_path / "turned.mat", *words))
+    assert [code for code, _, _ in ended] == [0, 0], ended
+    reports = [json.loads(out) for _, out, _ in ended]
     assert reports[0]["methods"] == reports[1]["methods"]
     assert set(reports[0]["methods"]) == {"pairs, NNLS", "VCA, FCLS"}
     for figures in reports[0]["methods"].values():
@@ -71,8 +80,7 @@ def test_bad_input_is_one_message_and_exit_code_2(tmp_path, image):
         (tmp_path / "whole.mat", "--endmembers", 4): "there are 3 true materials",
         (tmp_path / "whole.mat", "--rows", "magic"): "no method is called 'magic'",
     }
-    for arguments, message in cases.items():
-        ended = run(*arguments)
-        assert ended.returncode == 2
-        assert message in ended.stderr
-        assert ended.stderr.count("\n") == 1
+    for message, (code, _, errors) in zip(cases.values(), run(*cases), strict=True):
+        assert code == 2
+        assert message in errors
+        assert errors.count("\n") == 1

@@ -40,6 +40,9 @@ COAT_REFLECTANCE = 0.05
 SUBPIXELS = 3
 """Rays along each side of a pixel."""
 
+_RAYS_AT_ONCE = 2**14
+"""So many, where an image has fewer pixels: numpy takes as long for a few as for thousands."""
+
 
 @dataclass(frozen=True)
 class Thing:
@@ -122,16 +125,24 @@ def render_view(
     coverage = np.zeros(pixels, dtype=np.float32)
     abundances = np.zeros((pixels, len(MATERIALS)), dtype=np.float32)
     diffuse, specular = np.zeros_like(abundances), np.zeros_like(coverage)
-    for i in range(count):
-        offset = ((i % subpixels + 0.5) / subpixels, (i // subpixels + 0.5) / subpixels)
-        rays = cameras.image_rays(index, offset)
-        hits = trace(rays.origins.numpy(), rays.directions.numpy(), lamp_point(i, count, lamp), things, lamp)
-        coverage += hits.is_hit
-        abundances += hits.abundances
-        diffuse += hits.diffuse
+    at_once = max(1, _RAYS_AT_ONCE // pixels)
+    for first in range(0, count, at_once):
+        numbers = range(first, min(first + at_once, count))
+        rays = [cameras.image_rays(index, _offset(i, subpixels)) for i in numbers]
+        origins, directions = (
+            np.concatenate([getattr(one, name).numpy() for one in rays]) for name in ("origins", "directions")
+        )
+        lamps = np.stack([lamp_point(i, count, lamp) for i in numbers]).repeat(pixels, axis=0)
+        hits = trace(origins, directions, lamps, things, lamp)
         if sky is not None:
-            diffuse[~hits.is_hit] += sky(rays.directions.numpy()[~hits.is_hit])
-        specular += hits.specular
+            hits.diffuse[~hits.is_hit] = sky(directions[~hits.is_hit])
+        for total, values in (
+            (coverage, hits.is_hit),
+            (abundances, hits.abundances),
+            (diffuse, hits.diffuse),
+            (specular, hits.specular),
+        ):
+            total += values.reshape(len(numbers), *total.shape).sum(axis=0)
     shape = (cameras.height, cameras.width)
     return ViewCoefficients(
         (coverage / count).reshape(shape),
@@ -141,16 +152,22 @@ def render_view(
     )
 
 
+def _offset(i: int, subpixels: int) -> tuple[float, float]:
+    """Where in its pixel the i-th ray goes through, (x, y) in [0, 1]."""
+    return (i % subpixels + 0.5) / subpixels, (i // subpixels + 0.5) / subpixels
+
+
 def trace(
     origins: Float[np.ndarray, "R 3"],
     directions: Float[np.ndarray, "R 3"],
-    lamp: Float[np.ndarray, "3"],
+    lamps: Float[np.ndarray, "#R 3"],
     things: Sequence[Thing] = THINGS,
     lamp_middle: tuple[float, float, float] = LAMP_POSITION,
 ) -> Hits:
     """What each ray sees first, lit by one point of the lamp and by the sky. Directions have length 1.
 
     Args:
+        lamps: These points.
         lamp_middle: Of the lamp's disc, where highlights come from.
     """
     placements = [thing.placement for thing in things]
@@ -159,12 +176,13 @@ def trace(
     shape = (len(origins), len(MATERIALS))
     abundances, diffuse = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
     specular = np.zeros(len(origins), dtype=np.float32)
+    lamps = np.broadcast_to(lamps, origins.shape)
     for i, thing in enumerate(things):
         rows = np.flatnonzero(is_hit & (nearest == i))
         points = origins[rows] + distances[rows, None] * directions[rows]
         local_points = thing.placement.to_local(points)
         normals = thing.placement.normals_at(local_points)
-        lamplight = direct_light(points, normals, lamp, placements)
+        lamplight = direct_light(points, normals, lamps[rows], placements)
         abundances[rows] = thing.surface.abundances(local_points)
         diffuse[rows] = abundances[rows] * (lamplight + sky_light(points, normals, thing, things))[:, None]
         if thing.surface.roughness is not None:
@@ -193,11 +211,11 @@ def lamp_point(
 def direct_light(
     points: Float[np.ndarray, "P 3"],
     normals: Float[np.ndarray, "P 3"],
-    lamp: Float[np.ndarray, "3"],
+    lamps: Float[np.ndarray, "#P 3"],
     placements: Sequence[Placement] = PLACEMENTS,
 ) -> Float[np.ndarray, " P"]:
-    """Irradiance from one point of the lamp: 0 in the shadow of `placements`, no fall-off with distance."""
-    towards_lamp = lamp - points
+    """Irradiance of each point from one of the lamp's: 0 in the shadow of `placements`, no fall-off with distance."""
+    towards_lamp = lamps - points
     cosines = (dot(towards_lamp, normals) / np.sqrt(dot(towards_lamp, towards_lamp))).clip(0)
     # The segment to the lamp has length 1 here: nothing of the scene lies beyond the lamp.
     blocked, _ = first_hits(placements, points + 1e-3 * normals, towards_lamp)
