@@ -355,7 +355,7 @@ def test_the_viewer_stays_as_long_as_a_page_is_open_and_the_run_is_printed_last(
             is_page_open.set()
             printed("the viewer stays open while a page is; end it with Ctrl-C")
             page.wait_until(lambda: ">done<" in page.texts, START_S)
-            with pytest.raises(AssertionError):  # for longer than the viewer stays without a page
+            with pytest.raises(TimeoutError):  # for longer than the viewer stays without a page
                 page.wait_until(lambda: page.is_closed, 3.0)
 
     ended = visited(visit, train, *training_argv(trained, tmp_path, "--max-num-iterations", 3))
