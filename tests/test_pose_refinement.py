@@ -27,7 +27,8 @@ from unmix_plugin.errors import ConfigError
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.method_config import unmix_nerf
 from unmix_plugin.model import UnmixModel
-from unmix_plugin.pose_refinement import LARGEST_STEP, Knots, PoseConfig, PoseRefinement
+from unmix_plugin.pose_knots import Knots, row_waves
+from unmix_plugin.pose_refinement import LARGEST_STEP, PoseConfig, PoseRefinement
 from unmix_plugin.trained.open_run import open_run
 
 WIDTH, HEIGHT = 12, 40
@@ -65,9 +66,9 @@ def some_pixels(view: int) -> tuple[torch.Tensor, torch.Tensor]:
 def test_a_line_camera_has_knots_a_few_rows_apart_and_a_frame_camera_one():
     knots = Knots.of(cameras())
     assert knots.rows == (0, HEIGHT, 0)
-    assert knots.counts == [1, 6, 1]
-    assert_close(knots.heights(1), torch.linspace(0, 40, 6))
-    assert_close(knots.positions(cameras())[[0, 7]], cameras().camera_to_world[[0, 2], :, 3])
+    assert knots.counts == [1, 11, 1]
+    assert_close(knots.heights(1), torch.linspace(0, 40, 11))
+    assert_close(knots.positions(cameras())[[0, 12]], cameras().camera_to_world[[0, 2], :, 3])
 
 
 def test_nothing_changes_before_a_step_is_taken():
@@ -108,6 +109,12 @@ def test_gradients_of_moved_rays_are_those_of_finite_differences():
     assert torch.autograd.gradcheck(moved, inputs, eps=1e-6, atol=1e-5)
 
 
+def steps_to(corrections: torch.Tensor, knots: Knots) -> torch.Tensor:
+    """Steps that add up to these corrections at the knots."""
+    parts = corrections.split(knots.counts)
+    return torch.cat([torch.linalg.solve(row_waves(len(part)), part) for part in parts])
+
+
 def test_what_moves_all_views_alike_is_no_correction():
     """Turning, moving and scaling the world about its middle leaves nothing; the rest stays."""
     knots, own = Knots.of(cameras()), cameras()
@@ -117,11 +124,11 @@ def test_what_moves_all_views_alike_is_no_correction():
     moves = torch.linalg.cross(turn.expand_as(offsets), offsets) + shift + growth * offsets
     similar = torch.cat([turn.expand_as(offsets), moves / offsets.norm(dim=1, keepdim=True)], dim=1)
     with torch.no_grad():
-        found.steps.add_(similar / found.scale)
+        found.steps.add_(steps_to(similar, knots))
     assert_close(found.corrections.detach(), before, atol=1e-6, rtol=0)
     assert before.norm() > 0.05
     with torch.no_grad():
-        found.steps.copy_(before / found.scale)
+        found.steps.copy_(steps_to(before, knots))
     assert_close(found.corrections.detach(), before, atol=1e-6, rtol=0)
     assert sum(knots.counts) == len(before)
 

@@ -26,7 +26,7 @@ from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCal
 from unmix_plugin.engine.training.seeding import step_generator
 from unmix_plugin.errors import SceneError
 from unmix_plugin.lamp_search import find_lamp
-from unmix_plugin.pose_refinement import Knots
+from unmix_plugin.pose_knots import Knots
 from unmix_plugin.scenes.alpha_evidence import AlphaEvidence
 from unmix_plugin.scenes.geometry.carving import carve
 from unmix_plugin.scenes.geometry.lighting import judge_light

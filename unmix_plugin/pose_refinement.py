@@ -1,7 +1,8 @@
 """Poses corrected while training: small tangent steps of rotation and position, and of the lens that all views share.
 
-A correction is a function of the view and of the row: one step for a frame camera, and for a line camera steps at knots
-a few rows apart, between which it is interpolated linearly. Given poses stay what they are; rays are moved.
+A correction is a function of the view and of the row: one step for a frame camera, and for a line camera a sum of
+waves, computed at knots a few rows apart, between which it is interpolated linearly. Given poses stay what they are;
+rays are moved.
 
 What moves all views alike (a similarity of the world about the scene's middle) can't be seen in pictures, so it is
 taken out of the corrections. A view that goes farther than `LARGEST_STEP` has lost its way: it gets its given pose back
@@ -31,9 +32,8 @@ from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.rotations import rotation_matrix
 from unmix_plugin.errors import require
+from unmix_plugin.pose_knots import Knots, row_waves, similarities
 
-KNOT_ROWS = 8
-"""Rows between the knots of a line camera."""
 LARGEST_STEP = 0.25
 """Radians, or share of the distance to the scene's middle, beyond which a correction is undone."""
 MOST_UNDONE = 0.5
@@ -82,38 +82,6 @@ class PoseConfig:
         return [1.0 if x == 1 else round(0.5 - 0.5 * math.cos(math.pi * x), 12) for x in joined]
 
 
-@dataclass(frozen=True)
-class Knots:
-    """Where the corrections of each view stand."""
-
-    rows: tuple[int, ...]
-    """Rows of each view's image; 0 for a frame camera, whose correction holds for all rows."""
-
-    @staticmethod
-    def of(cameras: Cameras) -> Knots:
-        """Those of some cameras."""
-        lines = [cameras.is_line_camera(index) for index in range(len(cameras))]
-        return Knots(tuple(cameras.size(i)[1] if is_line else 0 for i, is_line in enumerate(lines)))
-
-    @property
-    def counts(self) -> list[int]:
-        """Knots of each view."""
-        return [1 if rows == 0 else max(2, round(rows / KNOT_ROWS) + 1) for rows in self.rows]
-
-    def heights(self, view: int) -> Float[Tensor, " n"]:
-        """y of the knots of a view, pixels; the middle of the image counts for a frame camera."""
-        rows, count = self.rows[view], self.counts[view]
-        return torch.zeros(1) if rows == 0 else torch.linspace(0, rows, count)
-
-    def positions(self, cameras: Cameras) -> Float[Tensor, "M 3"]:
-        """Where the cameras stand at the knots."""
-        found = []
-        for view in range(len(self.rows)):
-            y = self.heights(view)
-            found.append(cameras.poses_at(torch.full((len(y),), view), y)[:, :, 3])
-        return torch.cat(found)
-
-
 class PoseRefinement(nn.Module):
     """Corrections of the training views' poses, all 0 at first."""
 
@@ -122,7 +90,6 @@ class PoseRefinement(nn.Module):
     is_free: Tensor
     counts: Tensor
     first: Tensor
-    scale: Tensor
     rows: Tensor
 
     def __init__(self, rows: Sequence[int], lens: Literal["fixed", "focal", "radial"] = "fixed") -> None:
@@ -139,22 +106,26 @@ class PoseRefinement(nn.Module):
         self.register_buffer("counts", counts, persistent=False)
         self.register_buffer("first", counts.cumsum(0) - counts, persistent=False)
         self.register_buffer("rows", torch.tensor(rows), persistent=False)
-        # Fewer rays speak of a knot than of a view, so it takes smaller steps: else noise moves it more than pictures.
-        scale = counts.float().rsqrt().repeat_interleave(counts)[:, None]
-        self.register_buffer("scale", scale, persistent=False)
+        # Steps of a line camera are amounts of waves over its rows. Views of as many knots are computed together.
+        self.lines = sorted({count for count in self.knots.counts if count > 1})
+        for count in self.lines:
+            own = (counts == count).nonzero()[:, 0]
+            places = self.first[own, None] + torch.arange(count)
+            self.register_buffer(f"places_{count}", places, persistent=False)
+            self.register_buffer(f"waves_{count}", row_waves(count), persistent=False)
 
     @torch.no_grad()
     def begin(self, positions: Float[Tensor, "M 3"], middle: Float[Tensor, "3"]) -> None:
         """Take in where the cameras stand at the knots, and the scene's middle."""
         offsets = positions - middle
         self.reach.copy_(offsets.norm(dim=1).clamp(min=1e-6))
-        self.gauge.copy_(_similarities(offsets, self.reach))
+        self.gauge.copy_(similarities(offsets, self.reach))
 
     @property
     def corrections(self) -> Float[Tensor, "M 6"]:
         """Steps without what moves all views alike; 0 for views that were undone."""
         free = self.is_free.repeat_interleave(self.counts)[:, None]
-        steps = (self.steps * self.scale * free).flatten()
+        steps = (self._at_knots() * free).flatten()
         return (steps - self.gauge @ (self.gauge.T @ steps)).view(-1, 6) * free
 
     @property
@@ -220,6 +191,14 @@ class PoseRefinement(nn.Module):
         self.is_free &= ~is_lost
         self.steps.masked_fill_(~self.is_free[views][:, None], 0.0)
 
+    def _at_knots(self) -> Float[Tensor, "M 6"]:
+        """What the steps add up to at the knots."""
+        found = self.steps
+        for count in self.lines:
+            places = self.get_buffer(f"places_{count}")
+            found = found.index_put((places,), self.get_buffer(f"waves_{count}") @ self.steps[places])
+        return found
+
     def _at(
         self, views: Int[Tensor, " R"], y: Float[Tensor, " R"]
     ) -> tuple[Float[Tensor, "R 3 3"], Float[Tensor, "R 3"]]:
@@ -265,22 +244,3 @@ class PoseRefinement(nn.Module):
             heights = torch.cat([heights, self.knots.heights(view).to(heights)]).unique()
         poses = self._moved(cameras, torch.full((len(heights),), view, device=heights.device), heights)
         return KeyPoses(poses, heights, (len(heights),))
-
-
-def _similarities(offsets: Float[Tensor, "M 3"], reach: Float[Tensor, " M"]) -> Float[Tensor, "6*M 7"]:
-    """Orthonormal steps that turn, move or scale the world as seen from cameras at these offsets from its middle."""
-    axes = torch.eye(3, dtype=torch.float64)
-    places, lengths = offsets.double().cpu(), reach.double().cpu()[:, None]
-    zero = torch.zeros_like(places)
-    turned = [
-        torch.cat([axis.expand_as(places), torch.linalg.cross(axis.expand_as(places), places) / lengths], 1)
-        for axis in axes
-    ]
-    moved = [torch.cat([zero, axis / lengths], dim=1) for axis in axes]
-    columns = torch.stack(
-        [x.flatten() for x in [*turned, *moved, torch.cat([zero, places / lengths], dim=1)]], dim=1
-    )
-    found, sizes, _ = torch.linalg.svd(columns, full_matrices=False)
-    basis = torch.zeros_like(columns)
-    basis[:, : found.shape[1]] = found * (sizes > 1e-6 * sizes[0])
-    return basis.to(offsets)

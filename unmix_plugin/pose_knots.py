@@ -1,0 +1,81 @@
+"""Where the corrections of a view's pose stand, the waves of which those of a line camera are made, and what no picture
+shows of them.
+
+Notation: `M` knots of all views, `n` knots of one view.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+
+KNOT_ROWS = 4
+"""Rows between the knots of a line camera."""
+
+
+@dataclass(frozen=True)
+class Knots:
+    """Where the corrections of each view stand."""
+
+    rows: tuple[int, ...]
+    """Rows of each view's image; 0 for a frame camera, whose correction holds for all rows."""
+
+    @staticmethod
+    def of(cameras: Cameras) -> Knots:
+        """Those of some cameras."""
+        lines = [cameras.is_line_camera(index) for index in range(len(cameras))]
+        return Knots(tuple(cameras.size(i)[1] if is_line else 0 for i, is_line in enumerate(lines)))
+
+    @property
+    def counts(self) -> list[int]:
+        """Knots of each view."""
+        return [1 if rows == 0 else max(2, round(rows / KNOT_ROWS) + 1) for rows in self.rows]
+
+    def heights(self, view: int) -> Float[Tensor, " n"]:
+        """y of the knots of a view, pixels; the middle of the image counts for a frame camera."""
+        rows, count = self.rows[view], self.counts[view]
+        return torch.zeros(1) if rows == 0 else torch.linspace(0, rows, count)
+
+    def positions(self, cameras: Cameras) -> Float[Tensor, "M 3"]:
+        """Where the cameras stand at the knots."""
+        found = []
+        for view in range(len(self.rows)):
+            y = self.heights(view)
+            found.append(cameras.poses_at(torch.full((len(y),), view), y)[:, :, 3])
+        return torch.cat(found)
+
+
+def row_waves(count: int) -> Float[Tensor, "n n"]:
+    """Cosines over the knots of a view, one a column: the first is 1 everywhere, the next half a wave, and so on.
+
+    Few rays tell of one knot, all rays of a view tell of a wave. The k-th is 1 / k high: optimisers take steps of equal
+    size, so slow drift, which is most of what line cameras do, is found first, and noise moves the rest little.
+    """
+    place = torch.arange(count, dtype=torch.float64)
+    waves = torch.cos(math.pi * place[:, None] * place / max(count - 1, 1))
+    return (waves / (1 + place)).float()
+
+
+def similarities(offsets: Float[Tensor, "M 3"], reach: Float[Tensor, " M"]) -> Float[Tensor, "6*M 7"]:
+    """Orthonormal steps that turn, move or scale the world as seen from cameras at these offsets from its middle."""
+    axes = torch.eye(3, dtype=torch.float64)
+    places, lengths = offsets.double().cpu(), reach.double().cpu()[:, None]
+    zero = torch.zeros_like(places)
+    turned = [
+        torch.cat([axis.expand_as(places), torch.linalg.cross(axis.expand_as(places), places) / lengths], 1)
+        for axis in axes
+    ]
+    moved = [torch.cat([zero, axis / lengths], dim=1) for axis in axes]
+    columns = torch.stack(
+        [x.flatten() for x in [*turned, *moved, torch.cat([zero, places / lengths], dim=1)]], dim=1
+    )
+    found, sizes, _ = torch.linalg.svd(columns, full_matrices=False)
+    basis = torch.zeros_like(columns)
+    basis[:, : found.shape[1]] = found * (sizes > 1e-6 * sizes[0])
+    return basis.to(offsets)
