@@ -116,13 +116,6 @@ class TrainedObject:
         )
         return replace(self, environment=turned, own_light=own)
 
-    def with_environment(self, environment: Environment) -> TrainedObject:
-        """The object under any light; one in colours gets the lamp's spectrum where the material has bands."""
-        own, light = self.own_light or self.environment, environment.to(self.device)
-        if self.lamp is not None and light.num_colours != len(self.lamp):
-            light = of_lamp(light, self.lamp)
-        return replace(self, environment=light, own_light=own)
-
     def _named_light(self, name: str) -> Environment:
         if name in self.lights:
             light = built_in_environment(name)

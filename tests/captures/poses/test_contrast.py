@@ -3,7 +3,6 @@ import numpy as np
 from unmix_plugin.captures.poses.contrast import (
     contrast_picture,
     mean_weights,
-    principal_weights,
     stretch,
     without_rim,
 )
@@ -42,17 +41,6 @@ def test_a_cube_is_read_in_rows_and_bad_bands_do_not_count():
     np.testing.assert_array_equal(picture, stretch(cube[..., [0, 2]].mean(-1)))
     assert sum(read) == 150
     assert max(read) < 150
-
-
-def test_the_principal_component_follows_what_varies_and_keeps_bright_bright():
-    generator = np.random.default_rng(2)
-    level = generator.uniform(0, 1, (500, 1))
-    spectra = np.hstack([level, 0.1 * generator.uniform(0, 1, (500, 1)), 2 * level, 50 * level])
-    weights = principal_weights(spectra, np.array([True, True, True, False]))
-    np.testing.assert_allclose(weights[[0, 2]] / weights[0], [1, 2], rtol=0.02)
-    assert weights[0] > 0
-    assert abs(weights[1]) < 0.02
-    assert weights[3] == 0
 
 
 def test_the_rim_of_a_mask_is_left_out():

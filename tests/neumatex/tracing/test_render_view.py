@@ -13,7 +13,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.neumatex.geometry.mesh import mesh_of
 from unmix_plugin.neumatex.geometry.ray_mesh import RayMesh
 from unmix_plugin.neumatex.lighting.environment import Environment
-from unmix_plugin.neumatex.tracing.primary_hits import PrimaryHits, pixel_hits
+from unmix_plugin.neumatex.tracing.primary_hits import pixel_hits
 from unmix_plugin.neumatex.tracing.render_view import render_view
 
 SIZE = 48
@@ -49,12 +49,6 @@ def test_rays_of_a_pixel_are_averaged():
     assert len(inner) == 4
     assert bool((hits.pixels.diff() >= 0).all())
     assert_close(inner.to_eye.norm(dim=-1), torch.ones(4))
-
-
-def test_hits_are_found_once_a_camera():
-    hits = PrimaryHits(_sphere(), _camera())
-    assert hits.of(0) is hits.of(0)
-    assert hits.of(0).rays_a_pixel == 1
 
 
 def test_left_and_up_are_where_they_belong():

@@ -70,25 +70,6 @@ def mean_weights(good: Bool[np.ndarray, " B"]) -> Float64[np.ndarray, " B"]:
     return weights / weights.sum()
 
 
-def principal_weights(
-    spectra: Float[np.ndarray, "P B"], good: Bool[np.ndarray, " B"]
-) -> Float64[np.ndarray, " B"]:
-    """Weights of the first principal component of pixels, in which brighter stays brighter.
-
-    Args:
-        spectra: Pixels of several views, so that all views get the same weights.
-        good: Bands to use.
-    """
-    used = np.flatnonzero(good) if good.any() else np.arange(len(good))
-    finite = spectra[np.isfinite(spectra).all(axis=1)][:, used].astype(np.float64)
-    if len(finite) < 2:
-        return mean_weights(good)
-    _, axes = np.linalg.eigh(np.cov(finite, rowvar=False).reshape(len(used), len(used)))
-    weights = np.zeros(len(good))
-    weights[used] = axes[:, -1] * (1.0 if axes[:, -1].sum() >= 0 else -1.0)
-    return weights / np.abs(weights).sum()
-
-
 def without_rim(mask: Bool[np.ndarray, "H W"], pixels: int) -> Bool[np.ndarray, "H W"]:
     """A mask of matter without its rim, whose features belong to the silhouette and not to the surface."""
     from scipy.ndimage import binary_erosion

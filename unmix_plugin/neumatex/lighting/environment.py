@@ -39,10 +39,6 @@ class Environment:
         """The same light on another device."""
         return Environment(self.image.to(device), self.rotation_deg, self.exposure_stops)
 
-    def rotated(self, degrees: float) -> Environment:
-        """The same light turned further about +z."""
-        return Environment(self.image, self.rotation_deg + degrees, self.exposure_stops)
-
     def radiance(self, directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N C"]:
         """Radiance that comes from directions."""
         height, width, colours = self.image.shape

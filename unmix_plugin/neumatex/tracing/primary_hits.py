@@ -1,7 +1,6 @@
-"""What the pixels of cameras see of a mesh, found once and kept.
+"""Where the rays of a camera's pixels meet a mesh.
 
-A pixel has n x n rays through the middles of its n x n parts; n = 1 is the ray through the pixel's centre. These
-positions don't change between calls, so what is cached stays right.
+A pixel has n x n rays through the middles of its n x n parts; n = 1 is the ray through the pixel's centre.
 
 Notation: `H x W` pixels, `K` rays that meet the mesh.
 """
@@ -57,25 +56,8 @@ class PixelHits:
         )
 
 
-class PrimaryHits:
-    """The hits of each camera, traced at the first request."""
-
-    def __init__(self, ray_mesh: RayMesh, cameras: Cameras, subpixels: int = 1) -> None:
-        """Hits of cameras in the mesh's space, with subpixels x subpixels rays a pixel."""
-        self._ray_mesh = ray_mesh
-        self._cameras = cameras.to(ray_mesh.device)
-        self._subpixels = subpixels
-        self._known: dict[int, PixelHits] = {}
-
-    def of(self, index: int) -> PixelHits:
-        """The hits of one camera."""
-        if index not in self._known:
-            self._known[index] = pixel_hits(self._ray_mesh, self._cameras, index, self._subpixels)
-        return self._known[index]
-
-
 def pixel_hits(ray_mesh: RayMesh, cameras: Cameras, index: int, subpixels: int = 1) -> PixelHits:
-    """The hits of one camera, traced now."""
+    """The hits of one camera."""
     width, height = cameras.size(index)
     pixels, parts, to_eye = [], [], []
     for offset in subpixel_offsets(subpixels):
