@@ -97,7 +97,7 @@ def _by_few(training: Tensor, endmembers: Tensor) -> Explain:
     return explain
 
 
-def _raw_kmeans(pixels: Tensor, count: int, generator: torch.Generator, max_iterations: int = 100) -> Tensor:
+def _raw_kmeans(pixels: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Mean spectra of clusters by distance, where a shadow is as good a reason for a cluster as a material.
 
     The best of several restarts from pixels drawn by chance.
@@ -107,7 +107,7 @@ def _raw_kmeans(pixels: Tensor, count: int, generator: torch.Generator, max_iter
     for _ in range(_RESTARTS):
         centres = pixels[torch.randperm(len(pixels), generator=generator)[:count]]
         ids = torch.full((len(pixels),), -1)
-        for _ in range(max_iterations):
+        for _ in range(100):
             before, ids = ids, torch.cdist(pixels, centres).argmin(dim=1)
             if torch.equal(before, ids):
                 break

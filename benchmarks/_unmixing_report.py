@@ -78,9 +78,9 @@ def median(seeds: Seeds, key: str = "miou") -> float:
     return math.nan if any(map(math.isnan, values)) else statistics.median(values)
 
 
-def deviation(seeds: Seeds, key: str = "miou") -> float:
-    """Standard deviation over seeds; 0 of one."""
-    values = [_number(figures.get(key)) for figures in seeds.values()]
+def deviation(seeds: Seeds) -> float:
+    """Standard deviation of mIoU over seeds; 0 of one."""
+    values = [_number(figures.get("miou")) for figures in seeds.values()]
     return statistics.stdev(values) if len(values) > 1 else 0.0
 
 

@@ -58,11 +58,10 @@ def shown_matches(
     bands: Bands,
     light: Float64[np.ndarray, " B"] | None,
     library: MaterialLibrary,
-    count: int = 3,
     comparison: Comparison = "scale",
 ) -> list[list[ShownMatch]]:
-    """The nearest materials of each spectrum, nearest first, in the light and brightness of the spectrum."""
-    found = library.nearest(spectra, bands, light, count, comparison)
+    """The three nearest materials of each spectrum, nearest first, in the light and brightness of the spectrum."""
+    found = library.nearest(spectra, bands, light, 3, comparison)
     return [
         [ShownMatch(match, _as_seen(match, library, spectrum, bands, light)) for match in matches]
         for spectrum, matches in zip(spectra, found, strict=True)

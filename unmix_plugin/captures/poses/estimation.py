@@ -42,10 +42,7 @@ def estimate_poses(
     folder: Path,
     sensor_of: Mapping[str, str] | None = None,
     masks: Mapping[str, Bool[np.ndarray, "H W"]] | None = None,
-    camera_model: str = "SIMPLE_RADIAL",
-    most_features: int = 8192,
     threads: int | None = None,
-    seed: int = 0,
 ) -> PoseSet:
     """Find where pictures were taken from.
 
@@ -54,10 +51,7 @@ def estimate_poses(
         folder: For COLMAP's files and its log; is made.
         sensor_of: Sensor of each view; views of one have one lens and one size. None is one for all.
         masks: True on matter; features are found there, but not on its rim.
-        camera_model: Of COLMAP: SIMPLE_RADIAL, or OPENCV with many views and strong distortion.
-        most_features: A picture.
         threads: None takes those of the machine, at most 8; with 1 the same pictures give the same poses to the bit.
-        seed: Of everything random.
     Returns:
         Poses by the name of the view, in a world of no certain scale; `notes` say how many views were registered and
         the reprojection error.
@@ -84,11 +78,8 @@ def estimate_poses(
         folder=str(folder.resolve()),
         sensors=tuple(map(tuple, sensors.values())),
         has_masks=masks is not None,
-        camera_model=camera_model,
         sequential=len(pictures) > MOST_EXHAUSTIVE,
-        most_features=most_features,
         threads=threads or min(os.cpu_count() or 1, 8),
-        seed=seed,
     )
     models = _run(settings, folder)
     return _best(models, files, folder)

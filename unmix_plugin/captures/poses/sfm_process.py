@@ -22,6 +22,11 @@ FOCAL_FACTORS = (1.2, 3.0, 7.0)
 """First focal lengths to try, over the longer side: wide, tele and far lenses."""
 PEAK_THRESHOLD = 0.003
 """Of features: half of COLMAP's, as matter in a laboratory has less texture than a street."""
+CAMERA_MODEL = "SIMPLE_RADIAL"
+"""COLMAP's name of a lens with one number of distortion."""
+MOST_FEATURES = 8192
+"""Of a picture."""
+SEED = 0
 GAIN = 0.02
 """Part of the reprojection error that distortion has to take away to be believed."""
 GREATEST_BEND = 0.1
@@ -38,12 +43,9 @@ class SfmSettings:
     """Names of image files with one lens each."""
     has_masks: bool
     """Whether `masks` holds IMAGE.png for images, black where no features are wanted."""
-    camera_model: str
     sequential: bool
     """Match neighbours in the order of names instead of all pairs."""
-    most_features: int
     threads: int
-    seed: int
 
 
 def write_settings(settings: SfmSettings) -> Path:
@@ -59,7 +61,7 @@ def main(path: Path) -> None:
 
     values = json.loads(path.read_text(encoding="utf-8"))
     settings = SfmSettings(**{**values, "sensors": tuple(map(tuple, values["sensors"]))})
-    pycolmap.set_random_seed(settings.seed)
+    pycolmap.set_random_seed(SEED)
     folder = Path(settings.folder)
     database = folder / "database.db"
     database.unlink(missing_ok=True)
@@ -78,9 +80,9 @@ def main(path: Path) -> None:
 def _extract(pycolmap: Any, settings: SfmSettings, database: Path) -> None:
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads, options.use_gpu = settings.threads, False
-    options.sift.max_num_features, options.sift.peak_threshold = settings.most_features, PEAK_THRESHOLD
+    options.sift.max_num_features, options.sift.peak_threshold = MOST_FEATURES, PEAK_THRESHOLD
     reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = settings.camera_model
+    reader.camera_model = CAMERA_MODEL
     if settings.has_masks:
         reader.mask_path = Path(settings.folder) / "masks"
     for names in settings.sensors:
@@ -99,7 +101,7 @@ def _match(pycolmap: Any, settings: SfmSettings, database: Path) -> None:
     options = pycolmap.FeatureMatchingOptions()
     options.num_threads, options.use_gpu = settings.threads, False
     verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = settings.seed
+    verification.ransac.random_seed = SEED
     match = pycolmap.match_sequential if settings.sequential else pycolmap.match_exhaustive
     match(database, matching_options=options, verification_options=verification, device=pycolmap.Device.cpu)
 
@@ -121,14 +123,14 @@ def _map(pycolmap: Any, settings: SfmSettings, database: Path, output: Path) -> 
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed, options.min_model_size = (
         settings.threads,
-        settings.seed,
+        SEED,
         LEAST_MODEL,
     )
     options.max_num_models = 5
     options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = False
     options.max_focal_length_ratio = options.mapper.max_focal_length_ratio = 50.0
     options.triangulation.max_focal_length_ratio = 50.0
-    options.mapper.random_seed = options.triangulation.random_seed = settings.seed
+    options.mapper.random_seed = options.triangulation.random_seed = SEED
     options.mapper.init_min_tri_angle, options.mapper.init_min_num_inliers = 8.0, 50
     options.mapper.abs_pose_min_num_inliers, options.mapper.abs_pose_min_inlier_ratio = 15, 0.15
     models = pycolmap.incremental_mapping(database, Path(settings.folder) / "images", output, options)

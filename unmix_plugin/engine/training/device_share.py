@@ -105,11 +105,11 @@ class DeviceShare:
         finally:
             self._release(-cost * (time.perf_counter() - started))
 
-    def charge(self, seconds: float, cost: float = 1.0) -> None:
+    def charge(self, seconds: float) -> None:
         """Count time that the guest computed outside its turns, on processors that training could have used."""
         with self._turn:
             if self._is_training:
-                self._credit_s -= cost * seconds
+                self._credit_s -= seconds
 
     @property
     def guest_may_go(self) -> bool:

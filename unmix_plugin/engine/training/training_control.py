@@ -71,9 +71,9 @@ class TrainingControl:
             self._is_running = False
             self.device.is_training = False
 
-    def wait_while_paused(self, longest_s: float = 0.1) -> bool:
-        """Wait for `resume`, but no longer than that; whether a save is asked for."""
-        self._resumed.wait(longest_s)
+    def wait_while_paused(self) -> bool:
+        """Wait for `resume`, but at most 0.1 s; whether a save is asked for."""
+        self._resumed.wait(0.1)
         return self.take_save_request()
 
     def take_save_request(self) -> bool:

@@ -106,7 +106,6 @@ def demo_object(
     size: int = DEFAULT_SIZE,
     views: int = DEFAULT_VIEWS,
     lights: int = DEFAULT_LIGHTS,
-    overwrite: bool = False,
     say: Say | None = None,
 ) -> None:
     """Write an object. It is built beside the folder and moved in when complete.
@@ -117,7 +116,6 @@ def demo_object(
         size: Rows and columns of the pictures.
         views: Pictures under the light of training.
         lights: Other lights, each with `VIEWS_A_LIGHT` pictures.
-        overwrite: Whether a folder with something in it is accepted, which is then replaced.
         say: Gets a line for each light.
     Raises:
         ConfigError: a number out of bounds; a folder with something in it, or no folder at all.
@@ -131,10 +129,10 @@ def demo_object(
             "lights": (lights, LIGHTS_BOUNDS),
         },
     )
-    with staging_for(folder, "the demo object", overwrite) as staging:
+    with staging_for(folder, "the demo object", overwrite=False) as staging:
         _write_object(staging / "object", seed, size, views, lights, say)
         if folder.exists():
-            folder.rename(staging / "replaced")
+            folder.rmdir()
         (staging / "object").rename(folder)
 
 

@@ -70,7 +70,6 @@ def demo_spectral_object(
     views: int = DEFAULT_VIEWS,
     bands: int = DEFAULT_BANDS,
     lights: int = DEFAULT_LIGHTS,
-    overwrite: bool = False,
     say: Say | None = None,
     light: str = TRAINING_LIGHT,
 ) -> None:
@@ -83,7 +82,6 @@ def demo_spectral_object(
         views: Pictures under the light of training, every 8th for evaluation.
         bands: Evenly spaced over 400 to 700 nm.
         lights: Other lights, each with `VIEWS_A_LIGHT` pictures.
-        overwrite: Whether a folder with something in it is accepted, which is then replaced.
         say: Gets a line for each light.
         light: Built-in environment of training.
     Raises:
@@ -97,10 +95,10 @@ def demo_spectral_object(
         "lights": (lights, LIGHTS_BOUNDS),
     }
     check_bounds("a demo object", bounds)
-    with staging_for(folder, "the demo object", overwrite) as staging:
+    with staging_for(folder, "the demo object", overwrite=False) as staging:
         _write_object(staging / "object", seed, (size, views, bands, lights), light, say)
         if folder.exists():
-            folder.rename(staging / "replaced")
+            folder.rmdir()
         (staging / "object").rename(folder)
 
 

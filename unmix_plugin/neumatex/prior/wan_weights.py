@@ -23,12 +23,11 @@ if TYPE_CHECKING:
 _NULL_TEXT = "null_text.safetensors"
 
 
-def read_wan_prior(folder: Path, num_parameters: int, generator: torch.Generator | None = None) -> WanPrior:
+def read_wan_prior(folder: Path, num_parameters: int) -> WanPrior:
     """The prior that training starts from: Wan2.1's weights in float32, and new networks behind them.
 
     Args:
         num_parameters: P of the material.
-        generator: Draws the networks that read the planes.
     Raises:
         ConfigError: the extra is not installed, or a file or tensor is missing, damaged or of another shape.
     """
@@ -36,7 +35,7 @@ def read_wan_prior(folder: Path, num_parameters: int, generator: torch.Generator
     transformer = _read_model(transformer_class, folder / "transformer")
     autoencoder = _read_model(autoencoder_class, folder / "vae")
     null_text = _read_null_text(folder / _NULL_TEXT, transformer.config["text_dim"])
-    return WanPrior(transformer, autoencoder, num_parameters, null_text, generator)
+    return WanPrior(transformer, autoencoder, num_parameters, null_text)
 
 
 def _read_model(model_class: Any, folder: Path) -> Any:

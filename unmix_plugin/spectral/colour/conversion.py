@@ -104,9 +104,7 @@ def xyz_matrix(bands: Bands, dtype: torch.dtype = torch.float32) -> Float[Tensor
     return torch.tensor(_xyz_weights(bands), dtype=dtype)
 
 
-def band_composite_matrix(
-    bands: Bands, wavelengths_nm: Sequence[float | int], dtype: torch.dtype = torch.float32
-) -> Float[Tensor, "B 3"]:
+def band_composite_matrix(bands: Bands, wavelengths_nm: Sequence[float | int]) -> Float[Tensor, "B 3"]:
     """Matrix that shows three chosen bands as red, green and blue: the nearest to each wavelength, unscaled.
 
     Raises:
@@ -121,7 +119,7 @@ def band_composite_matrix(
         raise SpectrumError(
             f"a false-colour composite needs three wavelengths (red, green, blue); found {len(wavelengths_nm)}"
         )
-    matrix = torch.zeros(len(bands), 3, dtype=dtype)
+    matrix = torch.zeros(len(bands), 3)
     for channel, wavelength_nm in enumerate(wavelengths_nm):
         matrix[bands.nearest(wavelength_nm), channel] = 1
     return matrix
