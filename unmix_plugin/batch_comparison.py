@@ -32,7 +32,11 @@ class BatchComparison:
     balance: BandBalance
     guide: AbundanceGuide
     view_gains: ViewGains | None
-    num_endmembers: int
+
+    @property
+    def num_endmembers(self) -> int:
+        """K."""
+        return len(self.guide.endmembers)
 
     def parts(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor], materials: Materials

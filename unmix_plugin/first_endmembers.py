@@ -1,4 +1,4 @@
-"""The endmembers that a training starts from: spectra from a file, or found in the training pixels.
+"""The spectra that a training starts from: endmembers from a file or found in the training pixels, and those of gloss.
 
 Notation: `N` pixels, `K` endmembers, `B` bands of the scene, `b` channels of a sensor of a rig.
 """
@@ -53,6 +53,14 @@ def first_endmembers(
     balanced = balance.scaled(pixels, sensor)
     seen = balance.restored(initialise_endmembers(balanced, count, config.endmember_init, generator), sensor)
     return seen if sensor is None else _on_all_bands(seen, sensors, initial_data)
+
+
+def first_specular_spectra(
+    count: int, lamp: Float[Tensor, "B"], endmembers: Float[Tensor, "K B"]
+) -> Float[Tensor, "count B"]:
+    """The dictionary of gloss at the start: the lamp's spectrum, then the endmembers in turn."""
+    rows = [lamp if row == 0 else endmembers[(row - 1) % len(endmembers)] for row in range(count)]
+    return torch.stack(rows) if rows else endmembers[:0]
 
 
 def _on_all_bands(

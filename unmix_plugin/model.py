@@ -12,7 +12,6 @@ Source: Perez et al. 2025, UnMix-NeRF, eqs. 4 to 9.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 
@@ -28,11 +27,12 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.model import Model
 from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
-from unmix_plugin.field import CoefficientField, UnmixField
-from unmix_plugin.first_endmembers import first_endmembers
+from unmix_plugin.field import UnmixField
+from unmix_plugin.first_endmembers import first_endmembers, first_specular_spectra
 from unmix_plugin.grid_upkeep import is_due, record_seen, update_grid
+from unmix_plugin.model_parts import make_field, make_pose_refinement, make_renderer, make_view_gains
 from unmix_plugin.model_settings import UnmixModelConfig
-from unmix_plugin.pose_refinement import PoseRefinement
+from unmix_plugin.ray_outputs import met_by_rays, ray_outputs
 from unmix_plugin.renderer import VolumeRenderer
 from unmix_plugin.rendering.occupancy import OccupancyGrid
 from unmix_plugin.sensor_views import SensorViews
@@ -41,7 +41,6 @@ from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.metrics import psnr
 from unmix_plugin.surface_guide import surface_loss
-from unmix_plugin.view_gains import ViewGains
 
 _FEWEST_RAYS, _MOST_RAYS = 64, 8192
 
@@ -75,40 +74,26 @@ class UnmixModel(Model):
         self.step = config.renderer.sample_distance(
             metadata["pixel_size"], float(self.scene_box.size.max()), metadata["has_alpha"]
         )
-        opacity = choose(config.initial_opacity, self.preset.initial_opacity)
-        refines, field = config.poses == "refine", config.field
-        if refines:
-            coarsest = min(field.coarsest_resolution, config.pose_refinement.coarsest_resolution)
-            field = replace(field, coarsest_resolution=coarsest)
-        self.field: CoefficientField = field.setup(
-            scene_box=self.scene_box,
-            num_endmembers=self.num_endmembers,
-            num_specular=len(self.bands) if config.specular == "full" else num_dictionary,
-            initial_density=-math.log1p(-opacity) / (self.step * self._coarseness(0.0)),
-            pixel_size=metadata["pixel_size"],
-            exposure=choose(config.losses.exposure, 1.0),
-            lit_by_camera=config.light == "camera",
-            lamp=config.moving_lamp,
-            is_unbounded=self.is_unbounded,
-            coarse_to_fine=refines,
+        num_specular = len(self.bands) if config.specular == "full" else num_dictionary
+        self.field = make_field(
+            config,
+            self.preset,
+            self.scene_box,
+            metadata,
+            (self.num_endmembers, num_specular),
+            self.step * self._coarseness(0.0),
         )
         self.register_buffer("rgb_weights", rgb_matrix(self.bands), persistent=False)
         self.register_buffer("every_band", torch.eye(len(self.bands)), persistent=False)
         self.register_buffer("endmember_bound", torch.ones(()))
         self.guide = AbundanceGuide(*shape)
-        self.view_gains = self._make_view_gains()
-        self.poses = self._make_pose_refinement()
+        self.view_gains = make_view_gains(config, metadata)
+        self.poses = make_pose_refinement(config, metadata)
         self.seen_by = SensorViews(metadata.get("sensors", ()), self.rgb_weights)
         weights = () if config.losses.band_weights == "auto" else config.losses.band_weights
         self.balance = BandBalance(weights, self.bands, self.seen_by)
         self.comparison = BatchComparison(
-            config.losses,
-            self.preset,
-            self.seen_by,
-            self.balance,
-            self.guide,
-            self.view_gains,
-            self.num_endmembers,
+            config.losses, self.preset, self.seen_by, self.balance, self.guide, self.view_gains
         )
         self._progress = 0.0
 
@@ -137,9 +122,7 @@ class UnmixModel(Model):
         pixels = self.balance.scaled(torch.from_numpy(initial_data["pixels"]), sensor)
         seen = self.balance.scaled(self.seen_by.project(endmembers, sensor), sensor)
         self.guide.start(pixels, endmembers, self.config.losses.mixing_penalty, seen)
-        for row in range(len(self.specular_spectra)):
-            spectrum = lamp if row == 0 else endmembers[(row - 1) % len(endmembers)]
-            self.specular_spectra[row] = spectrum
+        self.specular_spectra.copy_(first_specular_spectra(len(self.specular_spectra), lamp, endmembers))
         reachable = torch.from_numpy(initial_data["reachable"])
         if self.poses is not None:
             self.poses.begin(torch.from_numpy(initial_data["knots"]), self.scene_box.aabb.mean(dim=0))
@@ -149,31 +132,20 @@ class UnmixModel(Model):
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """The hash table, the networks and the spectra."""
-        table = [value for name, value in self.field.named_parameters() if name == "table"]
-        networks = [value for name, value in self.field.named_parameters() if name != "table"]
-        spectra = [self.endmembers] if self.endmembers.requires_grad else []
-        spectra += [self.specular_spectra] if self.specular_spectra.numel() else []
+        networks = dict(self.field.named_parameters())
+        table = networks.pop("table")
+        spectra = [x for x in (self.endmembers, self.specular_spectra) if x.requires_grad and x.numel()]
         spectra += [] if self.view_gains is None else [self.view_gains.log_gains]
-        poses = (
-            [] if self.poses is None else [value for value in self.poses.parameters() if value.requires_grad]
-        )
-        return {"grid": table, "networks": networks, "spectra": spectra, "poses": poses}
+        poses = [] if self.poses is None else [x for x in self.poses.parameters() if x.requires_grad]
+        return {"grid": [table], "networks": [*networks.values()], "spectra": spectra, "poses": poses}
 
     @property
     def renderer(self) -> VolumeRenderer:
         """How rays are rendered at present; its grid follows the training."""
         if self._renderer is None or self._renderer.clearance is not self.grid.clearance:
-            config = self.config
-            self._renderer = VolumeRenderer(
-                self.scene_box.to(self.device),
-                self.grid.clearance,
-                self.grid.reachable,
-                self.step,
-                choose(config.renderer.smallest_weight, self.preset.smallest_weight),
-                self.is_unbounded,
-                config.losses.background == "last",
-                config.eval_num_rays_per_chunk,
-                self.grid.opaque,
+            box = self.scene_box.to(self.device)
+            self._renderer = make_renderer(
+                self.config, self.preset, box, self.grid, self.step, self.is_unbounded
             )
         return self._renderer
 
@@ -191,10 +163,8 @@ class UnmixModel(Model):
         )
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
-        """`spectral` (R, B) on black (of a rig `coefficients`, from which follows what its sensors see),
-        `abundances` (R, K) with those of the sky, `accumulation` (R), `spread` and `num_samples`, one number each, and
-        of the samples that carry weight `positions`, `weights`, `rays` and `views` (S). Where the grid records it,
-        `met_positions` and `met_densities` (N) of all samples looked at."""
+        """`spectral` (R, B) on black (of a rig `coefficients`, from which follows what its sensors see), all that
+        `ray_outputs` gives, and what `met_by_rays` gives where the grid records it."""
         generator = self.generator if self.training else None
         if self.poses is not None and self.training and self._progress >= self.config.pose_refinement.start:
             ray_bundle = self.poses(ray_bundle)
@@ -209,22 +179,8 @@ class UnmixModel(Model):
         if self.view_gains is not None:
             seen["cameras"] = ray_bundle.camera_indices
         if self.training and self.grid.met is not None:
-            positions = self.renderer.space.to_unit(
-                torch.cat(list(rendered.looked_at.all_positions)).detach()
-            )
-            seen["met_positions"] = positions
-            seen["met_densities"] = torch.cat(list(rendered.looked_at.all_densities))
-        return {
-            **seen,
-            "accumulation": coefficients.accumulation,
-            "abundances": rendered.mixtures,
-            "spread": rendered.spread,
-            "num_samples": torch.tensor(rendered.num_samples),
-            "positions": rendered.positions,
-            "weights": rendered.weights,
-            "rays": rendered.ray_indices,
-            "views": ray_bundle.camera_indices.index_select(0, rendered.ray_indices),
-        }
+            seen.update(met_by_rays(rendered, self.renderer.space))
+        return {**seen, **ray_outputs(rendered, ray_bundle)}
 
     def get_loss_dict(
         self,
@@ -307,9 +263,7 @@ class UnmixModel(Model):
         """Compile the kernels by one render along the box's diagonal and its backward pass."""
         low, high = self.renderer.box.aabb
         direction = torch.nn.functional.normalize(high - low, dim=0)
-        bundle = RayBundle(
-            (low - direction)[None], direction[None], torch.zeros(1, dtype=torch.int64, device=low.device)
-        )
+        bundle = RayBundle((low - direction)[None], direction[None], low.new_zeros(1, dtype=torch.int64))
         with torch.enable_grad():
             spectra = self.materials.spectra(self.renderer.render(self.field, bundle).coefficients)
             parameters = [value for group in self.get_param_groups().values() for value in group]
@@ -328,11 +282,7 @@ class UnmixModel(Model):
 
     def _begin_step(self, step: int, progress: float) -> None:
         self._progress = progress
-        if (
-            self.poses is not None
-            and isinstance(self.field, UnmixField)
-            and self.field.level_weights is not None
-        ):
+        if isinstance(self.field, UnmixField) and self.field.level_weights is not None:
             levels = self.config.pose_refinement.level_weights(len(self.field.level_weights), progress)
             self.field.level_weights.copy_(torch.tensor(levels))
         if is_due(step):
@@ -346,14 +296,3 @@ class UnmixModel(Model):
         self.specular_spectra.clamp_(0, 1)
         if self.poses is not None:
             self.poses.undo_runaways()
-
-    def _make_view_gains(self) -> ViewGains | None:
-        if self.config.light != "per-view":
-            return None
-        return ViewGains(self.metadata["num_train_views"], torch.tensor(self.metadata["wavelengths_nm"]))
-
-    def _make_pose_refinement(self) -> PoseRefinement | None:
-        if self.config.poses != "refine":
-            return None
-        rows = self.metadata.get("line_rows") or [0] * self.metadata["num_train_views"]
-        return PoseRefinement(rows, self.config.pose_refinement.lens)

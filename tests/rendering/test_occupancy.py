@@ -103,11 +103,3 @@ def test_what_rays_met_counts_once_and_the_largest_in_a_cell():
     assert float(grid.peak_densities[1, 1, 1]) == 0.5
     updated(grid, lambda points: torch.zeros(len(points)), num_cells=0)
     assert float(grid.peak_densities[0, 0, 0]) == 8.0
-
-
-def test_a_grid_that_was_saved_without_what_rays_met_can_be_loaded():
-    loaded, saved = OccupancyGrid(torch.ones(6, 6, 6) > 0, records_met=True), updated(full(6), ball, times=3)
-    loaded.load_state_dict(saved.state_dict())
-    for grid in (saved, loaded):
-        updated(grid, ball, times=3, num_cells=40, seed=1)
-    assert torch.equal(loaded.peak_densities, saved.peak_densities)

@@ -57,7 +57,6 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("clearance", clearance_of(reachable), persistent=False)
         self.register_buffer("reachable_cells", _flat_indices(reachable), persistent=False)
         self.register_load_state_dict_post_hook(_after_loading)
-        self.register_load_state_dict_pre_hook(_add_nothing_met)
 
     @torch.no_grad()
     def update(
@@ -136,12 +135,6 @@ def _decayed(peaks: Float[Tensor, "*cells"], decay: float) -> Float[Tensor, "*ce
 
 def _flat_indices(reachable: Bool[Tensor, "X Y Z"]) -> Int[Tensor, "N"]:
     return reachable.view(-1).nonzero()[:, 0]
-
-
-def _add_nothing_met(grid: OccupancyGrid, values: dict[str, Tensor], prefix: str, *_: object) -> None:
-    """Grids that were saved before they recorded what rays meet are taken to have met nothing."""
-    if grid.met is not None:
-        values.setdefault(f"{prefix}met", torch.full_like(grid.met, _NOTHING_MET))
 
 
 def _after_loading(grid: OccupancyGrid, _: object) -> None:
