@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import threading
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from jaxtyping import Float
-
-from unmix_plugin.spectral.library.material_library import LibraryMatch, measured_library
 from unmix_plugin.trained.relighting import LightChoice
 from unmix_plugin.viewer import html
 from unmix_plugin.viewer.failures import failures_said
@@ -20,11 +14,12 @@ from unmix_plugin.viewer.inputs import number
 from unmix_plugin.viewer.kept_pages import PageState
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings, first_settings
 from unmix_plugin.viewer.layers.painting import ColourMapLegend
+from unmix_plugin.viewer.notices import Notices
 from unmix_plugin.viewer.recipe_editor import RecipeHistory
 from unmix_plugin.viewer.rendering.edits import Edit
 from unmix_plugin.viewer.rendering.view import DEFAULT_HEIGHT, HEIGHT_BOUNDS, Shown, View
 from unmix_plugin.viewer.services import Services
-from unmix_plugin.viewer.view_cameras import ViewPose, camera_of, checked_pose, point_ahead, pose_of
+from unmix_plugin.viewer.view_cameras import ViewPose, camera_of, point_ahead, pose_from, pose_of
 
 if TYPE_CHECKING:
     import viser
@@ -37,10 +32,6 @@ _MOVING_QUALITY, _RESTING_QUALITY = 80, 90
 
 _SMALL_PIXELS = 1 << 14
 """Pictures of so few pixels are enlarged so much that compression with loss would show; they are sent as PNG."""
-
-_NOTICE_S = 8.0
-_ALIKE_RAD = 0.1
-"""Spectral angle up to which two materials are alike."""
 
 
 @dataclass(frozen=True)
@@ -99,10 +90,7 @@ class Session:
         self.value_range_shown: tuple[float, float] | None = None
         """Ends of the colour map of the picture shown; None where it has none."""
         self._object_owners: set[str] = set()
-        self._warning: viser.NotificationHandle | None = None
-        self._warning_said = (-math.inf, "")
-        self._note: viser.NotificationHandle | None = None
-        self._notes: tuple[str, ...] = ()
+        self._notices = Notices(client)
 
     def _first_settings(self) -> LayerSettings:
         if self.services.has_materials:
@@ -125,7 +113,7 @@ class Session:
             self.services.loop.remove(self.view)
             return
         if self.services.has_materials:
-            self._tell_notes(self.services.maker.edited(self.view.edit).notes)
+            self._show_notes(self.services.maker.edited(self.view.edit).notes)
         self.client.camera.on_update(self._moved)
         if self._returns and self.view.pose is not None:
             self.services.loop.move(self.view, self.view.pose)
@@ -157,40 +145,25 @@ class Session:
         """A callback for the browser's events: one at a time for each client, with errors shown to it."""
 
         def callback(_event: Any = None) -> None:
-            with self._lock, failures_said("that failed", self._warn):
+            with self._lock, failures_said("that failed", self.warn):
                 if not self.is_closed:
                     work()
 
         return callback
 
-    def say(self, title: str, text: str, is_warning: bool = False) -> viser.NotificationHandle | None:
-        """Show a notice. A warning replaces the one before, since a control that is dragged brings about many."""
-        if self.is_closed:
-            return None
-        if is_warning:
-            before, self._warning_said = self._warning_said, (time.monotonic(), text)
-            if before[1] == text and self._warning_said[0] - before[0] < _NOTICE_S:
-                return None
-            if self._warning is not None:
-                self._warning.remove()
-        notice = self.client.add_notification(
-            title, text[:2000], auto_close_seconds=_NOTICE_S, color="red" if is_warning else "teal"
-        )
-        if is_warning:
-            self._warning = notice
-        return notice
+    def say(self, title: str, text: str) -> None:
+        """Show a notice."""
+        if not self.is_closed:
+            self._notices.say(title, text)
 
-    def _warn(self, text: str) -> None:
-        self.say("not done", text, is_warning=True)
+    def warn(self, text: str, title: str = "not done") -> None:
+        """Show a warning in place of the one before."""
+        if not self.is_closed:
+            self._notices.warn(text, title)
 
-    def _tell_notes(self, notes: tuple[str, ...]) -> None:
-        """Show what is new among the notes of the edit in force, in place of those shown before."""
-        new = [note for note in notes if note not in self._notes]
-        self._notes = notes
-        if new:
-            if self._note is not None:
-                self._note.remove()
-            self._note = self.say("edited", "; ".join(new))
+    def _show_notes(self, notes: tuple[str, ...]) -> None:
+        if not self.is_closed:
+            self._notices.show_notes(notes)
 
     def restyle(self, settings: LayerSettings) -> None:
         """Show another layer, or the same otherwise."""
@@ -216,7 +189,7 @@ class Session:
         self.services.loop.change_edit(self.view, edit)
         for tell in self.on_edit:
             tell()
-        self._tell_notes(notes)
+        self._show_notes(notes)
 
     def change_light(self, light: LightChoice) -> None:
         """Show a scene whose light can be exchanged under another one."""
@@ -279,39 +252,6 @@ class Session:
             self._status.content = html.paragraph(text, is_warning=True)
 
 
-def nearest_materials(
-    spectra: Float[np.ndarray, "N B"], materials: Materials, count: int = 3
-) -> list[list[LibraryMatch]]:
-    """Known materials that spectra resemble, seen in the light of `materials`."""
-    light = None if materials.light is None else materials.light.cpu().double().numpy()
-    return measured_library().nearest(spectra, materials.bands, light, count)
-
-
-def likeness_rows(spectrum: Float[np.ndarray, "B"], materials: Materials) -> list[tuple[str, str]]:
-    """Rows of a table of the known materials that a spectrum resembles."""
-    matches = nearest_materials(spectrum[None], materials)[0]
-    return [("like" if rank == 0 else "", likeness(match)) for rank, match in enumerate(matches)]
-
-
-def likeness(match: LibraryMatch) -> str:
-    """A known material and its spectral angle; matches that say little are marked."""
-    remark = "" if match.angle_rad <= _ALIKE_RAD else ", not alike"
-    return f"{match.name} ({match.angle_rad:.3f} rad{remark})"
-
-
 def _first_height(canvas_rows: Any) -> int:
     """Rows of the finest picture of a new page: those of its canvas, within reason."""
     return int(number(canvas_rows, DEFAULT_HEIGHT, HEIGHT_BOUNDS[1], fallback=DEFAULT_HEIGHT)) // 16 * 16
-
-
-def pose_from(camera: viser.CameraHandle) -> ViewPose:
-    """The pose of a client's camera.
-
-    Raises:
-        ConfigError: it is invalid, or its canvas has no size.
-    """
-    height, width = camera.image_height, camera.image_width
-    has_size = isinstance(height, int) and isinstance(width, int) and height > 0 and width > 0
-    return checked_pose(
-        camera.wxyz, camera.position, camera.fov, width / height if has_size else float("nan")
-    )

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -20,6 +20,9 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.errors import ConfigError
+
+if TYPE_CHECKING:
+    import viser
 
 FOV_BOUNDS = (math.radians(1.0), math.radians(170.0))
 """Least and greatest vertical field of view."""
@@ -67,6 +70,19 @@ def checked_pose(wxyz: Any, position: Any, fov: Any, aspect: Any) -> ViewPose:
         (float(place[0]), float(place[1]), float(place[2])),
         min(max(angle, FOV_BOUNDS[0]), FOV_BOUNDS[1]),
         min(max(shape, _ASPECT_BOUNDS[0]), _ASPECT_BOUNDS[1]),
+    )
+
+
+def pose_from(camera: viser.CameraHandle) -> ViewPose:
+    """The pose of a client's camera.
+
+    Raises:
+        ConfigError: it is invalid, or its canvas has no size.
+    """
+    height, width = camera.image_height, camera.image_width
+    has_size = isinstance(height, int) and isinstance(width, int) and height > 0 and width > 0
+    return checked_pose(
+        camera.wxyz, camera.position, camera.fov, width / height if has_size else float("nan")
     )
 
 

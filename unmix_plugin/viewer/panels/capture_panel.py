@@ -136,7 +136,7 @@ class CapturePanel:
             self._capture = None
             self._show_progress(0.0)
             if reason:
-                session.say("no picture", reason, is_warning=True)
+                session.warn(reason, "no picture")
             else:
                 session.guarded(finish)()
 
@@ -238,7 +238,7 @@ class CapturePanel:
             self._video = None
             progress(0.0)
             if video is None:
-                session.say("no video", reason, is_warning=True)
+                session.warn(reason, "no video")
             else:
                 session.guarded(lambda: self._hand_over(video))()
 

@@ -25,6 +25,7 @@ from unmix_plugin.viewer import html
 from unmix_plugin.viewer.charts import Chart, Line
 from unmix_plugin.viewer.debounce import Debounced
 from unmix_plugin.viewer.inputs import index_in, number, text
+from unmix_plugin.viewer.likeness import likeness, likeness_rows, nearest_materials
 from unmix_plugin.viewer.panels.recipe_controls import RecipeControls
 from unmix_plugin.viewer.recipe_editor import (
     change_of,
@@ -34,7 +35,7 @@ from unmix_plugin.viewer.recipe_editor import (
     with_swap,
     with_visible,
 )
-from unmix_plugin.viewer.session import Session, likeness, likeness_rows, nearest_materials
+from unmix_plugin.viewer.session import Session
 
 _OWN_LIGHT = "as recorded"
 _COMMON_LIGHTS = ("D65", "D50", "A", "E", "C", "FL2", "FL7", "FL11")

@@ -11,9 +11,10 @@ from unmix_plugin.formats.files import write_file
 from unmix_plugin.viewer import html
 from unmix_plugin.viewer.charts import Chart, Line
 from unmix_plugin.viewer.inputs import new_file, number
+from unmix_plugin.viewer.likeness import likeness_rows
 from unmix_plugin.viewer.probing import ProbedPoint, abundances_csv, spectra_csv
 from unmix_plugin.viewer.scene_objects import add_probe
-from unmix_plugin.viewer.session import Session, likeness_rows
+from unmix_plugin.viewer.session import Session
 from unmix_plugin.viewer.view_cameras import camera_of
 
 if TYPE_CHECKING:
