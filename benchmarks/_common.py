@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 REPOSITORY = Path(__file__).resolve().parent.parent
 RESULTS = Path(__file__).resolve().parent / "results"
 
-Verdict: TypeAlias = Literal["aim reached", "pass", "MISS", "reported"]
+Verdict: TypeAlias = Literal["aim reached", "pass", "MISS", "not measured", "reported"]
 
 
 @dataclass(frozen=True)
@@ -54,15 +54,16 @@ class Limit:
     unit: str = ""
 
     def judge(self, what: str, value: float | None) -> Figure:
-        """The line of `value`; one that is not there is missed."""
+        """The line of `value`; None is a number that was not measured."""
         asked = f"{'at most' if self.is_upper else 'at least'} {self._with_unit(self.required)}"
         if self.aim is not None:
             asked += f"; aim {self._with_unit(self.aim)}"
-        reached = "nothing measured" if value is None else self._with_unit(value)
-        return Figure(what, asked, reached, self._verdict(value))
+        if value is None:
+            return Figure(what, asked, "", "not measured")
+        return Figure(what, asked, self._with_unit(value), self._verdict(value))
 
-    def _verdict(self, value: float | None) -> Verdict:
-        if value is None or not self._keeps(value, self.required):
+    def _verdict(self, value: float) -> Verdict:
+        if not self._keeps(value, self.required):
             return "MISS"
         return "aim reached" if self.aim is not None and self._keeps(value, self.aim) else "pass"
 
@@ -74,8 +75,8 @@ class Limit:
 
 
 def reported(what: str, reached: str) -> Figure:
-    """A line of which nothing is asked."""
-    return Figure(what, "", reached, "reported")
+    """A line of which nothing is asked; without text it was not measured."""
+    return Figure(what, "", reached, "reported" if reached else "not measured")
 
 
 def required(what: str, asked: str, holds: bool, reached: str) -> Figure:
@@ -117,6 +118,15 @@ class Report:
 def results_name(name: str, variant: str) -> str:
     """What a variant's files are called, without the ending."""
     return f"{name}-{variant}" if variant else name
+
+
+def seconds_variant(max_seconds: float | None) -> str:
+    """Variant of a benchmark whose trainings end after so many seconds.
+
+    >>> seconds_variant(90.0)
+    '90s'
+    """
+    return "" if max_seconds is None else f"{max_seconds:g}s"
 
 
 def publish(report: Report, results: Path | None) -> None:
@@ -245,9 +255,31 @@ def _markdown(report: Report) -> str:
     ]
     for table in report.tables:
         lines += ["", f"## {table.title}", "", *_markdown_table(table.headers, table.rows)]
-    lines += ["", "## Setting", "", *(f"- {key}: {value}" for key, value in report.setting.items())]
-    lines += ["", "## Machine", "", *(f"- {key}: {value}" for key, value in report.machine.items())]
+    lines += ["", "## Setting", "", *_list(report.setting)]
+    lines += ["", "## Machine", "", *_list(report.machine)]
     return "\n".join([*lines, "", f"Made by `python benchmarks/{report.name}.py`.", ""])
+
+
+def _list(values: Mapping[str, Any], indent: str = "") -> list[str]:
+    """Names and values as a list, those of a mapping as a list below its name.
+
+    >>> _list({"steps": (500, 800), "words": {"plain": ""}})
+    ['- steps: 500, 800', '- words:', '  - plain: none']
+    """
+    lines = []
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            lines += [f"{indent}- {key}:", *_list(value, indent + "  ")]
+        else:
+            shown = value if isinstance(value, Sequence) and not isinstance(value, str) else [value]
+            lines.append(f"{indent}- {key}: {', '.join(map(_readable, shown)) or 'none'}")
+    return lines
+
+
+def _readable(value: Any) -> str:
+    if value is None or value == "":
+        return "none"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def _markdown_table(headers: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

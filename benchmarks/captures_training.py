@@ -1,10 +1,10 @@
 """How well does training do on captures: light that moves, masks that err, a dark scene with blown-out pixels?
 
-    python benchmarks/captures_training.py [--max-seconds 180 600]
+    python benchmarks/captures_training.py [--max-seconds 600]
 
 Trains the scene `turntable` and the real capture "Basil" with the defaults of everything but the number of endmembers,
 and again without each of what captures need: evidence on alpha, light that moves, exposure. All variants of a scene
-take the same number of steps, or the same seconds where these are given.
+take the same number of steps, or the same seconds, after which what is written is named (captures_training-600s).
 """
 
 from __future__ import annotations
@@ -61,10 +61,10 @@ class Options:
     """Names of the scenes to run, turntable and basil; all if none is given."""
     variants: tuple[str, ...] = tuple(VARIANTS)
     """Which to train."""
-    steps: tuple[int, int] = (1000, 1000)
-    """Training steps on turntable and on basil."""
-    max_seconds: tuple[float, float] | None = None
-    """Seconds of training on turntable and on basil, instead of steps."""
+    steps: int = 500
+    """Of each training."""
+    max_seconds: float | None = None
+    """Of each training, instead of steps."""
     runs: Path | None = None
     """Keep the run folders here."""
     results: Path | None = None
@@ -78,21 +78,34 @@ def main(options: Options) -> None:
     machine, measured = _machine.describe_machine("cpu"), {}
     with ExitStack() as stack:
         place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="unmix-captures-")))
-        for row, (name, words) in enumerate(_scenes(options, place).items()):
-            limit = _limit(options, row if len(options.only) != 1 else list(LIMITS).index(name))
+        for name, words in _scenes(options, place).items():
+            words = [*words, *_limit(options)]
             measured[name] = {
-                variant: measure(f"{name}, {variant}", [*words, *limit, *VARIANTS[variant]], options, place)
+                variant: measure(f"{name}, {variant}", [*words, *VARIANTS[variant]], options, place)
                 for variant in options.variants
                 if (name, variant) not in USELESS
             }
     if not measured:
         print(f"no scene to measure in {options.shared}")
         return
-    setting = {"steps": options.steps, "max_seconds": options.max_seconds, "variants": VARIANTS}
+    seconds = options.max_seconds
+    setting = {
+        **({"steps": options.steps} if seconds is None else {"seconds": seconds}),
+        "variants": {name: " ".join(VARIANTS[name]) for name in options.variants},
+    }
     figures = [figure for name, found in measured.items() for figure in judge(name, found)]
     tables = tuple(details(name, found) for name, found in measured.items())
     question = "Evaluation views of captures, and what each part of training on them is worth"
-    report = _common.Report("captures_training", question, setting, machine, figures, measured, tables)
+    report = _common.Report(
+        "captures_training",
+        question,
+        setting,
+        machine,
+        figures,
+        measured,
+        tables,
+        _common.seconds_variant(seconds),
+    )
     _common.publish(report, _common.results_folder(options.results, options.quick))
 
 
@@ -107,12 +120,12 @@ def _scenes(options: Options, place: Path) -> dict[str, list[str]]:
     return found
 
 
-def _limit(options: Options, row: int) -> list[str]:
+def _limit(options: Options) -> list[str]:
     if options.quick:
         return ["--max-num-iterations", "10"]
     if options.max_seconds is not None:
-        return ["--max-seconds", str(options.max_seconds[row])]
-    return ["--max-num-iterations", str(options.steps[row])]
+        return ["--max-seconds", str(options.max_seconds)]
+    return ["--max-num-iterations", str(options.steps)]
 
 
 def measure(title: str, words: list[str], options: Options, place: Path) -> dict[str, Any]:
@@ -135,10 +148,11 @@ def judge(name: str, found: dict[str, dict[str, Any]]) -> list[_common.Figure]:
 
 
 def details(name: str, found: dict[str, dict[str, Any]]) -> _common.DetailTable:
-    """Every figure of every variant."""
+    """Every figure of every variant that there is truth for."""
     rows = [
-        [key, *("no truth" if values[key] is None else f"{values[key]:.4g}" for values in found.values())]
+        [key, *(f"{values[key]:.4g}" for values in found.values())]
         for key in SHOWN
+        if all(values[key] is not None for values in found.values())
     ]
     return _common.DetailTable(name, ["metric", *found], rows)
 

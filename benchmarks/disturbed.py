@@ -1,6 +1,6 @@
 """What do careless captures cost? The demo scene, undisturbed and disturbed, trained with the defaults for equal steps.
 
-    python benchmarks/disturbed.py [--steps 800]
+    python benchmarks/disturbed.py [--steps 300] [--only light]
 
 Disturbed are the training views only, except for the light that moves with the camera; every figure is taken on true
 evaluation views. Noise is trained twice, with the defaults and with values kept and bands that count alike.
@@ -37,10 +37,10 @@ WORDS = {
 class Options:
     """Train on the demo scene, undisturbed and disturbed."""
 
-    steps: int = 800
+    steps: int = 300
     """Of each training."""
     only: tuple[str, ...] = ()
-    """What to train on; all if none is given. The others keep their earlier results, if they took as many steps."""
+    """Disturbances to train on; all if none is given. What is written is named after them: disturbed-light."""
     runs: Path | None = None
     """Keep scenes and run folders here."""
     results: Path | None = None
@@ -53,41 +53,25 @@ def main(options: Options) -> None:
     """Measure every disturbance and publish."""
     machine = _machine.describe_machine("cpu")
     steps = 10 if options.quick else options.steps
-    results = _common.results_folder(options.results, options.quick)
-    measured = earlier(results, steps)
+    measured: dict[str, dict[str, Any]] = {}
     with ExitStack() as stack:
         place = Path(
             options.runs or stack.enter_context(tempfile.TemporaryDirectory(prefix="unmix-disturbed-"))
         )
         for name, folder in write_scenes(place / "scenes", options).items():
             measured[name] = measure(name, folder, steps, place / "runs")
-            publish(measured, steps, machine, results)
-
-
-def publish(
-    measured: dict[str, dict[str, Any]], steps: int, machine: dict[str, Any], results: Path | None
-) -> None:
-    """All that was measured so far."""
     figures = [
         figure
         for name, found in measured.items()
-        if name not in (BASE, KEPT_NOISE) and BASE in measured
+        if name not in (BASE, KEPT_NOISE)
         for figure in judge(name, found, measured[BASE])
     ]
     rows = [[key, *(f"{found[key]:.4g}" for found in measured.values())] for key in SHOWN]
     table = _common.DetailTable("All figures", ["metric", *measured], rows)
     question = "What disturbances of the demo scene cost on true evaluation views"
-    report = _common.Report("disturbed", question, {"steps": steps}, machine, figures, measured, (table,))
-    _common.publish(report, results)
-
-
-def earlier(results: Path | None, steps: int) -> dict[str, dict[str, Any]]:
-    """What was measured before with as many steps, by name."""
-    path = None if results is None else results / "disturbed.json"
-    if path is None or not path.is_file():
-        return {}
-    report = json.loads(path.read_text(encoding="utf-8"))
-    return report["measured"] if report["setting"] == {"steps": steps} else {}
+    setting, tables, variant = {"steps": steps}, (table,), "-".join(options.only)
+    report = _common.Report("disturbed", question, setting, machine, figures, measured, tables, variant)
+    _common.publish(report, _common.results_folder(options.results, options.quick))
 
 
 def write_scenes(folder: Path, options: Options) -> dict[str, Path]:
@@ -102,7 +86,7 @@ def write_scenes(folder: Path, options: Options) -> dict[str, Path]:
         "noise": disturbing.noise,
         KEPT_NOISE: disturbing.noise,
     }
-    scenes = {BASE: source} if BASE in (options.only or (BASE,)) else {}
+    scenes = {BASE: source}
     if "light" in (options.only or ("light",)):
         scenes["light"] = disturbing.write_lit_by_camera(source, folder / "light")
     for name, change in changes.items():

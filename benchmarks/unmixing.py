@@ -109,18 +109,9 @@ def publish(
         judge(measured),
         {scene: asdict(found) for scene, found in measured.items()},
         tables(measured),
-        variant(seconds),
+        _common.seconds_variant(seconds),
     )
     _common.publish(report, results)
-
-
-def variant(max_seconds: float | None) -> str:
-    """What tells files of runs that are broken off from those of whole ones.
-
-    >>> variant(90.0)
-    '90s'
-    """
-    return "" if max_seconds is None else f"{max_seconds:g}s"
 
 
 def every_row() -> list[str]:
@@ -182,7 +173,7 @@ def measure_pixels(folder: Path, names: list[str], seeds: tuple[int, ...], found
 
 def earlier(results: Path | None, setting: dict[str, Any]) -> dict[str, SceneFigures]:
     """What was measured before, by scene: 2-D rows, which no setting touches, and 3-D rows of the same words."""
-    name = _common.results_name("unmixing", variant(setting["max_seconds"]))
+    name = _common.results_name("unmixing", _common.seconds_variant(setting["max_seconds"]))
     path = None if results is None else results / f"{name}.json"
     if path is None or not path.is_file():
         return {}
