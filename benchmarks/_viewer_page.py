@@ -57,6 +57,7 @@ class Page:
             compression=None,
         )
         self._changed = threading.Condition()
+        self._seen_texts: list[str] = []
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
         return self
@@ -86,6 +87,17 @@ class Page:
             },
         )
 
+    def click(self, x: float, y: float) -> None:
+        """Click a point of the picture, given in parts of its width and height."""
+        self.send(
+            "ScenePointerMessage",
+            event_type="click",
+            ray_origin=(0.0, 0.0, 0.0),
+            ray_direction=(0.0, 0.0, 1.0),
+            screen_pos=((x, y),),
+            modifier=None,
+        )
+
     def control(self, label: str) -> str:
         """Identifier of the control with a label; the newest if there are several.
 
@@ -107,6 +119,10 @@ class Page:
         """Send any message."""
         self._socket.send(msgspec.msgpack.encode({"type": kind, **content}))
 
+    def send_raw(self, data: bytes | str) -> None:
+        """Send anything."""
+        self._socket.send(data)
+
     def wait_until(self, holds: Callable[[], bool], timeout_s: float = 30.0) -> None:
         """Wait for something to become true.
 
@@ -118,6 +134,11 @@ class Page:
                 raise TimeoutError(
                     f"{len(self.pictures)} pictures, notices {self.notices}, closed {self.is_closed}"
                 )
+
+    @property
+    def seen_texts(self) -> str:
+        """All HTML that controls were changed to so far."""
+        return "\n".join(self._seen_texts)
 
     @property
     def texts(self) -> str:
@@ -149,6 +170,7 @@ class Page:
             self.pictures.append((time.monotonic(), len(message["rgb_data"])))
         elif kind == "GuiUpdateMessage":
             self.controls.setdefault(message["uuid"], {}).update(message["updates"])
+            self._seen_texts.append(str(message["updates"].get("content", "")))
         elif kind == "GuiRemoveMessage":
             self.controls.pop(message["uuid"], None)
         elif kind.startswith("Gui") and "uuid" in message and "props" in message:
