@@ -145,13 +145,13 @@ def publish(report: Report, results: Path | None) -> None:
 
 
 def results_folder(given: Path | None, quick: bool) -> Path | None:
-    """Where to write: where it was said, else `results/` beside the benchmarks; nowhere after a quick run."""
+    """Where to write: the given folder, or `results/` beside the benchmarks; nowhere after a quick run."""
     return given if given is not None else None if quick else RESULTS
 
 
 @dataclass(frozen=True)
 class Ended:
-    """A command that came to its end."""
+    """A command that has ended."""
 
     status: int
     """Exit code; minus the signal's number if it was killed."""

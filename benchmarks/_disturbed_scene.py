@@ -1,4 +1,4 @@
-"""The demo scene as careless captures would have it: training views are disturbed, evaluation views keep the truth."""
+"""The demo scene as careless captures would show it: training views are disturbed, evaluation views keep the truth."""
 
 from __future__ import annotations
 

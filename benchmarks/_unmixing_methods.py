@@ -58,7 +58,7 @@ class PixelMethod:
 
 
 def find_endmembers(pixels: Tensor, count: int, find: str, generator: torch.Generator) -> Tensor:
-    """Endmembers (K, B) by a method that is no oracle.
+    """Endmembers (K, B) by a method that is not an oracle.
 
     Raises:
         SpectrumError: as `initialise_endmembers`.

@@ -85,7 +85,7 @@ def deviation(seeds: Seeds) -> float:
 
 
 def best_pixel_row(rows: dict[str, Seeds], finder: Literal["theirs", "ours"] = "theirs") -> str | None:
-    """The 2-D row of largest mIoU that is no oracle.
+    """The 2-D row of largest mIoU that is not an oracle.
 
     Args:
         finder: Whether endmembers are found by known methods or by `pairs`, which is half of what is judged.

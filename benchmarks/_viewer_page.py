@@ -1,6 +1,6 @@
 """A page of the viewer without a browser: speaks its websocket protocol, moves a camera, counts what it is shown.
 
-Whatever is measured with many pages would else measure their browsers.
+Otherwise a measurement with many pages would measure their browsers.
 """
 
 from __future__ import annotations

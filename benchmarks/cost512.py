@@ -3,7 +3,7 @@
     python benchmarks/cost512.py
 
 Trains on the built-in scene in 48 views of 512 x 512 pixels and 31 bands, with the defaults of all but the number of
-steps, and renders evaluation views. Processor time stands beside wall time: with one thread, a quiet machine takes
+steps, and renders evaluation views. Processor time is given beside wall time: with one thread, a quiet machine takes
 about as many seconds of wall time, with two fewer. Takes about five minutes, one of them for writing the scene.
 """
 

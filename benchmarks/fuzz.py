@@ -3,7 +3,7 @@
     python benchmarks/fuzz.py --cases 1000000
 
 Cases are shared evenly among the readers of `tests/fuzz/readers.py`: valid samples with damage, each read, and each
-either accepted or refused with the error that the reader promises. A seed and a case's number give back its bytes.
+either accepted or refused with the error that the reader promises. A seed and a case's number reproduce its bytes.
 Takes about ten minutes on two cores; with `--minutes` it ends when the time is up and reports the cases it did.
 """
 

@@ -3,7 +3,7 @@
     python benchmarks/quality.py [--scenes DIR] [--max-seconds 180]
 
 Trains and evaluates each scene below DIR by the commands that a user would give, with the defaults of everything but
-the number of endmembers. Beside the segmentation stand two methods that see single images only, scored by the same
+the number of endmembers. Beside the segmentation are two methods that see single images only, scored by the same
 code on the true pixels of the evaluation views: k-means on spectra of equal length, and VCA with the nearest endmember
 by angle, their spectra found in the training views. Takes four minutes a scene.
 """

@@ -269,7 +269,7 @@ def measure_load(server: Server, seconds: float) -> dict[str, Any]:
         ]
         for mover in movers:
             mover.start()
-        time.sleep(min(10.0, seconds))  # what every page takes once is no growth
+        time.sleep(min(10.0, seconds))  # what every page takes once is not growth
         before, counts = server.memory_mb, [len(page.pictures) for page in pages]
         time.sleep(seconds)
         after = server.memory_mb

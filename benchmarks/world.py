@@ -75,7 +75,7 @@ def main(options: Options) -> None:
 
 
 def measure(run: str, steps: int, place: Path) -> dict[str, float]:
-    """Train, evaluate, and look at what stands before the surfaces."""
+    """Train, evaluate, and look at what is in front of the surfaces."""
     name, world = RUNS[run]
     print(f"{run}: training ...", flush=True)
     words = ["--max-num-iterations", str(steps)]

@@ -223,7 +223,7 @@ def test_views_of_many_pixels_are_seen_by_one_ray_a_pixel(scene_folder, monkeypa
 
 
 def test_light_outside_a_mask_counts_as_evidence(scene_folder, tmp_path):
-    """A hole in one mask, through which the cube still shows matter, is neither believed nor carved."""
+    """A hole in one mask, through which the cube still shows matter, is neither trusted nor carved."""
     folder = tmp_path / "holed"
     shutil.copytree(scene_folder, folder)
     frame = make(folder).scene.frames[make(folder).scene.train_indices[0]]

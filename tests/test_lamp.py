@@ -1,4 +1,4 @@
-"""A lamp that moves with the camera: where it stands, what it reaches, and that training moves it to where it is."""
+"""A lamp that moves with the camera: where it is, what it reaches, and that training moves it to where it is."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Where the lamp stands that moves with the camera, told from pictures of a ball and of things on a table."""
+"""Where the lamp that moves with the camera is, found from pictures of a ball and of things on a table."""
 
 import numpy as np
 import pytest

@@ -209,7 +209,7 @@ class HyperspectralDataManager(DataManager):
 
     @cached_property
     def _knots(self) -> Knots:
-        """Where corrections of the training views' poses stand."""
+        """Where corrections of the training views' poses apply."""
         return Knots.of(self.train_cameras)
 
     @cached_property
@@ -261,7 +261,7 @@ class HyperspectralDataManager(DataManager):
         return choose(self.options.grid_resolution, self._preset.grid_resolution)
 
     def _light(self, reachable: Bool[np.ndarray, "R R R"]) -> dict[str, np.ndarray]:
-        """Judged by the views of the sensor that took most; and where the lamp stands if it moves with the camera."""
+        """Judged by the views of the sensor that took most; and where the lamp is if it moves with the camera."""
         if not self.scene.has_alpha:
             return {"light": np.array("fixed")}
         views, seen = self._evidence.log_brightness()

@@ -32,10 +32,10 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
     is 2, but 1 where the training views have more than 4 million pixels: more pixels teach more than exact ones."""
     single_ray_until: float | Auto = "auto"
     """Part of the training in which one ray a pixel has to do: coarse shape needs many pixels, not exact ones. Auto is
-    0.4 where alpha is known, else 0.8."""
+    0.4 where alpha is known, otherwise 0.8."""
     grid_resolution: int | Auto = "auto"
     """Cells along an edge of the occupancy grid, from which space is carved that the views show to be empty. Auto is
-    128 where alpha is known, else 64: only what few cameras see can be carved then."""
+    128 where alpha is known, otherwise 64: only what few cameras see can be carved then."""
     trust_alpha: bool = False
     """Believe alpha even where the light of a pixel contradicts it."""
     mend_values: bool = True
@@ -50,8 +50,8 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
 
     target_components: Components = "auto"
     """Numbers to keep of each training pixel instead of one a band: its components in the subspace that the scene's
-    spectra lie in. Auto is none where all bands fit into the memory for training pixels, else, from 100 bands on, as
-    many as leave out no more than noise. What training compares are spectra on all bands in any case."""
+    spectra lie in. Auto is none where all bands fit into the memory for training pixels; otherwise, from 100 bands on,
+    as many as leave out no more than noise. What training compares are spectra on all bands in any case."""
 
     def __post_init__(self) -> None:
         """Refuse impossible settings.

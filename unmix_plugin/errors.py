@@ -37,7 +37,7 @@ def did_you_mean(word: str, known: Iterable[str], likeness: float = 0.6, form: s
 
     Args:
         likeness: How near is near, from 0 to 1 for the same; lower among few names that hardly resemble each other.
-        form: How the question stands in its message, {} being the question; nothing of it is there without one.
+        form: How the question is put in its message, {} being the question; empty without one.
 
     >>> did_you_mean("segmentaton", ["segmentation", "depth"])
     'did you mean segmentation?'

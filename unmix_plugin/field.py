@@ -165,7 +165,7 @@ class UnmixField(CoefficientField):
             pixel_size: Edge of a pixel in the middle of the scene, scene units.
             exposure: How dark the scene is: the view-dependent part starts so many times darker.
             lit_by_camera: Whether the light moves with the camera, so that scales depend on the direction of view.
-            lamp: Where its lamp stands at the start of training; None if that is not known.
+            lamp: Where its lamp is at the start of training; None if that is not known.
             is_unbounded: Whether the field is defined in all of space, contracted around the box, with a sky behind.
             coarse_to_fine: Whether the grid's levels have weights, as refining poses needs them.
         """

@@ -42,7 +42,7 @@ class _Front:
     at: Int[Tensor, "A"]
     """Next sample of each."""
     todo: Int[Tensor, "A"]
-    """Samples of each from there on."""
+    """Samples of each from there."""
     left: Float[Tensor, "A"]
     """Share of its light that each still has."""
     num_seen: int = 0

@@ -1,4 +1,4 @@
-"""A lamp that moves with the camera, as seen from the object: where it stands.
+"""A lamp that moves with the camera, as seen from the object: where it is.
 
 Where an object is turned before a fixed camera and lamp, the middle of the turntable, its axis and the camera span a
 frame in which the lamp keeps its place. The frame follows from where a ray starts, so any new camera has its lamp too.
@@ -29,7 +29,7 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Lamp:
-    """Where the lamp stands of a scene that is turned before its camera, model space."""
+    """Where the lamp is in a scene that is turned in front of its camera, model space."""
 
     frame: LampFrame
     """Whether the lamp only turns about the axis with the camera, or also goes up and down with it."""

@@ -1,4 +1,4 @@
-"""Where the lamp stands that moves with the camera, by the brightness of places on the hull, before any training.
+"""Where the lamp that moves with the camera is, by the brightness of places on the hull, before any training.
 
 A place is as bright as a matt surface in the light of a lamp and of its surroundings:
 
@@ -28,7 +28,7 @@ from unmix_plugin.lamp import Lamp, LampFrame, MovingLamp, Triple
 from unmix_plugin.scenes.geometry.hull_places import Places, coarse_hull, seen_places
 
 LEAST_SHARE = 0.15
-"""Of the changes of brightness within places, that a lamp must explain to be believed."""
+"""Of the changes of brightness within places, that a lamp must explain to be accepted."""
 LEAST_SHADOWS = 0.003
 """Part of the changes that its shadows must explain beside, in either half of the places."""
 NUM_DIRECTIONS, NUM_KEPT = 300, 6

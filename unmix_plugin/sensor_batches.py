@@ -1,4 +1,4 @@
-"""Training batches of scenes with several sensors: the pixels of one sensor stand together, one sensor after the other.
+"""Training batches of scenes with several sensors: the pixels of one sensor are together, one sensor after the other.
 
 Such a batch has, beside what every batch has, `sensors`, `sensor_pixels` and `sensor_rays` (G each, on the CPU): which
 sensors some pixels are of, how many of each, and how many rays each such pixel has. `spectra` (R, b) is 0 beyond the

@@ -58,7 +58,7 @@ class SensorViews(nn.Module):
         return spectra if sensor is None else spectra @ self.matrix(sensor).T.to(spectra)
 
     def rgb_weights(self, sensor: int | None) -> Float[Tensor, "b 3"]:
-        """From channels to colours: sRGB where all bands are seen, else false colours."""
+        """From channels to colours: sRGB where all bands are seen, otherwise false colours."""
         return self.get_buffer("plain_colours" if sensor is None else f"colours_{sensor}")
 
     def tells_materials(self, sensor: SupportsInt | None, num_endmembers: int) -> bool:

@@ -17,7 +17,7 @@ from unmix_plugin.engine.geometry.contraction import UnitSpace
 SURFACE_CELLS = 64.0
 """Along an edge of contracted space: the unit of the two bounds below."""
 AT_SURFACE, OFF_SURFACE = 1.0, 3.0
-"""Distance from the known place up to which all light counts, and from which on none does."""
+"""Distance from the known place up to which all light counts, and beyond which none does."""
 
 
 def surface_loss(

@@ -33,7 +33,7 @@ class LossConfig:
 
     background: Background | Auto = "auto"
     """What lies behind the scene in training: a random grey a ray, black, white, or the colour of the last sample. Auto
-    is random where alpha is known, else black."""
+    is random where alpha is known, otherwise black."""
     spectral: float = 1.0
     """Weight of the mean squared error of spectra."""
     band_weights: tuple[float, ...] | Auto = "auto"
@@ -41,18 +41,18 @@ class LossConfig:
     much noisier than the others, or dead: the reciprocal of their noise's variance. The mean is 1."""
     rgb: float | Auto = "auto"
     """Weight of the mean squared error of their sRGB colours, in which dark pixels count more. Auto is 0.2 where alpha
-    is known, else 0: where black may be the void, it costs quality."""
+    is known, otherwise 0: where black may be the void, it costs quality."""
     opacity: float | Auto = "auto"
     """Weight of the mean squared transparency of pixels that are not dark: light comes from something solid. Auto is
-    0.01 where alpha is unknown, else 0."""
+    0.01 where alpha is unknown, otherwise 0."""
     spread: float | Auto = "auto"
     """Weight, at the start of training, of density spread along rays, which removes floaters; falls to 0 at
-    `spread_until`. Auto is 0.001 where alpha is unknown, else 0."""
+    `spread_until`. Auto is 0.001 where alpha is unknown, otherwise 0."""
     spread_until: float = 0.25
     """Part of the training in which spread density is penalised: later it would thin out surfaces."""
     surface: float | Auto = "auto"
     """Weight, at the start of training, of light from elsewhere than the surface that the views agree on, where they do
-    clearly; falls to 0 at `surface_until`. Auto is 0.3 in an unbounded world, else 0."""
+    clearly; falls to 0 at `surface_until`. Auto is 0.3 in an unbounded world, otherwise 0."""
     surface_until: float = 0.5
     """Part of the training in which known surfaces guide it: later they would hold back what is finer."""
     abundances: float = 0.1
@@ -65,8 +65,8 @@ class LossConfig:
     """Factor on spectra, rendered and measured, before they are compared: errors of dark scenes count as much as those
     of bright ones. Auto makes the median opaque pixel as bright as 0.2, but darkens nothing."""
     outlier: float = 1.0
-    """Error of an exposed value from which on it counts in proportion and no longer squared. It matters in dark scenes
-    only: a blown-out pixel would else outweigh all others. What a saturated value misses is unknown anyway, so for
+    """Error of an exposed value above which it counts in proportion instead of squared. It matters in dark scenes
+    only: a blown-out pixel would otherwise outweigh all others. What a saturated value misses is unknown anyway, so for
     such pixels the bound is divided by the exposure."""
     mixing_penalty: float = 2.0
     """By how much a further material must improve the fit of such a spectrum, in multiples of the mean angle that
@@ -119,7 +119,7 @@ class PixelComparison:
     opacities: Float[Tensor, "R"]
     """Rendered."""
     outliers: Float[Tensor, "R 1"]
-    """Error of a pixel's values from which on it is no longer squared."""
+    """Error of a pixel's values above which it is not squared."""
 
 
 def compare_pixels(

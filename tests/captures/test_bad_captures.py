@@ -136,7 +136,7 @@ CASES: dict[str, tuple[Spoil, dict[str, Any], str]] = {
     "poses of zeros": (
         _zero_poses,
         {},
-        "4 of 4 camera matrices that are no poses: .* the rotation is all zeros",
+        "4 of 4 camera matrices that are not poses: .* the rotation is all zeros",
     ),
     "poses of others": (
         lambda root: write_poses(root / "transforms.json", ["cow", "horse"]),
@@ -163,7 +163,7 @@ CASES: dict[str, tuple[Spoil, dict[str, Any], str]] = {
         {"drop_bands": "1400"},
         "no band in '1400' nm; the bands lie at 450 to 850",
     ),
-    "bands that are no numbers": (_nothing, {"drop_bands": "red"}, "'red' is no wavelength or range"),
+    "bands that are not numbers": (_nothing, {"drop_bands": "red"}, "'red' is not a wavelength or range"),
     "two white references": (
         _nothing,
         {**REFERENCES, "white_rectangle": ("view_00", 0, 0, 4, 4)},

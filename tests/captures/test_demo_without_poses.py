@@ -1,4 +1,4 @@
-"""The demo capture without poses, from raw counts to a scene whose cameras stand where the true ones do."""
+"""The demo capture without poses, from raw counts to a scene whose cameras are where the true ones are."""
 
 from functools import partial
 from pathlib import Path

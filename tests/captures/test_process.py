@@ -148,7 +148,9 @@ def test_a_panel_in_a_view_serves_as_white(tmp_path: Path):
     capture = make_capture(tmp_path / "capture", views=2)
     counts = np.full((HEIGHT, WIDTH, len(WAVELENGTHS_NM)), 600, np.uint16)
     counts[4:10, 5:12] = 2400
-    counts += np.random.default_rng(0).integers(0, 41, counts.shape, np.uint16)  # else its top is a plateau
+    counts += np.random.default_rng(0).integers(
+        0, 41, counts.shape, np.uint16
+    )  # otherwise its top is a plateau
     write_cube(capture.root, "view_00", counts)
     process(
         capture.root, tmp_path / "scene", white_rectangle=("view_00", 4, 5, 6, 7), white_reflectance="0.5"

@@ -34,5 +34,5 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
 
 @pytest.fixture
 def run_copy(trained: Trained, tmp_path: Path) -> Path:
-    """A copy of the trained run that a test may spoil."""
+    """A copy of the trained run that a test may damage."""
     return Path(shutil.copytree(trained.run, tmp_path / "copy" / "demo" / "unmix-nerf" / trained.run.name))

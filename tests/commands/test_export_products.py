@@ -59,7 +59,7 @@ def trained(tmp_path_factory):
 
 @pytest.fixture
 def run_copy(trained, tmp_path):
-    """A copy of the run that a test may spoil."""
+    """A copy of the run that a test may damage."""
     return Path(shutil.copytree(trained.run, tmp_path / "copy" / trained.run.name))
 
 
@@ -283,7 +283,7 @@ def test_removed_matter_leaves_the_surface(trained, tmp_path):
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        (["spectrum"], "give a pixel with --view and --pixel, or else a point with --point"),
+        (["spectrum"], "give a pixel with --view and --pixel, or a point with --point"),
         (["spectrum", "--view", "1", "--point", "1,2,3"], "give a pixel with --view and --pixel"),
         (["spectrum", "--view", "eval_003", "--pixel", "1,1"], "no view 'eval_003' (did you mean"),
         (["spectrum", "--view", "2", "--pixel", "1,1"], "a number from 0 to 1"),

@@ -284,7 +284,7 @@ def test_a_run_is_shown_with_the_edits_and_the_light_asked_for(run_copy):
             )
             assert page.controls[page.control("light")]["value"] == "FL2"
             assert "clay" in page.controls[page.control("other endmember")]["options"]
-            page.set("changes", "start anew")
+            page.set("changes", "start again")
             page.wait_until(lambda: page.controls[page.control("light")]["value"] == "as recorded")
     finally:
         viewer.stop()

@@ -1,4 +1,4 @@
-"""A trained run where the pages have theirs, and the code that stands on them."""
+"""A trained run where the pages have theirs, and the code that is on them."""
 
 import os
 import shutil

@@ -1,4 +1,4 @@
-"""What stands on the pages of the documentation."""
+"""What is on the pages of the documentation."""
 
 import re
 from pathlib import Path

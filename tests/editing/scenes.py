@@ -38,7 +38,7 @@ def lit_scene(**settings) -> TrainedScene:
     assert isinstance(model.field, UnmixField)
     with torch.no_grad():
         for weights in model.field.material_network.parameters():
-            weights.mul_(6)  # else every point is about a third of each
+            weights.mul_(6)  # otherwise every point is about a third of each
     model.field.log_initial_density += 1.5
     return scene_of(model, CAMERAS)
 

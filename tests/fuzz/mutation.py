@@ -1,6 +1,6 @@
 """Damage to valid inputs: bytes flipped, cut, repeated and swapped for what parsers trip over.
 
-A mutation depends on the generator alone, so a seed and the number of a case give back its bytes.
+A mutation depends on the generator alone, so a seed and the number of a case reproduce its bytes.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ VALUES: tuple[Any, ...] = (
     *("", "0", "nan", "..", "/", "/dev/null", "\0", "\ud800", "a" * 5000, ".", "../..", "~", "é", "\u202e"),
     *([], {}, [[]], [None], [[[]]], {"": None}, [1.0, 2.0], [True, False], ["a", "a"]),
 )
-"""What may stand anywhere in JSON."""
+"""What may be anywhere in JSON."""
 
 _NESTED = "nested lists"
 """Stands for lists nested deeper than the JSON module writes."""

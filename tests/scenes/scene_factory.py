@@ -1,4 +1,4 @@
-"""Tiny scene folders for tests: a matt ball at the origin, seen from a ring of cameras, written and then spoilt."""
+"""Tiny scene folders for tests: a matt ball at the origin, seen from a ring of cameras, written and then damaged."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FOCAL = 28.0
 
 @dataclass(frozen=True)
 class SceneFolder:
-    """A written scene and the means to spoil it."""
+    """A written scene and the means to damage it."""
 
     root: Path
 

@@ -1,4 +1,4 @@
-"""Packed coefficients give back what they were made of, whatever the axes before them."""
+"""Packed coefficients return what they were made of, whatever the axes before them."""
 
 import torch
 from hypothesis import given

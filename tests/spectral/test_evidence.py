@@ -1,4 +1,4 @@
-"""When alpha is believed, and what light says instead."""
+"""When alpha is trusted, and what light says instead."""
 
 import pytest
 import torch

@@ -63,7 +63,7 @@ def test_confidence_without_known_errors_is_the_margin():
 
 
 def test_confidence_rates_the_material_that_the_segmentation_names():
-    """By angle a ray can be of another material than that of its largest abundance, which then is no sign for it."""
+    """By angle a ray can be of another material than that of its largest abundance, which then is not a sign for it."""
     bright_and_dark = torch.tensor([[0.9, 0.1, 0.0, 0.0, 0.0], [0.0, 0.0, 0.01, 0.0, 0.0]])
     seen = shared([0.2, 0.8])
     by_abundance = materials(bright_and_dark)

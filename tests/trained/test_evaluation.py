@@ -150,7 +150,7 @@ def test_invalid_pixels_count_for_nothing(scene, view):
 
 
 def test_abundances_of_partly_covered_pixels_are_compared_as_shares(scene, view):
-    """Row 1 is half covered: composited abundances sum to 0.5 there, true ones to 1, and that is no error."""
+    """Row 1 is half covered: composited abundances sum to 0.5 there, true ones to 1, and that is not an error."""
     predicted = perfect(view, [0, 1, 2])
     assert float(predicted.abundances[1].sum(-1).max()) == pytest.approx(0.5)
     assert evaluated(scene, view, predicted, [0, 1, 2]).figures()["abundance_rmse"] == pytest.approx(

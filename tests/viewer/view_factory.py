@@ -97,7 +97,7 @@ def paint_layer(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -
 
 
 def some_pose(index: int = 0) -> ViewPose:
-    """Where one of the ring's cameras stands."""
+    """Where one of the ring's cameras is."""
     return pose_of(ring()[index])
 
 

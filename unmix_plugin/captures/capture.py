@@ -27,7 +27,7 @@ class CaptureView:
     labels: Path | None = None
     """True materials, if known."""
     alpha: SpectralFile | None = None
-    """Opacity in [0, 1], (H, W, 1), where it is no channel of the picture; the cube is multiplied by it."""
+    """Opacity in [0, 1], (H, W, 1), where it is not a channel of the picture; the cube is multiplied by it."""
     lens: Lens | None = None
     """Intrinsics that the camera itself writes; poses may bring better ones."""
     release: str = ""

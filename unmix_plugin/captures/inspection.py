@@ -88,7 +88,7 @@ def _poses_of(path: Path, refused: CaptureError | None) -> dict[str, Any]:
     """Number of cameras and notes of a file of poses.
 
     Raises:
-        CaptureError: it holds none, and is no image either: the more fitting of both reasons.
+        CaptureError: it holds none, and is not an image either: the more fitting of both reasons.
     """
     from unmix_plugin.captures.poses.reading import read_poses
 

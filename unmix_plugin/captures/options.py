@@ -25,7 +25,7 @@ class ProcessOptions:
     output_dir: Path
     """Folder to write the scene to; it appears when the scene is complete."""
     poses: str | None = None
-    """Where the cameras stood: a file or folder of another program (transforms.json, COLMAP, Metashape, ...), or
+    """Where the cameras were: a file or folder of another program (transforms.json, COLMAP, Metashape, ...), or
     `estimate` to find them from the images; without it, the poses of the layout."""
     wavelengths: str | None = None
     """Band centres in nm for files that don't name them: a CSV file with a column `wavelength`, or a list such as

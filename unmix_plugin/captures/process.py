@@ -70,7 +70,7 @@ def process_capture(options: ProcessOptions, say: Say, follow: Follow) -> list[s
 def _check(options: ProcessOptions) -> None:
     if options.layout not in LAYOUTS:
         raise ConfigError(
-            f"'{options.layout}' is no layout; expected one of {', '.join(LAYOUTS)}"
+            f"'{options.layout}' is not a layout; expected one of {', '.join(LAYOUTS)}"
             + did_you_mean(options.layout, LAYOUTS, form="; {}")
         )
     if options.white is not None and options.white_rectangle is not None:

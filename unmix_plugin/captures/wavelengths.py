@@ -18,7 +18,7 @@ def parse_wavelengths(text: str) -> Float64[np.ndarray, " B"]:
     A file may also hold one bare number a line, or one line of numbers.
 
     Raises:
-        ConfigError: no such file, no numbers, or numbers that are no wavelengths in nm.
+        ConfigError: no such file, no numbers, or numbers that are not wavelengths in nm.
     """
     words = text.split(",")
     if not all(map(_is_number, words)):
@@ -43,7 +43,7 @@ def in_ranges(text: str, wavelengths_nm: Float64[np.ndarray, " B"]) -> Bool[np.n
     """Which bands a text such as `1350-1450,1900` names; a single wavelength names the nearest band.
 
     Raises:
-        ConfigError: the text is no such list, or a part of it names no band.
+        ConfigError: the text is not such a list, or a part of it names no band.
 
     >>> in_ranges("500-600,700", np.array([450.0, 550.0, 650.0, 710.0]))
     array([False,  True, False,  True])
@@ -57,7 +57,7 @@ def in_ranges(text: str, wavelengths_nm: Float64[np.ndarray, " B"]) -> Bool[np.n
             ends = []
         if len(ends) not in (1, 2):
             raise ConfigError(
-                f"--drop-bands {text}: '{part}' is no wavelength or range; expected 1350-1450,1900"
+                f"--drop-bands {text}: '{part}' is not a wavelength or range; expected 1350-1450,1900"
             )
         if len(ends) == 1 and low <= ends[0] <= high:
             found = np.zeros(len(named), bool)

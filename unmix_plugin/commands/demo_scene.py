@@ -45,7 +45,7 @@ class DemoSceneOptions:
     """What lights the scene: a CIE illuminant (D50, D65, A, E, FL2, ...) or a .csv file (wavelength,power); D50, or A
     with --raw."""
     place: Literal["table", "world", "room"] = "table"
-    """What stands around the table: nothing, so that images have alpha; a ground that runs to the horizon under a sky;
+    """What is around the table: nothing, so that images have alpha; a ground that runs to the horizon under a sky;
     or a room with windows onto the same world, seen as by a phone held by hand."""
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Accept a folder that is not empty: a demo scene in it is replaced, other files stay."""
@@ -106,7 +106,7 @@ def _write_capture(options: DemoSceneOptions) -> None:
             ("view_000.hdr", "and .raw, the first view: counts, uint16, ENVI bil"),
             ("white.hdr", "white reference"),
             ("dark.hdr", "dark frame"),
-            (POSES, "where the cameras stood, to compare with poses that were estimated"),
+            (POSES, "where the cameras were, to compare with poses that were estimated"),
             ("truth", "true materials of each pixel and their reflectances, the lamp's spectrum"),
         ),
     )
@@ -117,7 +117,7 @@ def _write_capture(options: DemoSceneOptions) -> None:
 
 
 def _numbers(options: DemoSceneOptions, defaults: tuple[int, int, int]) -> tuple[int, ...]:
-    """Size, bands and views, as asked or else the defaults."""
+    """Size, bands and views, as asked, or the defaults."""
     asked = (options.size, options.bands, options.views)
     return tuple(default if value is None else value for value, default in zip(asked, defaults, strict=True))
 

@@ -87,7 +87,7 @@ def render(argv: list[str]) -> None:
         ConfigError: cameras, outputs or formats that are not there or don't fit each other, a recipe that is wrong or
             does not fit the run, files that would be overwritten, a method that does not unmix spectra, or a device
             that is not there.
-        SceneError: the environment map is missing, damaged or of no use.
+        SceneError: the environment map is missing, damaged or unusable.
         SpectrumError: a wavelength outside the bands, a light that is unknown, or a sensor that sees nothing in them.
     """
     options = tyro.cli(RenderOptions, prog="unmix-render", args=argv)

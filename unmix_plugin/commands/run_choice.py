@@ -13,7 +13,7 @@ from unmix_plugin.engine.runs.run_folder import newest_run
 
 
 def chosen_run(run: Path | None, output_dir: Path) -> Path:
-    """The run folder named, or else the newest under `output_dir`, which is then said.
+    """The run folder named, or the newest under `output_dir`, which is then printed.
 
     Raises:
         RunError: none was named and there is none.

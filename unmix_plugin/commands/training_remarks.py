@@ -11,10 +11,10 @@ from typing import Any
 _FEWEST_LINES = 8
 """Lines of metrics below which nothing is said."""
 _HARDLY_FELL = 0.6
-"""Loss in the last quarter of the training, over that in the first, from which on it hardly fell. Trainings that settle
+"""Loss in the last quarter of the training, over that in the first, above which it hardly fell. Trainings that settle
 stay below 0.35, also short ones."""
 _STILL_FALLS = 0.3
-"""Share by which the loss fell from the third to the last quarter, from which on more steps are worth while."""
+"""Share by which the loss fell from the third to the last quarter, above which more steps are worthwhile."""
 
 
 def read_remarks(metrics_path: Path) -> list[str]:

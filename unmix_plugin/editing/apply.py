@@ -72,7 +72,7 @@ def relight(scene: TrainedScene, light: Light) -> TrainedScene:
 
 
 def changes_geometry(recipe: Recipe) -> bool:
-    """Whether the edited scene has to be rendered anew; else coefficients of the unedited one serve with its
+    """Whether the edited scene has to be rendered again; otherwise coefficients of the unedited one serve with its
     materials."""
     return recipe.removes_parts or any(
         isinstance(one, Gloss) and one.endmember is not None for one in recipe.operations

@@ -50,7 +50,7 @@ def carry_out(recipe: Recipe, state: MaterialState) -> None:
     """Make all edits of a recipe, in order.
 
     Raises:
-        ConfigError: an edit can't be made, or contradicts another; the message says where it stands.
+        ConfigError: an edit can't be made, or contradicts another; the message says where it is.
     """
     for position, operation in enumerate(recipe.operations):
         where = recipe.where(position)

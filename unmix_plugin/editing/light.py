@@ -5,7 +5,7 @@ That is right if the recorded light has one spectrum everywhere; shadows, shadin
 that either light does not reach become 0: nothing is known of them.
 
 Brightness. The power of a new light is chosen so that a perfect white is as bright as before: as luminous if the bands
-see colours (CIE Y), else of the same mean radiance. So single bands may exceed 1, the full scale of the sensor.
+see colours (CIE Y), otherwise of the same mean radiance. So single bands may exceed 1, the full scale of the sensor.
 
 Notation: `B` bands.
 """

@@ -8,8 +8,8 @@ with M^T L (r + (r + f) d) = colour and bounds on the result, the one is taken w
 
 is least: it changes with wavelength as little as the colour allows, and fades far from where colour is seen. Asking
 for the colour that a surface has leaves its spectrum as it is. The equation is solved in least squares, with a large
-weight: exactly if the bounds allow it, else as nearly as they do. Channels count by the slope of the sRGB curve at the
-wanted colour, so that "near" is near on a display.
+weight: exactly if the bounds allow it, otherwise as nearly as they do. Channels count by the slope of the sRGB curve at
+the wanted colour, so that "near" is near on a display.
 """
 
 from __future__ import annotations

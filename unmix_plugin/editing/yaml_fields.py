@@ -30,7 +30,7 @@ MOST_ENDMEMBERS = 255
 
 
 def read_operation(node: yaml.Node, kind: type[Operation], folder: Path) -> Operation:
-    """An edit from what stands after its name.
+    """An edit from what follows its name.
 
     Raises:
         NodeError: it is not what the edit's fields ask for.
@@ -100,7 +100,7 @@ def written_fields(value: Any) -> dict[str, Any]:
 
 
 def written_operation(edit: Operation) -> Any:
-    """What stands after the name of an edit."""
+    """What follows the name of an edit."""
     found = written_fields(edit)
     if not edit.is_list:
         return found

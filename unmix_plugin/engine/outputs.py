@@ -47,7 +47,7 @@ def named_output(outputs: Iterable[AnyOutput], name: str) -> AnyOutput:
 
 
 def no_output(name: str, similar: Iterable[str], known: Collection[str]) -> ConfigError:
-    """The error that there is no output of that name; an argument after a colon is no part of what is looked for.
+    """The error that there is no output of that name; an argument after a colon is not part of what is looked for.
 
     Args:
         similar: Names of which some may have been meant.

@@ -1,4 +1,4 @@
-"""A colour for each material: its own where that can be told from the others, and else the nearest that can.
+"""A colour for each material: its own where that can be told from the others, otherwise the nearest that can.
 
 Notation: `K` materials, `N` colours; `lab` is CIE 1976 L*a*b* of sRGB colours under D65, in which equal distances look
 about equally different.

@@ -24,7 +24,7 @@ _LONGEST_CAPTION_PX = 240
 
 @dataclass(frozen=True)
 class CanvasLayout:
-    """Where tiles stand: in a grid, in columns that are wide enough for their names."""
+    """Where tiles are: in a grid, in columns that are wide enough for their names."""
 
     tile_size: tuple[int, int]
     """Width and height of a tile in pixels."""
@@ -82,7 +82,7 @@ class Canvas:
     ) -> None:
         """
         Args:
-            layout: Where tiles stand.
+            layout: Where tiles are.
             num_channels: 3 for colours, 4 with opacity.
             captions: One for each tile; none for one tile without a name.
             swatches: Colours of small squares before the captions; one for each, or none.

@@ -41,7 +41,7 @@ def write_obj(
         positions, normals: Of the vertices; unit normals.
         srgb: Colours of the vertices in [0, 1], which most viewers show; others show the materials.
         faces, materials: Indices of vertices, and the material of each face.
-        names, palette: Of the materials; in names what is no letter or digit becomes `_`; sRGB.
+        names, palette: Of the materials; in names what is not a letter or digit becomes `_`; sRGB.
         comments: First lines.
     """
     obj_path, library_path = obj_paths(path_without_suffix)

@@ -61,7 +61,7 @@ def read_ply_points(
     """Positions and, if there are any, colours of the vertices of a PLY, binary or text.
 
     Raises:
-        ValueError: it is no PLY, is cut short, or its vertices are no numbers x, y, z.
+        ValueError: it is not a PLY, is cut short, or its vertices are not numbers x, y, z.
         OSError: it can't be read.
     """
     data = path.read_bytes()
@@ -79,7 +79,7 @@ def read_ply_points(
     stop = elements[1] if len(elements) > 1 else len(lines)
     named = [line for line in lines[elements[0] + 1 : stop] if line[:1] == ["property"]]
     if any(len(line) != 3 or line[1] not in _READ_TYPES for line in named):
-        raise ValueError("a vertex has properties that are no plain numbers")
+        raise ValueError("a vertex has properties that are not plain numbers")
     names = [line[2] for line in named]
     if not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
         raise ValueError("vertices have no x, y, z")

@@ -53,7 +53,7 @@ def material_family(name: MaterialName, endmembers: Float[Tensor, "K B"] | None 
 
 
 def plain_parameters(family: MaterialFamily) -> Float[Tensor, "P"]:
-    """Parameters of a rough grey surface that is no metal and has no layers: where a fit without a prior starts.
+    """Parameters of a rough grey surface that is not metal and has no layers: where a fit without a prior starts.
 
     From the middle of all parameters, which is half a metal, a fit puts the colours of what is diffuse into what the
     metal reflects.

@@ -46,7 +46,7 @@ from unmix_plugin.neumatex.traced_object import SeenPoints, TracedObject, Traced
 from unmix_plugin.neumatex.triplane import Triplane
 
 _START_SEED = 0
-"""Of networks and planes before training; the run's own seed draws all else."""
+"""Of networks and planes before training; the run's own seed draws everything else."""
 
 
 class NeumatexModel(Model):

@@ -39,7 +39,7 @@ class NeumatexModelConfig(ModelConfig):
     metallicity), or for pictures of many bands spectral (a mixture of endmember reflectances under a grey gloss)."""
     num_endmembers: Annotated[int | Auto | None, Common] = None
     """Of spectral materials: K, how many reflectances are mixed; auto proposes it from the training pixels. None is the
-    number of --pipeline.model.from-run, else 6, or the number of bands if that is smaller."""
+    number of --pipeline.model.from-run, otherwise 6, or the number of bands if that is smaller."""
     endmember_init: EndmemberMethod = "pairs"
     """Of spectral materials: first guess of the endmembers, from the pixels divided by the light that reaches them."""
     from_run: Annotated[Path | None, Common] = None
@@ -97,7 +97,7 @@ class NeumatexModelConfig(ModelConfig):
 
         Raises:
             SpectrumError: no pixel is neither dark nor saturated.
-            ConfigError, RunError: the run to start from is of no use.
+            ConfigError, RunError: the run to start from is unusable.
         """
         if self.material != "spectral" or isinstance(self.num_endmembers, int):
             return self, ""

@@ -79,7 +79,8 @@ def object_outputs(family: MaterialFamily, has_variance: bool) -> tuple[Output, 
 def view_outputs(
     scene: TrainedObject, camera: Cameras, hits: PixelHits, light: Float[Tensor, "K C"]
 ) -> dict[str, Tensor]:
-    """All outputs of a view, (H, W, ...); colours are on black, all else is a mean over what is seen in a pixel."""
+    """All outputs of a view, (H, W, ...); colours are on black, everything else is a mean over what is seen in a
+    pixel."""
     alpha = hits.alpha()
     positions = hits.points.positions
     parameters = _in_chunks(scene.surface.parameters, positions, scene.surface.family.num_parameters)

@@ -67,7 +67,7 @@ def resolved_num_endmembers(
 
     Raises:
         SpectrumError: no pixel is neither dark nor saturated.
-        ConfigError, RunError: the run to start from is of no use.
+        ConfigError, RunError: the run to start from is unusable.
     """
     if "lamp" not in arrays:  # pictures in colours, which the model refuses
         return _USUAL_ENDMEMBERS, ""
@@ -96,7 +96,7 @@ def start_spectral(
 
     Raises:
         SpectrumError: the pixels don't allow so many endmembers.
-        ConfigError, RunError: the run to start from is of no use.
+        ConfigError, RunError: the run to start from is unusable.
     """
     assert model.endmembers is not None
     found = _seen_pixels(model, arrays)

@@ -105,7 +105,7 @@ class TrainedObject:
 
         Raises:
             ConfigError: there is no such light.
-            SceneError: the file of an environment map is missing, damaged or of no use.
+            SceneError: the file of an environment map is missing, damaged or unusable.
         """
         own = self.own_light or self.environment
         light = own if choice.name in (None, OWN_LIGHT) else self._named_light(str(choice.name))

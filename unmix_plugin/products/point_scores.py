@@ -89,7 +89,8 @@ def _plain(output: str) -> str:
 
 
 def _property_name(output: str, taken: Sequence[str]) -> str:
-    """`index_ndvi` of a named index; else the kind and the least number that is free: formats know few characters."""
+    """`index_ndvi` of a named index; otherwise the kind and the least number that is free: formats know few
+    characters."""
     kind, _, argument = output.partition(":")
     if kind == "index" and argument in NAMED_INDICES:
         return f"index_{argument.replace('-', '_')}"

@@ -67,7 +67,7 @@ class Spectrum(Product):
             job.claim(spectrum_paths(job.folder, name))
             place = self._pixel(job, view, pixel)
         else:
-            raise ConfigError("give a pixel with --view and --pixel, or else a point with --point")
+            raise ConfigError("give a pixel with --view and --pixel, or a point with --point")
         return write_spectrum(job.folder, name, place, job.materials)
 
     def _pixel(self, job: Job, view: RunView, pixel: tuple[int, int]) -> ProbedPlace:

@@ -2,7 +2,7 @@
 
 A kernel's first three parameters are `first`, `end` and `stride`: thread i works on the items `first + i`,
 `first + i + stride`, ... below `end`. On CUDA the whole range is one launch on torch's current stream, where each item
-has a thread. On a CPU a Warp launch is one loop that enters the kernel anew for each of Warp's threads; so there the
+has a thread. On a CPU a Warp launch is one loop that enters the kernel again for each of Warp's threads; so there the
 range is cut into parts, each a launch of one thread that walks its items itself, which lets the compiler take out of
 the loop what they share. Launches release the interpreter lock and parts run on a thread pool; two parts must not write
 to the same address, which is why a caller may say where the range is cut.

@@ -25,7 +25,7 @@ _LIT_BEST = 0.9
 
 
 class AlphaEvidence:
-    """Where alpha is to be believed, and what may show something."""
+    """Where alpha can be trusted, and what may show something."""
 
     def __init__(self, table: PixelTable, has_alpha: bool) -> None:
         """Judge the background of each sensor; without alpha nothing contradicts anything."""
@@ -33,7 +33,7 @@ class AlphaEvidence:
         self._levels = {block.sensor: _level(block) if has_alpha else None for block in self._blocks}
 
     def trust(self, pixels: DrawnPixels) -> Float[Tensor, " R"]:
-        """How far the alpha of drawn pixels is to be believed, 0 or 1."""
+        """How far the alpha of drawn pixels can be trusted, 0 or 1."""
         return alpha_trust(pixels.spectra, pixels.alpha, self._levels[pixels.sensor])
 
     def foreground(self) -> list[Bool[np.ndarray, "_ _"]]:

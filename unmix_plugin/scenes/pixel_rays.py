@@ -35,7 +35,7 @@ class PixelRays:
         """Of each sensor, the edge of a pixel where it looks at the middle of the scene box, median over its views."""
         centre = self._scene.scene_box.aabb.mean(dim=0)
         distances = (self._cameras.camera_to_world[:, :, 3] - centre).norm(dim=-1)
-        if self._scene.is_unbounded:  # cameras may stand in the middle of what they see
+        if self._scene.is_unbounded:  # cameras may be in the middle of what they see
             distances = distances.clamp(min=float(self._scene.scene_box.size.max()) / 2)
         edges = distances / self._cameras.focal_px.mean(dim=-1)
         sensors = torch.tensor([self._scene.frames[view].sensor for view in self._scene.train_indices])

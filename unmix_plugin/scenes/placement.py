@@ -52,7 +52,7 @@ class Placement:
         return not moves and self.scale == 1.0 and np.array_equal(self.rotation, np.eye(3))
 
     def to_json(self) -> dict[str, Any]:
-        """Keys of transforms.json; `read_placement` gives back the same value."""
+        """Keys of transforms.json; `read_placement` restores the same value."""
         return {
             TRANSFORM_KEY: np.column_stack([self.rotation, self.translation]).tolist(),
             SCALE_KEY: self.scale,

@@ -45,7 +45,7 @@ class SceneOptions:
     """With an interval split every n-th frame, from the first on, is for evaluation."""
     world: Annotated[Literal["bounded", "unbounded", "auto"], Common, short("world")] = "auto"
     """Whether all that pictures show lies in a box, or goes on behind it as far as the sky. Auto is bounded where
-    pictures have alpha; else it is unbounded if views agree on places outside of the box."""
+    pictures have alpha; otherwise it is unbounded if views agree on places outside of the box."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class Normalisation:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """Numbers and lists; `from_json` gives back the same bits."""
+        """Numbers and lists; `from_json` restores the same bits."""
         return {
             "rotation": self.rotation.tolist(),
             "translation": self.translation.tolist(),

@@ -39,7 +39,7 @@ def deviations(spectra: Float[Tensor, "*pixels B"]) -> Float[Tensor, "*pixels B"
 
 
 def deviation_limits(pixels: Float[Tensor, "N B"]) -> Float[Tensor, "B"]:
-    """Deviations from which on a value may be bad.
+    """Deviations from which a value may be bad.
 
     Args:
         pixels: Spectra of the scene, background left out; at least one.

@@ -19,13 +19,13 @@ from unmix_plugin.spectral.evidence import brightness
 from unmix_plugin.spectral.unmixing.num_materials import estimate_noise
 
 FEWEST_BANDS, PIXELS_PER_BAND = 8, 10
-"""From which on, and from how many pixels for each, noise is told from spectra."""
+"""Least number of bands, and of pixels for each, from which noise is told from spectra."""
 PLAIN_FACTOR = 3.0
 """Noise up to this multiple of the usual band's weighs nothing down."""
 PLAIN_NOISE = 0.02
 """Share of the median brightness up to which a band counts as clean, whatever the others are."""
 NOISE_SHARE = 0.7
-"""Standard deviation of noise, as a share of the band's own, from which on a band is mostly noise."""
+"""Standard deviation of noise, as a share of the band's own, above which a band is mostly noise."""
 DEAD_SPREAD, LEAST_WEIGHT = 1e-5, 1e-4
 """Standard deviation up to which a band shows one value everywhere; and its weight, before weights are scaled."""
 _SIGMA_OF_MAD = 1.4826

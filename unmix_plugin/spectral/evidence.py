@@ -1,7 +1,7 @@
 """What a measured pixel is evidence of: how bright it is, and whether there is anything at all.
 
 Alpha is evidence, not law: masks err by a pixel along edges, have holes and specks. Light is evidence too. Where the
-two contradict each other, alpha is not believed, and only light counts.
+two contradict each other, alpha is not trusted, and only light counts.
 
 Notation: `R` pixels, `B` bands; spectra are on black, premultiplied by alpha. The brightness of a pixel is the root
 mean square of its spectrum.
@@ -16,7 +16,7 @@ from torch import Tensor
 _TRANSPARENT = 0.5 / 255
 """Largest alpha of a pixel that shows nothing."""
 BLOWN_OUT = 0.9
-"""Value from which on a band counts as saturated."""
+"""Value from which a band counts as saturated."""
 _SIGMAS = 6.0
 """Standard deviations of the background's noise above its median that still count as background."""
 _SIGMA_OF_MAD = 1.4826
@@ -25,7 +25,7 @@ _DARK_SHARE = 0.5
 _FAINTEST_SURPLUS = 0.02
 """Brightness beyond what alpha allows that contradicts it: alpha is rounded, and edges are filtered."""
 _PLAIN_BRIGHTNESS = 0.2
-"""Median brightness of opaque pixels from which on a scene counts as well exposed."""
+"""Median brightness of opaque pixels from which a scene counts as well exposed."""
 _LARGEST_EXPOSURE = 100.0
 
 
@@ -45,7 +45,7 @@ def is_blown_out(spectra: Float[Tensor, "*pixels B"]) -> Bool[Tensor, "*pixels"]
 def background_level(spectra: Float[Tensor, "R B"], alpha: Float[Tensor, "R"]) -> float | None:
     """Brightness up to which a pixel can't be told from the background.
 
-    0 where the background is black; None where it is unknown, or as bright as what stands before it.
+    0 where the background is black; None where it is unknown, or as bright as what is in front of it.
     """
     seen, is_background = brightness(spectra), alpha <= _TRANSPARENT
     background, matter = seen[is_background], seen[~is_background]
@@ -60,7 +60,7 @@ def background_level(spectra: Float[Tensor, "R B"], alpha: Float[Tensor, "R"]) -
 def alpha_trust(
     spectra: Float[Tensor, "R B"], alpha: Float[Tensor, "R"], background: float | None
 ) -> Float[Tensor, "R"]:
-    """How far alpha is to be believed, 0 or 1.
+    """How far alpha can be trusted, 0 or 1.
 
     Not where a pixel sends more light than its alpha lets through, nor where alpha says that something is there and
     the light can't be told from the background's.
@@ -80,7 +80,7 @@ def alpha_trust(
 def may_show_matter(
     spectra: Float[Tensor, "R B"], alpha: Float[Tensor, "R"], background: float | None
 ) -> Bool[Tensor, "R"]:
-    """Pixels that may show something: by alpha where it is trusted, else by their light. Arguments as above."""
+    """Pixels that may show something: by alpha where it is trusted, otherwise by their light. Arguments as above."""
     is_trusted = alpha_trust(spectra, alpha, background) > 0
     return torch.where(is_trusted, alpha > 0, brightness(spectra) > (background or 0.0))
 

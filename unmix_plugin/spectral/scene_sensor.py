@@ -61,7 +61,7 @@ class SceneSensor:
         return near / near.sum(axis=0)
 
     def to_json(self) -> dict[str, Any]:
-        """Name, and bands or responses; `from_json` gives back the same bits."""
+        """Name, and bands or responses; `from_json` restores the same bits."""
         if self.bands is not None:
             return {"name": self.name, "bands": list(self.bands)}
         return {"name": self.name, "responses": self.matrix.tolist()}

@@ -13,7 +13,7 @@ from unmix_plugin.trained.protocol import RenderableScene
 
 @dataclass(frozen=True)
 class LightChoice:
-    """A light from far away, and how it stands."""
+    """A light from far away, and how it is turned."""
 
     name: str | None = None
     """One of a scene's `lights`, or the path of an environment map; None: the light of its pictures."""
@@ -37,7 +37,7 @@ class RelightableScene(RenderableScene, Protocol):
 
         Raises:
             ConfigError: there is no such light.
-            SceneError: the file of an environment map is missing, damaged or of no use.
+            SceneError: the file of an environment map is missing, damaged or unusable.
         """
         ...
 
@@ -61,7 +61,7 @@ def relit(scene: RenderableScene, choice: LightChoice, method_name: str) -> Reli
 
     Raises:
         ConfigError: its method knows no light from far away, or there is no such light.
-        SceneError: the file of an environment map is missing, damaged or of no use.
+        SceneError: the file of an environment map is missing, damaged or unusable.
     """
     if not isinstance(scene, RelightableScene):
         raise ConfigError(

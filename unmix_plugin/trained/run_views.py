@@ -41,7 +41,7 @@ def recorded_views(record: SceneRecord) -> tuple[RunView, ...]:
 
 
 def find_view(numbered: Sequence[RunView], wanted: str, others: Sequence[RunView] = ()) -> RunView:
-    """A view by its name, or else by its number from 0 in `numbered`; `others` can be had by name only.
+    """A view by its name, or by its number from 0 in `numbered`; `others` can be had by name only.
 
     Raises:
         ConfigError: there is none.

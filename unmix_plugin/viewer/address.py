@@ -20,7 +20,7 @@ def free_port(host: str, port: int) -> int:
     """The port, or the next free one after it; for 0 any free one.
 
     Raises:
-        ConfigError: the host is no address of this machine, or no port near is free.
+        ConfigError: the host is not an address of this machine, or no port near is free.
     """
     for candidate in range(port, min(port + _PORTS_TRIED, 65536)):
         found = _bound_port(host, candidate)

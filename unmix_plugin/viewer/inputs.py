@@ -18,7 +18,7 @@ _ChoiceT = TypeVar("_ChoiceT")
 
 
 def number(value: Any, low: float | int, high: float | int, fallback: float | int) -> float:
-    """A number within [low, high]; `fallback` for what is no number or not finite.
+    """A number within [low, high]; `fallback` for what is not a number or not finite.
 
     >>> number(7, 0, 5, fallback=1), number("x", 0, 5, fallback=1), number(float("nan"), 0, 5, fallback=1)
     (5.0, 1.0, 1.0)
@@ -31,7 +31,7 @@ def number(value: Any, low: float | int, high: float | int, fallback: float | in
 
 
 def choice(value: Any, known: Collection[_ChoiceT], fallback: _ChoiceT) -> _ChoiceT:
-    """The value if it is one of `known`, else `fallback`."""
+    """The value if it is one of `known`, otherwise `fallback`."""
     return next((one for one in known if type(one) is type(value) and one == value), fallback)
 
 
@@ -48,7 +48,7 @@ def index_in(menu: Any) -> int:
 
 
 def text(value: Any) -> str:
-    """What was typed, cut to `LONGEST_TEXT`; empty for what is no text."""
+    """What was typed, cut to `LONGEST_TEXT`; empty for what is not text."""
     return value[:LONGEST_TEXT] if isinstance(value, str) else ""
 
 

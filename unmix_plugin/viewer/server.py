@@ -59,7 +59,7 @@ class Viewer:
             recipe: Edits that every page starts with.
         Raises:
             ConfigError: the recipe does not fit the run, or environments were given and its method has none.
-            SceneError: an environment map is missing, damaged or of no use.
+            SceneError: an environment map is missing, damaged or unusable.
         """
         self._options = options
         self._say = say
@@ -80,9 +80,9 @@ class Viewer:
         """Listen, and say where.
 
         Raises:
-            ConfigError: the host is no address of this machine, or no port near is free.
+            ConfigError: the host is not an address of this machine, or no port near is free.
         """
-        # A page that is closed while it is being sent something is no reason to print anything.
+        # A page that is closed while it is being sent something is not a reason to print anything.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         port = free_port(self._options.host, self._options.port)
         self._server = open_server(self._options.host, port)

@@ -65,7 +65,7 @@ class Services:
             environments: Files of lights to offer beside those that the scene knows.
         Raises:
             ConfigError: the recipe does not fit the run, or its method has no environments.
-            SceneError: an environment map is missing, damaged or of no use.
+            SceneError: an environment map is missing, damaged or unusable.
         """
         self.source = source
         self.views = recorded_views(source.record)

@@ -44,7 +44,7 @@ def view_at(
     """A view of the ball.
 
     Args:
-        light: Where the lamp stands; None is at the camera.
+        light: Where the lamp is; None is at the camera.
         gain: On the brightness of the picture.
         facts: Of its record.
     """

@@ -30,7 +30,7 @@ EXIF = {
 
 @dataclass(frozen=True)
 class LensOfRig:
-    """One lens: its band, how it is turned (degrees) and where it stands (m) on the rig, and its calibration."""
+    """One lens: its band, how it is turned (degrees) and where it is on the rig (m), and its calibration."""
 
     ending: str
     name: str

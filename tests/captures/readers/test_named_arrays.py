@@ -117,7 +117,7 @@ def test_lists_of_pixels_are_images_once_their_size_is_known(tmp_path):
     options = ReadOptions(dataset="Y", size=(8, 9))
     file = open_spectral_file(tmp_path / "a.mat", options)
     np.testing.assert_array_equal(file.read(slice(2, 5), slice(1, 4)), CUBE[2:5, :, 1:4])
-    with pytest.raises(CaptureError, match=r"Y \(5, 72\) is no list of 70 pixels"):
+    with pytest.raises(CaptureError, match=r"Y \(5, 72\) is not a list of 70 pixels"):
         open_spectral_file(tmp_path / "a.mat", ReadOptions(dataset="Y", size=(7, 10)))
     scipy.io.savemat(tmp_path / "b.mat", {"Y": listed, "nRow": 8, "nCol": 9, "nBand": 5})
     np.testing.assert_array_equal(open_spectral_file(tmp_path / "b.mat").read(), CUBE)

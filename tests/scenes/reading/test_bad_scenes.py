@@ -122,7 +122,7 @@ def test_clipping_leaves_out_what_is_no_number(folder):
 
 def test_a_cube_that_is_mostly_negative_is_not_clipped(folder):
     folder.edit_cube(2, lambda cube: cube - 1)
-    assert "values far below 0, which is no noise" in fault_of(folder, invalid_pixels="clip")
+    assert "values far below 0, which is not noise" in fault_of(folder, invalid_pixels="clip")
 
 
 @pytest.mark.parametrize(

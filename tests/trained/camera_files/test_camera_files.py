@@ -110,7 +110,7 @@ BAD = {
     "blank": (" \n", "is empty"),
     "cut short": ('{"frames": [', "is not valid JSON .* at line 1"),
     "no object": ("[1, 2]", "holds a list of 2; expected an object with cameras"),
-    "something else": ({"wavelengths": [1]}, "is no camera file: .* found the keys wavelengths"),
+    "something else": ({"wavelengths": [1]}, "is not a camera file: .* found the keys wavelengths"),
     "newer": (frames(format_version=2), "has format_version 2; this version reads 1"),
     "version of no kind": (frames(format_version="x"), 'has format_version "x"'),
     "no cameras": (nerfstudio(camera_path=[]), "'camera_path' is empty; expected at least one camera"),

@@ -19,7 +19,7 @@ class FixedSpeed(Speedometer):
 
 
 def make_loop(source, slow_speed=None):
-    """A loop that waits to be driven; with `slow_speed` it believes to be so slow that moving pictures are small."""
+    """A loop that waits to be driven; `slow_speed` is a speed at which moving pictures are small."""
     with source.borrowed() as scene:
         channels = num_channels(scene.materials)
     maker = PictureMaker(source, SceneAids(source, has_materials=True), channels)

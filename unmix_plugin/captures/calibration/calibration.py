@@ -56,8 +56,8 @@ class Calibration:
     gain: float = 1.0
     """Factor on all values, such as one over the scale factor of the files."""
     exposure: float | None = None
-    """Exposure time times gain that values are brought to: that of the white reference, else of the first view; None
-    where the files are silent."""
+    """Exposure time times gain that values are brought to: that of the white reference, otherwise of the first view;
+    None where the files are silent."""
 
     @property
     def num_bands(self) -> int:

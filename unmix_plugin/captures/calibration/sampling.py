@@ -22,7 +22,7 @@ MOST_PIXELS = 20000
 """Of all views together."""
 DETECTOR_BITS = (8, 10, 12, 14, 16)
 LEAST_AT_TOP = 10
-"""Values that must stand at the greatest one before it counts as the detector's end."""
+"""Values that must equal the greatest one before it counts as the detector's end."""
 CROWDING = 20.0
 """Values at the greatest one, against the mean number at each value a little below it."""
 
@@ -52,7 +52,7 @@ def find_saturation(files: Sequence[SpectralFile], bands: np.ndarray) -> tuple[f
 
     Args:
         files: Of the views of one sensor.
-        bands: Indices of bands that may be of use; those with one value in all sampled pixels are left out here.
+        bands: Indices of bands that may be usable; those with one value in all sampled pixels are left out here.
     """
     dtype = files[0].dtype
     if dtype.kind not in "iu" or dtype.itemsize > 2:

@@ -1,4 +1,4 @@
-"""Where the cameras stand: how many there are, from which sides they look, and whether neighbours see the same."""
+"""Where the cameras are: how many there are, from which sides they look, and whether neighbours see the same."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from unmix_plugin.captures.poses.alignment import focus_of
 
 FEW_VIEWS = 15
 NARROW_DEG = 12.0
-"""Cameras that all stand within this range of elevation see the object from one height only."""
+"""Cameras that are all within this range of elevation see the object from one height only."""
 WIDE_RING_DEG = 180.0
 """Part of a circle from which a ring counts as one."""
 GAP_DEG = 75.0
@@ -48,7 +48,7 @@ def ring(views: Sequence[SeenView]) -> tuple[list[str], str]:
     findings = []
     if height < NARROW_DEG and around > WIDE_RING_DEG:
         findings.append(
-            f"a narrow ring: all cameras stand within {height:.0f} degrees of elevation, so that what is seen from "
+            f"a narrow ring: all cameras are within {height:.0f} degrees of elevation, so that what is seen from "
             "above or below is a guess; add a second ring 25 degrees higher"
         )
     if around > WIDE_RING_DEG and gap > GAP_DEG:

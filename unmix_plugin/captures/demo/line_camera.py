@@ -33,7 +33,7 @@ BAD_NOISE = 0.5
 
 @dataclass(frozen=True)
 class BadBands:
-    """Bands that measure nothing of use, by index, and whether the instrument marks them."""
+    """Bands that measure nothing usable, by index, and whether the instrument marks them."""
 
     noisy_marked: int
     dead_marked: int

@@ -45,7 +45,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class FrameList:
-    """All frames of a folder, and what stands above them."""
+    """All frames of a folder, and what is given for all of them."""
 
     source: Path
     """transforms.json, or the folder that holds one for each split."""
@@ -94,7 +94,7 @@ def _checked(listed: Any, path: Path) -> list[dict[str, Any]]:
 
 
 def _split_by_lists(frames: tuple[Frame, ...], top: dict[str, Any]) -> tuple[Frame, ...]:
-    """Splits from `train_filenames` and the like: evaluation is test if there is any, else validation."""
+    """Splits from `train_filenames` and the like: evaluation is test if there is any, otherwise validation."""
     lists = {
         name: {
             text.removeprefix("./") for text in top.get(f"{name}_filenames") or [] if isinstance(text, str)

@@ -27,7 +27,7 @@ class LayoutOptions:
     axes: Axes | None = None
     """Order of the axes in files that don't fix it."""
     exclude: tuple[Path, ...] = ()
-    """Files in the folder that are no views, such as dark and white references."""
+    """Files in the folder that are not views, such as dark and white references."""
 
     @property
     def read(self) -> ReadOptions:

@@ -4,8 +4,9 @@
     IMG_170101_101010_0000_GRE.TIF, RED, REG, NIR (and RGB.JPG)  Parrot Sequoia
     DJI_20230101_0001_MS_G.TIF ... or DJI_0011.TIF ...           DJI
 
-Every file is a view, with the lens as its sensor. Files of one release share an identifier in their XMP, else their
-name up to the band. Pictures in colour are left out, as nothing says what their channels measure; so are thermal bands.
+Every file is a view, with the lens as its sensor. Files of one release share an identifier in their XMP, otherwise
+their name up to the band. Pictures in colour are left out, as nothing says what their channels measure; so are thermal
+bands.
 """
 
 from __future__ import annotations

@@ -54,7 +54,7 @@ def open_band_file(path: Path, root: Path) -> BandFile:
 
 
 def sensor_names(bands: Sequence[BandFile]) -> list[str]:
-    """Names of the lenses: the band's, with the index in the rig where several share it; else the file's ending."""
+    """Names of the lenses: the band's, with the index in the rig where several share it; or the file's ending."""
     titles = [tag_text(item.tags, "BandName") or item.ending or "band" for item in bands]
     slugs = [re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-") or "band" for title in titles]
     indices = [tag_text(item.tags, "RigCameraIndex") or item.ending for item in bands]

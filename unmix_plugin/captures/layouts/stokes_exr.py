@@ -40,7 +40,7 @@ def open_opacity(path: Path) -> SpectralFile | None:
 
 
 def intensity_channel(names: Sequence[str]) -> str | None:
-    """The channel with s0, by its name, else by the number of channels.
+    """The channel with s0, by its name, otherwise by the number of channels.
 
     >>> intensity_channel(["A", "s0", "s1", "s2", "s3"])
     's0'
@@ -54,7 +54,7 @@ def intensity_channel(names: Sequence[str]) -> str | None:
 
 
 def opacity_channel(names: Sequence[str]) -> str | None:
-    """The alpha channel: by its name, else the fifth of five.
+    """The alpha channel: by its name, otherwise the fifth of five.
 
     >>> opacity_channel(["s0", "s1", "s2", "s3", "w"])
     'w'

@@ -1,8 +1,8 @@
 """Layouts `unmix-nerf` and `hs-nerf`: transforms.json of nerfstudio's form with `hyperspectral_file_path`.
 
 UnMix-NeRF names .npy cubes, wavelengths and labels, HS-NeRF .pt tensors of 8 bits without wavelengths. Splits are
-lists in the file, else the folder of a frame's file: `train` against `eval`, `val` or `test`. Paths with `val` whose
-files lie in `eval`, as UnMix-NeRF's converter leaves them, are followed there.
+lists in the file, otherwise the folder of a frame's file: `train` against `eval`, `val` or `test`. Paths with `val`
+whose files lie in `eval`, as UnMix-NeRF's converter leaves them, are followed there.
 """
 
 from __future__ import annotations

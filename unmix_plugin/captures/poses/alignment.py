@@ -127,7 +127,7 @@ def focus_of(poses: Float64[np.ndarray, "N 3 4"]) -> Float64[np.ndarray, "3"] | 
 
 
 def _extent(cameras: Sequence[PosedCamera]) -> float:
-    """Mean distance of cameras from their middle; 1 where they stand at one place."""
+    """Mean distance of cameras from their middle; 1 where they are at one place."""
     positions = np.stack([camera.camera_to_world[:, 3] for camera in cameras])
     return float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).mean()) or 1.0
 

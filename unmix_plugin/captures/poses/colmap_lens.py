@@ -1,4 +1,4 @@
-"""Camera models of COLMAP as our lens: exactly where they are of its kind, else the nearest one."""
+"""Camera models of COLMAP as our lens: exactly where they are of its kind, otherwise the nearest one."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
     """Cameras by their number.
 
     Raises:
-        CaptureError: a line is no camera.
+        CaptureError: a line is not a camera.
     """
 
     def parse(line: str) -> tuple[int, ColmapCamera]:
@@ -38,7 +38,7 @@ def read_images(path: Path) -> list[ColmapImage]:
     """Images with their poses; every second line, where points were seen, is passed over.
 
     Raises:
-        CaptureError: a line is no image.
+        CaptureError: a line is not an image.
     """
 
     def parse(line: str) -> ColmapImage:
@@ -60,7 +60,7 @@ def read_points(path: Path) -> SparsePoints:
     """Sparse points with their colours.
 
     Raises:
-        CaptureError: a line is no point.
+        CaptureError: a line is not a point.
     """
 
     def parse(line: str) -> tuple[list[float], list[int]]:

@@ -103,7 +103,7 @@ def _write_pictures(folder: Path, pictures: Mapping[str, UInt8[np.ndarray, "..."
 
 
 def _run(settings: SfmSettings, folder: Path) -> list[dict]:
-    """Start the process that reconstructs, its chatter in the log file."""
+    """Start the process that reconstructs, with its output in the log file."""
     result = folder / "result.json"
     result.unlink(missing_ok=True)
     command = [sys.executable, "-m", "unmix_plugin.captures.poses.sfm_process", str(write_settings(settings))]

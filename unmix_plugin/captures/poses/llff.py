@@ -21,7 +21,7 @@ def read_llff(path: Path) -> PoseSet:
     """Poses in the order of the file, with the names of the pictures beside it where there are as many.
 
     Raises:
-        CaptureError: it is no array of the right shape, or a size or focal length makes no sense.
+        CaptureError: it is not an array of the right shape, or a size or focal length makes no sense.
     """
     try:
         shape = read_array_header(path).shape

@@ -166,6 +166,6 @@ def _file_name(name: str) -> str:
 
 
 def _stem(name: str) -> str:
-    """File name without its suffix; a dot before digits is no suffix, as in `view.0001`."""
+    """File name without its suffix; a dot before digits is not a suffix, as in `view.0001`."""
     path = _path(name)
     return path.name if path.suffix[1:].isdecimal() else path.stem

@@ -22,7 +22,7 @@ def metashape_lens(sensor: ElementTree.Element, where: str) -> tuple[Lens | None
     """The lens of a sensor, None without any focal length; and what is not exactly as in the file.
 
     Raises:
-        CaptureError: it is no frame or fisheye camera, or the nearest lens is off by more than half a pixel.
+        CaptureError: it is not a frame or fisheye camera, or the nearest lens is off by more than half a pixel.
     """
     name = sensor.get("label", "?")
     where = f"{where}: sensor {name}"
@@ -65,7 +65,7 @@ def metashape_lens(sensor: ElementTree.Element, where: str) -> tuple[Lens | None
 def _calibration(
     sensor: ElementTree.Element, where: str
 ) -> tuple[ElementTree.Element | None, tuple[int, int]]:
-    """The adjusted calibration, else the first one, and the size of the picture."""
+    """The adjusted calibration, otherwise the first one, and the size of the picture."""
     found = sorted(sensor.findall("calibration"), key=lambda one: one.get("class") != "adjusted")
     calibration = found[0] if found else None
     for owner in (calibration, sensor):

@@ -24,7 +24,7 @@ CONVENTION = "eConvApero_DistM2C"
 
 
 def find_orientations(folder: Path) -> list[Path]:
-    """Orientation files of a folder, else of the only folder `Ori-...` in it."""
+    """Orientation files of a folder, otherwise of the only folder `Ori-...` in it."""
     own = sorted(folder.glob(f"{PREFIX}*.xml"))
     below = [sorted(place.glob(f"{PREFIX}*.xml")) for place in sorted(folder.glob("Ori-*"))]
     below = [files for files in below if files]

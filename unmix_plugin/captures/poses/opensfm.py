@@ -65,7 +65,7 @@ def read_opensfm(path: Path, content: Any) -> PoseSet:
 def _world_to_camera(
     content: dict[str, Any], name: str, shot: Any, where: str
 ) -> Float64[np.ndarray, "3 4"] | None:
-    """The shot's own pose, else that of its rig: first into the rig, then into its camera. None without either."""
+    """The shot's own pose, otherwise that of its rig: first into the rig, then into its camera. None without either."""
     if not isinstance(shot, dict):
         raise CaptureError(
             f"{where} is {describe(shot)}; expected an object with 'rotation' and 'translation'"

@@ -1,4 +1,4 @@
-"""Where a scene stands: +z up, its middle in the origin, its cameras at most 1 away; recorded to be undone."""
+"""Where a scene is placed: +z up, its middle in the origin, its cameras at most 1 away; recorded to be undone."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class PlacedPoses:
 def place_poses(poses: PoseSet) -> PlacedPoses:
     """Settle up axis, middle and scale of a scene.
 
-    The up axis is the source's where it has one, else the direction across which the cameras' horizontal axes lie,
-    else the mean of their up vectors. The middle is where the cameras look, else that of the sparse points.
+    The up axis is the source's where it has one, otherwise the direction across which the cameras' horizontal axes lie,
+    or the mean of their up vectors. The middle is where the cameras look, or that of the sparse points.
     """
     stacked = np.stack([camera.camera_to_world for camera in poses.cameras.values()])
     up, how_up = _find_up(stacked, poses.up)

@@ -13,7 +13,7 @@ from unmix_plugin.captures.poses.rigid import make_rigid, name_some
 from unmix_plugin.errors import CaptureError
 
 FAR = 100.0
-"""Cameras that stand further from the origin than so many times their spread are geo-referenced."""
+"""Cameras further from the origin than this many times their spread are geo-referenced."""
 FAR_ALONE = 1e4
 """The same for one camera, in units of the source."""
 
@@ -51,7 +51,7 @@ def make_pose_set(
         where: The file, for messages.
         up: Against gravity, in the source's coordinates.
     Raises:
-        CaptureError: a name twice with different poses, or a matrix is no pose.
+        CaptureError: a name twice with different poses, or a matrix is not a pose.
     """
     unique, repeated = _unique(cameras, where)
     poses, made_rigid = make_rigid({name: camera.matrix for name, camera in unique.items()}, where)
@@ -81,7 +81,7 @@ def make_pose_set(
 
 
 def find_offset(positions: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "3"]:
-    """What to subtract so that float32 suffices: the mean, in whole units, if far from 0 against the spread; else 0."""
+    """What to subtract so that float32 suffices: the mean, in whole units, if far from 0 against the spread, or 0."""
     middle = positions.mean(axis=0)
     spread = float(np.linalg.norm(positions - middle, axis=1).max())
     distance = float(np.linalg.norm(middle))

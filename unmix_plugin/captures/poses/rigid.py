@@ -34,7 +34,8 @@ def make_rigid(
     Returns:
         The poses, and what was changed, one sentence each.
     Raises:
-        CaptureError: there is no camera, or a matrix is no similarity: zeros, not finite, sheared, mirrored, far away.
+        CaptureError: there is no camera, or a matrix is not a similarity: zeros, not finite, sheared, mirrored, far
+            away.
     """
     if not matrices:
         raise CaptureError(f"{where} has no camera; expected one for each view, export it again")
@@ -47,7 +48,7 @@ def make_rigid(
     first = next(iter(rigid.values()))
     if len(rigid) > 1 and all(np.array_equal(first, pose) for pose in rigid.values()):
         raise CaptureError(
-            f"{where}: all {len(rigid)} cameras have the same pose; expected different ones, estimate them anew"
+            f"{where}: all {len(rigid)} cameras have the same pose; expected different ones, estimate them again"
         )
     scaled = [scale for scale in scales.values() if abs(scale - 1.0) > SCALE_TOLERANCE]
     if not scaled:
@@ -79,7 +80,8 @@ def _refuse(matrices: Mapping[str, Float64[np.ndarray, "3 4"]], where: str) -> N
         return
     listed = "; ".join(f"{name_some(names)}: {fault}" for fault, names in faulty.items())
     raise CaptureError(
-        f"{where} has {sum(map(len, faulty.values()))} of {len(matrices)} camera matrices that are no poses: {listed}; "
+        f"{where} has {sum(map(len, faulty.values()))} of {len(matrices)} camera matrices that are not poses: "
+        f"{listed}; "
         "expected camera to world, a rotation (or a scaled one) and a position: remove these frames or export again"
     )
 

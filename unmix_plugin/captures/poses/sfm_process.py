@@ -28,7 +28,7 @@ MOST_FEATURES = 8192
 """Of a picture."""
 SEED = 0
 GAIN = 0.02
-"""Part of the reprojection error that distortion has to take away to be believed."""
+"""Part of the reprojection error that distortion has to remove to be kept."""
 GREATEST_BEND = 0.1
 """Of half the diagonal: what distortion may move the corner of a picture by."""
 
@@ -145,7 +145,7 @@ def _map(pycolmap: Any, settings: SfmSettings, database: Path, output: Path) -> 
 
 
 def _with_distortion(pycolmap: Any, model: Any) -> Any:
-    """The model with distortion refined too, where that is better and stays small; else as it was."""
+    """The model with distortion refined too, where that is better and stays small; otherwise as it was."""
     bent = pycolmap.Reconstruction(model)
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_extra_params, options.print_summary = True, False

@@ -1,4 +1,4 @@
-"""Lenses of transforms.json: keys of a frame, else those of the whole file (nerfstudio's rule)."""
+"""Lenses of transforms.json: keys of a frame, otherwise those of the whole file (nerfstudio's rule)."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def lens_numbers(values: Mapping[str, Any], where: str) -> dict[str, float | Non
     """All numbers that a lens may have; None where they are absent.
 
     Raises:
-        CaptureError: one is no finite number.
+        CaptureError: one is not a finite number.
     """
     numbers = {key: _number(values, key, where) for key in _KEYS}
     listed = values.get("distortion_params")

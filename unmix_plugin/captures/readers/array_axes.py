@@ -20,7 +20,7 @@ def choose_axes(
 
     Args:
         shape: Of the array.
-        given: What the user says, which stands above all.
+        given: What the user says, which overrides everything.
         num_wavelengths: Length that the axis of bands has, if it is known.
         default: Where no length tells.
 

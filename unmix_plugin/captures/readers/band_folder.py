@@ -20,7 +20,7 @@ _KINDS = {".tif": "TIFF", ".tiff": "TIFF", ".png": "PNG", ".exr": "OpenEXR", ".j
 def open_band_folder(folder: Path, open_band: Callable[[Path], SpectralFile]) -> SpectralFile:
     """Open the files of a folder as the bands of one image, by rising wavelength or in the order of their names.
 
-    Wavelengths stand in the files, or in their names.
+    Wavelengths are in the files, or in their names.
 
     Raises:
         CaptureError: there are no such files, or they hold several bands each or differ in size.

@@ -37,7 +37,7 @@ _REFUSED = {
 }
 _KNOWN = "ENVI, TIFF, OpenEXR, MATLAB, HDF5, NetCDF, .npy, .npz, .pt, PNG, JPEG, or a folder with one picture a band"
 _HDF5_STARTS = (512, 1024, 2048, 4096)
-"""Where the mark of HDF5 may stand behind bytes of another program."""
+"""Where the mark of HDF5 may follow bytes of another program."""
 
 
 def file_kind(path: Path) -> str:

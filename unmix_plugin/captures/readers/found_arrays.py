@@ -64,7 +64,7 @@ class FoundArray:
 
 
 def find_image(path: Path, arrays: Sequence[FoundArray], options: ReadOptions) -> FoundArray:
-    """The array that is the image: the one that is named, else the only one of three axes.
+    """The array that is the image: the one that is named, otherwise the only one of three axes.
 
     Raises:
         CaptureError: there is none, or several that could be it.
@@ -128,7 +128,7 @@ def names_wavelengths(name: str) -> bool:
 def pixel_list_size(
     array: FoundArray, arrays: Sequence[FoundArray], options: ReadOptions
 ) -> tuple[int, int] | None:
-    """Rows and columns of an image that is stored as a matrix of bands and pixels; None if it is no such matrix."""
+    """Rows and columns of an image that is stored as a matrix of bands and pixels; None if it is not such a matrix."""
     size = options.size or _stated_size(arrays)
     if len(array.shape) != 2 or size is None or size[0] * size[1] not in array.shape:
         return None

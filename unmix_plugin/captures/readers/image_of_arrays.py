@@ -88,7 +88,9 @@ def _as_cube(
     size = pixel_list_size(image, arrays, options)
     if options.size is not None and size is None:
         pixels = options.size[0] * options.size[1]
-        raise CaptureError(f"{path}: {image.name or 'the array'} {image.shape} is no list of {pixels} pixels")
+        raise CaptureError(
+            f"{path}: {image.name or 'the array'} {image.shape} is not a list of {pixels} pixels"
+        )
     rows, columns = size or (0, 0)
     shape = (
         (*image.shape, 1)

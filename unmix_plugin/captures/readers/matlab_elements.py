@@ -22,7 +22,7 @@ _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13
 _MATRIX, _COMPRESSED = 14, 15
 _IS_COMPLEX = 0x0800
 _HEAD_BYTES = 2**16
-"""Enough for what stands before the numbers of an array."""
+"""Enough for what precedes the numbers of an array."""
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,7 @@ def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
         read_part=lambda rows, wanted: loaded(_load_deep if is_deep else _load, path)[rows][..., wanted],
         bands=bands,
         interleave="bip" if num_bands == 3 else None,
-        notes=("the picture has opacity, which is no band and is left out",) if alpha else (),
+        notes=("the picture has opacity, which is not a band and is left out",) if alpha else (),
         metadata=metadata,
     )
 

@@ -14,7 +14,7 @@ Axes: TypeAlias = Literal["yxb", "byx", "ybx", "xyb", "bxy", "xby"]
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """Facts that stand above what a file says."""
+    """Facts that override what a file says."""
 
     dataset: str | None = None
     """Variable or data set to take from a file that holds several."""

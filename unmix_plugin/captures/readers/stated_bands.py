@@ -1,4 +1,4 @@
-"""What a file says of its bands, checked: units brought to nm, and nothing believed that can't be true."""
+"""What a file says of its bands, checked: units brought to nm, and nothing impossible accepted."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _ASK = "give the wavelengths yourself (--wavelengths)"
 
 @dataclass(frozen=True)
 class StatedBands:
-    """Values as they stand in a file, text or numbers; None where the file has none."""
+    """Values as they are in a file, text or numbers; None where the file has none."""
 
     where: str
-    """Where the centres stand: `header field 'wavelength'`."""
+    """Where the centres are: `header field 'wavelength'`."""
     centres: Sequence[object] | None = None
     unit: str | None = None
     fwhm: Sequence[object] | None = None
@@ -93,7 +93,7 @@ def _numbers(what: str, values: Sequence[object], count: int, notes: list[str]) 
     try:
         numbers = np.array([float(str(value)) for value in fitting])
     except ValueError as error:
-        notes.append(f"{what} are no list of numbers ({str(error)[:80]}) and are left out")
+        notes.append(f"{what} are not a list of numbers ({str(error)[:80]}) and are left out")
         return None
     if not np.isfinite(numbers).all():
         band = int(np.argmin(np.isfinite(numbers)))

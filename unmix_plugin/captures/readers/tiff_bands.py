@@ -55,7 +55,7 @@ def gdal_items(page: TiffPage) -> list[GdalItem]:
 
 
 def state_bands(pages: list[TiffPage], items: list[GdalItem]) -> StatedBands:
-    """Wavelengths by the first of the places where they can stand, and names."""
+    """Wavelengths by the first of the places where they can be, and names."""
     return _from_gdal(items) or _from_description(pages[0]) or _from_pages(pages)
 
 
@@ -154,7 +154,7 @@ def _from_pages(pages: list[TiffPage]) -> StatedBands:
 
 
 def _number(text: str) -> float | None:
-    """A number, not a NaN where none can stand; None for other text."""
+    """A number, not a NaN where none is allowed; None for other text."""
     try:
         number = float(text.strip("\0 "))
     except ValueError:

@@ -1,4 +1,4 @@
-"""Wavelengths that stand in text: units, and numbers in the names of bands, channels and files."""
+"""Wavelengths in text: units, and numbers in the names of bands, channels and files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _WITH_UNIT = re.compile(
 )
 _PLAIN = re.compile(_NUMBER)
 _COUNTER = re.compile(r"(?:bands?|b|ch|channel|frame|img|image|view|page|dsc|#)[ _-]*$", re.I)
-"""What stands before a number that counts instead of measuring."""
+"""What precedes a number that counts instead of measuring."""
 _USUAL_NM = (200.0, 3000.0)
 """What a number without a unit must lie in to be taken for nm."""
 
@@ -37,7 +37,7 @@ class NamedWavelengths:
 
 
 def nm_per_unit(unit: str) -> float | None:
-    """How many nm one of the unit is; None for what is no unit of length that files use.
+    """How many nm one of the unit is; None for what is not a unit of length that files use.
 
     >>> nm_per_unit("Micrometers")
     1000.0

@@ -1,8 +1,8 @@
 """Poses of all lenses of a rig from those of some.
 
-Where two lenses have poses in the same releases, their offset follows from these. Else the rotations that the files
-give are used, and the lenses stand in one place (`RigRelatives`: Euler angles in degrees, R = Rx Ry Rz, from the axes
-of the lens to those of the reference lens, with +x right, +y down, +z forward).
+Where two lenses have poses in the same releases, their offset follows from these. Otherwise the rotations that the
+files give are used, and the lenses are taken to be in one place (`RigRelatives`: Euler angles in degrees, R = Rx Ry Rz,
+from the axes of the lens to those of the reference lens, with +x right, +y down, +z forward).
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def _say(sensor: str, kind: str, count: int) -> str:
         f"{count} views of lens {sensor} "
         + {
             "unposed": "are left out: no lens of their release has a pose",
-            "unknown": "are left out: they have no pose, and nothing says how the lens stands to others of the rig",
+            "unknown": "are left out: they have no pose, and nothing says where the lens is on the rig",
             "poses": "got the pose of another lens of their release, moved as in other releases",
             "files": "got the pose of another lens of their release, turned as the files say, at the same place",
         }[kind]

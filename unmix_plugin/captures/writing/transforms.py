@@ -34,8 +34,8 @@ class WrittenView:
 def transforms_json(views: Sequence[WrittenView], extra: dict[str, Any]) -> dict[str, Any]:
     """The content of the file.
 
-    What all views share stands above the frames. Views of different sensors have their own lens and size, `bands` as
-    indices into the `wavelengths` of the scene, and the name of their sensor.
+    What all views share is written above the frames. Views of different sensors have their own lens and size, `bands`
+    as indices into the `wavelengths` of the scene, and the name of their sensor.
 
     Args:
         views: At least one, in order.

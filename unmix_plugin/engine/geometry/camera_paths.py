@@ -30,7 +30,7 @@ _STEEPEST_DEG = 80.0
 def orbit(cameras: Cameras, box: SceneBox, num_frames: int) -> Cameras:
     """A circle around what the cameras look at, at their middle distance and elevation; it ends where it starts.
 
-    Where the cameras stand on one side only, it is an arc over that side, to and fro.
+    Where the cameras are on one side only, it is an arc over that side, there and back.
 
     Args:
         cameras: Those of the scene.

@@ -229,7 +229,7 @@ class Cameras:
         return torch.stack([x, y], dim=-1), torch.where(depths > 0, depths, -1.0)
 
     def to_json(self) -> dict[str, Any]:
-        """The cameras as numbers and lists; `from_json` gives back the same bits."""
+        """The cameras as numbers and lists; `from_json` restores the same bits."""
         return {
             "width": self.width,
             "height": self.height,

@@ -105,7 +105,7 @@ class KeyPoses:
         return turns.to(self.poses)
 
     def to_json(self) -> dict[str, Any]:
-        """Lists of numbers; `from_json` gives back the same bits."""
+        """Lists of numbers; `from_json` restores the same bits."""
         return {
             "counts": list(self.counts),
             "heights": self.heights.tolist(),

@@ -21,7 +21,7 @@ def config_to_json(value: Any) -> Any:
 
     Raises:
         ConfigError: a number is infinite or not a number.
-        TypeError: a config holds something that is no plain value.
+        TypeError: a config holds something that is not a plain value.
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {field.name: config_to_json(getattr(value, field.name)) for field in _fields(value)}
@@ -43,7 +43,7 @@ def config_from_json(values: Any, default: ConfigT, where: str = "config") -> Co
 
     Args:
         values: What `config_to_json` gave; fields that it lacks keep the default's value.
-        default: A config of the class wanted; its nested configs say which subclasses stand where.
+        default: A config of the class wanted; its nested configs say which subclasses are where.
         where: Name of the whole, for messages.
     Raises:
         ConfigError: an unknown field or a value of the wrong type or range, with the path of the field.

@@ -50,7 +50,7 @@ def read_run_json(path: Path) -> dict[str, Any]:
         raise RunError(f"can't read {path}: {error}; the run is damaged") from error
     version = values.get("format_version") if isinstance(values, dict) else None
     if type(version) is not int:
-        raise RunError(f"{path} is no file of a run: it has no format_version")
+        raise RunError(f"{path} is not a file of a run: it has no format_version")
     if version > RUN_FORMAT:
         raise OtherFormatError(
             f"{path} has format {version}, written by a newer version; this one reads format {RUN_FORMAT}: "

@@ -93,7 +93,7 @@ def open_run_folder(path: Path) -> RunFolder:
     """An existing run folder.
 
     Raises:
-        RunError: it is missing, is no run folder, is half-written, or has a link that leads out of it.
+        RunError: it is missing, is not a run folder, is half-written, or has a link that leads out of it.
     """
     if not path.is_dir():
         raise RunError(f"no run folder at {path}; give the path that training printed as its last line")
@@ -101,7 +101,7 @@ def open_run_folder(path: Path) -> RunFolder:
     _refuse_links_out(run.path)
     missing = [file.name for file in (run.config_path, run.scene_path) if not file.is_file()]
     if missing:
-        raise RunError(f"{path} is no run folder, or a half-written one: {' and '.join(missing)} missing")
+        raise RunError(f"{path} is not a run folder, or a half-written one: {' and '.join(missing)} missing")
     return run
 
 

@@ -107,7 +107,7 @@ def _check_frames(record: SceneRecord) -> None:
         raise ValueError("frames must be a list of different names")
     for name in frames:
         if not is_plain_name(name):
-            raise ValueError(f"{name!r} can't be the name of a frame: it is no plain file name")
+            raise ValueError(f"{name!r} can't be the name of a frame: it is not a plain file name")
     for split, cameras in (("train", record.train_cameras), ("eval", record.eval_cameras)):
         indices = summary.get(f"{split}_indices", [])
         if not isinstance(indices, list) or len(indices) not in (0, len(cameras)):

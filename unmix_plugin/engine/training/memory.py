@@ -11,7 +11,7 @@ def keep_freed_memory() -> None:
     """Let the C library keep large freed blocks instead of handing them back to the system.
 
     A training step frees and takes blocks of a few MB hundreds of times; by default glibc returns each, and the page
-    faults of taking it anew took 40 % of the time of a field evaluation on two cores. Does nothing where the C library
+    faults of taking it again took 40 % of the time of a field evaluation on two cores. Does nothing where the C library
     is another.
     """
     if not sys.platform.startswith("linux"):

@@ -71,7 +71,7 @@ class ProgressDisplay:
 
         Args:
             console: Where to show.
-            plain_interval_s: Seconds between lines where the console is no terminal.
+            plain_interval_s: Seconds between lines where the console is not a terminal.
             live_interval_s: Seconds between refreshes where it is one.
         """
         self.console = console

@@ -38,7 +38,7 @@ from unmix_plugin.errors import RunError
 class Trainer:
     """Trains one pipeline into one run folder.
 
-    A step is a function of the parameters and of (seed, step) alone: every generator is seeded anew before each, so a
+    A step is a function of the parameters and of (seed, step) alone: every generator is seeded again before each, so a
     run stopped and resumed takes the very steps of a straight one (while limits are given in steps).
     """
 

@@ -1,4 +1,4 @@
-"""Where the cameras of built-in objects stand: around the object, above and below.
+"""Where the cameras of built-in objects are: around the object, above and below.
 
 Notation: `N` views.
 """

@@ -65,7 +65,7 @@ def _parts(path: Path) -> list[tuple[Any, np.ndarray]]:
         raise SceneError(f"{path}: there is no such mesh file")
     if path.suffix.lower() not in SUFFIXES:
         raise SceneError(
-            f"{path}: is no mesh format that is read here; convert it to one of {', '.join(SUFFIXES)}"
+            f"{path}: is not a mesh format that is read here; convert it to one of {', '.join(SUFFIXES)}"
         )
     try:
         scene = trimesh.load_scene(path, process=False, maintain_order=True)
@@ -135,7 +135,7 @@ def _with_area(path: Path, vertices: np.ndarray, faces: np.ndarray) -> np.ndarra
 
 
 def _file_normals(loaded: Any) -> np.ndarray | None:
-    """Normals that the file holds; None where it has none, or none of use."""
+    """Normals that the file holds; None where it has none, or no usable ones."""
     if "vertex_normals" not in loaded._cache.cache:
         return None
     normals = np.array(loaded.vertex_normals, dtype=np.float64)

@@ -34,7 +34,7 @@ def read_environment(path: Path, rotation_deg: float = 0.0, exposure_stops: floa
     readers = {".exr": _read_exr, ".hdr": read_hdr}
     reader = readers.get(path.suffix.lower())
     if reader is None:
-        raise SceneError(f"{path}: is no environment map; convert it to one of {', '.join(SUFFIXES)}")
+        raise SceneError(f"{path}: is not an environment map; convert it to one of {', '.join(SUFFIXES)}")
     image = reader(path)
     check_environment(path, image)
     return Environment(torch.from_numpy(np.ascontiguousarray(image)), rotation_deg, exposure_stops)

@@ -3,8 +3,8 @@
 The last layer of the network names a stack of analytic layers: widths, colours and weights of lobes. Sharp highlights
 then cost no more than soft ones, and the stack is reciprocal, never brighter than its light, and can be sampled
 exactly. Chosen by measurement: a network that gives reflectances themselves (three layers of width 64, from latents and
-features of the half vector) came to a mean error of 31.8 dB after 1200 steps, given latents that were learnt already;
-this one came to 36.0 dB in as many, learning its encoder too.
+features of the half vector) reached a mean error of 31.8 dB after 1200 steps, given latents that were learnt already;
+this one reached 36.0 dB in as many, learning its encoder too.
 """
 
 import torch

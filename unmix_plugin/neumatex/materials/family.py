@@ -47,7 +47,7 @@ class MaterialFamily(Protocol):
         ...
 
     def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
-        """Base colour, linear, [0, 1]: what a metal reflects, and the diffuse albedo of all else."""
+        """Base colour, linear, [0, 1]: what a metal reflects, and the diffuse albedo of everything else."""
         ...
 
 

@@ -25,7 +25,7 @@ class LayeredFamily(StackFamily):
 
     | index | name | meaning |
     | --- | --- | --- |
-    | 0 to 2 | base colour | linear RGB; what a metal reflects, and the diffuse albedo of all else |
+    | 0 to 2 | base colour | linear RGB; what a metal reflects, and the diffuse albedo of everything else |
     | 3 | metallicity | 0 dielectric, 1 metal |
     | 4 | roughness | perceptual; the GGX width is about its square |
     | 5 | specular level | `f0` of the dielectric, 0 to 0.08; 0.5 is a refractive index of 1.5 |

@@ -55,6 +55,6 @@ class StackFamily(ABC):
         return parameters[:, :3]
 
     def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
-        """Linear base colour: what a metal reflects, and the diffuse albedo of all else."""
+        """Linear base colour: what a metal reflects, and the diffuse albedo of everything else."""
         layers = self.stack(parameters)
         return torch.lerp(self.diffuse_colour(parameters), layers.metal_colour.T, layers.metallicity[:, None])

@@ -136,7 +136,7 @@ def draw_batch(
 
 
 def _turned(positions: Float[Tensor, "B N 3"], generator: torch.Generator) -> Float[Tensor, "B N 3"]:
-    """Each object with its axes permuted and mirrored: all else that is observed does not change."""
+    """Each object with its axes permuted and mirrored: nothing else that is observed changes."""
     count = len(positions)
     order = torch.rand(count, 3, generator=generator).argsort(dim=1)
     signs = 1.0 - 2.0 * torch.randint(2, (count, 1, 3), generator=generator)

@@ -63,7 +63,7 @@ def training_object(
         seed: What is drawn; the same seed gives the same object.
         samples: Paths a point and view.
         demo_share: Chance of materials like those of the built-in objects, and two thirds of it for their shapes;
-            all else is of wider variety. No built-in object of a seed below `_FIRST_DEMO_SEED` is among them.
+            everything else varies more widely. No built-in object of a seed below `_FIRST_DEMO_SEED` is among them.
     """
     generator = torch.Generator().manual_seed(seed)
     kind = float(torch.rand((), generator=torch.Generator().manual_seed(_FIRST_DEMO_SEED + seed)))

@@ -47,7 +47,7 @@ def load_object(root: Path, lamp: str | None = None) -> ObjectScene:
         root: The folder.
         lamp: For pictures of many bands: what lit them, as `read_lamp` takes it, instead of what the folder says.
     Raises:
-        SceneError: the folder is no sound object; the message says what is wrong with it.
+        SceneError: the folder is not a sound object; the message says what is wrong with it.
     """
     root = root.resolve()
     faults, notes = Faults(root), list[str]()
@@ -92,7 +92,7 @@ class _Light:
     tone: ToneMapping | None
 
     def environment(self, spectral: SpectralLight | None) -> Environment:
-        """In the bands of spectral pictures, or else in colours."""
+        """In the bands of spectral pictures, otherwise in colours."""
         placement = (self.rotation_deg, self.exposure_stops)
         if spectral is None:
             return read_environment(self.environment_path, *placement)
@@ -120,7 +120,7 @@ def _read_light(root: Path, faults: Faults) -> _Light | None:
 
 
 def _find_file(root: Path, key: str, what: str, suffixes: tuple[str, ...], faults: Faults) -> Path | None:
-    """The file that a key names, or else the only one of its kind; None and a noted fault if there is none."""
+    """The file that a key names, or the only one of its kind; None and a noted fault if there is none."""
     named = _content(root).get(key)
     if named is not None:
         if not isinstance(named, str) or not named:

@@ -17,7 +17,7 @@ from unmix_plugin.neumatex.scene.object_scene import ObjectScene
 from unmix_plugin.neumatex.scene.posed_pictures import opacity
 
 OPAQUE = 0.99
-"""Alpha from which on a pixel shows the object alone."""
+"""Alpha from which a pixel shows the object alone."""
 _CORNERS = ((0.02, 0.02), (0.98, 0.02), (0.02, 0.98), (0.98, 0.98), (0.5, 0.5))
 """Where in a pixel the mesh has to be seen, so that every place in it sees it."""
 

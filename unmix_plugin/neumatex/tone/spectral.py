@@ -18,7 +18,7 @@ from unmix_plugin.spectral.colour.conversion import rgb_matrix
 
 class LampRatio(nn.Module):
     """Light over the lamp's power, so that all bands count by their reflectance; above 1 its logarithm, plus 1, so that
-    highlights do not outweigh all else.
+    highlights do not outweigh everything else.
 
     It is straight where nearly all light is: a curve that bends makes noisy estimates look too dark on average, and
     materials, dark ones most, would be fitted too bright.

@@ -59,7 +59,7 @@ class Palette:
         return colours
 
     def scale(self, output: Output) -> ColourScale | None:
-        """The scale of an output's colours; None where its colours are no scale."""
+        """The scale of an output's colours; None where its colours are not a scale."""
         if output.name in self.scales or output.value_range is None:
             return self.scales.get(output.name)
         return scale_of(output, *output.value_range)

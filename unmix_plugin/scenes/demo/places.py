@@ -1,4 +1,4 @@
-"""Where the demo scene stands: before nothing, on a ground that runs to the horizon under a sky, or in a room.
+"""Where the demo scene is: in front of nothing, on a ground that runs to the horizon under a sky, or in a room.
 
 Notation: `R` rays, `P` points, `K` materials.
 """

@@ -1,4 +1,4 @@
-"""The demo scene's views: where its cameras stand, and pixels from the coefficients that rays gathered.
+"""The demo scene's views: where its cameras are, and pixels from the coefficients that rays gathered.
 
 Notation: `B` bands, `K` materials, `H`, `W` rows and columns.
 """
@@ -75,5 +75,5 @@ def reflected(view: ViewCoefficients, spectra: Float[np.ndarray, "K B"]) -> Floa
 
 
 def label_image(view: ViewCoefficients) -> UInt8[np.ndarray, "H W"]:
-    """The material with the largest abundance where at least half a pixel is covered, else 255."""
+    """The material with the largest abundance where at least half a pixel is covered, otherwise 255."""
     return np.where(view.alpha >= 0.5, view.abundances.argmax(axis=-1), UNLABELLED).astype(np.uint8)

@@ -3,7 +3,7 @@
 With alpha: the hull of what is not transparent decides. Without, nothing but the cameras is known, and the box rests
 on how people frame pictures: the subject is where the optical axes meet, and is about as deep as the images are wide
 there. So the box starts as a cube around the point nearest to all axes (least squares), its half edge a little more
-than half the width of the images at that distance. If all cameras look from one side, nothing can stand between them
+than half the width of the images at that distance. If all cameras look from one side, nothing can be between them
 and their subject but things are seen behind it, and the cube moves away from them. It is then cut to what a third of
 the cameras see. Cameras that share no such point (parallel or outward-looking) get a cube in front of their middle,
 at a depth where most of their views overlap.
@@ -75,7 +75,7 @@ def find_bounds(root: Path, cameras: Cameras, foreground: list[Bool[np.ndarray, 
         raise SceneError(
             f"{root}: alpha and poses contradict: only {explained:.0%} of the pixels that are not transparent have "
             "a place behind them that no other training view looks through; check that 'transform_matrix' is camera "
-            "to world with OpenGL axes (+y up, looking along -z), and that each picture stands with its own pose"
+            "to world with OpenGL axes (+y up, looking along -z), and that each picture has its own pose"
         )
     box = _tighten(cameras, rays, box, hull)
     # The second look has finer cells and so a thinner margin.

@@ -22,9 +22,9 @@ LARGEST_HULL = 64
 SMOOTHING_CELLS = 2.0
 """Standard deviation of the blur of the hull from whose slope normals are taken."""
 LEAST_FACING = 0.35
-"""Cosine between normal and direction to the camera from which on a place is looked at."""
+"""Cosine between normal and direction to the camera from which a place is looked at."""
 CLEAR_CELLS, MOST_CELLS = 4.0, 64
-"""Way from a place, in cells, that is not checked for what stands in front of it; and how far it is checked."""
+"""Way from a place, in cells, that is not checked for what is in front of it; and how far it is checked."""
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,10 @@
 """Does the light move with the camera, or differ from view to view? Judged by the hull's surface, before any training.
 
 Where an object is turned before a fixed camera and lamp, the light follows the camera: a place gets brighter when it
-turns to the side of the image that the lamp stands on. Where the light is fixed to the object, a place looks about as
+turns to the side of the image that the lamp is on. Where the light is fixed to the object, a place looks about as
 bright from all sides. So places on the hull are followed through the views that see them, and functions of the normal
 in the camera's frame that tell left from right and up from down are fitted to the changes of their brightness in one
-half of the views. If they foretell the changes in the other half, whichever way the views are halved, the light moves.
+half of the views. If they predict the changes in the other half, whichever way the views are halved, the light moves.
 Functions that don't tell sides are left out: surfaces seen at a grazing angle look different under any light. So a
 lamp at the camera's very place is not found.
 
@@ -31,8 +31,8 @@ from unmix_plugin.scenes.geometry.hull_places import Places, seen_places
 FoundLight = Literal["fixed", "camera", "per-view"]
 
 MOVING_SHARE = 0.015
-"""Share of the changes of brightness that must be foretold in every half of the views. Two turntables have 0.03 and 0.2
-or more, three scenes with a fixed light none."""
+"""Share of the changes of brightness that must be predicted in every half of the views. Two turntables have 0.03 and
+0.2 or more, three scenes with a fixed light none."""
 LEAST_GAIN_SPREAD = 0.04
 """Standard deviation of the views' log gains that both halves of the places must agree on. Seven scenes of one exposure
 have up to 0.02, since hulls are not surfaces; with gains of +-20 % all have 0.09 or more, with +-10 % 0.04 to 0.08."""
@@ -56,7 +56,7 @@ def judge_light(
 
 
 def foretold_share(cameras: Cameras, places: Places, seen: Float[Tensor, "P N"]) -> float:
-    """Least share of the changes of brightness that the other half of the views foretells; 0 if too little is seen.
+    """Least share of the changes of brightness that the other half of the views predicts; 0 if too little is seen.
 
     Args:
         places, seen: As `seen_places` gives them.
@@ -144,7 +144,7 @@ def _smooth_functions(normals: Float[Tensor, "P N 3"]) -> Float[Tensor, "P N F"]
 def _least_share(
     values: Float[Tensor, "P N"], functions: Float[Tensor, "P N F"], halves: Bool[Tensor, "2 N"]
 ) -> float:
-    """Least share of the variance within places, seen by a half of the views, that a fit to the other foretells."""
+    """Least share of the variance within places, seen by a half of the views, that a fit to the other predicts."""
     shares: list[float] = []
     for half in halves:
         parts = [_changes(values[:, chosen], functions[:, chosen]) for chosen in (half, ~half)]

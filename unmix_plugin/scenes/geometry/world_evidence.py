@@ -1,7 +1,7 @@
 """Does the world go on behind the scene box? Asked of what the training views agree on.
 
 Points along the rays of some pixels are projected into neighbouring views, as for the check of poses. Where views agree
-on a place behind the box clearly better than on any in it, something stands there; where they agree on no place at
+on a place behind the box clearly better than on any in it, something is there; where they agree on no place at
 all, they see more than the box holds, too far away or too little overlapping to say where.
 
 Notation: `N` views, `P` pixels of one view, `D` points along a ray.

@@ -66,7 +66,7 @@ class PixelPool:
         return self._numbers[self._drawable[chosen]], self._values[self._drawable[chosen]]
 
     def _move_to(self, first: int) -> None:
-        """Hold the chunks of the order from `first` on; where that is no step ahead, all are read anew."""
+        """Hold the chunks of the order from `first` on; where that is no step ahead, all are read again."""
         wanted = range(first, first + self._num_held)
         if self._held and sorted(self._held) == list(wanted):
             return

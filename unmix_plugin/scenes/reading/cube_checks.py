@@ -146,7 +146,7 @@ def _note_invalid(named: list[tuple[str, CubeValues]], options: SceneOptions, fa
         elif options.invalid_pixels == "clip" and not values.is_noise:
             faults.add(
                 where,
-                f"the cube has {values.num_far_negative} values far below 0, which is no noise; check its dark frame",
+                f"the cube has {values.num_far_negative} values far below 0, which is not noise; check its dark frame",
             )
         elif values.num_invalid_pixels:
             usable.append((where, values))

@@ -25,7 +25,7 @@ Size = tuple[int, int]
 
 
 class UnreadableImageError(ValueError):
-    """A file is no picture of the kind needed; the text says why and what to do."""
+    """A file is not a picture of the kind needed; the text says why and what to do."""
 
 
 def read_colour(path: Path, size: Size) -> UInt8[np.ndarray, "H W C"]:

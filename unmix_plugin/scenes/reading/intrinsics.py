@@ -1,4 +1,4 @@
-"""Lens and image size of a frame: keys of the frame, else those of the whole scene (nerfstudio's rule)."""
+"""Lens and image size of a frame: keys of the frame, otherwise those of the whole scene (nerfstudio's rule)."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def _check_focal(
 
 
 class _Numbers:
-    """Numbers of a frame, or of the scene where the frame is silent; each fault is noted where the number stands."""
+    """Numbers of a frame, or of the scene where the frame has none; each fault is noted where the number is."""
 
     def __init__(self, content: dict[str, Any], frame: dict[str, Any], where: str, faults: Faults) -> None:
         self._content, self._frame, self._where, self._faults = content, frame, where, faults

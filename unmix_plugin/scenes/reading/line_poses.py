@@ -1,6 +1,6 @@
 """Poses of a line camera's frame: `row_poses`, one a row, or `key_poses`, between which poses are interpolated.
 
-Row r of the image, counted from 0, is taken when the camera has the pose of row r; a key pose may stand between rows.
+Row r of the image, counted from 0, is taken when the camera has the pose of row r; a key pose may be between rows.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ def load_scene(root: Path, options: SceneOptions | None = None) -> Scene:
         root: Folder that holds transforms.json.
         options: How to read it; None for the defaults.
     Raises:
-        SceneError: the folder is no sound scene; the message lists all that is wrong with it.
+        SceneError: the folder is not a sound scene; the message lists all that is wrong with it.
     """
     options = SceneOptions() if options is None else options
     faults = Faults(root)
@@ -254,7 +254,7 @@ def _key_poses(entry: SceneEntry, normalisation: Normalisation) -> KeyPoses | No
 
 
 def _distortion(lenses: list[Intrinsics]) -> Float[torch.Tensor, "N D"]:
-    """Coefficients of all lenses: six where any has higher radial terms, else four."""
+    """Coefficients of all lenses: six where any has higher radial terms, otherwise four."""
     count = max(len(lens.coefficients) for lens in lenses)
     rows = [(*lens.distortion, *lens.higher_radial)[:count] for lens in lenses]
     return torch.tensor(rows, dtype=torch.float32)

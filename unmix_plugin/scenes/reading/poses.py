@@ -21,7 +21,7 @@ MAX_DISTANCE = 1e9
 def read_pose(
     matrix: Any, where: str, faults: Faults, name: str = "'transform_matrix'"
 ) -> Float64[np.ndarray, "3 4"] | None:
-    """Check a `transform_matrix` (4x4 or 3x4, OpenGL camera to world); None and a noted fault if it is no pose.
+    """Check a `transform_matrix` (4x4 or 3x4, OpenGL camera to world); None and a noted fault if it is not a pose.
 
     Args:
         name: What messages call it.

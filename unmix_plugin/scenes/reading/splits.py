@@ -1,6 +1,6 @@
 """Which frames train and which evaluate: by lists, by folder or file name, or every n-th.
 
-Evaluation frames are those of the test split if there are any, else those of the validation split.
+Evaluation frames are those of the test split if there are any, otherwise those of the validation split.
 """
 
 from __future__ import annotations

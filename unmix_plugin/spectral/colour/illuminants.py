@@ -26,7 +26,7 @@ _FORMULA_RANGE_NM = (250.0, 3000.0)
 
 
 def parse_light(text: str) -> str | Path:
-    """A light as a user writes it: the name of a known one, or else the path of a CSV file.
+    """A light as a user writes it: the name of a known one, or the path of a CSV file.
 
     Raises:
         SpectrumError: neither; the message has the nearest names.
@@ -82,7 +82,8 @@ def covered_bands(light: str | Path, bands: Bands) -> Bool[np.ndarray, " B"]:
 
 
 def brightness(power: Float64[np.ndarray, " B"], bands: Bands) -> float:
-    """How bright a perfect white is in a light: its luminance where the bands see colours, else its mean radiance."""
+    """How bright a perfect white is in a light: its luminance where the bands see colours, otherwise its mean
+    radiance."""
     if colour_mode(bands) == "true-colour":
         return float(power @ xyz_matrix(bands).double().numpy()[:, 1])
     return float(power @ bands.widths_nm / bands.widths_nm.sum())

@@ -1,6 +1,6 @@
 """The text of an ENVI header as entries: `key = value` lines after the word ENVI.
 
-Lists stand in braces and may span lines; a line that begins with `;` is a comment.
+Lists are in braces and may span lines; a line that begins with `;` is a comment.
 """
 
 from __future__ import annotations

@@ -87,7 +87,7 @@ def read_spectra_csv(path: Path) -> SpectraTable:
 
     Raises:
         SpectrumError: missing, unreadable or empty; no `wavelength` column; names missing or repeated; a row of another
-            length; a value that is no number, not finite or negative; wavelengths that do not increase.
+            length; a value that is not a number, not finite or negative; wavelengths that do not increase.
     """
     try:
         header, rows = _read_rows(path)
@@ -177,7 +177,7 @@ def _parse_number(cell: str, where: str) -> float:
     try:
         return float(cell)
     except ValueError:
-        raise SpectrumError(f"{where}: '{cell.strip()}' is no number") from None
+        raise SpectrumError(f"{where}: '{cell.strip()}' is not a number") from None
 
 
 def _validate_names(names: tuple[str, ...]) -> None:

@@ -34,7 +34,7 @@ def read_spectra_envi(path: Path) -> SpectraTable:
     Args:
         path: Its header, or the file of numbers beside which the header lies.
     Raises:
-        SpectrumError: a part is missing, is no such library, has a unit of wavelength that is not known, or holds
+        SpectrumError: a part is missing, is not such a library, has a unit of wavelength that is not known, or holds
             values that are ignored, not finite or negative.
     """
     header_path = path if path.suffix.lower() == ".hdr" else path.with_suffix(".hdr")

@@ -141,7 +141,7 @@ class _Reader:
         self.start, self.end = match.span()
 
     def take(self, *signs: str) -> str:
-        """The token and a step onwards if it is one of these, else nothing."""
+        """The token and a step onwards if it is one of these, otherwise nothing."""
         token = self.token if self.token in signs else ""
         if token:
             self.advance()

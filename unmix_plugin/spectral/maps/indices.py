@@ -110,7 +110,7 @@ class SpectralIndex:
     """An index on spectra of one sampling: call it on reflectance."""
 
     name: str
-    """Of a named index, else the formula as it was written."""
+    """Of a named index, otherwise the formula as it was written."""
     what: str
     """One line: full name, formula and source, and the bands it is computed from."""
     usual_range: tuple[float, float] | None

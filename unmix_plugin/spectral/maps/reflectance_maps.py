@@ -70,7 +70,7 @@ def seen_reflectance(
 
     Args:
         spectra, opacity: Radiance on black, and the opacity in [0, 1] by which it is multiplied.
-        light: Relative power of the scene's light; None: unknown, so that radiance is given back. NaN in bands that it
+        light: Relative power of the scene's light; None: unknown, so that radiance is returned. NaN in bands that it
             leaves dark.
         smallest_opacity: NaN where there is less.
     """

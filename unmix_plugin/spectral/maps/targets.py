@@ -131,7 +131,7 @@ def parse_target(text: str, bands: Bands) -> Target:
     Raises:
         ConfigError: text of another form, no such file, no or several spectra that could be meant, a threshold on the
             wrong side or one that says the same of every pixel.
-        SpectrumError: the file is no table of spectra, does not cover the bands, is not in reflectances (the angle
+        SpectrumError: the file is not a table of spectra, does not cover the bands, is not in reflectances (the angle
             takes any unit), or has no angle to anything.
     """
     match = _GRAMMAR.fullmatch(text)

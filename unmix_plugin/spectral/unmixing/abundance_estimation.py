@@ -2,7 +2,7 @@
 
 Notation: `N` pixels, `B` bands, `K` endmembers (rows of `endmembers`, the paper's M is the transpose). A pixel x is
 explained as E^T a; `gram` is E E^T, so that half the squared error is a . gram a / 2 - (E x) . a plus a constant.
-Everything is computed in float64 and given back in the pixels' type.
+Everything is computed in float64 and returned in the pixels' type.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ def _constrained_step(
         if len(pixels) == 0:
             return
         start = amounts[pixels]
-        # As far along the way as all amounts stay above zero; what gets there first goes out of use.
+        # As far along the way as all amounts stay above zero; the first to get there becomes zero.
         room = torch.where(negative, start / (start - best).clamp(min=1e-300), torch.inf)
         reached = room.amin(dim=1, keepdim=True).clamp(max=1)
         used = used & ~(negative & (room <= reached))

@@ -21,7 +21,7 @@ _PLAIN_UNEXPLAINED = 0.02
 """Mean angle, in radians, at which the mixing penalty is as many such angles as asked for. Of three scenes, two of
 little coloured light leave 0.014 and 0.015, one whose walls colour each other 0.029."""
 _MOST_STRICT = 1.5
-"""Largest factor on that number: noise leaves angles too, and is no coloured light."""
+"""Largest factor on that number: noise leaves angles too, and is not coloured light."""
 _CLEAR_MARGIN = 0.9
 """Nearly pure pixels, whose margin is larger, hardly err, and would hide what the others do."""
 _DECAY = 0.99
@@ -33,7 +33,7 @@ _SHARED_ERROR = 2.0
 def mixing_penalty(
     pixels: Float[Tensor, "N B"], endmembers: Float[Tensor, "K B"], relative_penalty: float
 ) -> float:
-    """By how many radians a further material must improve the fit of a spectrum to be believed.
+    """By how many radians a further material must improve the fit of a spectrum to count.
 
     Args:
         pixels: Spectra of all training views.

@@ -127,7 +127,7 @@ def hysime(pixels: Float[Tensor, "N B"]) -> int:
     power = (directions * (correlation @ directions)).sum(dim=0)
     # Leaving a direction out costs its signal and saves its noise (equation 20): it stays if that is a loss.
     costs = 2 * (directions * (noise_power @ directions)).sum(dim=0) - power
-    # Without noise, what rounding leaves in a direction is no signal.
+    # Without noise, what rounding leaves in a direction is not a signal.
     return int(((costs < 0) & (power > 1e-12 * power.sum())).sum())
 
 

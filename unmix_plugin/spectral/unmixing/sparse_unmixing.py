@@ -130,7 +130,7 @@ def _extended(
     By block elimination: what of a spectrum and of a new endmember the set leaves unexplained gives the new share.
     """
     num_kept, size = sets.shape[1:]
-    # Where fewer sets fit than are kept, the rest repeat members, and their fits are no numbers.
+    # Where fewer sets fit than are kept, the rest repeat members, and their fits are not numbers.
     inverse = torch.linalg.inv_ex(gram[sets[..., :, None], sets[..., None, :]]).inverse
     own, across = loads.gather(1, sets.flatten(1)).view(sets.shape), gram[sets]
     alone, slopes = (inverse @ own[..., None])[..., 0], inverse @ across

@@ -76,7 +76,7 @@ def estimate_snr_db(pixels: Float[Tensor, "N B"], num_endmembers: int) -> float:
     signal_power = projected.square().sum(dim=1).mean() + mean.square().sum()
     noise_power = float(power - signal_power)
     excess_power = float(signal_power - num_endmembers / num_bands * power)
-    # A remainder of rounding errors is no noise.
+    # A remainder of rounding errors is not noise.
     if noise_power <= 1e-12 * float(power):
         return math.inf
     return 10 * math.log10(excess_power / noise_power) if excess_power > 0 else -math.inf

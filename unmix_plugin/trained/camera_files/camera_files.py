@@ -53,7 +53,7 @@ def read_camera_file(path: Path, frame: Normalisation) -> CameraFile:
         raise ConfigError(str(error)) from error
     keys = ", ".join(sorted(content)) or "none"
     raise ConfigError(
-        f"{path} is no camera file: expected 'camera_path', as in nerfstudio's camera_path.json, or 'frames', as in "
+        f"{path} is not a camera file: expected 'camera_path', as in nerfstudio's camera_path.json, or 'frames', as in "
         f"transforms.json; found the keys {keys}"
     )
 
@@ -125,7 +125,7 @@ def _frame_view(
 
 
 def _names(entries: Sequence[dict[str, Any]], path: Path) -> list[str]:
-    """`name` of the frames, else the name of their picture or cube, else numbers."""
+    """`name` of the frames, otherwise the name of their picture or cube, otherwise numbers."""
     numbers = [f"frame_{index:04d}" for index in range(len(entries))]
     for key in ("name", "file_path", "hyperspectral_file_path"):
         values = [entry.get(key) for entry in entries]

@@ -73,7 +73,7 @@ def read_camera_json(path: Path) -> dict[str, Any]:
     if version != FORMAT_VERSION:
         raise ConfigError(
             f"{path} has format_version {describe(version)}; this version reads {FORMAT_VERSION}: update this package "
-            "or write the file anew"
+            "or write the file again"
         )
     return content
 

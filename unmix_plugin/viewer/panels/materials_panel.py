@@ -215,7 +215,7 @@ class MaterialsPanel:
         return names if shown in names else (*names, shown)
 
     def _colour_of(self, materials: Materials, index: int) -> tuple[int, int, int]:
-        """8-bit sRGB colour that was asked for an endmember, or else that of its spectrum in full light."""
+        """8-bit sRGB colour that was asked for an endmember, or that of its spectrum in full light."""
         retint = change_of(self._recipe.recipe, Retint, index)
         if isinstance(retint, Retint):
             return _bytes(torch.tensor(retint.colour))

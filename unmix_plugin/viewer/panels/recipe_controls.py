@@ -53,10 +53,10 @@ class RecipeControls:
 
     def add_history(self) -> None:
         """Buttons to go back and forth."""
-        buttons = self._gui.add_button_group("changes", ("undo", "redo", "start anew"))
+        buttons = self._gui.add_button_group("changes", ("undo", "redo", "start again"))
 
         def step() -> None:
-            if buttons.value == "start anew":
+            if buttons.value == "start again":
                 self.change(Recipe())
                 return
             recipe = self._history.undone() if buttons.value == "undo" else self._history.redone()

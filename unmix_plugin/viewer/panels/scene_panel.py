@@ -1,4 +1,4 @@
-"""Where one looks from, how finely is rendered, and which objects stand beside the picture."""
+"""Where the client looks from, how finely pictures are rendered, and which objects are shown with them."""
 
 from __future__ import annotations
 

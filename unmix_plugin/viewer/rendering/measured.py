@@ -1,6 +1,6 @@
 """What the training views measured: spectra of points that they see, and errors of a rendered view.
 
-Notation: `P` points, `B` bands. A training view sees a point if nothing that the model renders stands before it.
+Notation: `P` points, `B` bands. A training view sees a point if nothing that the model renders is in front of it.
 """
 
 from __future__ import annotations

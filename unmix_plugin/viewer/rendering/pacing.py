@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 
 MOVING_S, LONGEST_MOVING_S = 1 / 30, 0.07
-"""Time for a moving picture: as on a fast device, and as on one that would else show nothing but blur."""
+"""Time for a moving picture: as on a fast device, and as on one that would otherwise show nothing but blur."""
 
 LEAST_MOVING_PIXELS, FEWEST_PIXELS = 4096, 256
 """A moving picture has so many pixels if they take no longer than `LONGEST_MOVING_S`, and never fewer than these."""

@@ -81,7 +81,7 @@ class PictureMaker:
     def finer_render(
         self, pose: ViewPose, frame: RenderedView, largest_height: int, subpixels: int
     ) -> FrameRender:
-        """The picture after `frame`: a finer one, another estimate of the same, or at the end the same anew."""
+        """The picture after `frame`: a finer one, another estimate of the same, or at the end the same again."""
         target = self.target_height(pose, largest_height)
         if isinstance(frame, ModelView) and frame.camera.height >= target and wants_more(frame):
             return FrameRender(frame.camera, subpixels, frame)
@@ -152,7 +152,7 @@ class PictureMaker:
             return shown
 
     def _ask(self, change: int) -> None:
-        """Note that a page waits for the device, or no longer: else the render loop would take turn after turn."""
+        """Note that a page waits for the device, or no longer: otherwise the render loop would take turn after turn."""
         with self._queue:
             self._num_asking += change
             self._queue.notify_all()

@@ -86,7 +86,7 @@ class RenderLoop:
                 self._repaint(view)
 
     def change_edit(self, view: View, edit: Edit) -> None:
-        """Show the scene with other materials or light; rendered anew only where shape or gloss changes."""
+        """Show the scene with other materials or light; rendered again only where shape or gloss changes."""
         with self._changed:
             view.edit = edit
             if edit.reuses(view.frame_edit):

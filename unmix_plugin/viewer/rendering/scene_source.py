@@ -19,7 +19,7 @@ from unmix_plugin.trained.trained_scene import TrainedScene
 
 @dataclass(frozen=True)
 class SceneSource:
-    """A scene, anew after each training step that it is asked for."""
+    """A scene, renewed after each training step in which it is asked for."""
 
     run: RunFolder
     """Where what the viewer writes goes."""
