@@ -91,6 +91,26 @@ def ball_alpha(pose: np.ndarray, radius: float, width: int, height: int, focal: 
     return hits.reshape(height, 5, width, 5).mean(axis=(1, 3))
 
 
+def write_view(root: Path, index: int, pose: np.ndarray, radius: float | None) -> dict[str, Any]:
+    """Write the files of a view of a ball, opaque everywhere where it has no radius; its frame in transforms.json."""
+    cover = np.ones((HEIGHT, WIDTH)) if radius is None else ball_alpha(pose, radius, WIDTH, HEIGHT, FOCAL)
+    np.save(root / f"cubes/view_{index}.npy", (cover[..., None] * SPECTRUM).astype(np.float16))
+    grey = (200 * cover).astype(np.uint8)
+    pixels = np.stack([grey, grey, grey, np.round(255 * cover).astype(np.uint8)], axis=-1)
+    Image.fromarray(pixels).save(root / f"images/view_{index}.png")
+    labels = np.where(cover > 0.5, np.uint8(1), np.uint8(255))
+    Image.fromarray(labels).save(root / f"labels/view_{index}.png")
+    abundances = np.stack([np.zeros_like(cover), (cover > 0.5).astype(float)], axis=-1)
+    np.save(root / f"abundances/view_{index}.npy", abundances.astype(np.float16))
+    return {
+        "file_path": f"images/view_{index}.png",
+        "hyperspectral_file_path": f"cubes/view_{index}.npy",
+        "seg_file_path": f"labels/view_{index}.png",
+        "abundance_file_path": f"abundances/view_{index}.npy",
+        "transform_matrix": pose.tolist(),
+    }
+
+
 def make_scene(
     root: Path,
     frames: int = 6,
@@ -102,26 +122,7 @@ def make_scene(
     for folder in ("cubes", "images", "labels", "abundances"):
         (root / folder).mkdir(parents=True)
     poses = ring_poses(frames) if poses is None else poses
-    entries = []
-    for index, pose in enumerate(poses):
-        cover = ball_alpha(pose, radius, WIDTH, HEIGHT, FOCAL) if alpha else np.ones((HEIGHT, WIDTH))
-        np.save(root / f"cubes/view_{index}.npy", (cover[..., None] * SPECTRUM).astype(np.float16))
-        grey = (200 * cover).astype(np.uint8)
-        pixels = np.stack([grey, grey, grey, np.round(255 * cover).astype(np.uint8)], axis=-1)
-        Image.fromarray(pixels).save(root / f"images/view_{index}.png")
-        labels = np.where(cover > 0.5, np.uint8(1), np.uint8(255))
-        Image.fromarray(labels).save(root / f"labels/view_{index}.png")
-        abundances = np.stack([np.zeros_like(cover), (cover > 0.5).astype(float)], axis=-1)
-        np.save(root / f"abundances/view_{index}.npy", abundances.astype(np.float16))
-        entries.append(
-            {
-                "file_path": f"images/view_{index}.png",
-                "hyperspectral_file_path": f"cubes/view_{index}.npy",
-                "seg_file_path": f"labels/view_{index}.png",
-                "abundance_file_path": f"abundances/view_{index}.npy",
-                "transform_matrix": pose.tolist(),
-            }
-        )
+    entries = [write_view(root, index, pose, radius if alpha else None) for index, pose in enumerate(poses)]
     (root / "endmembers.csv").write_text(
         "wavelength,leaf,clay\n450,0.1,0.2\n520,0.3,0.5\n600,0.1,0.8\n680,0.1,0.4\n", encoding="utf-8"
     )

@@ -175,9 +175,8 @@ def _render(
     with processes.together():
         if processes.is_first:
             refuse_to_overwrite(paths, options.overwrite)
-            write_file(
-                camera_path, camera_bytes
-            )  # first, so that a folder that can't be written is noticed early
+            # First, so that a folder that can't be written is noticed early.
+            write_file(camera_path, camera_bytes)
     say(console, _announcement(cameras, outputs))
     with processes.together():
         survey = _survey(loaded, cameras, outputs, console)

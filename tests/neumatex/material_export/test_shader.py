@@ -59,6 +59,21 @@ def looked_up(c, name, roughness, cosine):
     return (1 - y) * upper + y * ((1 - x) * table[i + 1, j] + x * table[i + 1, j + 1])
 
 
+def lobe(roughness, cosine, sine2, ni, no):
+    """A GGX lobe with its masking, by the half vector's cosine and squared sine."""
+    a2 = (0.002 + 0.998 * roughness**2) ** 2
+    density = a2 / (np.pi * np.maximum(a2 * cosine**2 + sine2, 1e-9) ** 2)
+    masks = ni * np.sqrt(no**2 + a2 * (1 - no**2)) + no * np.sqrt(ni**2 + a2 * (1 - ni**2))
+    return density * 0.5 / masks
+
+
+def dust_light(c, cover, light, eye):
+    """What a cover of dust reflects, given the parts of light that pass it to the surface and to the eye."""
+    places, weights = np.array(c["NODE_PLACES"]), np.array(c["NODE_WEIGHTS"])
+    mean_held = 1 - (2 * weights * places * (1 - cover[:, None]) ** (1 / places)).sum(axis=1)
+    return (1 - light) * (1 - eye) / mean_held * np.array(c["DUST_COLOUR"])[:, None] / np.pi
+
+
 def reflectance(c, parameters, wi, wo):
     """The shader's arithmetic in NumPy, from the numbers in decoder.json alone."""
     n = decoded(c, parameters[:, 3:])
@@ -89,19 +104,11 @@ def reflectance(c, parameters, wi, wo):
     half = wi + wo
     half /= np.linalg.norm(half, axis=1, keepdims=True)
     edge = (1 - (half * wo).sum(axis=1)) ** 5
-    sine2 = half[:, 0] ** 2 + half[:, 1] ** 2
-    ni, no = wi[:, 2], wo[:, 2]
-    lobes = []
-    for one in rough:
-        a2 = (0.002 + 0.998 * one**2) ** 2
-        density = a2 / (np.pi * np.maximum(a2 * half[:, 2] ** 2 + sine2, 1e-9) ** 2)
-        masks = ni * np.sqrt(no**2 + a2 * (1 - no**2)) + no * np.sqrt(ni**2 + a2 * (1 - ni**2))
-        lobes.append(density * 0.5 / masks)
+    sine2, ni, no = half[:, 0] ** 2 + half[:, 1] ** 2, wi[:, 2], wo[:, 2]
+    lobes = [lobe(one, half[:, 2], sine2, ni, no) for one in rough]
     width = 1 / (c["SMALLEST_SHEEN_WIDTH"] + (1 - c["SMALLEST_SHEEN_WIDTH"]) * sheen_rough)
     cloth = (2 + width) / (2 * np.pi) * np.maximum(sine2, 1e-12) ** (width / 2) / (4 * (ni + no - ni * no))
-    places, weights = np.array(c["NODE_PLACES"]), np.array(c["NODE_WEIGHTS"])
-    mean_held = 1 - (2 * weights * places * (1 - cover[:, None]) ** (1 / places)).sum(axis=1)
-    dusty = (1 - light[0]) * (1 - eye[0]) / mean_held * np.array(c["DUST_COLOUR"])[:, None] / np.pi
+    dusty = dust_light(c, cover, light[0], eye[0])
     rows = np.linspace(0, 1, c["ROWS"])
     means = [
         f0 * np.interp(one, rows, c["GGX_MEAN_A"]) + np.interp(one, rows, c["GGX_MEAN_B"])

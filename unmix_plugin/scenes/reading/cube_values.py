@@ -77,8 +77,8 @@ def measure_cube(path: Path, value_scale: float | None, invalid_pixels: InvalidP
     height, width, bands = cube.shape
     rows = max(1, BLOCK_VALUES // max(1, width * bands))
     digest, is_in_file_order = hashlib.sha256(), cube.flags.c_contiguous
-    with path.open("rb") as file:
-        digest.update(file.read(cube.offset if is_in_file_order else -1))  # type: ignore[attr-defined]
+    head, end = (cube.offset, cube.offset + cube.nbytes) if is_in_file_order else (-1, 0)  # type: ignore[attr-defined]
+    digest.update(_read_bytes(path, 0, head))
     totals = np.zeros(5, dtype=np.int64)
     greatest, least = 0.0, 0.0
     invalid = np.zeros((height, width), bool)
@@ -93,21 +93,13 @@ def measure_cube(path: Path, value_scale: float | None, invalid_pixels: InvalidP
         if low >= 0.0 and high <= 1.0:  # false with any NaN; most blocks of a sound scene end here
             greatest = max(greatest, float(stored.max()))
             continue
-        finite, negative = np.isfinite(block), block < 0.0
-        totals += (
-            np.isnan(block).sum(),
-            np.isinf(block).sum(),
-            (negative & finite).sum(),
-            ((block < -NOISE) & finite).sum(),
-            ((block > 1.0) & finite).sum(),
-        )
+        finite = np.isfinite(block)
+        totals += _odd_values(block, finite)
         invalid[first : first + rows] = find_invalid(block, invalid_pixels)
         greatest = max(greatest, float(stored.max(where=finite, initial=0.0)))
         least = min(least, float(block.min(where=finite, initial=0.0)))
     if is_in_file_order:
-        with path.open("rb") as file:
-            file.seek(cube.offset + cube.nbytes)  # type: ignore[attr-defined]
-            digest.update(file.read())
+        digest.update(_read_bytes(path, end))
     return CubeValues(
         digest.hexdigest(),
         cube.size,
@@ -117,6 +109,25 @@ def measure_cube(path: Path, value_scale: float | None, invalid_pixels: InvalidP
         least,
         *(int(total) for total in totals),
         invalid=invalid if invalid.any() else None,
+    )
+
+
+def _read_bytes(path: Path, start: int, count: int = -1) -> bytes:
+    with path.open("rb") as file:
+        file.seek(start)
+        return file.read(count)
+
+
+def _odd_values(
+    block: Float32[np.ndarray, "h W B"], finite: Bool[np.ndarray, "h W B"]
+) -> tuple[np.int64, ...]:
+    """Values that are NaN, infinite, negative, further below 0 than noise, and above 1."""
+    return (
+        np.isnan(block).sum(),
+        np.isinf(block).sum(),
+        ((block < 0.0) & finite).sum(),
+        ((block < -NOISE) & finite).sum(),
+        ((block > 1.0) & finite).sum(),
     )
 
 
