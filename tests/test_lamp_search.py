@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.scenes.geometry.test_carving import make_cameras
-from tests.scenes.geometry.test_lighting import LAMP, ball_views
+from tests.scenes.geometry.ball_views import LAMP, ball_views, make_cameras
 from tests.scenes.scene_factory import ring_poses
 from unmix_plugin import lamp_search
 from unmix_plugin.engine.geometry.scene_box import SceneBox

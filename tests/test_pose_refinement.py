@@ -12,7 +12,7 @@ import torch
 from rich.console import Console
 from torch.testing import assert_close
 
-from tests.engine.test_resume import stop_at
+from tests.engine.stopped_runs import stop_at
 from tests.method_factory import BOX, CONFIG, initial_data, make_model
 from tests.scenes.scene_factory import make_scene
 from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import io
-import shutil
 import time
 from pathlib import Path
 
@@ -12,11 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.commands.browser import CHROMIUM, FLAGS
 from unmix_plugin.commands.view import ViewOptions, prepared
 from unmix_plugin.viewer.layers.layers import LAYERS
 from unmix_plugin.viewer.options import ViewerOptions
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 MISSING = [
     name
     for name, is_there in (
@@ -27,10 +26,6 @@ MISSING = [
 ]
 pytestmark = pytest.mark.skipif(bool(MISSING), reason=f"needs {' and '.join(MISSING)}")
 
-FLAGS = (
-    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
-    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
-)
 WIDTH, HEIGHT, PANEL = 1000, 700, 400
 WAIT_MS = 60_000
 LEAST_SPREAD = 4.0

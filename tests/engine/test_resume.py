@@ -1,55 +1,27 @@
 """A run that was stopped and resumed is the run that was never stopped."""
 
-import io
 import json
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from rich.console import Console
 
+from tests.engine.stopped_runs import call_after_step, newest, quiet_trainer, stop_at
 from unmix_plugin.engine.configs import TrainerConfig
-from unmix_plugin.engine.runs.checkpoints import Checkpoint, checkpoint_steps, newest_complete_checkpoint
+from unmix_plugin.engine.runs.checkpoints import checkpoint_steps
 from unmix_plugin.engine.runs.load_run import load_config, load_model
-from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.engine.training.interrupts import Interrupted
-from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.errors import RunError
-
-
-def quiet_trainer(config: TrainerConfig) -> Trainer:
-    return Trainer(config, console=Console(file=io.StringIO()))
-
-
-def call_after_step(trainer: Trainer, step: int, action: Callable[[], None]) -> None:
-    """Let `action` run inside the step that brings the count to `step`."""
-    where = TrainingCallbackLocation.AFTER_TRAIN_ITERATION
-    trainer.callbacks.append(TrainingCallback(where, lambda i, _: action() if i + 1 == step else None))
-
-
-def stop_at(config: TrainerConfig, step: int, number: int = signal.SIGINT) -> Interrupted:
-    trainer = quiet_trainer(config)
-    call_after_step(trainer, step, lambda: os.kill(os.getpid(), number))
-    with pytest.raises(Interrupted) as caught:
-        trainer.train()
-    return caught.value
 
 
 def press_ctrl_c_twice() -> None:
     os.kill(os.getpid(), signal.SIGINT)
     os.kill(os.getpid(), signal.SIGINT)
-
-
-def newest(run: Path) -> Checkpoint:
-    checkpoint = newest_complete_checkpoint(run / "checkpoints")
-    assert checkpoint is not None
-    return checkpoint
 
 
 def train_lines(run: Path) -> list[dict]:

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.captures.poses.llff_table import table
+from tests.captures.poses.metashape_document import document
+from tests.captures.poses.micmac_files import CALIBRATION, ORIENTATION, RADIAL, text_of
+from tests.captures.poses.opensfm_reconstruction import BROWN, reconstruction
 from tests.captures.poses.pose_factory import FLIP, ring, transforms
-from tests.captures.poses.test_llff import table
-from tests.captures.poses.test_metashape import document
-from tests.captures.poses.test_micmac import CALIBRATION, ORIENTATION, RADIAL, text_of
-from tests.captures.poses.test_opensfm import BROWN, reconstruction
 from unmix_plugin.captures.poses.matching import match_poses
 from unmix_plugin.captures.poses.placement import place_poses
 from unmix_plugin.captures.poses.reading import read_poses

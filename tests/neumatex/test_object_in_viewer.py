@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.neumatex.test_trained_object import RECORD, make_object
+from tests.neumatex.trained_factory import RECORD, make_object
 from tests.viewer.pages import decoded, has_control, opened, serving, show_layer
 from tests.viewer.view_factory import make_source, no_scene
 from unmix_plugin.engine.runs.run_folder import RunFolder

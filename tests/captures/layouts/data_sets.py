@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import OpenEXR
+import torch
+from PIL import Image
 
 from unmix_plugin.captures.layouts.registry import LayoutOptions
 
@@ -59,3 +61,71 @@ def write_nespof(root: Path, wavelengths: tuple[int, ...] = (450, 460, 470), alp
             write_exr(path, stokes(intensity(index, wavelength), opacity))
     for split, listed in (*frames.items(), ("test", frames["val"] + frames["train"])):
         write_json(root / f"transforms_{split}.json", {"camera_angle_x": 0.8, "frames": listed})
+
+
+def write_real(root, views=("v10", "v2"), wavelengths=(450, 460), poses=True):
+    for index, view in enumerate(views):
+        for wavelength in wavelengths:
+            write_exr(root / "exr" / view / f"{wavelength}.exr", stokes(intensity(index, wavelength)))
+    if poses:
+        rows = []
+        for index in range(len(views)):
+            right, up, back, place = np.array(pose(index))[:3].T
+            matrix = np.column_stack([-up, right, back, place, [5.0, 7.0, 9.0]])
+            rows.append([*matrix.ravel(), 0.5, 4.0])
+        np.save(root / "poses_bounds.npy", np.array(rows))
+
+
+LENS = {"fl_x": 9.0, "fl_y": 9.0, "cx": 4.0, "cy": 3.0, "w": 8, "h": 6}
+
+
+def cube(index: int) -> np.ndarray:
+    return np.random.default_rng(index).random((6, 8, 4)).astype(np.float32)
+
+
+def write_picture(path, mode="RGB"):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pixels = np.random.default_rng(5).integers(0, 256, (6, 8, len(mode)), dtype=np.uint8)
+    Image.fromarray(pixels, mode).save(path)
+    return pixels
+
+
+def write_unmix(root, written="eval", named="val", **top):
+    """Three training views, and two for evaluation whose paths name one folder and whose files may lie in another."""
+    frames = []
+    for index in range(5):
+        folder, real = ("train", "train") if index < 3 else (named, written)
+        name = f"frame_{index:05d}"
+        (root / real).mkdir(parents=True, exist_ok=True)
+        np.save(root / real / f"{name}.npy", cube(index))
+        write_picture(root / real / f"{name}.png")
+        Image.fromarray(np.full((6, 8), index, np.uint8)).save(root / real / f"{name}_seg.png")
+        frames.append(
+            {
+                "file_path": f"./{folder}/{name}.png",
+                "hyperspectral_file_path": f"{folder}/{name}.npy",
+                "seg_file_path": f"{folder}/{name}_seg.png",
+                "transform_matrix": pose(index),
+            }
+        )
+    write_json(
+        root / "transforms.json", LENS | {"wavelengths": [450, 500, 550, 600]} | top | {"frames": frames}
+    )
+
+
+def write_hs(root, kind=torch.uint8):
+    frames = []
+    for index in range(3):
+        (root / "plant" / "torch").mkdir(parents=True, exist_ok=True)
+        values = torch.from_numpy(cube(index))
+        tensor = (values * 255).to(kind) if kind == torch.uint8 else values.to(kind)
+        torch.save(tensor, root / "plant" / "torch" / f"frame_{index:05d}.pt")
+        write_picture(root / "images" / f"frame_{index:05d}.jpg")
+        frames.append(
+            {
+                "file_path": f"images/frame_{index:05d}.jpg",
+                "hyperspectral_file_path": f"plant/torch/frame_{index:05d}.pt",
+                "transform_matrix": pose(index),
+            }
+        )
+    write_json(root / "transforms.json", LENS | {"frames": frames})

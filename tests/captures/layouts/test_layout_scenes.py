@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.captures.layouts.data_sets import intensity, write_nespof
-from tests.captures.layouts.test_nespof import write_real
-from tests.captures.layouts.test_transforms_layouts import cube, write_hs, write_unmix
+from tests.captures.layouts.data_sets import cube, intensity, write_hs, write_nespof, write_real, write_unmix
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.process import process_capture
 from unmix_plugin.errors import CaptureError

@@ -5,7 +5,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.captures.layouts.data_sets import PLAIN, intensity, pose, stokes, write_exr, write_nespof
+from tests.captures.layouts.data_sets import (
+    PLAIN,
+    intensity,
+    pose,
+    stokes,
+    write_exr,
+    write_nespof,
+    write_real,
+)
 from unmix_plugin.captures.layouts.nespof import find_nespof
 from unmix_plugin.captures.layouts.nespof_real import find_nespof_real
 from unmix_plugin.captures.layouts.registry import LayoutOptions
@@ -148,19 +156,6 @@ def test_a_folder_of_another_kind_is_refused(tmp_path, name):
         shutil.rmtree(path) if path.is_dir() else path.unlink()
     with pytest.raises(CaptureError, match="holds no"):
         find_nespof(tmp_path, PLAIN)
-
-
-def write_real(root, views=("v10", "v2"), wavelengths=(450, 460), poses=True):
-    for index, view in enumerate(views):
-        for wavelength in wavelengths:
-            write_exr(root / "exr" / view / f"{wavelength}.exr", stokes(intensity(index, wavelength)))
-    if poses:
-        rows = []
-        for index in range(len(views)):
-            right, up, back, place = np.array(pose(index))[:3].T
-            matrix = np.column_stack([-up, right, back, place, [5.0, 7.0, 9.0]])
-            rows.append([*matrix.ravel(), 0.5, 4.0])
-        np.save(root / "poses_bounds.npy", np.array(rows))
 
 
 def test_real_captures_have_one_folder_a_view(tmp_path):

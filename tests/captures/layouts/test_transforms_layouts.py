@@ -7,47 +7,20 @@ import pytest
 import torch
 from PIL import Image
 
-from tests.captures.layouts.data_sets import PLAIN, pose, write_json
+from tests.captures.layouts.data_sets import (
+    LENS,
+    PLAIN,
+    cube,
+    pose,
+    write_hs,
+    write_json,
+    write_picture,
+    write_unmix,
+)
 from unmix_plugin.captures.layouts.nerfstudio import find_nerfstudio
 from unmix_plugin.captures.layouts.registry import LAYOUTS, LayoutOptions, find_views
 from unmix_plugin.captures.layouts.unmix_nerf import find_hs_nerf, find_unmix_nerf
 from unmix_plugin.errors import CaptureError
-
-LENS = {"fl_x": 9.0, "fl_y": 9.0, "cx": 4.0, "cy": 3.0, "w": 8, "h": 6}
-
-
-def cube(index: int) -> np.ndarray:
-    return np.random.default_rng(index).random((6, 8, 4)).astype(np.float32)
-
-
-def write_picture(path, mode="RGB"):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    pixels = np.random.default_rng(5).integers(0, 256, (6, 8, len(mode)), dtype=np.uint8)
-    Image.fromarray(pixels, mode).save(path)
-    return pixels
-
-
-def write_unmix(root, written="eval", named="val", **top):
-    """Three training views, and two for evaluation whose paths name one folder and whose files may lie in another."""
-    frames = []
-    for index in range(5):
-        folder, real = ("train", "train") if index < 3 else (named, written)
-        name = f"frame_{index:05d}"
-        (root / real).mkdir(parents=True, exist_ok=True)
-        np.save(root / real / f"{name}.npy", cube(index))
-        write_picture(root / real / f"{name}.png")
-        Image.fromarray(np.full((6, 8), index, np.uint8)).save(root / real / f"{name}_seg.png")
-        frames.append(
-            {
-                "file_path": f"./{folder}/{name}.png",
-                "hyperspectral_file_path": f"{folder}/{name}.npy",
-                "seg_file_path": f"{folder}/{name}_seg.png",
-                "transform_matrix": pose(index),
-            }
-        )
-    write_json(
-        root / "transforms.json", LENS | {"wavelengths": [450, 500, 550, 600]} | top | {"frames": frames}
-    )
 
 
 def edit(root, change):
@@ -178,24 +151,6 @@ def test_a_damaged_list_of_frames_is_refused(tmp_path, content):
     (tmp_path / "transforms.json").write_text(content)
     with pytest.raises(CaptureError, match=r"transforms.json"):
         find_unmix_nerf(tmp_path, PLAIN)
-
-
-def write_hs(root, kind=torch.uint8):
-    frames = []
-    for index in range(3):
-        (root / "plant" / "torch").mkdir(parents=True, exist_ok=True)
-        values = torch.from_numpy(cube(index))
-        tensor = (values * 255).to(kind) if kind == torch.uint8 else values.to(kind)
-        torch.save(tensor, root / "plant" / "torch" / f"frame_{index:05d}.pt")
-        write_picture(root / "images" / f"frame_{index:05d}.jpg")
-        frames.append(
-            {
-                "file_path": f"images/frame_{index:05d}.jpg",
-                "hyperspectral_file_path": f"plant/torch/frame_{index:05d}.pt",
-                "transform_matrix": pose(index),
-            }
-        )
-    write_json(root / "transforms.json", LENS | {"frames": frames})
 
 
 @pytest.mark.parametrize(("kind", "scale"), [(torch.uint8, 255.0), (torch.float32, None)])

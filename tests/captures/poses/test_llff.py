@@ -1,17 +1,10 @@
 import numpy as np
 import pytest
 
+from tests.captures.poses.llff_table import table
 from tests.captures.poses.pose_factory import assert_same_poses, ring
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.errors import CaptureError
-
-
-def table(poses, hwf=(480.0, 640.0, 500.0)):
-    rows = []
-    for pose in poses:
-        right, up, back, position = pose.T
-        rows.append([*np.column_stack([-up, right, back, position, hwf]).ravel(), 0.5, 9.0])
-    return np.array(rows)
 
 
 def write(tmp_path, **options):

@@ -2,36 +2,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.captures.poses.pose_factory import FLIP, assert_same_poses, ring
+from tests.captures.poses.metashape_document import document, text_of
+from tests.captures.poses.pose_factory import assert_same_poses, ring
 from unmix_plugin.captures.poses.lens_fit import project_opencv
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.errors import CaptureError
-
-SENSOR = """<sensor id="0" label="lens" type="{kind}"><resolution width="640" height="480"/>
-<property name="pixel_width" value="0.004"/><property name="pixel_height" value="0.005"/>
-<property name="focal_length" value="2"/>{calibration}</sensor>"""
-CALIBRATION = """<calibration type="{kind}" class="adjusted"><resolution width="640" height="480"/>
-<f>500</f><cx>3</cx><cy>-4</cy>{terms}</calibration>"""
-
-
-def text_of(matrix):
-    return " ".join(repr(float(value)) for value in np.asarray(matrix).ravel())
-
-
-def document(poses, component="", chunk="", terms="", kind="frame", calibration=CALIBRATION, extra=""):
-    """What Metashape writes for cameras at these poses of the chunk, all in a group."""
-    cameras = "".join(
-        f'<camera id="{index}" sensor_id="0" component_id="0" label="{name}"><transform>'
-        f"{text_of(np.vstack([np.column_stack([pose[:, :3] @ FLIP, pose[:, 3]]), [0, 0, 0, 1]]))}"
-        "</transform></camera>"
-        for index, (name, pose) in enumerate(poses.items())
-    )
-    sensor = SENSOR.format(kind=kind, calibration=calibration.format(kind=kind, terms=terms))
-    return (
-        f'<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"><chunk label="c" enabled="true">{chunk}'
-        f'<sensors>{sensor}</sensors><components><component id="0">{component}</component></components>'
-        f'<cameras><group id="0">{cameras}</group>{extra}</cameras></chunk></document>'
-    )
 
 
 def read(tmp_path, *args, **options):

@@ -9,7 +9,7 @@ import pytest
 import torch
 from rich.console import Console
 
-from tests.engine.test_resume import call_after_step, newest, quiet_trainer
+from tests.engine.stopped_runs import call_after_step, newest, quiet_trainer
 from unmix_plugin.engine.runs.checkpoints import checkpoint_steps
 from unmix_plugin.engine.runs.load_run import load_config
 from unmix_plugin.engine.training.interrupts import Interrupted

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.commands.test_view_in_browser import CHROMIUM, FLAGS
+from tests.commands.browser import CHROMIUM, FLAGS
 from unmix_plugin.neumatex.material_export.shader import shader_paths, write_shader
 from unmix_plugin.neumatex.materials.neural import NeuralFamily
 

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from tests.scenes.geometry.ball_views import BOX, FOCAL, SIDE, ball_matter, make_cameras
 from tests.scenes.scene_factory import ball_alpha, look_at, make_scene, ring_poses
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
@@ -18,30 +19,11 @@ from unmix_plugin.scenes.geometry.bounds import find_bounds, focus_point
 from unmix_plugin.scenes.geometry.carving import carve_box, foreground_mask, needed_witnesses
 from unmix_plugin.scenes.geometry.foreground_rays import foreground_rays
 
-BOX = SceneBox(torch.tensor([[-1.0, -1.2, -0.9], [1.1, 1.0, 1.0]]))
-SIDE, FOCAL = 40, 60.0
-
-
-def make_cameras(poses: list[np.ndarray], distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)) -> Cameras:
-    count = len(poses)
-    return Cameras(
-        camera_to_world=torch.from_numpy(np.stack(poses)[:, :3]).float(),
-        focal_px=torch.full((count, 2), FOCAL),
-        center_px=torch.full((count, 2), SIDE / 2),
-        distortion=torch.tensor([distortion]).repeat(count, 1),
-        width=SIDE,
-        height=SIDE,
-    )
-
 
 def centres(box: SceneBox, cells: int) -> np.ndarray:
     steps = (np.arange(cells) + 0.5) / cells
     grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1)
     return box.aabb[0].numpy() + grid * box.size.numpy()
-
-
-def ball_matter(poses: list[np.ndarray], radius: float) -> list[np.ndarray]:
-    return [ball_alpha(pose, radius, SIDE, SIDE, FOCAL) > 0 for pose in poses]
 
 
 @settings(max_examples=15)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.scenes.geometry.test_carving import make_cameras
+from tests.scenes.geometry.ball_views import make_cameras
 from tests.scenes.scene_factory import look_at
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.contraction import UnitSpace

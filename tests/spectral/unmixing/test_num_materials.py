@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.spectral.mixtures import mixed_pixels, seeded, smooth_endmembers
-from tests.spectral.unmixing.test_two_material_mixtures import surface_pixels
+from tests.spectral.unmixing.surface_pixels import surface_pixels
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.unmixing.num_materials import elbow, estimate_noise, hysime, propose_num_materials
 

@@ -1,0 +1,40 @@
+"""Trainings without a display that are stopped after a step."""
+
+import io
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from unmix_plugin.engine.configs import TrainerConfig
+from unmix_plugin.engine.runs.checkpoints import Checkpoint, newest_complete_checkpoint
+from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
+from unmix_plugin.engine.training.interrupts import Interrupted
+from unmix_plugin.engine.training.trainer import Trainer
+
+
+def quiet_trainer(config: TrainerConfig) -> Trainer:
+    return Trainer(config, console=Console(file=io.StringIO()))
+
+
+def call_after_step(trainer: Trainer, step: int, action: Callable[[], None]) -> None:
+    """Let `action` run inside the step that brings the count to `step`."""
+    where = TrainingCallbackLocation.AFTER_TRAIN_ITERATION
+    trainer.callbacks.append(TrainingCallback(where, lambda i, _: action() if i + 1 == step else None))
+
+
+def stop_at(config: TrainerConfig, step: int, number: int = signal.SIGINT) -> Interrupted:
+    trainer = quiet_trainer(config)
+    call_after_step(trainer, step, lambda: os.kill(os.getpid(), number))
+    with pytest.raises(Interrupted) as caught:
+        trainer.train()
+    return caught.value
+
+
+def newest(run: Path) -> Checkpoint:
+    checkpoint = newest_complete_checkpoint(run / "checkpoints")
+    assert checkpoint is not None
+    return checkpoint

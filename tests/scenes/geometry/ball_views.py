@@ -1,0 +1,61 @@
+"""A matt ball seen from a ring of cameras, and what its pictures show of it."""
+
+import numpy as np
+import torch
+
+from tests.scenes.scene_factory import ball_alpha, ring_poses
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.scenes.geometry.carving import carve_box
+from unmix_plugin.scenes.geometry.hull_places import local_log_brightness
+
+BOX = SceneBox(torch.tensor([[-1.0, -1.2, -0.9], [1.1, 1.0, 1.0]]))
+SIDE, FOCAL = 40, 60.0
+
+
+def make_cameras(poses: list[np.ndarray], distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)) -> Cameras:
+    count = len(poses)
+    return Cameras(
+        camera_to_world=torch.from_numpy(np.stack(poses)[:, :3]).float(),
+        focal_px=torch.full((count, 2), FOCAL),
+        center_px=torch.full((count, 2), SIDE / 2),
+        distortion=torch.tensor([distortion]).repeat(count, 1),
+        width=SIDE,
+        height=SIDE,
+    )
+
+
+def ball_matter(poses: list[np.ndarray], radius: float) -> list[np.ndarray]:
+    return [ball_alpha(pose, radius, SIDE, SIDE, FOCAL) > 0 for pose in poses]
+
+
+RADIUS = 0.6
+LAMP = np.array([0.8, 0.3, 0.52])
+
+
+def ball_brightness(pose: np.ndarray, lamp: np.ndarray) -> np.ndarray:
+    """A matt ball in the light of a far lamp (unit direction in the world); 0 beside it."""
+    steps = np.arange(SIDE) + 0.5 - SIDE / 2
+    x, y = np.meshgrid(steps / FOCAL, -steps / FOCAL)
+    directions = np.stack([x, y, -np.ones_like(x)], axis=-1) @ pose[:3, :3].T
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    origin = pose[:3, 3]
+    along = -(directions @ origin)
+    beside = origin @ origin - along**2
+    distance = along - np.sqrt(np.maximum(RADIUS**2 - beside, 0))
+    normals = (origin + distance[..., None] * directions) / RADIUS
+    return np.where(beside < RADIUS**2, 0.1 + np.maximum(normals @ lamp, 0), 0.0)
+
+
+def ball_views(follows_camera: bool, noise: float = 0.0, log_gains: np.ndarray | None = None):
+    """Cameras, brightness and hull of a ball, as `seen_places` takes them."""
+    poses = ring_poses(16)
+    generator = np.random.default_rng(0)
+    images = []
+    for index, pose in enumerate(poses):
+        lamp = pose[:3, :3] @ LAMP if follows_camera else LAMP
+        seen = ball_brightness(pose, lamp) * np.exp(noise * generator.normal(size=(SIDE, SIDE)))
+        seen *= 1.0 if log_gains is None else np.exp(log_gains[index])
+        images.append(local_log_brightness(torch.from_numpy(seen).float()))
+    cameras = make_cameras(poses)
+    return cameras, images, carve_box(cameras, ball_matter(poses, RADIUS), BOX, 32), BOX
