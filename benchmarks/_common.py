@@ -86,7 +86,7 @@ def required(what: str, asked: str, holds: bool, reached: str) -> Figure:
 
 @dataclass(frozen=True)
 class DetailTable:
-    """A further table, for whoever looks closer."""
+    """A further table, with details."""
 
     title: str
     headers: Sequence[str]

@@ -31,7 +31,7 @@ TRAINED_ROWS: dict[str, list[str]] = {
     "3d:ours, no specular part": [f"{_MODEL}.specular", "none"],
     "3d:ours, probe": [f"{_MODEL}.segmentation", "probe"],
 }
-"""What `unmix-train unmix-nerf` is told besides the scene, the seed, the time and the number of endmembers.
+"""What `unmix-train unmix-nerf` is given besides the scene, the seed, the time and the number of endmembers.
 
 As published, but with VCA on the pixels of all views, since one may not show every material, and at one of the
 temperatures that its authors chose by scene. An ablation changes one thing of ours."""

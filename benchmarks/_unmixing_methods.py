@@ -100,7 +100,7 @@ def _by_few(training: Tensor, endmembers: Tensor) -> Explain:
 def _raw_kmeans(pixels: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Mean spectra of clusters by distance, where a shadow is as good a reason for a cluster as a material.
 
-    The best of several restarts from pixels drawn by chance.
+    The best of several restarts from pixels drawn at random.
     """
     pixels = pixels[torch.randperm(len(pixels), generator=generator)[:_LARGEST_SAMPLE]]
     best, least = pixels[:count], float("inf")

@@ -109,7 +109,7 @@ def _page(port: int, moves: bool) -> subprocess.Popen[str]:
 
 
 def _no_scene() -> NoReturn:
-    """A training has its scene at hand, but nobody asks for it here."""
+    """A training has its scene, which is not needed here."""
     from unmix_plugin.errors import SceneError
 
     raise SceneError("not read")

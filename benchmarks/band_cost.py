@@ -172,7 +172,7 @@ def synchronise(trainer: Trainer) -> None:
 
 
 def summarise(costs: list[StepCost]) -> dict[str, Any]:
-    """Medians, and every step's times for whoever wants to know their spread."""
+    """Medians, and every step's times which show their spread."""
     return {
         "wall_ms": 1e3 * median(cost.wall_seconds for cost in costs),
         "cpu_ms": 1e3 * median(cost.cpu_seconds for cost in costs),

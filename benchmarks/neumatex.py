@@ -32,7 +32,7 @@ SECONDS = _common.Limit(600.0, is_upper=True, unit=" s")
 PEAK_MEMORY = _common.Limit(4.0, is_upper=True, unit=" GiB")
 MAIN, BASELINE = "neural", "pbr"
 ORACLE = "neural, oracle's uncertainty"
-"""Held to the prior by its true squared error, of which only an object's maker knows."""
+"""Held to the prior by its true squared error, which is known for generated objects only."""
 VARIANTS: dict[str, tuple[str, ...]] = {
     MAIN: ("--pipeline.model.material", "neural"),
     BASELINE: ("--pipeline.model.material", "pbr"),

@@ -229,7 +229,7 @@ def timed(task: Callable[[Operators], Any], operators: Operators, device: torch.
 
 
 def summarise(seconds: dict[str, list[float]], num_samples: int) -> dict[str, Any]:
-    """Medians, speeds and their ratio; and every time for whoever wants to know the spread."""
+    """Medians, speeds and their ratio; and every time which show the spread."""
     medians = {name: median(found) for name, found in seconds.items()}
     return {
         "milliseconds": {name: 1e3 * found for name, found in medians.items()},

@@ -1,4 +1,4 @@
-"""Does training work in a world without end: objects as good as alone, and no fog before the cameras?
+"""Does training work in an unbounded world: objects as good as alone, and no fog before the cameras?
 
     python benchmarks/world.py [--steps 400] [--runs FOLDER]
 
@@ -36,7 +36,7 @@ _CHUNK = 8192
 
 @dataclass(frozen=True)
 class Options:
-    """Train in a world without end."""
+    """Train in an unbounded world."""
 
     steps: int = 400
     """Of each training."""
@@ -69,7 +69,7 @@ def main(options: Options) -> None:
     setting = {"steps": steps, "pixels": f"{size} x {size}", "views": views, "defaults": "all others"}
     rows = [[run, *(f"{value:.3f}" for value in found.values())] for run, found in measured.items()]
     details = _common.DetailTable("All runs", ["run", *next(iter(measured.values()))], rows)
-    question = "Objects in a world without end against the same objects alone, at equal steps"
+    question = "Objects in an unbounded world against the same objects alone, at equal steps"
     report = _common.Report("world", question, setting, machine, judge(measured), measured, (details,))
     _common.publish(report, _common.results_folder(options.results, options.quick))
 

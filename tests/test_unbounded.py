@@ -1,4 +1,4 @@
-"""Rendering a world without end: what rays see outside the box, and the sky that fills what is left."""
+"""Rendering an unbounded world: what rays see outside the box, and the sky that fills what is left."""
 
 import math
 from dataclasses import replace

@@ -2,7 +2,7 @@
 
 With alpha, space outside the objects' visual hull is carved away before training, and a transparent pixel is known to
 be empty. Without it, as in a closed room, a black pixel may show a black thing or nothing at all, and free space is
-only cleared by training. In a world without end every ray ends on something, if only the sky.
+only cleared by training. In an unbounded world every ray ends on something, if only the sky.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ UNBOUNDED = replace(
 
 
 def preset_for(has_alpha: bool, is_unbounded: bool = False) -> AlphaPreset:
-    """The preset of a scene with or without alpha, in a box or in a world without end."""
+    """The preset of a scene with or without alpha, in a box or in an unbounded world."""
     return UNBOUNDED if is_unbounded else WITH_ALPHA if has_alpha else WITHOUT_ALPHA
 
 

@@ -214,7 +214,7 @@ class HyperspectralDataManager(DataManager):
 
     @cached_property
     def _pixels(self) -> PixelTable:
-        """Read when training asks: evaluation needs none of it."""
+        """Read when training begins: evaluation needs none of it."""
         memory_gb = None if self.options.memory_gb == "auto" else self.options.memory_gb
         return PixelTable(
             self.scene,

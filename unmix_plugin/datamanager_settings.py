@@ -31,7 +31,7 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
     """Rays cast through a pixel, along each of its edges; their mean is the pixel, in training and in rendering. Auto
     is 2, but 1 where the training views have more than 4 million pixels: more pixels teach more than exact ones."""
     single_ray_until: float | Auto = "auto"
-    """Part of the training in which one ray a pixel has to do: coarse shape needs many pixels, not exact ones. Auto is
+    """Part of the training in which a pixel has a single ray: coarse shape needs many pixels, not exact ones. Auto is
     0.4 where alpha is known, otherwise 0.8."""
     grid_resolution: int | Auto = "auto"
     """Cells along an edge of the occupancy grid, from which space is carved that the views show to be empty. Auto is

@@ -90,7 +90,7 @@ class UnmixFieldConfig(InstantiateConfig):
 
 
 class CoefficientField(Field):
-    """What the renderer asks of a field: densities by way of an encoding, and the coefficients of spectra."""
+    """What the renderer needs of a field: densities by way of an encoding, and the coefficients of spectra."""
 
     @property
     def moving_lamp(self) -> MovingLamp | None:

@@ -38,7 +38,7 @@ def first_endmembers(
         balance: What each band counts where pixels are compared.
         sensors: What the sensors of a rig see.
         lamp: Spectrum of the light, which reflectances of a file are multiplied by.
-        initial_data: What the data manager knows of the training pixels.
+        initial_data: The data manager's summary of the training pixels.
     Raises:
         SpectrumError: more endmembers than distinct pixels, or spectra that don't cover the bands.
         ConfigError: the file has another number of spectra.

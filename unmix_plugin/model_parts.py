@@ -1,6 +1,6 @@
 """The parts of a model that its settings choose: field, renderer, gains of views and corrections of poses.
 
-`metadata` is what the data manager knows of the scene, as `engine.model.Model` has it.
+`metadata` describes the scene, as in `engine.model.Model`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What training asks of rendered rays: their spectra first, and what spectra alone leave open.
+"""What rendered rays are compared with in training: their spectra first, and what spectra alone leave open.
 
 Notation: `R` pixels, `P` rays through each, `B` bands, `K` endmembers.
 """

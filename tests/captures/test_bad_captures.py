@@ -1,4 +1,4 @@
-"""What is wrong with a capture is told in one message with exit status 2, and nothing like a scene is left."""
+"""What is wrong with a capture is reported in one message with exit status 2, and nothing like a scene is left."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The product of metamers: whose pairs are in the table, and swatches in the colours that the table speaks of."""
+"""The product of metamers: whose pairs are in the table, and swatches in the colours of the table."""
 
 import csv
 import io

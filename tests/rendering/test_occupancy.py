@@ -1,4 +1,4 @@
-"""What the occupancy grid remembers and forgets."""
+"""What the occupancy grid keeps and discards."""
 
 import torch
 

@@ -22,7 +22,7 @@ def copy(folder, tmp_path):
 
 
 def run_on(root):
-    """What a run remembers of a scene."""
+    """What a run records of a scene."""
     return json.loads(json.dumps(load_scene(root, SceneOptions()).summary()))
 
 

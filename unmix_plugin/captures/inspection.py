@@ -31,7 +31,7 @@ FACTS = (
     ),
     *("bad_bands", "scale", "no_data", "poses", "notes", "metadata"),
 )
-"""What is told of every file, None where it has no such thing."""
+"""What is reported of every file, None where it has no such thing."""
 
 
 def inspect_file(path: Path, options: ReadOptions | None = None) -> dict[str, Any]:

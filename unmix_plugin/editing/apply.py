@@ -109,7 +109,7 @@ def _specular(
     state: MaterialState,
 ) -> tuple[Float64[np.ndarray, "GJ B"], Float64[np.ndarray, "G K"] | None]:
     """Specular spectra mirrored in each colour, one after the other, and the gloss of each endmember in each of them;
-    None where all materials shine alike, so that the spectra say all."""
+    None where all materials have the same gloss, which the spectra describe fully."""
     colours = list(dict.fromkeys(state.mirrors))
     gloss = np.array(
         [

@@ -1,4 +1,4 @@
-"""A field of which some materials are gone and others shine differently.
+"""A field of which some materials are gone and others have another gloss.
 
 Notation: `S` samples, `K` endmembers, `J` specular coefficients, `G` mirrors. A material that is removed is
 transparent: density is multiplied with a function of the share that is kept, which is 0 up to a quarter and 1 from

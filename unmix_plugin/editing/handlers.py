@@ -40,7 +40,7 @@ _GREATEST_REFLECTANCE = 2.0
 """Of a table of reflectances; more is a sign of per cent. Fluorescent ones exceed 1."""
 
 _VISIBLE_DIFFERENCE = 2.5 / 255
-"""Of sRGB channels, from which a user is told."""
+"""Of sRGB channels, above which the user gets a note."""
 
 _REPLACED, _RETINTED, _NAMED, _COLOURED = "replaced", "retinted", "renamed", "given a colour of gloss"
 _REMOVED, _ISOLATED = "removed", "isolated"

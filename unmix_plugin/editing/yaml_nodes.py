@@ -1,4 +1,4 @@
-"""YAML as plain data whose every value knows its line; only single plain values are ever constructed."""
+"""YAML as plain data with the line of every value; only single plain values are ever constructed."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ class ColourScale:
     """How values become colours."""
 
     colour_map: str
-    """A name that matplotlib knows."""
+    """A name of matplotlib's."""
     low: float
     high: float
     """Values at the two ends; those outside get the colours of the ends."""

@@ -175,7 +175,7 @@ class ObjectDataManager(DataManager):
 
     @cached_property
     def _pixels(self) -> PixelList:
-        """Read when training asks: evaluation needs none of it."""
+        """Read when training begins: evaluation needs none of it."""
         return PixelList.of(self.object, self.options.max_pixels, self.seed)
 
     def _find_image(self, index: int) -> int | tuple[int, int]:

@@ -1,4 +1,4 @@
-"""Samples along rays through a world without end, in the occupied cells of a grid over contracted space.
+"""Samples along rays through an unbounded world, in the occupied cells of a grid over contracted space.
 
 Rays start at their origins. Samples lie `step` apart within the inner cube and farther apart outside, as the contracted
 cells are: `step` r up to r = 2, `step` r^2 / 2 beyond, r the maximum norm in units of the inner cube's half edge. They

@@ -1,4 +1,4 @@
-"""A grid over the scene box that remembers which cells may be occupied, so that rays skip empty space.
+"""A grid over the scene box of which cells may be occupied, so that rays skip empty space.
 
 Each cell keeps an exponential moving maximum of the densities probed in it. The grid only says what is empty; what is
 visible is decided from the field's own densities, since a cell's maximum would hide what lies behind its empty part.
@@ -104,7 +104,7 @@ class OccupancyGrid(nn.Module):
             self.met.view(-1).scatter_reduce_(0, (x * side_y + y) * side_z + z, densities, "amax")
 
     def _take_in_met(self, decay: float) -> None:
-        """Treat each cell in which rays met a density as one that was probed, and forget what was met."""
+        """Treat each cell in which rays met a density as one that was probed, and clear what was met."""
         if self.met is not None:
             peaks = torch.maximum(_decayed(self.peak_densities, decay), self.met)
             self.peak_densities.copy_(torch.where(self.met > _NOTHING_MET, peaks, self.peak_densities))

@@ -1,4 +1,4 @@
-"""Which cells training rays have lately ended in: elsewhere nothing was learnt, and nothing is shown.
+"""Which cells training rays have recently ended in: elsewhere nothing was learnt, and nothing is shown.
 
 Behind every surface lies space that no training ray reaches. What a field says there was never compared with a picture:
 from another side it is a grey floater, and it costs time. What one view alone sees isn't held by the others, and grows
@@ -66,7 +66,7 @@ class VisibleCells(nn.Module):
 
     @torch.no_grad()
     def update(self) -> None:
-        """Keep only what two views saw, if enough rays were cast, and forget who saw what.
+        """Keep only what two views saw, if enough rays were cast, and start over.
 
         Where two views saw no cell, what one saw is kept; where none saw any, as in thin semi-transparent density, all
         that was visible.

@@ -61,7 +61,7 @@ class Placement:
 
 
 def read_placement(content: dict[str, Any], faults: Faults, where: str) -> Placement:
-    """What transforms.json records; the identity where it is silent, and with noted faults where it is wrong."""
+    """What transforms.json records; the identity where it records none, and with noted faults where it is wrong."""
     transform = _numbers(content.get(TRANSFORM_KEY), (3, 4))
     if content.get(TRANSFORM_KEY) is None:
         transform = np.eye(3, 4)

@@ -230,7 +230,7 @@ class Scene:
         return None if path is None else np.array(map_array(path), dtype=np.float32, order="C")
 
     def summary(self) -> dict[str, Any]:
-        """What a run has to remember of the scene, as JSON-able values."""
+        """What a run has to record of the scene, as JSON-able values."""
         return {
             "root": str(self.root),
             "wavelengths_nm": self.wavelengths_nm.tolist(),

@@ -1,4 +1,4 @@
-"""Where surfaces are in a world without end, as far as the training views agree on it before any training.
+"""Where surfaces are in an unbounded world, as far as the training views agree on it before any training.
 
 Notation: `R` drawn pixels, `N` training views, `h x w` pixels of a view that were asked.
 """

@@ -19,7 +19,7 @@ from unmix_plugin.spectral.evidence import brightness
 from unmix_plugin.spectral.unmixing.num_materials import estimate_noise
 
 FEWEST_BANDS, PIXELS_PER_BAND = 8, 10
-"""Least number of bands, and of pixels for each, from which noise is told from spectra."""
+"""Least number of bands, and of pixels for each, from which noise can be estimated."""
 PLAIN_FACTOR = 3.0
 """Noise up to this multiple of the usual band's weighs nothing down."""
 PLAIN_NOISE = 0.02

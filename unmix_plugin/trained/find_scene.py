@@ -17,7 +17,7 @@ def find_scene(summary: Mapping[str, Any], run: Path, data: Path | None) -> Scen
     """The scene of a run, if it is where it was and has not changed.
 
     Args:
-        summary: What the run remembers of its scene.
+        summary: What the run recorded of its scene.
         run: Its folder.
         data: Where the scene is now; then it has to be there. None: where it was.
     Raises:

@@ -29,7 +29,7 @@ class RelightableScene(RenderableScene, Protocol):
 
     @property
     def lights(self) -> tuple[str, ...]:
-        """Names of the lights that it knows; the first is that of its pictures."""
+        """Names of the lights that it has; the first is that of its pictures."""
         ...
 
     def with_light(self, choice: LightChoice) -> RelightableScene:
@@ -60,12 +60,12 @@ def relit(scene: RenderableScene, choice: LightChoice, method_name: str) -> Reli
     """A scene under another light.
 
     Raises:
-        ConfigError: its method knows no light from far away, or there is no such light.
+        ConfigError: its method has no light from far away, or there is no such light.
         SceneError: the file of an environment map is missing, damaged or unusable.
     """
     if not isinstance(scene, RelightableScene):
         raise ConfigError(
             f"the method {method_name} has no environment that could be exchanged: --environment needs a run of a "
-            "method that knows light and material apart"
+            "method that separates light and material"
         )
     return scene.with_light(choice)

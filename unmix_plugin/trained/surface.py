@@ -1,7 +1,7 @@
 """The surface of a trained scene as its own cameras see it: where their rays end, and whether they agree.
 
 A ray that grazes an edge ends, on average, between what is before and what is behind it: in the air. And what no camera
-sees was never learnt. Both are told by asking the other cameras: a point lies on the surface where cameras see
+sees was never learnt. Both are found by comparing with the other cameras: a point lies on the surface where cameras see
 something at its distance, and few see through it.
 
 Notation: `P` points, `K` endmembers. Model space.

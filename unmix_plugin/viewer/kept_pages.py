@@ -38,7 +38,7 @@ class PageState:
 
 
 class KeptPages:
-    """States of pages that were closed lately, by the browser that they were in."""
+    """States of pages that were closed recently, by the browser that they were in."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock

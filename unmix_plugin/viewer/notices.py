@@ -15,7 +15,7 @@ _LONGEST = 2000
 
 
 class Notices:
-    """What a client is told: warnings and notes on edits replace the ones before."""
+    """Notices to a client: warnings and notes on edits replace the ones before."""
 
     def __init__(self, client: viser.ClientHandle) -> None:
         self._client = client

@@ -62,7 +62,7 @@ class Services:
             source: The model.
             read_scene: Reads the scene.
             recipe: What every client sees the scene with at first.
-            environments: Files of lights to offer beside those that the scene knows.
+            environments: Files of lights to offer beside those of the scene.
         Raises:
             ConfigError: the recipe does not fit the run, or its method has no environments.
             SceneError: an environment map is missing, damaged or unusable.
@@ -174,7 +174,7 @@ def thumbnail(scene: Scene, name: str) -> Thumbnail | None:
 
 
 def _lights(scene: RenderableScene, environments: Sequence[Path]) -> tuple[str, ...]:
-    """Names of the lights that a scene knows, and the paths of those that a user brings."""
+    """Names of a scene's lights, and the paths of those that a user gives."""
     paths = tuple(str(path.resolve()) for path in environments)
     for path in paths:
         relit(scene, LightChoice(path), "of this run")

@@ -41,7 +41,7 @@ class Panel:
     title: str
     """Label of the tab."""
     build: Callable[[Session], object]
-    """Builds the controls in the tab that is open; what follows a run or an edit asks the session to be told."""
+    """Builds the controls in the tab that is open; what follows a run or an edit registers with the session."""
     applies: Callable[[Services], bool] = lambda _: True
     """Whether clients of a viewer have it."""
 

@@ -61,7 +61,7 @@ def open_server(host: str, port: int) -> viser.ViserServer:
 def _own_page() -> Iterator[None]:
     """Context in which servers send viser's page under our title, dark where the browser's user prefers that.
 
-    viser has no setting for either, and reads its page from a folder that only its websocket server is told.
+    viser has no setting for either, and reads its page from a folder that only its websocket server has.
     """
     from viser import infra
 

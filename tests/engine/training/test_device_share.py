@@ -1,4 +1,4 @@
-"""Turns on a device: exclusive, in the proportion stated, and nobody waits for ever."""
+"""Turns on a device: exclusive, in the proportion stated, and nobody waits forever."""
 
 import math
 import threading

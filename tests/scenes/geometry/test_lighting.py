@@ -1,4 +1,4 @@
-"""Whether a light is told from one that moves with the camera, on a matt ball."""
+"""Whether a light is distinguished from one that moves with the camera, on a matt ball."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Poses of a wrong convention are told from right ones, and what they are is said."""
+"""Poses of a wrong convention are found, and the right convention is named."""
 
 import json
 import shutil

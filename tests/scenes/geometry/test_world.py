@@ -1,4 +1,4 @@
-"""What tells a world without end from a closed box, and which of its cells are carved."""
+"""What distinguishes an unbounded world from a closed box, and which of its cells are carved."""
 
 import json
 from functools import partial

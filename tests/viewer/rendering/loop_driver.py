@@ -12,7 +12,7 @@ LARGEST = 64
 
 
 class FixedSpeed(Speedometer):
-    """Believes what it is told, and no measurement."""
+    """A speed that is set, not measured."""
 
     def add(self, rays, seconds):
         pass

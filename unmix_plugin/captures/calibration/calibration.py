@@ -57,7 +57,7 @@ class Calibration:
     """Factor on all values, such as one over the scale factor of the files."""
     exposure: float | None = None
     """Exposure time times gain that values are brought to: that of the white reference, otherwise of the first view;
-    None where the files are silent."""
+    None where the files do not say."""
 
     @property
     def num_bands(self) -> int:

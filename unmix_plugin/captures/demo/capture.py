@@ -34,7 +34,7 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 
 RAW_SIZE, RAW_BANDS, RAW_VIEWS = 400, 31, 40
-"""Defaults: as many views and pixels as structure from motion likes."""
+"""Defaults: as many views and pixels as structure from motion needs."""
 RAW_LAMP = "A"
 """The lamp of the laboratory: a halogen lamp, which has little blue."""
 RAW_BANDS_BOUNDS = (10, 512)

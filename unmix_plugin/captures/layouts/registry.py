@@ -31,7 +31,7 @@ class LayoutOptions:
 
     @property
     def read(self) -> ReadOptions:
-        """What the readers are told."""
+        """What the readers get."""
         return ReadOptions(self.dataset, self.wavelengths_nm, self.axes)
 
 

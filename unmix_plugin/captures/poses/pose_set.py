@@ -51,7 +51,7 @@ class PosedCamera:
 
 @dataclass(frozen=True)
 class PoseSet:
-    """All cameras that a source knows."""
+    """All cameras of a source."""
 
     cameras: dict[str, PosedCamera]
     """By the name of the image as the source writes it, with folders and suffix."""

@@ -44,7 +44,7 @@ def file_kind(path: Path) -> str:
     """Name of the reader for a file or folder.
 
     Raises:
-        CaptureError: it is missing, empty, or of a kind that no reader knows.
+        CaptureError: it is missing, empty, or of a kind that no reader reads.
     """
     if path.is_dir():
         return "folder"

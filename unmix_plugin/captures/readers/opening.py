@@ -49,7 +49,7 @@ def open_spectral_file(path: Path, options: ReadOptions | None = None) -> Spectr
 
     Args:
         path: For ENVI the header or the file of numbers.
-        options: What the user knows better than the file.
+        options: What the user gives, which overrides the file.
     Raises:
         CaptureError: the file is missing, damaged or of no known kind, or the options don't fit it.
     """

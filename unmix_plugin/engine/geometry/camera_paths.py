@@ -30,7 +30,7 @@ _STEEPEST_DEG = 80.0
 def orbit(cameras: Cameras, box: SceneBox, num_frames: int) -> Cameras:
     """A circle around what the cameras look at, at their middle distance and elevation; it ends where it starts.
 
-    Where the cameras are on one side only, it is an arc over that side, there and back.
+    Where the cameras are on one side only, it is an arc over that side, back and forth.
 
     Args:
         cameras: Those of the scene.
@@ -124,7 +124,7 @@ def _ground_axes(
 
 
 def _swing(angles: Float64[np.ndarray, "N"], num_frames: int) -> Float64[np.ndarray, "F"]:
-    """Angles in radians of a full circle, or to and fro over the arc on which the cameras are."""
+    """Angles in radians of a full circle, or back and forth over the arc on which the cameras are."""
     turn = np.arange(num_frames) / num_frames * 2 * np.pi
     ordered = np.sort(angles)
     gaps = np.diff(np.append(ordered, ordered[0] + 2 * np.pi))

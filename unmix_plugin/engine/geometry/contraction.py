@@ -1,4 +1,4 @@
-"""From a world without end to the unit cube: space around the scene box is contracted, the box itself is not.
+"""From an unbounded world to the unit cube: space around the scene box is contracted, the box itself is not.
 
 Notation: `P` points; u are coordinates in which the box's longest edge runs from -1 to 1, r = max |u| (the maximum
 norm). Where r <= 1, nothing happens; elsewhere u becomes (2 - 1/r) u / r, so that infinity lies at r = 2. The cube of

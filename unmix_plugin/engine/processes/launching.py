@@ -98,7 +98,7 @@ def _wait_until(worker: subprocess.Popen[bytes], deadline: float) -> int | None:
 
 @contextmanager
 def _forwarded_signals(first: subprocess.Popen[bytes]) -> Iterator[None]:
-    """Context in which the first process hears what this one is told; Ctrl-C reaches all of a terminal by itself."""
+    """Context in which the first process gets the signals of this one; Ctrl-C reaches all of a terminal by itself."""
 
     def forward(number: int, _frame: FrameType | None) -> None:
         with suppress(OSError):

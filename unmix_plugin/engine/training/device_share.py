@@ -125,7 +125,7 @@ class DeviceShare:
         return self._is_training_waiting and self._was_guests_turn and not self._is_training
 
     def _refuse_nesting(self) -> None:
-        """A thread that has the device would wait for itself for ever."""
+        """A thread that has the device would wait for itself forever."""
         if self._owner == threading.get_ident():
             raise RuntimeError("this thread has the device already: turns do not nest")
 

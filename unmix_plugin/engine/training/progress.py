@@ -51,13 +51,13 @@ class TrainingStatus:
 
 
 class ProgressConsole(Console):
-    """Standard output that falls silent when nobody reads it any more, where rich would end the process."""
+    """Standard output that drops what it gets once its reader has gone, where rich would end the process."""
 
     is_closed = False
     """Whether that has happened; training then stops as after Ctrl-C."""
 
     def on_broken_pipe(self) -> None:
-        """Fall silent."""
+        """Drop everything from now on."""
         self.is_closed = self.quiet = True
 
 

@@ -19,7 +19,7 @@ from unmix_plugin.neumatex.materials.layered import LayeredFamily
 
 @dataclass(frozen=True)
 class _Pattern:
-    """A material that changes to and fro between two sets of parameters."""
+    """A material that changes back and forth between two sets of parameters."""
 
     noise: Noise
     first: Float[Tensor, " P"]

@@ -76,7 +76,7 @@ class ObjectScene:
         return found
 
     def summary(self) -> dict[str, Any]:
-        """What a run has to remember of the object, as JSON-able values."""
+        """What a run has to record of the object, as JSON-able values."""
         return {
             "root": str(self.root),
             "frames": self.pictures.names,

@@ -124,7 +124,7 @@ def _symbols(
         return palette.by_id[values][:, :, None]
     scale = palette.scale(output)
     assert scale is not None, output.name
-    if output.name == "abundances":  # of what is seen: that a pixel is half covered is told by its opacity
+    if output.name == "abundances":  # of what is seen: that a pixel is half covered is shown by its opacity
         values = values / np.maximum(opacity, 1e-6)[..., None]
     maps = values[..., None] if kind == "map" else values
     return np.stack([paint(np.asarray(one, np.float64), scale) for one in np.moveaxis(maps, -1, 0)], axis=2)

@@ -25,7 +25,7 @@ _STYLES = (("dashed", "#4b545c"), ("dotted", "#7a838b"), ("solid", "#a2aab1"))
 
 @dataclass(frozen=True)
 class TrueMaterials:
-    """What the run knows of the scene's materials."""
+    """What is known of the scene's materials."""
 
     names: Sequence[str]
     radiance: Float64[np.ndarray, "M B"]
@@ -59,7 +59,7 @@ def material_cards(
         proportions: Part of all that is seen that each is.
         light: In which the spectra are seen; None where it is unknown.
         library: Known materials.
-        truth: True materials, where the run knows them.
+        truth: True materials, where they are known.
     """
     spectra = materials.endmembers.detach().cpu().double().numpy()
     colours = endmember_colours(materials)

@@ -38,7 +38,8 @@ DEPTHS = (0.1, 60.0)
 BOX_MARGIN = 1.15
 """The box is widened by this for what still counts as in it: agreement has the width of a pixel's patch."""
 CLEARLY = 0.7
-"""Disagreement behind the box over that in it, below which a pixel speaks for a world there; and the reverse."""
+"""Disagreement behind the box over that in it, below which a pixel counts as evidence of a world there; and the
+reverse."""
 MOST_DISAGREEMENT = 0.3
 """Of a pixel that is explained, against that of unrelated pixels."""
 MOST_BEHIND = 0.15

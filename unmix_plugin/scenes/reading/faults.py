@@ -13,7 +13,7 @@ MAX_PLACES = 3
 
 
 class Faults:
-    """What is wrong with one scene, in the order found; the same fault in many places is told once."""
+    """What is wrong with one scene, in the order found; the same fault in many places is reported once."""
 
     def __init__(self, root: Path) -> None:
         self._root = root

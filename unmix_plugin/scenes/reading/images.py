@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from PIL import Image
 
 FORMATS = ("PNG", "JPEG", "TIFF")
-"""Pillow knows more, some of which start other programs."""
+"""Pillow reads more formats, some of which start other programs."""
 COLOUR_MODES = {"RGB": "RGB", "RGBA": "RGBA", "L": "RGB", "LA": "RGBA", "1": "RGB"}
 """How each pillow mode of 8 bits is brought to RGB or RGBA; palettes are looked at separately."""
 

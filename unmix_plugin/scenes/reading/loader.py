@@ -81,7 +81,7 @@ def _check_line_poses(entry: SceneEntry, sizes: list[Size], faults: Faults) -> N
 
 @dataclass(frozen=True)
 class _Truth:
-    """What a scene says of its materials and light; None where it is silent."""
+    """What a scene says of its materials and light; None where it says nothing."""
 
     material_names: tuple[str, ...] | None
     illuminant: Float64[np.ndarray, " B"] | None

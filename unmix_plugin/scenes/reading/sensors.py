@@ -23,7 +23,7 @@ from unmix_plugin.spectral.sensor import read_sensor
 
 @dataclass(frozen=True)
 class SensorEntry:
-    """What a frame says of its sensor; None where it is silent."""
+    """What a frame says of its sensor; None where it says nothing."""
 
     name: str | None = None
     bands: tuple[int, ...] | None = None

@@ -29,7 +29,7 @@ def brightness_factor(
     """The one factor on all endmembers with which nearly every pixel is a mixture of amounts that sum to at most 0.75.
 
     Spectra from a file are as bright as a white surface in the brightest band of the lamp; a scene's exposure is
-    anything. Ratios between endmembers, which the file knows, stay.
+    anything. Ratios between endmembers, which the file gives, stay.
 
     Args:
         endmembers: Reflectance times the lamp's relative power.

@@ -95,7 +95,7 @@ def margin_error(variance: Float[Tensor, ""]) -> Float[Tensor, ""]:
 
 
 class MixtureCache:
-    """Mixtures of pixels that were unmixed lately: a mixture depends on the pixel alone, and pixels come again.
+    """Mixtures of pixels that were unmixed recently: a mixture depends on the pixel alone, and pixels come again.
 
     A fixed number of slots, whatever the size of the scene; values are kept, and given even the first time, in half
     precision, so that a resumed training sees the same ones.

@@ -19,7 +19,7 @@ from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.unmixing.vca_nascimento2005 import vca
 
 _MIN_GAIN = 1e-9
-"""Least relative growth of the volume that counts: rounding errors must not swap equal pixels for ever."""
+"""Least relative growth of the volume that counts: rounding errors must not swap equal pixels forever."""
 
 
 def nfindr(

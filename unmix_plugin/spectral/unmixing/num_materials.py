@@ -30,7 +30,7 @@ LEAST_FALL = 0.004
 
 @dataclass(frozen=True)
 class MaterialCount:
-    """A proposed number of materials and what speaks for it."""
+    """A proposed number of materials and the evidence for it."""
 
     number: int
     mean_distances: tuple[float, ...]

@@ -35,7 +35,7 @@ _DISTINCT = 4e-10
 """Squared distance above which unit spectra are distinct; k-means then finds at least as many shapes."""
 
 _LEAST_GAIN = 1e-7
-"""Least fall of the mean distance that counts: rounding errors must not swap for ever."""
+"""Least fall of the mean distance that counts: rounding errors must not swap forever."""
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,7 @@ class LayerAids:
         return (max(0.0, distance - radius) / scale, (distance + radius) / scale)
 
     def _remembered(self, what: str, materials: Materials, make: Callable[[], _ValueT]) -> _ValueT:
-        """What `make` gives, remembered for the materials that clients look at."""
+        """What `make` gives, kept for the materials that clients look at."""
         spectra = torch.cat([materials.endmembers, materials.specular_spectra])
         key = (what, spectra.cpu().numpy().tobytes())
         found = self._kept.get(key)  # looked up once: another thread may clear what is kept at any moment

@@ -142,7 +142,7 @@ class MeasuredViews:
         return rows, columns, inside & ((distance - rendered).abs() < _TOLERANCE * distance)
 
     def _distance_of(self, index: int, lent: TrainedScene | None) -> Float[Tensor, "H W"]:
-        """Distances along the rays of a training view as rendered lately, infinite where nothing is."""
+        """Distances along the rays of a training view as last rendered, infinite where nothing is."""
         step = self._source.version
         with self._lock:
             kept = self._distances.get(index)

@@ -25,7 +25,7 @@ _MEMORY = 0.7
 
 @dataclass
 class Speedometer:
-    """Rays a second, as measured lately."""
+    """Rays a second, as measured recently."""
 
     rays_per_second: float = _FIRST_GUESS
 

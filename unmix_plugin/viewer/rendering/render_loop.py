@@ -38,7 +38,7 @@ class RenderLoop:
         self._thread.start()
 
     def stop(self) -> None:
-        """End after the block under way; captures that are not finished are told so."""
+        """End after the block under way; unfinished captures are reported as such."""
         with self._changed:
             self._is_stopping = True
             self._changed.notify_all()
