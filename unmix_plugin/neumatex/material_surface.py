@@ -40,14 +40,19 @@ class TriplaneSurface:
         return self.triplane.parameters_at(positions)
 
 
-def material_family(name: MaterialName, endmembers: Float[Tensor, "K B"] | None = None) -> MaterialFamily:
-    """The family of that name; the neural one with the shipped decoder, the spectral one with these endmembers.
+def material_family(
+    name: MaterialName,
+    endmembers: Float[Tensor, "K B"] | None = None,
+    gains: Float[Tensor, " K"] | None = None,
+) -> MaterialFamily:
+    """The family of that name; the neural one with the shipped decoder, the spectral one with these endmembers and
+    gains.
 
     Raises:
         ConfigError: the shipped decoder can't be read.
     """
     if endmembers is not None:
-        return SpectralFamily(endmembers)
+        return SpectralFamily(endmembers, gains)
     families: dict[MaterialName, type] = {"neural": NeuralFamily, "pbr": PbrFamily}
     return families[name]()
 

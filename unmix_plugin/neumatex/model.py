@@ -64,7 +64,8 @@ class NeumatexModel(Model):
         record = ObjectRecord.from_json(self.metadata)
         self.record = record
         self.endmembers: nn.Parameter | None = self._empty_endmembers()
-        self.family = material_family(self.config.material, self.endmembers)
+        self.gains = None if self.endmembers is None else nn.Parameter(torch.ones(len(self.endmembers)))
+        self.family = material_family(self.config.material, self.endmembers, self.gains)
         # A run keeps the decoder that it was fitted with.
         self.family_parts = nn.ModuleDict(frozen_parts(self.family))
         generator = torch.Generator().manual_seed(_START_SEED)
@@ -116,13 +117,15 @@ class NeumatexModel(Model):
         if not self.config.fit_networks:
             groups["networks"] = []
         spectra = [] if self.endmembers is None else [self.endmembers]
-        return {**groups, "response": list(self.curve.parameters()), "endmembers": spectra}
+        gains = [] if self.gains is None else [self.gains]
+        response = list(self.curve.parameters())
+        return {**groups, "response": response, "endmembers": spectra, "gains": gains}
 
     def get_training_callbacks(self) -> list[TrainingCallback]:
-        """Keep endmembers what reflectances can be."""
+        """Make the endmembers as bright as their gains say, and keep them what reflectances can be."""
         if self.endmembers is None:
             return []
-        return [TrainingCallback(TrainingCallbackLocation.AFTER_TRAIN_ITERATION, self._bound_endmembers)]
+        return [TrainingCallback(TrainingCallbackLocation.AFTER_TRAIN_ITERATION, self._settle_endmembers)]
 
     @property
     def mesh(self) -> Mesh:
@@ -269,9 +272,11 @@ class NeumatexModel(Model):
         return tone_curve("agx" if name == "auto" else name)
 
     @torch.no_grad()
-    def _bound_endmembers(self, step: int, progress: float) -> None:
+    def _settle_endmembers(self, step: int, progress: float) -> None:
         assert self.endmembers is not None
-        self.endmembers.clamp_(0, 1)
+        assert self.gains is not None
+        self.endmembers.mul_(self.gains[:, None]).clamp_(0, 1)
+        self.gains.fill_(1)
 
     def _random(self) -> torch.Generator:
         """The step's source of random numbers; outside training always the same."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from unmix_plugin.engine import step_generator
@@ -28,7 +28,6 @@ from unmix_plugin.neumatex.traced_object import SeenPoints, TracedObject
 from unmix_plugin.neumatex.triplane import Triplane
 from unmix_plugin.spectral.unmixing.abundance_estimation import fcls
 from unmix_plugin.spectral.unmixing.endmembers import drop_uninformative_pixels, initialise_endmembers
-from unmix_plugin.spectral.unmixing.kmeans_normalised import scale_to_lit_pixels
 from unmix_plugin.spectral.unmixing.num_materials import propose_num_materials
 
 if TYPE_CHECKING:
@@ -42,6 +41,8 @@ _USUAL_ENDMEMBERS = 6
 _SAMPLES = 64
 _DARKEST = 0.1
 """Light on a pixel, as a part of the median, below which its reflectance is noise."""
+_PURE, _FEWEST_PURE = 0.02, 50
+"""Part of the pixels, and how many at least, that count as purest of an endmember."""
 _STEPS, _POINTS, _RATE = 200, 4096, 5e-3
 
 
@@ -114,8 +115,8 @@ def _from_pixels(
     pixels = found.reflectance
     count = model.family.num_parameters - NUM_GLOSS
     first = initialise_endmembers(pixels, count, model.config.endmember_init, generator)
-    ids = (pixels @ torch.nn.functional.normalize(first, dim=1).T).argmax(dim=1)
-    endmembers = _as_bright(first, pixels, ids)
+    unit = torch.nn.functional.normalize
+    endmembers = as_bright(first, pixels, unit(pixels, dim=1) @ unit(first, dim=1).T)
     return endmembers, fcls(pixels, endmembers)
 
 
@@ -128,14 +129,23 @@ def _from_run(
     count = model.family.num_parameters - NUM_GLOSS
     first = run.reflectances(model.record.bands, arrays["lamp"], count).to(found.reflectance)
     shares = run.abundances(found.positions, found.normals, arrays["world_corners"])
-    return _as_bright(first, found.reflectance, shares.argmax(dim=1)), shares
+    return as_bright(first, found.reflectance, shares), shares
 
 
-def _as_bright(
-    spectra: Float[Tensor, "K B"], pixels: Float[Tensor, "N B"], ids: Int[Tensor, " N"]
+def as_bright(
+    spectra: Float[Tensor, "K B"], pixels: Float[Tensor, "N B"], purity: Float[Tensor, "N K"]
 ) -> Float[Tensor, "K B"]:
-    """Spectra as bright as the usual one of their pixels: in known light a pixel is as bright as its material."""
-    return scale_to_lit_pixels(spectra, pixels, ids, brightness_quantile=0.5).clamp(0, 1)
+    """Spectra of the same shape, each as bright as the purest of its pixels: in known light a pixel is as bright as its
+    material, but one that shows others, too, is as bright as the mixture.
+
+    Args:
+        purity: The larger, the more a pixel is of an endmember alone.
+    """
+    count = min(len(pixels), max(_FEWEST_PURE, round(_PURE * len(pixels))))
+    purest = purity.topk(count, dim=0).indices
+    brightness = pixels.norm(dim=1)[purest].median(dim=0).values
+    bright = torch.nn.functional.normalize(spectra, dim=1) * brightness[:, None]
+    return bright / bright.amax(dim=1, keepdim=True).clamp(min=1)
 
 
 def _seen_pixels(model: NeumatexModel, arrays: Mapping[str, np.ndarray]) -> SeenPixels:

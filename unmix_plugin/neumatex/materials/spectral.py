@@ -38,12 +38,15 @@ class SpectralFamily(LobeFamily):
     The gloss reflects the square of the specular level at normal incidence: 0.2 is a common dielectric's 4 %.
     """
 
-    def __init__(self, endmembers: Float[Tensor, "K B"]) -> None:
+    def __init__(self, endmembers: Float[Tensor, "K B"], gains: Float[Tensor, " K"] | None = None) -> None:
         """
         Args:
             endmembers: Reflectances, [0, 1]; kept as they are given, so that their gradients arrive there.
+            gains: Factors of the endmembers, whose gradients tell how bright these should be. They are 1 except within
+                a step of training, so that `endmembers` are the whole reflectances.
         """
         self.endmembers = endmembers
+        self.gains = endmembers.new_ones(len(endmembers)) if gains is None else gains
 
     @property
     def num_endmembers(self) -> int:
@@ -88,7 +91,7 @@ class SpectralFamily(LobeFamily):
 
     def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
         """Diffuse reflectance of each band, [0, 1]."""
-        return self.abundances(parameters) @ self.endmembers
+        return self.abundances(parameters) @ (self.gains[:, None] * self.endmembers)
 
     def _gloss(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
         """Roughness (1 N), and what the gloss reflects at normal incidence (1 N)."""
