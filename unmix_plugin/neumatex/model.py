@@ -26,6 +26,7 @@ from unmix_plugin.engine import (
 )
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.datamanager import batch_environment
+from unmix_plugin.neumatex.endmember_gains import empty_endmembers, settle
 from unmix_plugin.neumatex.geometry.mesh import Mesh
 from unmix_plugin.neumatex.image_evaluation import evaluate_object_image, evaluation_outputs
 from unmix_plugin.neumatex.lighting.environment import Environment
@@ -63,7 +64,7 @@ class NeumatexModel(Model):
         """Modules and buffers in the shapes that config and object ask for."""
         record = ObjectRecord.from_json(self.metadata)
         self.record = record
-        self.endmembers: nn.Parameter | None = self._empty_endmembers()
+        self.endmembers: nn.Parameter | None = empty_endmembers(self.config, record)
         self.gains = None if self.endmembers is None else nn.Parameter(torch.ones(len(self.endmembers)))
         self.family = material_family(self.config.material, self.endmembers, self.gains)
         # A run keeps the decoder that it was fitted with.
@@ -176,9 +177,12 @@ class NeumatexModel(Model):
         batch: dict[str, Tensor],
         metrics_dict: dict[str, Tensor] | None = None,
     ) -> dict[str, Tensor]:
-        """`picture`: the squared error of tone-mapped light, from two independent estimates; `prior`: the distance
-        from the prior's material."""
-        losses = {"picture": _squared_error(self._residuals(outputs, batch), outputs["found"])}
+        """`picture`: the squared error of tone-mapped light, from two independent estimates, of spectral pictures with
+        weights; `prior`: the distance from the prior's material."""
+        residuals = self._residuals(outputs, batch)
+        if isinstance(self.light_curve, LampRatio):
+            residuals = residuals * self.light_curve.weights(batch["numbers"])
+        losses = {"picture": _squared_error(residuals, outputs["found"])}
         if self.anchor is not None and self.config.regularisation > 0:
             positions = outputs["positions"]
             distance = self.anchor.distance(self.surface.parameters(positions), positions)
@@ -242,27 +246,6 @@ class NeumatexModel(Model):
         shown, wanted = self.compared(outputs["halves"], batch["numbers"], tone, self.light_curve)
         return shown - wanted
 
-    def _empty_endmembers(self) -> nn.Parameter | None:
-        """Endmembers (K, B) of a spectral material, not yet filled; None for materials in colours.
-
-        Raises:
-            ConfigError: the material does not fit the pictures.
-        """
-        count, bands = self.config.num_endmembers, self.record.num_colours
-        if self.record.is_spectral != (self.config.material == "spectral"):
-            fitting = "spectral" if self.record.is_spectral else "neural or pbr"
-            raise ConfigError(
-                f"the material {self.config.material} does not fit pictures of {bands} "
-                f"{'bands' if self.record.is_spectral else 'colours'}; choose {fitting}"
-            )
-        if not self.record.is_spectral:
-            return None
-        if not isinstance(count, int):
-            raise ConfigError("num-endmembers is not settled: call resolve_auto first")
-        if count > bands:
-            raise ConfigError(f"num-endmembers is {count} but the pictures have {bands} bands; choose fewer")
-        return nn.Parameter(torch.zeros(count, bands))
-
     def _light_curve(self) -> nn.Module:
         name = self.config.light_curve
         if self.record.is_spectral:
@@ -275,8 +258,7 @@ class NeumatexModel(Model):
     def _settle_endmembers(self, step: int, progress: float) -> None:
         assert self.endmembers is not None
         assert self.gains is not None
-        self.endmembers.mul_(self.gains[:, None]).clamp_(0, 1)
-        self.gains.fill_(1)
+        settle(self.endmembers, self.gains)
 
     def _random(self) -> torch.Generator:
         """The step's source of random numbers; outside training always the same."""

@@ -24,6 +24,20 @@ def test_the_curve_and_its_slope_have_no_step():
     assert_close(slope, torch.tensor([1.0, 1.0, 1.0, 0.999, 0.25]), atol=1e-4, rtol=0)
 
 
+def test_relative_errors_of_bright_pixels_count_alike_and_dark_ones_have_no_boundless_weight():
+    light = torch.tensor([0.0, 1e-4, 1.0, 40.0, 80.0])[:, None] * torch.tensor(LAMP)
+    weights = LampRatio(LAMP).weights(light)[:, 0]
+    assert_close(weights[3] / weights[4], torch.tensor(2.0), rtol=0.1, atol=0)
+    assert_close(weights[0], weights[1], rtol=1e-3, atol=0)
+    assert_close(weights.square().mean(), torch.tensor(1.0))
+
+
+def test_the_weights_of_pixels_do_not_depend_on_the_exposure_nor_on_the_lamp():
+    light = torch.rand(50, 3, generator=torch.Generator().manual_seed(0))
+    weights = LampRatio((1.0, 1.0, 1.0)).weights(light)
+    assert_close(LampRatio(LAMP).weights(7 * light * torch.tensor(LAMP)), weights)
+
+
 def test_a_flat_spectrum_is_shown_as_a_grey():
     display = SpectralDisplay(Bands.of([450, 500, 550, 600, 650]))
     assert_close(display.rgb(torch.full((5,), 0.4)), torch.full((3,), 0.4))

@@ -15,6 +15,9 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.agx import agx
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
 
+_DARK = 0.25
+"""Brightness, as a part of the mean, far below which pixels count alike."""
+
 
 class LampRatio(nn.Module):
     """Light over the lamp's power, so that all bands count by their reflectance; above 1 its logarithm, plus 1, so that
@@ -38,6 +41,17 @@ class LampRatio(nn.Module):
         """Numbers of at least 0."""
         ratio = light / self.lamp
         return torch.where(ratio < 1, ratio, 1 + ratio.clamp(min=1).log())
+
+    def weights(self, light: Float[Tensor, "R B"]) -> Float[Tensor, "R 1"]:
+        """Of errors of a picture's pixels, with which relative errors count: else materials that are dark or in the
+        shade would be fitted last. Pixels far darker than the mean get no more, since they hold little but noise.
+
+        Weights follow from the picture alone, so that the noise of rendered light makes no bias; the mean of their
+        squares is 1.
+        """
+        brightness = (light / self.lamp).mean(dim=-1, keepdim=True).clamp(min=0)
+        weights = 1 / (_DARK * brightness.mean().clamp(min=1e-6) + brightness)
+        return weights / weights.square().mean().sqrt()
 
 
 class SpectralDisplay(nn.Module):
