@@ -35,8 +35,8 @@ neumatex = MethodSpecification(
             "planes": OptimizerConfig(lr=5e-3, final_factor=0.2),
             "networks": OptimizerConfig(lr=5e-3, final_factor=0.2),
             "response": OptimizerConfig(lr=2e-2, final_factor=0.1),
-            # Brightness soon comes right; the shapes of the spectra drift where they may move as fast.
-            "endmembers": OptimizerConfig(lr=2e-4, final_factor=0.1),
+            # Brightness soon comes right; shapes of spectra drift where they may move as fast (see endmember_gains).
+            "endmembers": OptimizerConfig(lr=1e-3, final_factor=0.1),
             "gains": OptimizerConfig(lr=6e-3, final_factor=0.1),
         },
     ),
