@@ -3,7 +3,8 @@
 import torch
 from torch.testing import assert_close
 
-from unmix_plugin.pose_refinement import PoseRefinement
+from unmix_plugin.pose_knots import row_waves
+from unmix_plugin.pose_refinement import PoseConfig, PoseRefinement
 
 
 def test_a_line_camera_is_corrected_by_waves_over_its_rows():
@@ -30,3 +31,40 @@ def test_knots_follow_a_wobble_of_three_waves_of_10_px_within_a_fifth_of_a_pixel
     shares = (1 - (place[:, None] - torch.arange(found.knots.counts[0])).abs()).clamp(min=0)
     fitted = shares @ torch.linalg.lstsq(shares, wobble[:, None]).solution
     assert float((fitted[:, 0] - wobble).square().mean().sqrt()) < 0.2
+
+
+def test_a_bend_of_a_line_camera_costs_and_a_drift_does_not():
+    found, config = PoseRefinement((0, 40, 40, 4)), PoseConfig(penalty=0.0, roughness=2.0)
+
+    def cost(*shapes: torch.Tensor) -> float:
+        """Of corrections of the two long sweeps; the frame and the short sweep have their own."""
+        with torch.no_grad():
+            found.steps.fill_(0.1)
+            for first, shape in zip((1, 12), shapes, strict=True):
+                found.steps[first : first + 11] = torch.linalg.solve(row_waves(11), shape[:, None]).expand(
+                    -1, 6
+                )
+            return float(found.penalty(config))
+
+    drift, bump = torch.linspace(0.0, 0.2, 11), torch.eye(11)[5] * 0.01
+    assert cost(drift, -3 * drift + 0.5) < 1e-10
+    # A bump bends by 1, -2 and 1 of its height; each sweep has 9 bends.
+    assert abs(cost(drift + bump, drift) - 2.0 * 6 * 1e-4 / 18) < 1e-8
+
+
+def test_frames_have_no_roughness():
+    found = PoseRefinement((0, 0, 0))
+    with torch.no_grad():
+        found.steps.normal_(generator=torch.Generator().manual_seed(0))
+        assert float(found.penalty(PoseConfig(penalty=0.0))) == 0.0
+
+
+def test_a_sweep_that_goes_far_in_a_few_rows_is_not_undone_and_one_that_goes_far_in_all_is():
+    found = PoseRefinement((40, 40, 40))
+    few = torch.zeros(11)
+    few[4:6] = 0.3
+    with torch.no_grad():
+        found.steps[:11, 0] = torch.linalg.solve(row_waves(11), few)
+        found.steps[11, 0] = 0.3
+    found.undo_runaways()
+    assert found.is_free.tolist() == [True, False, True]

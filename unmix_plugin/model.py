@@ -198,7 +198,7 @@ class UnmixModel(Model):
         if "surface" in weights and "surfaces" in batch:
             losses["surface"] = surface_loss(outputs, batch["surfaces"], self.renderer.space)
         if self.poses is not None:
-            weights["poses"], losses["poses"] = self.config.pose_refinement.penalty, self.poses.penalty()
+            weights["poses"], losses["poses"] = 1.0, self.poses.penalty(self.config.pose_refinement)
         return {name: weights[name] * losses[name] for name in weights if name in losses}
 
     def observe(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> None:
