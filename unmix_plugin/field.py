@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Literal
@@ -34,6 +35,8 @@ from unmix_plugin.lamp import SHADOW_LOGIT, Lamp, MovingLamp
 from unmix_plugin.rendering.hash_encoding import HashGridLayout, hash_encode
 
 _LARGEST_LOG_DENSITY = 15.0
+_CACHED_ROWS = 4096
+"""Samples of which a hidden layer stays in a core's cache."""
 LARGEST_RESOLUTION = 4096
 
 
@@ -234,7 +237,7 @@ class UnmixField(CoefficientField):
         """Density per scene unit and geometry features where the encoding is `encoded`."""
         if self.level_weights is not None:
             encoded = encoded * self.level_weights.repeat_interleave(self.config.features_per_level)
-        features = self.density_network(encoded)
+        features = torch.cat([self.density_network(part) for (part,) in _parts(encoded)])
         return bounded_exp(features[:, 0] + self.log_initial_density), features
 
     def get_outputs(
@@ -263,9 +266,10 @@ class UnmixField(CoefficientField):
         visible: Float[Tensor, "S"] | None = None,
     ) -> tuple[Float[Tensor, "S K"], Float[Tensor, "S C"]]:
         """Abundances and scales; C is 1 or K. Only scales depend on directions, and only in a moving light."""
-        material = self.material_network(features)
-        abundances = torch.softmax(material[:, : self.num_endmembers] / self.config.temperature, dim=-1)
-        scales = material[:, self.num_endmembers :]
+        material = rows_of_outputs(self.material_network, features)
+        # A softmax along a last axis of a few numbers takes ten times as long.
+        abundances = torch.softmax(material[: self.num_endmembers] / self.config.temperature, dim=0).t()
+        scales = material[self.num_endmembers :].t()
         if self.lit_by_camera and directions is not None:
             # A sum over harmonics rather than a network of both: that took textures for shading.
             shading = self.shading_network(features)
@@ -281,9 +285,9 @@ class UnmixField(CoefficientField):
     ) -> Float[Tensor, "S J"]:
         if self.num_specular == 0:
             return features.new_zeros(len(features), 0)
-        seen = torch.cat([features, direction_features(directions)], dim=-1)
-        factors = torch.sigmoid(self.specular_network(seen) + self.specular_bias / 2)
-        return factors[:, :1] * factors[:, 1:]
+        seen = (features, direction_features(directions))
+        factors = torch.sigmoid(rows_of_outputs(self.specular_network, *seen) + self.specular_bias / 2)
+        return (factors[:1] * factors[1:]).t()
 
 
 def bounded_exp(raw: Float[Tensor, "S"]) -> Float[Tensor, "S"]:
@@ -298,3 +302,31 @@ def bias_free_network(*widths: int) -> nn.Sequential:
     for num_inputs, num_outputs in pairwise(widths):
         layers += [nn.Linear(num_inputs, num_outputs, bias=False), nn.ReLU(inplace=True)]
     return nn.Sequential(*layers[:-1])
+
+
+def rows_of_outputs(network: nn.Sequential, *inputs: Float[Tensor, "S _"]) -> Float[Tensor, "O S"]:
+    """What a bias-free network gives, an output a row: products with few columns take twice as long.
+
+    Args:
+        inputs: Side by side the network's inputs, which joining would cost time.
+    """
+    return torch.cat([_rows_of_part(network, *part) for part in _parts(*inputs)], dim=1)
+
+
+def _rows_of_part(network: nn.Sequential, *inputs: Float[Tensor, "S _"]) -> Float[Tensor, "O S"]:
+    first, *inner, last = network
+    assert isinstance(first, nn.Linear)
+    weights = first.weight.split([values.shape[1] for values in inputs], dim=1)
+    hidden = inputs[0] @ weights[0].t()
+    for values, weight in zip(inputs[1:], weights[1:], strict=True):
+        hidden.addmm_(values, weight.t())
+    for layer in inner:
+        hidden = layer(hidden)
+    assert isinstance(last, nn.Linear)
+    return last.weight @ hidden.t()
+
+
+def _parts(*values: Float[Tensor, "S _"]) -> Iterator[tuple[Float[Tensor, "_ _"], ...]]:
+    """The same rows of all; without gradients few at a time, so that a hidden layer of them stays in the cache."""
+    size = max(len(values[0]), 1) if torch.is_grad_enabled() else _CACHED_ROWS
+    return zip(*(each.split(size) for each in values), strict=True)
