@@ -23,13 +23,15 @@ from unmix_plugin.rendering.marching import PackedSamples
 from unmix_plugin.rendering.merging import MergedSamples, MergeLimits, merge_samples
 from unmix_plugin.spectral.coefficients import Coefficients
 
-_ENDING_LIGHT = 2.0
+_ENDING_LIGHT = 3.0
 """Share of its light at which a ray ends, in multiples of the smallest weight of a sample."""
-_MERGED_WEIGHT = 50.0
+_MERGED_WEIGHT = 125.0
 """Most of a ray's light that merged samples carry together, in the same unit."""
 _SAMPLES_AT_ONCE = 4
-"""Of each ray, that are looked at before it is known whether light gets farther; later as many as so far, since light
-that gets through those gets through more."""
+"""Of each ray, that are looked at before it is known whether light gets farther; later at most as many as so far, since
+light that gets through those gets through more."""
+_DENSER = 2.0
+"""How many times as dense as what was looked at what follows is taken to be: a ray has mostly just entered a surface."""
 
 _Visible = Callable[[Float[Tensor, "S 3"], Float[Tensor, "S 3"]], Float[Tensor, "S"] | None]
 
@@ -45,24 +47,21 @@ class _Front:
     """Samples of each from there."""
     left: Float[Tensor, "A"]
     """Share of its light that each still has."""
+    wanted: Int[Tensor, "A"]
+    """Samples of each that are looked at next, at most `todo`."""
     num_seen: int = 0
-    """Samples of each that were looked at."""
-
-    @property
-    def wanted(self) -> Int[Tensor, "A"]:
-        """Samples of each that are looked at next."""
-        return self.todo.clamp(max=self._at_once)
-
-    @property
-    def _at_once(self) -> int:
-        return max(_SAMPLES_AT_ONCE, self.num_seen)
+    """Most samples of one that were looked at."""
 
     def after(self, left: Float[Tensor, "A"], ending_light: float) -> _Front:
         """Behind these samples, where there are more and enough light is left."""
-        values = (self.rays, self.at + self.wanted, self.todo - self.wanted, left)
-        alive = ((left > ending_light) & (values[2] > 0)).nonzero()[:, 0]
-        rays, at, todo, left = (value.index_select(0, alive) for value in values)
-        return _Front(rays, at, todo, left, self.num_seen + self._at_once)
+        at_once = max(_SAMPLES_AT_ONCE, self.num_seen)
+        todo = self.todo - self.wanted
+        alive = ((left > ending_light) & (todo > 0)).nonzero()[:, 0]
+        values = (self.rays, self.at + self.wanted, todo, left, self.wanted, self.left)
+        rays, at, todo, left, wanted, before = (value.index_select(0, alive) for value in values)
+        enough = wanted / _DENSER * (left / ending_light).log() / (before / left).log()
+        wanted = torch.minimum(enough.ceil().clamp(1, at_once).long(), todo)
+        return _Front(rays, at, todo, left, wanted, self.num_seen + at_once)
 
 
 @torch.no_grad()
@@ -91,7 +90,7 @@ def composite_front_to_back(
     limits = MergeLimits(samples.step, smallest_weight, _MERGED_WEIGHT * smallest_weight)
     rays = counts.nonzero()[:, 0]
     at, todo, light = (value.index_select(0, rays) for value in (starts, counts, left))
-    front = _Front(rays, at, todo, light)
+    front = _Front(rays, at, todo, light, todo.clamp(max=_SAMPLES_AT_ONCE))
     totals = last = torch.zeros(0)
     while True:
         merged = _look(field, samples, ray_bundle, front, limits)
