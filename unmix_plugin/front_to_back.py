@@ -31,7 +31,7 @@ _SAMPLES_AT_ONCE = 4
 """Of each ray, that are looked at before it is known whether light gets farther; later at most as many as so far, since
 light that gets through those gets through more."""
 _DENSER = 2.0
-"""How many times as dense as what was looked at what follows is taken to be: a ray has mostly just entered a surface."""
+"""How many times denser what follows is taken to be than what was looked at: most rays have just entered a surface."""
 
 _Visible = Callable[[Float[Tensor, "S 3"], Float[Tensor, "S 3"]], Float[Tensor, "S"] | None]
 
