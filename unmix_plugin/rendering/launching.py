@@ -114,7 +114,7 @@ def launch(
             stream = wp.stream_from_torch(torch.cuda.current_stream(device))
             wp.launch(_specialised(kernel, types), dim=size, inputs=[0, size, size, *values], stream=stream)
         return
-    threads = min(torch.get_num_threads(), os.cpu_count() or 1)
+    threads = min(torch.get_num_threads(), _num_cores())
     part = cpu_part or max(_SMALLEST_PART, -(-size // (_PARTS_PER_THREAD * threads)))
     with _PACKING:
         concrete = _specialised(kernel, types)
@@ -158,6 +158,12 @@ def _run(commands: Sequence[Any], threads: int) -> None:
     for helper in helpers:
         if not helper.cancel():
             helper.result()
+
+
+@cache
+def _num_cores() -> int:
+    """Cores of the machine: asking the system takes as long as a short launch."""
+    return os.cpu_count() or 1
 
 
 @cache
