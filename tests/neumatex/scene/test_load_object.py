@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from tests.neumatex.object_factory import CENTRE, RADIUS, write_light, write_object, write_picture
+from tests.neumatex.object_factory import CENTRE, RADIUS, SIZE, write_light, write_object, write_picture
 from unmix_plugin.errors import SceneError
 from unmix_plugin.formats.exr import write_exr
 from unmix_plugin.neumatex.geometry.ray_mesh import RayMesh
@@ -106,6 +106,19 @@ def _move_mesh(folder: Path) -> None:
     mesh.export(folder / "mesh.ply")
 
 
+def _scale_mesh(folder: Path, factor: float) -> None:
+    mesh = trimesh.load_mesh(folder / "mesh.ply", process=False)
+    mesh.apply_translation(-CENTRE)
+    mesh.apply_scale(factor)
+    mesh.apply_translation(CENTRE)
+    mesh.export(folder / "mesh.ply")
+
+
+def _blank_alpha(folder: Path) -> None:
+    for path in (folder / "images").iterdir():
+        write_exr(path, dict.fromkeys("RGBA", np.zeros((SIZE, SIZE), np.float32)), {})
+
+
 def _flatten_mesh(folder: Path) -> None:
     mesh = trimesh.load_mesh(folder / "mesh.ply", process=False)
     mesh.apply_scale(0.0)
@@ -128,8 +141,32 @@ def _no_pose(folder: Path) -> None:
     (folder / "transforms.json").write_text(json.dumps(content))
 
 
+def test_a_mesh_of_another_size_is_said_to_fit_badly(made, folder):
+    assert not any("outlines" in note for note in load_object(made).notes)
+    _scale_mesh(folder, 1.25)
+    notes = load_object(folder).notes
+    assert any("mesh.ply and alpha show different outlines: their overlap is 6" in note for note in notes)
+
+
+@pytest.mark.parametrize(("sky", "stops"), [(1e4, "-13"), (1e-3, "10")])
+def test_pictures_and_light_of_different_units_are_told(made, folder, sky, stops):
+    assert not any("units" in note for note in load_object(made).notes)
+    write_light(folder, sky=sky)
+    notes = [note for note in load_object(folder).notes if "different units" in note]
+    assert len(notes) == 1
+    assert f"'environment_exposure_stops' {stops} higher" in notes[0]
+
+
 FAULTS = {
-    "mesh elsewhere": (_move_mesh, r"mesh.ply is not where .* in 6 of 6 views .* 2 away"),
+    "mesh elsewhere": (
+        _move_mesh,
+        r"is not where .* in 6 of 6 views .* is \(0.3, -0.2, 3.5\), the cameras look at \(0.3, -0.2, 1.5\), 2 away",
+    ),
+    "mesh in another unit": (
+        lambda folder: _scale_mesh(folder, 0.001),
+        "0.001 long; its middle is .*, 0 away from there, and stand 3 from what they look at",
+    ),
+    "alpha of nothing": (lambda folder: _blank_alpha(folder), "no pixel shows the object; write alpha"),
     "mesh without area": (_flatten_mesh, "has an area"),
     "no mesh": (lambda folder: (folder / "mesh.ply").unlink(), r"has no mesh; put mesh.glb or .* there"),
     "several meshes": (_second_mesh, r"has several: a.ply, b.ply; name one with 'mesh_path'"),

@@ -21,7 +21,8 @@ from unmix_plugin.neumatex.lighting.environment import Environment
 from unmix_plugin.neumatex.lighting.lamp import read_environment_of_bands
 from unmix_plugin.neumatex.lighting.read_environment import SUFFIXES as ENVIRONMENT_SUFFIXES
 from unmix_plugin.neumatex.lighting.read_environment import read_environment
-from unmix_plugin.neumatex.scene.mesh_check import misplacement
+from unmix_plugin.neumatex.scene.light_check import light_doubt
+from unmix_plugin.neumatex.scene.mesh_check import mesh_fit
 from unmix_plugin.neumatex.scene.object_scene import HeldOutLight, ObjectScene
 from unmix_plugin.neumatex.scene.posed_pictures import PosedPictures, has_alpha, read_posed_pictures
 from unmix_plugin.neumatex.scene.spectral_light import SpectralLight, spectral_light
@@ -63,6 +64,8 @@ def load_object(root: Path, lamp: str | None = None) -> ObjectScene:
     )
     spectral = spectral_light(root, entry, pictures, lamp)
     environment = light.environment(spectral)
+    doubt = light_doubt(pictures, environment)
+    notes += [] if doubt is None else [doubt]
     files = {mesh_path.name: mesh_path, light.environment_path.name: light.environment_path}
     truth = root / "truth" / "base_colour"
     return ObjectScene(
@@ -107,7 +110,7 @@ def _read_light(root: Path, faults: Faults) -> _Light | None:
     for key, most in (("environment_rotation_deg", 1e6), ("environment_exposure_stops", MOST_STOPS)):
         number = read_number(content.get(key, 0.0))
         if number is None or abs(number) > most:
-            faults.add(FILE_NAME, f"'{key}' is {describe(content[key])}; expected a number, at most {most:g}")
+            faults.add(FILE_NAME, f"'{key}' is {describe(content[key])}; expected a number from {-most:g} to {most:g}")
         numbers[key] = number or 0.0
     tone = content.get("tone_mapping")
     if tone is not None and tone not in TONE_MAPPINGS:
@@ -157,13 +160,15 @@ def _placed(
         frame, mesh = _model_space(placed)
         pictures = read_posed_pictures(root, entry, _from_poses(frame, entry.placement), light.tone, faults)
         alphas = [_alpha(pictures, index) for index in range(len(pictures))]
-        wrong = misplacement(RayMesh(mesh), pictures.cameras, alphas, frame, name)
-        if wrong is None:
+        fit = mesh_fit(RayMesh(mesh), pictures.cameras, alphas, frame, name)
+        if fit.misplaced is None:
+            doubt = fit.doubt(name)
+            notes += [] if doubt is None else [doubt]
             notes += (
                 [f"{name} has y as its upward axis, the poses have z: the mesh was turned"] if found else []
             )
             return frame, mesh, pictures
-        found.append(wrong)
+        found.append(fit.misplaced)
     raise SceneError(found[0])
 
 

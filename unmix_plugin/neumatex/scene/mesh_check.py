@@ -5,7 +5,9 @@ Notation: `N` cameras.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -13,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.errors import SceneError
 from unmix_plugin.neumatex.geometry.ray_mesh import RayMesh
 from unmix_plugin.scenes.scene import Normalisation
 
@@ -20,38 +23,82 @@ LONGEST_EDGE_PX = 64
 """Of the views that are compared."""
 LEAST_OVERLAP = 0.5
 """Of silhouette and alpha, shared part over both: below it a view disagrees. Right meshes have 0.9 and more."""
+DOUBTFUL_OVERLAP = 0.85
+"""Of the median view: below it a mesh is somewhat off, which blurs materials."""
 MOST_VIEWS = 24
+_OPAQUE = 0.5
 
 
-def misplacement(
+@dataclass(frozen=True)
+class MeshFit:
+    """How well the silhouettes of a mesh agree with alpha."""
+
+    overlaps: list[float]
+    """Of the views that were compared."""
+    misplaced: str | None
+    """How far off the mesh is, where most views do not see it where their pictures show the object."""
+
+    def doubt(self, where: str) -> str | None:
+        """What to say of a mesh that is somewhat off; None if it is right."""
+        median = float(np.median(self.overlaps))
+        if median >= DOUBTFUL_OVERLAP:
+            return None
+        return (
+            f"{where} and alpha show different outlines: their overlap is {median:.0%} (median of "
+            f"{len(self.overlaps)} views; 90% and more is usual), which blurs materials. Check size and place of the "
+            "mesh, lenses and alpha"
+        )
+
+
+def mesh_fit(
     ray_mesh: RayMesh,
     cameras: Cameras,
     alphas: Sequence[Float[np.ndarray, "_ _"] | None],
     frame: Normalisation,
     where: str,
-) -> str | None:
-    """How far off a mesh is that most views do not see where their pictures show the object; None if it is right.
+) -> MeshFit:
+    """Compare a mesh with what pictures show of it.
 
     Args:
         ray_mesh: The mesh in model space.
         cameras: Of the pictures, model space.
         alphas: Opacity of each picture, None where it has none: then the mesh has only to be in the view.
         frame: To give places in the world.
-        where: What the message calls the mesh.
+        where: What messages call the mesh.
+    Raises:
+        SceneError: no pixel of any picture is opaque.
     """
+    if all(alpha is not None and not (alpha > _OPAQUE).any() for alpha in alphas):
+        raise SceneError(
+            "alpha of all pictures is below one half everywhere, so that no pixel shows the object; write alpha "
+            "that is 1 on the object, or pictures without alpha"
+        )
     step = max(1, -(-len(cameras) // MOST_VIEWS))
-    views = range(0, len(cameras), step)
-    overlaps = [_overlap(ray_mesh, cameras[view], alphas[view]) for view in views]
+    overlaps = [_overlap(ray_mesh, cameras[view], alphas[view]) for view in range(0, len(cameras), step)]
     wrong = sum(overlap < LEAST_OVERLAP for overlap in overlaps)
     if 2 * wrong <= len(overlaps):
-        return None
-    middle, target = frame.to_world(np.zeros(3)), frame.to_world(looked_at(cameras).numpy())
-    distance, edge = float(np.linalg.norm(target - middle)), 2 / frame.scale
-    return (
+        return MeshFit(overlaps, None)
+    edge = 2 / frame.scale
+    message = (
         f"{where} is not where the pictures show the object: in {wrong} of {len(overlaps)} views it covers less than "
         f"half of what alpha shows, or is not in the view (median overlap {np.median(overlaps):.0%}). Its box is "
-        f"centred at {_place(middle)} and {edge:.4g} long; the cameras look at {_place(target)}, {distance:.4g} away. "
-        "Bring it into the world of the poses: the same origin, unit and axes. With y upwards it does not fit either"
+        f"{edge:.4g} long; {_places(cameras, frame)}. Bring it into the world of the poses: the same origin, unit and "
+        "axes. With y upwards it does not fit either"
+    )
+    return MeshFit(overlaps, message)
+
+
+def _places(cameras: Cameras, frame: Normalisation) -> str:
+    """Where the mesh and the cameras are in the world, without digits that rounding made."""
+    positions = frame.to_world(cameras.camera_to_world[:, :, 3].double().numpy())
+    middle, target = frame.to_world(np.zeros(3)), frame.to_world(looked_at(cameras).numpy())
+    away = float(np.median(np.linalg.norm(positions - target, axis=1)))
+    unit = 10.0 ** math.floor(math.log10(1e-4 * max(away, 2 / frame.scale)))
+    middle, target = (np.round(point / unit) * unit + 0.0 for point in (middle, target))
+    distance = float(np.linalg.norm(target - middle))
+    return (
+        f"its middle is {_place(middle)}, the cameras look at {_place(target)}, {distance:.4g} away from there, and "
+        f"stand {away:.4g} from what they look at"
     )
 
 
@@ -77,7 +124,7 @@ def _overlap(ray_mesh: RayMesh, camera: Cameras, alpha: Float[np.ndarray, "_ _"]
     columns = np.minimum(
         ((np.arange(small.width) + 0.5) * camera.width / small.width).astype(int), camera.width - 1
     )
-    shown = torch.from_numpy(alpha[rows][:, columns] > 0.5).flatten()
+    shown = torch.from_numpy(alpha[rows][:, columns] > _OPAQUE).flatten()
     union = int((seen | shown).sum())
     return float((seen & shown).sum()) / union if union else 1.0
 
