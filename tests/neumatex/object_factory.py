@@ -58,14 +58,15 @@ def write_views(
     (folder / "transforms.json").write_text(json.dumps(content))
 
 
-def write_picture(path: Path, colour: tuple[float, ...]) -> None:
-    """The ball's silhouette filled with a colour."""
+def write_picture(path: Path, colour: tuple[float, ...], lit_rows: int = SIZE) -> None:
+    """The ball's silhouette filled with a colour; all but the upper `lit_rows` nearly black."""
     path.parent.mkdir(parents=True, exist_ok=True)
     side = np.arange(SIZE) + 0.5 - SIZE / 2
     radius = LENS_PX * RADIUS / math.sqrt(DISTANCE**2 - RADIUS**2)
     alpha = (np.hypot(*np.meshgrid(side, side)) < radius).astype(np.float32)
     if path.suffix == ".exr":
-        channels = {name: alpha * np.float32(value) for name, value in zip("RGB", colour, strict=True)}
+        light = alpha * np.where(np.arange(SIZE) < lit_rows, 1, 1e-4)[:, None].astype(np.float32)
+        channels = {name: light * np.float32(value) for name, value in zip("RGB", colour, strict=True)}
         write_exr(path, {**channels, "A": alpha}, {})
         return
     pixels = np.dstack([np.full_like(alpha, value) for value in colour] + [alpha])

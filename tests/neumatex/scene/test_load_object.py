@@ -157,6 +157,12 @@ def test_pictures_and_light_of_different_units_are_told(made, folder, sky, stops
     assert f"'environment_exposure_stops' {stops} higher" in notes[0]
 
 
+def test_an_object_that_is_mostly_in_the_shade_is_not_doubted(folder):
+    for path in (folder / "images").iterdir():
+        write_picture(path, (0.5, 0.3, 0.1), lit_rows=SIZE // 2 - 4)
+    assert not any("units" in note for note in load_object(folder).notes)
+
+
 FAULTS = {
     "mesh elsewhere": (
         _move_mesh,

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from PIL import Image
 
 from tests.neumatex.object_factory import write_object
 from tests.neumatex.spectral_factory import (
@@ -19,6 +20,7 @@ from tests.neumatex.spectral_factory import (
 )
 from unmix_plugin.errors import UnmixError
 from unmix_plugin.neumatex.scene.load_object import load_object
+from unmix_plugin.neumatex.scene.pixel_list import PixelList
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +68,34 @@ def test_true_materials_are_read(made):
     assert shares[3, 12].tolist() == [1, 0]
 
 
+def _store_integers(folder: Path) -> None:
+    for path in (folder / "cubes").glob("*.npy"):
+        np.save(path, np.rint(np.load(path) * 10000).astype(np.uint16))
+
+
+def test_cubes_of_integers_are_divided_by_the_value_scale(made, folder):
+    _store_integers(folder)
+    change(folder, value_scale=10000.0)
+    expected, found = (load_object(path).pictures.read(1).numbers for path in (made, folder))
+    assert_allclose(found, expected, atol=1e-4)
+
+
+def test_pixels_that_a_mask_leaves_out_are_not_trained_on(made, folder):
+    scene = load_object(made)
+    view = scene.split.train[0]
+    width, height = scene.pictures.cameras.size(view)
+    black = np.full((height, width), 255, np.uint8)
+    black[:, : width // 2] = 0
+    Image.fromarray(black).save(folder / "mask.png")
+    frames = json.loads((folder / "transforms.json").read_text())["frames"]
+    frames[view]["mask_path"] = "mask.png"
+    change(folder, frames=frames)
+    pixels, all_pixels = (PixelList.of(object_, 10**6, 0) for object_ in (load_object(folder), scene))
+    masked = (all_pixels.views == 0) & (all_pixels.corners[:, 0] < width // 2)
+    assert masked.any()
+    assert len(pixels.views) == int((~masked).sum())
+
+
 def _fewer_bands(folder: Path) -> None:
     for path in (folder / "relit" / "dim" / "cubes").glob("*.npy"):
         np.save(path, np.load(path)[..., :4])
@@ -80,7 +110,7 @@ def _fewer_bands(folder: Path) -> None:
         (lambda folder: change(folder, wavelengths=[450, 550]), "2 'wavelengths' for pictures of 5 bands"),
         (lambda folder: change(folder, wavelengths=[450, 500, 550, 600, 900]), "do not reach"),
         (lambda folder: change(folder, tone_mapping="srgb"), "expected linear light"),
-        (lambda folder: change(folder, value_scale=100.0), "divide the cubes by it"),
+        (lambda folder: _store_integers(folder), "holds uint16; expected floats, or 'value_scale'"),
         (lambda folder: change(folder, materials=["blue"]), "endmembers_path"),
         (_fewer_bands, "pictures of 4 bands, wavelengths of 5 bands"),
         (lambda folder: write_cubes(folder / "relit" / "dim", 2, 1.0, wavelengths=[1, 2]), "wavelengths"),

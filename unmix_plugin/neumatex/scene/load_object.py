@@ -110,7 +110,10 @@ def _read_light(root: Path, faults: Faults) -> _Light | None:
     for key, most in (("environment_rotation_deg", 1e6), ("environment_exposure_stops", MOST_STOPS)):
         number = read_number(content.get(key, 0.0))
         if number is None or abs(number) > most:
-            faults.add(FILE_NAME, f"'{key}' is {describe(content[key])}; expected a number from {-most:g} to {most:g}")
+            faults.add(
+                FILE_NAME,
+                f"'{key}' is {describe(content[key])}; expected a number from {-most:g} to {most:g}",
+            )
         numbers[key] = number or 0.0
     tone = content.get("tone_mapping")
     if tone is not None and tone not in TONE_MAPPINGS:

@@ -6,10 +6,11 @@ Notation: `H x W` pixels, `C` colours or bands.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32
 
 from unmix_plugin.errors import CaptureError, SceneError
 from unmix_plugin.scenes.reading.arrays import UnreadableArrayError, map_array, read_array_header
@@ -27,15 +28,20 @@ class Picture:
     """Linear light, or display values in [0, 1]."""
     alpha: Float32[np.ndarray, "H W"] | None
     """Opacity in [0, 1]; None where the file has none."""
+    valid: Bool[np.ndarray, "H W"] | None = None
+    """Pixels that count; None where no mask says."""
 
 
-def read_picture(path: Path) -> Picture:
+def read_picture(path: Path, value_scale: float | None = None) -> Picture:
     """Read and check one picture.
 
+    Args:
+        path: Its file.
+        value_scale: Stored number of a .npy cube that stands for 1; None for floats of light as they are.
     Raises:
         SceneError: it can't be read, has less than 3 colours, or values that are negative or not finite.
     """
-    readers = {".exr": _read_exr, ".npy": _read_npy}
+    readers = {".exr": _read_exr, ".npy": partial(_read_npy, value_scale=value_scale)}
     try:
         picture = readers.get(path.suffix.lower(), _read_display)(path)
     except (UnreadableArrayError, UnreadableImageError) as error:
@@ -82,10 +88,16 @@ def _read_exr(path: Path) -> Picture:
     return Picture(numbers, np.asarray(alpha, dtype=np.float32)[..., 0].clip(0, 1))
 
 
-def _read_npy(path: Path) -> Picture:
+def _read_npy(path: Path, value_scale: float | None) -> Picture:
     header = read_array_header(path)
-    if len(header.shape) != 3 or header.shape[2] < 3 or header.dtype.kind != "f":
+    if len(header.shape) != 3 or header.shape[2] < 3:
         raise SceneError(
-            f"{path}: holds {header.dtype} of shape {header.shape}; expected floats, rows x columns x 3 or more colours"
+            f"{path}: holds numbers of shape {header.shape}; expected rows x columns x 3 or more colours"
         )
-    return Picture(np.array(map_array(path), dtype=np.float32, order="C"), None)
+    if value_scale is None and header.dtype.kind != "f":
+        raise SceneError(
+            f"{path}: holds {header.dtype}; expected floats, or 'value_scale' in transforms.json: the number that "
+            "stands for 1"
+        )
+    numbers = np.array(map_array(path), dtype=np.float32, order="C")
+    return Picture(numbers if value_scale is None else numbers / np.float32(value_scale), None)

@@ -5,7 +5,7 @@ Notation: `N` pictures of `H x W` pixels, `C` colours or bands.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 
@@ -17,9 +17,10 @@ from unmix_plugin.errors import SceneError
 from unmix_plugin.neumatex.scene.picture_files import LIGHT_SUFFIXES, Picture, read_picture
 from unmix_plugin.neumatex.tone.curves import ToneMapping
 from unmix_plugin.scenes.reading.faults import Faults
+from unmix_plugin.scenes.reading.images import UnreadableImageError, read_mask
 from unmix_plugin.scenes.reading.loader import make_cameras
 from unmix_plugin.scenes.reading.scene_paths import resolve_path, sha256_of
-from unmix_plugin.scenes.reading.transforms_json import SceneEntry
+from unmix_plugin.scenes.reading.transforms_json import FrameEntry, SceneEntry
 from unmix_plugin.scenes.scene import Normalisation
 
 
@@ -33,6 +34,10 @@ class PictureFiles:
     """What holds its colours."""
     opacity: Path | None = None
     """What holds its alpha, where that is another file."""
+    mask: Path | None = None
+    """Black where pixels do not count."""
+    value_scale: float | None = None
+    """Stored number of a cube that stands for 1."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +85,13 @@ def read_files(files: PictureFiles) -> Picture:
     Raises:
         SceneError: one can't be read, or their sizes differ.
     """
-    picture = read_picture(files.colours)
+    picture = read_picture(files.colours, files.value_scale)
+    if files.mask is not None:
+        try:
+            height, width = picture.numbers.shape[:2]
+            picture = replace(picture, valid=read_mask(files.mask, (height, width)))
+        except UnreadableImageError as error:
+            raise SceneError(f"{files.mask} {error}") from error
     if files.opacity is None:
         return picture
     alpha = read_picture(files.opacity).alpha
@@ -91,7 +102,8 @@ def read_files(files: PictureFiles) -> Picture:
             f"{files.opacity}: has {alpha.shape[1]} x {alpha.shape[0]} pixels, its cube {files.colours.name} has "
             f"{picture.numbers.shape[1]} x {picture.numbers.shape[0]}; give both one size"
         )
-    return Picture(picture.numbers / np.maximum(alpha, np.float32(1e-3))[..., None], alpha)
+    numbers = picture.numbers / np.maximum(alpha, np.float32(1e-3))[..., None]
+    return Picture(numbers, alpha, picture.valid)
 
 
 def read_posed_pictures(
@@ -108,13 +120,11 @@ def read_posed_pictures(
     Raises:
         SceneError: pictures are missing or malformed; all their faults in one message.
     """
-    located = [_locate(root, paths.paths, paths.where, faults) for paths in entry.frames]
+    located = [_locate(root, frame, entry.value_scale, faults) for frame in entry.frames]
     faults.raise_if_any()
     names = _names([str(files.colours.relative_to(root)) for files in located if files is not None])
     named = [
-        PictureFiles(name, files.colours, files.opacity)
-        for name, files in zip(names, located, strict=True)
-        if files is not None
+        replace(files, name=name) for name, files in zip(names, located, strict=True) if files is not None
     ]
     sizes, colours = _check(root, named, faults)
     kinds = {files.colours.suffix.lower() in LIGHT_SUFFIXES for files in named}
@@ -127,13 +137,16 @@ def read_posed_pictures(
     return PosedPictures(tuple(named), make_cameras(entry, sizes, frame), tone or usual, colours.pop())
 
 
-def _locate(root: Path, paths: dict[str, str], where: str, faults: Faults) -> PictureFiles | None:
+def _locate(root: Path, frame: FrameEntry, value_scale: float | None, faults: Faults) -> PictureFiles | None:
     """The files of a frame; None with noted faults where one is missing."""
-    keys = [key for key in ("hyperspectral_file_path", "file_path") if key in paths]
-    found = [resolve_path(root, paths[key], False, where, faults) for key in keys]
-    if any(path is None for path in found) or not found:
+    keys = [key for key in ("hyperspectral_file_path", "file_path", "mask_path") if key in frame.paths]
+    found = {key: resolve_path(root, frame.paths[key], False, frame.where, faults) for key in keys}
+    mask = found.pop("mask_path", None)
+    pictures = [path for path in found.values() if path is not None]
+    if len(pictures) < len(found) or not pictures or (mask is None and "mask_path" in keys):
         return None
-    return PictureFiles("", *[path for path in found if path is not None])
+    is_cube = "hyperspectral_file_path" in found
+    return PictureFiles("", *pictures, mask=mask, value_scale=value_scale if is_cube else None)
 
 
 def _check(root: Path, named: list[PictureFiles], faults: Faults) -> tuple[list[tuple[int, int]], set[int]]:
@@ -164,5 +177,6 @@ def has_alpha(picture: Picture) -> bool:
 
 
 def opacity(picture: Picture) -> Float32[np.ndarray, "H W"]:
-    """Alpha; 1 where the picture has none."""
-    return np.ones(picture.numbers.shape[:2], np.float32) if picture.alpha is None else picture.alpha
+    """Alpha; 1 where the picture has none, 0 where a mask says that pixels do not count."""
+    alpha = np.ones(picture.numbers.shape[:2], np.float32) if picture.alpha is None else picture.alpha
+    return alpha if picture.valid is None else alpha * picture.valid

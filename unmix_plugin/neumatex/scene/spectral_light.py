@@ -81,10 +81,6 @@ def spectral_light(
         raise SceneError(
             f"{root / FILE_NAME}: pictures of {count} bands with 'tone_mapping' {pictures.tone}; expected linear light"
         )
-    if entry.value_scale not in (None, 1.0):
-        raise SceneError(
-            f"{root / FILE_NAME}: 'value_scale' is {entry.value_scale:g}; divide the cubes by it and store floats"
-        )
     bands = Bands(found)
     return SpectralLight(bands, _own_lamp(root, entry, bands) if lamp is None else read_lamp(lamp, bands))
 
