@@ -66,7 +66,7 @@ SPOILT = {
     "newer config.json": (newer("config.json"), "written by a newer version"),
     "newer scene.json": (newer("scene.json"), "written by a newer version"),
     "newer checkpoint": (newer("checkpoints/step-000020.json"), "written by a newer version"),
-    "tensors cut off": (cut_off("checkpoints/step-000020.safetensors"), "no complete checkpoint"),
+    "tensors cut off": (cut_off("checkpoints/step-000020.safetensors"), "damaged or cut short"),
     "no checkpoint": (without_checkpoints, "no complete checkpoint"),
 }
 

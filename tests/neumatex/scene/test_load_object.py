@@ -157,6 +157,16 @@ def test_pictures_and_light_of_different_units_are_told(made, folder, sky, stops
     assert f"'environment_exposure_stops' {stops} higher" in notes[0]
 
 
+def test_integer_arrays_of_file_path_are_divided_by_the_value_scale(folder):
+    path = folder / "transforms.json"
+    content = json.loads(path.read_text())
+    for index, frame in enumerate(content["frames"]):
+        frame["file_path"] = f"images/{index}.npy"
+        np.save(folder / frame["file_path"], np.full((SIZE, SIZE, 3), 2000, np.uint16))
+    path.write_text(json.dumps({**content, "value_scale": 4000}))
+    assert load_object(folder).pictures.read(0).numbers.max() == 0.5
+
+
 def test_an_object_that_is_mostly_in_the_shade_is_not_doubted(folder):
     for path in (folder / "images").iterdir():
         write_picture(path, (0.5, 0.3, 0.1), lit_rows=SIZE // 2 - 4)

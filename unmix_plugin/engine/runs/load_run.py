@@ -8,7 +8,7 @@ from unmix_plugin.engine.devices import resolve_device
 from unmix_plugin.engine.model import Model
 from unmix_plugin.engine.pipeline import Pipeline
 from unmix_plugin.engine.registry import find_method
-from unmix_plugin.engine.runs.checkpoints import Checkpoint, newest_complete_checkpoint
+from unmix_plugin.engine.runs.checkpoints import Checkpoint, checkpoint_steps, newest_complete_checkpoint
 from unmix_plugin.engine.runs.config_json import config_from_json, config_to_json
 from unmix_plugin.engine.runs.run_files import read_run_json, write_run_json
 from unmix_plugin.engine.runs.run_folder import RunFolder, open_run_folder
@@ -130,9 +130,12 @@ def require_checkpoint(run: RunFolder) -> Checkpoint:
     """
     checkpoint = newest_complete_checkpoint(run.checkpoints)
     if checkpoint is None:
-        raise RunError(
-            f"no complete checkpoint in {run.checkpoints}: training ended before the first was saved"
+        reason = (
+            "the files there are damaged or cut short; copy the run again, or train anew"
+            if any(checkpoint_steps(run.checkpoints))
+            else "training ended before the first was saved"
         )
+        raise RunError(f"no complete checkpoint in {run.checkpoints}: {reason}")
     return checkpoint
 
 

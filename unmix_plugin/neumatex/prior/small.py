@@ -83,7 +83,8 @@ def observe(
     if not bool(visible.any()):
         raise SceneError(
             f"none of {len(eyes)} views shows the mesh: {int(known.visible.sum())} of its points face a camera, but "
-            "the object is at none of their pixels; are mesh and cameras in the same world, and is alpha right?"
+            "the object is at none of their pixels; are mesh and cameras in the same world, and are alpha and masks "
+            "right?"
         )
     mean = environment.mean_radiance().mean().clamp(min=1e-12)
     return Observations(

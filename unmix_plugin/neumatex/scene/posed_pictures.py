@@ -37,7 +37,7 @@ class PictureFiles:
     mask: Path | None = None
     """Black where pixels do not count."""
     value_scale: float | None = None
-    """Stored number of a cube that stands for 1."""
+    """Stored number of a .npy array that stands for 1."""
 
 
 @dataclass(frozen=True)
@@ -145,8 +145,7 @@ def _locate(root: Path, frame: FrameEntry, value_scale: float | None, faults: Fa
     pictures = [path for path in found.values() if path is not None]
     if len(pictures) < len(found) or not pictures or (mask is None and "mask_path" in keys):
         return None
-    is_cube = "hyperspectral_file_path" in found
-    return PictureFiles("", *pictures, mask=mask, value_scale=value_scale if is_cube else None)
+    return PictureFiles("", *pictures, mask=mask, value_scale=value_scale)
 
 
 def _check(root: Path, named: list[PictureFiles], faults: Faults) -> tuple[list[tuple[int, int]], set[int]]:
