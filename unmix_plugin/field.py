@@ -328,5 +328,7 @@ def _rows_of_part(network: nn.Sequential, *inputs: Float[Tensor, "S _"]) -> Floa
 
 def _parts(*values: Float[Tensor, "S _"]) -> Iterator[tuple[Float[Tensor, "_ _"], ...]]:
     """The same rows of all; without gradients few at a time, so that a hidden layer of them stays in the cache."""
-    size = max(len(values[0]), 1) if torch.is_grad_enabled() else _CACHED_ROWS
+    # As many for each thread: they wait for one another after every part.
+    at_once = _CACHED_ROWS * torch.get_num_threads()
+    size = max(len(values[0]), 1) if torch.is_grad_enabled() else at_once
     return zip(*(each.split(size) for each in values), strict=True)
