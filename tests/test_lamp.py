@@ -15,6 +15,7 @@ from unmix_plugin.lamp import Lamp, MovingLamp
 from unmix_plugin.lamp_shadows import lamp_visibility, visible_part
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.model_settings import UnmixModelConfig
+from unmix_plugin.rendering.grid_cells import clearance_of
 
 TURNTABLE = Lamp("turntable", (0.0, 0.0, 0.1), (0.0, 0.0, 1.0), (-1.0, 2.0, 3.0))
 NUMBERS = TURNTABLE.numbers()
@@ -59,7 +60,7 @@ def test_a_lamp_is_the_same_after_it_was_written_as_numbers():
 def test_what_stands_before_the_lamp_casts_a_shadow_and_what_stands_behind_does_not():
     positions = torch.tensor([[-0.5, 0.0, 0.5], [-0.5, 0.0, -0.5], [0.99, 0.0, 0.5]])
     lamps = positions + torch.tensor([5.0, 0.0, 0.0])
-    found = visible_part(positions, lamps, BOX, wall())
+    found = visible_part(positions, lamps, BOX, clearance_of(wall() != 0))
     assert found[0] < 0.01
     assert_close(found[1:], torch.ones(2))
 
@@ -74,7 +75,7 @@ def test_the_slope_of_the_visible_part_follows_what_moving_the_lamp_changes():
         with torch.no_grad():
             lamp.change.copy_(torch.tensor([0.0, change, 0.0]))
         generator = torch.Generator().manual_seed(0)
-        return lamp_visibility(lamp, origins, positions, BOX, wall(), generator).mean()
+        return lamp_visibility(lamp, origins, positions, BOX, clearance_of(wall() != 0), generator).mean()
 
     high, low = (float(mean_visible(change).detach()) for change in (0.05, -0.05))
     expected = (high - low) / 0.1
@@ -82,6 +83,14 @@ def test_the_slope_of_the_visible_part_follows_what_moving_the_lamp_changes():
     assert lamp.change.grad is not None
     assert expected < -0.3
     assert float(lamp.change.grad[1]) == pytest.approx(expected, rel=0.25)
+
+
+def cast_shadows(model: UnmixModel, opaque: torch.Tensor) -> None:
+    """Make these cells of the model's grid the opaque ones."""
+    assert model.grid.opaque is not None
+    assert model.grid.opaque_clearance is not None
+    model.grid.opaque.copy_(opaque)
+    model.grid.opaque_clearance.copy_(clearance_of(opaque != 0))
 
 
 def model_with_lamp() -> UnmixModel:
@@ -94,16 +103,14 @@ def model_with_lamp() -> UnmixModel:
         data = {**initial_data(), "reachable": np.ones((64, 64, 64), bool)}
         model.initialise(data, torch.Generator().manual_seed(0))
         model.field.get_parameter("table").normal_(std=0.5)
-    assert model.grid.opaque is not None
-    model.grid.opaque.copy_(wall())
+    cast_shadows(model, wall())
     return model.eval()
 
 
 def test_shadows_change_brightness_and_not_abundances():
     model, rays = model_with_lamp(), make_rays(60)
     shaded = model.get_outputs(rays)
-    assert model.grid.opaque is not None
-    model.grid.opaque.zero_()
+    cast_shadows(model, torch.zeros_like(wall()))
     lit = model.get_outputs(rays)
     assert_close(shaded["abundances"], lit["abundances"])
     assert_close(shaded["accumulation"], lit["accumulation"])
@@ -114,8 +121,7 @@ def test_a_scene_keeps_its_shadows_while_training_goes_on():
     model = model_with_lamp()
     scene = scene_of(model)
     before = scene.render(CAMERA, ["spectral"])["spectral"]
-    assert model.grid.opaque is not None
-    model.grid.opaque.zero_()
+    cast_shadows(model, torch.zeros_like(wall()))
     with torch.no_grad():
         model.field.get_parameter("lamp.change").add_(0.5)
     assert_close(scene.render(CAMERA, ["spectral"])["spectral"], before)
@@ -126,7 +132,7 @@ def test_a_loaded_model_casts_the_same_shadows():
     model, other = model_with_lamp(), model_with_lamp()
     with torch.no_grad():
         model.field.get_parameter("lamp.change").add_(0.5)
-    model.grid.opaque = wall().flip(0)
+    cast_shadows(model, wall().flip(0))
     other.load_state_dict(model.state_dict())
     rays = make_rays(20)
     assert_close(other.get_outputs(rays)["spectral"], model.get_outputs(rays)["spectral"])

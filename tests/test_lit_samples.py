@@ -27,7 +27,7 @@ def test_samples_found_from_the_front_are_those_of_all(smallest_weight, opacity)
     assert torch.equal(found.samples.t, samples.t[keep])
     assert torch.equal(found.samples.packed_info, samples.select(keep).packed_info)
     assert torch.equal(found.encoded(), encoded[keep])
-    assert_close(found.densities, densities[keep])
+    assert_close(found.densities(), densities[keep])
     assert_close(found.features(), features[keep])
     assert found.num_looked_at <= len(samples)
 

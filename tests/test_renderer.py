@@ -12,7 +12,8 @@ from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.field import UnmixField, UnmixFieldConfig
-from unmix_plugin.renderer import RendererConfig, VolumeRenderer
+from unmix_plugin.renderer import VolumeRenderer
+from unmix_plugin.renderer_settings import RendererConfig
 from unmix_plugin.rendering.grid_cells import clearance_of
 
 BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))

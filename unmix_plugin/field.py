@@ -11,9 +11,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Literal
 
 import torch
@@ -32,11 +30,10 @@ from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.engine.instantiate import InstantiateConfig, Target
 from unmix_plugin.errors import require
 from unmix_plugin.lamp import SHADOW_LOGIT, Lamp, MovingLamp
+from unmix_plugin.networks import bias_free_network, in_parts, rows_of_outputs
 from unmix_plugin.rendering.hash_encoding import HashGridLayout, hash_encode
 
 _LARGEST_LOG_DENSITY = 15.0
-_CACHED_ROWS = 4096
-"""Samples of which a hidden layer stays in a core's cache."""
 LARGEST_RESOLUTION = 4096
 
 
@@ -237,7 +234,7 @@ class UnmixField(CoefficientField):
         """Density per scene unit and geometry features where the encoding is `encoded`."""
         if self.level_weights is not None:
             encoded = encoded * self.level_weights.repeat_interleave(self.config.features_per_level)
-        features = torch.cat([self.density_network(part) for (part,) in _parts(encoded)])
+        features = in_parts(self.density_network, encoded)
         return bounded_exp(features[:, 0] + self.log_initial_density), features
 
     def get_outputs(
@@ -293,42 +290,3 @@ class UnmixField(CoefficientField):
 def bounded_exp(raw: Float[Tensor, "S"]) -> Float[Tensor, "S"]:
     """exp, clamped in value only: a point that grew too dense can still become less dense."""
     return (raw + (raw.clamp(max=_LARGEST_LOG_DENSITY) - raw).detach()).exp()
-
-
-def bias_free_network(*widths: int) -> nn.Sequential:
-    """Linear layers from each width to the next, with a ReLU between them."""
-    # Without biases, as in Mueller et al. 2022: torch copies a bias into the output first, a fifth of the layer's time.
-    layers: list[nn.Module] = []
-    for num_inputs, num_outputs in pairwise(widths):
-        layers += [nn.Linear(num_inputs, num_outputs, bias=False), nn.ReLU(inplace=True)]
-    return nn.Sequential(*layers[:-1])
-
-
-def rows_of_outputs(network: nn.Sequential, *inputs: Float[Tensor, "S _"]) -> Float[Tensor, "O S"]:
-    """What a bias-free network gives, an output a row: products with few columns take twice as long.
-
-    Args:
-        inputs: Side by side the network's inputs, which joining would cost time.
-    """
-    return torch.cat([_rows_of_part(network, *part) for part in _parts(*inputs)], dim=1)
-
-
-def _rows_of_part(network: nn.Sequential, *inputs: Float[Tensor, "S _"]) -> Float[Tensor, "O S"]:
-    first, *inner, last = network
-    assert isinstance(first, nn.Linear)
-    weights = first.weight.split([values.shape[1] for values in inputs], dim=1)
-    hidden = inputs[0] @ weights[0].t()
-    for values, weight in zip(inputs[1:], weights[1:], strict=True):
-        hidden.addmm_(values, weight.t())
-    for layer in inner:
-        hidden = layer(hidden)
-    assert isinstance(last, nn.Linear)
-    return last.weight @ hidden.t()
-
-
-def _parts(*values: Float[Tensor, "S _"]) -> Iterator[tuple[Float[Tensor, "_ _"], ...]]:
-    """The same rows of all; without gradients few at a time, so that a hidden layer of them stays in the cache."""
-    # As many for each thread: they wait for one another after every part.
-    at_once = _CACHED_ROWS * torch.get_num_threads()
-    size = max(len(values[0]), 1) if torch.is_grad_enabled() else at_once
-    return zip(*(each.split(size) for each in values), strict=True)

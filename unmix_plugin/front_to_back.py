@@ -4,7 +4,7 @@ For pictures of a trained field. `VolumeRenderer.render` is the careful way, whi
 sample that carries weight, and goes on farther. Here neighbouring samples are merged where together they carry little
 of their ray's light, and what lies behind the place where a ray ends is taken to look like what lies before it.
 
-Notation: `R` rays, `A` rays that still have light, `C` coefficients.
+Notation: `R` rays, `M` of them that are marched, `A` that still have light, `C` coefficients.
 """
 
 from __future__ import annotations
@@ -33,6 +33,10 @@ light that gets through those gets through more."""
 _DENSER = 2.0
 """How many times denser what follows is taken to be than what was looked at: most rays have just entered a surface."""
 
+FIRST_SAMPLES = 16
+"""Of each ray, that are marched before it is known whether light gets behind them."""
+
+_MarchOn = Callable[[RayBundle, Float[Tensor, "R"]], PackedSamples]
 _Visible = Callable[[Float[Tensor, "S 3"], Float[Tensor, "S 3"]], Float[Tensor, "S"] | None]
 
 
@@ -51,6 +55,17 @@ class _Front:
     """Samples of each that are looked at next, at most `todo`."""
     num_seen: int = 0
     """Most samples of one that were looked at."""
+
+    @classmethod
+    def before(
+        cls, samples: PackedSamples, rays: Int[Tensor, "M"], left: Float[Tensor, "R"], num_seen: int
+    ) -> _Front:
+        """Before the samples of M marched rays, of which each is one of R and had some before."""
+        starts, counts = samples.packed_info.unbind(-1)
+        found = counts.nonzero()[:, 0]
+        rays, at, todo = (value.index_select(0, found) for value in (rays, starts, counts))
+        wanted = todo.clamp(max=_SAMPLES_AT_ONCE)
+        return cls(rays, at, todo, left.index_select(0, rays), wanted, num_seen)
 
     def after(self, left: Float[Tensor, "A"], ending_light: float) -> _Front:
         """Behind these samples, where there are more and enough light is left."""
@@ -72,6 +87,7 @@ def composite_front_to_back(
     smallest_weight: float,
     visible: _Visible,
     residual_on_last_sample: bool = False,
+    march_on: _MarchOn | None = None,
 ) -> Coefficients:
     """Coefficients (R, ...) of each ray.
 
@@ -83,14 +99,14 @@ def composite_front_to_back(
         visible: From origins of rays and positions on them to the part of a moving lamp's light that reaches them, as
             `CoefficientField.get_outputs` takes it.
         residual_on_last_sample: Whether the last sample of a ray takes all the light that is left.
+        march_on: From rays and distances along them to the samples behind, where `samples` are the first
+            `FIRST_SAMPLES` of each ray; None where they are all.
     """
     starts, counts = samples.packed_info.unbind(-1)
     left = torch.ones_like(counts, dtype=samples.t.dtype)
     ending_light = _ENDING_LIGHT * smallest_weight
     limits = MergeLimits(samples.step, smallest_weight, _MERGED_WEIGHT * smallest_weight)
-    rays = counts.nonzero()[:, 0]
-    at, todo, light = (value.index_select(0, rays) for value in (starts, counts, left))
-    front = _Front(rays, at, todo, light, todo.clamp(max=_SAMPLES_AT_ONCE))
+    front = _Front.before(samples, torch.arange(len(counts), device=counts.device), left, 0)
     totals = last = torch.zeros(0)
     while True:
         merged = _look(field, samples, ray_bundle, front, limits)
@@ -104,6 +120,10 @@ def composite_front_to_back(
             last[front.rays[found]] = values.packed[merged.packed_info[found].sum(dim=1) - 1]
         left[front.rays] = merged.left
         front = front.after(merged.left, ending_light)
+        if len(front.rays) == 0 and march_on is not None:
+            lit = ((left > ending_light) & (counts == FIRST_SAMPLES)).nonzero()[:, 0]
+            samples = march_on(ray_bundle[lit], samples.t[starts[lit] + FIRST_SAMPLES - 1])
+            front, march_on = _Front.before(samples, lit, left, FIRST_SAMPLES), None
         if len(front.rays) == 0:
             break
     if residual_on_last_sample:

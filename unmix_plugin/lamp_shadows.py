@@ -30,13 +30,13 @@ def lamp_visibility(
     origins: Float[Tensor, "S 3"],
     positions: Float[Tensor, "S 3"],
     box: SceneBox,
-    opaque: UInt8[Tensor, "X Y Z"],
+    clearance: UInt8[Tensor, "X Y Z"],
     generator: torch.Generator | None = None,
 ) -> Float[Tensor, "S"]:
     """Part of the lamp's light that reaches samples of rays from `origins`, [0, 1]; differentiable in the lamp's place.
 
     Args:
-        opaque: Cells of the box that cast shadows.
+        clearance: 0 in the cells of the box that cast shadows; in others what `clearance_of` says.
         generator: Draws two points beside the lamp's middle for each sample; None takes four fixed ones.
     """
     origins, positions = origins.detach(), positions.detach()
@@ -44,11 +44,11 @@ def lamp_visibility(
     fixed, spread = middle.detach(), _SPREAD * float(lamp.first_place.norm())
     if generator is None:
         corners = spread * positions.new_tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
-        parts = [visible_part(positions, fixed + corner, box, opaque) for corner in corners]
+        parts = [visible_part(positions, fixed + corner, box, clearance) for corner in corners]
         return torch.stack(parts).mean(dim=0)
     drawn = torch.randn(positions.shape, generator=generator, device=generator.device)
     offsets = spread * drawn.to(positions)
-    one, other = (visible_part(positions, fixed + shift, box, opaque) for shift in (offsets, -offsets))
+    one, other = (visible_part(positions, fixed + shift, box, clearance) for shift in (offsets, -offsets))
     # Stein's identity: the mean of these slopes is the gradient of the visible part, blurred over the points.
     slopes = ((one - other) / (2 * spread**2))[:, None] * offsets
     return (one + other) / 2 + (slopes * (middle - fixed)).sum(dim=-1)
@@ -59,12 +59,12 @@ def visible_part(
     positions: Float[Tensor, "S 3"],
     lamps: Float[Tensor, "S 3"],
     box: SceneBox,
-    opaque: UInt8[Tensor, "X Y Z"],
+    clearance: UInt8[Tensor, "X Y Z"],
 ) -> Float[Tensor, "S"]:
-    """Part of the light from points outside the box that the opaque cells of the box let through to each position."""
+    """Part of the light from points outside the box that the box lets through to each position."""
     towards = normalize(lamps - positions, dim=-1)
-    cell = float((box.size / torch.tensor(opaque.shape, device=box.size.device)).max())
+    cell = float((box.size / torch.tensor(clearance.shape, device=box.size.device)).max())
     t_far = box.intersect(positions, towards)[1]
     t_near = torch.full_like(t_far, CLEAR_CELLS * cell)
-    counts = count_samples(box.normalise(positions), towards / box.size, t_near, t_far, opaque, cell)
+    counts = count_samples(box.normalise(positions), towards / box.size, t_near, t_far, clearance, cell)
     return torch.exp(-(counts / DARK_CELLS).square())

@@ -26,7 +26,6 @@ class LitSamples:
     """Samples that contribute enough, and what was found of them, without gradients."""
 
     samples: PackedSamples
-    densities: Float[Tensor, "S"]
     num_looked_at: int
     """N."""
     rows: Int[Tensor, "S"]
@@ -39,6 +38,10 @@ class LitSamples:
     """Where they lie, model space."""
     all_densities: Sequence[Float[Tensor, "_"]]
     """Their densities."""
+
+    def densities(self) -> Float[Tensor, "S"]:
+        """Densities of the samples."""
+        return torch.cat(list(self.all_densities)).index_select(0, self.rows)
 
     def encoded(self) -> Float[Tensor, "S LF"]:
         """Encodings of the samples."""
@@ -94,7 +97,6 @@ def samples_carrying_weight(
     keep = volume_weights(depths, samples.packed_info) > smallest_weight
     return LitSamples(
         samples.select(keep),
-        depths[keep] / step,
         num_seen,
         rows[keep],
         all_encoded,

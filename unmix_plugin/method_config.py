@@ -9,7 +9,7 @@ from unmix_plugin.engine.registry import MethodSpecification
 from unmix_plugin.engine.training.optimizers import OptimizerConfig
 from unmix_plugin.model_settings import UnmixModelConfig
 from unmix_plugin.published_field import PublishedFieldConfig
-from unmix_plugin.renderer import RendererConfig
+from unmix_plugin.renderer_settings import RendererConfig
 from unmix_plugin.trained.snapshot import unmix_scene
 from unmix_plugin.training_losses import LossConfig
 

@@ -79,7 +79,7 @@ def make_renderer(
         is_unbounded,
         config.losses.background == "last",
         config.eval_num_rays_per_chunk,
-        grid.opaque,
+        grid.opaque_clearance,
     )
 
 

@@ -22,9 +22,9 @@ from unmix_plugin.field import (
     NUM_DIRECTION_FEATURES,
     UnmixField,
     UnmixFieldConfig,
-    bias_free_network,
     direction_features,
 )
+from unmix_plugin.networks import bias_free_network
 
 _NUM_FREQUENCIES = 2
 _NUM_POSITION_FEATURES = 3 * 2 * _NUM_FREQUENCIES

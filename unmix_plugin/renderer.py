@@ -13,86 +13,22 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from unmix_plugin.alpha_preset import Auto, choose
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.contraction import UnitSpace
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
-from unmix_plugin.errors import require
 from unmix_plugin.field import CoefficientField
-from unmix_plugin.front_to_back import composite_front_to_back
+from unmix_plugin.front_to_back import FIRST_SAMPLES, composite_front_to_back
 from unmix_plugin.lamp_shadows import lamp_visibility
 from unmix_plugin.lit_samples import LitSamples, points_of, samples_carrying_weight
 from unmix_plugin.rendering.compositing import accumulate, volume_weights
 from unmix_plugin.rendering.contracted_marching import march_contracted
 from unmix_plugin.rendering.grid_cells import cells_at
-from unmix_plugin.rendering.marching import PackedSamples, march
+from unmix_plugin.rendering.marching import ALL_SAMPLES, PackedSamples, march
 from unmix_plugin.spectral.coefficients import Coefficients
 
-_LARGE_BOX = 300
-"""Pixels along the scene box from which on fewer samples a pixel do."""
 _SPREAD_DEPTH = 0.03
 """Optical depth of a sample from which on its part of the spread grows slower than the depth."""
-
-
-@dataclass(frozen=True)
-class RendererConfig:
-    """How finely rays are sampled and what is left out."""
-
-    samples_per_pixel: float | Auto = "auto"
-    """Samples of a ray along the length of a pixel's edge where it meets the middle of the scene box. Auto is 1.5, but
-    1 where alpha is known and the box is more than 300 pixels long: more rays teach more than closer samples."""
-    coarse_samples: int | Auto = "auto"
-    """Samples along the longest edge of the scene box at the start of training, if there are more in the end: what is
-    coarse must be found first, by many rays of few samples. Auto is 256, but 64 in an unbounded world, where rays go
-    on outside the box."""
-    coarse_until: float = 0.5
-    """Part of the training in which samples move together to the distance they have in the end."""
-    smallest_weight: float | Auto = "auto"
-    """Samples that contribute less than this share of their ray's light are left out. Auto is 0.004 where alpha is
-    known, else 0.001."""
-    visible_weight: float | Auto = "auto"
-    """Share of its ray's light from which a sample counts as seen. Cells that no two training views have lately seen
-    are left out; 1 leaves none out. Auto is 0.05 where alpha is known, else 1."""
-
-    def __post_init__(self) -> None:
-        """Refuse impossible settings.
-
-        Raises:
-            ConfigError: a number out of its range.
-        """
-        rules = {
-            "samples-per-pixel of 0.01 to 100 or auto": self.samples_per_pixel == "auto"
-            or 0.01 <= self.samples_per_pixel <= 100,
-            "coarse-samples of at least 1 or auto": self.coarse_samples == "auto" or self.coarse_samples >= 1,
-            "coarse-until in [0, 1]": 0 <= self.coarse_until <= 1,
-            "smallest-weight in [0, 1) or auto": self.smallest_weight == "auto"
-            or 0 <= self.smallest_weight < 1,
-            "visible-weight in (0, 1] or auto": self.visible_weight == "auto" or 0 < self.visible_weight <= 1,
-        }
-        require("the renderer", rules)
-
-    def sample_distance(self, pixel_size: float, longest_edge: float, has_alpha: bool) -> float:
-        """Distance of samples in the unit of a pixel's edge and of the scene box's longest one.
-
-        >>> [RendererConfig().sample_distance(1.0, edge, has_alpha=True) for edge in (270.0, 480.0)]
-        [0.6666666666666666, 1.0]
-        """
-        is_large = has_alpha and longest_edge > _LARGE_BOX * pixel_size
-        return pixel_size / choose(self.samples_per_pixel, 1.0 if is_large else 1.5)
-
-    def coarseness(self, samples: float, coarse_samples: int, progress: float) -> float:
-        """Factor on the distance of samples when that part of the training is over.
-
-        Args:
-            samples, coarse_samples: Along the longest edge of the scene box in the end, and at the start.
-            progress: In [0, 1].
-
-        >>> RendererConfig(coarse_until=0.5).coarseness(400.0, 100, 0.25)
-        2.0
-        """
-        left = 0.0 if progress >= self.coarse_until else 1.0 - progress / self.coarse_until
-        return max(samples / coarse_samples, 1.0) ** left
 
 
 @dataclass(frozen=True)
@@ -137,8 +73,9 @@ class VolumeRenderer:
     """Whether the last sample of a ray takes all the light that is left."""
     rays_per_chunk: int = 32_768
     """Rays rendered at once for a whole image; fewer take less memory."""
-    opaque: UInt8[Tensor, "X Y Z"] | None = None
-    """Cells that cast shadows in the light of a lamp that moves with the camera; None without one."""
+    opaque_clearance: UInt8[Tensor, "X Y Z"] | None = None
+    """0 in the cells that cast shadows in the light of a lamp that moves with the camera, in others what `clearance_of`
+    says; None without such a lamp."""
 
     def render(
         self, field: CoefficientField, ray_bundle: RayBundle, generator: torch.Generator | None = None
@@ -157,7 +94,7 @@ class VolumeRenderer:
         if torch.is_grad_enabled():
             densities, features = field.density_of(field.encode(positions, seen.encoded()))
         else:
-            densities, features = seen.densities, seen.features()
+            densities, features = seen.densities(), seen.features()
         origins = ray_bundle.origins.index_select(0, kept.ray_indices)
         visible = self._visible(field, origins, positions, generator)
         outputs = field.get_outputs(positions, along, features, *(() if visible is None else (visible,)))
@@ -202,7 +139,7 @@ class VolumeRenderer:
         return Coefficients.concatenate([self._composite(field, ray_bundle[i : i + chunk]) for i in starts])
 
     def _composite(self, field: CoefficientField, ray_bundle: RayBundle) -> Coefficients:
-        samples = self._march(ray_bundle, None)
+        samples = self._march(ray_bundle, None, most=FIRST_SAMPLES)
         found = composite_front_to_back(
             field,
             samples,
@@ -210,6 +147,7 @@ class VolumeRenderer:
             self.smallest_weight,
             lambda origins, positions: self._visible(field, origins, positions),
             self.residual_on_last_sample,
+            None if self.is_unbounded else lambda rays, t: self._march(rays, None, behind=t),
         )
         return _before_sky(found, field.sky(ray_bundle.directions))[0]
 
@@ -283,11 +221,19 @@ class VolumeRenderer:
         positions: Float[Tensor, "S 3"],
         generator: torch.Generator | None = None,
     ) -> Float[Tensor, "S"] | None:
-        if field.moving_lamp is None or self.opaque is None:
+        if field.moving_lamp is None or self.opaque_clearance is None:
             return None
-        return lamp_visibility(field.moving_lamp, origins, positions, self.box, self.opaque, generator)
+        lamp, clearance = field.moving_lamp, self.opaque_clearance
+        return lamp_visibility(lamp, origins, positions, self.box, clearance, generator)
 
-    def _march(self, ray_bundle: RayBundle, generator: torch.Generator | None) -> PackedSamples:
+    def _march(
+        self,
+        ray_bundle: RayBundle,
+        generator: torch.Generator | None,
+        most: int = ALL_SAMPLES,
+        behind: Float[Tensor, "R"] | None = None,
+    ) -> PackedSamples:
+        """Samples of rays; in a bounded world `most` of each, those behind samples at these distances."""
         origins, directions = ray_bundle.origins.detach(), ray_bundle.directions.detach()
         jitter = torch.full_like(origins[:, 0], 0.5)
         if generator is not None:
@@ -296,8 +242,10 @@ class VolumeRenderer:
             inner_origins, inner_directions = self.space.centred(origins), directions / self.space.half_edge
             return march_contracted(inner_origins, inner_directions, jitter, self.clearance, self.step)
         t_near, t_far = self.box.intersect(origins, directions)
+        if behind is not None:
+            t_near = behind + self.step / 2
         unit_origins, unit_directions = self.box.normalise(origins), directions / self.box.size
-        return march(unit_origins, unit_directions, t_near, t_far, jitter, self.clearance, self.step)
+        return march(unit_origins, unit_directions, t_near, t_far, jitter, self.clearance, self.step, most)
 
 
 def scale_gradient(values: Float[Tensor, "*S"], factors: Float[Tensor, "*#S"]) -> Float[Tensor, "*S"]:

@@ -118,6 +118,23 @@ def test_rays_that_miss_or_meet_nothing_have_no_samples():
     assert empty.packed_info[:, 1].tolist() == [0] * 6
 
 
+@pytest.mark.parametrize("most", [0, 1, 3, 1000])
+def test_a_ray_ends_after_as_many_samples_as_were_asked_for(most, device):
+    clearance = clearance_of(torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(3)) < 0.3).to(device)
+    o, d, t_near, t_far, jitter = (x.to(device) for x in make_rays(300))
+    everything = march(o, d, t_near, t_far, jitter, clearance, 0.013)
+    starts, counts = everything.packed_info.unbind(-1)
+    first = torch.arange(len(everything), device=device) - starts[everything.ray_indices] < most
+    expected = everything.select(first)
+    for function in (march, march_twin):
+        found = function(o, d, t_near, t_far, jitter, clearance, 0.013, most)
+        # A sample within rounding of a cell's face may fall to either side.
+        assert_close(found.packed_info[:, 1], counts.clamp(max=most), rtol=0, atol=2)
+    found = march(o, d, t_near, t_far, jitter, clearance, 0.013, most)
+    assert torch.equal(found.packed_info, expected.packed_info)
+    assert torch.equal(found.t, expected.t)
+
+
 def test_selecting_samples_keeps_them_packed_by_ray():
     samples = PackedSamples(
         torch.arange(5.0), torch.tensor([0, 0, 2, 2, 2]), torch.tensor([[0, 2], [2, 0], [2, 3]]), 0.1
@@ -135,12 +152,12 @@ def test_a_step_of_no_length_is_refused():
 
 @pytest.mark.parametrize("num_rays", [0, 300])
 def test_samples_are_counted_as_they_are_taken(num_rays, device):
-    occupied = (torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(3)) < 0.3).byte()
+    occupied = torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(3)) < 0.3
     o, d, t_near, t_far, _ = (x.to(device) for x in make_rays(num_rays))
-    cells = occupied.to(device)
+    clearance = clearance_of(occupied).to(device)
     half = torch.full((num_rays,), 0.5, device=device)
-    taken = march_twin(o, d, t_near, t_far, half, 1 - cells, 0.013)
-    counts = count_samples(o, d, t_near, t_far, cells, 0.013)
+    taken = march_twin(o, d, t_near, t_far, half, clearance, 0.013)
+    counts = count_samples(o, d, t_near, t_far, clearance, 0.013)
     # A sample within rounding of a cell's face may fall to either side.
     assert_close(counts, taken.packed_info[:, 1], rtol=0, atol=2)
     assert int(counts.sum()) == pytest.approx(int(taken.packed_info[:, 1].sum()), rel=1e-3)

@@ -92,6 +92,7 @@ def count_kernel(
     jitter: wp.array(dtype=float),
     step: float,
     clearance: wp.array3d(dtype=wp.uint8),
+    most: int,
     counts: wp.array(dtype=wp.int64),
 ):
     index = first + wp.tid()
@@ -99,7 +100,7 @@ def count_kernel(
         ray = ray_at(index, origins, directions, t_near, t_far, jitter, step, clearance)
         count = int(0)  # noqa: RUF046, UP018 - Warp takes a bare literal for a constant
         i = int(0)  # noqa: RUF046, UP018
-        while i < ray.num_points:
+        while i < ray.num_points and count < most:
             clear = clearance_at(ray, point_at(ray, step, i), clearance)
             if clear <= _NEAR:
                 for k in range(8):
@@ -107,7 +108,7 @@ def count_kernel(
                     count += int(clear == 0 and i + k < ray.num_points)
                 i += 7
             i += points_to_next(ray, clear)
-        counts[index] = wp.int64(count)
+        counts[index] = wp.int64(wp.min(count, most))
         index += stride
 
 

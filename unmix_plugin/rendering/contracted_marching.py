@@ -44,7 +44,7 @@ def march_contracted(
     from unmix_plugin.rendering._contracted_kernels import count_kernel, write_kernel
 
     check_step(step)
-    device, point = origins.device, vector_type(3, torch.float32)
+    point = vector_type(3, torch.float32)
     rays = [
         as_warp(origins.contiguous(), point),
         as_warp(directions.contiguous(), point),
@@ -52,7 +52,7 @@ def march_contracted(
         step,
         as_warp(clearance.contiguous()),
     ]
-    return PackedSamples(*count_and_write(count_kernel, write_kernel, rays, len(origins), device), step)
+    return PackedSamples(*count_and_write(count_kernel, write_kernel, rays, origins), step)
 
 
 def march_contracted_twin(

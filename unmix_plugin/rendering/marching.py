@@ -17,6 +17,8 @@ from torch import Tensor
 from unmix_plugin.rendering.grid_cells import cells_at
 from unmix_plugin.rendering.launching import KernelArray, as_warp, launch, vector_type
 
+ALL_SAMPLES = 2**31 - 1
+
 
 @dataclass(frozen=True)
 class PackedSamples:
@@ -62,6 +64,7 @@ def march(
     jitter: Float[Tensor, "R"],
     clearance: UInt8[Tensor, "X Y Z"],
     step: float,
+    most: int = ALL_SAMPLES,
 ) -> PackedSamples:
     """Samples at t_near + (i + jitter) step that lie in occupied cells.
 
@@ -71,21 +74,14 @@ def march(
         jitter: Offset of each ray's lattice in steps, [0, 1).
         clearance: 0 in occupied cells, as `clearance_of` says; cell (x, y, z) is [x/X, (x+1)/X] and so on.
         step: Distance of neighbouring samples in the ray parameter, > 0.
+        most: Samples after which a ray ends.
     Raises:
         ValueError: step isn't positive.
     """
     from unmix_plugin.rendering._marching_kernels import count_kernel, write_kernel
 
-    check_step(step)
-    device, point = origins.device, vector_type(3, torch.float32)
-    rays = [
-        as_warp(origins.contiguous(), point),
-        as_warp(directions.contiguous(), point),
-        *(as_warp(values.contiguous()) for values in (t_near, t_far, jitter)),
-        step,
-        as_warp(clearance.contiguous()),
-    ]
-    return PackedSamples(*count_and_write(count_kernel, write_kernel, rays, len(origins), device), step)
+    rays = _rays(origins, directions, t_near, t_far, jitter, clearance, step)
+    return PackedSamples(*count_and_write(count_kernel, write_kernel, rays, origins, [most]), step)
 
 
 def count_samples(
@@ -93,40 +89,54 @@ def count_samples(
     directions: Float[Tensor, "R 3"],
     t_near: Float[Tensor, "R"],
     t_far: Float[Tensor, "R"],
-    occupied: UInt8[Tensor, "X Y Z"],
+    clearance: UInt8[Tensor, "X Y Z"],
     step: float,
 ) -> Int[Tensor, "R"]:
-    """How many samples of each ray lie in occupied cells: of those that `march` takes at t_near + (i + 1/2) step."""
+    """How many samples of each ray `march` takes at t_near + (i + 1/2) step."""
     from unmix_plugin.rendering._marching_kernels import count_kernel
 
-    check_step(step)
-    device, point = origins.device, vector_type(3, torch.float32)
-    jitter = torch.full_like(t_near, 0.5)
-    counts = torch.empty(len(origins), dtype=torch.int64, device=device)
-    rays = [as_warp(x.contiguous(), point) for x in (origins, directions)]
-    bounds = [as_warp(values.contiguous()) for values in (t_near, t_far, jitter)]
-    clearance = (occupied == 0).to(torch.uint8)
-    arrays = [*rays, *bounds, step, as_warp(clearance.contiguous()), as_warp(counts)]
-    launch(count_kernel, len(origins), arrays, device)
+    rays = _rays(origins, directions, t_near, t_far, torch.full_like(t_near, 0.5), clearance, step)
+    counts = torch.empty(len(origins), dtype=torch.int64, device=origins.device)
+    launch(count_kernel, len(origins), [*rays, ALL_SAMPLES, as_warp(counts)], origins.device)
     return counts
+
+
+def _rays(
+    origins: Float[Tensor, "R 3"],
+    directions: Float[Tensor, "R 3"],
+    t_near: Float[Tensor, "R"],
+    t_far: Float[Tensor, "R"],
+    jitter: Float[Tensor, "R"],
+    clearance: UInt8[Tensor, "X Y Z"],
+    step: float,
+) -> list[KernelArray | float]:
+    """The arguments that both kernels share."""
+    check_step(step)
+    point = vector_type(3, torch.float32)
+    lines = [as_warp(values.contiguous(), point) for values in (origins, directions)]
+    numbers = [as_warp(values.contiguous()) for values in (t_near, t_far, jitter)]
+    return [*lines, *numbers, step, as_warp(clearance.contiguous())]
 
 
 def count_and_write(
     count_kernel: Any,
     write_kernel: Any,
     rays: Sequence[KernelArray | float],
-    num_rays: int,
-    device: torch.device,
+    origins: Float[Tensor, "R 3"],
+    counted: Sequence[int] = (),
 ) -> tuple[Float[Tensor, "S"], Int[Tensor, "S"], Int[Tensor, "R 2"]]:
     """Samples of rays by two launches: one counts them, the other writes them where there is then room.
 
     Args:
         rays: Arguments of both kernels.
+        origins: Of the rays.
+        counted: Arguments of the one that counts, after those.
     Returns:
         Distances and rays of the samples, and each ray's first sample and number of samples.
     """
+    num_rays, device = len(origins), origins.device
     counts = torch.empty(num_rays, dtype=torch.int64, device=device)
-    launch(count_kernel, num_rays, [*rays, as_warp(counts)], device)
+    launch(count_kernel, num_rays, [*rays, *counted, as_warp(counts)], device)
     ends = counts.cumsum(0)
     packed_info = torch.stack([ends - counts, counts], dim=-1)
     total = int(ends[-1]) if len(ends) else 0
@@ -146,6 +156,7 @@ def march_twin(
     jitter: Float[Tensor, "R"],
     clearance: UInt8[Tensor, "X Y Z"],
     step: float,
+    most: int = ALL_SAMPLES,
 ) -> PackedSamples:
     """The same as `march` in plain PyTorch: tests every lattice point of every ray."""
     check_step(step)
@@ -156,6 +167,7 @@ def march_twin(
     points = origins[:, None] + t[..., None] * directions[:, None]
     cells = cells_at(points, clearance.shape)
     hit = (t < t_far[:, None]) & (clearance[tuple(cells.unbind(-1))] == 0)
+    hit &= hit.cumsum(dim=1) <= most
     counts = hit.sum(dim=1)
     starts = counts.cumsum(0) - counts
     ray_indices, _ = hit.nonzero(as_tuple=True)

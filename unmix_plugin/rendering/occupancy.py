@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
 from unmix_plugin.rendering.grid_cells import cells_at, clearance_of
@@ -36,6 +36,8 @@ class OccupancyGrid(nn.Module):
     reachable: Tensor
     reachable_cells: Tensor
     opaque: Tensor | None
+    opaque_clearance: Tensor | None
+    """As `clearance_of` says, of the cells that cast shadows."""
 
     def __init__(
         self, reachable: Bool[Tensor, "X Y Z"], casts_shadows: bool = False, records_met: bool = False
@@ -53,6 +55,7 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("occupied", reachable.to(torch.uint8))
         opaque = torch.zeros(reachable.shape, dtype=torch.uint8) if casts_shadows else None
         self.register_buffer("opaque", opaque)
+        self.register_buffer("opaque_clearance", _clearance(opaque), persistent=False)
         self.register_buffer("met", torch.full(reachable.shape, _NOTHING_MET) if records_met else None)
         self.register_buffer("clearance", clearance_of(reachable), persistent=False)
         self.register_buffer("reachable_cells", _flat_indices(reachable), persistent=False)
@@ -90,9 +93,10 @@ class OccupancyGrid(nn.Module):
         self.visibility.update()
         is_visible = self.visibility.visible.view(-1)[self.reachable_cells]
         self.occupied.view(-1)[self.reachable_cells] = ((reachable_peaks > limit) & is_visible).byte()
-        if self.opaque is not None:
+        if self.opaque is not None and self.opaque_clearance is not None:
             is_opaque = is_known & is_visible & (reachable_peaks > _OPAQUE * limit)
             self.opaque.view(-1)[self.reachable_cells] = is_opaque.byte()
+            self.opaque_clearance.copy_(clearance_of(self.opaque != 0))
         self.clearance.copy_(clearance_of(self.occupied != 0))
 
     @torch.no_grad()
@@ -137,7 +141,12 @@ def _flat_indices(reachable: Bool[Tensor, "X Y Z"]) -> Int[Tensor, "N"]:
     return reachable.view(-1).nonzero()[:, 0]
 
 
+def _clearance(cells: UInt8[Tensor, "X Y Z"] | None) -> UInt8[Tensor, "X Y Z"] | None:
+    return None if cells is None else clearance_of(cells != 0)
+
+
 def _after_loading(grid: OccupancyGrid, _: object) -> None:
     """Find anew what follows from what was loaded: searching the whole grid takes longer than an update."""
     grid.reachable_cells = _flat_indices(grid.reachable)
     grid.clearance = clearance_of(grid.occupied != 0)
+    grid.opaque_clearance = _clearance(grid.opaque)

@@ -37,11 +37,12 @@ def unmix_scene(
         own = copy.deepcopy(model.poses, frozen)  # type: ignore[arg-type]
         record = replace(record, train_cameras=own.refined(record.train_cameras))
     materials = replace(materials, endmembers=frozen[id(model.endmembers)], specular_spectra=specular)
+    opaque = renderer.opaque_clearance
     renderer = replace(
         renderer,
         clearance=renderer.clearance.clone(),
         reachable=renderer.reachable.clone(),
-        opaque=None if renderer.opaque is None else renderer.opaque.clone(),
+        opaque_clearance=None if opaque is None else opaque.clone(),
     )
     return TrainedScene(
         copy.deepcopy(model.field, frozen).eval(),  # type: ignore[arg-type]

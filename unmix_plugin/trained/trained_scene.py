@@ -127,12 +127,13 @@ class TrainedScene:
         """The same scene on another device; `self` stays where it is."""
         if torch.device(device) == self.device:
             return self
+        opaque = self.renderer.opaque_clearance
         renderer = replace(
             self.renderer,
             box=self.renderer.box.to(device),
             clearance=self.renderer.clearance.to(device),
             reachable=self.renderer.reachable.to(device),
-            opaque=None if self.renderer.opaque is None else self.renderer.opaque.to(device),
+            opaque_clearance=None if opaque is None else opaque.to(device),
         )
         field = copy.deepcopy(self.field).to(device)
         return replace(self, field=field, renderer=renderer, materials=self.materials.to(device))
