@@ -22,7 +22,7 @@ def textured(smallest_weight: float, opacity: float):
     return renderer, field
 
 
-@pytest.mark.parametrize("opacity", [1e-4, 0.05, 0.9])
+@pytest.mark.parametrize("opacity", [1e-4, 0.05, 0.9, 1 - 1e-10])
 def test_with_nothing_left_out_both_ways_are_equal(opacity):
     renderer, field = textured(0.0, opacity)
     bundle = rays(40)
