@@ -75,7 +75,9 @@ class _Front:
         values = (self.rays, self.at + self.wanted, todo, left, self.wanted, self.left)
         rays, at, todo, left, wanted, before = (value.index_select(0, alive) for value in values)
         enough = wanted / _DENSER * (left / ending_light).log() / (before / left).log()
-        enough = enough.ceil().nan_to_num(nan=at_once).clamp(1, at_once)  # no number if both logarithms are infinite
+        enough = (
+            enough.ceil().nan_to_num(nan=at_once).clamp(1, at_once)
+        )  # no number if both logarithms are infinite
         wanted = torch.minimum(enough.long(), todo)
         return _Front(rays, at, todo, left, wanted, self.num_seen + at_once)
 
