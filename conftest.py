@@ -1,5 +1,6 @@
 """What every test and every doctest runs under: one thread, no display, slow first calls allowed, numpy's own print."""
 
+import gc
 import os
 import signal
 
@@ -25,3 +26,14 @@ def default_numpy_print():
     """Importing colour-science sets numpy's print to that of 1.13, which would change what doctests show."""
     with np.printoptions(legacy=False):
         yield
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """What is imported lives to the end: Python need not look for garbage in it, half a second each time."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
