@@ -117,7 +117,7 @@ def test_wavelengths_come_with_their_evidence(tmp_path, entries, nm, evidence):
     [
         ("wavelength = {400, 500, 600}", "wavelengths are left out: 3 for 4 bands"),
         ("wavelength = {400, nan, 600, 700}", "that of band 1 (from 0) is nan"),
-        ("wavelength = {400, x, 600, 700}", "no list of numbers"),
+        ("wavelength = {400, x, 600, 700}", "are not a list of numbers"),
         (
             "wavelength units = Index\nwavelength = {1, 2, 3, 4}",
             "with the unit 'Index' can't be brought to nm",
