@@ -48,6 +48,14 @@ def test_a_view_that_is_off_by_pixels_is_brought_back(camera, share, left):
     assert after < left * before  # the sweep shows little that changes along its path
 
 
+def test_a_view_that_is_off_by_a_quarter_of_its_width_is_brought_back_too():
+    scene = make_scene()
+    given = moved(CAMERA, torch.tensor([-0.1, 0.12, 0.1, 0.0, 0.0, 0.0]), scene)
+    assert float((points_seen(given) - points_seen(CAMERA)).norm(dim=1).mean()) > 7
+    found = align_pose(scene, given, truth_of(scene, CAMERA))
+    assert float((points_seen(found) - points_seen(CAMERA)).norm(dim=1).mean()) < 0.5
+
+
 def test_a_view_that_is_right_stays():
     scene = make_scene()
     found = align_pose(scene, CAMERA, truth_of(scene, CAMERA))

@@ -4,6 +4,11 @@ Corrected poses and field move together, so a given pose no longer says exactly 
 for fields that refine poses, each evaluation view is aligned before it is measured: one turn and one shift are found
 with which the field shows it best, coarse pictures first. Nothing of the field changes.
 
+A view that is off by a tenth of its width must first be brought near: pictures three pixels wide are alike within a
+third of the width. A turn alone does so where a shift as well would be drawn away, but not always; so both are tried
+beside the given pose, and each is taken only where it is clearly better: coarse pictures also move a view that is
+right, and a line camera whose rows can hardly be told apart.
+
 Notation: `P` pixels of a coarse picture, `C` spectral channels compared, `D` those and opacity.
 
 Source: Lin et al. 2021, BARF (alignment of views at test time); here by Levenberg-Marquardt steps with differences of
@@ -13,7 +18,7 @@ renders.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -30,8 +35,19 @@ if TYPE_CHECKING:
 
 SIDES_PX = (24, 48, 96, 192)
 """Longest sides of the pictures compared, one after the other; none larger than the view."""
-STEPS = (5, 3, 2, 1)
-"""Steps taken on each."""
+STEPS = (6, 3, 2, 1)
+"""Most steps taken on each."""
+_FIRST_STEPS = 3
+"""Steps taken from each start before the best is chosen."""
+_POOLED = (8, 4, 2)
+"""Edges of the blocks of pixels whose means are compared before, on the smallest picture."""
+_POOLED_STEPS = 4
+_FIRST_MOVES = (3, 6)
+"""Numbers of a pose that are fitted on pooled pictures: its turn alone, or all."""
+_CLEARLY_BETTER = 0.8
+"""Part of the squared error of what was tried before, below which a pose is taken."""
+_APART_PX = 1.0
+"""How far starts are apart on the smallest picture, at least: nearer ones lead to the same pose."""
 _CHANNELS = 3
 _DAMPING = 1e-3
 _DIFFERENCE_PX = 0.5
@@ -49,18 +65,74 @@ def align_pose(scene: TrainedScene, camera: Cameras, truth: ViewTruth) -> Camera
     for side, count in zip(SIDES_PX, STEPS, strict=True):
         if side > max(camera.width, camera.height) and side > SIDES_PX[0]:
             break
-        small = _shrunk(camera, side)
-        wanted, counts = _pooled(truth, axes, small)
-        focal = float(small.focal_px.mean())
-
-        def residuals(
-            x: Float[Tensor, "6"], small: Cameras = small, wanted: Tensor = wanted, counts: Tensor = counts
-        ) -> Float[Tensor, " n"]:
-            seen = _shown(scene, moved(small, x, scene), truth, axes)
-            return ((seen - wanted) * counts).flatten()
-
-        step = _fit(residuals, step, count, _DIFFERENCE_PX / focal)
+        comparison = _Comparison.of(scene, _shrunk(camera, side), truth, axes)
+        if side == SIDES_PX[0]:
+            step = _best_start(comparison)
+        step = _fit(comparison.residuals, step, count, comparison.difference)
     return moved(camera, step, scene)
+
+
+def _best_start(comparison: _Comparison) -> Float[Tensor, "6"]:
+    """A few steps from the given pose, or from where coarse pictures lead if that is clearly better."""
+    starts, best, smallest = [torch.zeros(6)], torch.zeros(6), float("inf")
+    starts += [_brought_near(comparison, num_moves) for num_moves in _FIRST_MOVES]
+    apart = _APART_PX / _DIFFERENCE_PX * comparison.difference
+    for number, start in enumerate(starts):
+        if any(float((start - other).norm()) < apart for other in starts[:number]):
+            continue
+        found = _fit(comparison.residuals, start, _FIRST_STEPS, comparison.difference)
+        error = float(comparison.residuals(found).square().sum())
+        if error < _CLEARLY_BETTER * smallest:
+            best, smallest = found, error
+    return best
+
+
+def _brought_near(comparison: _Comparison, num_moves: int) -> Float[Tensor, "6"]:
+    """A first step, found on pictures of few pixels."""
+    step = torch.zeros(6)
+    for block in _POOLED:
+        pooled = replace(comparison, block=block)
+        step = _fit(pooled.residuals, step, _POOLED_STEPS, pooled.difference, num_moves)
+    return step
+
+
+@dataclass(frozen=True)
+class _Comparison:
+    """What the field shows beside what was measured, as the camera moves."""
+
+    scene: TrainedScene
+    camera: Cameras
+    truth: ViewTruth
+    axes: Float[Tensor, "B C"]
+    wanted: Float[Tensor, "P D"]
+    counts: Float[Tensor, "P 1"]
+    """Share of each pixel that counts."""
+    block: int = 1
+    """Edge of the blocks of pixels whose means are compared."""
+
+    @classmethod
+    def of(
+        cls, scene: TrainedScene, camera: Cameras, truth: ViewTruth, axes: Float[Tensor, "B C"]
+    ) -> _Comparison:
+        """In as many pixels as the camera has."""
+        return cls(scene, camera, truth, axes, *_pooled(truth, axes, camera))
+
+    @property
+    def difference(self) -> float:
+        """A turn that moves the picture by half a pixel, or block, in radians."""
+        return _DIFFERENCE_PX * self.block / float(self.camera.focal_px.mean())
+
+    def residuals(self, step: Float[Tensor, "6"]) -> Float[Tensor, " n"]:
+        """Shown less measured, of each pixel or block and channel."""
+        is_coarse = self.block == 1 and max(self.camera.width, self.camera.height) <= SIDES_PX[0]
+        camera = moved(self.camera, step, self.scene)
+        seen = _shown(self.scene, camera, self.truth, self.axes, subpixels=2 if is_coarse else 1)
+        errors = (seen - self.wanted) * self.counts
+        if self.block == 1:
+            return errors.flatten()
+        rows = errors.unflatten(0, (self.camera.height, self.camera.width)).permute(2, 0, 1)
+        height, width = (max(1, round(edge / self.block)) for edge in rows.shape[1:])
+        return torch.nn.functional.adaptive_avg_pool2d(rows, (height, width)).flatten()
 
 
 def moved(camera: Cameras, step: Float[Tensor, "6"], scene: TrainedScene) -> Cameras:
@@ -81,18 +153,20 @@ def moved(camera: Cameras, step: Float[Tensor, "6"], scene: TrainedScene) -> Cam
 
 
 def _fit(
-    residuals: Residuals, start: Float[Tensor, "6"], count: int, difference: float
+    residuals: Residuals, start: Float[Tensor, "6"], count: int, difference: float, num_moves: int = 6
 ) -> Float[Tensor, "6"]:
-    """Levenberg-Marquardt steps from `start` that each lower the sum of squares, within `LARGEST_STEP`."""
+    """Levenberg-Marquardt steps from `start` that each lower the sum of squares, within `LARGEST_STEP`, in the first
+    numbers of a pose."""
     best, found = start, residuals(start)
+    axes = torch.eye(6)[:num_moves]
     damping = _DAMPING
     for _ in range(count):
-        columns = [residuals(best + difference * axis) - found for axis in torch.eye(6)]
+        columns = [residuals(best + difference * axis) - found for axis in axes]
         slopes = torch.stack(columns, dim=1).double() / difference
         normal, pull = slopes.T @ slopes, slopes.T @ found.double()
         for _ in range(3):
-            ridge = damping * normal.diagonal().mean().clamp(min=1e-12) * torch.eye(6, dtype=torch.float64)
-            tried = best - torch.linalg.solve(normal + ridge, pull).float()
+            ridge = damping * normal.diagonal().mean().clamp(min=1e-12) * torch.eye(num_moves).double()
+            tried = best - torch.linalg.solve(normal + ridge, pull).float() @ axes
             tried = tried.clamp(-LARGEST_STEP, LARGEST_STEP)
             seen = residuals(tried)
             if float(seen.square().sum()) < float(found.square().sum()):
@@ -142,9 +216,11 @@ def _pooled(
 
 
 def _shown(
-    scene: TrainedScene, camera: Cameras, truth: ViewTruth, axes: Float[Tensor, "B C"]
+    scene: TrainedScene, camera: Cameras, truth: ViewTruth, axes: Float[Tensor, "B C"], subpixels: int
 ) -> Float[Tensor, "P D"]:
-    view = scene.look(camera, 2 if max(camera.width, camera.height) <= SIDES_PX[0] else 1)
+    fine = camera.resized(subpixels * camera.width, subpixels * camera.height)
+    view = scene.look(fine, 1)
     opacity = view.opacity if truth.alpha is not None else torch.ones_like(view.opacity)
     seen = truth.seen(view["spectral"]).float() @ axes.to(view.opacity)
-    return torch.cat([seen, opacity[..., None]], dim=-1).flatten(0, 1).cpu()
+    values = torch.cat([seen, opacity[..., None]], dim=-1).permute(2, 0, 1)
+    return torch.nn.functional.avg_pool2d(values, subpixels).flatten(1).T.cpu()
