@@ -18,11 +18,17 @@ MODULE = "tests.engine.processes.worker"
 
 @pytest.fixture
 def run(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
-    """Runs an action in two processes: exit code, standard error and what each process kept."""
+    """Runs an action in two processes: exit code, standard error and what each process kept.
+
+    None may leave threads of the group behind, which can abort a process when Python ends.
+    """
 
     def run_action(action: str) -> tuple[int, str, list[dict[str, torch.Tensor]]]:
         code = run_processes(MODULE, [str(tmp_path), action], 2)
         kept = [torch.load(path) for path in sorted(tmp_path.glob("rank-*.pt"))]
+        left = [path.read_text() for path in tmp_path.glob("threads-*.txt")]
+        assert left
+        assert not any("gloo" in names for names in left), left
         return code, capfd.readouterr().err, kept
 
     return run_action

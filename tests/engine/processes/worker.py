@@ -1,8 +1,10 @@
 """A process of a training of the second method, as the tests start it: `worker.py FOLDER ACTION`.
 
-Each process writes what its model has at the end to FOLDER/rank-N.pt.
+Each process writes what its model has at the end to FOLDER/rank-N.pt, and the names of the threads that are left when
+it ends to FOLDER/threads-N.txt.
 """
 
+import atexit
 import os
 import sys
 from dataclasses import replace
@@ -83,10 +85,16 @@ def fixed_batch(pipeline: Pipeline) -> Any:
     return pipeline.datamanager.next_train(0)
 
 
+def name_threads(path: Path) -> None:
+    """Write the names of this process's threads, where the system tells them."""
+    path.write_text("".join(thread.read_text() for thread in Path("/proc/self/task").glob("*/comm")))
+
+
 def main(argv: list[str]) -> None:
     """Do what was asked."""
     load_run.find_method = lambda _: rgb_nerf
     folder, action = Path(argv[0]), argv[1]
+    atexit.register(name_threads, folder / f"threads-{os.environ['RANK']}.txt")
     config = config_for(folder)
     is_second = os.environ.get("RANK") == "1"
     if action == "gradients":

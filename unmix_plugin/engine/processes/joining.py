@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import os
+import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from datetime import timedelta
@@ -44,6 +46,9 @@ def join(device: str) -> Processes:
         _take_device(int(os.environ.get("LOCAL_RANK", "0")), processes_here())
     backend = "nccl" if is_cuda else "gloo"
     _require_backend(backend)
+    # Imported later it would keep the group in defaults of its functions, and the group's threads would live on when
+    # Python ends, which aborts the process where one of them then lets go of a tensor.
+    importlib.import_module("torch.distributed.nn")
     distributed.init_process_group(backend, timeout=_PATIENCE)
     return Processes(rank, count)
 
@@ -66,6 +71,10 @@ def joined(device: str) -> Iterator[Processes]:
     processes = join(device)
     try:
         yield processes
+    except BaseException as error:
+        if processes.count > 1:
+            _let_go(error)
+        raise
     finally:
         leave(processes)
 
@@ -100,6 +109,13 @@ def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
             _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
         )
     return found
+
+
+def _let_go(error: BaseException | None) -> None:
+    """Clear the local variables an error keeps: the group is among them, and its threads end with it alone."""
+    while error is not None:
+        traceback.clear_frames(error.__traceback__)
+        error = error.__cause__ or error.__context__
 
 
 def _take_device(local_rank: int, processes: int) -> None:
