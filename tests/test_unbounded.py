@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -12,9 +13,12 @@ from tests.method_factory import CONFIG, initial_data, make_model, make_rays
 from unmix_plugin.editing.edited_field import EditedField
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.processes.processes import Processes
 from unmix_plugin.field import UnmixField, UnmixFieldConfig
+from unmix_plugin.grid_upkeep import update_grid
 from unmix_plugin.renderer import VolumeRenderer, scale_gradient
 from unmix_plugin.rendering.grid_cells import clearance_of
+from unmix_plugin.rendering.occupancy import OccupancyGrid
 
 BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 
@@ -133,3 +137,19 @@ def test_training_tells_the_grid_what_rays_meet_in_a_world_without_end_and_only_
     assert bool(is_met[tuple((centre[0] * 8).long())])
     density = world.field.get_density(torch.zeros(1, 3))[0]
     assert_close(world.grid.met[is_met].mean(), density[0], rtol=0.5, atol=0)
+
+
+def test_a_world_without_end_begins_with_cells_as_large_as_those_of_a_coarse_grid():
+    """And with its own in the second half; a bounded scene has its own from the start."""
+    blocks: list[int] = []
+
+    class Watched(OccupancyGrid):
+        def update(self, *args: Any, block: int = 1, **words: Any) -> None:
+            blocks.append(block)
+
+    for is_unbounded in (True, False):
+        renderer = replace(make()[0], is_unbounded=is_unbounded)
+        grid = Watched(torch.ones(128, 128, 128) > 0)
+        for progress in (0.0, 0.4, 0.6):
+            update_grid(grid, make()[1], renderer, Processes(), None, progress)
+    assert blocks == [2, 2, 1, 1, 1, 1]

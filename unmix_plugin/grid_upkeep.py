@@ -21,6 +21,12 @@ _GRID_DECAY = 0.5
 _OCCUPIED_OPACITY = 0.03
 """Opacity of one sample's interval from which a cell counts as occupied."""
 
+_FIRST_CELLS = 64
+"""Along an edge of the grid of a world without end, in the first part of the training: smaller cells are emptied before
+surfaces are found."""
+_FIRST_CELLS_UNTIL = 0.5
+"""That part."""
+
 
 def is_due(step: int) -> bool:
     """Whether the grid is updated before this training step."""
@@ -33,6 +39,7 @@ def update_grid(
     renderer: VolumeRenderer,
     processes: Processes,
     generator: torch.Generator | None,
+    progress: float,
 ) -> None:
     """Probe the field in some cells, the same in each process, and decide anew what is occupied.
 
@@ -42,18 +49,21 @@ def update_grid(
         renderer: With the distance of samples of the present training step.
         processes: That train together; they share which cells their rays saw.
         generator: Source of the cells.
+        progress: Part of the training that is over.
     """
     device = torch.device("cpu") if generator is None else generator.device
     drawn = torch.randint(2**62, (1,), generator=generator, device=device)
     seed = int(processes.of_first(drawn))
     share_sights(grid, processes)
     space = renderer.space
+    begins_coarsely = renderer.is_unbounded and progress < _FIRST_CELLS_UNTIL
     grid.update(
         lambda points: field.get_density(space.from_unit(points))[0],
         threshold=-math.log1p(-_OCCUPIED_OPACITY) / renderer.step,
         decay=_GRID_DECAY,
         num_cells=_PROBED_CELLS,
         generator=torch.Generator().manual_seed(seed),
+        block=max(len(grid.occupied) // _FIRST_CELLS, 1) if begins_coarsely else 1,
     )
 
 

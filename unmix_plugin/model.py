@@ -287,7 +287,7 @@ class UnmixModel(Model):
             self.field.level_weights.copy_(torch.tensor(levels))
         if is_due(step):
             renderer = replace(self.renderer, step=self._training_step)
-            update_grid(self.grid, self.field, renderer, self.processes, self.generator)
+            update_grid(self.grid, self.field, renderer, self.processes, self.generator, progress)
             self.processes.mean(self.guide.margin_variance)
 
     @torch.no_grad()

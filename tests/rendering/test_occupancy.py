@@ -9,10 +9,14 @@ def ball(points: torch.Tensor) -> torch.Tensor:
     return 100.0 * ((points - 0.5).norm(dim=-1) < 0.25)
 
 
-def updated(grid: OccupancyGrid, density_fn, times: int = 1, num_cells=None, seed=0) -> OccupancyGrid:
+def updated(
+    grid: OccupancyGrid, density_fn, times: int = 1, num_cells=None, seed=0, block=1
+) -> OccupancyGrid:
     generator = torch.Generator().manual_seed(seed)
     for _ in range(times):
-        grid.update(density_fn, threshold=1.0, decay=0.5, num_cells=num_cells, generator=generator)
+        grid.update(
+            density_fn, threshold=1.0, decay=0.5, num_cells=num_cells, generator=generator, block=block
+        )
     return grid
 
 
@@ -103,3 +107,13 @@ def test_what_rays_met_counts_once_and_the_largest_in_a_cell():
     assert float(grid.peak_densities[1, 1, 1]) == 0.5
     updated(grid, lambda points: torch.zeros(len(points)), num_cells=0)
     assert float(grid.peak_densities[0, 0, 0]) == 8.0
+
+
+def test_cells_of_a_block_stay_while_one_of_them_is_dense():
+    """Small cells are soon emptied by chance; blocks of them only where nothing was met in any."""
+    for block, expected in ((1, 1), (2, 8), (3, 27)):
+        grid = OccupancyGrid(torch.ones(5, 5, 5) > 0, records_met=True)
+        updated(grid, lambda points: torch.zeros(len(points)))
+        grid.record_met(torch.tensor([[0.5, 0.5, 0.5]]), torch.tensor([8.0]))
+        updated(grid, lambda points: torch.zeros(len(points)), num_cells=0, block=block)
+        assert int(grid.occupied.sum()) == expected

@@ -69,6 +69,7 @@ class OccupancyGrid(nn.Module):
         decay: float,
         num_cells: int | None,
         generator: torch.Generator,
+        block: int = 1,
     ) -> None:
         """Probe one random point in each of some cells and decide anew what is occupied: dense and visible.
 
@@ -78,14 +79,14 @@ class OccupancyGrid(nn.Module):
             decay: Factor on a probed cell's old maximum.
             num_cells: Cells to probe: half drawn from the occupied ones, half from all reachable ones; None for all.
             generator: Source of the points and cells.
+            block: Cells along the edge of blocks of which each counts as one cell, as dense as the densest in it.
         """
-        self._take_in_met(decay)
         cells = self._choose_cells(num_cells, generator)
         sides = torch.tensor(self.occupied.shape, device=cells.device)
         offsets = torch.rand(len(cells), 3, generator=generator).to(cells.device)
         densities = density_fn((self._coordinates(cells) + offsets) / sides)
+        self._take_in(cells, densities, decay, block)
         peaks = self.peak_densities.view(-1)
-        peaks[cells] = torch.maximum(_decayed(peaks[cells], decay), densities)
         reachable_peaks = peaks[self.reachable_cells]
         is_known = torch.isfinite(reachable_peaks)
         known_peaks = reachable_peaks if bool(is_known.all()) else reachable_peaks[is_known]
@@ -107,11 +108,17 @@ class OccupancyGrid(nn.Module):
             x, y, z = cells_at(points, self.met.shape).unbind(-1)
             self.met.view(-1).scatter_reduce_(0, (x * side_y + y) * side_z + z, densities, "amax")
 
-    def _take_in_met(self, decay: float) -> None:
-        """Treat each cell in which rays met a density as one that was probed, and clear what was met."""
+    def _take_in(
+        self, cells: Int[Tensor, "N"], densities: Float[Tensor, "N"], decay: float, block: int
+    ) -> None:
+        """Let what was probed and what rays met change the peaks, each cell's once, and clear what was met."""
+        peaks = self.peak_densities
+        found = torch.full_like(peaks, _NOTHING_MET) if self.met is None else self.met.clone()
+        found.view(-1)[cells] = torch.maximum(found.view(-1)[cells], densities)
+        if block > 1:
+            found = _block_maxima(found, block)
+        peaks.copy_(torch.where(found > _NOTHING_MET, torch.maximum(_decayed(peaks, decay), found), peaks))
         if self.met is not None:
-            peaks = torch.maximum(_decayed(self.peak_densities, decay), self.met)
-            self.peak_densities.copy_(torch.where(self.met > _NOTHING_MET, peaks, self.peak_densities))
             self.met.fill_(_NOTHING_MET)
 
     def _choose_cells(self, num_cells: int | None, generator: torch.Generator) -> Int[Tensor, "N"]:
@@ -135,6 +142,14 @@ class OccupancyGrid(nn.Module):
 def _decayed(peaks: Float[Tensor, "*cells"], decay: float) -> Float[Tensor, "*cells"]:
     """Remembered maxima of cells that are looked at once more; 0 where nothing was known."""
     return torch.where(torch.isinf(peaks), 0.0, peaks * decay)
+
+
+def _block_maxima(values: Float[Tensor, "X Y Z"], block: int) -> Float[Tensor, "X Y Z"]:
+    """The largest value in the block that each cell belongs to."""
+    found = torch.nn.functional.max_pool3d(values[None, None], block, ceil_mode=True)[0, 0]
+    for axis, side in enumerate(values.shape):
+        found = found.repeat_interleave(block, dim=axis).narrow(axis, 0, side)
+    return found
 
 
 def _flat_indices(reachable: Bool[Tensor, "X Y Z"]) -> Int[Tensor, "N"]:
