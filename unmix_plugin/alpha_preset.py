@@ -68,6 +68,7 @@ WITHOUT_ALPHA = AlphaPreset(
 
 UNBOUNDED = replace(
     WITHOUT_ALPHA,
+    grid_resolution=128,
     initial_opacity=0.005,
     surface_loss_weight=0.3,
     coarse_samples=64,
