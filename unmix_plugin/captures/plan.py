@@ -9,27 +9,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
 
 from unmix_plugin import __version__
-from unmix_plugin.captures.calibration.linear import is_srgb
-from unmix_plugin.captures.calibration.sampling import sampled_rows
 from unmix_plugin.captures.calibration.scale import choose_scale
 from unmix_plugin.captures.calibration.sensor import References, Sensor, prepare_sensor
 from unmix_plugin.captures.capture import Capture, CaptureView
-from unmix_plugin.captures.masks import Background, BackgroundRule, background_brightness, find_background
+from unmix_plugin.captures.mask_choice import background_rule, choose_mask, white_background_note
 from unmix_plugin.captures.options import MaskKind, ProcessOptions
+from unmix_plugin.captures.picture_notes import notes_on_pictures
 from unmix_plugin.captures.pictures import Colours
 from unmix_plugin.captures.view_masks import has_opacity
 from unmix_plugin.captures.writing.sources import stamps
 from unmix_plugin.captures.writing.view_files import ViewRecipe
-from unmix_plugin.errors import CaptureError
 from unmix_plugin.spectral.bands import Bands
-
-BORDER_SHARE = 0.02
-"""Width of the border that a background is judged by, as a share of the view's."""
-MOST_BORDER_PIXELS = 20000
-BRIGHT_PERCENTILE = 99.0
 
 
 @dataclass(frozen=True)
@@ -83,7 +75,7 @@ def make_plan(
         for name, same in by_sensor.items()
     }
     scale, why = choose_scale(list(sensors.values()), options.scale)
-    mask = _choose_mask(views, options.mask)
+    mask, said_of_mask = choose_mask(views, options.mask)
     recipes = {name: _recipe(sensor, by_sensor[name], scale, mask) for name, sensor in sensors.items()}
     decisions = {
         "scale": {"calibrated": scale, "evidence": why},
@@ -93,8 +85,12 @@ def make_plan(
         },
     }
     said = [note for sensor in sensors.values() for note in sensor.notes]
-    if any(is_srgb(view.cube) for view in views):
-        said.append("pictures are taken as sRGB and brought to linear light")
+    said += said_of_mask
+    if options.mask is None and not any(map(has_opacity, views)):
+        name, sensor = next(iter(sensors.items()))
+        sample = sensor.sample / np.float32(scale)
+        said += white_background_note(sensor, by_sensor[name], scale, sample)
+    said += notes_on_pictures([view.cube for view in views])
     said += [note for view in views[:1] for note in view.cube.notes]
     opened = [file for file in (references.dark, references.white) if file is not None]
     return Plan(
@@ -133,53 +129,11 @@ def input_files(view: CaptureView) -> list[Path]:
     return [*view.cube.files, *more]
 
 
-def _choose_mask(views: Sequence[CaptureView], asked: MaskKind | None) -> MaskKind:
-    if asked not in (None, "files"):
-        return asked
-    found = [has_opacity(view) for view in views]
-    if asked == "files" and not all(found):
-        missing = views[found.index(False)].name
-        raise CaptureError(
-            f"--mask files: view {missing} has no mask; expected a picture with an alpha channel, or a mask that is "
-            "white where matter is, for every view"
-        )
-    if asked is None:
-        found = [has_opacity(view, alpha_only=True) for view in views]
-    return "files" if all(found) else "none"
-
-
 def _recipe(sensor: Sensor, views: Sequence[CaptureView], scale: float, mask: MaskKind) -> ViewRecipe:
     sample = sensor.sample / np.float32(scale)
     colours = Colours.of(Bands(sensor.centers_nm), sample)
-    rule = _background(sensor, views, scale, mask, sample) if mask in ("white", "black") else None
+    rule = background_rule(sensor, views, scale, mask, sample) if mask in ("white", "black") else None
     return ViewRecipe(sensor.calibration, scale, colours, rule, mask == "files")
-
-
-def _background(
-    sensor: Sensor,
-    views: Sequence[CaptureView],
-    scale: float,
-    kind: Background,
-    sample: Float32[np.ndarray, "N c"],
-) -> BackgroundRule:
-    raster = sensor.calibration.raster
-    width = max(1, round(BORDER_SHARE * raster.width))
-    columns = np.r_[0:width, raster.width - width : raster.width]
-    rows = sorted({0, raster.height - 1, *sampled_rows(raster.height)})
-    step = max(1, len(views) * (2 * raster.width + 2 * width * len(rows)) // MOST_BORDER_PIXELS)
-    border = []
-    for view in views:
-        for row in rows:
-            part = sensor.calibration.rows(view.cube, row, row + 1)
-            shown = np.arange(raster.width) if row in (0, raster.height - 1) else columns
-            shown = shown[row % step :: step]
-            values = np.where(part.saturated[0, shown], np.float32(scale), part.values[0, shown])
-            border.append(values[~part.missing[0, shown]])
-    pixels = np.clip(np.concatenate(border) / np.float32(scale), 0.0, 1.0)
-    everywhere = np.concatenate([background_brightness(kind, sample), background_brightness(kind, pixels)])
-    return find_background(
-        kind, pixels, float(np.percentile(np.clip(everywhere, 0.0, 1.0), BRIGHT_PERCENTILE))
-    )
 
 
 def _plain(value: Any) -> Any:

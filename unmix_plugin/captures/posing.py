@@ -114,6 +114,11 @@ def fit_lens(lens: Lens | None, view: CaptureView) -> Lens:
         raise CaptureError(
             f"view {view.name} has {width} x {height} pixels (width x height), its lens is given for {lens.width} x "
             f"{lens.height}; expected the same shape: give the poses of these images"
+            + (
+                ", or store them turned as EXIF's orientation says"
+                if "orientation" in view.cube.metadata
+                else ""
+            )
         )
     return replace(
         lens,

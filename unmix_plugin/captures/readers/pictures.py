@@ -22,6 +22,8 @@ _COLOUR = ("RGB", "RGBA", "P", "PA", "CMYK", "YCbCr")
 _DEPTH_AT, _KIND_AT = 24, 25
 """Bits of a number, and kind of colours, in the first bytes of a PNG."""
 _WITH_COLOURS = (2, 6)
+_ORIENTATION = 0x0112
+"""EXIF's code; 1 to 8, where 1 is not turned."""
 
 
 def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
@@ -34,6 +36,7 @@ def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
 
     with Image.open(path, formats=("PNG", "JPEG")) as picture:
         mode, (width, height), info = picture.mode, picture.size, dict(picture.info)
+        orientation = picture.getexif().get(_ORIENTATION, 1)
     is_deep = _is_deep_colour(path)
     if mode not in _GREY and mode not in _COLOUR:
         raise CaptureError(f"{path}: a picture of mode {mode}; expected grey or RGB")
@@ -47,6 +50,8 @@ def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
     metadata: dict[str, Any] = {"xmp": xmp} if xmp else {}
     if num_bands == 3 and dtype.itemsize == 1 and bands.wavelengths_nm is None:
         metadata["encoding"] = "sRGB"
+    if orientation in range(2, 9):
+        metadata["orientation"] = orientation
     if alpha:
         metadata["has_alpha"] = True
     return SpectralFile(
