@@ -13,7 +13,7 @@ from rich.console import Console
 from torch.testing import assert_close
 
 from tests.engine.stopped_runs import stop_at
-from tests.method_factory import BOX, CONFIG, initial_data, make_model
+from tests.method_factory import BOX, CONFIG, initial_data, make_model, make_rays
 from tests.scenes.scene_factory import make_scene
 from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
 from unmix_plugin.engine.configs import TrainerConfig
@@ -172,6 +172,19 @@ def refining_model() -> UnmixModel:
         model.initialise({**initial_data(), "knots": places.numpy()}, torch.Generator().manual_seed(0))
         model.field.get_parameter("table").normal_(std=0.5)
     return model
+
+
+def test_what_rays_meet_counts_as_probed_since_nothing_is_carved():
+    model = refining_model().train()
+    model.generator = torch.Generator().manual_seed(0)
+    assert bool(model.grid.reachable.all())
+    rays = make_rays(200)
+    rays = replace(rays, axes=rays.directions, image_y=torch.zeros(200))
+    batch = {"spectra": torch.rand(200, 5), "alpha": torch.ones(200), "pixels": torch.arange(200)}
+    model.observe(model.get_outputs(rays), batch)
+    nothing = torch.Generator().manual_seed(0)
+    model.grid.update(lambda points: torch.zeros(len(points)), 0.1, 0.5, 0, nothing)
+    assert 0.1 < model.grid.peak_densities.isfinite().float().mean() < 1
 
 
 class Blob(CoefficientField):

@@ -30,11 +30,10 @@ from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCal
 from unmix_plugin.field import UnmixField
 from unmix_plugin.first_endmembers import first_endmembers, first_specular_spectra
 from unmix_plugin.grid_upkeep import is_due, record_seen, update_grid
-from unmix_plugin.model_parts import make_field, make_pose_refinement, make_renderer, make_view_gains
+from unmix_plugin.model_parts import make_field, make_grid, make_pose_refinement, make_renderer, make_view_gains
 from unmix_plugin.model_settings import UnmixModelConfig
 from unmix_plugin.ray_outputs import met_by_rays, ray_outputs
 from unmix_plugin.renderer import VolumeRenderer
-from unmix_plugin.rendering.occupancy import OccupancyGrid
 from unmix_plugin.sensor_views import SensorViews
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
@@ -69,7 +68,7 @@ class UnmixModel(Model):
         num_dictionary = config.num_dictionary_spectra(self.preset, self.num_endmembers)
         self.specular_spectra = nn.Parameter(torch.zeros(num_dictionary, len(self.bands)))
         reachable = torch.ones((metadata["grid_resolution"],) * 3, dtype=torch.bool)
-        self.grid = OccupancyGrid(reachable, config.moving_lamp is not None, self.is_unbounded)
+        self.grid = make_grid(config, reachable, self.is_unbounded)
         self._renderer: VolumeRenderer | None = None
         self.step = config.renderer.sample_distance(
             metadata["pixel_size"], float(self.scene_box.size.max()), metadata["has_alpha"]
@@ -127,8 +126,7 @@ class UnmixModel(Model):
         if self.poses is not None:
             self.poses.begin(torch.from_numpy(initial_data["knots"]), self.scene_box.aabb.mean(dim=0))
             reachable = torch.ones_like(reachable)  # poses that are off carve away what is there
-        casts_shadows = self.config.moving_lamp is not None
-        self.grid = OccupancyGrid(reachable, casts_shadows, self.is_unbounded).to(self.device)
+        self.grid = make_grid(self.config, reachable, self.is_unbounded).to(self.device)
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """The hash table, the networks and the spectra."""

@@ -1,4 +1,4 @@
-"""The parts of a model that its settings choose: field, renderer, gains of views and corrections of poses.
+"""The parts of a model that its settings choose: field, grid, renderer, gains of views and corrections of poses.
 
 `metadata` describes the scene, as in `engine.model.Model`.
 """
@@ -11,6 +11,8 @@ from dataclasses import replace
 from typing import Any
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from unmix_plugin.alpha_preset import AlphaPreset, choose
 from unmix_plugin.engine.geometry.scene_box import SceneBox
@@ -54,6 +56,15 @@ def make_field(
         is_unbounded=bool(metadata.get("is_unbounded", False)),
         coarse_to_fine=refines,
     )
+
+
+def make_grid(config: UnmixModelConfig, reachable: Bool[Tensor, "X Y Z"], is_unbounded: bool) -> OccupancyGrid:
+    """The occupancy grid before training.
+
+    Where nothing was carved, cells are too many to wait until each was probed: what rays meet in them counts as well.
+    """
+    records_met = is_unbounded or config.poses == "refine"
+    return OccupancyGrid(reachable, config.moving_lamp is not None, records_met)
 
 
 def make_renderer(
