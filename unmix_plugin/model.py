@@ -30,7 +30,13 @@ from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCal
 from unmix_plugin.field import UnmixField
 from unmix_plugin.first_endmembers import first_endmembers, first_specular_spectra
 from unmix_plugin.grid_upkeep import is_due, record_seen, update_grid
-from unmix_plugin.model_parts import make_field, make_grid, make_pose_refinement, make_renderer, make_view_gains
+from unmix_plugin.model_parts import (
+    make_field,
+    make_grid,
+    make_pose_refinement,
+    make_renderer,
+    make_view_gains,
+)
 from unmix_plugin.model_settings import UnmixModelConfig
 from unmix_plugin.ray_outputs import met_by_rays, ray_outputs
 from unmix_plugin.renderer import VolumeRenderer

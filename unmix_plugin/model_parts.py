@@ -58,7 +58,9 @@ def make_field(
     )
 
 
-def make_grid(config: UnmixModelConfig, reachable: Bool[Tensor, "X Y Z"], is_unbounded: bool) -> OccupancyGrid:
+def make_grid(
+    config: UnmixModelConfig, reachable: Bool[Tensor, "X Y Z"], is_unbounded: bool
+) -> OccupancyGrid:
     """The occupancy grid before training.
 
     Where nothing was carved, cells are too many to wait until each was probed: what rays meet in them counts as well.
