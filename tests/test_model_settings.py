@@ -60,8 +60,8 @@ def test_more_endmembers_than_bands_or_distinct_pixels_are_refused():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"num_endmembers": 0}, "num-endmembers of 1 to 255"),
-        ({"endmember_init": "file"}, "endmember-file exactly when endmember-init is file"),
+        ({"num_endmembers": 0}, r"num-endmembers of 1 to 255 or auto \(got 0\)$"),
+        ({"endmember_init": "file"}, r"is file \(got endmember-init file, endmember-file none\)$"),
         ({"initial_opacity": 1.0}, r"initial-opacity in \(0, 1\) or auto"),
     ],
 )

@@ -71,4 +71,4 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
             or self.target_components >= 1,
             "max-initial-pixels of at least 1": self.max_initial_pixels >= 1,
         }
-        require("the data manager", rules)
+        require("the data manager", self, rules)

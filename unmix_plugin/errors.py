@@ -5,7 +5,10 @@ traceback and exit with status 2; anything else that escapes is an internal erro
 """
 
 import difflib
+import re
 from collections.abc import Iterable
+from dataclasses import fields
+from typing import Any
 
 
 class UnmixError(Exception):
@@ -46,15 +49,25 @@ def did_you_mean(word: str, known: Iterable[str], likeness: float = 0.6, form: s
     return form.format(f"did you mean {' or '.join(near)}?") if near else ""
 
 
-def require(what: str, rules: dict[str, bool]) -> None:
+def require(what: str, settings: Any, rules: dict[str, bool]) -> None:
     """Refuse settings that break a rule.
 
     Args:
         what: Whose settings, for the message.
-        rules: What must hold, and whether it does.
+        settings: A dataclass of them.
+        rules: What must hold, in words that name the settings with hyphens, and whether it does.
     Raises:
-        ConfigError: a rule is broken; the message names all of them.
+        ConfigError: a rule is broken; the message names all of them, and what was found.
     """
-    broken = [rule for rule, holds in rules.items() if not holds]
+    broken = [rule + _found(settings, rule) for rule, holds in rules.items() if not holds]
     if broken:
         raise ConfigError(f"{what} needs {' and '.join(broken)}")
+
+
+def _found(settings: Any, rule: str) -> str:
+    """The values of the settings that a rule names."""
+    words = re.findall(r"[\w-]+", rule)
+    values = {field.name.replace("_", "-"): getattr(settings, field.name) for field in fields(settings)}
+    told = [(name, "none" if value is None else value) for name, value in values.items() if name in words]
+    shown = [str(value) if len(told) == 1 else f"{name} {value}" for name, value in told]
+    return f" (got {', '.join(shown)})" if shown else ""

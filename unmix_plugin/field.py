@@ -81,7 +81,7 @@ class UnmixFieldConfig(InstantiateConfig):
             "a temperature of 0.01 to 100": 0.01 <= self.temperature <= 100,
             "a specular-bias of -50 to 50": -50 <= self.specular_bias <= 50,
         }
-        require("the field", rules)
+        require("the field", self, rules)
 
     def cells_of_finest_level(self, scene_box: SceneBox, pixel_size: float) -> int:
         """Cells along the scene box's longest edge; `pixel_size` is as `UnmixField` takes it."""

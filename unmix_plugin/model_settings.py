@@ -110,7 +110,7 @@ class UnmixModelConfig(ModelConfig):
             "endmember-file exactly when endmember-init is file": (self.endmember_init == "file")
             == (self.endmember_file is not None),
         }
-        require("the model", rules)
+        require("the model", self, rules)
 
     def resolve_auto(
         self, initial_data: Callable[[], Mapping[str, np.ndarray]], generator: torch.Generator

@@ -74,7 +74,7 @@ class PoseConfig:
             "a penalty of 0 to 1e6": 0 <= self.penalty <= 1e6,
             "a roughness of 0 to 1e6": 0 <= self.roughness <= 1e6,
         }
-        require("pose refinement", rules)
+        require("pose refinement", self, rules)
 
     def level_weights(self, num_levels: int, progress: float) -> list[float]:
         """Weights in [0, 1] of a grid's levels when that part of the training is over.

@@ -46,7 +46,7 @@ class RendererConfig:
             or 0 <= self.smallest_weight < 1,
             "visible-weight in (0, 1] or auto": self.visible_weight == "auto" or 0 < self.visible_weight <= 1,
         }
-        require("the renderer", rules)
+        require("the renderer", self, rules)
 
     def sample_distance(self, pixel_size: float, longest_edge: float, has_alpha: bool) -> float:
         """Distance of samples in the unit of a pixel's edge and of the scene box's longest one.

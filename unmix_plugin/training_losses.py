@@ -26,6 +26,8 @@ from unmix_plugin.spectral.losses import (
 
 Background = Literal["random", "black", "white", "last"]
 
+_WEIGHTS = ("spectral", "rgb", "opacity", "spread", "surface", "abundances", "mixing_penalty")
+
 
 @dataclass(frozen=True)
 class LossConfig:
@@ -78,10 +80,12 @@ class LossConfig:
         Raises:
             ConfigError: a number out of its range.
         """
-        weights = (self.spectral, self.rgb, self.opacity, self.spread, self.surface, self.abundances)
-        weights = (*weights, self.mixing_penalty)
+        weights = {name: getattr(self, name) for name in _WEIGHTS}
         rules = {
-            "weights of at least 0": all(weight == "auto" or weight >= 0 for weight in weights),
+            **{
+                f"{name.replace('_', '-')} of at least 0": weight == "auto" or weight >= 0
+                for name, weight in weights.items()
+            },
             "band-weights above 0, auto or none": self.band_weights == "auto"
             or all(weight > 0 for weight in self.band_weights),
             "an exposure above 0 or auto": self.exposure == "auto" or self.exposure > 0,
@@ -90,7 +94,7 @@ class LossConfig:
             "surface-until in (0, 1]": 0 < self.surface_until <= 1,
             "abundances-final-factor in (0, 1]": 0 < self.abundances_final_factor <= 1,
         }
-        require("the losses", rules)
+        require("the losses", self, rules)
 
     def weights(self, preset: AlphaPreset, progress: float) -> dict[str, float]:
         """Weight of each loss when that part of the training is over, by name."""

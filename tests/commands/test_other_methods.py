@@ -39,7 +39,7 @@ def test_its_run_opens_as_a_scene_with_the_outputs_that_it_names(ball_run):
     np.testing.assert_allclose(found.values["rgb"], picture[11, 9], atol=1e-6)
     with pytest.raises(ConfigError, match=r"no output named 'rbg' \(did you mean rgb\?\); known are rgb"):
         scene.render(camera, ["rbg"])
-    with pytest.raises(ConfigError, match="the method rgb-nerf has no endmembers"):
+    with pytest.raises(ConfigError, match="the method rgb-nerf makes no scene of mixed materials"):
         open_run(ball_run, "cpu")
 
 
@@ -63,7 +63,7 @@ def test_what_needs_endmembers_is_refused_in_one_sentence(ball_run, tmp_path):
     for words in (["abundances"], ["mesh"], ["endmembers"]):
         ended = run(export, *words, "--run", ball_run, "--output", tmp_path / "out", "--device", "cpu")
         assert ended.status == 2
-        assert "the method rgb-nerf has no endmembers" in " ".join(ended.err.split())
+        assert "the method rgb-nerf makes no scene of mixed materials" in " ".join(ended.err.split())
     ended = run(evaluate, "--run", ball_run, "--illuminant", "A", "--device", "cpu")
     assert ended.status == 2
 

@@ -76,6 +76,9 @@ def test_settings_that_most_people_need_have_short_names(tmp_path):
     assert parse(["unmix-nerf", "--pipeline.model.num-endmembers", "4"]).pipeline.model == replace(
         parse(["unmix-nerf"]).pipeline.model, num_endmembers=4
     )
+    assert parse(["neumatex", "--endmembers", "4"]).pipeline.model == replace(
+        parse(["neumatex"]).pipeline.model, num_endmembers=4
+    )
 
 
 def test_help_shows_the_common_options_and_help_all_the_others_too():

@@ -102,7 +102,7 @@ def test_a_scene_without_materials_is_refused(run, tmp_path, monkeypatch):
     sensor = tmp_path / "sensor.csv"
     sensor.write_text("wavelength,green\n500,0\n550,1\n600,0\n")
     for illuminant, camera in (("A", None), (None, sensor)):
-        with pytest.raises(ConfigError, match="the method unmix-nerf has no endmembers"):
+        with pytest.raises(ConfigError, match="the method unmix-nerf makes no scene of mixed materials"):
             load_edited_run(run, "cpu", illuminant=illuminant, sensor=camera)
 
 

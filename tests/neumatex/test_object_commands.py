@@ -47,9 +47,11 @@ def test_the_material_is_exported_with_its_latents_and_decoder(trained, tmp_path
 
 
 def test_products_of_mixed_materials_are_refused_in_one_sentence(trained, tmp_path):
-    ended = run(export, "abundances", "--run", trained, "--output", tmp_path, "--device", "cpu")
+    ended = run(export, "endmembers", "--run", trained, "--output", tmp_path, "--device", "cpu")
     assert ended.status == 2
-    assert "the method neumatex has no endmembers" in " ".join(ended.err.split())
+    said = " ".join(ended.err.split())
+    assert "the method neumatex makes no scene of mixed materials" in said
+    assert "unmix-export has products of its own for it: material" in said
 
 
 def test_a_view_is_rendered_under_a_map_from_a_file(trained, tmp_path):

@@ -12,7 +12,7 @@ from unmix_plugin.engine.instantiate import Common, InstantiateConfig, Target, r
 from unmix_plugin.engine.pipeline import PipelineConfig
 from unmix_plugin.engine.processes.launching import MOST_PROCESSES
 from unmix_plugin.engine.training.optimizers import OptimizerConfig
-from unmix_plugin.errors import ConfigError
+from unmix_plugin.errors import require
 
 __all__ = ["DeviceName", "InstantiateConfig", "OptimizerConfig", "Target", "TrainerConfig"]
 
@@ -82,17 +82,15 @@ class TrainerConfig:
             ConfigError: a number out of its range, or no limit at all.
         """
         rules = {
-            "max_num_iterations >= 0": self.max_num_iterations is None or self.max_num_iterations >= 0,
-            "max_seconds > 0 and finite": self.max_seconds is None or 0 < self.max_seconds < math.inf,
-            "max_num_iterations or max_seconds": (self.max_num_iterations, self.max_seconds) != (None, None),
-            "steps_per_save >= 0": self.steps_per_save >= 0,
-            "steps_per_eval_all_images >= 0": self.steps_per_eval_all_images >= 0,
-            "steps_per_log >= 1": self.steps_per_log >= 1,
-            "checkpoints_kept >= 1": self.checkpoints_kept >= 1,
-            "average_decay in [0, 1)": self.average_decay is None or 0 <= self.average_decay < 1,
-            "a file name as method_name": bool(self.method_name) and "/" not in self.method_name,
+            "max-num-iterations of at least 0": self.max_num_iterations is None
+            or self.max_num_iterations >= 0,
+            "max-seconds above 0 and finite": self.max_seconds is None or 0 < self.max_seconds < math.inf,
+            "max-num-iterations or max-seconds": (self.max_num_iterations, self.max_seconds) != (None, None),
+            "steps-per-save of at least 0": self.steps_per_save >= 0,
+            "steps-per-eval-all-images of at least 0": self.steps_per_eval_all_images >= 0,
+            "steps-per-log of at least 1": self.steps_per_log >= 1,
+            "checkpoints-kept of at least 1": self.checkpoints_kept >= 1,
+            "average-decay in [0, 1)": self.average_decay is None or 0 <= self.average_decay < 1,
+            "a file name as method-name": bool(self.method_name) and "/" not in self.method_name,
         }
-        broken = [rule for rule, holds in rules.items() if not holds]
-        if broken:
-            values = {rule: getattr(self, rule.split()[0], None) for rule in broken}
-            raise ConfigError(f"the training settings must have {', '.join(broken)}; got {values}")
+        require("a training", self, rules)

@@ -66,7 +66,7 @@ class ObjectDataManagerConfig(DataManagerConfig):
             ConfigError: a number out of its range.
         """
         super().__post_init__()
-        require("the data manager", {"max-pixels of at least 1": self.max_pixels >= 1})
+        require("the data manager", self, {"max-pixels of at least 1": self.max_pixels >= 1})
 
 
 class ObjectDataManager(DataManager):

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from unmix_plugin.engine import Model, ModelConfig, Target
-from unmix_plugin.engine.instantiate import Common
+from unmix_plugin.engine.instantiate import Common, short
 from unmix_plugin.errors import require
 from unmix_plugin.neumatex.material_surface import MaterialName
 from unmix_plugin.neumatex.tone.curves import LightCurve
@@ -37,7 +37,7 @@ class NeumatexModelConfig(ModelConfig):
     material: Annotated[MaterialName, Common] = "neural"
     """Family of materials: neural (base colour and latents of a shared decoder), pbr (base colour, roughness,
     metallicity), or for pictures of many bands spectral (a mixture of endmember reflectances under a grey gloss)."""
-    num_endmembers: Annotated[int | Auto | None, Common] = None
+    num_endmembers: Annotated[int | Auto | None, Common, short("endmembers")] = None
     """Of spectral materials: K, how many reflectances are mixed; auto proposes it from the training pixels. None is the
     number of --pipeline.model.from-run, otherwise 6, or the number of bands if that is smaller."""
     endmember_init: EndmemberMethod = "pairs"
@@ -88,7 +88,7 @@ class NeumatexModelConfig(ModelConfig):
         rules["from-run with the material spectral only"] = (
             self.from_run is None or self.material == "spectral"
         )
-        require("the model", rules)
+        require("the model", self, rules)
 
     def resolve_auto(
         self, initial_data: Callable[[], Mapping[str, np.ndarray]], generator: torch.Generator

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from unmix_plugin.engine.configs import TrainerConfig
+from unmix_plugin.engine.registry import discover_methods
 from unmix_plugin.engine.runs.load_run import SceneRecord, load_model
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.training.training_state import TrainingRecord
@@ -68,7 +70,19 @@ def require_materials(scene: RenderableScene, method_name: str) -> TrainedScene:
         ConfigError: it has none.
     """
     if not isinstance(scene, TrainedScene):
+        own = _own_products(method_name)
         raise ConfigError(
-            f"the method {method_name} has no endmembers: this needs a run of a method that unmixes spectra"
+            f"the method {method_name} makes no scene of mixed materials, as unmix-nerf does and this needs"
+            + (f"; unmix-export has products of its own for it: {', '.join(own)}" if own else "")
         )
     return scene
+
+
+def _own_products(method_name: str) -> list[str]:
+    """Names of the products that a method brings along."""
+    method = discover_methods()[0].get(method_name)
+    if method is None or method.products is None:
+        return []
+    with suppress(Exception):  # a third party's module may fail in any way at all
+        return [product.name for product in method.products()]
+    return []

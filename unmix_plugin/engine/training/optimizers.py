@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from unmix_plugin.errors import ConfigError
+from unmix_plugin.errors import ConfigError, require
 
 _BETAS = (0.9, 0.99)
 _EPS = 1e-15  # far below any gradient, so that the size of the loss does not matter
@@ -35,13 +35,11 @@ class OptimizerConfig:
             ConfigError: a number out of its range.
         """
         rules = {
-            "lr > 0": 0 < self.lr < math.inf,
-            "final_factor in (0, 1]": 0 < self.final_factor <= 1,
-            "weight_decay >= 0": 0 <= self.weight_decay < math.inf,
+            "lr above 0 and finite": 0 < self.lr < math.inf,
+            "final-factor in (0, 1]": 0 < self.final_factor <= 1,
+            "weight-decay of at least 0 and finite": 0 <= self.weight_decay < math.inf,
         }
-        broken = [rule for rule, holds in rules.items() if not holds]
-        if broken:
-            raise ConfigError(f"optimizer settings must have {' and '.join(broken)}; got {self}")
+        require("an optimizer", self, rules)
 
 
 def learning_rate(config: OptimizerConfig, progress: float) -> float:

@@ -132,7 +132,7 @@ def _find_file(root: Path, key: str, what: str, suffixes: tuple[str, ...], fault
         if not isinstance(named, str) or not named:
             faults.add(FILE_NAME, f"'{key}' is {describe(named)}; expected a path")
             return None
-        return resolve_path(root, named, False, f"'{key}'", faults)
+        return resolve_path(root, named, None, f"'{key}'", faults)
     found = sorted(path for path in root.iterdir() if path.suffix.lower() in suffixes and path.is_file())
     usual = [path for path in found if path.stem == what]
     chosen = usual if len(found) > 1 and usual else found

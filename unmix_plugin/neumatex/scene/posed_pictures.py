@@ -140,7 +140,7 @@ def read_posed_pictures(
 def _locate(root: Path, frame: FrameEntry, value_scale: float | None, faults: Faults) -> PictureFiles | None:
     """The files of a frame; None with noted faults where one is missing."""
     keys = [key for key in ("hyperspectral_file_path", "file_path", "mask_path") if key in frame.paths]
-    found = {key: resolve_path(root, frame.paths[key], False, frame.where, faults) for key in keys}
+    found = {key: resolve_path(root, frame.paths[key], None, frame.where, faults) for key in keys}
     mask = found.pop("mask_path", None)
     pictures = [path for path in found.values() if path is not None]
     if len(pictures) < len(found) or not pictures or (mask is None and "mask_path" in keys):

@@ -90,6 +90,6 @@ def _own_lamp(root: Path, entry: SceneEntry, bands: Bands) -> Float64[np.ndarray
     if entry.illuminant_path is None:
         return None
     faults = Faults(root)
-    path = resolve_path(root, entry.illuminant_path, False, "'illuminant_path'", faults)
+    path = resolve_path(root, entry.illuminant_path, None, "'illuminant_path'", faults)
     faults.raise_if_any()
     return None if path is None else read_lamp(str(path), bands)

@@ -61,13 +61,13 @@ def read_true_materials(
     if spectral is None or entry.endmembers_path is None:
         return None
     faults = Faults(root)
-    path = resolve_path(root, entry.endmembers_path, False, "'endmembers_path'", faults)
+    path = resolve_path(root, entry.endmembers_path, None, "'endmembers_path'", faults)
     table = None
     if path is not None:
         centers = spectral.bands.centers_nm
         table = read_endmembers(path, centers, entry.materials, "'endmembers_path'", faults)
     files = tuple(
-        resolve_path(root, frame.paths["abundance_file_path"], False, frame.where, faults)
+        resolve_path(root, frame.paths["abundance_file_path"], None, frame.where, faults)
         if "abundance_file_path" in frame.paths
         else None
         for frame in entry.frames

@@ -10,11 +10,14 @@ from unmix_plugin.scenes.reading.faults import Faults
 HASH_BLOCK_BYTES = 1 << 20
 
 
-def resolve_path(root: Path, text: str, allow_outside: bool, where: str, faults: Faults) -> Path | None:
+def resolve_path(
+    root: Path, text: str, allow_outside: bool | None, where: str, faults: Faults
+) -> Path | None:
     """Find the file a scene names; None and a noted fault if it is missing, no plain file, or out of bounds.
 
     A path is out of bounds if it is absolute or if it leads out of the scene folder, be it by `..` or through a
-    symbolic link.
+    symbolic link. Such a path is followed with `allow_outside`; None is for those who can't be asked to, to whom the
+    setting is not named.
     """
     path = root / text
     try:
@@ -27,11 +30,10 @@ def resolve_path(root: Path, text: str, allow_outside: bool, where: str, faults:
         )
         return None
     if not inside and not allow_outside:
-        faults.add(
-            where,
-            f"{text!r} leaves the scene folder; copy the file into it, or allow it with allow_outside_paths "
-            "if you trust this scene",
+        or_allow = (
+            "" if allow_outside is None else ", or allow it with allow_outside_paths if you trust this scene"
         )
+        faults.add(where, f"{text!r} leaves the scene folder; copy the file into it{or_allow}")
         return None
     if not is_file:
         found = "is not a plain file" if path.exists() else "is missing"
