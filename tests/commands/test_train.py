@@ -119,7 +119,7 @@ def test_a_limit_given_alone_is_the_only_limit(words, iterations, seconds):
         (["unmix-nerf", "--data", "no-such-folder"], "no-such-folder"),
         (["unmix-nerf", "--data", "demo", "--no-such-option"], "--no-such-option"),
         (["unmix-nerf", "--data", "demo", "--seed", "pi"], "seed"),
-        (["unmix-nerf", "--data", "demo", "--max-seconds", "-1"], "max_seconds > 0"),
+        (["unmix-nerf", "--data", "demo", "--max-seconds", "-1"], "max-seconds above 0"),
         (["unmix-nerf", "--data", "demo", "--pipeline.model.num-endmembers", "0"], "num-endmembers"),
         (["unmix-nerf", "--load-run", "no-such-run"], "no run folder at no-such-run"),
     ],

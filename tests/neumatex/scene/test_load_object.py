@@ -235,5 +235,5 @@ def test_a_fault_is_told_in_one_message(folder, fault):
 def test_paths_out_of_the_folder_are_refused_without_a_setting_that_is_not_there(folder):
     shutil.move(folder / "mesh.ply", folder.parent / "mesh.ply")
     _change(folder, mesh_path="../mesh.ply")
-    with pytest.raises(SceneError, match="leaves the scene folder; copy the file into it$"):
+    with pytest.raises(SceneError, match=r"leaves the scene folder; copy the file into it$"):
         load_object(folder)
