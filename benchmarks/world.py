@@ -1,6 +1,6 @@
 """Does training work in an unbounded world: objects as good as alone, and no fog before the cameras?
 
-    python benchmarks/world.py [--steps 400] [--runs FOLDER]
+    python benchmarks/world.py [--steps 2400] [--runs FOLDER]
 
 Trains the demo scene's table three times with as many steps: alone (with alpha), on a ground under a sky, and in a room
 with windows, the last two without alpha. The room is trained as a bounded scene too, which shows what the world is
@@ -38,7 +38,7 @@ _CHUNK = 8192
 class Options:
     """Train in an unbounded world."""
 
-    steps: int = 400
+    steps: int = 2400
     """Of each training."""
     only: tuple[str, ...] = tuple(RUNS)
     """Runs to make."""
