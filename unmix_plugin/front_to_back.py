@@ -4,13 +4,15 @@ For pictures of a trained field. `VolumeRenderer.render` is the careful way, whi
 sample that carries weight, and goes on farther. Here neighbouring samples are merged where together they carry little
 of their ray's light, and what lies behind the place where a ray ends is taken to look like what lies before it.
 
-Notation: `R` rays, `M` of them that are marched, `A` that still have light, `C` coefficients.
+So many rays are under way at once as keep the processor busy: those that end make room for others.
+
+Notation: `R` rays, `A` of them that are under way, `M` samples of each that are marched at once, `C` coefficients.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -19,7 +21,7 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.rendering.compositing import accumulate
-from unmix_plugin.rendering.marching import PackedSamples
+from unmix_plugin.rendering.marching import FirstSamples
 from unmix_plugin.rendering.merging import MergedSamples, MergeLimits, merge_samples
 from unmix_plugin.spectral.coefficients import Coefficients
 
@@ -30,130 +32,157 @@ _MERGED_WEIGHT = 125.0
 _SAMPLES_AT_ONCE = 4
 """Of each ray, that are looked at before it is known whether light gets farther; later at most as many as so far, since
 light that gets through those gets through more."""
+_MARCHED_AT_ONCE = 16
+"""Samples of each ray that are marched before it is known whether light gets behind them."""
 _DENSER = 2.0
 """How many times denser what follows is taken to be than what was looked at: most rays have just entered a surface."""
 
-FIRST_SAMPLES = 16
-"""Of each ray, that are marched before it is known whether light gets behind them."""
-
-_MarchOn = Callable[[RayBundle, Float[Tensor, "R"]], PackedSamples]
+_March = Callable[[Float[Tensor, "A 3"], Float[Tensor, "A 3"], Float[Tensor, "A"], int], FirstSamples]
 _Visible = Callable[[Float[Tensor, "S 3"], Float[Tensor, "S 3"]], Float[Tensor, "S"] | None]
 
 
 @dataclass(frozen=True)
+class FrontToBack:
+    """How rays are looked at."""
+
+    march: _March
+    """From origins, directions, distances and a number: the first so many samples behind the distances, at first 0."""
+    step: float
+    """Distance of samples, for which each counts."""
+    smallest_weight: float
+    """Samples that contribute no more of their ray's light are left out."""
+    visible: _Visible
+    """From origins of rays and positions on them to the part of a moving lamp's light that reaches them, as
+    `CoefficientField.get_outputs` takes it."""
+    residual_on_last_sample: bool = False
+    """Whether the last sample of a ray takes all the light that is left."""
+    rays_at_once: int = 32_768
+    """Rays under way."""
+
+    @property
+    def ending_light(self) -> float:
+        """Share of its light at which a ray ends."""
+        return _ENDING_LIGHT * self.smallest_weight
+
+    @property
+    def merge_limits(self) -> MergeLimits:
+        """Which samples are merged."""
+        return MergeLimits(self.step, self.smallest_weight, _MERGED_WEIGHT * self.smallest_weight)
+
+
+@dataclass(frozen=True)
 class _Front:
-    """How far rays that still have light were looked at."""
+    """How far rays under way were looked at."""
 
     rays: Int[Tensor, "A"]
-    at: Int[Tensor, "A"]
-    """Next sample of each."""
-    todo: Int[Tensor, "A"]
-    """Samples of each from there."""
     left: Float[Tensor, "A"]
     """Share of its light that each still has."""
     wanted: Int[Tensor, "A"]
-    """Samples of each that are looked at next, at most `todo`."""
-    num_seen: int = 0
-    """Most samples of one that were looked at."""
+    """Samples of each to look at next, if it has as many."""
+    num_seen: Int[Tensor, "A"]
+    """Samples of each that were looked at."""
+    ends: Float[Tensor, "A"]
+    """From where to march on."""
+    t: Float[Tensor, "A M"]
+    """The samples that were marched."""
+    counts: Int[Tensor, "A"]
+    """How many there are."""
+    at: Int[Tensor, "A"]
+    """The next of them."""
 
     @classmethod
-    def before(
-        cls, samples: PackedSamples, rays: Int[Tensor, "M"], left: Float[Tensor, "R"], num_seen: int
-    ) -> _Front:
-        """Before the samples of M marched rays, of which each is one of R and had some before."""
-        starts, counts = samples.packed_info.unbind(-1)
-        found = counts.nonzero()[:, 0]
-        rays, at, todo = (value.index_select(0, found) for value in (rays, starts, counts))
-        wanted = todo.clamp(max=_SAMPLES_AT_ONCE)
-        return cls(rays, at, todo, left.index_select(0, rays), wanted, num_seen)
+    def before(cls, rays: Int[Tensor, "A"], like: Float[Tensor, "_ _"]) -> _Front:
+        """Rays before they are marched."""
+        none, numbers = torch.zeros_like(rays), like.new_zeros(len(rays))
+        t = like.new_zeros(len(rays), _MARCHED_AT_ONCE)
+        return cls(rays, numbers + 1, none + _SAMPLES_AT_ONCE, none, numbers, t, none, none)
 
-    def after(self, left: Float[Tensor, "A"], ending_light: float) -> _Front:
-        """Behind these samples, where there are more and enough light is left."""
-        at_once = max(_SAMPLES_AT_ONCE, self.num_seen)
-        todo = self.todo - self.wanted
-        alive = ((left > ending_light) & (todo > 0)).nonzero()[:, 0]
-        values = (self.rays, self.at + self.wanted, todo, left, self.wanted, self.left)
-        rays, at, todo, left, wanted, before = (value.index_select(0, alive) for value in values)
-        enough = wanted / _DENSER * (left / ending_light).log() / (before / left).log()
-        enough = (
-            enough.ceil().nan_to_num(nan=at_once).clamp(1, at_once)
-        )  # no number if both logarithms are infinite
-        wanted = torch.minimum(enough.long(), todo)
-        return _Front(rays, at, todo, left, wanted, self.num_seen + at_once)
+    def __len__(self) -> int:
+        return len(self.rays)
+
+    def select(self, chosen: Int[Tensor, "N"]) -> _Front:
+        """Some of the rays."""
+        return _Front(*(getattr(self, each.name).index_select(0, chosen) for each in fields(self)))
+
+    def join(self, more: _Front) -> _Front:
+        """With other rays."""
+        pairs = ((getattr(self, each.name), getattr(more, each.name)) for each in fields(self))
+        return _Front(*map(torch.cat, pairs))
+
+    def marched(self, ray_bundle: RayBundle, march: _March) -> _Front:
+        """With the next samples of each ray that has some."""
+        found = march(*_lines(ray_bundle, self.rays), self.ends, _MARCHED_AT_ONCE)
+        marched = replace(self, t=found.t, counts=found.counts, ends=found.ends, at=torch.zeros_like(self.at))
+        return marched.select(found.counts.nonzero()[:, 0])
+
+    def next_counts(self) -> Int[Tensor, "A"]:
+        """How many samples of each are looked at next."""
+        return torch.minimum(self.wanted, self.counts - self.at)
+
+    def after(self, left: Float[Tensor, "A"], ending_light: float) -> tuple[_Front, _Front]:
+        """Behind these samples: rays with enough light of which there are more, and those to be marched on."""
+        looked = self.next_counts()
+        at, num_seen = self.at + looked, self.num_seen + looked
+        enough = looked / _DENSER * (left / ending_light).log() / (self.left / left).log()
+        enough = enough.ceil().nan_to_num(nan=torch.inf)  # no number if both logarithms are infinite
+        wanted = torch.minimum(enough, num_seen.clamp(min=_SAMPLES_AT_ONCE)).clamp(min=1).long()
+        front = replace(self, left=left, wanted=wanted, num_seen=num_seen, at=at)
+        is_lit, has_more = left > ending_light, at < self.counts
+        may_have_more = ~has_more & (self.counts == _MARCHED_AT_ONCE)
+        chosen = ((is_lit & which).nonzero()[:, 0] for which in (has_more, may_have_more))
+        going, waiting = (front.select(rays) for rays in chosen)
+        return going, waiting
 
 
 @torch.no_grad()
-def composite_front_to_back(
-    field: CoefficientField,
-    samples: PackedSamples,
-    ray_bundle: RayBundle,
-    smallest_weight: float,
-    visible: _Visible,
-    residual_on_last_sample: bool = False,
-    march_on: _MarchOn | None = None,
-) -> Coefficients:
-    """Coefficients (R, ...) of each ray.
-
-    Args:
-        field: What is rendered.
-        samples: Of the rays of the bundle, each `samples.step` long.
-        ray_bundle: R rays.
-        smallest_weight: Samples that contribute no more of their ray's light are left out.
-        visible: From origins of rays and positions on them to the part of a moving lamp's light that reaches them, as
-            `CoefficientField.get_outputs` takes it.
-        residual_on_last_sample: Whether the last sample of a ray takes all the light that is left.
-        march_on: From rays and distances along them to the samples behind, where `samples` are the first
-            `FIRST_SAMPLES` of each ray; None where they are all.
-    """
-    starts, counts = samples.packed_info.unbind(-1)
-    left = torch.ones_like(counts, dtype=samples.t.dtype)
-    ending_light = _ENDING_LIGHT * smallest_weight
-    limits = MergeLimits(samples.step, smallest_weight, _MERGED_WEIGHT * smallest_weight)
-    front = _Front.before(samples, torch.arange(len(counts), device=counts.device), left, 0)
-    totals = last = torch.zeros(0)
+def composite_front_to_back(field: CoefficientField, ray_bundle: RayBundle, how: FrontToBack) -> Coefficients:
+    """Coefficients (R, ...) of each ray of a field."""
+    origins = ray_bundle.origins
+    left = torch.ones_like(origins[:, 0])
+    all_rays = torch.arange(len(left), device=left.device)
+    going = waiting = _Front.before(all_rays[:0], origins)
+    num_begun, totals, last = 0, None, None
     while True:
-        merged = _look(field, samples, ray_bundle, front, limits)
-        values = _values(field, ray_bundle, front.rays, merged, visible)
-        if totals.dim() == 1:
-            totals = values.packed.new_zeros(len(counts), values.packed.shape[1])
-            last = torch.zeros_like(totals)
+        new = all_rays[num_begun : num_begun + max(how.rays_at_once - len(going) - len(waiting), 0)]
+        num_begun += len(new)
+        marched = waiting.join(_Front.before(new, origins)).marched(ray_bundle, how.march)
+        front = going.join(marched)
+        merged = _look(field, ray_bundle, front, how.merge_limits)
+        values = _values(field, ray_bundle, front.rays, merged, how.visible)
+        if totals is None or last is None:
+            totals = values.packed.new_zeros(len(left), values.packed.shape[1])
+            last = torch.zeros_like(totals) if how.residual_on_last_sample else totals[:0]
         totals.index_add_(0, front.rays, accumulate(merged.weights, values.packed, merged.packed_info))
-        if residual_on_last_sample:
+        if how.residual_on_last_sample:
             found = merged.packed_info[:, 1].nonzero()[:, 0]
             last[front.rays[found]] = values.packed[merged.packed_info[found].sum(dim=1) - 1]
         left[front.rays] = merged.left
-        front = front.after(merged.left, ending_light)
-        if len(front.rays) == 0 and march_on is not None:
-            lit = ((left > ending_light) & (counts == FIRST_SAMPLES)).nonzero()[:, 0]
-            samples = march_on(ray_bundle[lit], samples.t[starts[lit] + FIRST_SAMPLES - 1])
-            front, march_on = _Front.before(samples, lit, left, FIRST_SAMPLES), None
-        if len(front.rays) == 0:
+        going, waiting = front.after(merged.left, how.ending_light)
+        if num_begun == len(left) and len(going) == len(waiting) == 0:
             break
-    if residual_on_last_sample:
+    if how.residual_on_last_sample:
         totals = totals + (1 - totals[:, :1]) * last
     else:
-        totals *= torch.where(left > ending_light, 1.0, 1 / (1 - left))[:, None]
+        totals *= torch.where(left > how.ending_light, 1.0, 1 / (1 - left))[:, None]
     return Coefficients(totals, values.num_endmembers)
 
 
 def _look(
-    field: CoefficientField,
-    samples: PackedSamples,
-    ray_bundle: RayBundle,
-    front: _Front,
-    limits: MergeLimits,
+    field: CoefficientField, ray_bundle: RayBundle, front: _Front, limits: MergeLimits
 ) -> MergedSamples:
     """The next samples of rays, merged."""
-    wanted = front.wanted
-    ends = wanted.cumsum(0)
+    counts = front.next_counts()
+    ends = counts.cumsum(0)
     size = int(ends[-1]) if len(ends) else 0
-    packed_info = torch.stack([ends - wanted, wanted], dim=-1)
-    owners = torch.repeat_interleave(wanted, output_size=size)
-    chosen = (front.at - packed_info[:, 0]).index_select(0, owners)
-    t = samples.t.index_select(0, chosen.add_(torch.arange(size, device=chosen.device)))
+    starts = ends - counts
+    owners = torch.repeat_interleave(counts, output_size=size)
+    firsts = torch.arange(len(front), device=ends.device) * _MARCHED_AT_ONCE + front.at
+    chosen = (firsts - starts).index_select(0, owners).add_(torch.arange(size, device=ends.device))
+    t = front.t.view(-1).index_select(0, chosen)
     origins, along = _lines(ray_bundle, front.rays.index_select(0, owners))
     densities, features = field.density_of(field.encode(torch.addcmul(origins, along, t[:, None])))
-    return merge_samples(densities * limits.step, t, features, packed_info, front.left, limits)
+    info = torch.stack([starts, counts], dim=-1)
+    return merge_samples(densities * limits.step, t, features, info, front.left, limits)
 
 
 def _values(

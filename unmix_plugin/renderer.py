@@ -18,13 +18,13 @@ from unmix_plugin.engine.geometry.contraction import UnitSpace
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.field import CoefficientField
-from unmix_plugin.front_to_back import FIRST_SAMPLES, composite_front_to_back
+from unmix_plugin.front_to_back import FrontToBack, composite_front_to_back
 from unmix_plugin.lamp_shadows import lamp_visibility
 from unmix_plugin.lit_samples import LitSamples, points_of, samples_carrying_weight
 from unmix_plugin.rendering.compositing import accumulate, volume_weights
-from unmix_plugin.rendering.contracted_marching import march_contracted
+from unmix_plugin.rendering.contracted_marching import march_contracted, march_contracted_first
 from unmix_plugin.rendering.grid_cells import cells_at
-from unmix_plugin.rendering.marching import ALL_SAMPLES, PackedSamples, march
+from unmix_plugin.rendering.marching import FirstSamples, PackedSamples, march, march_first
 from unmix_plugin.spectral.coefficients import Coefficients
 
 _SPREAD_DEPTH = 0.03
@@ -72,7 +72,7 @@ class VolumeRenderer:
     residual_on_last_sample: bool = False
     """Whether the last sample of a ray takes all the light that is left."""
     rays_per_chunk: int = 32_768
-    """Rays rendered at once for a whole image; fewer take less memory."""
+    """Rays under way at once for a whole image; fewer take less memory."""
     opaque_clearance: UInt8[Tensor, "X Y Z"] | None = None
     """0 in the cells that cast shadows in the light of a lamp that moves with the camera, in others what `clearance_of`
     says; None without such a lamp."""
@@ -134,22 +134,18 @@ class VolumeRenderer:
 
         Those of `render` but for what front_to_back.py says, in less time.
         """
-        chunk = self.rays_per_chunk
-        starts = range(0, max(len(ray_bundle), 1), chunk)
-        return Coefficients.concatenate([self._composite(field, ray_bundle[i : i + chunk]) for i in starts])
-
-    def _composite(self, field: CoefficientField, ray_bundle: RayBundle) -> Coefficients:
-        samples = self._march(ray_bundle, None, most=FIRST_SAMPLES)
-        found = composite_front_to_back(
-            field,
-            samples,
-            ray_bundle,
+        how = FrontToBack(
+            self._march_first,
+            self.step,
             self.smallest_weight,
-            lambda origins, positions: self._visible(field, origins, positions),
+            lambda starts, positions: self._visible(field, starts, positions),
             self.residual_on_last_sample,
-            None if self.is_unbounded else lambda rays, t: self._march(rays, None, behind=t),
+            self.rays_per_chunk,
         )
-        return _before_sky(found, field.sky(ray_bundle.directions))[0]
+        found = composite_front_to_back(field, ray_bundle, how)
+        parts = [field.sky(along) for along in ray_bundle.directions.split(self.rays_per_chunk)]
+        skies = [sky for sky in parts if sky is not None]
+        return _before_sky(found, torch.cat(skies) if skies else None)[0]
 
     @torch.no_grad()
     def composite_view(self, field: CoefficientField, camera: Cameras, subpixels: int = 1) -> Coefficients:
@@ -226,26 +222,40 @@ class VolumeRenderer:
         lamp, clearance = field.moving_lamp, self.opaque_clearance
         return lamp_visibility(lamp, origins, positions, self.box, clearance, generator)
 
-    def _march(
-        self,
-        ray_bundle: RayBundle,
-        generator: torch.Generator | None,
-        most: int = ALL_SAMPLES,
-        behind: Float[Tensor, "R"] | None = None,
-    ) -> PackedSamples:
-        """Samples of rays; in a bounded world `most` of each, those behind samples at these distances."""
+    def _march(self, ray_bundle: RayBundle, generator: torch.Generator | None) -> PackedSamples:
+        """All samples of rays; a generator shifts those of each ray at random."""
         origins, directions = ray_bundle.origins.detach(), ray_bundle.directions.detach()
         jitter = torch.full_like(origins[:, 0], 0.5)
         if generator is not None:
             jitter = torch.rand(jitter.shape, generator=generator, device=generator.device).to(jitter)
+        starts, along = self._in_grid(origins, directions)
         if self.is_unbounded:
-            inner_origins, inner_directions = self.space.centred(origins), directions / self.space.half_edge
-            return march_contracted(inner_origins, inner_directions, jitter, self.clearance, self.step)
+            return march_contracted(starts, along, jitter, self.clearance, self.step)
         t_near, t_far = self.box.intersect(origins, directions)
-        if behind is not None:
-            t_near = behind + self.step / 2
-        unit_origins, unit_directions = self.box.normalise(origins), directions / self.box.size
-        return march(unit_origins, unit_directions, t_near, t_far, jitter, self.clearance, self.step, most)
+        return march(starts, along, t_near, t_far, jitter, self.clearance, self.step)
+
+    def _march_first(
+        self,
+        origins: Float[Tensor, "R 3"],
+        directions: Float[Tensor, "R 3"],
+        behind: Float[Tensor, "R"],
+        most: int,
+    ) -> FirstSamples:
+        """The first samples of rays behind these distances, at most so many of each."""
+        starts, along = self._in_grid(origins, directions)
+        if self.is_unbounded:
+            return march_contracted_first(starts, along, behind, self.clearance, self.step, most)
+        t_near, t_far = self.box.intersect(origins, directions)
+        t_near = torch.maximum(t_near, behind)
+        return march_first(starts, along, t_near, t_far, self.clearance, self.step, most)
+
+    def _in_grid(
+        self, origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"]
+    ) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]:
+        """Rays in the coordinates that they are marched in."""
+        if self.is_unbounded:
+            return self.space.centred(origins), directions / self.space.half_edge
+        return self.box.normalise(origins), directions / self.box.size
 
 
 def scale_gradient(values: Float[Tensor, "*S"], factors: Float[Tensor, "*#S"]) -> Float[Tensor, "*S"]:

@@ -9,6 +9,7 @@ from unmix_plugin.rendering.contracted_marching import (
     FAR_RADIUS,
     LINEAR_RADIUS,
     march_contracted,
+    march_contracted_first,
     march_contracted_twin,
     unit_points,
 )
@@ -42,6 +43,23 @@ def test_kernel_and_twin_take_the_same_samples(num_rays, sides, device):
     assert torch.equal(kept[0].ray_indices, kept[1].ray_indices)
     close = (kept[0].t - kept[1].t).abs() <= 1e-3 * kept[1].t.clamp(min=0.01)
     assert num_rays < 300 or close.float().mean() > 0.995
+
+
+@pytest.mark.parametrize("most", [1, 7, 1000])
+def test_the_first_samples_and_what_follows_are_those_of_all(most, device):
+    occupied = torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(3)) < 0.3
+    clearance = clearance_of(occupied).to(device)
+    origins, directions, _ = (values.to(device) for values in make_rays(200))
+    samples = march_contracted(origins, directions, torch.full_like(origins[:, 0], 0.5), clearance, 0.05)
+    starts, counts = samples.packed_info.unbind(-1)
+    ends = torch.zeros_like(origins[:, 0])
+    for before in (0, most):
+        found = march_contracted_first(origins, directions, ends, clearance, 0.05, most)
+        assert torch.equal(found.counts, (counts - before).clamp(0, most))
+        is_written = torch.arange(most, device=device) < found.counts[:, None]
+        rows = (starts[:, None] + before + torch.arange(most, device=device))[is_written]
+        assert torch.equal(found.t[is_written], samples.t[rows])
+        ends = found.ends
 
 
 def test_samples_are_a_step_apart_in_the_inner_cube_and_then_farther_up_to_the_far_end():

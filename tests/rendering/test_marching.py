@@ -5,7 +5,13 @@ import torch
 from torch.testing import assert_close
 
 from unmix_plugin.rendering.grid_cells import clearance_of
-from unmix_plugin.rendering.marching import PackedSamples, count_samples, march, march_twin
+from unmix_plugin.rendering.marching import (
+    PackedSamples,
+    count_samples,
+    march,
+    march_first,
+    march_twin,
+)
 
 
 def make_rays(num_rays: int, seed: int = 0):
@@ -118,21 +124,38 @@ def test_rays_that_miss_or_meet_nothing_have_no_samples():
     assert empty.packed_info[:, 1].tolist() == [0] * 6
 
 
-@pytest.mark.parametrize("most", [0, 1, 3, 1000])
-def test_a_ray_ends_after_as_many_samples_as_were_asked_for(most, device):
+@pytest.mark.parametrize("most", [1, 3, 200])
+def test_the_first_samples_of_rays_are_those_of_all_and_of_the_twin(most, device):
     clearance = clearance_of(torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(3)) < 0.3).to(device)
-    o, d, t_near, t_far, jitter = (x.to(device) for x in make_rays(300))
-    everything = march(o, d, t_near, t_far, jitter, clearance, 0.013)
-    starts, counts = everything.packed_info.unbind(-1)
-    first = torch.arange(len(everything), device=device) - starts[everything.ray_indices] < most
-    expected = everything.select(first)
-    for function in (march, march_twin):
-        found = function(o, d, t_near, t_far, jitter, clearance, 0.013, most)
+    o, d, t_near, t_far, _ = (x.to(device) for x in make_rays(300))
+    found = march_first(o, d, t_near, t_far, clearance, 0.013, most)
+    for function, atol in ((march, 0), (march_twin, 2)):
+        samples = function(o, d, t_near, t_far, torch.full_like(t_near, 0.5), clearance, 0.013)
+        starts, counts = samples.packed_info.unbind(-1)
         # A sample within rounding of a cell's face may fall to either side.
-        assert_close(found.packed_info[:, 1], counts.clamp(max=most), rtol=0, atol=2)
-    found = march(o, d, t_near, t_far, jitter, clearance, 0.013, most)
-    assert torch.equal(found.packed_info, expected.packed_info)
-    assert torch.equal(found.t, expected.t)
+        assert_close(found.counts, counts.clamp(max=most), rtol=0, atol=atol)
+        first = torch.arange(most, device=device) < counts[:, None]
+        chosen = (starts[:, None] + torch.arange(most, device=device))[first]
+        same = (found.counts == counts.clamp(max=most))[:, None].expand_as(first)[first]
+        close = (found.t[first] - samples.t[chosen])[same].abs() < (1e-8 if atol == 0 else 2e-6)
+        assert close.double().mean() > (0.9999 if atol == 0 else 0.99)
+    assert most < 200 or (found.counts < most).all()
+
+
+@pytest.mark.parametrize("most", [1, 5])
+def test_marching_on_from_the_ends_gives_what_follows(most, device):
+    clearance = clearance_of(torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(3)) < 0.3).to(device)
+    o, d, t_near, t_far, _ = (x.to(device) for x in make_rays(300))
+    together = march_first(o, d, t_near, t_far, clearance, 0.013, 2 * most)
+    first = march_first(o, d, t_near, t_far, clearance, 0.013, most)
+    full = first.counts == most
+    then = march_first(o[full], d[full], first.ends[full], t_far[full], clearance, 0.013, most)
+    # The same lattice but for rounding, by which a sample may fall to either side of a cell's face.
+    same = then.counts == together.counts[full] - most
+    assert same.double().mean() > 0.98
+    written = same[:, None] & (torch.arange(most, device=device) < then.counts[:, None])
+    close = (then.t - together.t[full, most:])[written].abs() < 2e-6
+    assert close.double().mean() > 0.98
 
 
 def test_selecting_samples_keeps_them_packed_by_ray():

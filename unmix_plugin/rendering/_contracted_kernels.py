@@ -92,3 +92,39 @@ def write_kernel(
             t += length
             radius = radius_at(origins[index] + t * directions[index])
         index += stride
+
+
+@wp.kernel(enable_backward=False)
+@no_type_check
+def first_kernel(
+    first: int,
+    end: int,
+    stride: int,
+    origins: wp.array(dtype=wp.vec3f),
+    directions: wp.array(dtype=wp.vec3f),
+    jitter: wp.array(dtype=float),
+    step: float,
+    clearance: wp.array3d(dtype=wp.uint8),
+    t_start: wp.array(dtype=float),
+    counts: wp.array(dtype=wp.int64),
+    ends: wp.array(dtype=float),
+    t_samples: wp.array2d(dtype=float),
+):
+    # One pass: there is room for as many samples of each ray as are wanted.
+    index = first + wp.tid()
+    most = t_samples.shape[1]
+    while index < end:
+        row = t_samples[index]
+        slot = int(0)  # noqa: RUF046, UP018
+        t = t_start[index]
+        radius = radius_at(origins[index] + t * directions[index])
+        while slot < most and radius <= 512.0:
+            length = stride_at(radius, step)
+            middle = t + jitter[index] * length
+            row[slot] = middle
+            slot += is_occupied(origins[index] + middle * directions[index], clearance)
+            t += length
+            radius = radius_at(origins[index] + t * directions[index])
+        counts[index] = wp.int64(slot)
+        ends[index] = t
+        index += stride

@@ -92,7 +92,6 @@ def count_kernel(
     jitter: wp.array(dtype=float),
     step: float,
     clearance: wp.array3d(dtype=wp.uint8),
-    most: int,
     counts: wp.array(dtype=wp.int64),
 ):
     index = first + wp.tid()
@@ -100,7 +99,7 @@ def count_kernel(
         ray = ray_at(index, origins, directions, t_near, t_far, jitter, step, clearance)
         count = int(0)  # noqa: RUF046, UP018 - Warp takes a bare literal for a constant
         i = int(0)  # noqa: RUF046, UP018
-        while i < ray.num_points and count < most:
+        while i < ray.num_points:
             clear = clearance_at(ray, point_at(ray, step, i), clearance)
             if clear <= _NEAR:
                 for k in range(8):
@@ -108,7 +107,7 @@ def count_kernel(
                     count += int(clear == 0 and i + k < ray.num_points)
                 i += 7
             i += points_to_next(ray, clear)
-        counts[index] = wp.int64(wp.min(count, most))
+        counts[index] = wp.int64(count)
         index += stride
 
 
@@ -147,4 +146,43 @@ def write_kernel(
                         slot += 1
                 i += 7
             i += points_to_next(ray, clear)
+        index += stride
+
+
+@wp.kernel(enable_backward=False)
+@no_type_check
+def first_kernel(
+    first: int,
+    end: int,
+    stride: int,
+    origins: wp.array(dtype=wp.vec3f),
+    directions: wp.array(dtype=wp.vec3f),
+    t_near: wp.array(dtype=float),
+    t_far: wp.array(dtype=float),
+    jitter: wp.array(dtype=float),
+    step: float,
+    clearance: wp.array3d(dtype=wp.uint8),
+    counts: wp.array(dtype=wp.int64),
+    t_samples: wp.array2d(dtype=float),
+):
+    # One pass: there is room for as many samples of each ray as are wanted.
+    index = first + wp.tid()
+    most = t_samples.shape[1]
+    while index < end:
+        ray = ray_at(index, origins, directions, t_near, t_far, jitter, step, clearance)
+        row = t_samples[index]
+        slot = int(0)  # noqa: RUF046, UP018
+        i = int(0)  # noqa: RUF046, UP018
+        while slot < most and i < ray.num_points:
+            clear = clearance_at(ray, point_at(ray, step, i), clearance)
+            if clear <= _NEAR:
+                for k in range(8):
+                    t = point_at(ray, step, i + k)
+                    clear = clearance_at(ray, t, clearance)
+                    if clear == 0 and slot < most and i + k < ray.num_points:
+                        row[slot] = t
+                        slot += 1
+                i += 7
+            i += points_to_next(ray, clear)
+        counts[index] = wp.int64(slot)
         index += stride

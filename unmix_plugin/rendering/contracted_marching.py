@@ -17,8 +17,14 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from unmix_plugin.rendering.grid_cells import cells_at
-from unmix_plugin.rendering.launching import as_warp, vector_type
-from unmix_plugin.rendering.marching import PackedSamples, check_step, count_and_write
+from unmix_plugin.rendering.launching import KernelArray, as_warp, launch, vector_type
+from unmix_plugin.rendering.marching import (
+    FirstSamples,
+    PackedSamples,
+    check_step,
+    count_and_write,
+    room_for_samples,
+)
 
 FAR_RADIUS = 512.0
 LINEAR_RADIUS = 2.0
@@ -43,16 +49,45 @@ def march_contracted(
     """
     from unmix_plugin.rendering._contracted_kernels import count_kernel, write_kernel
 
+    rays = _rays(origins, directions, jitter, clearance, step)
+    return PackedSamples(*count_and_write(count_kernel, write_kernel, rays, origins), step)
+
+
+def march_contracted_first(
+    origins: Float[Tensor, "R 3"],
+    directions: Float[Tensor, "R 3"],
+    t_start: Float[Tensor, "R"],
+    clearance: UInt8[Tensor, "X Y Z"],
+    step: float,
+    most: int,
+) -> FirstSamples:
+    """The first samples that `march_contracted` takes of each ray in the middles of intervals, at most `most`.
+
+    Args:
+        t_start: 0, or the `ends` of the samples before.
+    """
+    from unmix_plugin.rendering._contracted_kernels import first_kernel
+
+    rays = _rays(origins, directions, torch.full_like(t_start, 0.5), clearance, step)
+    t, counts = room_for_samples(origins, most)
+    ends = torch.empty_like(t_start)
+    arrays = [as_warp(values) for values in (t_start.contiguous(), counts, ends, t)]
+    launch(first_kernel, len(origins), [*rays, *arrays], origins.device)
+    return FirstSamples(t, counts, ends)
+
+
+def _rays(
+    origins: Float[Tensor, "R 3"],
+    directions: Float[Tensor, "R 3"],
+    jitter: Float[Tensor, "R"],
+    clearance: UInt8[Tensor, "X Y Z"],
+    step: float,
+) -> list[KernelArray | float]:
+    """The arguments that all kernels share."""
     check_step(step)
     point = vector_type(3, torch.float32)
-    rays = [
-        as_warp(origins.contiguous(), point),
-        as_warp(directions.contiguous(), point),
-        as_warp(jitter.contiguous()),
-        step,
-        as_warp(clearance.contiguous()),
-    ]
-    return PackedSamples(*count_and_write(count_kernel, write_kernel, rays, origins), step)
+    lines = [as_warp(values.contiguous(), point) for values in (origins, directions)]
+    return [*lines, as_warp(jitter.contiguous()), step, as_warp(clearance.contiguous())]
 
 
 def march_contracted_twin(

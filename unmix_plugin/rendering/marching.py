@@ -17,8 +17,6 @@ from torch import Tensor
 from unmix_plugin.rendering.grid_cells import cells_at
 from unmix_plugin.rendering.launching import KernelArray, as_warp, launch, vector_type
 
-ALL_SAMPLES = 2**31 - 1
-
 
 @dataclass(frozen=True)
 class PackedSamples:
@@ -56,6 +54,18 @@ class PackedSamples:
         )
 
 
+@dataclass(frozen=True)
+class FirstSamples:
+    """The first samples of rays, in rows of one length M."""
+
+    t: Float[Tensor, "R M"]
+    """Ray parameters; behind a ray's last sample anything."""
+    counts: Int[Tensor, "R"]
+    """Samples of each; less than M if there are no more."""
+    ends: Float[Tensor, "R"]
+    """From where to march on for more; anything if there are none."""
+
+
 def march(
     origins: Float[Tensor, "R 3"],
     directions: Float[Tensor, "R 3"],
@@ -64,7 +74,6 @@ def march(
     jitter: Float[Tensor, "R"],
     clearance: UInt8[Tensor, "X Y Z"],
     step: float,
-    most: int = ALL_SAMPLES,
 ) -> PackedSamples:
     """Samples at t_near + (i + jitter) step that lie in occupied cells.
 
@@ -74,14 +83,40 @@ def march(
         jitter: Offset of each ray's lattice in steps, [0, 1).
         clearance: 0 in occupied cells, as `clearance_of` says; cell (x, y, z) is [x/X, (x+1)/X] and so on.
         step: Distance of neighbouring samples in the ray parameter, > 0.
-        most: Samples after which a ray ends.
     Raises:
         ValueError: step isn't positive.
     """
     from unmix_plugin.rendering._marching_kernels import count_kernel, write_kernel
 
     rays = _rays(origins, directions, t_near, t_far, jitter, clearance, step)
-    return PackedSamples(*count_and_write(count_kernel, write_kernel, rays, origins, [most]), step)
+    return PackedSamples(*count_and_write(count_kernel, write_kernel, rays, origins), step)
+
+
+def march_first(
+    origins: Float[Tensor, "R 3"],
+    directions: Float[Tensor, "R 3"],
+    t_near: Float[Tensor, "R"],
+    t_far: Float[Tensor, "R"],
+    clearance: UInt8[Tensor, "X Y Z"],
+    step: float,
+    most: int,
+) -> FirstSamples:
+    """The first samples that `march` takes of each ray at t_near + (i + 1/2) step, at most `most`."""
+    from unmix_plugin.rendering._marching_kernels import first_kernel
+
+    rays = _rays(origins, directions, t_near, t_far, torch.full_like(t_near, 0.5), clearance, step)
+    t, counts = room_for_samples(origins, most)
+    launch(first_kernel, len(origins), [*rays, as_warp(counts), as_warp(t)], origins.device)
+    return FirstSamples(t, counts, t[:, -1] + step / 2)
+
+
+def room_for_samples(
+    origins: Float[Tensor, "R 3"], most: int
+) -> tuple[Float[Tensor, "R M"], Int[Tensor, "R"]]:
+    """Memory for M samples of each ray, and for how many each has."""
+    device = origins.device
+    t = torch.empty(len(origins), most, dtype=torch.float32, device=device)
+    return t, torch.empty(len(origins), dtype=torch.int64, device=device)
 
 
 def count_samples(
@@ -97,7 +132,7 @@ def count_samples(
 
     rays = _rays(origins, directions, t_near, t_far, torch.full_like(t_near, 0.5), clearance, step)
     counts = torch.empty(len(origins), dtype=torch.int64, device=origins.device)
-    launch(count_kernel, len(origins), [*rays, ALL_SAMPLES, as_warp(counts)], origins.device)
+    launch(count_kernel, len(origins), [*rays, as_warp(counts)], origins.device)
     return counts
 
 
@@ -123,20 +158,18 @@ def count_and_write(
     write_kernel: Any,
     rays: Sequence[KernelArray | float],
     origins: Float[Tensor, "R 3"],
-    counted: Sequence[int] = (),
 ) -> tuple[Float[Tensor, "S"], Int[Tensor, "S"], Int[Tensor, "R 2"]]:
     """Samples of rays by two launches: one counts them, the other writes them where there is then room.
 
     Args:
         rays: Arguments of both kernels.
         origins: Of the rays.
-        counted: Arguments of the one that counts, after those.
     Returns:
         Distances and rays of the samples, and each ray's first sample and number of samples.
     """
     num_rays, device = len(origins), origins.device
     counts = torch.empty(num_rays, dtype=torch.int64, device=device)
-    launch(count_kernel, num_rays, [*rays, *counted, as_warp(counts)], device)
+    launch(count_kernel, num_rays, [*rays, as_warp(counts)], device)
     ends = counts.cumsum(0)
     packed_info = torch.stack([ends - counts, counts], dim=-1)
     total = int(ends[-1]) if len(ends) else 0
@@ -156,7 +189,6 @@ def march_twin(
     jitter: Float[Tensor, "R"],
     clearance: UInt8[Tensor, "X Y Z"],
     step: float,
-    most: int = ALL_SAMPLES,
 ) -> PackedSamples:
     """The same as `march` in plain PyTorch: tests every lattice point of every ray."""
     check_step(step)
@@ -167,7 +199,6 @@ def march_twin(
     points = origins[:, None] + t[..., None] * directions[:, None]
     cells = cells_at(points, clearance.shape)
     hit = (t < t_far[:, None]) & (clearance[tuple(cells.unbind(-1))] == 0)
-    hit &= hit.cumsum(dim=1) <= most
     counts = hit.sum(dim=1)
     starts = counts.cumsum(0) - counts
     ray_indices, _ = hit.nonzero(as_tuple=True)
