@@ -264,3 +264,14 @@ def test_noise_stripes_and_spikes_are_found_and_named(tmp_path):
     assert weights.argmin() == 5
     assert weights[5] < 0.1 * weights[4]
     assert make(folder, mend_values=False).warnings() == [noisy]
+
+
+def test_camera_to_world_does_not_name_the_option_world(scene_folder, tmp_path):
+    folder = tmp_path / "world"
+    shutil.copytree(scene_folder, folder)
+    content = json.loads((folder / "transforms.json").read_text())
+    content["frames"][0]["transform_matrix"] = None
+    (folder / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(SceneError, match="camera to world") as refused:
+        make(folder)
+    assert "--pipeline" not in str(refused.value)

@@ -6,6 +6,7 @@ its area, so several rays are cast through it, one in each cell of a grid on it;
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import fields
 from functools import cached_property
@@ -278,7 +279,9 @@ def _load(folder: Path, options: SceneOptions) -> Scene:
     try:
         return load_scene(folder, options)
     except SceneError as error:
-        named = [item.name for item in fields(SceneOptions) if item.name in str(error)]
+        names = [item.name for item in fields(SceneOptions)]
+        # "camera to world" and a folder called world don't name the option.
+        named = [name for name in names if re.search(rf"(?<!to )(?<![\w/]){name}\b", str(error))]
         flags = [f"{name} is --pipeline.datamanager.scene.{name.replace('_', '-')}" for name in named]
         raise SceneError("\n".join([str(error), *flags])) from error
 

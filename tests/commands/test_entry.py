@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 
 import pytest
 import torch
@@ -154,6 +155,38 @@ def test_anything_else_exits_1_and_is_called_a_bug_in_one_line(capsys):
 def test_an_interrupt_exits_130(capsys):
     assert end_of(raising(KeyboardInterrupt())) == 130
     assert capsys.readouterr().err == "interrupted\n"
+
+
+def test_an_interrupt_that_an_import_loses_is_still_one(capsys):
+    def command(_words):
+        with suppress(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+        raise AttributeError("module 'numpy' has no attribute 'matrix'")
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        assert end_of(command) == 130
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert capsys.readouterr().err == "interrupted\n"
+
+
+@pytest.mark.parametrize("script", ["train", "export", "demo_scene"])
+def test_an_interrupt_while_a_command_is_imported_is_no_traceback(script):
+    """As when somebody notices a wrong word right after Enter."""
+    code = (
+        "import signal, sys\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "class Interrupting:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name == 'torch':\n"
+        "            signal.raise_signal(signal.SIGINT)\n"
+        "sys.meta_path.insert(0, Interrupting())\n"
+        f"from unmix_plugin.commands import scripts; scripts.{script}()"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (130, "interrupted\n")
 
 
 @pytest.mark.parametrize("status", [0, 2])

@@ -53,10 +53,11 @@ def run_command(command: Callable[[list[str]], object], arguments: Sequence[str]
     """
     argv = list(sys.argv[1:] if arguments is None else arguments)
     is_debug = "--debug" in argv
+    interrupts: list[int] = []
     try:
         if isinstance(sys.stdout, io.TextIOWrapper):
             sys.stdout.reconfigure(errors="surrogateescape")  # names of files need not be text
-        with _signals_as_exits():
+        with _signals_as_exits(interrupts):
             command([argument for argument in argv if argument != "--debug"])
             sys.stdout.flush()
     except KeyboardInterrupt:
@@ -65,30 +66,40 @@ def run_command(command: Callable[[list[str]], object], arguments: Sequence[str]
     except Exception as error:  # noqa: BLE001 - the one border where any error becomes an exit code
         if isinstance(error, BrokenPipeError) and _is_output_closed():
             sys.exit(BROKEN_PIPE)
-        message, status = _verdict(error)
+        # An import in C can lose the KeyboardInterrupt and go on without what it was about to import.
+        message, status = ("interrupted", INTERRUPTED) if interrupts else _verdict(error)
         _say(message, is_debug)
         sys.exit(status)
     sys.exit(DONE)
 
 
 @contextmanager
-def _signals_as_exits() -> Iterator[None]:
-    """Context in which SIGTERM and SIGHUP raise SystemExit, so that whatever was begun is cleaned up."""
+def _signals_as_exits(interrupts: list[int]) -> Iterator[None]:
+    """Context in which SIGTERM and SIGHUP raise SystemExit, so that whatever was begun is cleaned up.
+
+    Args:
+        interrupts: Gets the number of each SIGINT, which raises KeyboardInterrupt as it always does.
+    """
 
     def leave(number: int, _frame: FrameType | None) -> NoReturn:
         sys.exit(128 + number)
+
+    def interrupt(number: int, _frame: FrameType | None) -> NoReturn:
+        interrupts.append(number)
+        raise KeyboardInterrupt
 
     numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
     # One that is ignored stays so, as under nohup; outside the main thread there are no handlers.
     is_main = threading.current_thread() is threading.main_thread()
     changed = [number for number in numbers if is_main and signal.getsignal(number) is signal.SIG_DFL]
-    for number in changed:
-        signal.signal(number, leave)
+    before = {number: signal.signal(number, leave) for number in changed}
+    if is_main and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        before[signal.SIGINT] = signal.signal(signal.SIGINT, interrupt)
     try:
         yield
     finally:
-        for number in changed:
-            signal.signal(number, signal.SIG_DFL)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _is_output_closed() -> bool:

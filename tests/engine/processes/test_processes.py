@@ -76,6 +76,13 @@ def test_a_failure_anywhere_ends_all_with_one_message(run, action: str, message:
     assert message in lines[0]
 
 
+def test_ctrl_c_reaches_all_processes_and_what_was_learned_is_saved(run, tmp_path: Path):
+    code, errors, _ = run("interrupted")
+    assert code != 2, errors
+    assert "can't reach the others" not in errors
+    assert list((tmp_path / "outputs").glob(f"*/*/*/checkpoints/step-{STEPS // 2 + 1:06d}.safetensors"))
+
+
 def test_more_processes_than_rays_are_refused(tmp_path: Path):
     _, steps = prepare_steps(config_for(tmp_path))
     steps.processes = Processes(0, 4)

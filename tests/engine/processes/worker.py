@@ -6,6 +6,7 @@ it ends to FOLDER/threads-N.txt.
 
 import atexit
 import os
+import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -85,6 +86,18 @@ def fixed_batch(pipeline: Pipeline) -> Any:
     return pipeline.datamanager.next_train(0)
 
 
+def interrupt_in(number: int) -> None:
+    """Let this process get SIGINT in a step, as all processes of a terminal do at Ctrl-C."""
+    take = TrainingSteps.take
+
+    def interrupted(steps: TrainingSteps, step: int, progress: float) -> Any:
+        if step == number:
+            signal.raise_signal(signal.SIGINT)
+        return take(steps, step, progress)
+
+    setattr(TrainingSteps, "take", interrupted)  # noqa: B010
+
+
 def name_threads(path: Path) -> None:
     """Write the names of this process's threads, where the system tells them."""
     path.write_text("".join(thread.read_text() for thread in Path("/proc/self/task").glob("*/comm")))
@@ -108,6 +121,9 @@ def main(argv: list[str]) -> None:
         train(folder, replace(config, seed=5 if is_second else 4))
     elif action == "no-scene":
         train(folder, replace(config, data=None) if is_second else config)
+    elif action == "interrupted":
+        interrupt_in(STEPS // 2)
+        train(folder, config)
     elif action == "die":
         if is_second:
             setattr(TrainingSteps, "take", lambda *_: os._exit(9))  # noqa: B010

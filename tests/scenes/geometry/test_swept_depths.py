@@ -159,6 +159,17 @@ def test_nothing_is_known_of_views_that_show_one_colour_or_are_too_few():
     assert torch.isfinite(unrelated.distances).float().mean() < 0.05
 
 
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (1, 1000)])
+def test_views_of_a_pixel_or_a_row_are_too_small_to_be_swept(scene, size):
+    cameras = scene.cameras[list(scene.train_indices)]
+    height, width = size
+    small = Cameras(
+        cameras.camera_to_world, cameras.focal_px, cameras.center_px, cameras.distortion, width, height
+    )
+    pixels = np.random.default_rng(0).random((*size, 3), np.float32)
+    assert sweep_depths(small, BOX, lambda view, part: (pixels + 0.01 * view)[part]) is None
+
+
 @pytest.mark.parametrize("num_views", [2, 3])
 def test_three_views_must_look_through_a_cell(num_views):
     positions = [np.array([2.5, side, 0.3]) for side in (-0.4, 0.0, 0.4)]

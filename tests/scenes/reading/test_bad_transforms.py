@@ -21,6 +21,11 @@ def test_an_absent_folder_is_named(tmp_path):
         load_scene(tmp_path / "nowhere")
 
 
+def test_a_file_in_place_of_the_folder_is_named(folder):
+    with pytest.raises(SceneError, match=r"transforms\.json: is a file, not a scene folder; give the folder"):
+        load_scene(folder.root / "transforms.json")
+
+
 def test_an_absent_transforms_json_is_named(folder):
     (folder.root / "transforms.json").unlink()
     assert "transforms.json: is not in the scene folder" in fault_of(folder)
@@ -164,9 +169,12 @@ IDENTITY = np.eye(4).tolist()
         (None, "'transform_matrix' is absent"),
         ("identity", "'transform_matrix' is \"identity\"; expected 4 (or 3) rows"),
         ([[1, 0, 0], [0, 1, 0], [0, 0, 1]], "expected 4 (or 3) rows of 4 finite numbers"),
-        ([*IDENTITY[:3], "0001"], "expected 4 (or 3) rows of 4 finite numbers"),
+        ([*IDENTITY[:3], "0001"], 'is a list of 4 whose row 3 is "0001"; expected 4 (or 3) rows of 4'),
         ([["1", "0", "0", "0"], *IDENTITY[1:]], "expected 4 (or 3) rows of 4 finite numbers"),
-        ([[float("nan"), 0, 0, 0], *IDENTITY[1:]], "expected 4 (or 3) rows of 4 finite numbers"),
+        (
+            [IDENTITY[0], [float("nan"), 0, 0, 0], *IDENTITY[2:]],
+            "is a list of 4 rows with NaN in row 1; expected",
+        ),
         ([[True, 0, 0, 0], *IDENTITY[1:]], "expected 4 (or 3) rows of 4 finite numbers"),
         (np.diag([2.0, 2.0, 2.0, 1.0]).tolist(), "is not rigid: its axes have lengths (2, 2, 2)"),
         ([[1, 0.5, 0, 0], *IDENTITY[1:]], "is not rigid"),

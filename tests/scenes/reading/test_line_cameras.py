@@ -103,7 +103,10 @@ def test_poses_that_do_not_fit_the_rows_are_one_error(folder):
         (lambda keys: {"key_poses": keys[:1]}, "at least two poses"),
         (lambda _: {"key_poses": "a"}, "at least two poses"),
         (lambda keys: {"key_poses": [keys[0], 7]}, "expected an object with 'row'"),
-        (lambda keys: {"key_poses": [keys[0], {**keys[1], "row": "x"}]}, "expected an object with 'row'"),
+        (
+            lambda keys: {"key_poses": [keys[0], {**keys[1], "row": "x"}]},
+            "has the row \"x\"; expected an object with 'row' (a number)",
+        ),
         (lambda keys: {"key_poses": [keys[0], {"row": 15}]}, "'transform_matrix' is absent"),
         (lambda keys: {"key_poses": turned(keys, 1)}, "turns by 180 degrees from row 0 to row 15"),
         (lambda keys: {"row_poses": [k["transform_matrix"] for k in keys]}, "'row_poses' and 'key_poses'"),

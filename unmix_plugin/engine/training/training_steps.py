@@ -21,6 +21,7 @@ from unmix_plugin.engine.runs.load_run import require_checkpoint, require_data
 from unmix_plugin.engine.runs.run_folder import open_run_folder
 from unmix_plugin.engine.training.callbacks import TrainingCallbackLocation, run_callbacks
 from unmix_plugin.engine.training.guards import GradientGuard
+from unmix_plugin.engine.training.interrupts import StopSignals
 from unmix_plugin.engine.training.optimizers import OptimizerConfig, build_optimizer, set_learning_rates
 from unmix_plugin.engine.training.seeding import seed_everything
 from unmix_plugin.engine.training.training_state import TrainingRecord, restore_training
@@ -193,9 +194,12 @@ def follow_training(config: TrainerConfig, processes: Processes) -> None:
             if config.load_run is not None:
                 step = steps.restore(require_checkpoint(open_run_folder(config.load_run))).steps
         steps.pipeline.model.warm_up()
-        steps.begin(step)
-        while (progress := processes.announce(None)) is not None:
-            steps.take(step, progress)
-            step += 1
+        with (
+            StopSignals()
+        ):  # a terminal's Ctrl-C reaches all processes; the first decides when to stop, and saves
+            steps.begin(step)
+            while (progress := processes.announce(None)) is not None:
+                steps.take(step, progress)
+                step += 1
     except UnmixError as error:
         raise Follower(2) from error

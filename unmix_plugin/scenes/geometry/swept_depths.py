@@ -68,7 +68,7 @@ class SweptDepths:
 
 
 def sweep_depths(cameras: Cameras, box: SceneBox, read_view: ReadView) -> SweptDepths | None:
-    """Distances of the pixels of all views, or of `MOST_VIEWS`; None if views are too few or too plain to compare.
+    """Distances of the pixels of all views, or of `MOST_VIEWS`; None if views are too few, too small or too plain.
 
     Args:
         cameras: Of the training views, all of one size, each with one pose.
@@ -80,6 +80,8 @@ def sweep_depths(cameras: Cameras, box: SceneBox, read_view: ReadView) -> SweptD
     if count < NUM_AGREEING + 1:
         return None
     stride = -(-max(cameras.width, cameras.height) // LONGEST_SIDE_PX)
+    if min(cameras.width, cameras.height) // stride < PIXEL_STRIDE:
+        return None
     fine = max(1, stride // _POOLED)
     pooled = stride // fine
     bands = read_view(views[0], (slice(1), slice(1))).shape[2]

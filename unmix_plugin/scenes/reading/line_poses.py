@@ -91,9 +91,12 @@ def _key_poses(entries: list[Any], where: str, faults: Faults) -> tuple[list[flo
         here = f"{where} '{KEY_POSES}'[{index}]"
         row = read_number(entry.get("row")) if isinstance(entry, dict) else None
         if row is None:
-            faults.add(
-                here, f"is {describe(entry)}; expected an object with 'row' (a number) and 'transform_matrix'"
+            found = (
+                f"has the row {describe(entry.get('row'))}"
+                if isinstance(entry, dict)
+                else f"is {describe(entry)}"
             )
+            faults.add(here, f"{found}; expected an object with 'row' (a number) and 'transform_matrix'")
             return None
         pose = read_pose(entry.get("transform_matrix"), here, faults)
         if pose is None:

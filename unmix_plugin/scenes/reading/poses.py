@@ -28,7 +28,7 @@ def read_pose(
     """
     rows = _read_rows(matrix)
     if rows is None:
-        found = "is absent" if matrix is None else f"is {describe(matrix)}"
+        found = "is absent" if matrix is None else f"is {_found(matrix)}"
         faults.add(where, f"{name} {found}; expected 4 (or 3) rows of 4 finite numbers, camera to world")
         return None
     if len(rows) == 4 and np.abs(rows[3] - np.array([0.0, 0.0, 0.0, 1.0])).max() > 1e-6:
@@ -65,3 +65,15 @@ def _read_rows(matrix: Any) -> Float64[np.ndarray, "rows 4"] | None:
     if any(number is None for row in numbers for number in row):
         return None
     return np.array(numbers, dtype=np.float64)
+
+
+def _found(matrix: Any) -> str:
+    """What stands in place of rows of numbers: a value that is no number, or else the whole."""
+    if isinstance(matrix, list):
+        for number, row in enumerate(matrix):
+            if not isinstance(row, list) or len(row) != 4:
+                return f"{describe(matrix)} whose row {number} is {describe(row)}"
+            for value in row:
+                if read_number(value) is None:
+                    return f"{describe(matrix)} rows with {describe(value)} in row {number}"
+    return describe(matrix)

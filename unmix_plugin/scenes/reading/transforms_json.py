@@ -105,9 +105,8 @@ def read_transforms(root: Path, faults: Faults, needs_cubes: bool = True) -> Sce
 
 def _read_object(path: Path, faults: Faults) -> dict[str, Any]:
     if not path.parent.is_dir():
-        faults.add(
-            str(path.parent), "the scene folder is not there; give the folder that holds transforms.json"
-        )
+        found = "is a file, not a scene folder" if path.parent.is_file() else "the scene folder is not there"
+        faults.add(str(path.parent), f"{found}; give the folder that holds transforms.json with --data")
     elif not path.is_file():
         faults.add(
             FILE_NAME, "is not in the scene folder; expected nerfstudio's form (see the README, 'own data')"
