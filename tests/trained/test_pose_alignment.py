@@ -37,15 +37,15 @@ def points_seen(camera: Cameras) -> torch.Tensor:
     return camera.project(points, 0)[0]
 
 
-@pytest.mark.parametrize(("camera", "share", "left"), [(CAMERA, 1.0, 0.2), (swept(), 0.4, 0.4)])
-def test_a_view_that_is_off_by_pixels_is_brought_back(camera, share, left):
+@pytest.mark.parametrize(("camera", "share"), [(CAMERA, 1.0), (swept(), 0.4)])
+def test_a_view_that_is_off_by_pixels_is_brought_back(camera, share):
     scene = make_scene()
     given = moved(camera, share * OFF, scene)
     before = (points_seen(given) - points_seen(camera)).norm(dim=1).mean()
     found = align_pose(scene, given, truth_of(scene, camera))
     after = (points_seen(found) - points_seen(camera)).norm(dim=1).mean()
     assert before > 1.0
-    assert after < left * before  # the sweep shows little that changes along its path
+    assert after < 0.1 * before
 
 
 def test_a_view_that_is_off_by_a_quarter_of_its_width_is_brought_back_too():

@@ -5,14 +5,14 @@ for fields that refine poses, each evaluation view is aligned before it is measu
 with which the field shows it best, coarse pictures first. Nothing of the field changes.
 
 A view that is off by a tenth of its width must first be brought near: pictures three pixels wide are alike within a
-third of the width. A turn alone does so where a shift as well would be drawn away, but not always; so both are tried
-beside the given pose, and each is taken only where it is clearly better: coarse pictures also move a view that is
-right, and a line camera whose rows can hardly be told apart.
+third of the width. A turn alone does so first, since a shift as well would be drawn away. What is found is taken only
+where it is clearly better than what the given pose leads to: coarse pictures also move a view that is right, and a line
+camera whose rows can hardly be told apart.
 
 Notation: `P` pixels of a coarse picture, `C` spectral channels compared, `D` those and opacity.
 
-Source: Lin et al. 2021, BARF (alignment of views at test time); here by Levenberg-Marquardt steps with differences of
-renders.
+Source: Lin et al. 2021, BARF (alignment of views at test time); here by Levenberg-Marquardt steps with central
+differences of renders, since one-sided ones stop early.
 """
 
 from __future__ import annotations
@@ -39,17 +39,18 @@ STEPS = (6, 3, 2, 1)
 """Most steps taken on each."""
 _FIRST_STEPS = 3
 """Steps taken from each start before the best is chosen."""
-_POOLED = (8, 4, 2)
-"""Edges of the blocks of pixels whose means are compared before, on the smallest picture."""
+_POOLED = ((8, 3), (4, 3), (2, 3), (2, 6))
+"""Edges of the blocks of pixels whose means are compared before, on the smallest picture, and how many numbers of a
+pose are fitted: its turn, or all."""
 _POOLED_STEPS = 4
-_FIRST_MOVES = (3, 6)
-"""Numbers of a pose that are fitted on pooled pictures: its turn alone, or all."""
 _CLEARLY_BETTER = 0.8
-"""Part of the squared error of what was tried before, below which a pose is taken."""
+"""Part of the squared error to which the given pose leads, below which another is taken."""
 _APART_PX = 1.0
-"""How far starts are apart on the smallest picture, at least: nearer ones lead to the same pose."""
+"""How far the other start is from the given pose on the smallest picture, at least: a nearer one leads there too."""
 _CHANNELS = 3
 _DAMPING = 1e-3
+_TRIES = 6
+"""Dampings of a step that are tried, each ten times the one before."""
 _DIFFERENCE_PX = 0.5
 _SMALLEST_STEP_PX = 0.05
 """Below which no further step is taken on a picture."""
@@ -74,23 +75,23 @@ def align_pose(scene: TrainedScene, camera: Cameras, truth: ViewTruth) -> Camera
 
 def _best_start(comparison: _Comparison) -> Float[Tensor, "6"]:
     """A few steps from the given pose, or from where coarse pictures lead if that is clearly better."""
-    starts, best, smallest = [torch.zeros(6)], torch.zeros(6), float("inf")
-    starts += [_brought_near(comparison, num_moves) for num_moves in _FIRST_MOVES]
-    apart = _APART_PX / _DIFFERENCE_PX * comparison.difference
-    for number, start in enumerate(starts):
-        if any(float((start - other).norm()) < apart for other in starts[:number]):
-            continue
+
+    def fit(start: Float[Tensor, "6"]) -> tuple[Float[Tensor, "6"], float]:
         found = _fit(comparison.residuals, start, _FIRST_STEPS, comparison.difference)
-        error = float(comparison.residuals(found).square().sum())
-        if error < _CLEARLY_BETTER * smallest:
-            best, smallest = found, error
-    return best
+        return found, float(comparison.residuals(found).square().sum())
+
+    near = _brought_near(comparison)
+    (stayed, error), apart = fit(torch.zeros(6)), _APART_PX / _DIFFERENCE_PX * comparison.difference
+    if float(near.norm()) < apart:
+        return stayed
+    found, other_error = fit(near)
+    return found if other_error < _CLEARLY_BETTER * error else stayed
 
 
-def _brought_near(comparison: _Comparison, num_moves: int) -> Float[Tensor, "6"]:
+def _brought_near(comparison: _Comparison) -> Float[Tensor, "6"]:
     """A first step, found on pictures of few pixels."""
     step = torch.zeros(6)
-    for block in _POOLED:
+    for block, num_moves in _POOLED:
         pooled = replace(comparison, block=block)
         step = _fit(pooled.residuals, step, _POOLED_STEPS, pooled.difference, num_moves)
     return step
@@ -119,8 +120,8 @@ class _Comparison:
 
     @property
     def difference(self) -> float:
-        """A turn that moves the picture by half a pixel, or block, in radians."""
-        return _DIFFERENCE_PX * self.block / float(self.camera.focal_px.mean())
+        """A turn that moves the picture by half a pixel, in radians."""
+        return _DIFFERENCE_PX / float(self.camera.focal_px.mean())
 
     def residuals(self, step: Float[Tensor, "6"]) -> Float[Tensor, " n"]:
         """Shown less measured, of each pixel or block and channel."""
@@ -161,10 +162,10 @@ def _fit(
     axes = torch.eye(6)[:num_moves]
     damping = _DAMPING
     for _ in range(count):
-        columns = [residuals(best + difference * axis) - found for axis in axes]
-        slopes = torch.stack(columns, dim=1).double() / difference
+        columns = [residuals(best + difference * axis) - residuals(best - difference * axis) for axis in axes]
+        slopes = torch.stack(columns, dim=1).double() / (2 * difference)
         normal, pull = slopes.T @ slopes, slopes.T @ found.double()
-        for _ in range(3):
+        for _ in range(_TRIES):
             ridge = damping * normal.diagonal().mean().clamp(min=1e-12) * torch.eye(num_moves).double()
             tried = best - torch.linalg.solve(normal + ridge, pull).float() @ axes
             tried = tried.clamp(-LARGEST_STEP, LARGEST_STEP)
