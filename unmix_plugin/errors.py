@@ -49,6 +49,15 @@ def did_you_mean(word: str, known: Iterable[str], likeness: float = 0.6, form: s
     return form.format(f"did you mean {' or '.join(near)}?") if near else ""
 
 
+def counted(number: int, noun: str) -> str:
+    """A number of things in words; the noun's plural ends with s.
+
+    >>> counted(1, "view"), counted(12000, "pixel")
+    ('1 view', '12000 pixels')
+    """
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
 def require(what: str, settings: Any, rules: dict[str, bool]) -> None:
     """Refuse settings that break a rule.
 

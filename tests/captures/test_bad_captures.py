@@ -127,6 +127,11 @@ CASES: dict[str, tuple[Spoil, dict[str, Any], str]] = {
         "the wavelengths of its 9 bands are unknown .* --wavelengths",
     ),
     "too few wavelengths": (_nothing, {"wavelengths": "500,600"}, "2 wavelengths were given for .* 9 bands"),
+    "an infinite wavelength": (
+        _nothing,
+        {"wavelengths": "500,inf"},
+        "500,inf holds NaN or infinity; expected",
+    ),
     "micrometres": (_nothing, {"wavelengths": "0.5,0.6"}, "look like micrometres"),
     "words for wavelengths": (
         _nothing,
@@ -157,6 +162,11 @@ CASES: dict[str, tuple[Spoil, dict[str, Any], str]] = {
     ),
     "binning to nothing": (_nothing, {"bin_pixels": 20}, "--bin-pixels 20 leaves fewer than 2 x 2"),
     "binning by nothing": (_nothing, {"bin_bands": 0}, "--bin-bands 0: expected 1 or more"),
+    "no band for a bin": (
+        _nothing,
+        {"bin_bands": 10},
+        "9 of 9 bands are left, 10 or more are needed: lower --bin-",
+    ),
     "no band left": (_nothing, {"drop_bands": "400-900"}, "0 of 9 bands are left, 1 or more are needed"),
     "bands that are not there": (
         _nothing,

@@ -82,7 +82,7 @@ def test_every_file_written_is_named_and_nothing_else_is_there(exported, name):
     assert files
     lines = said[name].splitlines()
     assert sorted(line for line in lines if line.startswith(str(root))) == files
-    assert lines[-1] == f"{len(files)} files written to {root / name}"
+    assert lines[-1] == f"{len(files)} file{'s' if len(files) > 1 else ''} written to {root / name}"
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -18,7 +18,15 @@ from unmix_plugin.commands.train import train
 from unmix_plugin.commands.view import view
 
 PAGES = ["README.md", *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md")))]
-OF_OTHERS = {"--debug", "--constraint", "--help-all", "--pipeline", "--pipeline.model.resolution", "--seeds"}
+OF_OTHERS = {
+    "--debug",
+    "--constraint",
+    "--help-all",
+    "--pipeline",
+    "--pipeline.model.resolution",
+    "--rows",
+    "--seeds",
+}
 """Taken before a command sees them, of pip, a beginning, of an example's method, of benchmarks."""
 OF_SCRIPTS = {
     *("--folder", "--start", "--count", "--first-seed", "--demo-share"),

@@ -153,7 +153,7 @@ def test_a_scene_without_labels_has_no_figures():
 
 def test_ids_beyond_the_declared_numbers_are_refused():
     tally = SegmentationTally(2, 3)
-    with pytest.raises(SpectrumError, match="predicted ids must be below 2 or 255; found 2 in 1 pixels"):
+    with pytest.raises(SpectrumError, match=r"predicted ids must be below 2 or 255; found 2 in 1 pixel$"):
         tally.add(labels(0, 2), labels(0, 2))
     with pytest.raises(SpectrumError, match="true labels must be below 3 or 255; found 7 in 2 pixels"):
         tally.add(labels(0, 1), labels(7, 7))

@@ -30,8 +30,10 @@ def parse_wavelengths(text: str) -> Float64[np.ndarray, " B"]:
             f"--wavelengths {text}: {error}; expected numbers in nm, such as 620,555,503, or a CSV file with a "
             "column 'wavelength'"
         ) from error
-    if not len(values) or not np.isfinite(values).all():
-        raise ConfigError(f"--wavelengths {text} holds no or infinite numbers; expected band centres in nm")
+    if not len(values):
+        raise ConfigError(f"--wavelengths {text} holds no numbers; expected band centres in nm")
+    if not np.isfinite(values).all():
+        raise ConfigError(f"--wavelengths {text} holds NaN or infinity; expected band centres in nm")
     try:
         require_nanometres(values)
     except SpectrumError as error:

@@ -12,6 +12,7 @@ import tyro
 
 from unmix_plugin.commands.entry import run_command
 from unmix_plugin.engine.configs import DeviceName
+from unmix_plugin.errors import counted
 
 if TYPE_CHECKING:
     import numpy as np
@@ -107,7 +108,8 @@ def _evaluate(options: EvalOptions, processes: Processes) -> None:
     _show(console, figures, subject)
     print(f"{subject.folder / 'metrics.json'}  these figures, and those of each view")
     print(
-        f"{subject.folder}  {num_pictures} pictures: rgb/, segmentation/ and abundances/, truth beside prediction"
+        f"{subject.folder}  {counted(num_pictures, 'picture')}: rgb/, segmentation/ and abundances/, "
+        "truth beside prediction"
     )
 
 
@@ -276,7 +278,7 @@ def _show(console: Console, figures: dict[str, Any], subject: _Subject) -> None:
     of = "" if subject.edits is None else ", edited, against the scene as measured"
     of += "" if subject.light_factors is None else " (in the same light)"
     name = subject.loaded.run.path.name
-    title = f"{name}: {figures['views']} evaluation views, {figures['bands']} bands{of}"
+    title = f"{name}: {counted(figures['views'], 'evaluation view')}, {counted(figures['bands'], 'band')}{of}"
     table = Table(title=title, title_justify="left")
     table.add_column("figure", no_wrap=True)
     table.add_column("value", justify="right", no_wrap=True)

@@ -14,7 +14,7 @@ import tyro
 
 from unmix_plugin.commands.entry import run_command
 from unmix_plugin.commands.method_products import OwnProduct, own_products
-from unmix_plugin.errors import ConfigError
+from unmix_plugin.errors import ConfigError, counted
 from unmix_plugin.products.abundances import Abundances
 from unmix_plugin.products.cubes import Cubes
 from unmix_plugin.products.endmembers import Endmembers
@@ -93,7 +93,7 @@ def _write(product: RunProduct, own: dict[str, OwnProduct], processes: Processes
         return
     for file in written:
         print(file)
-    print(f"{len(written)} files written to {job.folder}")
+    print(f"{counted(len(written), 'file')} written to {job.folder}")
 
 
 def _open(product: RunProduct, own: dict[str, OwnProduct], processes: Processes) -> Job:

@@ -12,7 +12,7 @@ import tyro
 
 from unmix_plugin.captures.readers.read_options import Axes, ReadOptions
 from unmix_plugin.commands.entry import DONE, USER_ERROR
-from unmix_plugin.errors import CaptureError, ConfigError
+from unmix_plugin.errors import CaptureError, ConfigError, counted
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -93,7 +93,9 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
     if report["shape"] is not None:
         rows = _image_rows(report)
     if report.get("poses") is not None:
-        rows.append(("poses", f"{report['poses']} cameras ({report['metadata'].get('source', '')})"))
+        rows.append(
+            ("poses", f"{counted(report['poses'], 'camera')} ({report['metadata'].get('source', '')})")
+        )
     rows += [("note", note) for note in report["notes"]]
     others = [name for name in report["metadata"] if name not in ("axes", "source")]
     return rows + ([("also holds", ", ".join(others))] if others else [])
@@ -101,7 +103,7 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _image_rows(report: dict[str, Any]) -> list[tuple[str, str]]:
     height, width, num_bands = report["shape"]
-    size = f"{height} rows x {width} columns x {num_bands} band{'s' if num_bands != 1 else ''}"
+    size = f"{height} rows x {width} columns x {counted(num_bands, 'band')}"
     interleave = f", {report['interleave']}" if report["interleave"] else ""
     rows = [("image", f"{size}, {report['dtype']}{interleave}, read as {report['reader']}")]
     rows.append(("wavelengths", _wavelength_text(report)))

@@ -12,6 +12,7 @@ import tyro
 
 from unmix_plugin.commands.entry import run_command
 from unmix_plugin.engine.configs import DeviceName
+from unmix_plugin.errors import counted
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -233,8 +234,7 @@ def _camera_file(folder: Path, source: str, loaded: LoadedRun, cameras: RenderCa
 def _announcement(cameras: RenderCameras, outputs: tuple[FormattedOutput, ...]) -> str:
     names = dict.fromkeys(one.output.name for one in outputs)
     width, height = cameras.size
-    views = f"{len(cameras.views)} view{'' if len(cameras.views) == 1 else 's'}"
-    return f"{views} of {width} x {height} pixels: {', '.join(names)}"
+    return f"{counted(len(cameras.views), 'view')} of {width} x {height} pixels: {', '.join(names)}"
 
 
 def _list(
@@ -245,9 +245,10 @@ def _list(
 
     for one in outputs:
         paths = output_paths(folder, one, cameras)
-        what = palette.describe(one.output) if one.format in ("png", "mp4") else one.output.what
+        is_picture = one.format in ("png", "mp4")
+        what = palette.describe(one.output, one.format == "mp4") if is_picture else one.output.what
         if is_video_of_all(one, cameras):
-            print(f"{paths[0]}  {len(cameras.views)} frames; {what}")
+            print(f"{paths[0]}  {counted(len(cameras.views), 'frame')}; {what}")
         elif len(paths) == 1:
             print(f"{paths[0]}  {what}")
         else:

@@ -12,7 +12,7 @@ from unmix_plugin.commands.entry import INTERRUPTED, run_command
 from unmix_plugin.commands.train_arguments import PROGRAM, overview, parse_all
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.registry import discover_methods
-from unmix_plugin.errors import ConfigError
+from unmix_plugin.errors import ConfigError, counted
 from unmix_plugin.viewer.options import TrainingViewerOptions
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def _prepared(config: TrainerConfig, console: Console, processes: Processes) -> 
     data = trainer.pipeline.datamanager
     say(
         console,
-        f"{len(data.train_cameras)} views to train on, {len(data.eval_cameras)} for evaluation; "
+        f"{counted(len(data.train_cameras), 'view')} to train on, {len(data.eval_cameras)} for evaluation; "
         f"computing on {trainer.pipeline.model.device}",
     )
     if trainer.limits.reached(trainer.step, trainer.clock.seconds):
@@ -100,7 +100,7 @@ def _run(trainer: Trainer, console: Console) -> None:
         print(f"run: {stop.run}", flush=True)
         sys.exit(INTERRUPTED)
     speed = f"{record.train_rays_per_second:,.0f} rays/s"
-    say(console, f"trained {record.steps} steps in {record.train_seconds:.1f} s, {speed}")
+    say(console, f"trained {counted(record.steps, 'step')} in {record.train_seconds:.1f} s, {speed}")
     if spectral_scene(trainer.pipeline.datamanager) is not None:  # remarks name settings of spectral methods
         for remark in read_remarks(trainer.run.metrics_path):
             say(console, remark)

@@ -8,6 +8,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from unmix_plugin.errors import counted
+
 _FEWEST_LINES = 8
 """Lines of metrics below which nothing is said."""
 _HARDLY_FELL = 0.6
@@ -43,8 +45,8 @@ def remarks(lines: Sequence[Mapping[str, Any]]) -> list[str]:
     undone = int(known[-1].get("poses_undone") or 0)
     if undone:
         found.append(
-            f"corrections of the poses of {undone} views went beyond a quarter of the distance to the scene (or 14 "
-            "degrees) and were undone: look whether these views belong to the scene, or train with --poses fixed"
+            f"corrections of the poses of {counted(undone, 'view')} went beyond a quarter of the distance to the scene "
+            "(or 14 degrees) and were undone: look whether these views belong to the scene, or train with --poses fixed"
         )
     if last > _HARDLY_FELL * first:
         found.append(

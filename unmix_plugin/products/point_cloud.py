@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from unmix_plugin.errors import ConfigError, RunError
+from unmix_plugin.errors import ConfigError, RunError, counted
 from unmix_plugin.formats.ply import write_ply
 from unmix_plugin.products.cloud import is_outlier, plane_normals, thinned
 from unmix_plugin.products.product import Job, Product
@@ -57,7 +57,7 @@ class PointCloud(Product):
             path, written = write_point_cloud(
                 job.folder, surface.points(), count, materials, job.frame, scores
             )
-        job.say(f"{written} points")
+        job.say(counted(written, "point"))
         return [path]
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from unmix_plugin.errors import SpectrumError
+from unmix_plugin.errors import SpectrumError, counted
 
 VISIBLE_RANGE_NM = (380.0, 780.0)
 """What a band must lie in to count as visible: the range in which colour matching functions are noticeably non-zero."""
@@ -69,8 +69,7 @@ class Bands:
         return hash(self.centers_nm.tobytes())
 
     def __str__(self) -> str:
-        plural = "" if len(self) == 1 else "s"
-        return f"{len(self)} band{plural}, {self.centers_nm[0]:g}-{self.centers_nm[-1]:g} nm"
+        return f"{counted(len(self), 'band')}, {self.centers_nm[0]:g}-{self.centers_nm[-1]:g} nm"
 
     @property
     def edges_nm(self) -> Float64[np.ndarray, " edges"]:

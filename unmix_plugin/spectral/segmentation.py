@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float, Int64, UInt8
 from torch import Tensor
 
-from unmix_plugin.errors import SpectrumError
+from unmix_plugin.errors import SpectrumError, counted
 
 NOTHING_ID = 255
 """Predicted id of a pixel with nothing in it; true label of an unlabelled pixel."""
@@ -133,5 +133,6 @@ def _require_known(ids: np.ndarray, num_known: int, what: str) -> None:
     unknown = ids[(ids >= num_known) & (ids != NOTHING_ID)]
     if unknown.size:
         raise SpectrumError(
-            f"{what} must be below {num_known} or {NOTHING_ID}; found {unknown.max()} in {unknown.size} pixels"
+            f"{what} must be below {num_known} or {NOTHING_ID}; found {unknown.max()} in "
+            f"{counted(unknown.size, 'pixel')}"
         )

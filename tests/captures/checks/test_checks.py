@@ -72,7 +72,7 @@ def test_a_jump_of_exposure_is_found_in_its_view_alone(tmp_path: Path):
     views = _views(tmp_path, ring_of(20), gains={4: 0.7})
     findings, _ = exposure(views, ball_points())
     assert len(findings) == 1
-    assert "exposure jumps in 1 views" in findings[0]
+    assert "exposure jumps in 1 view" in findings[0]
     assert "view_4 (0.7" in findings[0]
 
 
@@ -91,7 +91,7 @@ def test_a_view_far_from_the_others_hardly_overlaps(tmp_path: Path):
     positions[-1][0] = 0.01
     findings, _ = overlap(_views(tmp_path, positions))
     assert len(findings) == 1
-    assert findings[0].startswith("1 views hardly overlap with another one (view_6)")
+    assert findings[0].startswith("1 view with hardly any overlap with another one (view_6)")
 
 
 def test_overlap_of_cameras_in_parallel_takes_sparse_points(tmp_path: Path):
@@ -103,7 +103,7 @@ def test_overlap_of_cameras_in_parallel_takes_sparse_points(tmp_path: Path):
     ]
     assert overlap(views)[0] == []
     findings, said = overlap(views, ball_points())
-    assert "1 views hardly overlap with another one (a)" in findings[0]
+    assert "1 view with hardly any overlap with another one (a)" in findings[0]
     assert "least 0%" in said
 
 
@@ -114,7 +114,7 @@ def test_few_views_are_said(sound):
 def test_blur_is_found_against_the_other_views(sound):
     spoilt = [replace(sound[0], record=record_of("view_0", detail=0.4)), *sound[1:]]
     findings, _ = blur(spoilt)
-    assert findings == ["1 views are less sharp than the others: view_0 (40% of the usual detail)"]
+    assert findings == ["1 view less sharp than the others: view_0 (40% of the usual detail)"]
 
 
 def test_detail_falls_when_a_picture_is_blurred():

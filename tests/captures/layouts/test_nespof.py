@@ -54,7 +54,7 @@ def test_splits_are_those_of_the_files_and_repeated_frames_are_left_out(tmp_path
     write_nespof(tmp_path)
     capture = find_nespof(tmp_path, PLAIN)
     assert [view.split for view in capture.views] == ["eval", "train", "train", "train", "train"]
-    assert any("5 frames of transforms_test.json are listed before" in note for note in capture.notes)
+    assert any("5 frames of transforms_test.json listed before" in note for note in capture.notes)
 
 
 def test_poses_and_field_of_view_belong_to_the_views(tmp_path):

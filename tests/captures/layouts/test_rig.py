@@ -73,7 +73,7 @@ def test_bands_come_from_the_tags(flight):
 
 def test_what_is_left_out_or_ignored_is_said(flight):
     notes = " ".join(find_rig(flight, PLAIN).notes)
-    assert "1 colour pictures are left out" in notes
+    assert "1 colour picture left out" in notes
     assert "EXIF's orientation of 40 files is ignored" in notes
 
 
@@ -249,7 +249,7 @@ def test_thermal_bands_and_missing_bands_are_said(tmp_path):
     capture = find_rig(tmp_path, PLAIN)
     assert [view.name for view in capture.views] == ["IMG_0000_1", "IMG_0000_2", "IMG_0001_1"]
     notes = " ".join(capture.notes)
-    assert "1 thermal images are left out" in notes
+    assert "1 thermal image left out" in notes
     assert "1 of 2 releases lack a band: IMG_0001" in notes
 
 

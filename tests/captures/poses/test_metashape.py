@@ -85,8 +85,8 @@ def test_cameras_that_are_disabled_or_not_aligned_are_left_out_and_named(tmp_pat
     )
     found = read(tmp_path, ring(), extra=extra)
     assert_same_poses(found, ring())
-    assert "1 cameras have no transform: loose" in found.notes
-    assert "1 cameras are disabled: left out" in found.notes
+    assert "1 camera without transform: loose" in found.notes
+    assert "1 disabled camera left out" in found.notes
     with pytest.raises(CaptureError, match="none of 2 cameras is enabled and has a transform"):
         read(tmp_path, {}, extra=extra)
 

@@ -61,7 +61,7 @@ def test_offsets_between_posed_lenses_go_before_those_in_the_files():
     expected = np.vstack([posed["r3a"].camera_to_world, [0, 0, 0, 1]]) @ offset
     np.testing.assert_allclose(completed["r3b"].camera_to_world, expected[:3], atol=1e-12)
     assert notes == (
-        "1 views of lens b got the pose of another lens of their release, moved as in other releases",
+        "1 view of lens b got the pose of another lens of their release, moved as in other releases",
     )
 
 
@@ -69,9 +69,7 @@ def test_views_without_any_help_are_left_out_and_said():
     views = [view("r1", "a"), view("r1", "b"), view("r2", "a", ANGLES["a"]), view("r2", "b", ANGLES["b"])]
     completed, notes = complete_rigs(views, {"r1a": camera(1)})
     assert set(completed) == {"r1a"}
-    assert any(
-        "1 views of lens b are left out: they have no pose, and nothing says" in note for note in notes
-    )
+    assert any("1 view of lens b left out: there is no pose, and nothing says" in note for note in notes)
     assert sum("no lens of their release has a pose" in note for note in notes) == 2
 
 

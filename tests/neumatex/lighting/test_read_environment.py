@@ -71,9 +71,9 @@ def test_hdr_repeats_pixels_in_the_old_code(tmp_path):
     [
         (
             lambda image: image.__setitem__((1, 2, 0), np.nan),
-            "not finite in 1 pixels, first in row 1, column 2",
+            "not finite in 1 pixel, first in row 1, column 2",
         ),
-        (lambda image: image.__setitem__((0, 3, 1), -0.5), "negative value in 1 pixels"),
+        (lambda image: image.__setitem__((0, 3, 1), -0.5), "negative value in 1 pixel,"),
         (lambda image: image.fill(0.0), "black everywhere"),
     ],
 )

@@ -16,6 +16,7 @@ from unmix_plugin.products.render.files import still_paths
 from unmix_plugin.products.render.formats import choose_formats
 from unmix_plugin.products.render.job import RenderJob, output_paths
 from unmix_plugin.products.render.legend import draw_legend, needs_legend
+from unmix_plugin.products.render.pictures import Palette
 from unmix_plugin.products.render.survey import take_survey
 from unmix_plugin.trained.protocol import RenderableScene
 
@@ -112,3 +113,10 @@ def test_without_a_wish_it_gets_what_is_usual_of_what_it_has():
     assert {one.output.name for one in choose_formats([], [], SCENE, False)} == {"rgb"}
     odd = GlowScene(OUTPUTS[1:3])
     assert {one.output.name for one in choose_formats([], [], odd, True)} == {"heat", "classes"}
+
+
+def test_pictures_are_described_by_what_is_behind_them():
+    colours = Palette.of(None, {})
+    assert colours.describe(OUTPUTS[0]) == "sRGB, transparent where nothing is"
+    assert colours.describe(OUTPUTS[0], is_opaque=True) == "sRGB on light grey"
+    assert colours.describe(OUTPUTS[2], is_opaque=True) == OUTPUTS[2].what

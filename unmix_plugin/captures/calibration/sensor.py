@@ -26,7 +26,7 @@ from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.radiometry import radiometric_model
 from unmix_plugin.captures.spectral_file import SpectralFile
 from unmix_plugin.captures.wavelengths import in_ranges
-from unmix_plugin.errors import CaptureError, ConfigError
+from unmix_plugin.errors import CaptureError, ConfigError, counted
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,9 @@ def _common_exposure(
     known = [exposure for exposure in found if exposure is not None]
     if len(known) < len(found):
         missing = len(found) - len(known)
-        said = [f"{missing} views have no exposure time: exposures are not compared"] if known else []
+        said = (
+            [f"{counted(missing, 'view')} without exposure time: exposures are not compared"] if known else []
+        )
         return None, said
     common, source = (known[0], "the first view") if of_white is None else (of_white, "the white reference")
     if all(exposure == common for exposure in known):

@@ -9,6 +9,7 @@ from jaxtyping import Float64
 
 from unmix_plugin.captures.checks.seen_view import SeenView, angles_between
 from unmix_plugin.captures.poses.alignment import focus_of
+from unmix_plugin.errors import counted
 
 FEW_VIEWS = 15
 NARROW_DEG = 12.0
@@ -88,9 +89,9 @@ def overlap(
         worst = min(alone, key=lambda index: shares[index])
         names = ", ".join(views[index].name for index in alone[:5]) + (" and more" if len(alone) > 5 else "")
         findings.append(
-            f"{len(alone)} views hardly overlap with another one ({names}): of {views[worst].name} at most "
-            f"{shares[worst]:.0%} is seen by a neighbour, the nearest looks from {nearest[worst]:.0f} degrees away; "
-            "take views in smaller steps"
+            f"{counted(len(alone), 'view')} with hardly any overlap with another one ({names}): of "
+            f"{views[worst].name} at most {shares[worst]:.0%} is seen by a neighbour, the nearest looks from "
+            f"{nearest[worst]:.0f} degrees away; take views in smaller steps"
         )
     return findings, (
         f"views share {np.median(shares):.0%} with a neighbour (median; least {shares.min():.0%}); the nearest one "

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from unmix_plugin.captures.checks.seen_view import SeenView, angles_between, log_ratio
+from unmix_plugin.errors import counted
 
 BLURRED = 0.6
 """Detail of a view against the median of all, below which it is blurred."""
@@ -33,7 +34,9 @@ def blur(views: Sequence[SeenView]) -> tuple[list[str], str]:
         for view, detail in zip(views, details, strict=True)
         if detail < BLURRED * middle
     ]
-    findings = [f"{len(blurred)} views are less sharp than the others: {_some(blurred)}"] if blurred else []
+    findings = (
+        [f"{counted(len(blurred), 'view')} less sharp than the others: {_some(blurred)}"] if blurred else []
+    )
     return (
         findings,
         f"finest structures have {middle:.2f} times the contrast of those twice as large (median of views)",
@@ -58,7 +61,9 @@ def exposure(views: Sequence[SeenView], points: Float64[np.ndarray, "P 3"] | Non
         if abs(gain) > limit
     ]
     findings = (
-        [f"exposure jumps in {len(jumps)} views, judged by sparse points: {_some(jumps)}"] if jumps else []
+        [f"exposure jumps in {counted(len(jumps), 'view')}, judged by sparse points: {_some(jumps)}"]
+        if jumps
+        else []
     )
     return (
         findings,
@@ -94,10 +99,12 @@ def pixels(views: Sequence[SeenView]) -> list[str]:
         shares = {view.name: getattr(view.record, share) / view.record.num_pixels for view in views}
         many = [f"{name} ({part:.0%})" for name, part in shares.items() if part > limit]
         if many:
-            findings.append(f"{len(many)} views have more than {limit:.0%} {what} pixels: {_some(many)}")
+            findings.append(
+                f"{counted(len(many), 'view')} with more than {limit:.0%} {what} pixels: {_some(many)}"
+            )
     empty = [view.name for view in views if view.record.matter_share == 0.0]
     if empty:
-        findings.append(f"{len(empty)} views show no matter at all by their mask: {_some(empty)}")
+        findings.append(f"{counted(len(empty), 'view')} without any matter, by the mask: {_some(empty)}")
     return findings
 
 

@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
-from unmix_plugin.errors import CaptureError
+from unmix_plugin.errors import CaptureError, counted
 
 MOST_NAMED = 3
 
@@ -61,7 +61,7 @@ class FoundFiles:
             shown = ", ".join(self._missing[:MOST_NAMED])
             more = len(self._missing) - MOST_NAMED
             raise CaptureError(
-                f"{self._root} lacks {len(self._missing)} files that belong to views: {shown}"
+                f"{self._root} lacks {counted(len(self._missing), 'file')} of its views: {shown}"
                 f"{f' and {more} more' if more > 0 else ''}; {advice}"
             )
 

@@ -13,7 +13,7 @@ from unmix_plugin.captures.json_files import load_json
 from unmix_plugin.captures.layouts.registry import LayoutOptions
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.spectral_file import BandTable, SpectralFile
-from unmix_plugin.errors import CaptureError
+from unmix_plugin.errors import CaptureError, counted
 from unmix_plugin.scenes.reading.json_values import describe
 
 Split: TypeAlias = Literal["train", "eval"]
@@ -81,7 +81,9 @@ def read_frames(root: Path) -> FrameList:
             frame = Frame(f"{path.name}: frames[{index}]", values, split)
             if frames.setdefault(frame.name or frame.where, frame) is not frame:
                 repeated[path.name] += 1
-    notes = [f"{count} frames of {name} are listed before: left out" for name, count in repeated.items()]
+    notes = [
+        f"{counted(count, 'frame')} of {name} listed before: left out" for name, count in repeated.items()
+    ]
     source = whole if whole in files else root
     return FrameList(source, _split_by_lists(tuple(frames.values()), top), top, tuple(notes))
 

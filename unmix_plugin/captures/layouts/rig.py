@@ -31,7 +31,7 @@ from unmix_plugin.captures.layouts.rig_files import (
 )
 from unmix_plugin.captures.rigs.lens_tags import lens_of
 from unmix_plugin.captures.spectral_file import BandTable, SpectralFile
-from unmix_plugin.errors import CaptureError
+from unmix_plugin.errors import CaptureError, counted
 
 TIFF_SUFFIXES = (".tif", ".tiff")
 COLOUR_SUFFIXES = (".jpg", ".jpeg")
@@ -68,7 +68,9 @@ def find_rig(root: Path, options: LayoutOptions) -> Capture:
         lens_notes.update((sensor, note) for note in said)
         views.append(CaptureView(name, item.file, sensor, lens=lens, release=release, split=splits[release]))
     _check_lenses(views)
-    notes += [f"lens {sensor}: {note} ({count} files)" for (sensor, note), count in lens_notes.items()]
+    notes += [
+        f"lens {sensor}: {note} ({counted(count, 'file')})" for (sensor, note), count in lens_notes.items()
+    ]
     views = _with_given_bands(views, options)
     return Capture("rig", root, tuple(sorted(views, key=lambda view: view.name)), notes=tuple(notes))
 
@@ -139,9 +141,11 @@ def _left_out(opened: Iterable[BandFile], paths: Iterable[Path]) -> list[str]:
     colour = sum(file.shape[2] > 1 for file in files) + sum(
         path.suffix.lower() in COLOUR_SUFFIXES for path in paths
     )
-    notes = [f"{thermal} thermal images are left out"] if thermal else []
+    notes = [f"{counted(thermal, 'thermal image')} left out"] if thermal else []
     notes += (
-        [f"{colour} colour pictures are left out: nothing says what their channels measure"] if colour else []
+        [f"{counted(colour, 'colour picture')} left out: nothing says what their channels measure"]
+        if colour
+        else []
     )
     return notes
 
@@ -153,7 +157,9 @@ def _odd(bands: Sequence[BandFile], releases: Sequence[str]) -> list[str]:
     counts = Counter(releases)
     incomplete = [release for release, count in counts.items() if count < max(counts.values())]
     notes = (
-        [f"EXIF's orientation of {turned} files is ignored, as poses and lenses refer to the stored raster"]
+        [
+            f"EXIF's orientation of {counted(turned, 'file')} is ignored: poses and lenses refer to the stored raster"
+        ]
         if turned
         else []
     )

@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 from unmix_plugin.captures.poses.rigid import name_some
-from unmix_plugin.errors import CaptureError
+from unmix_plugin.errors import CaptureError, counted
 
 BY_ORDER = "#"
 """Names of cameras whose source gives none begin with it; they are matched in the order of names."""
@@ -59,7 +59,7 @@ def match_poses(poses: PoseSet, views: Sequence[tuple[str, Sequence[str | Path]]
     unused = tuple(name for name in owners if name not in set(found.values()))
     notes = [f"{len(found)} of {len(wanted)} views were matched {how}"]
     notes += [f"views without pose: {', '.join(unposed)}"] if unposed else []
-    notes += [f"{len(unused)} cameras have no view: {name_some(unused)}"] if unused else []
+    notes += [f"{counted(len(unused), 'camera')} without view: {name_some(unused)}"] if unused else []
     cameras = {view: poses.cameras[found[view]] for view in wanted if view in found}
     return Matches(cameras, unposed, unused, (*notes, *_ambiguous(owners, unposed, wanted)))
 

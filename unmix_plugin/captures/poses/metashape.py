@@ -17,7 +17,7 @@ from unmix_plugin.captures.poses.pose_set import Lens, PoseSet
 from unmix_plugin.captures.poses.raw_poses import RawCamera, make_pose_set
 from unmix_plugin.captures.poses.rigid import FLIP, name_some
 from unmix_plugin.captures.poses.xml_text import numbers_of
-from unmix_plugin.errors import CaptureError
+from unmix_plugin.errors import CaptureError, counted
 
 EARTH_RADII = (6.2e6, 6.6e6)
 """Metres from the middle of the Earth between which a position is geocentric."""
@@ -62,7 +62,7 @@ def _aligned(chunk: ElementTree.Element, path: Path, notes: list[str]) -> list[E
     cameras = [camera for group in chunk.findall("cameras") for camera in group.iter("camera")]
     enabled = [camera for camera in cameras if camera.get("enabled", "true") != "false"]
     if len(enabled) < len(cameras):
-        notes.append(f"{len(cameras) - len(enabled)} cameras are disabled: left out")
+        notes.append(f"{counted(len(cameras) - len(enabled), 'disabled camera')} left out")
     aligned = [camera for camera in enabled if camera.find("transform") is not None]
     missing = [camera.get("label", "?") for camera in enabled if camera.find("transform") is None]
     if not aligned:
@@ -76,7 +76,7 @@ def _aligned(chunk: ElementTree.Element, path: Path, notes: list[str]) -> list[E
             if slaves
             else ""
         )
-        notes.append(f"{len(missing)} cameras have no transform{why}: {name_some(missing)}")
+        notes.append(f"{counted(len(missing), 'camera')} without transform{why}: {name_some(missing)}")
     return aligned
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Float64, UInt8
 
 from unmix_plugin.captures.poses.pose_set import Lens, PosedCamera, PoseSet
 from unmix_plugin.captures.poses.rigid import make_rigid, name_some
-from unmix_plugin.errors import CaptureError
+from unmix_plugin.errors import CaptureError, counted
 
 FAR = 100.0
 """Cameras further from the origin than this many times their spread are geo-referenced."""
@@ -63,7 +63,9 @@ def make_pose_set(
     }
     said = [*notes, *made_rigid]
     if repeated:
-        said.append(f"{len(repeated)} cameras are listed twice with the same pose: {name_some(repeated)}")
+        said.append(
+            f"{counted(len(repeated), 'camera')} listed twice with the same pose: {name_some(repeated)}"
+        )
     if offset.any():
         said.append(f"coordinates are large: less the offset {', '.join(f'{value:.0f}' for value in offset)}")
     kept = _finite(points)

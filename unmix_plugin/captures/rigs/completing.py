@@ -17,6 +17,7 @@ from jaxtyping import Float64
 from unmix_plugin.captures.camera_tags import tag_numbers
 from unmix_plugin.captures.capture import CaptureView
 from unmix_plugin.captures.poses.pose_set import PosedCamera
+from unmix_plugin.errors import counted
 
 Pose: TypeAlias = Float64[np.ndarray, "4 4"]
 Offsets: TypeAlias = dict[tuple[str, str], Pose]
@@ -59,10 +60,10 @@ def complete_rigs(
 
 def _say(sensor: str, kind: str, count: int) -> str:
     return (
-        f"{count} views of lens {sensor} "
+        f"{counted(count, 'view')} of lens {sensor} "
         + {
-            "unposed": "are left out: no lens of their release has a pose",
-            "unknown": "are left out: they have no pose, and nothing says where the lens is on the rig",
+            "unposed": "left out: no lens of their release has a pose",
+            "unknown": "left out: there is no pose, and nothing says where the lens is on the rig",
             "poses": "got the pose of another lens of their release, moved as in other releases",
             "files": "got the pose of another lens of their release, turned as the files say, at the same place",
         }[kind]

@@ -11,6 +11,7 @@ from unmix_plugin.captures.calibration.sensor import Sensor
 from unmix_plugin.captures.plan import Plan
 from unmix_plugin.captures.posing import PosedViews
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, ViewRecord
+from unmix_plugin.errors import counted
 from unmix_plugin.spectral.bands import Bands
 
 REFERENCES = {"dark": "dark frame", "white": "white reference"}
@@ -51,9 +52,10 @@ def what_was_done(plan: Plan, posed: PosedViews, records: dict[str, ViewRecord])
     )
     views = [records[view.name] for view in posed.views]
     lines.append(
-        f"{_sum(views, 'saturated_pixels')} pixels with saturated bands, which are written as 1; "
-        f"{_sum(views, 'clipped_values')} values above 1, written as 1 too; {_sum(views, 'negative_values')} below 0, "
-        f"written as 0; {_sum(views, 'missing_pixels')} pixels masked, as nothing was measured there"
+        f"{counted(_sum(views, 'saturated_pixels'), 'pixel')} with saturated bands, which are written as 1; "
+        f"{counted(_sum(views, 'clipped_values'), 'value')} above 1, written as 1 too; "
+        f"{_sum(views, 'negative_values')} below 0, written as 0; "
+        f"{counted(_sum(views, 'missing_pixels'), 'pixel')} masked, as nothing was measured there"
     )
     lines.append(_masks_in_words(plan, views))
     return [*lines, *posed.notes, *plan.notes]

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from unmix_plugin.errors import SceneError
+from unmix_plugin.errors import SceneError, counted
 from unmix_plugin.neumatex.lighting.environment import Environment
 from unmix_plugin.neumatex.lighting.radiance_hdr import read_hdr
 
@@ -69,8 +69,8 @@ def check_environment(path: Path, image: np.ndarray) -> None:
             row, column = (int(index[0]) for index in np.nonzero(where))
             values = image[row, column].tolist()
             raise SceneError(
-                f"{path}: has {fault} in {int(where.sum())} pixels, first in row {row}, column {column}: {values}; "
-                "repair the picture"
+                f"{path}: has {fault} in {counted(int(where.sum()), 'pixel')}, first in row {row}, column {column}: "
+                f"{values}; repair the picture"
             )
     if not (image > 0).any():
         raise SceneError(

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from unmix_plugin.errors import CaptureError, SceneError
+from unmix_plugin.errors import CaptureError, SceneError, counted
 from unmix_plugin.scenes.reading.arrays import UnreadableArrayError, map_array, read_array_header
 from unmix_plugin.scenes.reading.images import FORMATS, UnreadableImageError, read_colour
 
@@ -54,7 +54,8 @@ def read_picture(path: Path, value_scale: float | None = None) -> Picture:
     if not (np.isfinite(shown).all() and (shown >= 0).all()):
         bad = int((~np.isfinite(shown) | (shown < 0)).any(axis=-1).sum())
         raise SceneError(
-            f"{path}: {bad} pixels hold negative values, NaN or infinity; expected light, 0 and up: repair the picture"
+            f"{path}: negative values, NaN or infinity in {counted(bad, 'pixel')}; expected light, 0 and up: "
+            "repair the picture"
         )
     return picture
 

@@ -64,12 +64,14 @@ class Palette:
             return self.scales.get(output.name)
         return scale_of(output, *output.value_range)
 
-    def describe(self, output: Output) -> str:
-        """What an output's colours mean."""
+    def describe(self, output: Output, is_opaque: bool = False) -> str:
+        """What an output's colours mean, in pictures with opacity or in opaque ones, over the neutral grey."""
+        behind = " on light grey" if is_opaque else ", transparent where nothing is"
+        what = output.what.replace(" on black", behind)
         scale = self.scale(output)
         if scale is None:
-            return output.what
-        return f"{output.what}; colours: {scale.colour_map} from {scale.low:.6g} to {scale.high:.6g}"
+            return what
+        return f"{what}; colours: {scale.colour_map} from {scale.low:.6g} to {scale.high:.6g}"
 
 
 def scale_of(output: Output, low: float, high: float) -> ColourScale:
