@@ -13,10 +13,12 @@ CHUNK_BYTES = 1 << 26
 """Bytes handed to one write."""
 
 _MAKE_ROOM, _ELSEWHERE = "; make room or choose another folder", "; choose a folder that you may write to"
+_RAISE_LIMIT = "; raise the limit of a file's size (ulimit -f), or choose a folder on another file system"
 _ADVICE = {
     os.strerror(number): advice
     for advice, numbers in (
         (_MAKE_ROOM, (errno.ENOSPC, errno.EDQUOT)),
+        (_RAISE_LIMIT, (errno.EFBIG,)),
         (_ELSEWHERE, (errno.EACCES, errno.EPERM, errno.EROFS)),
     )
     for number in numbers

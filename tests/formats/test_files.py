@@ -16,13 +16,17 @@ def test_a_file_is_written_into_a_folder_made_for_it(tmp_path):
     assert [file.name for file in path.parent.iterdir()] == ["b.npy"]
 
 
-def test_a_full_disk_keeps_the_old_file_and_says_what_to_do(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("number", "advice"),
+    [(errno.ENOSPC, "No space left on device; make room"), (errno.EFBIG, r"File too large; .*ulimit -f")],
+)
+def test_a_full_disk_keeps_the_old_file_and_says_what_to_do(tmp_path, monkeypatch, number, advice):
     def full(*_args):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        raise OSError(number, os.strerror(number))
 
     path = write_file(tmp_path / "file", b"old")
     monkeypatch.setattr(os, "write", full)
-    with pytest.raises(RunError, match=r"can't write .*file: No space left on device; make room"):
+    with pytest.raises(RunError, match=f"can't write .*file: {advice}"):
         write_file(path, b"new")
     assert path.read_bytes() == b"old"
     assert len(list(tmp_path.iterdir())) == 1

@@ -86,6 +86,7 @@ class TrainerConfig:
             or self.max_num_iterations >= 0,
             "max-seconds above 0 and finite": self.max_seconds is None or 0 < self.max_seconds < math.inf,
             "max-num-iterations or max-seconds": (self.max_num_iterations, self.max_seconds) != (None, None),
+            "seed of -2^63 to 2^63 - 1": -(2**63) <= self.seed < 2**63,
             "steps-per-save of at least 0": self.steps_per_save >= 0,
             "steps-per-eval-all-images of at least 0": self.steps_per_eval_all_images >= 0,
             "steps-per-log of at least 1": self.steps_per_log >= 1,

@@ -132,6 +132,7 @@ def test_a_config_that_holds_an_object_is_refused():
 @pytest.mark.parametrize(
     ("settings_", "rule"),
     [
+        ({"seed": 2**63}, r"seed of -2\^63 to 2\^63 - 1 \(got 9223372036854775808\)$"),
         ({"max_num_iterations": -1}, r"max-num-iterations of at least 0 \(got -1\)$"),
         ({"max_seconds": 0.0}, r"max-seconds above 0 and finite \(got 0.0\)$"),
         ({"max_seconds": math.inf}, r"max-seconds above 0 and finite \(got inf\)$"),
