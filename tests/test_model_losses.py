@@ -163,8 +163,8 @@ def test_the_guide_of_abundances_lets_go_of_them_as_training_goes_on():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"rgb": -1.0}, "weights of at least 0"),
-        ({"mixing_penalty": -0.1}, "weights of at least 0"),
+        ({"rgb": -1.0}, r"rgb of at least 0 \(got -1.0\)$"),
+        ({"mixing_penalty": -0.1}, r"mixing-penalty of at least 0 \(got -0.1\)$"),
         ({"spread_until": 0.0}, r"spread-until in \(0, 1\]"),
     ],
 )
