@@ -26,8 +26,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.rotations import rotation_matrix
 from unmix_plugin.pose_refinement import LARGEST_STEP
+from unmix_plugin.trained.material_view import MaterialView
 
 if TYPE_CHECKING:
     from unmix_plugin.trained.evaluation import ViewTruth
@@ -55,7 +57,8 @@ _DIFFERENCE_PX = 0.5
 _SMALLEST_STEP_PX = 0.05
 """Below which no further step is taken on a picture."""
 
-Residuals = Callable[[Float[Tensor, "6"]], Float[Tensor, " n"]]
+Residuals = Callable[[Float[Tensor, "m 6"]], Float[Tensor, "m n"]]
+"""Of each of some steps."""
 
 
 @torch.no_grad()
@@ -78,7 +81,7 @@ def _best_start(comparison: _Comparison) -> Float[Tensor, "6"]:
 
     def fit(start: Float[Tensor, "6"]) -> tuple[Float[Tensor, "6"], float]:
         found = _fit(comparison.residuals, start, _FIRST_STEPS, comparison.difference)
-        return found, float(comparison.residuals(found).square().sum())
+        return found, comparison.error(found)
 
     near = _brought_near(comparison)
     (stayed, error), apart = fit(torch.zeros(6)), _APART_PX / _DIFFERENCE_PX * comparison.difference
@@ -123,17 +126,21 @@ class _Comparison:
         """A turn that moves the picture by half a pixel, in radians."""
         return _DIFFERENCE_PX / float(self.camera.focal_px.mean())
 
-    def residuals(self, step: Float[Tensor, "6"]) -> Float[Tensor, " n"]:
-        """Shown less measured, of each pixel or block and channel."""
+    def residuals(self, steps: Float[Tensor, "m 6"]) -> Float[Tensor, "m n"]:
+        """Shown less measured, of each pixel or block and channel, after each step."""
         is_coarse = self.block == 1 and max(self.camera.width, self.camera.height) <= SIDES_PX[0]
-        camera = moved(self.camera, step, self.scene)
-        seen = _shown(self.scene, camera, self.truth, self.axes, subpixels=2 if is_coarse else 1)
+        cameras = [moved(self.camera, step, self.scene) for step in steps]
+        seen = _shown(self.scene, cameras, self.truth, self.axes, subpixels=2 if is_coarse else 1)
         errors = (seen - self.wanted) * self.counts
         if self.block == 1:
-            return errors.flatten()
-        rows = errors.unflatten(0, (self.camera.height, self.camera.width)).permute(2, 0, 1)
-        height, width = (max(1, round(edge / self.block)) for edge in rows.shape[1:])
-        return torch.nn.functional.adaptive_avg_pool2d(rows, (height, width)).flatten()
+            return errors.flatten(1)
+        rows = errors.unflatten(1, (self.camera.height, self.camera.width)).permute(0, 3, 1, 2)
+        height, width = (max(1, round(edge / self.block)) for edge in rows.shape[2:])
+        return torch.nn.functional.adaptive_avg_pool2d(rows, (height, width)).flatten(1)
+
+    def error(self, step: Float[Tensor, "6"]) -> float:
+        """Sum of the squares."""
+        return float(self.residuals(step[None]).square().sum())
 
 
 def moved(camera: Cameras, step: Float[Tensor, "6"], scene: TrainedScene) -> Cameras:
@@ -158,18 +165,18 @@ def _fit(
 ) -> Float[Tensor, "6"]:
     """Levenberg-Marquardt steps from `start` that each lower the sum of squares, within `LARGEST_STEP`, in the first
     numbers of a pose."""
-    best, found = start, residuals(start)
+    best, found = start, residuals(start[None])[0]
     axes = torch.eye(6)[:num_moves]
     damping = _DAMPING
     for _ in range(count):
-        columns = [residuals(best + difference * axis) - residuals(best - difference * axis) for axis in axes]
-        slopes = torch.stack(columns, dim=1).double() / (2 * difference)
+        ahead, behind = residuals(best + torch.cat([difference * axes, -difference * axes])).double().chunk(2)
+        slopes = (ahead - behind).T / (2 * difference)
         normal, pull = slopes.T @ slopes, slopes.T @ found.double()
         for _ in range(_TRIES):
             ridge = damping * normal.diagonal().mean().clamp(min=1e-12) * torch.eye(num_moves).double()
             tried = best - torch.linalg.solve(normal + ridge, pull).float() @ axes
             tried = tried.clamp(-LARGEST_STEP, LARGEST_STEP)
-            seen = residuals(tried)
+            seen = residuals(tried[None])[0]
             if float(seen.square().sum()) < float(found.square().sum()):
                 change = float((tried - best).norm()) / difference * _DIFFERENCE_PX
                 best, found, damping = tried, seen, damping / 3
@@ -217,11 +224,14 @@ def _pooled(
 
 
 def _shown(
-    scene: TrainedScene, camera: Cameras, truth: ViewTruth, axes: Float[Tensor, "B C"], subpixels: int
-) -> Float[Tensor, "P D"]:
-    fine = camera.resized(subpixels * camera.width, subpixels * camera.height)
-    view = scene.look(fine, 1)
+    scene: TrainedScene, cameras: list[Cameras], truth: ViewTruth, axes: Float[Tensor, "B C"], subpixels: int
+) -> Float[Tensor, "m P D"]:
+    """What each camera sees: pictures of equal size, rendered as one."""
+    height, width = subpixels * cameras[0].height, subpixels * cameras[0].width
+    rays = [camera.resized(width, height).to(scene.device).image_rays(0) for camera in cameras]
+    found = scene.renderer.composite(scene.field, RayBundle.join(rays))
+    view = MaterialView(scene, cameras[0], found.unflatten(len(cameras) * height, width))
     opacity = view.opacity if truth.alpha is not None else torch.ones_like(view.opacity)
     seen = truth.seen(view["spectral"]).float() @ axes.to(view.opacity)
-    values = torch.cat([seen, opacity[..., None]], dim=-1).permute(2, 0, 1)
-    return torch.nn.functional.avg_pool2d(values, subpixels).flatten(1).T.cpu()
+    values = torch.cat([seen, opacity[..., None]], dim=-1).unflatten(0, (len(cameras), height))
+    return torch.nn.functional.avg_pool2d(values.permute(0, 3, 1, 2), subpixels).flatten(2).mT.cpu()

@@ -36,3 +36,12 @@ def test_moving_to_a_device_keeps_the_values():
     moved = bundle.to("cpu")
     assert torch.equal(moved.origins, bundle.origins)
     assert moved.camera_indices.dtype == torch.int64
+
+
+def test_joined_bundles_are_one_after_the_other():
+    bundle = make_bundle(5)
+    joined = RayBundle.join([bundle[:2], bundle[2:]])
+    assert torch.equal(joined.origins, bundle.origins)
+    assert torch.equal(joined.directions, bundle.directions)
+    assert torch.equal(joined.camera_indices, bundle.camera_indices)
+    assert joined.axes is None

@@ -5,8 +5,9 @@ Notation: `R` counts rays. A point on a ray is `origin + t * direction`, t in sc
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -34,6 +35,17 @@ class RayBundle:
     def __getitem__(self, index: slice | Tensor) -> RayBundle:
         """The rays at a slice, an index tensor (R',) or a boolean mask (R,)."""
         return self._map(lambda values: values[index])
+
+    @staticmethod
+    def join(bundles: Sequence[RayBundle]) -> RayBundle:
+        """The rays of several bundles that know the same of their rays, one after the other."""
+        named = {
+            field.name: [getattr(bundle, field.name) for bundle in bundles] for field in fields(RayBundle)
+        }
+        parts: dict[str, Any] = {
+            name: None if values[0] is None else torch.cat(values) for name, values in named.items()
+        }
+        return RayBundle(**parts)
 
     def to(self, device: torch.device | str) -> RayBundle:
         """The same rays on another device."""
