@@ -106,14 +106,11 @@ def require_bands(choice: BandChoice, binning: int, where: str) -> None:
     """
     if len(choice.kept) >= binning:
         return
-    reasons = sorted(set(choice.dropped.values()))
-    why = ": lower --bin-bands"
-    if reasons:
-        why = (
-            f"; left out: {'; '.join(reasons)}. Check dark and white, or change --drop-bands, --max-noise or "
-        )
-        why += "--bin-bands"
+    reasons = "; ".join(sorted(set(choice.dropped.values())))
+    advice = (
+        f"; left out: {reasons}. Check dark and white, or change --drop-bands, --max-noise or --bin-bands"
+    )
     raise CaptureError(
         f"{where}: {len(choice.kept)} of {len(choice.wavelengths_nm)} bands are left, {binning} or more are needed"
-        + why
+        + (advice if reasons else ": lower --bin-bands")
     )
