@@ -79,7 +79,7 @@ def pose_views(views: Sequence[CaptureView], poses: PoseSet) -> PosedViews:
     if len(posed) < LEAST_VIEWS:
         raise CaptureError(
             f"{poses.source}: {len(posed)} of {len(views)} views has a pose; a scene needs {LEAST_VIEWS} or more. "
-            + " ".join(matches.notes)
+            + "; ".join(matches.notes)
         )
     fitted = {
         view.name: replace(cameras[view.name], lens=fit_lens(cameras[view.name].lens or view.lens, view))
