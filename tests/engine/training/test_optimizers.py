@@ -76,7 +76,7 @@ def test_weight_decay_draws_what_has_no_gradient_to_zero_and_hardly_moves_the_re
         optimizer.step()
     assert 0.4 < float(param.detach()[0]) < 0.6
     torch.testing.assert_close(param.detach()[1], torch.tensor(-0.5), atol=1e-3, rtol=0)
-    with pytest.raises(ConfigError, match="weight_decay >= 0"):
+    with pytest.raises(ConfigError, match="weight-decay of at least 0"):
         OptimizerConfig(weight_decay=-1.0)
 
 

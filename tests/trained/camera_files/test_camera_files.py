@@ -150,7 +150,7 @@ BAD = {
     ),
     "15 numbers": (
         nerfstudio(camera_path=[{"camera_to_world": [1.0] * 15, "fov": 50}]),
-        "'camera_to_world' is a list of 15; expected 4",
+        "'camera_to_world' is a list of 15 whose row 0 is 1.0; expected 4",
     ),
     "mirrored": (
         frames(frames=[{"transform_matrix": (POSE @ np.diag([1, 1, -1, 1.0])).tolist()}]),
