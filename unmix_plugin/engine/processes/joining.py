@@ -36,16 +36,23 @@ def join(device: str) -> Processes:
     Args:
         device: `auto`, `cpu` or `cuda`. On CUDA each process of a machine takes a device of its own.
     Raises:
-        ConfigError: fewer devices than processes, or PyTorch lacks what they talk through.
+        ConfigError: fewer devices than processes, or PyTorch lacks what they talk through; the first process of each
+            machine says so.
     """
     if not are_started():
         return ALONE
     rank, count = int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
+    local_rank = int(os.environ.get("LOCAL_RANK", "0"))
     is_cuda = device == "cuda" or (device == "auto" and torch.cuda.is_available())
-    if is_cuda:
-        _take_device(int(os.environ.get("LOCAL_RANK", "0")), processes_here())
     backend = "nccl" if is_cuda else "gloo"
-    _require_backend(backend)
+    try:
+        if is_cuda:
+            _take_device(local_rank, processes_here())
+        _require_backend(backend)
+    except ConfigError:
+        if local_rank > 0:
+            raise Follower(2) from None
+        raise
     # Imported later it would keep the group in defaults of its functions, and the group's threads would live on when
     # Python ends, which aborts the process where one of them then lets go of a tensor.
     importlib.import_module("torch.distributed.nn")
