@@ -19,6 +19,7 @@ from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
+from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.rotations import rotation_matrix
 from unmix_plugin.engine.pipeline import PipelineConfig
 from unmix_plugin.engine.runs.load_run import load_config, load_model
@@ -112,7 +113,9 @@ def test_gradients_of_moved_rays_are_those_of_finite_differences():
 def steps_to(corrections: torch.Tensor, knots: Knots) -> torch.Tensor:
     """Steps that add up to these corrections at the knots."""
     parts = corrections.split(knots.counts)
-    return torch.cat([torch.linalg.solve(row_waves(len(part)), part) for part in parts])
+    return torch.cat(
+        [part if len(part) == 1 else torch.linalg.solve(row_waves(len(part)), part) for part in parts]
+    )
 
 
 def test_what_moves_all_views_alike_is_no_correction():
@@ -122,7 +125,7 @@ def test_what_moves_all_views_alike_is_no_correction():
     before = found.corrections.detach()
     turn, shift, growth = torch.tensor([0.1, -0.2, 0.3]), torch.tensor([0.3, 0.1, -0.2]), 0.2
     moves = torch.linalg.cross(turn.expand_as(offsets), offsets) + shift + growth * offsets
-    similar = torch.cat([turn.expand_as(offsets), moves / offsets.norm(dim=1, keepdim=True)], dim=1)
+    similar = torch.cat([turn.expand_as(offsets), moves / found.reach[:, None]], dim=1)
     with torch.no_grad():
         found.steps.add_(steps_to(similar, knots))
     assert_close(found.corrections.detach(), before, atol=1e-6, rtol=0)
@@ -161,6 +164,33 @@ def test_when_most_views_run_away_all_are_undone():
     found.undo_runaways()
     assert found.num_undone == 4
     assert torch.equal(found.corrections.detach(), torch.zeros(4, 6))
+
+
+def test_while_the_grid_is_coarse_a_view_that_runs_away_may_try_again():
+    found = PoseRefinement((0,) * 4)
+    with torch.no_grad():
+        found.steps.fill_(0.01)
+        found.steps[2, 0] = 1.0
+    found.undo_runaways(is_final=False)
+    assert found.num_undone == 0
+    assert torch.equal(found.corrections[2].detach(), torch.zeros(6))
+    assert bool((found.corrections[[0, 1, 3]] != 0).all())
+    with torch.no_grad():
+        found.steps[2, 0] = 0.1
+    assert float(found.corrections[2, 0].detach()) == pytest.approx(0.1)
+
+
+def test_a_shift_counts_by_the_distance_to_the_middle_of_the_scene():
+    found = PoseRefinement((0, 0))
+    found.begin(torch.tensor([[4.0, 0.0, 0.0], [0.0, 2.0, 0.0]]), torch.zeros(3))
+    found.gauge.zero_()
+    rays = RayBundle(torch.zeros(2, 3), torch.eye(3)[:2], torch.arange(2))
+    rays = replace(rays, axes=rays.directions, image_y=torch.zeros(2))
+    with torch.no_grad():
+        found.steps[:, 5] = 0.2
+        moved = found(rays).origins.norm(dim=1)
+    assert_close(float(found.figures()["pose_shift"]), float((moved / torch.tensor([4.0, 2.0])).mean()))
+    assert float(moved[0]) > 0.1
 
 
 def refining_model() -> UnmixModel:
@@ -246,11 +276,19 @@ def test_the_gradient_of_a_picture_by_a_pose_is_that_of_finite_differences():
 
 
 def test_levels_of_the_grid_join_the_coarsest_first():
-    weights = [PoseConfig(coarse_until=0.4).level_weights(5, share) for share in np.linspace(0, 0.4, 9)]
+    weights = [PoseConfig().level_weights(5, share) for share in np.linspace(0, 1, 9)]
     assert weights[0] == [1.0, 0.0, 0.0, 0.0, 0.0]
     assert weights[-1] == [1.0] * 5
     assert (np.diff(np.array(weights), axis=0) >= 0).all()
     assert (np.diff(np.array(weights), axis=1) <= 0).all()
+
+
+def test_the_coarse_part_is_a_part_of_the_training_and_never_longer_than_its_steps():
+    config = PoseConfig(coarse_until=0.4, coarse_steps=500)
+    assert [config.fineness(step, step / 1000) for step in (0, 100, 200, 400, 900)] == [0, 0.25, 0.5, 1, 1]
+    assert [config.fineness(step, step / 10_000) for step in (0, 125, 250, 500)] == [0, 0.25, 0.5, 1]
+    assert PoseConfig(coarse_until=0.0).fineness(0, 0.0) == 1.0
+    assert PoseConfig(coarse_steps=0).fineness(0, 0.0) == 1.0
 
 
 def test_levels_without_weight_change_nothing():
@@ -311,6 +349,40 @@ def test_poses_that_are_taken_as_they_are_leave_training_as_it_was(folder):
     first = model.train().get_outputs(rays)["spectral"]
     model.generator = torch.Generator().manual_seed(0)
     assert torch.equal(first, model.get_outputs(bare)["spectral"])
+
+
+def test_space_is_carved_once_by_the_corrected_cameras(folder):
+    asked = []
+
+    class Watched(PoseRefinement):
+        def refined(self, cameras: Cameras) -> Cameras:
+            asked.append((trainer.step, super().refined(cameras)))
+            return asked[-1][1]
+
+    trainer = Trainer(config_for(folder, steps=20), console=Console(file=io.StringIO()))
+    model: Any = trainer.pipeline.model
+    assert bool(model.grid.reachable.all())
+    model.poses.__class__ = Watched
+    trainer.train()
+    datamanager: Any = trainer.pipeline.datamanager
+    [(step, cameras)] = asked
+    assert step == 6
+    hull = torch.from_numpy(datamanager.judge_again(cameras)["reachable"])
+    assert 0 < hull.float().mean() < 1
+    assert torch.equal(model.grid.reachable, hull)
+    assert not torch.equal(hull, torch.from_numpy(datamanager.initial_data()["reachable"]))
+    assert not bool((model.grid.occupied.bool() & ~model.grid.reachable).any())
+
+
+def test_nothing_is_carved_by_cameras_that_contradict_each_other(folder):
+    trainer = Trainer(config_for(folder), console=Console(file=io.StringIO()))
+    datamanager: Any = trainer.pipeline.datamanager
+    right = datamanager.train_cameras
+    turned = right.camera_to_world.clone()
+    turns = 0.3 * torch.randn(len(right), 3, generator=torch.Generator().manual_seed(0))
+    turned[:, :, :3] = rotation_matrix(turns) @ turned[:, :, :3]
+    assert set(datamanager.judge_again(right)) == {"reachable"}
+    assert datamanager.judge_again(replace(right, camera_to_world=turned)) == {}
 
 
 def test_a_resumed_refinement_is_the_one_that_was_never_stopped(folder):

@@ -31,6 +31,7 @@ from unmix_plugin.pose_knots import Knots
 from unmix_plugin.scenes.alpha_evidence import AlphaEvidence
 from unmix_plugin.scenes.geometry.carving import carve
 from unmix_plugin.scenes.geometry.lighting import judge_light
+from unmix_plugin.scenes.geometry.mask_agreement import mask_warning, share_explained
 from unmix_plugin.scenes.geometry.pose_check import check_scene_poses
 from unmix_plugin.scenes.identity import scene_identity
 from unmix_plugin.scenes.pixel_rays import PixelRays
@@ -51,6 +52,9 @@ from unmix_plugin.spectral.unmixing.partial_bands import typical_spectrum
 
 _MANY_PIXELS = 4_000_000
 """Pixels of all training views beyond which one ray a pixel is enough."""
+_FAIRLY_EXPLAINED = 0.99
+"""Share of the foreground that a hull must explain to be carved by refined cameras; where poses are off by many pixels,
+views look through what others show."""
 DEMO = Path("demo")
 """`--data demo` stands for the built-in scene."""
 
@@ -170,8 +174,7 @@ class HyperspectralDataManager(DataManager):
         most, seed, sensors = self.options.max_initial_pixels, self.seed, self.scene.sensors
         shares = self._pixels.shares
         chosen = max(shares, key=lambda sensor: (sensors[sensor].num_channels, shares[sensor]))
-        foreground = self._evidence.foreground() if self.scene.has_alpha else None
-        reachable = self._surfaces.carved(carve(self.scene, self._grid_resolution, foreground))
+        reachable, _ = self._carved
         found = {
             "knots": self._knots.positions(self.train_cameras).numpy(),
             "pixels": self._pixels.sample_opaque(chosen, most, seed),
@@ -186,6 +189,15 @@ class HyperspectralDataManager(DataManager):
         matrices = [torch.from_numpy(sensors[sensor].matrix).float() for sensor in shares]
         return {**found, "sensor": np.array(chosen), "typical": typical_spectrum(means, matrices).numpy()}
 
+    def judge_again(self, cameras: Cameras) -> Mapping[str, np.ndarray]:
+        """`reachable`, where alpha tells of it and the cameras are right enough to carve by."""
+        if not self.scene.has_alpha or self.scene.is_unbounded:
+            return {}
+        foreground = self._evidence.foreground()
+        hull = carve(self.scene, self._grid_resolution, foreground, cameras)
+        is_right = share_explained(self.scene, hull, foreground, cameras) >= _FAIRLY_EXPLAINED
+        return {"reachable": hull} if is_right else {}
+
     def summary(self) -> dict[str, Any]:
         """The scene's own record: files, splits, normalisation, truth, hashes."""
         return self.scene.summary()
@@ -197,9 +209,10 @@ class HyperspectralDataManager(DataManager):
         check_recorded_scene(summary)
 
     def warnings(self) -> list[str]:
-        """Poses that seem to follow another convention, sensors that share no band or no place with another, and bad
-        bands and values."""
-        found = [check_scene_poses(self.scene), *self._pixels.notes]
+        """Poses that seem to follow another convention, masks that contradict each other, sensors that share no band or
+        no place with another, and bad bands and values."""
+        wrong_poses = check_scene_poses(self.scene)
+        found = [self._carved[1] if wrong_poses is None else wrong_poses, *self._pixels.notes]
         found += noise_warnings(self.scene, self._noise, self._pixels.bad_share)
         found += rig_warnings(self.scene, self._initial_data["reachable"]) if self.scene.is_rig else []
         return [warning for warning in found if warning is not None]
@@ -234,6 +247,15 @@ class HyperspectralDataManager(DataManager):
     @cached_property
     def _evidence(self) -> AlphaEvidence:
         return AlphaEvidence(self._pixels, self.scene.has_alpha and not self.options.trust_alpha)
+
+    @cached_property
+    def _carved(self) -> tuple[Bool[np.ndarray, "R R R"], str | None]:
+        """Where something may be, and what to say of masks that contradict each other; all pixels are read for it."""
+        foreground = self._evidence.foreground() if self.scene.has_alpha else None
+        hull = self._surfaces.carved(carve(self.scene, self._grid_resolution, foreground))
+        if foreground is None or self.scene.is_unbounded:
+            return hull, None
+        return hull, mask_warning(self.scene, foreground)
 
     @cached_property
     def _surfaces(self) -> SurfaceEvidence:

@@ -30,7 +30,7 @@ unmix_nerf = MethodSpecification(
             "grid": OptimizerConfig(lr=2e-2, final_factor=0.05, weight_decay=1e-7),
             "networks": OptimizerConfig(lr=2e-2, final_factor=0.15),
             "spectra": OptimizerConfig(lr=2e-3, final_factor=0.03),
-            "poses": OptimizerConfig(lr=5e-3, final_factor=0.04),
+            "poses": OptimizerConfig(lr=5e-3, final_factor=0.08),
         },
     ),
     description="radiance field of spectral images whose every point is a mixture of a few materials",

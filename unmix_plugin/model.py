@@ -100,7 +100,7 @@ class UnmixModel(Model):
         self.comparison = BatchComparison(
             config.losses, self.preset, self.seen_by, self.balance, self.guide, self.view_gains
         )
-        self._progress = 0.0
+        self._progress = self._fineness = 0.0
 
     def initialise(self, initial_data: Mapping[str, np.ndarray], generator: torch.Generator) -> None:
         """Endmembers from the training pixels or a file, the light in the dictionary, and the carved grid.
@@ -133,6 +133,19 @@ class UnmixModel(Model):
             self.poses.begin(torch.from_numpy(initial_data["knots"]), self.scene_box.aabb.mean(dim=0))
             reachable = torch.ones_like(reachable)  # poses that are off carve away what is there
         self.grid = make_grid(self.config, reachable, self.is_unbounded).to(self.device)
+
+    def settled_cameras(self, cameras: Cameras) -> Cameras | None:
+        """The corrected cameras once the levels of the grid have joined."""
+        if self.poses is None or self.poses.is_settled or self._fineness < 1:
+            return None
+        return self.poses.refined(cameras)
+
+    def take_in(self, data: Mapping[str, np.ndarray]) -> None:
+        """Keep empty what the masks carve away as seen by the corrected cameras."""
+        assert self.poses is not None
+        self.poses.settle()
+        if "reachable" in data:
+            self.grid.empty_beyond(torch.from_numpy(data["reachable"]).to(self.device))
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """The hash table, the networks and the spectra."""
@@ -170,7 +183,7 @@ class UnmixModel(Model):
         """`spectral` (R, B) on black (of a rig `coefficients`, from which follows what its sensors see), all that
         `ray_outputs` gives, and what `met_by_rays` gives where the grid records it."""
         generator = self.generator if self.training else None
-        if self.poses is not None and self.training and self._progress >= self.config.pose_refinement.start:
+        if self.poses is not None and self.training and self._fineness >= self.config.pose_refinement.start:
             ray_bundle = self.poses(ray_bundle)
         renderer = replace(self.renderer, step=self._training_step) if self.training else self.renderer
         rendered = renderer.render(self.field, ray_bundle, generator)
@@ -286,8 +299,9 @@ class UnmixModel(Model):
 
     def _begin_step(self, step: int, progress: float) -> None:
         self._progress = progress
+        self._fineness = self.config.pose_refinement.fineness(step, progress)
         if isinstance(self.field, UnmixField) and self.field.level_weights is not None:
-            levels = self.config.pose_refinement.level_weights(len(self.field.level_weights), progress)
+            levels = self.config.pose_refinement.level_weights(len(self.field.level_weights), self._fineness)
             self.field.level_weights.copy_(torch.tensor(levels))
         if is_due(step):
             renderer = replace(self.renderer, step=self._training_step)
@@ -299,4 +313,4 @@ class UnmixModel(Model):
         self.endmembers.clamp_(min=0.0).clamp_(max=self.endmember_bound)
         self.specular_spectra.clamp_(0, 1)
         if self.poses is not None:
-            self.poses.undo_runaways()
+            self.poses.undo_runaways(is_final=self._fineness >= 1)

@@ -54,12 +54,13 @@ class Knots:
 def row_waves(count: int) -> Float[Tensor, "n n"]:
     """Cosines over the knots of a view, one a column: the first is 1 everywhere, the next half a wave, and so on.
 
-    Few rays tell of one knot, all rays of a view tell of a wave. The k-th is 1 / k high: optimisers take steps of equal
-    size, so slow drift, which is most of what line cameras do, is found first, and noise moves the rest little.
+    Few rays tell of one knot, all rays of a view tell of a wave. The k-th is 1 / (2 k) high: optimisers take steps of
+    equal size, so slow drift, which is most of what line cameras do, is found first, and noise moves the rest little;
+    and since waves add up, steps are half of those of a frame camera.
     """
     place = torch.arange(count, dtype=torch.float64)
     waves = torch.cos(math.pi * place[:, None] * place / max(count - 1, 1))
-    return (waves / (1 + place)).float()
+    return (waves / (2 * (1 + place))).float()
 
 
 def similarities(offsets: Float[Tensor, "M 3"], reach: Float[Tensor, " M"]) -> Float[Tensor, "6*M 7"]:

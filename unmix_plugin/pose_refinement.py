@@ -5,12 +5,11 @@ waves, computed at knots a few rows apart, between which it is interpolated line
 rays are moved.
 
 What moves all views alike (a similarity of the world about the scene's middle) can't be seen in pictures, so it is
-taken out of the corrections. A view that goes farther than `LARGEST_STEP` has lost its way: it gets its given pose back
-and keeps it.
+taken out of the corrections. A view that goes farther than `LARGEST_STEP` has lost its way: it gets its given pose
+back, and keeps it unless the grid is still coarse.
 
 Notation: `V` training views, `M` knots of all views, `R` rays. A step is (w, m): the camera turns by the rotation
-vector w in world axes about itself, and moves by m times its distance to the scene's middle, so that equal numbers move
-a picture by about as much.
+vector w in world axes about itself, and moves by m times its reach.
 
 Source: Lin et al. 2021, BARF (joint refinement, coarse to fine); Wang et al. 2021, NeRF-- (focal length).
 """
@@ -37,6 +36,10 @@ from unmix_plugin.pose_knots import Knots, row_waves, similarities
 LARGEST_STEP = 0.25
 """Radians, or share of the distance to the scene's middle, beyond which a correction is undone; of a line camera in the
 mean over its knots."""
+LINE_REACH = 0.25
+"""Reach of a line camera as a share of its distance to the scene's middle, which is the reach of a frame camera. A row
+can hardly tell a shift from a turn: steps of equal effect would split between both what is mostly a turn, and parallax
+sorts it out slowly."""
 MOST_UNDONE = 0.5
 """Share of the views that may be undone before all are."""
 
@@ -47,17 +50,19 @@ class PoseConfig:
 
     lens: Literal["fixed", "focal", "radial"] = "fixed"
     """What of the lens that all views share is refined too: nothing, its focal length, or also k1 and k2."""
-    coarse_until: float = 0.5
+    coarse_until: float = 0.3
     """Part of the training in which the levels of the field's grid join, the coarsest first: what is fine draws poses
-    to the nearest likeness."""
+    to the nearest likeness. Where pictures have alpha, space is carved at its end."""
+    coarse_steps: int = 900
+    """Steps in which they join at most: what is coarse hardly holds poses, and they drift."""
     coarsest_resolution: int = 4
     """Cells along the scene box on the coarsest level, if the field's own has more: a pose that is off by a cell still
     finds its way."""
-    start: float = 0.03
-    """Part of the training before which poses stay: the field must show something first."""
+    start: float = 0.1
+    """Part of the coarse part before which poses stay: the field must show something first."""
     penalty: float = 1e-3
     """Weight of the mean squared correction."""
-    roughness: float = 0.4
+    roughness: float = 1.5
     """Weight of the mean squared bend (second difference between knots) of a line camera's corrections: what carries a
     camera moves smoothly, and rows that see little follow their neighbours."""
 
@@ -70,19 +75,29 @@ class PoseConfig:
         rules = {
             "coarse-until in [0, 1]": 0 <= self.coarse_until <= 1,
             "coarsest-resolution of 2 to 4096": 2 <= self.coarsest_resolution <= 4096,
+            "coarse-steps of at least 0": self.coarse_steps >= 0,
             "start in [0, 1]": 0 <= self.start <= 1,
             "a penalty of 0 to 1e6": 0 <= self.penalty <= 1e6,
             "a roughness of 0 to 1e6": 0 <= self.roughness <= 1e6,
         }
         require("pose refinement", self, rules)
 
-    def level_weights(self, num_levels: int, progress: float) -> list[float]:
-        """Weights in [0, 1] of a grid's levels when that part of the training is over.
+    def fineness(self, step: int, progress: float) -> float:
+        """How much of the coarse part is over in [0, 1], after some steps and that part of the training.
 
-        >>> PoseConfig(coarse_until=0.5).level_weights(4, 0.125)
+        >>> PoseConfig(coarse_until=0.3, coarse_steps=900).fineness(100, 0.15)
+        0.5
+        """
+        if progress >= self.coarse_until or step >= self.coarse_steps:
+            return 1.0
+        return max(progress / self.coarse_until, step / self.coarse_steps)
+
+    def level_weights(self, num_levels: int, share: float) -> list[float]:
+        """Weights in [0, 1] of a grid's levels when that share of the coarse part is over.
+
+        >>> PoseConfig().level_weights(4, 0.25)
         [1.0, 0.853553390593, 0.0, 0.0]
         """
-        share = 1.0 if progress >= self.coarse_until else progress / self.coarse_until
         joined = [min(max(1 + share * (num_levels - 1) - level, 0.0), 1.0) for level in range(num_levels)]
         return [1.0 if x == 1 else round(0.5 - 0.5 * math.cos(math.pi * x), 12) for x in joined]
 
@@ -91,8 +106,11 @@ class PoseRefinement(nn.Module):
     """Corrections of the training views' poses, all 0 at first."""
 
     reach: Tensor
+    shares: Tensor
+    """Of the distance to the scene's middle, that are the reach at each knot."""
     gauge: Tensor
     is_free: Tensor
+    settled: Tensor
     counts: Tensor
     first: Tensor
     rows: Tensor
@@ -106,8 +124,15 @@ class PoseRefinement(nn.Module):
         self.steps = nn.Parameter(torch.zeros(total, 6))
         self.lens = nn.Parameter(torch.zeros(3), requires_grad=self.num_lens > 0)
         self.register_buffer("reach", torch.ones(total))
+        shares = torch.where(counts > 1, LINE_REACH, 1.0).repeat_interleave(counts)
+        self.register_buffer("shares", shares, persistent=False)
         self.register_buffer("gauge", torch.zeros(6 * total, 7))
         self.register_buffer("is_free", torch.ones(len(rows), dtype=torch.bool))
+        self.register_buffer("settled", torch.zeros((), dtype=torch.bool))
+        self.is_settled = False
+        """Whether the scene was judged by the corrected cameras; the buffer keeps it, but reading that from a GPU in
+        each step would take time."""
+        self.register_load_state_dict_post_hook(_after_loading)
         self.register_buffer("counts", counts, persistent=False)
         self.register_buffer("first", counts.cumsum(0) - counts, persistent=False)
         self.register_buffer("rows", torch.tensor(rows), persistent=False)
@@ -123,8 +148,13 @@ class PoseRefinement(nn.Module):
     def begin(self, positions: Float[Tensor, "M 3"], middle: Float[Tensor, "3"]) -> None:
         """Take in where the cameras stand at the knots, and the scene's middle."""
         offsets = positions - middle
-        self.reach.copy_(offsets.norm(dim=1).clamp(min=1e-6))
+        self.reach.copy_(self.shares * offsets.norm(dim=1).clamp(min=1e-6))
         self.gauge.copy_(similarities(offsets, self.reach))
+
+    def settle(self) -> None:
+        """Note that the scene was judged by the corrected cameras."""
+        self.settled.fill_(True)
+        self.is_settled = True
 
     @property
     def corrections(self) -> Float[Tensor, "M 6"]:
@@ -142,7 +172,7 @@ class PoseRefinement(nn.Module):
     def figures(self) -> dict[str, Tensor]:
         """`pose_turn_deg` and `pose_shift` (share of the distance to the scene's middle), means over knots, and
         `poses_undone`."""
-        turns, shifts = self.corrections.view(-1, 2, 3).norm(dim=-1).mean(dim=0)
+        turns, shifts = self._sizes().mean(dim=0)
         return {
             "pose_turn_deg": turns.rad2deg(),
             "pose_shift": shifts,
@@ -190,16 +220,26 @@ class PoseRefinement(nn.Module):
         return moved.to(cameras.camera_to_world.device)
 
     @torch.no_grad()
-    def undo_runaways(self) -> None:
-        """Give views that went too far their poses back; where most did, all."""
-        sizes = self.corrections.view(-1, 2, 3).norm(dim=-1).amax(dim=-1)
+    def undo_runaways(self, is_final: bool = True) -> None:
+        """Give views that went too far their poses back; where most did, all.
+
+        Args:
+            is_final: Whether they keep them; else they may try again.
+        """
+        sizes = self._sizes().amax(dim=1)
         views = torch.arange(len(self.is_free), device=sizes.device).repeat_interleave(self.counts)
         # In the mean over its knots: a line camera may wobble farther in a few rows and still be on its way.
         size = torch.zeros(len(self.is_free), device=sizes.device).index_add_(0, views, sizes) / self.counts
-        self.is_free &= size <= LARGEST_STEP
-        is_lost = (~self.is_free).float().mean() > MOST_UNDONE
-        self.is_free &= ~is_lost
-        self.steps.masked_fill_(~self.is_free[views][:, None], 0.0)
+        is_held = self.is_free & (size <= LARGEST_STEP)
+        is_held &= is_held.float().mean() >= 1 - MOST_UNDONE
+        self.steps.masked_fill_(~is_held[views][:, None], 0.0)
+        if is_final:
+            self.is_free.copy_(is_held)
+
+    def _sizes(self) -> Float[Tensor, "M 2"]:
+        """Of turns, radians, and shifts, share of the distance to the scene's middle."""
+        turns, shifts = self.corrections.view(-1, 2, 3).norm(dim=-1).unbind(dim=1)
+        return torch.stack([turns, shifts * self.shares], dim=1)
 
     def _at_knots(self) -> Float[Tensor, "M 6"]:
         """What the steps add up to at the knots."""
@@ -254,3 +294,7 @@ class PoseRefinement(nn.Module):
             heights = torch.cat([heights, self.knots.heights(view).to(heights)]).unique()
         poses = self._moved(cameras, torch.full((len(heights),), view, device=heights.device), heights)
         return KeyPoses(poses, heights, (len(heights),))
+
+
+def _after_loading(poses: PoseRefinement, _: object) -> None:
+    poses.is_settled = bool(poses.settled)

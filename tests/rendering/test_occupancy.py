@@ -2,6 +2,7 @@
 
 import torch
 
+from unmix_plugin.rendering.grid_cells import clearance_of
 from unmix_plugin.rendering.occupancy import OccupancyGrid
 
 
@@ -38,6 +39,19 @@ def test_unreachable_cells_stay_empty_whatever_the_density():
     grid = updated(OccupancyGrid(reachable), lambda points: torch.full((len(points),), 50.0), times=3)
     assert not grid.occupied[0].any()
     assert grid.occupied[1:].all()
+
+
+def test_what_is_emptied_later_stays_empty_and_all_else_is_as_it_was():
+    reachable = torch.ones(8, 8, 8, dtype=torch.bool)
+    reachable[:4] = False
+    grid, other = updated(full(), ball, times=3), updated(full(), ball, times=3)
+    grid.empty_beyond(reachable)
+    assert torch.equal(grid.occupied[4:], other.occupied[4:])
+    assert not grid.occupied[:4].any()
+    assert torch.equal(grid.clearance, clearance_of(grid.occupied != 0))
+    updated(grid, ball, times=3, seed=1)
+    assert not grid.occupied[:4].any()
+    assert grid.occupied[4:].any()
 
 
 def test_a_cell_is_forgotten_once_its_density_has_decayed():

@@ -105,6 +105,11 @@ class DataManager(ABC):
         one is loaded, since by then the values are in the checkpoint."""
         return {}
 
+    def judge_again(self, cameras: Cameras) -> Mapping[str, np.ndarray]:
+        """What of `initial_data` depends on where the training views were taken, by other cameras than the given ones;
+        empty where nothing does."""
+        return {}
+
     def summary(self) -> dict[str, Any]:
         """What a person or a later command may ask about the scene (splits, normalisation, hashes); JSON like
         `metadata`, kept in the run folder."""

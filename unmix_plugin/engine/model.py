@@ -88,6 +88,18 @@ class Model(nn.Module, ABC):
         """Fill parameters and buffers from the data manager's `initial_data`; called once when a run starts, after
         the move to the device, and never when one is loaded. `generator` is on the CPU."""
 
+    def settled_cameras(self, cameras: Cameras) -> Cameras | None:
+        """The training views' cameras as this model has corrected them, once they hardly change any more and until
+        `take_in` was called; else None. Asked before each training step.
+
+        Args:
+            cameras: As the data manager has them.
+        """
+        return None
+
+    def take_in(self, data: Mapping[str, np.ndarray]) -> None:
+        """Learn what the data manager's `judge_again` finds with `settled_cameras`."""
+
     @abstractmethod
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Parameters to train, by the name of the optimizer config that they use."""

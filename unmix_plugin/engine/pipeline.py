@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from unmix_plugin.engine.data_manager import DataManager, DataManagerConfig
 from unmix_plugin.engine.instantiate import InstantiateConfig, Target
 from unmix_plugin.engine.model import Model, ModelConfig
-from unmix_plugin.engine.training.callbacks import TrainingCallback
+from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.engine.training.seeding import step_generator, step_seed
 
 MODEL_STREAM = 1
@@ -111,8 +111,15 @@ class Pipeline(nn.Module):
         return self.model.get_param_groups()
 
     def get_training_callbacks(self) -> list[TrainingCallback]:
-        """The data manager's callbacks, then the model's."""
-        return self.datamanager.get_training_callbacks() + self.model.get_training_callbacks()
+        """The data manager's callbacks, then the model's, then what one tells the other of corrected cameras."""
+        own = TrainingCallback(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, self._judge_again)
+        return [*self.datamanager.get_training_callbacks(), *self.model.get_training_callbacks(), own]
+
+    @torch.no_grad()
+    def _judge_again(self, step: int, progress: float) -> None:
+        cameras = self.model.settled_cameras(self.datamanager.train_cameras)
+        if cameras is not None:
+            self.model.take_in(self.datamanager.judge_again(cameras))
 
 
 def average_metrics(found: Sequence[Mapping[str, float]]) -> dict[str, float]:

@@ -59,7 +59,7 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("met", torch.full(reachable.shape, _NOTHING_MET) if records_met else None)
         self.register_buffer("clearance", clearance_of(reachable), persistent=False)
         self.register_buffer("reachable_cells", _flat_indices(reachable), persistent=False)
-        self.register_load_state_dict_post_hook(_after_loading)
+        self.register_load_state_dict_post_hook(lambda grid, _: grid._follow())
 
     @torch.no_grad()
     def update(
@@ -101,6 +101,15 @@ class OccupancyGrid(nn.Module):
         self.clearance.copy_(clearance_of(self.occupied != 0))
 
     @torch.no_grad()
+    def empty_beyond(self, reachable: Bool[Tensor, "X Y Z"]) -> None:
+        """From now on keep those cells empty too that `reachable` leaves out."""
+        self.reachable &= reachable
+        self.occupied *= self.reachable
+        if self.opaque is not None:
+            self.opaque *= self.reachable
+        self._follow()
+
+    @torch.no_grad()
     def record_met(self, points: Float[Tensor, "S 3"], densities: Float[Tensor, "S"]) -> None:
         """Note the densities of points in the unit cube, as far as this grid records what rays meet."""
         if self.met is not None:
@@ -133,6 +142,13 @@ class OccupancyGrid(nn.Module):
         ]
         return torch.cat(chosen).unique()
 
+    def _follow(self) -> None:
+        """Find what follows from cells that were loaded or emptied: searching the whole grid takes longer than an
+        update."""
+        self.reachable_cells = _flat_indices(self.reachable)
+        self.clearance = clearance_of(self.occupied != 0)
+        self.opaque_clearance = _clearance(self.opaque)
+
     def _coordinates(self, cells: Int[Tensor, "N"]) -> Float[Tensor, "N 3"]:
         _, side_y, side_z = self.occupied.shape
         x, rest = cells // (side_y * side_z), cells % (side_y * side_z)
@@ -158,10 +174,3 @@ def _flat_indices(reachable: Bool[Tensor, "X Y Z"]) -> Int[Tensor, "N"]:
 
 def _clearance(cells: UInt8[Tensor, "X Y Z"] | None) -> UInt8[Tensor, "X Y Z"] | None:
     return None if cells is None else clearance_of(cells != 0)
-
-
-def _after_loading(grid: OccupancyGrid, _: object) -> None:
-    """Find anew what follows from what was loaded: searching the whole grid takes longer than an update."""
-    grid.reachable_cells = _flat_indices(grid.reachable)
-    grid.clearance = clearance_of(grid.occupied != 0)
-    grid.opaque_clearance = _clearance(grid.opaque)

@@ -26,7 +26,12 @@ from unmix_plugin.engine.geometry.camera_distortion import distort, undistort
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
-from unmix_plugin.scenes.geometry.foreground_rays import MIN_EXPLAINED, foreground_rays, share_through
+from unmix_plugin.scenes.geometry.foreground_rays import (
+    MIN_EXPLAINED,
+    foreground_rays,
+    share_through,
+    without_specks,
+)
 from unmix_plugin.scenes.geometry.line_footprints import LineView
 from unmix_plugin.scenes.geometry.world_carving import carve_world
 from unmix_plugin.scenes.scene import Scene
@@ -53,7 +58,10 @@ BLOCK_CELLS = 1 << 15
 
 
 def carve(
-    scene: Scene, resolution: int, foreground: list[Bool[np.ndarray, "_ _"]] | None = None
+    scene: Scene,
+    resolution: int,
+    foreground: list[Bool[np.ndarray, "_ _"]] | None = None,
+    cameras: Cameras | None = None,
 ) -> Bool[np.ndarray, "R R R"]:
     """Cells of the scene box, or of the world contracted around it, that may be occupied.
 
@@ -61,11 +69,12 @@ def carve(
         scene: With alpha its hull is carved; without, what hardly any training camera sees.
         resolution: Cells along each edge of the box.
         foreground: For each training view True on pixels that may show something; None takes them from alpha.
+        cameras: Of the training views; None takes those of the scene.
     Returns:
         True where something may be.
     """
     indices = list(scene.train_indices)
-    cameras, box = scene.cameras[indices], scene.scene_box
+    cameras, box = scene.cameras[indices] if cameras is None else cameras, scene.scene_box
     if scene.is_unbounded:
         return carve_world(cameras, box, resolution)
     if not scene.has_alpha:
@@ -74,7 +83,7 @@ def carve(
     if foreground is None:
         foreground = [foreground_mask(scene, index) for index in indices]
     fair = max(1, math.ceil(FAIR_SHARE * len(indices)))
-    rays = foreground_rays(cameras, [_without_specks(mask) for mask in foreground])
+    rays = foreground_rays(cameras, [without_specks(mask) for mask in foreground])
     witnesses = needed_witnesses(cameras, foreground, box, rays)
     kept = carve_box(cameras, foreground, box, resolution, fair, witnesses)
     if share_through(rays, box, kept) >= MIN_EXPLAINED:
@@ -96,13 +105,6 @@ def needed_witnesses(
         if shares[-1] >= MIN_EXPLAINED:
             return witnesses
     return WITNESSES[int(np.argmax(shares))]
-
-
-def _without_specks(foreground: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """Foreground that has neighbours: single pixels in the air need no hull behind them."""
-    from scipy.ndimage import binary_opening  # slow to import, and most commands carve nothing
-
-    return binary_opening(foreground, np.ones((2, 2), dtype=bool))
 
 
 def foreground_mask(scene: Scene, index: int) -> Bool[np.ndarray, "H W"]:

@@ -41,3 +41,10 @@ def share_through(rays: RayBundle, box: SceneBox, hull: Bool[np.ndarray, "R R R"
         x, y, z = (box.normalise(points) * cells).long().clamp(0, cells - 1).unbind(-1)
         meets |= kept[x, y, z] & (t_far > t_near)
     return float(meets.double().mean())
+
+
+def without_specks(foreground: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """Foreground that has neighbours: single pixels in the air need no hull behind them."""
+    from scipy.ndimage import binary_opening  # slow to import, and most commands carve nothing
+
+    return binary_opening(foreground, np.ones((2, 2), dtype=bool))
