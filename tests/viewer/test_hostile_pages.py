@@ -1,12 +1,14 @@
 """Pages that send nonsense, leave, come in crowds or are not allowed in: the others go on."""
 
 import math
+import time
 
 import msgspec
 import pytest
 
 from tests.viewer.pages import has_control, opened, page_of, serving, show_layer
 from unmix_plugin.viewer.gate import MOST_CLIENTS
+from unmix_plugin.viewer.token_prompt import TokenPrompt
 
 
 @pytest.mark.parametrize(
@@ -121,6 +123,18 @@ def test_a_page_must_give_the_token_before_it_sees_anything(source):
         enter_token(page, "sesame")
         page.wait_until(lambda: bool(page.pictures))
         assert not has_control(page, "token")
+
+
+def test_a_page_that_answers_at_once_is_heard(source, monkeypatch):
+    ask = TokenPrompt.__init__
+
+    def ask_slowly(*words):
+        ask(*words)
+        time.sleep(1.0)
+
+    monkeypatch.setattr(TokenPrompt, "__init__", ask_slowly)
+    with serving(source, token="sesame") as (viewer, _), page_of(viewer) as page:
+        try_a_wrong_token(page)
 
 
 def test_the_right_token_is_let_in_while_another_page_guesses(source):

@@ -57,9 +57,10 @@ class TokenPrompts:
         """Ask a page; False if too many from its address are asked already."""
         if not self._gate.enter(client.client_id, address):
             return False
-        prompt = TokenPrompt(client, self._gate)
-        with self._lock:
-            self._prompts[client.client_id] = prompt
+        with client.atomic():  # nobody can answer before the answer is listened for
+            prompt = TokenPrompt(client, self._gate)
+            with self._lock:
+                self._prompts[client.client_id] = prompt
         return True
 
     def leave(self, client: viser.ClientHandle) -> None:
