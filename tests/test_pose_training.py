@@ -1,4 +1,4 @@
-"""Training that corrects poses: it carves by corrected cameras, goes on where it stopped, and its views are corrected."""
+"""Training that corrects poses: it carves by corrected cameras, goes on where it stopped, and moves its views."""
 
 import io
 import json
