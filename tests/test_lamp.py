@@ -12,7 +12,7 @@ from tests.method_factory import BOX, CAMERA, CONFIG, initial_data, make_model, 
 from unmix_plugin.editing.edited_field import EditedField
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.lamp import Lamp, MovingLamp
-from unmix_plugin.lamp_shadows import lamp_visibility, visible_part
+from unmix_plugin.lamp_shadows import FINEST, ShadowDetail, lamp_visibility, visible_part
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.model_settings import UnmixModelConfig
 from unmix_plugin.rendering.grid_cells import clearance_of
@@ -65,6 +65,20 @@ def test_what_stands_before_the_lamp_casts_a_shadow_and_what_stands_behind_does_
     assert_close(found[1:], torch.ones(2))
 
 
+def test_shadows_come_nearer_and_get_sharper_until_training_ends():
+    plate = torch.zeros(64, 64, 64, dtype=torch.uint8)
+    plate[:, :, 32:36] = 1
+    below = torch.tensor([[0.0, 0.0, -0.2], [0.0, 0.0, -0.7]])
+    lamps, clearance = below + torch.tensor([0.0, 0.0, 5.0]), clearance_of(plate != 0)
+    first, middle, last = (
+        visible_part(below, lamps, BOX, clearance, ShadowDetail.at(progress)) for progress in (0.0, 0.5, 1.0)
+    )
+    assert torch.equal(visible_part(below, lamps, BOX, clearance), last)
+    assert bool((first > middle).all() & (middle > last).all())
+    assert float(last.max()) < 0.05
+    assert ShadowDetail.at(1.0) == FINEST
+
+
 def test_the_slope_of_the_visible_part_follows_what_moving_the_lamp_changes():
     """Against differences of the blurred visible part, near a shadow's edge."""
     positions = torch.tensor([-0.5, 0.0, -0.1]) + 0.05 * torch.randn(4000, 3)
@@ -75,7 +89,9 @@ def test_the_slope_of_the_visible_part_follows_what_moving_the_lamp_changes():
         with torch.no_grad():
             lamp.change.copy_(torch.tensor([0.0, change, 0.0]))
         generator = torch.Generator().manual_seed(0)
-        return lamp_visibility(lamp, origins, positions, BOX, clearance_of(wall() != 0), generator).mean()
+        return lamp_visibility(
+            lamp, origins, positions, BOX, clearance_of(wall() != 0), ShadowDetail.at(0.0), generator
+        ).mean()
 
     high, low = (float(mean_visible(change).detach()) for change in (0.05, -0.05))
     expected = (high - low) / 0.1

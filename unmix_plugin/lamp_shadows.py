@@ -8,6 +8,8 @@ Notation: `S` samples, `X Y Z` cells of a grid over the scene box.
 
 from __future__ import annotations
 
+from dataclasses import astuple, dataclass
+
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
@@ -17,12 +19,28 @@ from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.lamp import MovingLamp
 from unmix_plugin.rendering.marching import count_samples
 
-CLEAR_CELLS = 8.0
-"""Way from a place towards the lamp, in cells, that casts no shadow: surfaces are as thick as that while they form."""
-DARK_CELLS = 5.0
-"""Opaque cells on the way to the lamp that leave 1 / e of its light."""
-_SPREAD = 0.05
-"""Standard deviation of the points beside the lamp's middle along each axis, in its distance."""
+
+@dataclass(frozen=True)
+class ShadowDetail:
+    """How sharp shadows are. Surfaces are thick while they form, and so are their shadows."""
+
+    clear_cells: float
+    """Way from a place towards the lamp, in cells, that casts no shadow: a surface would else lie in its own."""
+    dark_cells: float
+    """Opaque cells on the way to the lamp that leave 1 / e of its light."""
+    spread: float
+    """Standard deviation of the points beside the lamp's middle along each axis, in its distance."""
+
+    @staticmethod
+    def at(progress: float) -> ShadowDetail:
+        """When that part of the training is over, from 0 to 1; each number changes by equal factors."""
+        ends = zip(astuple(_FIRST), astuple(FINEST), strict=True)
+        return ShadowDetail(*(first * (last / first) ** progress for first, last in ends))
+
+
+_FIRST = ShadowDetail(clear_cells=8.0, dark_cells=5.0, spread=0.05)
+FINEST = ShadowDetail(clear_cells=3.0, dark_cells=2.0, spread=0.02)
+"""At the end of training, and in renders."""
 
 
 def lamp_visibility(
@@ -31,24 +49,28 @@ def lamp_visibility(
     positions: Float[Tensor, "S 3"],
     box: SceneBox,
     clearance: UInt8[Tensor, "X Y Z"],
+    detail: ShadowDetail = FINEST,
     generator: torch.Generator | None = None,
 ) -> Float[Tensor, "S"]:
     """Part of the lamp's light that reaches samples of rays from `origins`, [0, 1]; differentiable in the lamp's place.
 
     Args:
         clearance: 0 in the cells of the box that cast shadows; in others what `clearance_of` says.
+        detail: How sharp they are.
         generator: Draws two points beside the lamp's middle for each sample; None takes four fixed ones.
     """
     origins, positions = origins.detach(), positions.detach()
     middle = lamp.positions(origins)
-    fixed, spread = middle.detach(), _SPREAD * float(lamp.first_place.norm())
+    fixed, spread = middle.detach(), detail.spread * float(lamp.first_place.norm())
     if generator is None:
         corners = spread * positions.new_tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
-        parts = [visible_part(positions, fixed + corner, box, clearance) for corner in corners]
+        parts = [visible_part(positions, fixed + corner, box, clearance, detail) for corner in corners]
         return torch.stack(parts).mean(dim=0)
     drawn = torch.randn(positions.shape, generator=generator, device=generator.device)
     offsets = spread * drawn.to(positions)
-    one, other = (visible_part(positions, fixed + shift, box, clearance) for shift in (offsets, -offsets))
+    one, other = (
+        visible_part(positions, fixed + shift, box, clearance, detail) for shift in (offsets, -offsets)
+    )
     # Stein's identity: the mean of these slopes is the gradient of the visible part, blurred over the points.
     slopes = ((one - other) / (2 * spread**2))[:, None] * offsets
     return (one + other) / 2 + (slopes * (middle - fixed)).sum(dim=-1)
@@ -60,11 +82,12 @@ def visible_part(
     lamps: Float[Tensor, "S 3"],
     box: SceneBox,
     clearance: UInt8[Tensor, "X Y Z"],
+    detail: ShadowDetail = FINEST,
 ) -> Float[Tensor, "S"]:
     """Part of the light from points outside the box that the box lets through to each position."""
     towards = normalize(lamps - positions, dim=-1)
     cell = float((box.size / torch.tensor(clearance.shape, device=box.size.device)).max())
     t_far = box.intersect(positions, towards)[1]
-    t_near = torch.full_like(t_far, CLEAR_CELLS * cell)
+    t_near = torch.full_like(t_far, detail.clear_cells * cell)
     counts = count_samples(box.normalise(positions), towards / box.size, t_near, t_far, clearance, cell)
-    return torch.exp(-(counts / DARK_CELLS).square())
+    return torch.exp(-(counts / detail.dark_cells).square())

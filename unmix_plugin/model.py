@@ -30,6 +30,7 @@ from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCal
 from unmix_plugin.field import UnmixField
 from unmix_plugin.first_endmembers import first_endmembers, first_specular_spectra
 from unmix_plugin.grid_upkeep import is_due, record_seen, update_grid
+from unmix_plugin.lamp_shadows import ShadowDetail
 from unmix_plugin.model_parts import (
     make_field,
     make_grid,
@@ -185,7 +186,7 @@ class UnmixModel(Model):
         generator = self.generator if self.training else None
         if self.poses is not None and self.training and self._fineness >= self.config.pose_refinement.start:
             ray_bundle = self.poses(ray_bundle)
-        renderer = replace(self.renderer, step=self._training_step) if self.training else self.renderer
+        renderer = self._training_renderer if self.training else self.renderer
         rendered = renderer.render(self.field, ray_bundle, generator)
         coefficients = rendered.coefficients
         seen = (
@@ -287,9 +288,10 @@ class UnmixModel(Model):
             torch.autograd.grad(spectra.sum(), parameters, allow_unused=True)
 
     @property
-    def _training_step(self) -> float:
-        """Distance of samples in the present training step."""
-        return self.step * self._coarseness(self._progress)
+    def _training_renderer(self) -> VolumeRenderer:
+        """That of the present training step: samples may be farther apart, and shadows softer, than in the end."""
+        step = self.step * self._coarseness(self._progress)
+        return replace(self.renderer, step=step, shadow_detail=ShadowDetail.at(self._progress))
 
     def _coarseness(self, progress: float) -> float:
         """How many times farther apart samples are in training than in the end: large images begin coarsely."""
@@ -304,8 +306,9 @@ class UnmixModel(Model):
             levels = self.config.pose_refinement.level_weights(len(self.field.level_weights), self._fineness)
             self.field.level_weights.copy_(torch.tensor(levels))
         if is_due(step):
-            renderer = replace(self.renderer, step=self._training_step)
-            update_grid(self.grid, self.field, renderer, self.processes, self.generator, progress)
+            update_grid(
+                self.grid, self.field, self._training_renderer, self.processes, self.generator, progress
+            )
             self.processes.mean(self.guide.margin_variance)
 
     @torch.no_grad()

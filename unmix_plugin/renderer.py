@@ -19,7 +19,7 @@ from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.front_to_back import FrontToBack, composite_front_to_back
-from unmix_plugin.lamp_shadows import lamp_visibility
+from unmix_plugin.lamp_shadows import FINEST, ShadowDetail, lamp_visibility
 from unmix_plugin.lit_samples import LitSamples, points_of, samples_carrying_weight
 from unmix_plugin.rendering.compositing import accumulate, volume_weights
 from unmix_plugin.rendering.contracted_marching import march_contracted, march_contracted_first
@@ -76,6 +76,8 @@ class VolumeRenderer:
     opaque_clearance: UInt8[Tensor, "X Y Z"] | None = None
     """0 in the cells that cast shadows in the light of a lamp that moves with the camera, in others what `clearance_of`
     says; None without such a lamp."""
+    shadow_detail: ShadowDetail = FINEST
+    """How sharp those shadows are."""
 
     def render(
         self, field: CoefficientField, ray_bundle: RayBundle, generator: torch.Generator | None = None
@@ -220,7 +222,7 @@ class VolumeRenderer:
         if field.moving_lamp is None or self.opaque_clearance is None:
             return None
         lamp, clearance = field.moving_lamp, self.opaque_clearance
-        return lamp_visibility(lamp, origins, positions, self.box, clearance, generator)
+        return lamp_visibility(lamp, origins, positions, self.box, clearance, self.shadow_detail, generator)
 
     def _march(self, ray_bundle: RayBundle, generator: torch.Generator | None) -> PackedSamples:
         """All samples of rays; a generator shifts those of each ray at random."""
