@@ -123,7 +123,7 @@ class Page:
         """Send anything."""
         self._socket.send(data)
 
-    def wait_until(self, holds: Callable[[], bool], timeout_s: float = 30.0) -> None:
+    def wait_until(self, holds: Callable[[], bool], timeout_s: float = 120.0) -> None:
         """Wait for something to become true.
 
         Raises:

@@ -20,5 +20,5 @@ def test_compiling_is_said_only_when_a_kernel_is_not_in_the_cache(tmp_path, monk
     with announce_kernel_compilation(Console(file=out)):
         if compiles:
             (tmp_path / "wp_module_new").mkdir()
-            assert is_said.wait(20)
+            assert is_said.wait(120)
     assert out.getvalue().count("compiling kernels") == compiles

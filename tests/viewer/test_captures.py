@@ -38,7 +38,7 @@ def captured(services, camera, take, subpixels=1):
     request = PictureRequest(camera, Edit(), subpixels)
     capture = StripCapture(services.loop, request, take, done, parts.append)
     capture.start()
-    assert ended.wait(30)
+    assert ended.wait(120)
     return reasons[0], parts
 
 
@@ -97,7 +97,7 @@ def test_a_capture_can_be_cancelled(services, monkeypatch):
         lambda _: None,
     )
     capture.start()
-    assert ended.wait(30)
+    assert ended.wait(120)
     assert reasons == ["cancelled"]
 
 

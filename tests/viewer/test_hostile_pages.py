@@ -88,7 +88,7 @@ def test_pages_that_leave_in_mid_render_are_forgotten(viewer):
             page.look_from(0.4)
     with opened(viewer):
         with viewer.services.loop._changed:  # told of every view that is removed
-            assert viewer.services.loop._changed.wait_for(lambda: viewer.services.loop.num_views == 1, 20)
+            assert viewer.services.loop._changed.wait_for(lambda: viewer.services.loop.num_views == 1, 120)
         assert viewer.num_clients == 1
 
 

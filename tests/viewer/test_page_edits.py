@@ -89,7 +89,7 @@ def test_a_colour_that_is_refused_again_and_again_is_one_notice(viewer, monkeypa
     with opened(viewer) as page:
         for green in range(10):
             page.set("colour", (10, green, 10))
-            assert refused.acquire(timeout=30)
+            assert refused.acquire(timeout=120)
         page.wait_until(lambda: bool(page.notices))
         show_layer(page, "depth")
         assert [text for _, text in page.notices].count("that can't be") == 1

@@ -23,7 +23,7 @@ def test_stopping_frees_the_port_and_every_thread(source):
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         probe.bind(("127.0.0.1", port))
     for thread in set(threading.enumerate()) - before:
-        thread.join(20)
+        thread.join(120)
         assert not thread.is_alive(), thread
 
 
@@ -92,7 +92,7 @@ def test_waiting_ends_when_no_page_is_left(source, monkeypatch):
             waiting.start()
             waiting.join(2.5)
             assert waiting.is_alive()
-        waiting.join(30)
+        waiting.join(120)
         assert not waiting.is_alive()
 
 

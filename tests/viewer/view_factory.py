@@ -110,7 +110,7 @@ class Screen:
         self._changed = threading.Condition()
         self.view = View(show=self._show, report=self._report)
 
-    def wait_until(self, holds: Callable[[], bool], timeout_s: float = 20.0) -> None:
+    def wait_until(self, holds: Callable[[], bool], timeout_s: float = 120.0) -> None:
         """Wait for something to become true; fails the test if it does not."""
         with self._changed:
             assert self._changed.wait_for(holds, timeout_s), (len(self.shown), self.reports)

@@ -47,7 +47,7 @@ def contest(monkeypatch):
             step(device.training_turn(), "training")
         is_over.set()
         device.is_training = False
-        guest.join(20)
+        guest.join(120)
         return taken["guest"] / sum(taken.values())
 
     return run
@@ -122,7 +122,7 @@ def test_a_guest_that_waits_for_credit_goes_on_when_training_ends():
     guest.start()
     assert not went.wait(0.1)
     device.is_training = False
-    assert went.wait(5)
+    assert went.wait(120)
     guest.join()
 
 
@@ -179,5 +179,5 @@ def test_a_turn_of_training_that_has_not_begun_comes_after_the_guests_turn_under
     for _ in range(3):
         with device.guest_turn():
             order.append("guest")
-    training.join(20)
+    training.join(120)
     assert order == ["training", "guest", "guest", "guest"]

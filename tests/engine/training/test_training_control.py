@@ -23,7 +23,7 @@ def in_background(work):
     return thread
 
 
-def wait_for(holds, timeout_s=20.0):
+def wait_for(holds, timeout_s=120.0):
     until = time.monotonic() + timeout_s
     while not holds():
         assert time.monotonic() < until
@@ -40,7 +40,7 @@ def wait_for_rounds(control, number):
 
     control.wait_while_paused = counted
     for _ in range(number):
-        assert seen.acquire(timeout=20)
+        assert seen.acquire(timeout=120)
     control.wait_while_paused = look
 
 
@@ -82,7 +82,7 @@ def test_a_pause_stops_the_steps_and_the_clock_until_it_is_over(short_config):
     wait_for_rounds(control, 3)
     assert (trainer.step, trainer.clock.seconds) == (5, seconds)
     control.resume()
-    thread.join(20)
+    thread.join(120)
     assert trainer.step == 12
     assert not control.is_running
     assert not control.device.is_training
@@ -101,7 +101,7 @@ def test_a_paused_training_saves_when_asked_and_not_otherwise(short_config):
     assert trainer.step == 3
     assert trainer.control.device.training_turns <= turns + 1
     trainer.control.resume()
-    thread.join(20)
+    thread.join(120)
 
 
 def test_a_checkpoint_that_is_asked_for_is_saved_after_the_step(short_config):
@@ -161,7 +161,7 @@ def test_the_terminal_says_when_training_pauses_and_goes_on(short_config):
     thread = in_background(trainer.train)
     wait_for(lambda: "paused at step 5" in out.getvalue())
     trainer.control.resume()
-    thread.join(20)
+    thread.join(120)
     assert out.getvalue().count("paused") == 1
     assert "resumed at step 5" in out.getvalue()
 

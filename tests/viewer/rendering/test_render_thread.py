@@ -20,7 +20,7 @@ def test_while_training_runs_pictures_follow_it(tmp_path, monkeypatch):
         screen.view.largest_height = LARGEST
         loop.add(screen.view)
         loop.move(screen.view, some_pose())
-        until = time.monotonic() + 60
+        until = time.monotonic() + 120
         while len(screen.shown) < 6:
             assert time.monotonic() < until
             with control.device.training_turn(), torch.no_grad():

@@ -68,7 +68,7 @@ class Ending:
         self._ended.set()
 
     def wait(self):
-        assert self._ended.wait(60)
+        assert self._ended.wait(120)
         return self
 
 
@@ -117,7 +117,7 @@ def test_videos_are_rendered_in_turn_and_can_be_cancelled(tmp_path, run_instead)
     begun = threading.Event()
     first.job.progress = lambda _: begun.set()
     queue.start(first.job)
-    assert begun.wait(60)
+    assert begun.wait(120)
     queue.start(second.job)
     queue.cancel(second.job)
     run_instead("print('rendering: 1 of 1 done')")
@@ -136,7 +136,7 @@ def test_stopping_ends_the_encoder_that_the_render_started(tmp_path, run_instead
     queue, one, begun = VideoQueue(), Ending(tmp_path), threading.Event()
     one.job.progress = lambda _: begun.set()
     queue.start(one.job)
-    assert begun.wait(60)
+    assert begun.wait(120)
     queue.stop()
     # Its output is read to the end, which comes only once the encoder, which shares it, has ended.
     assert one.wait().reason == "cancelled"
