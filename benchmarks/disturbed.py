@@ -1,6 +1,6 @@
 """What do careless captures cost? The demo scene, undisturbed and disturbed, trained with the defaults for equal steps.
 
-    python benchmarks/disturbed.py [--steps 300] [--only light]
+    python benchmarks/disturbed.py [--steps 1200] [--only light]
 
 Disturbed are the training views only, except for the light that moves with the camera; every figure is taken on true
 evaluation views. Noise is trained twice, with the defaults and with values kept and bands that count alike.
@@ -37,7 +37,7 @@ WORDS = {
 class Options:
     """Train on the demo scene, undisturbed and disturbed."""
 
-    steps: int = 300
+    steps: int = 1200
     """Of each training."""
     only: tuple[str, ...] = ()
     """Disturbances to train on; all if none is given. What is written is named after them: disturbed-light."""
