@@ -103,12 +103,11 @@ class Session:
         gui = self.client.gui
         self._status = gui.add_html(html.paragraph("waiting for the first picture"))
         self._legend = gui.add_html("")
-        with self.client.atomic():  # nobody can use a control before it is listened to
-            tabs = gui.add_tab_group()
-            for panel in panels:
-                if panel.applies(self.services):
-                    with tabs.add_tab(panel.title):
-                        panel.build(self)
+        tabs = gui.add_tab_group()
+        for panel in panels:
+            if panel.applies(self.services):
+                with tabs.add_tab(panel.title):
+                    panel.build(self)
         self.services.loop.add(self.view)
         if self.is_closed:  # the client left while its panels were built
             self.services.loop.remove(self.view)
