@@ -29,7 +29,8 @@ from unmix_plugin.engine.geometry.contraction import contracted_unit
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.engine.instantiate import InstantiateConfig, Target
 from unmix_plugin.errors import require
-from unmix_plugin.lamp import SHADOW_LOGIT, Lamp, MovingLamp
+from unmix_plugin.lamp import Lamp, MovingLamp
+from unmix_plugin.lamp_shading import LOBES, Lamplight, LampShading, LitSurface
 from unmix_plugin.networks import bias_free_network, in_parts, rows_of_outputs
 from unmix_plugin.rendering.hash_encoding import HashGridLayout, hash_encode
 
@@ -103,12 +104,13 @@ class CoefficientField(Field):
         positions: Float[Tensor, "S 3"],
         directions: Float[Tensor, "S 3"],
         features: Float[Tensor, "S G"],
-        visible: Float[Tensor, "S"] | None = None,
+        light: Lamplight | None = None,
     ) -> dict[str, Tensor]:
         """`abundances` (S, K), `scaled_abundances` (S, K) and `specular_coefficients` (S, J) along `directions`.
 
         Args:
-            visible: Part of the light of `moving_lamp` that reaches each sample; None where there is no such lamp.
+            light: What reaches each sample of `moving_lamp`; None where there is no such lamp, or to see all places
+                as if it shone on them squarely, without gloss.
         """
 
     @abstractmethod
@@ -196,14 +198,15 @@ class UnmixField(CoefficientField):
     def _make_networks(self) -> None:
         width, num_features = self.config.hidden_width, self.config.num_features + 1
         num_scales = 1 if self.config.scale == "shared" else self.num_endmembers
+        num_seen = NUM_DIRECTION_FEATURES if self.lamp is None else len(LOBES)
         self.density_network = bias_free_network(self.num_encoded, width, num_features)
         self.material_network = bias_free_network(num_features, width, self.num_endmembers + num_scales)
-        seen = num_features + NUM_DIRECTION_FEATURES
         if self.num_specular:
-            self.specular_network = bias_free_network(seen, width, self.num_specular + 1)
+            self.specular_network = bias_free_network(num_features + num_seen, width, self.num_specular + 1)
         if self.lit_by_camera:
-            num_shading = NUM_DIRECTION_FEATURES + (self.lamp is not None)  # the last is for its shadow
-            self.shading_network = bias_free_network(num_features, width, num_shading)
+            self.shading_network = bias_free_network(num_features, width, NUM_DIRECTION_FEATURES)
+        if self.lamp is not None:
+            self.lamp_shading = LampShading(num_features, width)
 
     @property
     def moving_lamp(self) -> MovingLamp | None:
@@ -242,14 +245,15 @@ class UnmixField(CoefficientField):
         positions: Float[Tensor, "S 3"],
         directions: Float[Tensor, "S 3"],
         features: Float[Tensor, "S G"],
-        visible: Float[Tensor, "S"] | None = None,
+        light: Lamplight | None = None,
     ) -> dict[str, Tensor]:
         """`abundances` (S, K), `scaled_abundances` S a (S, K) and `specular_coefficients` h u (S, J)."""
-        abundances, scales = self._material(features, directions, visible)
+        lit = None if light is None or self.lamp is None else self.lamp_shading(features, directions, light)
+        abundances, scales = self._material(features, directions, lit)
         return {
             "abundances": abundances,
             "scaled_abundances": scales * abundances,
-            "specular_coefficients": self._specular(directions, features),
+            "specular_coefficients": self._specular(directions, features, lit),
         }
 
     def abundances_of(self, features: Float[Tensor, "S G"]) -> Float[Tensor, "S K"]:
@@ -260,7 +264,7 @@ class UnmixField(CoefficientField):
         self,
         features: Float[Tensor, "S G"],
         directions: Float[Tensor, "S 3"] | None = None,
-        visible: Float[Tensor, "S"] | None = None,
+        lit: LitSurface | None = None,
     ) -> tuple[Float[Tensor, "S K"], Float[Tensor, "S C"]]:
         """Abundances and scales; C is 1 or K. Only scales depend on directions, and only in a moving light."""
         material = rows_of_outputs(self.material_network, features)
@@ -269,21 +273,23 @@ class UnmixField(CoefficientField):
         scales = material[self.num_endmembers :].t()
         if self.lit_by_camera and directions is not None:
             # A sum over harmonics rather than a network of both: that took textures for shading.
-            shading = self.shading_network(features)
-            changes = shading[:, :NUM_DIRECTION_FEATURES] * direction_features(directions)
+            changes = self.shading_network(features) * direction_features(directions)
             scales = scales + changes.sum(dim=-1, keepdim=True)
-            if visible is not None:
-                shadow = SHADOW_LOGIT + shading[:, NUM_DIRECTION_FEATURES:]
-                scales = scales - (1 - visible[:, None]) * shadow
-        return abundances, torch.sigmoid(scales)
+        scales = torch.sigmoid(scales)
+        return abundances, scales if lit is None else scales * lit.brightness
 
     def _specular(
-        self, directions: Float[Tensor, "S 3"], features: Float[Tensor, "S G"]
+        self, directions: Float[Tensor, "S 3"], features: Float[Tensor, "S G"], lit: LitSurface | None
     ) -> Float[Tensor, "S J"]:
         if self.num_specular == 0:
             return features.new_zeros(len(features), 0)
-        seen = (features, direction_features(directions))
-        factors = torch.sigmoid(rows_of_outputs(self.specular_network, *seen) + self.specular_bias / 2)
+        if self.lamp is None:
+            seen = direction_features(directions)
+        else:
+            seen = features.new_zeros(len(features), len(LOBES)) if lit is None else lit.lobes
+        factors = torch.sigmoid(
+            rows_of_outputs(self.specular_network, features, seen) + self.specular_bias / 2
+        )
         return (factors[:1] * factors[1:]).t()
 
 

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.field import CoefficientField
+from unmix_plugin.lamp_shading import Lamplight
 from unmix_plugin.rendering.compositing import accumulate
 from unmix_plugin.rendering.marching import FirstSamples
 from unmix_plugin.rendering.merging import MergedSamples, MergeLimits, merge_samples
@@ -38,7 +39,7 @@ _DENSER = 2.0
 """How many times denser what follows is taken to be than what was looked at: most rays have just entered a surface."""
 
 _March = Callable[[Float[Tensor, "A 3"], Float[Tensor, "A 3"], Float[Tensor, "A"], int], FirstSamples]
-_Visible = Callable[[Float[Tensor, "S 3"], Float[Tensor, "S 3"]], Float[Tensor, "S"] | None]
+_LightAt = Callable[[Float[Tensor, "S 3"], Float[Tensor, "S 3"]], Lamplight | None]
 
 
 @dataclass(frozen=True)
@@ -51,8 +52,8 @@ class FrontToBack:
     """Distance of samples, for which each counts."""
     smallest_weight: float
     """Samples that contribute no more of their ray's light are left out."""
-    visible: _Visible
-    """From origins of rays and positions on them to the part of a moving lamp's light that reaches them, as
+    light_at: _LightAt
+    """From origins of rays and positions on them to what of a moving lamp's light reaches them, as
     `CoefficientField.get_outputs` takes it."""
     residual_on_last_sample: bool = False
     """Whether the last sample of a ray takes all the light that is left."""
@@ -148,7 +149,7 @@ def composite_front_to_back(field: CoefficientField, ray_bundle: RayBundle, how:
         marched = waiting.join(_Front.before(new, origins)).marched(ray_bundle, how.march)
         front = going.join(marched)
         merged = _look(field, ray_bundle, front, how.merge_limits)
-        values = _values(field, ray_bundle, front.rays, merged, how.visible)
+        values = _values(field, ray_bundle, front.rays, merged, how.light_at)
         if totals is None or last is None:
             totals = values.packed.new_zeros(len(left), values.packed.shape[1])
             last = torch.zeros_like(totals) if how.residual_on_last_sample else totals[:0]
@@ -190,13 +191,12 @@ def _values(
     ray_bundle: RayBundle,
     rays: Int[Tensor, "A"],
     merged: MergedSamples,
-    visible: _Visible,
+    light_at: _LightAt,
 ) -> Coefficients:
     """What groups of samples look like."""
     origins, along = _lines(ray_bundle, rays.index_select(0, merged.ray_indices))
     positions = torch.addcmul(origins, along, merged.t[:, None])
-    lit = visible(origins, positions)
-    outputs = field.get_outputs(positions, along, merged.features, *(() if lit is None else (lit,)))
+    outputs = field.get_outputs(positions, along, merged.features, light_at(origins, positions))
     return Coefficients.of(
         torch.ones_like(merged.t),
         merged.t,

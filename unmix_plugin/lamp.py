@@ -19,8 +19,6 @@ from torch.nn.functional import normalize
 
 _PACE = 0.4
 """Shift of the lamp, in its first distance, for a change of its parameter by 1."""
-SHADOW_LOGIT = 2.0
-"""What a shadow takes off the logit of brightness before training learns it for each place."""
 LampFrame = Literal["turntable", "camera"]
 _FRAMES: tuple[LampFrame, ...] = ("turntable", "camera")
 NUM_LAMP_NUMBERS = 10

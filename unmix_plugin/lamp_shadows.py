@@ -17,6 +17,7 @@ from torch.nn.functional import normalize
 
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.lamp import MovingLamp
+from unmix_plugin.lamp_shading import Lamplight
 from unmix_plugin.rendering.marching import count_samples
 
 
@@ -41,6 +42,23 @@ class ShadowDetail:
 _FIRST = ShadowDetail(clear_cells=8.0, dark_cells=5.0, spread=0.05)
 FINEST = ShadowDetail(clear_cells=3.0, dark_cells=2.0, spread=0.02)
 """At the end of training, and in renders."""
+
+
+def lamplight(
+    lamp: MovingLamp,
+    origins: Float[Tensor, "S 3"],
+    positions: Float[Tensor, "S 3"],
+    box: SceneBox,
+    clearance: UInt8[Tensor, "X Y Z"],
+    detail: ShadowDetail = FINEST,
+    generator: torch.Generator | None = None,
+) -> Lamplight:
+    """What of a lamp's light reaches samples; arguments as `lamp_visibility` takes them. Only the visible part is
+    differentiable in the lamp's place: shading would move it to where wrong normals want it."""
+    visible = lamp_visibility(lamp, origins, positions, box, clearance, detail, generator)
+    with torch.no_grad():
+        towards = normalize(lamp.positions(origins) - positions, dim=-1)
+    return Lamplight(visible, towards)
 
 
 def lamp_visibility(

@@ -24,6 +24,7 @@ from unmix_plugin.field import (
     UnmixFieldConfig,
     direction_features,
 )
+from unmix_plugin.lamp_shading import Lamplight
 from unmix_plugin.networks import bias_free_network
 
 _NUM_FREQUENCIES = 2
@@ -76,7 +77,7 @@ class PublishedField(UnmixField):
         positions: Float[Tensor, "S 3"],
         directions: Float[Tensor, "S 3"],
         features: Float[Tensor, "S G"],
-        visible: Float[Tensor, "S"] | None = None,
+        light: Lamplight | None = None,
     ) -> dict[str, Tensor]:
         """As `UnmixField.get_outputs`, with the tint from the network of the abundances."""
         logits = self.material_network(features)

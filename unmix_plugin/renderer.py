@@ -19,7 +19,8 @@ from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.front_to_back import FrontToBack, composite_front_to_back
-from unmix_plugin.lamp_shadows import FINEST, ShadowDetail, lamp_visibility
+from unmix_plugin.lamp_shading import Lamplight
+from unmix_plugin.lamp_shadows import FINEST, ShadowDetail, lamplight
 from unmix_plugin.lit_samples import LitSamples, points_of, samples_carrying_weight
 from unmix_plugin.rendering.compositing import accumulate, volume_weights
 from unmix_plugin.rendering.contracted_marching import march_contracted, march_contracted_first
@@ -98,8 +99,8 @@ class VolumeRenderer:
         else:
             densities, features = seen.densities(), seen.features()
         origins = ray_bundle.origins.index_select(0, kept.ray_indices)
-        visible = self._visible(field, origins, positions, generator)
-        outputs = field.get_outputs(positions, along, features, *(() if visible is None else (visible,)))
+        light = self._lamplight(field, origins, positions, generator)
+        outputs = field.get_outputs(positions, along, features, light)
         if self.is_unbounded:
             near = self._near_cameras(kept.t)
             densities = scale_gradient(densities, near)
@@ -140,7 +141,7 @@ class VolumeRenderer:
             self._march_first,
             self.step,
             self.smallest_weight,
-            lambda starts, positions: self._visible(field, starts, positions),
+            lambda starts, positions: self._lamplight(field, starts, positions),
             self.residual_on_last_sample,
             self.rays_per_chunk,
         )
@@ -212,17 +213,17 @@ class VolumeRenderer:
         """
         return (t / self.space.half_edge).square().clamp(max=1.0)
 
-    def _visible(
+    def _lamplight(
         self,
         field: CoefficientField,
         origins: Float[Tensor, "S 3"],
         positions: Float[Tensor, "S 3"],
         generator: torch.Generator | None = None,
-    ) -> Float[Tensor, "S"] | None:
+    ) -> Lamplight | None:
         if field.moving_lamp is None or self.opaque_clearance is None:
             return None
         lamp, clearance = field.moving_lamp, self.opaque_clearance
-        return lamp_visibility(lamp, origins, positions, self.box, clearance, self.shadow_detail, generator)
+        return lamplight(lamp, origins, positions, self.box, clearance, self.shadow_detail, generator)
 
     def _march(self, ray_bundle: RayBundle, generator: torch.Generator | None) -> PackedSamples:
         """All samples of rays; a generator shifts those of each ray at random."""

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.lamp import MovingLamp
+from unmix_plugin.lamp_shading import Lamplight
 
 _GONE_SHARE, _WHOLE_SHARE = 0.25, 0.75
 """Kept share of a point up to which nothing of it is left, and from which it is as dense as before."""
@@ -93,11 +94,10 @@ class EditedField(CoefficientField):
         positions: Float[Tensor, "S 3"],
         directions: Float[Tensor, "S 3"],
         features: Float[Tensor, "S G"],
-        visible: Float[Tensor, "S"] | None = None,
+        light: Lamplight | None = None,
     ) -> dict[str, Tensor]:
         """`abundances`, `scaled_abundances` (S, K) of what is left, and `specular_coefficients` (S, G J)."""
-        known = () if visible is None else (visible,)
-        outputs = self.field.get_outputs(positions, directions, features, *known)
+        outputs = self.field.get_outputs(positions, directions, features, light)
         factors = self._renormalising(outputs["abundances"])
         abundances = outputs["abundances"] * factors
         shine = abundances @ self.gloss.T.to(abundances)
