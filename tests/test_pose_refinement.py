@@ -15,6 +15,7 @@ from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.rotations import rotation_matrix
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.field import CoefficientField
+from unmix_plugin.lamp_shading import Lamplight
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.pose_knots import Knots, row_waves
 from unmix_plugin.pose_refinement import LARGEST_STEP, PoseConfig, PoseRefinement
@@ -221,7 +222,7 @@ class Blob(CoefficientField):
         positions: torch.Tensor,
         directions: torch.Tensor,
         features: torch.Tensor,
-        visible: torch.Tensor | None = None,
+        light: Lamplight | None = None,
     ) -> dict[str, torch.Tensor]:
         abundances = self.abundances_of(features)
         specular = 0.3 * (1 + directions[:, :1] * directions[:, 1:2])

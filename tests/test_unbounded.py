@@ -16,7 +16,8 @@ from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.engine.processes.processes import Processes
 from unmix_plugin.field import UnmixField, UnmixFieldConfig
 from unmix_plugin.grid_upkeep import update_grid
-from unmix_plugin.renderer import VolumeRenderer, scale_gradient
+from unmix_plugin.renderer import VolumeRenderer
+from unmix_plugin.rendering.gradients import scale_gradient
 from unmix_plugin.rendering.grid_cells import clearance_of
 from unmix_plugin.rendering.occupancy import OccupancyGrid
 

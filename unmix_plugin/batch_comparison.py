@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from unmix_plugin.abundance_guide import AbundanceGuide
@@ -20,6 +20,9 @@ from unmix_plugin.spectral.coefficients import Coefficients
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.training_losses import LossConfig, compare_pixels, pixel_mean, spectral_losses
 from unmix_plugin.view_gains import ViewGains
+
+_MATTER = 0.01
+"""Opacity of pixels that show matter."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,26 @@ class BatchComparison:
             return {"psnr": (spectra.detach().clamp(0, 1) - measured).square().mean()}
 
         return -10 * torch.log10(mean_over_parts(parts, error)["psnr"].clamp(min=1e-12))
+
+    @staticmethod
+    def errors_of_poses(
+        parts: list[SensorPart],
+    ) -> tuple[Int[Tensor, " R"], Float[Tensor, " R"], Bool[Tensor, " R"]]:
+        """Of each pixel the nearest knot of its pose, its mean squared error on black, and whether it shows matter in
+        the picture or in the scene."""
+        found: list[tuple[Tensor, ...]] = []
+        for part in parts:
+            measured, alpha = part.batch["spectra"], part.batch["alpha"]
+            seen, opacities = (
+                pixel_mean(part.outputs[name].detach(), len(measured))
+                for name in ("spectral", "accumulation")
+            )
+            knots = part.outputs["knots"].view(len(measured), -1)[:, 0]
+            found.append(
+                (knots, (seen - measured).square().mean(dim=1), torch.maximum(alpha, opacities) > _MATTER)
+            )
+        knots, squares, shows_matter = map(torch.cat, zip(*found, strict=True))
+        return knots, squares, shows_matter
 
     def observe(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> None:
         """Note how far margins of abundances are from those of measured spectra."""

@@ -198,7 +198,10 @@ class UnmixModel(Model):
             seen["cameras"] = ray_bundle.camera_indices
         if self.training and self.grid.met is not None:
             seen.update(met_by_rays(rendered, self.renderer.space))
-        return {**seen, **ray_outputs(rendered, ray_bundle)}
+        outputs = {**seen, **ray_outputs(rendered, ray_bundle)}
+        if self.poses is not None and self.training and self._fineness >= 1:
+            outputs = self.poses.believed(outputs, ray_bundle)
+        return outputs
 
     def get_loss_dict(
         self,
@@ -226,6 +229,9 @@ class UnmixModel(Model):
         if "met_densities" in outputs:
             self.grid.record_met(outputs["met_positions"], outputs["met_densities"])
         self.comparison.observe(outputs, batch)
+        if self.poses is not None and "knots" in outputs:
+            parts = self.comparison.parts(outputs, batch, self.materials)
+            self.poses.trust.observe(*self.comparison.errors_of_poses(parts))
 
     def warnings(self) -> list[str]:
         """Sensors whose pixels can't be unmixed into so many endmembers one by one."""
@@ -310,6 +316,8 @@ class UnmixModel(Model):
                 self.grid, self.field, self._training_renderer, self.processes, self.generator, progress
             )
             self.processes.mean(self.guide.margin_variance)
+            if self.poses is not None and self._fineness >= 1:
+                self.poses.trust.judge(self.processes)
 
     @torch.no_grad()
     def _bound_spectra(self, step: int, progress: float) -> None:

@@ -32,6 +32,8 @@ from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.rotations import rotation_matrix
 from unmix_plugin.errors import require
 from unmix_plugin.pose_knots import Knots, row_waves, similarities
+from unmix_plugin.pose_trust import PoseTrust
+from unmix_plugin.rendering.gradients import scale_gradient
 
 LARGEST_STEP = 0.25
 """Radians, or share of the distance to the scene's middle, beyond which a correction is undone; of a line camera in the
@@ -40,6 +42,8 @@ LINE_REACH = 0.25
 """Reach of a line camera as a share of its distance to the scene's middle, which is the reach of a frame camera. A row
 can hardly tell a shift from a turn: steps of equal effect would split between both what is mostly a turn, and parallax
 sorts it out slowly."""
+_COMPARED = ("spectral", "coefficients", "accumulation", "abundances")
+"""Outputs of rays that losses compare with pixels."""
 MOST_UNDONE = 0.5
 """Share of the views that may be undone before all are."""
 
@@ -123,6 +127,7 @@ class PoseRefinement(nn.Module):
         total = int(counts.sum())
         self.steps = nn.Parameter(torch.zeros(total, 6))
         self.lens = nn.Parameter(torch.zeros(3), requires_grad=self.num_lens > 0)
+        self.trust = PoseTrust(total)
         self.register_buffer("reach", torch.ones(total))
         shares = torch.where(counts > 1, LINE_REACH, 1.0).repeat_interleave(counts)
         self.register_buffer("shares", shares, persistent=False)
@@ -170,13 +175,14 @@ class PoseRefinement(nn.Module):
 
     @torch.no_grad()
     def figures(self) -> dict[str, Tensor]:
-        """`pose_turn_deg` and `pose_shift` (share of the distance to the scene's middle), means over knots, and
-        `poses_undone`."""
+        """`pose_turn_deg` and `pose_shift` (share of the distance to the scene's middle), means over knots,
+        `poses_undone`, and the share of the knots that is hardly believed, `poses_doubted`."""
         turns, shifts = self._sizes().mean(dim=0)
         return {
             "pose_turn_deg": turns.rad2deg(),
             "pose_shift": shifts,
             "poses_undone": (~self.is_free).sum().float(),
+            "poses_doubted": (self.trust.weights < 0.5).float().mean(),
         }
 
     def penalty(self, config: PoseConfig) -> Float[Tensor, ""]:
@@ -187,6 +193,24 @@ class PoseRefinement(nn.Module):
         large = steps.square().mean() + self.lens.square().sum()
         return config.penalty * large + config.roughness * bent.square().sum() / max(1, len(bent))
 
+    def nearest_knots(self, rays: RayBundle) -> Int[Tensor, " R"]:
+        """Of rays as `forward` takes them."""
+        assert rays.image_y is not None
+        views = rays.camera_indices
+        return self.first[views] + self._place(views, rays.image_y).round().long()
+
+    def believed(self, outputs: dict[str, Tensor], rays: RayBundle) -> dict[str, Tensor]:
+        """Outputs of training rays through which these shape the scene as far as their poses are believed, and the
+        `knots` (R) that are nearest to them."""
+        knots = self.nearest_knots(rays)
+        weights = self.trust.weights[knots]
+        compared = {
+            name: scale_gradient(value, weights.view(-1, *[1] * (value.dim() - 1)))
+            for name, value in outputs.items()
+            if name in _COMPARED
+        }
+        return {**outputs, **compared, "knots": knots}
+
     def forward(self, rays: RayBundle) -> RayBundle:
         """Rays of training views as their corrected cameras send them.
 
@@ -196,6 +220,9 @@ class PoseRefinement(nn.Module):
         assert rays.axes is not None
         assert rays.image_y is not None
         turns, moves = self._at(rays.camera_indices, rays.image_y)
+        # What is not believed is to be mended: `believed` takes the weight off the scene, not off the pose.
+        pull = 1 / self.trust.weights[self.nearest_knots(rays)][:, None]
+        turns, moves = scale_gradient(turns, pull[:, :, None]), scale_gradient(moves, pull)
         directions, axes = ((turns @ x[:, :, None])[:, :, 0] for x in (rays.directions, rays.axes))
         if self.num_lens:
             directions = self._through_lens(directions, axes)
@@ -253,7 +280,7 @@ class PoseRefinement(nn.Module):
         self, views: Int[Tensor, " R"], y: Float[Tensor, " R"]
     ) -> tuple[Float[Tensor, "R 3 3"], Float[Tensor, "R 3"]]:
         """Rotation and shift of each ray's camera."""
-        place = y / self.rows[views].clamp(min=1) * (self.counts[views] - 1)
+        place = self._place(views, y)
         knot = torch.minimum(place.long(), (self.counts[views] - 2).clamp(min=0)).clamp(min=0)
         share = torch.where(self.rows[views] > 0, place - knot, 0.0)[:, None]
         low = self.first[views] + knot
@@ -262,6 +289,10 @@ class PoseRefinement(nn.Module):
         scaled = torch.cat([turns, moves * self.reach[:, None]], dim=1)
         step = scaled.index_select(0, low) * (1 - share) + scaled.index_select(0, high) * share
         return rotation_matrix(step[:, :3]), step[:, 3:]
+
+    def _place(self, views: Int[Tensor, " R"], y: Float[Tensor, " R"]) -> Float[Tensor, " R"]:
+        """Where rays start among the knots of their views, from 0."""
+        return y / self.rows[views].clamp(min=1) * (self.counts[views] - 1)
 
     def _through_lens(
         self, directions: Float[Tensor, "R 3"], axes: Float[Tensor, "R 3"]

@@ -24,6 +24,7 @@ from unmix_plugin.lamp_shadows import FINEST, ShadowDetail, lamplight
 from unmix_plugin.lit_samples import LitSamples, points_of, samples_carrying_weight
 from unmix_plugin.rendering.compositing import accumulate, volume_weights
 from unmix_plugin.rendering.contracted_marching import march_contracted, march_contracted_first
+from unmix_plugin.rendering.gradients import scale_gradient
 from unmix_plugin.rendering.grid_cells import cells_at
 from unmix_plugin.rendering.marching import FirstSamples, PackedSamples, march, march_first
 from unmix_plugin.spectral.coefficients import Coefficients
@@ -259,12 +260,6 @@ class VolumeRenderer:
         if self.is_unbounded:
             return self.space.centred(origins), directions / self.space.half_edge
         return self.box.normalise(origins), directions / self.box.size
-
-
-def scale_gradient(values: Float[Tensor, "*S"], factors: Float[Tensor, "*#S"]) -> Float[Tensor, "*S"]:
-    """The same values; gradients that reach them are multiplied with `factors`."""
-    constant = values.detach()
-    return constant + factors * (values - constant)
 
 
 def _before_sky(

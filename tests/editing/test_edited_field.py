@@ -30,7 +30,7 @@ class GivenField(CoefficientField):
     def abundances_of(self, features):
         return features
 
-    def get_outputs(self, positions, directions, features, visible=None):
+    def get_outputs(self, positions, directions, features, light=None):
         specular = torch.tensor([[0.2, 0.4]]).expand(len(features), 2)
         return {
             "abundances": features,

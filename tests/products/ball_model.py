@@ -12,6 +12,7 @@ from tests.scenes.scene_factory import look_at
 from tests.trained.camera_files.camera_scenes import cameras_at
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.field import CoefficientField
+from unmix_plugin.lamp_shading import Lamplight
 from unmix_plugin.renderer_settings import RendererConfig
 from unmix_plugin.trained.trained_scene import TrainedScene
 
@@ -50,7 +51,7 @@ class BallField(CoefficientField):
         return torch.stack([above, 1 - above, torch.zeros_like(above)], dim=-1)
 
     def get_outputs(
-        self, positions: Tensor, directions: Tensor, features: Tensor, visible: Tensor | None = None
+        self, positions: Tensor, directions: Tensor, features: Tensor, light: Lamplight | None = None
     ) -> dict[str, Tensor]:
         """The same shade everywhere, and no gloss."""
         abundances = self.abundances_of(features)
