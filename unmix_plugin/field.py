@@ -174,6 +174,7 @@ class UnmixField(CoefficientField):
         super().__init__()
         self.config, self.lit_by_camera = config, lit_by_camera
         self.lamp = MovingLamp(lamp) if lamp is not None and lit_by_camera else None
+        self.lamp_shading: LampShading | None = None
         self.specular_bias = config.specular_bias - math.log(exposure)
         self.num_endmembers, self.num_specular = num_endmembers, num_specular
         self.num_encoded = config.num_levels * config.features_per_level
@@ -206,7 +207,7 @@ class UnmixField(CoefficientField):
         if self.lit_by_camera:
             self.shading_network = bias_free_network(num_features, width, NUM_DIRECTION_FEATURES)
         if self.lamp is not None:
-            self.lamp_shading = LampShading(num_features, width)
+            self.lamp_shading = LampShading(num_features, width, self.lamp.upwards)
 
     @property
     def moving_lamp(self) -> MovingLamp | None:
@@ -248,7 +249,8 @@ class UnmixField(CoefficientField):
         light: Lamplight | None = None,
     ) -> dict[str, Tensor]:
         """`abundances` (S, K), `scaled_abundances` S a (S, K) and `specular_coefficients` h u (S, J)."""
-        lit = None if light is None or self.lamp is None else self.lamp_shading(features, directions, light)
+        shading = self.lamp_shading
+        lit = None if light is None or shading is None else shading(features, directions, light)
         abundances, scales = self._material(features, directions, lit)
         return {
             "abundances": abundances,

@@ -23,7 +23,7 @@ from unmix_plugin.networks import bias_free_network
 LOBES = (8.0, 32.0, 128.0, 512.0)
 """m_k: the last is half as high where the normal is 2 degrees off."""
 _FIRST_NORMAL = 0.1
-"""Length of what points to the eye in the untrained normal."""
+"""Length of the untrained normal before it gets length 1: gradients of shorter ones would outweigh all others."""
 
 
 @dataclass(frozen=True)
@@ -49,23 +49,31 @@ class LitSurface:
 class LampShading(nn.Module):
     """Learnt normals, and how much of the light comes from all around."""
 
-    def __init__(self, num_features: int, width: int) -> None:
+    first_normal: Tensor
+
+    def __init__(self, num_features: int, width: int, upwards: tuple[float, float, float]) -> None:
         """
         Args:
             num_features: G.
             width: Of the hidden layer.
+            upwards: Unit vector that all normals are near at first.
         """
         super().__init__()
+        self.register_buffer("first_normal", _FIRST_NORMAL * torch.tensor(upwards), persistent=False)
         self.network = bias_free_network(num_features, width, 4)
+
+    def surface(self, features: Float[Tensor, "S G"]) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 1"]]:
+        """Unit normals in model space, and r."""
+        raw = self.network(features)
+        return normalize(raw[:, :3] + self.first_normal, dim=1), torch.sigmoid(raw[:, 3:])
 
     def forward(
         self, features: Float[Tensor, "S G"], directions: Float[Tensor, "S 3"], light: Lamplight
     ) -> LitSurface:
         """How samples look along unit directions."""
-        raw, share = self.network(features).split([3, 1], dim=1)
-        normals = normalize(raw - _FIRST_NORMAL * directions, dim=1)
+        normals, around = self.surface(features)
         cosine = bounded_below((normals * light.towards).sum(dim=1, keepdim=True))
-        around, visible = torch.sigmoid(share), light.visible[:, None]
+        visible = light.visible[:, None]
         halfway = normalize(light.towards - directions, dim=1)
         away = 1 - (normals * halfway).sum(dim=1, keepdim=True).clamp(min=0).square()
         lobes = visible * torch.exp(-away * away.new_tensor(LOBES))

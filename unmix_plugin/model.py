@@ -39,6 +39,7 @@ from unmix_plugin.model_parts import (
     make_view_gains,
 )
 from unmix_plugin.model_settings import UnmixModelConfig
+from unmix_plugin.normal_guide import normals_error
 from unmix_plugin.ray_outputs import met_by_rays, ray_outputs
 from unmix_plugin.renderer import VolumeRenderer
 from unmix_plugin.sensor_views import SensorViews
@@ -218,6 +219,12 @@ class UnmixModel(Model):
             losses["spread"] = outputs["spread"]
         if "surface" in weights and "surfaces" in batch:
             losses["surface"] = surface_loss(outputs, batch["surfaces"], self.renderer.space)
+        shading = self.field.lamp_shading if isinstance(self.field, UnmixField) else None
+        if "normals" in weights and shading is not None:
+            places = self.renderer.space.from_unit(outputs["positions"])
+            losses["normals"] = normals_error(
+                self.field.get_density, shading, places, outputs["weights"], self.generator
+            )
         if self.poses is not None:
             weights["poses"], losses["poses"] = 1.0, self.poses.penalty(self.config.pose_refinement)
         return {name: weights[name] * losses[name] for name in weights if name in losses}

@@ -26,7 +26,7 @@ from unmix_plugin.spectral.losses import (
 
 Background = Literal["random", "black", "white", "last"]
 
-_WEIGHTS = ("spectral", "rgb", "opacity", "spread", "surface", "abundances", "mixing_penalty")
+_WEIGHTS = ("spectral", "rgb", "opacity", "spread", "surface", "normals", "abundances", "mixing_penalty")
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,11 @@ class LossConfig:
     clearly; falls to 0 at `surface_until`. Auto is 0.3 in an unbounded world, otherwise 0."""
     surface_until: float = 0.5
     """Part of the training in which known surfaces guide it: later they would hold back what is finer."""
+    normals: float = 0.01
+    """Weight, at the start of training, of the disagreement of normals that shading by a moving lamp learns with those
+    of the densities; falls to 0 at `normals_until`. Without such a lamp there is none."""
+    normals_until: float = 1.0
+    """Part of the training in which densities guide normals."""
     abundances: float = 0.1
     """Weight of the mean squared distance of composited abundances to those of the measured spectra, unmixed one by
     one with the first endmembers; 0 as published."""
@@ -92,6 +97,7 @@ class LossConfig:
             "outlier above 0": self.outlier > 0,
             "spread-until in (0, 1]": 0 < self.spread_until <= 1,
             "surface-until in (0, 1]": 0 < self.surface_until <= 1,
+            "normals-until in (0, 1]": 0 < self.normals_until <= 1,
             "abundances-final-factor in (0, 1]": 0 < self.abundances_final_factor <= 1,
         }
         require("the losses", self, rules)
@@ -105,6 +111,7 @@ class LossConfig:
             "spread": choose(self.spread, preset.spread_loss_weight) * fading(progress, self.spread_until),
             "surface": choose(self.surface, preset.surface_loss_weight)
             * fading(progress, self.surface_until),
+            "normals": self.normals * fading(progress, self.normals_until),
             "abundances": self.abundances * self.abundances_final_factor**progress,
         }
 
