@@ -59,7 +59,7 @@ def test_turning_the_whole_scene_changes_nothing_but_the_first_normals():
     other = LampShading(4, 8, tuple((turn @ torch.tensor(UPWARDS)).tolist()))  # type: ignore[arg-type]
     other.load_state_dict(one.state_dict())
     with torch.no_grad():
-        last = other.network[-1].weight
+        *_, last = other.network.parameters()
         last[:3] = turn @ last[:3]
     expected = one(features, along, light_from(towards))
     found = other(features, along @ turn.T, light_from(towards @ turn.T))

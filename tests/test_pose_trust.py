@@ -61,7 +61,7 @@ def test_before_anything_was_seen_all_count():
 
 def gradients(weight: float) -> tuple[torch.Tensor, torch.Tensor]:
     """Of the scene and of the poses, where the pixels of one view weigh this much."""
-    poses = refinement()
+    poses: Any = refinement()
     poses.trust.weights.fill_(weight)
     model: Any = make_model().train()
     model.generator = torch.Generator().manual_seed(0)
