@@ -2,16 +2,19 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from tests.method_factory import BOX, CAMERA, CONFIG, initial_data, make_model, make_rays, scene_of
 from unmix_plugin.editing.edited_field import EditedField
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.lamp import Lamp, MovingLamp
+from unmix_plugin.lamp_shading import Lamplight
 from unmix_plugin.lamp_shadows import FINEST, ShadowDetail, lamp_visibility, visible_part
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.model_settings import UnmixModelConfig
@@ -171,6 +174,32 @@ def test_an_edited_field_stands_in_the_same_light():
     rays = make_rays(20)
     found, expected = (model.renderer.render(one, rays).coefficients for one in (edited, model.field))
     assert_close(found.packed, expected.packed)
+
+
+def test_a_point_without_a_view_is_lit_squarely_and_without_gloss():
+    field: Any = model_with_lamp().field
+    positions = torch.rand(30, 3) - 0.5
+    along = normalize(torch.randn(30, 3), dim=1)
+    _, features = field.get_density(positions)
+    normals, _ = field.lamp_shading.surface(features)
+    facing = field.get_outputs(positions, torch.zeros(30, 3), features, Lamplight(torch.ones(30), normals))
+    found = field.get_outputs(positions, torch.zeros(30, 3), features)
+    assert_close(found["scaled_abundances"], facing["scaled_abundances"])
+    dark = field.get_outputs(positions, along, features, Lamplight(torch.zeros(30), normals))
+    assert_close(found["specular_coefficients"], dark["specular_coefficients"])
+    assert (facing["specular_coefficients"] - dark["specular_coefficients"]).abs().max() > 1e-4
+
+
+def test_gloss_follows_the_lamp_and_not_the_eye_alone():
+    field: Any = model_with_lamp().field
+    positions, along = torch.rand(30, 3) - 0.5, normalize(torch.randn(30, 3), dim=1)
+    _, features = field.get_density(positions)
+    one, other = (
+        field.get_outputs(positions, along, features, Lamplight(torch.ones(30), normalize(side, dim=1)))
+        for side in (-along + 0.1, -along + 1.5)
+    )
+    assert_close(one["abundances"], other["abundances"])
+    assert (one["specular_coefficients"] - other["specular_coefficients"]).abs().max() > 1e-4
 
 
 def test_where_the_lamp_is_not_known_shading_depends_on_the_direction_of_view():

@@ -7,7 +7,7 @@ A place is as bright as a matt surface in the light of a lamp and of its surroun
 with a number a for each place, the cosine c between its normal and the direction to the lamp, and V = 0 where the hull
 stands in the way. Lamps in all directions are tried in two frames, one that turns about the turntable's axis with the
 camera and the camera's own; the one that explains most of the changes is moved until no other explains more. Both
-halves of the places must find the same lamp, and need its shadows to explain what they see.
+halves of the places must find the same lamp, and together need its shadows to explain what they see.
 
 Notation: `P` places, `N` views, `R` cells along an edge, `S` pairs of a place and a view that sees it.
 """
@@ -30,7 +30,7 @@ from unmix_plugin.scenes.geometry.hull_places import Places, coarse_hull, seen_p
 LEAST_SHARE = 0.15
 """Of the changes of brightness within places, that a lamp must explain to be accepted."""
 LEAST_SHADOWS = 0.003
-"""Part of the changes that its shadows must explain beside, in either half of the places."""
+"""Part of the changes that its shadows must explain beside, in the mean over both halves of the places."""
 NUM_DIRECTIONS, NUM_KEPT = 300, 6
 """Directions that are tried in each frame without shadows, and the best of each that are tried with shadows."""
 FEWEST_VIEWS, FEWEST_PLACES = 4, 50
@@ -131,16 +131,19 @@ def find_lamp(
     places, seen = seen_places(cameras, log_shading, hull, box)
     seen, is_even = seen.clamp(min=DARKEST_LOG), torch.arange(len(seen)) % 2 == 0
     found: list[Candidate] = []
+    by_shadows = 0.0
     for half in (is_even, ~is_even):
         part = Places(places.positions[half], places.normals[half])
         evidence = LampEvidence.of(cameras, part, seen[half], hull, box)
         if len(evidence.place.unique()) < FEWEST_PLACES:
             return None
         share, lamp = best_lamp(evidence, cameras)
-        by_shadows = share - evidence.share(lamp, with_shadows=False)
-        if share < LEAST_SHARE or by_shadows < LEAST_SHADOWS:
+        if share < LEAST_SHARE:
             return None
+        by_shadows += 0.5 * (share - evidence.share(lamp, with_shadows=False))
         found.append((share, lamp))
+    if by_shadows < LEAST_SHADOWS:
+        return None
     one, other = (normalize(torch.tensor(lamp.place), dim=0) for _, lamp in found)
     agree = found[0][1].frame == found[1][1].frame and float(one @ other) > LEAST_AGREEMENT
     return max(found, key=lambda candidate: candidate[0])[1] if agree else None
