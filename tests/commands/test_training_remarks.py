@@ -50,3 +50,10 @@ def test_poses_that_ran_away_are_said():
     assert remarks([*lines[:-1], {**lines[-1], "poses_undone": 0.0}]) == []
     said = remarks([*lines[:-1], {**lines[-1], "poses_undone": 3.0}])
     assert "corrections of the poses of 3 views went beyond" in said[0]
+
+
+def test_poses_that_are_not_believed_are_said():
+    lines = course(1.0, 0.2, 0.1, 0.09)
+    assert remarks([*lines[:-1], {**lines[-1], "poses_doubted": 0.01}]) == []
+    said = remarks([*lines[:-1], {**lines[-1], "poses_doubted": 0.12}])
+    assert "12% of the views, or of the rows of line cameras, still fit far worse than the others" in said[0]

@@ -12,6 +12,8 @@ from unmix_plugin.errors import counted
 
 _FEWEST_LINES = 8
 """Lines of metrics below which nothing is said."""
+_DOUBTED = 0.02
+"""Share of poses that are not believed, of which more is said."""
 _HARDLY_FELL = 0.6
 """Loss in the last quarter of the training, over that in the first, above which it hardly fell. Trainings that settle
 stay below 0.35, also short ones."""
@@ -47,6 +49,12 @@ def remarks(lines: Sequence[Mapping[str, Any]]) -> list[str]:
         found.append(
             f"corrections of the poses of {counted(undone, 'view')} went beyond a quarter of the distance to the scene "
             "(or 14 degrees) and were undone: look whether these views belong to the scene, or train with --poses fixed"
+        )
+    doubted = float(known[-1].get("poses_doubted") or 0)
+    if doubted > _DOUBTED:
+        found.append(
+            f"{doubted:.0%} of the views, or of the rows of line cameras, still fit far worse than the others and "
+            "hardly shape the scene: their poses are off by more than was found, or they show something else"
         )
     if last > _HARDLY_FELL * first:
         found.append(
