@@ -4,7 +4,8 @@ import torch
 from torch.testing import assert_close
 
 from unmix_plugin.pose_knots import row_waves
-from unmix_plugin.pose_refinement import PoseConfig, PoseRefinement
+from unmix_plugin.pose_refinement import PoseRefinement
+from unmix_plugin.pose_settings import PoseConfig
 
 
 def test_a_line_camera_is_corrected_by_waves_over_its_rows():

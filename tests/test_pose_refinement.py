@@ -18,7 +18,8 @@ from unmix_plugin.field import CoefficientField
 from unmix_plugin.lamp_shading import Lamplight
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.pose_knots import Knots, row_waves
-from unmix_plugin.pose_refinement import LARGEST_STEP, PoseConfig, PoseRefinement
+from unmix_plugin.pose_refinement import LARGEST_STEP, PoseRefinement
+from unmix_plugin.pose_settings import PoseConfig
 
 WIDTH, HEIGHT = 12, 40
 MIDDLE = torch.tensor([0.1, -0.2, 0.3])

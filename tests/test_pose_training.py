@@ -22,7 +22,8 @@ from unmix_plugin.engine.pipeline import PipelineConfig
 from unmix_plugin.engine.runs.load_run import load_config, load_model
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.method_config import unmix_nerf
-from unmix_plugin.pose_refinement import PoseConfig, PoseRefinement
+from unmix_plugin.pose_refinement import PoseRefinement
+from unmix_plugin.pose_settings import PoseConfig
 from unmix_plugin.trained.open_run import open_run
 
 

@@ -16,7 +16,7 @@ from unmix_plugin.engine.model import Model, ModelConfig
 from unmix_plugin.errors import ConfigError, require
 from unmix_plugin.field import UnmixFieldConfig
 from unmix_plugin.lamp import NUM_LAMP_NUMBERS, Lamp
-from unmix_plugin.pose_refinement import PoseConfig
+from unmix_plugin.pose_settings import PoseConfig
 from unmix_plugin.renderer_settings import RendererConfig
 from unmix_plugin.spectral.evidence import exposure_of
 from unmix_plugin.spectral.materials import SegmentationMethod

@@ -36,7 +36,7 @@ def normals_error(
         weights: Share of its ray's light that each sample contributes.
         generator: Chooses the samples.
 
-    Source: Verbin et al. 2022, Ref-NeRF, eq. 10, there as an angle of predicted normals.
+    Source: Verbin et al. 2022, Ref-NeRF, on predicted normals; there as a squared distance, which is twice as much.
     """
     chosen = torch.randperm(len(positions), generator=generator, device=_device_of(generator, positions))
     chosen = chosen[: -(-len(positions) // _ONE_OF)].to(positions.device)
