@@ -15,7 +15,7 @@ from unmix_plugin.editing.edited_field import EditedField
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.lamp import Lamp, MovingLamp
 from unmix_plugin.lamp_shading import Lamplight
-from unmix_plugin.lamp_shadows import FINEST, ShadowDetail, lamp_visibility, visible_part
+from unmix_plugin.lamp_shadows import FINEST, ShadowDetail, lamplight, visible_part
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.model_settings import UnmixModelConfig
 from unmix_plugin.rendering.grid_cells import clearance_of
@@ -92,9 +92,9 @@ def test_the_slope_of_the_visible_part_follows_what_moving_the_lamp_changes():
         with torch.no_grad():
             lamp.change.copy_(torch.tensor([0.0, change, 0.0]))
         generator = torch.Generator().manual_seed(0)
-        return lamp_visibility(
+        return lamplight(
             lamp, origins, positions, BOX, clearance_of(wall() != 0), ShadowDetail.at(0.0), generator
-        ).mean()
+        ).visible.mean()
 
     high, low = (float(mean_visible(change).detach()) for change in (0.05, -0.05))
     expected = (high - low) / 0.1

@@ -53,24 +53,9 @@ def lamplight(
     detail: ShadowDetail = FINEST,
     generator: torch.Generator | None = None,
 ) -> Lamplight:
-    """What of a lamp's light reaches samples; arguments as `lamp_visibility` takes them. Only the visible part is
-    differentiable in the lamp's place: shading would move it to where wrong normals want it."""
-    visible = lamp_visibility(lamp, origins, positions, box, clearance, detail, generator)
-    with torch.no_grad():
-        towards = normalize(lamp.positions(origins) - positions, dim=-1)
-    return Lamplight(visible, towards)
+    """What of a lamp's light reaches samples of rays from `origins`.
 
-
-def lamp_visibility(
-    lamp: MovingLamp,
-    origins: Float[Tensor, "S 3"],
-    positions: Float[Tensor, "S 3"],
-    box: SceneBox,
-    clearance: UInt8[Tensor, "X Y Z"],
-    detail: ShadowDetail = FINEST,
-    generator: torch.Generator | None = None,
-) -> Float[Tensor, "S"]:
-    """Part of the lamp's light that reaches samples of rays from `origins`, [0, 1]; differentiable in the lamp's place.
+    Only the visible part is differentiable in the lamp's place: shading would move it to where wrong normals want it.
 
     Args:
         clearance: 0 in the cells of the box that cast shadows; in others what `clearance_of` says.
@@ -80,10 +65,11 @@ def lamp_visibility(
     origins, positions = origins.detach(), positions.detach()
     middle = lamp.positions(origins)
     fixed, spread = middle.detach(), detail.spread * float(lamp.first_place.norm())
+    towards = normalize(fixed - positions, dim=-1)
     if generator is None:
         corners = spread * positions.new_tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
         parts = [visible_part(positions, fixed + corner, box, clearance, detail) for corner in corners]
-        return torch.stack(parts).mean(dim=0)
+        return Lamplight(torch.stack(parts).mean(dim=0), towards)
     drawn = torch.randn(positions.shape, generator=generator, device=generator.device)
     offsets = spread * drawn.to(positions)
     one, other = (
@@ -91,7 +77,7 @@ def lamp_visibility(
     )
     # Stein's identity: the mean of these slopes is the gradient of the visible part, blurred over the points.
     slopes = ((one - other) / (2 * spread**2))[:, None] * offsets
-    return (one + other) / 2 + (slopes * (middle - fixed)).sum(dim=-1)
+    return Lamplight((one + other) / 2 + (slopes * (middle - fixed)).sum(dim=-1), towards)
 
 
 @torch.no_grad()
