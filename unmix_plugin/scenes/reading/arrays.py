@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 
@@ -12,6 +13,9 @@ READ_HEADER = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
 }
+
+_ONE_PARSER = Lock()
+"""NumPy parses headers as Python literals, which fails in CPython 3.11 if several threads do so at the same moment."""
 
 
 class UnreadableArrayError(ValueError):
@@ -43,7 +47,8 @@ def read_array_header(path: Path) -> ArrayHeader:
         if version not in READ_HEADER:
             raise UnreadableArrayError(f"is a .npy file of version {version}; write it with numpy.save")
         try:
-            shape, _, dtype = READ_HEADER[version](file)
+            with _ONE_PARSER:
+                shape, _, dtype = READ_HEADER[version](file)
         except Exception as error:  # numpy raises SyntaxError, TokenError, ValueError... for a damaged header
             raise UnreadableArrayError("has a damaged .npy header; write it again") from error
         found_bytes = path.stat().st_size - file.tell()
@@ -66,4 +71,5 @@ def read_array_header(path: Path) -> ArrayHeader:
 
 def map_array(path: Path) -> np.ndarray:
     """Map a checked .npy file into memory, read-only; values are read when touched."""
-    return np.load(path, mmap_mode="r", allow_pickle=False)
+    with _ONE_PARSER:
+        return np.load(path, mmap_mode="r", allow_pickle=False)
