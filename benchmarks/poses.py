@@ -1,6 +1,6 @@
 """Do poses that are off come back, and do line cameras train as well as frames?
 
-    python benchmarks/poses.py [--steps 10000] [--line-steps 3000]
+    python benchmarks/poses.py [--steps 10000] [--line-steps 10000]
 
 The demo scene with the poses of all views off by 10 px in the mean is trained with `--poses refine`, beside the same
 scene with its true poses and beside the wrong poses taken as they are. Then 16 sweeps of line cameras, with a slow
@@ -37,7 +37,7 @@ class Options:
 
     steps: int = 10_000
     """Of each training on frames that are off: as many as a training has by default."""
-    line_steps: int = 3000
+    line_steps: int = 10_000
     """Of each training on line cameras, and of that on frames beside them."""
     size: int = 96
     """Edge of the pictures, pixels."""
