@@ -7,14 +7,14 @@ from torch.testing import assert_close
 from unmix_plugin.lamp_shading import Lamplight, LampShading
 
 COUNT = 400
-UPWARDS = (0.0, 0.0, 1.0)
+UPWARDS = torch.tensor([0.0, 0.0, 1.0])
 
 
 class FacingUp(LampShading):
     """Of which all normals are upwards and a quarter of the light comes from all around."""
 
     def surface(self, features):
-        up = torch.tensor([UPWARDS]).repeat(len(features), 1)
+        up = UPWARDS[None].repeat(len(features), 1)
         return up, torch.full((len(features), 1), 0.25)
 
 
@@ -56,7 +56,7 @@ def test_turning_the_whole_scene_changes_nothing_but_the_first_normals():
     towards, along = (normalize(torch.randn(50, 3, generator=generator), dim=1) for _ in range(2))
     features = torch.randn(50, 4, generator=generator)
     one = LampShading(4, 8, UPWARDS)
-    other = LampShading(4, 8, tuple((turn @ torch.tensor(UPWARDS)).tolist()))  # type: ignore[arg-type]
+    other = LampShading(4, 8, turn @ UPWARDS)
     other.load_state_dict(one.state_dict())
     with torch.no_grad():
         *_, last = other.network.parameters()

@@ -18,7 +18,7 @@ def growing_downwards(positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tens
 
 def shading_of(normal: tuple[float, float, float]) -> LampShading:
     """That has this normal everywhere."""
-    shading = LampShading(3, 4, normal)
+    shading = LampShading(3, 4, torch.tensor(normal))
     for values in shading.parameters():
         nn.init.zeros_(values)
     return shading

@@ -207,7 +207,7 @@ class UnmixField(CoefficientField):
         if self.lit_by_camera:
             self.shading_network = bias_free_network(num_features, width, NUM_DIRECTION_FEATURES)
         if self.lamp is not None:
-            self.lamp_shading = LampShading(num_features, width, self.lamp.upwards)
+            self.lamp_shading = LampShading(num_features, width, self.lamp.axis)
 
     @property
     def moving_lamp(self) -> MovingLamp | None:

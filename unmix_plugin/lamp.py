@@ -63,7 +63,6 @@ class MovingLamp(nn.Module):
         """
         super().__init__()
         self.frame: LampFrame = lamp.frame
-        self.upwards = lamp.axis
         for name, values in (("middle", lamp.middle), ("axis", lamp.axis), ("first_place", lamp.place)):
             self.register_buffer(name, torch.tensor(values, dtype=torch.float32))
         self.change = nn.Parameter(torch.zeros(3))

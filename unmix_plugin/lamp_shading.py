@@ -51,7 +51,7 @@ class LampShading(nn.Module):
 
     first_normal: Tensor
 
-    def __init__(self, num_features: int, width: int, upwards: tuple[float, float, float]) -> None:
+    def __init__(self, num_features: int, width: int, upwards: Float[Tensor, "3"]) -> None:
         """
         Args:
             num_features: G.
@@ -59,7 +59,7 @@ class LampShading(nn.Module):
             upwards: Unit vector that all normals are near at first.
         """
         super().__init__()
-        self.register_buffer("first_normal", _FIRST_NORMAL * torch.tensor(upwards), persistent=False)
+        self.register_buffer("first_normal", _FIRST_NORMAL * upwards, persistent=False)
         self.network = bias_free_network(num_features, width, 4)
 
     def surface(self, features: Float[Tensor, "S G"]) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 1"]]:

@@ -38,7 +38,8 @@ def normals_error(
 
     Source: Verbin et al. 2022, Ref-NeRF, on predicted normals; there as a squared distance, which is twice as much.
     """
-    chosen = torch.randperm(len(positions), generator=generator, device=_device_of(generator, positions))
+    device = positions.device if generator is None else generator.device
+    chosen = torch.randperm(len(positions), generator=generator, device=device)
     chosen = chosen[: -(-len(positions) // _ONE_OF)].to(positions.device)
     at, shares = positions[chosen].requires_grad_(), weights.detach()[chosen]
     densities, features = get_density(at)
@@ -46,7 +47,3 @@ def normals_error(
     (slope,) = torch.autograd.grad(logs, at, retain_graph=True)
     agreement = (shading.surface(features)[0] * normalize(-slope, dim=1)).sum(dim=1)
     return (shares * (1 - agreement)).sum() / shares.sum().clamp(min=1e-6)
-
-
-def _device_of(generator: torch.Generator | None, values: Tensor) -> torch.device:
-    return values.device if generator is None else generator.device

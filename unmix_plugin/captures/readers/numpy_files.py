@@ -13,7 +13,13 @@ from unmix_plugin.captures.readers.loaded_arrays import loaded
 from unmix_plugin.captures.readers.read_options import ReadOptions
 from unmix_plugin.captures.spectral_file import SpectralFile
 from unmix_plugin.errors import CaptureError
-from unmix_plugin.scenes.reading.arrays import READ_HEADER, UnreadableArrayError, map_array, read_array_header
+from unmix_plugin.scenes.reading.arrays import (
+    READ_HEADER,
+    UnreadableArrayError,
+    map_array,
+    parse_header,
+    read_array_header,
+)
 
 
 def open_npy(path: Path, options: ReadOptions) -> SpectralFile:
@@ -49,7 +55,7 @@ def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Foun
             raise CaptureError(
                 f"{path}: {info.filename} is a .npy file of version {version}; write it with numpy.savez"
             )
-        shape, _, dtype = READ_HEADER[version](file)
+        shape, _, dtype = parse_header(file, version)
     needed = int(np.prod(shape, dtype=object)) * dtype.itemsize
     if not dtype.hasobject and info.file_size < needed:
         raise CaptureError(

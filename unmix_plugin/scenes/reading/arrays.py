@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from math import prod
 from pathlib import Path
 from threading import Lock
+from typing import Any
 
 import numpy as np
 
@@ -47,8 +48,7 @@ def read_array_header(path: Path) -> ArrayHeader:
         if version not in READ_HEADER:
             raise UnreadableArrayError(f"is a .npy file of version {version}; write it with numpy.save")
         try:
-            with _ONE_PARSER:
-                shape, _, dtype = READ_HEADER[version](file)
+            shape, _, dtype = parse_header(file, version)
         except Exception as error:  # numpy raises SyntaxError, TokenError, ValueError... for a damaged header
             raise UnreadableArrayError("has a damaged .npy header; write it again") from error
         found_bytes = path.stat().st_size - file.tell()
@@ -67,6 +67,16 @@ def read_array_header(path: Path) -> ArrayHeader:
             f"is cut short: {found_bytes} bytes of values found, {expected_bytes} expected for shape {shape}"
         )
     return ArrayHeader(shape, dtype)
+
+
+def parse_header(file: Any, version: tuple[int, int]) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, whether the first axis runs fastest, and type, of an open binary file behind its magic string.
+
+    Raises:
+        Exception: of NumPy, of many kinds, for a damaged header.
+    """
+    with _ONE_PARSER:
+        return READ_HEADER[version](file)
 
 
 def map_array(path: Path) -> np.ndarray:
