@@ -20,6 +20,7 @@ from tests.captures.layouts.rig_flight import (
 )
 from unmix_plugin.captures.layouts.registry import LayoutOptions
 from unmix_plugin.captures.layouts.rig import find_rig
+from unmix_plugin.captures.layouts.rig_files import splits_of
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.process import process_capture
 from unmix_plugin.captures.radiometry import radiometric_model
@@ -127,9 +128,18 @@ def test_frames_have_their_band_lens_and_release(scene):
 def test_releases_stay_together_when_views_are_split(scene):
     content, _ = _frames(scene)
     evaluation = content["test_filenames"]
-    assert len(evaluation) == 8
-    assert {path.rpartition("_")[0].rpartition("_")[2] for path in evaluation} == {"0000", "0008"}
-    assert len(content["train_filenames"]) == 32
+    assert len(evaluation) == 4
+    assert {path.rpartition("_")[0].rpartition("_")[2] for path in evaluation} == {"0004"}
+    assert len(content["train_filenames"]) == 36
+
+
+@pytest.mark.parametrize(
+    ("count", "evaluated"), [(1, [0]), (2, [1]), (5, [2]), (8, [4]), (12, [4]), (20, [4, 12])]
+)
+def test_what_is_evaluated_lies_in_the_middle_of_a_flight(count, evaluated):
+    names = [f"IMG_{number:04d}" for number in range(count)]
+    splits = splits_of(names)
+    assert [number for number, name in enumerate(names) if splits[name] == "eval"] == evaluated
 
 
 def test_all_lenses_are_posed_by_the_rig(scene):

@@ -5,8 +5,9 @@ on how people frame pictures: the subject is where the optical axes meet, and is
 there. So the box starts as a cube around the point nearest to all axes (least squares), its half edge a little more
 than half the width of the images at that distance. If all cameras look from one side, nothing can be between them
 and their subject but things are seen behind it, and the cube moves away from them. It is then cut to what a third of
-the cameras see. Cameras that share no such point (parallel or outward-looking) get a cube in front of their middle,
-at a depth where most of their views overlap.
+the cameras see. Axes that are nearly parallel or miss each other, as those of a flight over land, have no such point;
+then places that views agree on decide, and how far the views reach at their distance. Where there are too few such
+places, parallel cameras get a cube in front of their middle, at a depth where most of their views overlap.
 
 Notation: poses are camera to world, OpenGL axes, float64; `N` training cameras.
 """
@@ -26,9 +27,19 @@ from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.geometry.carving import carve_box
 from unmix_plugin.scenes.geometry.foreground_rays import MIN_EXPLAINED, foreground_rays, share_through
+from unmix_plugin.scenes.geometry.matched_points import MatchedPoints
 
 MIN_CONVERGENCE = 1e-3
 """Least mean squared sine between optical axes and their spread direction that still fixes a focus, (1.8 deg)^2."""
+LEAST_AXES_SPREAD_DEG = 6.0
+"""Root mean square angle of optical axes to their spread direction that cameras turned about a subject have; a flight
+whose camera sways has less."""
+MOST_MISSED = 0.5
+"""By how much half of the axes may miss the focus, in half widths of the images there."""
+OUTLIERS = 0.005
+"""Share of the matched places that may lie outside the box, at each of its sides."""
+PLACES_MARGIN = 0.05
+"""By how much the box of places is wider, in their median depth: little that stands on the ground is matched."""
 FRAME_MARGIN = 1.2
 """The cube of views over the width of the images at the focus."""
 SHIFT_BEHIND = 0.2
@@ -50,18 +61,26 @@ SEEN_CELLS = 32
 """Cells along an edge when the region that cameras share is sought."""
 
 
-def find_bounds(root: Path, cameras: Cameras, foreground: list[Bool[np.ndarray, "_ _"]] | None) -> SceneBox:
+def find_bounds(
+    root: Path,
+    cameras: Cameras,
+    foreground: list[Bool[np.ndarray, "_ _"]] | None,
+    points: MatchedPoints | None = None,
+) -> SceneBox:
     """The box that the training views show.
 
     Args:
         root: Scene folder, for messages.
         cameras: Training cameras, in coordinates of order 1.
         foreground: For each view True where it may show something; None where there is no alpha.
+        points: Places that views agree on, for cameras that do not look at one place.
     Returns:
         The box in the cameras' space.
     Raises:
         SceneError: with alpha, no place is opaque in all views that see it: poses and pictures contradict.
     """
+    if foreground is None and points is not None:
+        return _box_of_places(cameras, points)
     centre, half = _cube_of_views(cameras)
     if foreground is None:
         return _cut_to_shared_view(cameras, _box(centre - half, centre + half))
@@ -82,24 +101,68 @@ def find_bounds(root: Path, cameras: Cameras, foreground: list[Bool[np.ndarray, 
     return _tighten(cameras, rays, box, carve_box(cameras, foreground, box, HULL_CELLS))
 
 
+def look_at_one_place(cameras: Cameras) -> bool:
+    """Whether optical axes meet well enough to say where the subject is."""
+    focus, poses = focus_point(cameras), cameras.camera_to_world.double().numpy()
+    if focus is None or np.sqrt(_convergence(poses)) < np.sin(np.radians(LEAST_AXES_SPREAD_DEG)):
+        return False
+    forward, towards = -poses[:, :, 2], focus - poses[:, :, 3]
+    depths = (towards * forward).sum(axis=-1)
+    missed = np.linalg.norm(towards - depths[:, None] * forward, axis=-1)
+    return bool(np.median(missed / (np.abs(depths) * _half_angles(cameras)).clip(min=1e-12)) <= MOST_MISSED)
+
+
 def focus_point(cameras: Cameras) -> Float64[np.ndarray, "3"] | None:
     """The point nearest to all optical axes; None if they are (nearly) parallel or most point away from it."""
     poses = cameras.camera_to_world.double().numpy()
     positions, forward = poses[:, :, 3], -poses[:, :, 2]
-    projectors = np.eye(3) - forward[:, :, None] * forward[:, None, :]
-    mean = projectors.mean(axis=0)
-    if np.linalg.eigvalsh(mean)[0] < MIN_CONVERGENCE:
+    projectors = _across(poses)
+    if _convergence(poses) < MIN_CONVERGENCE:
         return None
-    point = np.linalg.solve(mean, (projectors @ positions[:, :, None]).mean(axis=0)[:, 0])
+    point = np.linalg.solve(projectors.mean(axis=0), (projectors @ positions[:, :, None]).mean(axis=0)[:, 0])
     is_ahead = ((point - positions) * forward).sum(axis=-1) > 0.0
     return point if is_ahead.mean() > 0.5 else None
+
+
+def _across(poses: Float64[np.ndarray, "N 3 4"]) -> Float64[np.ndarray, "N 3 3"]:
+    """Projections of space to what is square to each optical axis."""
+    forward = -poses[:, :, 2]
+    return np.eye(3) - forward[:, :, None] * forward[:, None, :]
+
+
+def _convergence(poses: Float64[np.ndarray, "N 3 4"]) -> float:
+    """Mean squared sine between optical axes and the direction that they spread from least."""
+    return max(float(np.linalg.eigvalsh(_across(poses).mean(axis=0))[0]), 0.0)
+
+
+def _half_angles(cameras: Cameras) -> Float64[np.ndarray, " N"]:
+    """Tangents of half the angle that the longer side of each image spans."""
+    sides = np.array([cameras.size(index) for index in range(len(cameras))], dtype=np.float64)
+    return (0.5 * sides / cameras.focal_px.double().numpy()).max(axis=-1)
+
+
+def _box_of_places(cameras: Cameras, points: MatchedPoints) -> SceneBox:
+    """What the matched places span, and the corners of all views as deep as those are that it shows."""
+    usual, ends = float(points.depths.median()), []
+    for view in range(len(cameras)):
+        own = points.depths[points.views == view]
+        width, height = cameras.size(view)
+        coords = torch.tensor([(x, y) for x in (0.0, float(width)) for y in (0.0, float(height))])
+        rays = cameras.generate_rays(torch.full((4,), view), coords)
+        assert rays.axes is not None
+        cosines = (rays.directions * rays.axes).sum(dim=-1)
+        away = (float(own.median()) if len(own) else usual) / cosines
+        ends.append(rays.origins + away[:, None] * rays.directions)
+    corners, places = torch.cat(ends).double().numpy(), points.places.double().numpy()
+    low, high = np.quantile(places, (OUTLIERS, 1 - OUTLIERS), axis=0)
+    margin = PLACES_MARGIN * usual
+    return _box(np.minimum(low, corners.min(axis=0)) - margin, np.maximum(high, corners.max(axis=0)) + margin)
 
 
 def _cube_of_views(cameras: Cameras) -> tuple[Float64[np.ndarray, "3"], float]:
     poses = cameras.camera_to_world.double().numpy()
     positions, forward = poses[:, :, 3], -poses[:, :, 2]
-    sides = np.array([cameras.size(index) for index in range(len(cameras))], dtype=np.float64)
-    half_angles = (0.5 * sides / cameras.focal_px.double().numpy()).max(axis=-1)
+    half_angles = _half_angles(cameras)
     focus = focus_point(cameras)
     if focus is not None:
         depths = ((focus - positions) * forward).sum(axis=-1)

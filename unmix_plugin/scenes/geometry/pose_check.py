@@ -11,7 +11,6 @@ with OpenGL axes, in world units, float64.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +19,7 @@ from jaxtyping import Float, Float32, Float64, Int
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.scenes.geometry.thinned_views import MOST_BANDS, ReadView
 from unmix_plugin.scenes.scene import Scene
 
 NUM_REFERENCES, NUM_NEIGHBOURS, NUM_AGREEING = 8, 4, 3
@@ -28,7 +28,7 @@ that agrees least may be hidden by something."""
 NUM_PIXELS, NUM_POINTS, NUM_FEATURES = 150, 192, 4
 BUSIEST_SHARE = 0.3
 """Share of a view's pixels, those where it changes most, that are drawn from."""
-LONGEST_SIDE_PX, MOST_BANDS = 128, 32
+LONGEST_SIDE_PX = 128
 """Of what is compared: larger views are thinned out."""
 DEPTHS = (0.4, 60.0)
 """Nearest and farthest point along a ray, in median distances between neighbouring cameras."""
@@ -50,8 +50,6 @@ _REMEDIES = {
 }
 
 Poses = Float64[np.ndarray, "N 3 4"]
-ReadView = Callable[[int, tuple[slice, ...]], Float32[np.ndarray, "H W B"]]
-"""From a view, and the rows, columns and bands wanted, to its picture."""
 
 
 def check_scene_poses(scene: Scene) -> str | None:

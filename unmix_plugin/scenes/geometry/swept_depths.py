@@ -15,21 +15,20 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.scenes.geometry.pose_check import (
     LONGEST_SIDE_PX,
-    MOST_BANDS,
     NUM_AGREEING,
-    ReadView,
     choose_neighbours,
     thinned_lenses,
     view_differences,
     view_features,
 )
+from unmix_plugin.scenes.geometry.thinned_views import ReadView, Thinning
 
 MOST_VIEWS = 64
 """Of a scene with more, so many are swept."""
@@ -51,8 +50,6 @@ LEAST_KNOWN = 0.35
 SURROUNDINGS = 21
 """Edge of what is around a pixel, in pixels of the thinned-out view."""
 _CHANCE_PIXELS = 4000
-_POOLED = 4
-"""Pixels along an edge that are averaged when a view is thinned out, if there are so many."""
 
 
 @dataclass(frozen=True)
@@ -79,28 +76,18 @@ def sweep_depths(cameras: Cameras, box: SceneBox, read_view: ReadView) -> SweptD
     views = np.linspace(0, len(cameras) - 1, count).round().astype(int).tolist()
     if count < NUM_AGREEING + 1:
         return None
-    stride = -(-max(cameras.width, cameras.height) // LONGEST_SIDE_PX)
-    if min(cameras.width, cameras.height) // stride < PIXEL_STRIDE:
+    thinning = Thinning.to(cameras, LONGEST_SIDE_PX)
+    if min(cameras.width, cameras.height) // thinning.stride < PIXEL_STRIDE:
         return None
-    fine = max(1, stride // _POOLED)
-    pooled = stride // fine
-    bands = read_view(views[0], (slice(1), slice(1))).shape[2]
-    part = (slice(None, None, fine), slice(None, None, fine), slice(None, None, -(-bands // MOST_BANDS)))
-    images = [_pooled(read_view(view, part), pooled) for view in views]
-    lenses = thinned_lenses(cameras[views], images[0], fine * pooled, fine * (pooled - 1) / 2)
+    images = [thinning.read(read_view, view) for view in views]
+    lenses = thinned_lenses(cameras[views], images[0], thinning.stride, thinning.first)
     found = _sweep_all(images, lenses, box)
     if found is None:
         return None
     if torch.isfinite(found).float().mean() < LEAST_KNOWN:
         relative = _sweep_all([_over_surroundings(image) for image in images], lenses, box)
         found = found if relative is None else torch.where(torch.isfinite(found), found, relative)
-    return SweptDepths(tuple(views), found, fine * pooled * PIXEL_STRIDE)
-
-
-def _pooled(view: Float32[np.ndarray, "H W B"], width: int) -> Float[Tensor, "h w B"]:
-    """Means over squares of pixels."""
-    image = torch.from_numpy(np.ascontiguousarray(view)).permute(2, 0, 1)
-    return torch.nn.functional.avg_pool2d(image, width).permute(1, 2, 0)
+    return SweptDepths(tuple(views), found, thinning.stride * PIXEL_STRIDE)
 
 
 def _over_surroundings(image: Float[Tensor, "H W B"]) -> Float[Tensor, "H W B"]:

@@ -20,15 +20,14 @@ from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.scenes.geometry.pose_check import (
     LONGEST_SIDE_PX,
-    MOST_BANDS,
     NUM_AGREEING,
-    ReadView,
     choose_neighbours,
     local_change,
     thinned_lenses,
     view_differences,
     view_features,
 )
+from unmix_plugin.scenes.geometry.thinned_views import MOST_BANDS, ReadView
 
 TILES = 12
 """Along each side of a view: a pixel of each part is asked, since what is far away may be a small part of a view."""

@@ -1,0 +1,120 @@
+"""Places that views agree on, and the box of what a flight sees."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from tests.scenes.geometry.ball_views import make_cameras
+from tests.scenes.geometry.ground_views import (
+    FOCAL,
+    HEIGHT,
+    SLOPE,
+    WIDTH,
+    flight_cameras,
+    flight_poses,
+    ground_views,
+    strip_cameras,
+)
+from tests.scenes.scene_factory import look_at, ring_poses
+from unmix_plugin.scenes import load_scene
+from unmix_plugin.scenes.geometry.bounds import find_bounds, look_at_one_place
+from unmix_plugin.scenes.geometry.matched_points import find_matched_points
+
+
+def read_from(views):
+    return lambda view, part: views[view][part]
+
+
+def above_ground(places):
+    """Signed heights."""
+    return places[:, 2] - SLOPE * places[:, 0]
+
+
+@pytest.mark.parametrize(
+    "cameras", [flight_cameras(flight_poses()), strip_cameras()], ids=["frames", "lines"]
+)
+def test_matched_places_lie_on_the_ground(cameras):
+    found = find_matched_points(cameras, read_from(ground_views(cameras)))
+    assert found is not None
+    assert above_ground(found.places).abs().quantile(0.9) < 0.05
+    assert found.are_equally_far
+
+
+def test_depths_are_those_of_the_camera_that_is_named():
+    cameras = flight_cameras(flight_poses())
+    found = find_matched_points(cameras, read_from(ground_views(cameras)))
+    assert found is not None
+    for view in found.views.unique().tolist():
+        of_view = found.views == view
+        _, depths = cameras.project(found.places[of_view], view)
+        assert torch.allclose(depths, found.depths[of_view], rtol=1e-3)
+
+
+def test_large_views_are_thinned_out_and_their_places_stay_where_they_are(monkeypatch):
+    cameras = flight_cameras(flight_poses())
+    monkeypatch.setattr("unmix_plugin.scenes.geometry.matched_points.LONGEST_SIDE_PX", WIDTH // 2)
+    found = find_matched_points(cameras, read_from(ground_views(cameras)))
+    assert found is not None
+    assert above_ground(found.places).mean().abs() < 0.02
+
+
+def test_views_that_share_nothing_or_show_one_colour_have_no_matched_places():
+    cameras = flight_cameras(flight_poses())
+    unrelated = [np.random.default_rng(view).random((HEIGHT, WIDTH, 1), np.float32) for view in range(5)]
+    plain = [np.full((HEIGHT, WIDTH, 1), 0.5, np.float32)] * 5
+    assert find_matched_points(cameras, read_from(unrelated)) is None
+    assert find_matched_points(cameras, read_from(plain)) is None
+
+
+def test_views_from_one_place_tell_no_distance():
+    poses = flight_poses(5, spacing=0.0, sway=0.1)
+    cameras = flight_cameras(poses)
+    assert find_matched_points(cameras, read_from(ground_views(cameras))) is None
+
+
+@pytest.mark.parametrize("count", [5, 12])
+def test_the_box_of_a_flight_lies_on_the_ground_and_holds_all_of_it_that_is_seen(tmp_path, count):
+    cameras = flight_cameras(flight_poses(count))
+    points = find_matched_points(cameras, read_from(ground_views(cameras)))
+    box = find_bounds(tmp_path, cameras, None, points)
+    for index in range(len(cameras)):
+        rays = cameras.image_rays(index)
+        heights = rays.origins[:, 2] - SLOPE * rays.origins[:, 0]
+        away = heights / (SLOPE * rays.directions[:, 0] - rays.directions[:, 2])
+        assert box.contains(rays.origins + away[:, None] * rays.directions).float().mean() > 0.99
+    low, high = box.aabb[:, 2].tolist()
+    assert -0.6 < low < -0.1
+    assert 0.1 < high < 0.6
+
+
+def test_cameras_around_a_subject_look_at_one_place_and_those_of_a_flight_do_not():
+    assert look_at_one_place(make_cameras(ring_poses(12)))
+    aside = [look_at(np.array([0.3 * x, -3.0, 0.0]), np.zeros(3)) for x in (-2, -1, 0, 1, 2)]
+    assert look_at_one_place(make_cameras(aside))
+    for count in (3, 5, 20):
+        assert not look_at_one_place(flight_cameras(flight_poses(count)))
+
+
+def test_a_flight_is_read_as_a_bounded_scene_on_the_ground(tmp_path):
+    cameras = flight_cameras(flight_poses())
+    frames = []
+    for index, (pose, view) in enumerate(zip(flight_poses(), ground_views(cameras), strict=True)):
+        for band in (0, 1):
+            np.save(tmp_path / f"{index}_{band}.npy", (0.2 + 0.4 * view * (band + 1)).clip(0, 1))
+            frames.append(
+                {
+                    "hyperspectral_file_path": f"{index}_{band}.npy",
+                    "sensor": f"lens {band}",
+                    "bands": [band],
+                    "transform_matrix": pose.tolist(),
+                }
+            )
+    content = {"wavelengths": [500, 600], "fl_x": FOCAL, "frames": frames}
+    content["test_filenames"] = [frame["hyperspectral_file_path"] for frame in frames[4:6]]
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    scene = load_scene(tmp_path)
+    assert not scene.is_unbounded
+    low, high = scene.normalisation.to_world(scene.scene_box.aabb.double().numpy())[:, 2]
+    assert -0.6 < low < 0.0 < high < 0.6

@@ -1,0 +1,152 @@
+"""Places that views agree on, before any training: features matched between views, seen along rays of given poses.
+
+Nothing is assumed of where the scene is. A match counts if its two rays pass each other closer than a pixel and a
+half, before both cameras, and at an angle that tells how far away they do. With poses that are right nearly all do.
+
+Notation: `N` cameras, `M` matches, `P` places, `F` features of a view.
+
+Source: features and their matches as in Lowe 2004, Distinctive Image Features from Scale-Invariant Keypoints.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Int
+from torch import Tensor
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.scenes.geometry.thinned_views import ReadView, Thinning
+
+LONGEST_SIDE_PX = 320
+"""Of the views that are compared."""
+MOST_REFERENCES = 8
+"""Views, spread over all, that are each compared with views beside them."""
+NEIGHBOUR_RANKS = (0, 1, 3, 7)
+"""Those beside a view, by their rank in distance: the nearest show most of what it does, farther ones tell depths
+better."""
+MOST_AMBIGUOUS = 0.85
+"""Of a match, its difference over that of the second best."""
+MOST_APART_PX = 1.5
+"""Of the rays of a match, in pixels of the thinned-out view."""
+SMALLEST_ANGLE_DEG = 1.0
+"""Between the rays of a match."""
+LEAST_POINTS = 60
+"""Fewer may be chance."""
+MOST_DEPTH_RATIO = 2.0
+"""Of far to near places that are about as far away."""
+_ENDS = torch.tensor([0.05, 0.95])
+_BRIGHT = 0.99
+"""Quantile of a view's brightness that is taken for white."""
+
+
+@dataclass(frozen=True)
+class MatchedPoints:
+    """Places that two views show."""
+
+    places: Float[Tensor, "P 3"]
+    """In the cameras' space."""
+    views: Int[Tensor, " P"]
+    """A camera that sees each."""
+    depths: Float[Tensor, " P"]
+    """How far before that camera, along its optical axis."""
+
+    @property
+    def are_equally_far(self) -> bool:
+        """Whether all are about as far away, as ground is below an aircraft: views end there."""
+        near, far = torch.quantile(self.depths[:: max(1, len(self.depths) // 100_000)], _ENDS)
+        return bool(far < MOST_DEPTH_RATIO * near)
+
+
+def find_matched_points(cameras: Cameras, read_view: ReadView) -> MatchedPoints | None:
+    """Places that the views agree on; None if those are too few to say anything.
+
+    Args:
+        cameras: Of views that show the same bands. All have one size; line cameras may be among them.
+        read_view: Reads a part of a view.
+    """
+    thinning = Thinning.to(cameras, LONGEST_SIDE_PX)
+    pairs = _choose_pairs(cameras.camera_to_world[:, :, 3])
+    features = {view: _features_of(thinning, read_view, view) for view in sorted({*sum(pairs, ())})}
+    found = [_triangulate(cameras, thinning, pair, features[pair[0]], features[pair[1]]) for pair in pairs]
+    if sum(len(points.views) for points in found) < LEAST_POINTS:
+        return None
+    return MatchedPoints(
+        torch.cat([points.places for points in found]),
+        torch.cat([points.views for points in found]),
+        torch.cat([points.depths for points in found]),
+    )
+
+
+@dataclass(frozen=True)
+class _Features:
+    """What stands out in a view."""
+
+    coords: Float[Tensor, "F 2"]
+    """In the whole view, pixels."""
+    descriptors: Float32[np.ndarray, "F 128"]
+
+
+def _choose_pairs(positions: Float[Tensor, "N 3"]) -> list[tuple[int, int]]:
+    """Some views and others beside them, each pair once; views at one place tell no distance."""
+    away = torch.cdist(positions.double(), positions.double())
+    chosen = np.linspace(0, len(positions) - 1, min(MOST_REFERENCES, len(positions))).round().astype(int)
+    pairs = set()
+    for view in chosen.tolist():
+        others = [other for other in away[view].argsort().tolist() if away[view, other] > 1e-6 * away.max()]
+        for rank in NEIGHBOUR_RANKS:
+            if rank < len(others):
+                pairs.add((min(view, others[rank]), max(view, others[rank])))
+    return sorted(pairs)
+
+
+def _features_of(thinning: Thinning, read_view: ReadView, view: int) -> _Features:
+    from skimage.feature import SIFT  # slow to import
+
+    brightness = thinning.read(read_view, view).mean(dim=-1)
+    dark, bright = torch.quantile(brightness.flatten()[:: max(1, brightness.numel() // 100_000)], _levels())
+    sift = SIFT(upsampling=1)
+    try:
+        sift.detect_and_extract(((brightness - dark) / (bright - dark).clamp(min=1e-9)).clamp(0, 1).numpy())
+    except (RuntimeError, ValueError):  # nothing stands out, or the view is too small for it
+        return _Features(torch.zeros(0, 2), np.zeros((0, 128), dtype=np.float32))
+    coords = torch.from_numpy(np.array(sift.keypoints, dtype=np.float32)[:, ::-1].copy()) + 0.5
+    return _Features(thinning.whole(coords), np.array(sift.descriptors, dtype=np.float32))
+
+
+def _levels() -> Float[Tensor, "2"]:
+    return torch.tensor([1 - _BRIGHT, _BRIGHT])
+
+
+def _triangulate(
+    cameras: Cameras, thinning: Thinning, pair: tuple[int, int], one: _Features, other: _Features
+) -> MatchedPoints:
+    """Of each match whose rays meet, the place where they pass each other."""
+    from skimage.feature import match_descriptors
+
+    chosen = torch.zeros(0, 2, dtype=torch.int64)
+    if min(len(one.coords), len(other.coords)) > 1:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # of descriptors that differ by nothing
+            matches = match_descriptors(one.descriptors, other.descriptors, max_ratio=MOST_AMBIGUOUS)
+        chosen = torch.from_numpy(np.array(matches, dtype=np.int64))
+    ends = zip(pair, (one.coords[chosen[:, 0]], other.coords[chosen[:, 1]]), strict=True)
+    rays = [cameras.generate_rays(torch.full((len(chosen),), view), coords) for view, coords in ends]
+    along, across = (ray.directions.double() for ray in rays)
+    between = (rays[1].origins - rays[0].origins).double()
+    cosine = (along * across).sum(dim=-1)
+    sine = (1 - cosine.square()).clamp(min=1e-12)
+    # Where two lines pass each other: each distance is least squares, given the other.
+    first = ((between * along).sum(dim=-1) - cosine * (between * across).sum(dim=-1)) / sine
+    second = (cosine * (between * along).sum(dim=-1) - (between * across).sum(dim=-1)) / sine
+    gaps = (first[:, None] * along - between - second[:, None] * across).norm(dim=-1)
+    pixel = thinning.stride / cameras.focal_px[pair[0]].min().double()
+    meets = (first > 0) & (second > 0) & (gaps < MOST_APART_PX * pixel * torch.minimum(first, second))
+    meets &= sine.sqrt() > np.sin(np.radians(SMALLEST_ANGLE_DEG))
+    reached = (first[:, None] * along)[meets].float()
+    assert rays[0].axes is not None
+    depths = (reached * rays[0].axes[meets]).sum(dim=-1)
+    return MatchedPoints(rays[0].origins[meets] + reached, torch.full((len(depths),), pair[0]), depths)
