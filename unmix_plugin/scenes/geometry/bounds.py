@@ -142,7 +142,18 @@ def _half_angles(cameras: Cameras) -> Float64[np.ndarray, " N"]:
 
 
 def _box_of_places(cameras: Cameras, points: MatchedPoints) -> SceneBox:
-    """What the matched places span, and the corners of all views as deep as those are that it shows."""
+    """What the nearer of the places span; where nothing lies behind them, all that the views show at their depth."""
+    near = points.nearer
+    places, margin = near.places.double().numpy(), PLACES_MARGIN * float(near.depths.median())
+    low, high = np.quantile(places, (OUTLIERS, 1 - OUTLIERS), axis=0)
+    if points.are_equally_far:
+        corners = _corners_at_depth(cameras, near)
+        low, high = np.minimum(low, corners.min(axis=0)), np.maximum(high, corners.max(axis=0))
+    return _box(low - margin, high + margin)
+
+
+def _corners_at_depth(cameras: Cameras, points: MatchedPoints) -> Float64[np.ndarray, "P 3"]:
+    """The corners of each view, as deep as most of the places that it shows."""
     usual, ends = float(points.depths.median()), []
     for view in range(len(cameras)):
         own = points.depths[points.views == view]
@@ -150,13 +161,9 @@ def _box_of_places(cameras: Cameras, points: MatchedPoints) -> SceneBox:
         coords = torch.tensor([(x, y) for x in (0.0, float(width)) for y in (0.0, float(height))])
         rays = cameras.generate_rays(torch.full((4,), view), coords)
         assert rays.axes is not None
-        cosines = (rays.directions * rays.axes).sum(dim=-1)
-        away = (float(own.median()) if len(own) else usual) / cosines
+        away = (float(own.median()) if len(own) else usual) / (rays.directions * rays.axes).sum(dim=-1)
         ends.append(rays.origins + away[:, None] * rays.directions)
-    corners, places = torch.cat(ends).double().numpy(), points.places.double().numpy()
-    low, high = np.quantile(places, (OUTLIERS, 1 - OUTLIERS), axis=0)
-    margin = PLACES_MARGIN * usual
-    return _box(np.minimum(low, corners.min(axis=0)) - margin, np.maximum(high, corners.max(axis=0)) + margin)
+    return torch.cat(ends).double().numpy()
 
 
 def _cube_of_views(cameras: Cameras) -> tuple[Float64[np.ndarray, "3"], float]:

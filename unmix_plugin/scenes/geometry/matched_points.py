@@ -39,6 +39,7 @@ LEAST_POINTS = 60
 MOST_DEPTH_RATIO = 2.0
 """Of far to near places that are about as far away."""
 _ENDS = torch.tensor([0.05, 0.95])
+_NEAR = 0.25
 _BRIGHT = 0.99
 """Quantile of a view's brightness that is taken for white."""
 
@@ -59,6 +60,13 @@ class MatchedPoints:
         """Whether all are about as far away, as ground is below an aircraft: views end there."""
         near, far = torch.quantile(self.depths[:: max(1, len(self.depths) // 100_000)], _ENDS)
         return bool(far < MOST_DEPTH_RATIO * near)
+
+    @property
+    def nearer(self) -> MatchedPoints:
+        """Those before a distant background: at most twice as deep as the nearest quarter."""
+        near = float(self.depths[:: max(1, len(self.depths) // 100_000)].quantile(_NEAR))
+        kept = self.depths <= MOST_DEPTH_RATIO * near
+        return MatchedPoints(self.places[kept], self.views[kept], self.depths[kept])
 
 
 def find_matched_points(cameras: Cameras, read_view: ReadView) -> MatchedPoints | None:
