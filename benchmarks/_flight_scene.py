@@ -102,7 +102,7 @@ def write_flight(folder: Path, releases: int, seed: int) -> Path:
         body = np.eye(4)
         body[:3, :3] = Rotation.from_rotvec(rng.normal(0, SWAY_RAD, 3) * (1, 1, 0.4)).as_matrix()
         along = (release - (releases - 1) / 2) * SPACING_M
-        body[:3, 3] = (*rng.normal(0, 1, 3), 0.0, along, ALTITUDE_M)
+        body[:3, 3] = np.add(rng.normal(0, 1, 3), (0.0, along, ALTITUDE_M))
         for band, (name, (turn, place)) in enumerate(mounts.items()):
             pose = body.copy()
             pose[:3, 3] += body[:3, :3] @ place
