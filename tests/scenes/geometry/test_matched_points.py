@@ -60,6 +60,17 @@ def test_large_views_are_thinned_out_and_their_places_stay_where_they_are(monkey
     assert above_ground(found.places).mean().abs() < 0.02
 
 
+def test_pixels_that_are_not_valid_are_no_features():
+    cameras = flight_cameras(flight_poses())
+    views = ground_views(cameras)
+    for view in views:
+        view[::31, ::29] = np.nan
+        view[150:, 160:] = np.inf
+    found = find_matched_points(cameras, read_from(views))
+    assert found is not None
+    assert above_ground(found.places).abs().quantile(0.9) < 0.1
+
+
 def test_views_that_share_nothing_or_show_one_colour_have_no_matched_places():
     cameras = flight_cameras(flight_poses())
     unrelated = [np.random.default_rng(view).random((HEIGHT, WIDTH, 1), np.float32) for view in range(5)]

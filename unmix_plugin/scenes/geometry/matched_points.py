@@ -58,14 +58,13 @@ class MatchedPoints:
     @property
     def are_equally_far(self) -> bool:
         """Whether all are about as far away, as ground is below an aircraft: views end there."""
-        near, far = torch.quantile(self.depths[:: max(1, len(self.depths) // 100_000)], _ENDS)
+        near, far = self.depths.quantile(_ENDS)
         return bool(far < MOST_DEPTH_RATIO * near)
 
     @property
     def nearer(self) -> MatchedPoints:
         """Those before a distant background: at most twice as deep as the nearest quarter."""
-        near = float(self.depths[:: max(1, len(self.depths) // 100_000)].quantile(_NEAR))
-        kept = self.depths <= MOST_DEPTH_RATIO * near
+        kept = self.depths <= MOST_DEPTH_RATIO * self.depths.quantile(_NEAR)
         return MatchedPoints(self.places[kept], self.views[kept], self.depths[kept])
 
 
@@ -114,8 +113,8 @@ def _choose_pairs(positions: Float[Tensor, "N 3"]) -> list[tuple[int, int]]:
 def _features_of(thinning: Thinning, read_view: ReadView, view: int) -> _Features:
     from skimage.feature import SIFT  # slow to import
 
-    brightness = thinning.read(read_view, view).mean(dim=-1)
-    dark, bright = torch.quantile(brightness.flatten()[:: max(1, brightness.numel() // 100_000)], _levels())
+    brightness = thinning.read(read_view, view).mean(dim=-1).nan_to_num(0.0, 0.0, 0.0)
+    dark, bright = brightness.flatten().quantile(torch.tensor([1 - _BRIGHT, _BRIGHT]))
     sift = SIFT(upsampling=1)
     try:
         sift.detect_and_extract(((brightness - dark) / (bright - dark).clamp(min=1e-9)).clamp(0, 1).numpy())
@@ -123,10 +122,6 @@ def _features_of(thinning: Thinning, read_view: ReadView, view: int) -> _Feature
         return _Features(torch.zeros(0, 2), np.zeros((0, 128), dtype=np.float32))
     coords = torch.from_numpy(np.array(sift.keypoints, dtype=np.float32)[:, ::-1].copy()) + 0.5
     return _Features(thinning.whole(coords), np.array(sift.descriptors, dtype=np.float32))
-
-
-def _levels() -> Float[Tensor, "2"]:
-    return torch.tensor([1 - _BRIGHT, _BRIGHT])
 
 
 def _triangulate(
