@@ -85,7 +85,8 @@ def pose_views(views: Sequence[CaptureView], poses: PoseSet) -> PosedViews:
         view.name: replace(cameras[view.name], lens=fit_lens(cameras[view.name].lens or view.lens, view))
         for view in posed
     }
-    placed = place_poses(replace(poses, cameras=fitted))
+    has_many_lenses = len({view.sensor for view in posed if view.release}) > 1
+    placed = place_poses(replace(poses, cameras=fitted), is_flight=has_many_lenses)
     return PosedViews(
         posed,
         placed.poses.cameras,

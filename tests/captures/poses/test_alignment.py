@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.captures.poses.pose_factory import LENS, ring_set
-from unmix_plugin.captures.poses.alignment import align_poses, focus_of, moved, similarity_of
+from unmix_plugin.captures.poses.alignment import align_poses, moved, similarity_of
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.scenes.placement import Placement
@@ -61,15 +61,6 @@ def test_umeyama_does_not_mirror():
     source = generator.normal(size=(9, 3))
     found = similarity_of(source, source * [1, 1, -1])
     np.testing.assert_allclose(np.linalg.det(found.rotation), 1)
-
-
-def test_the_focus_is_where_the_cameras_look_and_none_where_they_look_in_parallel():
-    stacked = np.stack([camera.camera_to_world for camera in ring_set().cameras.values()])
-    focus = focus_of(stacked)
-    assert focus is not None
-    np.testing.assert_allclose(focus, 0, atol=1e-9)
-    stacked = np.stack([camera.camera_to_world for camera in in_a_row().cameras.values()])
-    assert focus_of(stacked) is None
 
 
 def test_fewer_than_three_shared_cameras_are_refused():

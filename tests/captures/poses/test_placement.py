@@ -6,8 +6,10 @@ from plyfile import PlyData
 
 from tests.captures.poses.pose_factory import ring_set, transforms, write_json
 from tests.captures.poses.test_alignment import SIMILARITY, elsewhere, in_a_row
+from tests.scenes.geometry.ground_views import flight_poses
 from tests.scenes.scene_factory import make_scene, ring_poses
 from unmix_plugin.captures.poses.placement import place_poses, write_points
+from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.scenes import load_scene
 
@@ -46,6 +48,29 @@ def test_a_known_up_axis_is_kept_and_cameras_in_parallel_have_their_points_in_th
     placed = place_poses(type(row)(row.cameras, row.source, points))
     np.testing.assert_allclose(placed.placement.to_source(np.zeros(3)), [2, 2, -3])
     assert "up is the mean of the cameras' up vectors" in placed.notes
+
+
+def flight_over(points):
+    """A swaying camera above land at z = 0, in a world that knows no up."""
+    cameras = {f"{n}": PosedCamera(pose[:3], None) for n, pose in enumerate(flight_poses(6))}
+    return PoseSet(cameras, "a flight", points)
+
+
+def test_land_lies_level_below_the_cameras_of_a_flight():
+    points = np.random.default_rng(0).uniform(-1, 1, (50, 3)) * np.array([1, 1, 0.01])
+    placed = place_poses(flight_over(points), is_flight=True)
+    assert placed.poses.points is not None
+    assert np.ptp(placed.poses.points[:, 2]) < 0.1 * np.ptp(placed.poses.points[:, 0])
+    assert all(camera.camera_to_world[2, 3] > 0.5 for camera in placed.poses.cameras.values())
+    assert any("up is against where the cameras look" in note for note in placed.notes)
+    np.testing.assert_allclose(placed.placement.to_source(np.zeros(3)), np.median(points, axis=0), atol=1e-9)
+
+
+def test_cameras_turned_about_a_subject_are_no_flight_whatever_took_them():
+    given = elsewhere(ring_set(12))
+    np.testing.assert_array_equal(
+        place_poses(given, is_flight=True).placement.rotation, place_poses(given).placement.rotation
+    )
 
 
 def test_sparse_points_are_written_with_their_colours(tmp_path):

@@ -15,7 +15,7 @@ from tests.scenes.scene_factory import ball_alpha, look_at, make_scene, ring_pos
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.scenes import carve, load_scene
-from unmix_plugin.scenes.geometry.bounds import find_bounds, focus_point
+from unmix_plugin.scenes.geometry.bounds import find_bounds
 from unmix_plugin.scenes.geometry.carving import carve_box, foreground_mask, needed_witnesses
 from unmix_plugin.scenes.geometry.foreground_rays import foreground_rays
 
@@ -150,21 +150,6 @@ def test_pixels_that_a_mask_ignores_count_as_matter(tmp_path):
     assert foreground_mask(after, 1)[:, 10:].all()
     assert np.array_equal(foreground_mask(after, 1)[:, :10], foreground_mask(before, 1)[:, :10])
     assert np.array_equal(foreground_mask(after, 2), foreground_mask(before, 2))
-
-
-def test_the_focus_is_where_all_axes_meet():
-    target = np.array([0.3, -0.2, 0.5])
-    poses = [look_at(np.array(p), target) for p in ((3.0, 0, 1), (0, 3.0, 2), (-2.0, -2.0, 0))]
-    focus = focus_point(make_cameras(poses))
-    assert focus is not None
-    np.testing.assert_allclose(focus, target, atol=1e-5)
-
-
-def test_parallel_and_outward_cameras_have_no_focus():
-    parallel = [look_at(np.array([x, -3.0, 0.0]), np.array([x, 0.0, 0.0])) for x in (-0.5, 0.0, 0.5)]
-    outward = [look_at(pose[:3, 3], 2.0 * pose[:3, 3]) for pose in ring_poses(6)]
-    assert focus_point(make_cameras(parallel)) is None
-    assert focus_point(make_cameras(outward)) is None
 
 
 def test_the_box_of_a_ball_is_tight_around_it(tmp_path):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from tests.scenes.geometry.ball_views import make_cameras
 from tests.scenes.geometry.ground_views import (
     FOCAL,
     HEIGHT,
@@ -17,9 +16,8 @@ from tests.scenes.geometry.ground_views import (
     ground_views,
     strip_cameras,
 )
-from tests.scenes.scene_factory import look_at, ring_poses
 from unmix_plugin.scenes import load_scene
-from unmix_plugin.scenes.geometry.bounds import find_bounds, look_at_one_place
+from unmix_plugin.scenes.geometry.bounds import find_bounds
 from unmix_plugin.scenes.geometry.matched_points import find_matched_points
 
 
@@ -98,14 +96,6 @@ def test_the_box_of_a_flight_lies_on_the_ground_and_holds_all_of_it_that_is_seen
     low, high = box.aabb[:, 2].tolist()
     assert -0.6 < low < -0.1
     assert 0.1 < high < 0.6
-
-
-def test_cameras_around_a_subject_look_at_one_place_and_those_of_a_flight_do_not():
-    assert look_at_one_place(make_cameras(ring_poses(12)))
-    aside = [look_at(np.array([0.3 * x, -3.0, 0.0]), np.zeros(3)) for x in (-2, -1, 0, 1, 2)]
-    assert look_at_one_place(make_cameras(aside))
-    for count in (3, 5, 20):
-        assert not look_at_one_place(flight_cameras(flight_poses(count)))
 
 
 def test_a_flight_is_read_as_a_bounded_scene_on_the_ground(tmp_path):

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from unmix_plugin.captures.checks.seen_view import SeenView, angles_between
-from unmix_plugin.captures.poses.alignment import focus_of
+from unmix_plugin.engine.geometry.focus import meeting_point
 from unmix_plugin.errors import counted
 
 FEW_VIEWS = 15
@@ -33,9 +33,9 @@ def few_views(views: Sequence[SeenView]) -> list[str]:
 def ring(views: Sequence[SeenView]) -> tuple[list[str], str]:
     """From which sides the cameras look, and what is missing."""
     poses = np.stack([view.camera.camera_to_world for view in views])
-    focus = focus_of(poses)
+    focus = meeting_point(poses)
     if focus is None:
-        return [], "the cameras look in parallel: sides are not judged"
+        return [], "the cameras look at no one place: sides are not judged"
     directions = poses[:, :, 3] - focus
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     elevation = np.degrees(np.arcsin(np.clip(directions[:, 2], -1.0, 1.0)))
@@ -63,15 +63,15 @@ def overlap(
     """Whether each view shows something that another view shows from a similar side.
 
     A grid of rays of each view is followed to the depth of the middle of the scene: where the cameras look, or that of
-    the sparse points if they look in parallel. What other cameras see of these places is the overlap, if they look from
-    within 35 degrees.
+    the sparse points if they look at no one place. What other cameras see of these places is the overlap, if they look
+    from within 35 degrees.
     """
     poses = np.stack([view.camera.camera_to_world for view in views])
-    focus = focus_of(poses)
+    focus = meeting_point(poses)
     if focus is None and points is not None and len(points):
         focus = np.median(points, axis=0)
     if focus is None or len(views) < 2:
-        return [], "overlap is not judged: the cameras look in parallel, and there are no sparse points"
+        return [], "overlap is not judged: the cameras look at no one place, and there are no sparse points"
     between = angles_between(views)
     shares = np.zeros(len(views))
     nearest = np.zeros(len(views))

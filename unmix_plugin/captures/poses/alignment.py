@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float64
 from unmix_plugin.captures.poses.lens_fit import project_opencv
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 from unmix_plugin.captures.poses.rigid import FLIP
+from unmix_plugin.engine.geometry.focus import focus_point
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.scenes.placement import Placement
 
@@ -114,18 +115,6 @@ def moved(camera: PosedCamera, similarity: Placement) -> PosedCamera:
     return replace(camera, camera_to_world=np.column_stack([similarity.rotation @ pose[:, :3], position]))
 
 
-def focus_of(poses: Float64[np.ndarray, "N 3 4"]) -> Float64[np.ndarray, "3"] | None:
-    """The point nearest to all optical axes; None where they are nearly parallel or it is behind most cameras."""
-    axes, positions = -poses[:, :, 2], poses[:, :, 3]
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    total = across.sum(axis=0)
-    if np.linalg.eigvalsh(total)[0] < 1e-3 * len(poses):
-        return None
-    point = np.linalg.solve(total, (across @ positions[:, :, None]).sum(axis=0))[:, 0]
-    in_front = ((point - positions) * axes).sum(axis=1) > 0
-    return point if in_front.mean() > 0.5 else None
-
-
 def _extent(cameras: Sequence[PosedCamera]) -> float:
     """Mean distance of cameras from their middle; 1 where they are at one place."""
     positions = np.stack([camera.camera_to_world[:, 3] for camera in cameras])
@@ -149,7 +138,7 @@ def _points_of(
         return similarity.to_scene(estimated.points)
     poses = np.stack([camera.camera_to_world for camera in theirs])
     reach = _extent(theirs)
-    middle = focus_of(poses)
+    middle = focus_point(poses)
     if middle is None:
         middle = (poses[:, :, 3] - reach * poses[:, :, 2]).mean(axis=0)
     cross = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.captures.poses.alignment import focus_of, moved
+from unmix_plugin.captures.poses.alignment import moved
 from unmix_plugin.captures.poses.pose_set import PoseSet
+from unmix_plugin.engine.geometry.focus import focus_point, meeting_point
 from unmix_plugin.formats.ply import write_ply
 from unmix_plugin.scenes.placement import Placement
 
@@ -17,6 +18,8 @@ POINTS_FILE = "points.ply"
 """Of a scene folder; its `ply_file_path`."""
 LEAST_TURN_DEG = 10.0
 """Horizontal axes of cameras that span less than this do not tell the vertical."""
+MOST_SWAY_DEG = 30.0
+"""Between the axes of cameras that look down and their mean, about."""
 
 
 @dataclass(frozen=True)
@@ -31,14 +34,18 @@ class PlacedPoses:
     """How up axis, middle and scale were found, one sentence each."""
 
 
-def place_poses(poses: PoseSet) -> PlacedPoses:
+def place_poses(poses: PoseSet, is_flight: bool = False) -> PlacedPoses:
     """Settle up axis, middle and scale of a scene.
 
     The up axis is the source's where it has one, otherwise the direction across which the cameras' horizontal axes lie,
     or the mean of their up vectors. The middle is where the cameras look, or that of the sparse points.
+
+    Args:
+        poses: In the source's world.
+        is_flight: Whether cameras that all look one way look down.
     """
     stacked = np.stack([camera.camera_to_world for camera in poses.cameras.values()])
-    up, how_up = _find_up(stacked, poses.up)
+    up, how_up = _find_up(stacked, poses.up, is_flight)
     middle, how_middle = _find_middle(stacked, poses.points)
     reach = float(np.linalg.norm(stacked[:, :, 3] - middle, axis=1).max())
     scale = 1.0 / reach if reach > 0 else 1.0
@@ -71,10 +78,13 @@ def write_points(folder: Path, poses: PoseSet) -> str | None:
 
 
 def _find_up(
-    poses: Float64[np.ndarray, "N 3 4"], known: Float64[np.ndarray, "3"] | None
+    poses: Float64[np.ndarray, "N 3 4"], known: Float64[np.ndarray, "3"] | None, is_flight: bool
 ) -> tuple[Float64[np.ndarray, "3"], str]:
     if known is not None:
         return known, "up is the source's"
+    back = poses[:, :, 2].mean(axis=0)
+    if is_flight and np.linalg.norm(back) > np.cos(np.radians(MOST_SWAY_DEG)):
+        return back / np.linalg.norm(back), "up is against where the cameras look, as they would in a flight"
     mean = poses[:, :, 1].mean(axis=0)
     _, singular, vt = np.linalg.svd(poses[:, :, 0], full_matrices=True)
     is_spread = len(singular) > 1 and singular[1] > np.sin(np.radians(LEAST_TURN_DEG)) * singular[0]
@@ -89,13 +99,13 @@ def _find_up(
 def _find_middle(
     poses: Float64[np.ndarray, "N 3 4"], points: Float64[np.ndarray, "P 3"] | None
 ) -> tuple[Float64[np.ndarray, "3"], str]:
-    focus = focus_of(poses)
-    if focus is not None:
-        return focus, "the middle is the point nearest to all optical axes"
-    if points is not None and len(points) > 0:
-        return np.median(
-            points, axis=0
-        ), "the middle is that of the sparse points, as the cameras look in parallel"
+    met, nearest = meeting_point(poses), focus_point(poses)
+    if met is None and points is not None and len(points) > 0:
+        return np.median(points, axis=0), (
+            "the middle is that of the sparse points, as the cameras look at no one place"
+        )
+    if nearest is not None:
+        return nearest, "the middle is the point nearest to all optical axes"
     return poses[:, :, 3].mean(axis=0), "the middle is that of the cameras"
 
 

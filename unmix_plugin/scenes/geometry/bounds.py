@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.focus import focus_point
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.errors import SceneError
@@ -29,13 +30,6 @@ from unmix_plugin.scenes.geometry.carving import carve_box
 from unmix_plugin.scenes.geometry.foreground_rays import MIN_EXPLAINED, foreground_rays, share_through
 from unmix_plugin.scenes.geometry.matched_points import MatchedPoints
 
-MIN_CONVERGENCE = 1e-3
-"""Least mean squared sine between optical axes and their spread direction that still fixes a focus, (1.8 deg)^2."""
-LEAST_AXES_SPREAD_DEG = 6.0
-"""Root mean square angle of optical axes to their spread direction that cameras turned about a subject have; a flight
-whose camera sways has less."""
-MOST_MISSED = 0.5
-"""By how much half of the axes may miss the focus, in half widths of the images there."""
 OUTLIERS = 0.005
 """Share of the matched places that may lie outside the box, at each of its sides."""
 PLACES_MARGIN = 0.05
@@ -101,40 +95,6 @@ def find_bounds(
     return _tighten(cameras, rays, box, carve_box(cameras, foreground, box, HULL_CELLS))
 
 
-def look_at_one_place(cameras: Cameras) -> bool:
-    """Whether optical axes meet well enough to say where the subject is."""
-    focus, poses = focus_point(cameras), cameras.camera_to_world.double().numpy()
-    if focus is None or np.sqrt(_convergence(poses)) < np.sin(np.radians(LEAST_AXES_SPREAD_DEG)):
-        return False
-    forward, towards = -poses[:, :, 2], focus - poses[:, :, 3]
-    depths = (towards * forward).sum(axis=-1)
-    missed = np.linalg.norm(towards - depths[:, None] * forward, axis=-1)
-    return bool(np.median(missed / (np.abs(depths) * _half_angles(cameras)).clip(min=1e-12)) <= MOST_MISSED)
-
-
-def focus_point(cameras: Cameras) -> Float64[np.ndarray, "3"] | None:
-    """The point nearest to all optical axes; None if they are (nearly) parallel or most point away from it."""
-    poses = cameras.camera_to_world.double().numpy()
-    positions, forward = poses[:, :, 3], -poses[:, :, 2]
-    projectors = _across(poses)
-    if _convergence(poses) < MIN_CONVERGENCE:
-        return None
-    point = np.linalg.solve(projectors.mean(axis=0), (projectors @ positions[:, :, None]).mean(axis=0)[:, 0])
-    is_ahead = ((point - positions) * forward).sum(axis=-1) > 0.0
-    return point if is_ahead.mean() > 0.5 else None
-
-
-def _across(poses: Float64[np.ndarray, "N 3 4"]) -> Float64[np.ndarray, "N 3 3"]:
-    """Projections of space to what is square to each optical axis."""
-    forward = -poses[:, :, 2]
-    return np.eye(3) - forward[:, :, None] * forward[:, None, :]
-
-
-def _convergence(poses: Float64[np.ndarray, "N 3 4"]) -> float:
-    """Mean squared sine between optical axes and the direction that they spread from least."""
-    return max(float(np.linalg.eigvalsh(_across(poses).mean(axis=0))[0]), 0.0)
-
-
 def _half_angles(cameras: Cameras) -> Float64[np.ndarray, " N"]:
     """Tangents of half the angle that the longer side of each image spans."""
     sides = np.array([cameras.size(index) for index in range(len(cameras))], dtype=np.float64)
@@ -170,7 +130,7 @@ def _cube_of_views(cameras: Cameras) -> tuple[Float64[np.ndarray, "3"], float]:
     poses = cameras.camera_to_world.double().numpy()
     positions, forward = poses[:, :, 3], -poses[:, :, 2]
     half_angles = _half_angles(cameras)
-    focus = focus_point(cameras)
+    focus = focus_point(poses)
     if focus is not None:
         depths = ((focus - positions) * forward).sum(axis=-1)
         ahead = depths > 0.0

@@ -11,9 +11,10 @@ import torch
 from jaxtyping import Float32
 
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.focus import meeting_point
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.errors import SceneError
-from unmix_plugin.scenes.geometry.bounds import find_bounds, look_at_one_place
+from unmix_plugin.scenes.geometry.bounds import find_bounds
 from unmix_plugin.scenes.geometry.matched_points import MatchedPoints, find_matched_points
 from unmix_plugin.scenes.geometry.pose_check import commonest, compare_conventions, describe
 from unmix_plugin.scenes.geometry.thinned_views import ReadView
@@ -46,7 +47,7 @@ def find_model_space(
         return read_cube(cubes[train[alike[view]]], options.value_scale, options.invalid_pixels, part)
 
     points = None
-    if foreground is None and not look_at_one_place(cameras):
+    if foreground is None and meeting_point(cameras.camera_to_world.double().numpy()) is None:
         points = _matched_points(cameras, alike, read_view)
     try:
         first_box = find_bounds(root, cameras, foreground, points)
