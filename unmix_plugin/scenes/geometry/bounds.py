@@ -67,7 +67,7 @@ def find_bounds(
         root: Scene folder, for messages.
         cameras: Training cameras, in coordinates of order 1.
         foreground: For each view True where it may show something; None where there is no alpha.
-        points: Places that views agree on, for cameras that do not look at one place.
+        points: By the numbers of these cameras, places that views agree on, for cameras that do not look at one place.
     Returns:
         The box in the cameras' space.
     Raises:
@@ -93,12 +93,6 @@ def find_bounds(
     box = _tighten(cameras, rays, box, hull)
     # The second look has finer cells and so a thinner margin.
     return _tighten(cameras, rays, box, carve_box(cameras, foreground, box, HULL_CELLS))
-
-
-def _half_angles(cameras: Cameras) -> Float64[np.ndarray, " N"]:
-    """Tangents of half the angle that the longer side of each image spans."""
-    sides = np.array([cameras.size(index) for index in range(len(cameras))], dtype=np.float64)
-    return (0.5 * sides / cameras.focal_px.double().numpy()).max(axis=-1)
 
 
 def _box_of_places(cameras: Cameras, points: MatchedPoints) -> SceneBox:
@@ -129,7 +123,8 @@ def _corners_at_depth(cameras: Cameras, points: MatchedPoints) -> Float64[np.nda
 def _cube_of_views(cameras: Cameras) -> tuple[Float64[np.ndarray, "3"], float]:
     poses = cameras.camera_to_world.double().numpy()
     positions, forward = poses[:, :, 3], -poses[:, :, 2]
-    half_angles = _half_angles(cameras)
+    sides = np.array([cameras.size(index) for index in range(len(cameras))], dtype=np.float64)
+    half_angles = (0.5 * sides / cameras.focal_px.double().numpy()).max(axis=-1)
     focus = focus_point(poses)
     if focus is not None:
         depths = ((focus - positions) * forward).sum(axis=-1)
