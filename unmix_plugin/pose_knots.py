@@ -63,8 +63,13 @@ def row_waves(count: int) -> Float[Tensor, "n n"]:
     return (waves / (2 * (1 + place))).float()
 
 
-def similarities(offsets: Float[Tensor, "M 3"], reach: Float[Tensor, " M"]) -> Float[Tensor, "6*M 7"]:
-    """Orthonormal steps that turn, move or scale the world as seen from cameras at these offsets from its middle."""
+def similarities(
+    offsets: Float[Tensor, "M 3"], reach: Float[Tensor, " M"], sight: Float[Tensor, " M"]
+) -> Float[Tensor, "6*M 7"]:
+    """Orthonormal steps that turn, move or scale the world as seen from cameras at these offsets from its middle.
+
+    A step turns by `sight` and moves by `sight` times `reach`.
+    """
     axes = torch.eye(3, dtype=torch.float64)
     places, lengths = offsets.double().cpu(), reach.double().cpu()[:, None]
     zero = torch.zeros_like(places)
@@ -73,9 +78,8 @@ def similarities(offsets: Float[Tensor, "M 3"], reach: Float[Tensor, " M"]) -> F
         for axis in axes
     ]
     moved = [torch.cat([zero, axis / lengths], dim=1) for axis in axes]
-    columns = torch.stack(
-        [x.flatten() for x in [*turned, *moved, torch.cat([zero, places / lengths], dim=1)]], dim=1
-    )
+    amounts = [*turned, *moved, torch.cat([zero, places / lengths], dim=1)]
+    columns = torch.stack([(x / sight.double().cpu()[:, None]).flatten() for x in amounts], dim=1)
     found, sizes, _ = torch.linalg.svd(columns, full_matrices=False)
     basis = torch.zeros_like(columns)
     basis[:, : found.shape[1]] = found * (sizes > 1e-6 * sizes[0])

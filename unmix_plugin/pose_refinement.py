@@ -9,7 +9,7 @@ taken out of the corrections. A view that goes farther than `LARGEST_STEP` has l
 back, and keeps it unless the grid is still coarse.
 
 Notation: `V` training views, `M` knots of all views, `R` rays. A step is (w, m): the camera turns by the rotation
-vector w in world axes about itself, and moves by m times its reach.
+vector w in world axes about itself, and moves by m times its reach, both times its sight.
 
 Source: Lin et al. 2021, BARF (joint refinement, coarse to fine); Wang et al. 2021, NeRF-- (focal length).
 """
@@ -29,6 +29,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.rotations import rotation_matrix
+from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.pose_knots import Knots, row_waves, similarities
 from unmix_plugin.pose_settings import PoseConfig
 from unmix_plugin.pose_trust import PoseTrust
@@ -36,7 +37,10 @@ from unmix_plugin.rendering.gradients import scale_gradient
 
 LARGEST_STEP = 0.25
 """Radians, or share of the distance to the scene's middle, beyond which a correction is undone; of a line camera in the
-mean over its knots."""
+mean over its knots. Less for a camera that sees the scene under a smaller angle than the next, by as much."""
+SMALLEST_SIGHT = 0.25
+"""Half of the scene's longest edge over its distance, from which on steps are smaller in proportion: seen from far, as
+through a long lens, the same turn moves the picture by more of its width."""
 LINE_REACH = 0.25
 """Reach of a line camera as a share of its distance to the scene's middle, which is the reach of a frame camera. A row
 can hardly tell a shift from a turn: steps of equal effect would split between both what is mostly a turn, and parallax
@@ -51,6 +55,8 @@ class PoseRefinement(nn.Module):
     """Corrections of the training views' poses, all 0 at first."""
 
     reach: Tensor
+    sight: Tensor
+    """What is left of a step at each knot where the scene is seen under a small angle, in (0, 1]."""
     shares: Tensor
     """Of the distance to the scene's middle, that are the reach at each knot."""
     gauge: Tensor
@@ -70,6 +76,7 @@ class PoseRefinement(nn.Module):
         self.lens = nn.Parameter(torch.zeros(3), requires_grad=self.num_lens > 0)
         self.trust = PoseTrust(total)
         self.register_buffer("reach", torch.ones(total))
+        self.register_buffer("sight", torch.ones(total))
         shares = torch.where(counts > 1, LINE_REACH, 1.0).repeat_interleave(counts)
         self.register_buffer("shares", shares, persistent=False)
         self.register_buffer("gauge", torch.zeros(6 * total, 7))
@@ -91,11 +98,13 @@ class PoseRefinement(nn.Module):
             self.register_buffer(f"waves_{count}", row_waves(count), persistent=False)
 
     @torch.no_grad()
-    def begin(self, positions: Float[Tensor, "M 3"], middle: Float[Tensor, "3"]) -> None:
-        """Take in where the cameras stand at the knots, and the scene's middle."""
-        offsets = positions - middle
-        self.reach.copy_(self.shares * offsets.norm(dim=1).clamp(min=1e-6))
-        self.gauge.copy_(similarities(offsets, self.reach))
+    def begin(self, positions: Float[Tensor, "M 3"], box: SceneBox) -> None:
+        """Take in where the cameras stand at the knots, and the scene."""
+        offsets = positions - box.aabb.mean(dim=0)
+        distances = offsets.norm(dim=1).clamp(min=1e-6)
+        self.reach.copy_(self.shares * distances)
+        self.sight.copy_((0.5 * box.size.max() / distances / SMALLEST_SIGHT).clamp(max=1.0))
+        self.gauge.copy_(similarities(offsets, self.reach, self.sight))
 
     def settle(self) -> None:
         """Note that the scene was judged by the corrected cameras."""
@@ -104,6 +113,10 @@ class PoseRefinement(nn.Module):
 
     @property
     def corrections(self) -> Float[Tensor, "M 6"]:
+        """By how much the cameras are turned and moved at the knots."""
+        return self._free_steps() * self.sight[:, None]
+
+    def _free_steps(self) -> Float[Tensor, "M 6"]:
         """Steps without what moves all views alike; 0 for views that were undone."""
         free = self.is_free.repeat_interleave(self.counts)[:, None]
         steps = (self._at_knots() * free).flatten()
@@ -128,7 +141,7 @@ class PoseRefinement(nn.Module):
 
     def penalty(self, config: PoseConfig) -> Float[Tensor, ""]:
         """What large and rough corrections cost."""
-        steps = self.corrections
+        steps = self._free_steps()
         bends = [steps[self.get_buffer(f"places_{count}")].diff(n=2, dim=1).flatten() for count in self.lines]
         bent = torch.cat([steps.new_zeros(0), *bends])
         large = steps.square().mean() + self.lens.square().sum()
@@ -194,7 +207,7 @@ class PoseRefinement(nn.Module):
         Args:
             is_final: Whether they keep them; else they may try again.
         """
-        sizes = self._sizes().amax(dim=1)
+        sizes = self._sizes().amax(dim=1) / self.sight
         views = torch.arange(len(self.is_free), device=sizes.device).repeat_interleave(self.counts)
         # In the mean over its knots: a line camera may wobble farther in a few rows and still be on its way.
         size = torch.zeros(len(self.is_free), device=sizes.device).index_add_(0, views, sizes) / self.counts
