@@ -19,7 +19,7 @@ from unmix_plugin.field import CoefficientField
 from unmix_plugin.lamp_shading import Lamplight
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.pose_knots import Knots, row_waves
-from unmix_plugin.pose_refinement import LARGEST_STEP, PoseRefinement
+from unmix_plugin.pose_refinement import COARSEST_PIXEL, LARGEST_STEP, PoseRefinement
 from unmix_plugin.pose_settings import PoseConfig
 
 WIDTH, HEIGHT = 12, 40
@@ -42,10 +42,10 @@ def cameras() -> Cameras:
     return Cameras(poses, focal, center, torch.zeros(3, 4), WIDTH, HEIGHT, key_poses=keys)
 
 
-def refinement(lens: str = "fixed", size: float = 0.04, half: float = 3.0) -> PoseRefinement:
+def refinement(lens: str = "fixed", size: float = 0.04, pixel_size: float = 0.1) -> PoseRefinement:
     own, knots = cameras(), Knots.of(cameras())
     found = PoseRefinement(knots.rows, lens)  # type: ignore[arg-type]
-    found.begin(knots.positions(own), box_around(MIDDLE, half))
+    found.begin(knots.positions(own), box_around(MIDDLE), pixel_size)
     with torch.no_grad():
         found.steps.copy_(size * torch.randn(found.steps.shape, generator=torch.Generator().manual_seed(1)))
         found.lens[: found.num_lens] = torch.tensor([0.05, -0.08, 0.03])[: found.num_lens]
@@ -112,21 +112,21 @@ def steps_to(corrections: torch.Tensor, knots: Knots) -> torch.Tensor:
     )
 
 
-@pytest.mark.parametrize("half", [3.0, 0.3])
-def test_what_moves_all_views_alike_is_no_correction(half):
-    """Turning, moving and scaling the world about its middle leaves nothing; the rest stays, near or far."""
+@pytest.mark.parametrize("pixel_size", [0.1, 0.003])
+def test_what_moves_all_views_alike_is_no_correction(pixel_size):
+    """Turning, moving and scaling the world about its middle leaves nothing; the rest stays."""
     knots, own = Knots.of(cameras()), cameras()
-    found, offsets = refinement(half=half), Knots.of(own).positions(own) - MIDDLE
+    found, offsets = refinement(pixel_size=pixel_size), Knots.of(own).positions(own) - MIDDLE
     before = found.corrections.detach()
     turn, shift, growth = torch.tensor([0.1, -0.2, 0.3]), torch.tensor([0.3, 0.1, -0.2]), 0.2
     moves = torch.linalg.cross(turn.expand_as(offsets), offsets) + shift + growth * offsets
     similar = torch.cat([turn.expand_as(offsets), moves / found.reach[:, None]], dim=1)
     with torch.no_grad():
-        found.steps.add_(steps_to(similar / found.sight[:, None], knots))
+        found.steps.add_(steps_to(similar / found.scale[:, None], knots))
     assert_close(found.corrections.detach(), before, atol=1e-6, rtol=0)
-    assert before.norm() > 0.05 * float(found.sight.min())
+    assert before.norm() > 0.05 * float(found.scale.min())
     with torch.no_grad():
-        found.steps.copy_(steps_to(before / found.sight[:, None], knots))
+        found.steps.copy_(steps_to(before / found.scale[:, None], knots))
     assert_close(found.corrections.detach(), before, atol=1e-6, rtol=0)
     assert sum(knots.counts) == len(before)
 
@@ -137,7 +137,7 @@ def test_a_view_that_runs_away_gets_its_pose_back_and_keeps_it():
     places = 4 * torch.nn.functional.normalize(
         torch.randn(6, 3, generator=torch.Generator().manual_seed(0)), dim=1
     )
-    found.begin(places, box_around(torch.zeros(3)))
+    found.begin(places, box_around(torch.zeros(3)), 0.1)
     found.gauge.zero_()
     with torch.no_grad():
         found.steps.fill_(0.01)
@@ -151,16 +151,16 @@ def test_a_view_that_runs_away_gets_its_pose_back_and_keeps_it():
     assert bool((found.corrections[0] != 0).all())
 
 
-def test_steps_shrink_with_the_angle_under_which_the_scene_is_seen():
-    """Four times as far, with a lens four times as long, a step moves the picture by as many pixels."""
+def test_steps_are_a_share_of_a_pixel_and_bounds_a_share_of_the_picture():
+    """The cameras stand at 2, 4, 16 and 16 from a scene of half edge 1; at its middle a pixel is 0.0272 wide."""
     found = PoseRefinement((0,) * 4)
     directions = torch.eye(3)[[0, 1, 2, 0]]
     distances = torch.tensor([2.0, 4.0, 16.0, 16.0])
-    found.begin(distances[:, None] * directions, box_around(torch.zeros(3), 1.0))
+    found.begin(distances[:, None] * directions, box_around(torch.zeros(3), 1.0), 4 * COARSEST_PIXEL)
     found.gauge.zero_()
     with torch.no_grad():
         found.steps.fill_(0.1)
-        found.steps[3] = 0.3  # runs away as seen from so far
+        found.steps[3] = 0.3  # 0.075 radians about each axis, where the scene spans 0.0625
     turns = found.corrections.detach()[:3, :3].norm(dim=1)
     assert_close(turns / turns[0], torch.tensor([1.0, 1.0, 0.25]))
     found.undo_runaways()
@@ -193,7 +193,7 @@ def test_while_the_grid_is_coarse_a_view_that_runs_away_may_try_again():
 
 def test_a_shift_counts_by_the_distance_to_the_middle_of_the_scene():
     found = PoseRefinement((0, 0))
-    found.begin(torch.tensor([[4.0, 0.0, 0.0], [0.0, 2.0, 0.0]]), box_around(torch.zeros(3)))
+    found.begin(torch.tensor([[4.0, 0.0, 0.0], [0.0, 2.0, 0.0]]), box_around(torch.zeros(3)), 0.1)
     found.gauge.zero_()
     rays = RayBundle(torch.zeros(2, 3), torch.eye(3)[:2], torch.arange(2))
     rays = replace(rays, axes=rays.directions, image_y=torch.zeros(2))

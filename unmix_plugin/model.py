@@ -132,7 +132,8 @@ class UnmixModel(Model):
         self.specular_spectra.copy_(first_specular_spectra(len(self.specular_spectra), lamp, endmembers))
         reachable = torch.from_numpy(initial_data["reachable"])
         if self.poses is not None:
-            self.poses.begin(torch.from_numpy(initial_data["knots"]), self.scene_box)
+            knots = torch.from_numpy(initial_data["knots"])
+            self.poses.begin(knots, self.scene_box, self.metadata["pixel_size"])
             reachable = torch.ones_like(reachable)  # poses that are off carve away what is there
         self.grid = make_grid(self.config, reachable, self.is_unbounded).to(self.device)
 

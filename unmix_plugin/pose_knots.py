@@ -64,11 +64,11 @@ def row_waves(count: int) -> Float[Tensor, "n n"]:
 
 
 def similarities(
-    offsets: Float[Tensor, "M 3"], reach: Float[Tensor, " M"], sight: Float[Tensor, " M"]
+    offsets: Float[Tensor, "M 3"], reach: Float[Tensor, " M"], scale: Float[Tensor, " M"]
 ) -> Float[Tensor, "6*M 7"]:
     """Orthonormal steps that turn, move or scale the world as seen from cameras at these offsets from its middle.
 
-    A step turns by `sight` and moves by `sight` times `reach`.
+    A step turns by `scale` and moves by `scale` times `reach`.
     """
     axes = torch.eye(3, dtype=torch.float64)
     places, lengths = offsets.double().cpu(), reach.double().cpu()[:, None]
@@ -79,7 +79,7 @@ def similarities(
     ]
     moved = [torch.cat([zero, axis / lengths], dim=1) for axis in axes]
     amounts = [*turned, *moved, torch.cat([zero, places / lengths], dim=1)]
-    columns = torch.stack([(x / sight.double().cpu()[:, None]).flatten() for x in amounts], dim=1)
+    columns = torch.stack([(x / scale.double().cpu()[:, None]).flatten() for x in amounts], dim=1)
     found, sizes, _ = torch.linalg.svd(columns, full_matrices=False)
     basis = torch.zeros_like(columns)
     basis[:, : found.shape[1]] = found * (sizes > 1e-6 * sizes[0])

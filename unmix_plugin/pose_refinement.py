@@ -9,7 +9,7 @@ taken out of the corrections. A view that goes farther than `LARGEST_STEP` has l
 back, and keeps it unless the grid is still coarse.
 
 Notation: `V` training views, `M` knots of all views, `R` rays. A step is (w, m): the camera turns by the rotation
-vector w in world axes about itself, and moves by m times its reach, both times its sight.
+vector w in world axes about itself, and moves by m times its reach, both times its scale.
 
 Source: Lin et al. 2021, BARF (joint refinement, coarse to fine); Wang et al. 2021, NeRF-- (focal length).
 """
@@ -37,10 +37,12 @@ from unmix_plugin.rendering.gradients import scale_gradient
 
 LARGEST_STEP = 0.25
 """Radians, or share of the distance to the scene's middle, beyond which a correction is undone; of a line camera in the
-mean over its knots. Less for a camera that sees the scene under a smaller angle than the next, by as much."""
+mean over its knots."""
 SMALLEST_SIGHT = 0.25
-"""Half of the scene's longest edge over its distance, from which on steps are smaller in proportion: seen from far, as
-through a long lens, the same turn moves the picture by more of its width."""
+"""Half of the scene's longest edge over its distance, below which `LARGEST_STEP` is smaller in proportion: through a
+long lens, the same turn moves the picture by more of its width."""
+COARSEST_PIXEL = 6.8e-3
+"""Angle of a pixel, radians, below which steps are smaller in proportion: they are a share of a pixel, however fine."""
 LINE_REACH = 0.25
 """Reach of a line camera as a share of its distance to the scene's middle, which is the reach of a frame camera. A row
 can hardly tell a shift from a turn: steps of equal effect would split between both what is mostly a turn, and parallax
@@ -55,8 +57,10 @@ class PoseRefinement(nn.Module):
     """Corrections of the training views' poses, all 0 at first."""
 
     reach: Tensor
-    sight: Tensor
-    """What is left of a step at each knot where the scene is seen under a small angle, in (0, 1]."""
+    scale: Tensor
+    """Radians, or reaches, that a step of 1 stands for at each knot, in (0, 1]."""
+    bound: Tensor
+    """Largest correction at each knot, radians or share of the distance to the scene's middle."""
     shares: Tensor
     """Of the distance to the scene's middle, that are the reach at each knot."""
     gauge: Tensor
@@ -76,7 +80,8 @@ class PoseRefinement(nn.Module):
         self.lens = nn.Parameter(torch.zeros(3), requires_grad=self.num_lens > 0)
         self.trust = PoseTrust(total)
         self.register_buffer("reach", torch.ones(total))
-        self.register_buffer("sight", torch.ones(total))
+        self.register_buffer("scale", torch.ones(total))
+        self.register_buffer("bound", torch.full((total,), LARGEST_STEP))
         shares = torch.where(counts > 1, LINE_REACH, 1.0).repeat_interleave(counts)
         self.register_buffer("shares", shares, persistent=False)
         self.register_buffer("gauge", torch.zeros(6 * total, 7))
@@ -98,13 +103,15 @@ class PoseRefinement(nn.Module):
             self.register_buffer(f"waves_{count}", row_waves(count), persistent=False)
 
     @torch.no_grad()
-    def begin(self, positions: Float[Tensor, "M 3"], box: SceneBox) -> None:
-        """Take in where the cameras stand at the knots, and the scene."""
+    def begin(self, positions: Float[Tensor, "M 3"], box: SceneBox, pixel_size: float) -> None:
+        """Take in where the cameras stand at the knots, the scene, and how large a pixel is at its middle."""
         offsets = positions - box.aabb.mean(dim=0)
         distances = offsets.norm(dim=1).clamp(min=1e-6)
         self.reach.copy_(self.shares * distances)
-        self.sight.copy_((0.5 * box.size.max() / distances / SMALLEST_SIGHT).clamp(max=1.0))
-        self.gauge.copy_(similarities(offsets, self.reach, self.sight))
+        self.scale.copy_((pixel_size / distances / COARSEST_PIXEL).clamp(max=1.0))
+        sight = 0.5 * box.size.max() / distances
+        self.bound.copy_(LARGEST_STEP * (sight / SMALLEST_SIGHT).clamp(max=1.0))
+        self.gauge.copy_(similarities(offsets, self.reach, self.scale))
 
     def settle(self) -> None:
         """Note that the scene was judged by the corrected cameras."""
@@ -114,7 +121,7 @@ class PoseRefinement(nn.Module):
     @property
     def corrections(self) -> Float[Tensor, "M 6"]:
         """By how much the cameras are turned and moved at the knots."""
-        return self._free_steps() * self.sight[:, None]
+        return self._free_steps() * self.scale[:, None]
 
     def _free_steps(self) -> Float[Tensor, "M 6"]:
         """Steps without what moves all views alike; 0 for views that were undone."""
@@ -207,11 +214,11 @@ class PoseRefinement(nn.Module):
         Args:
             is_final: Whether they keep them; else they may try again.
         """
-        sizes = self._sizes().amax(dim=1) / self.sight
+        sizes = self._sizes().amax(dim=1) / self.bound
         views = torch.arange(len(self.is_free), device=sizes.device).repeat_interleave(self.counts)
         # In the mean over its knots: a line camera may wobble farther in a few rows and still be on its way.
         size = torch.zeros(len(self.is_free), device=sizes.device).index_add_(0, views, sizes) / self.counts
-        is_held = self.is_free & (size <= LARGEST_STEP)
+        is_held = self.is_free & (size <= 1)
         is_held &= is_held.float().mean() >= 1 - MOST_UNDONE
         self.steps.masked_fill_(~is_held[views][:, None], 0.0)
         if is_final:
