@@ -75,7 +75,7 @@ def find_matched_points(cameras: Cameras, read_view: ReadView) -> MatchedPoints 
         cameras: Of views that show the same bands. All have one size; line cameras may be among them.
         read_view: Reads a part of a view.
     """
-    thinning = Thinning.to(cameras, LONGEST_SIDE_PX)
+    thinning = Thinning.to(LONGEST_SIDE_PX, cameras, read_view)
     pairs = _choose_pairs(cameras.camera_to_world[:, :, 3])
     features = {view: _features_of(thinning, read_view, view) for view in sorted({*sum(pairs, ())})}
     found = [_triangulate(cameras, thinning, pair, features[pair[0]], features[pair[1]]) for pair in pairs]

@@ -15,11 +15,11 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Float64, Int
+from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.scenes.geometry.thinned_views import MOST_BANDS, ReadView
+from unmix_plugin.scenes.geometry.thinned_views import ReadView, Thinning
 from unmix_plugin.scenes.scene import Scene
 
 NUM_REFERENCES, NUM_NEIGHBOURS, NUM_AGREEING = 8, 4, 3
@@ -86,13 +86,8 @@ def compare_conventions(poses: Poses, lenses: Cameras, read_view: ReadView) -> d
     neighbours = choose_neighbours(poses)
     generator = torch.Generator().manual_seed(0)
     used = sorted({*neighbours, *(other for others in neighbours.values() for other in others)})
-    corner = read_view(used[0], (slice(1), slice(1)))
-    stride, band_step = (
-        -(-max(lenses.width, lenses.height) // LONGEST_SIDE_PX),
-        -(-corner.shape[2] // MOST_BANDS),
-    )
-    part = (slice(None, None, stride), slice(None, None, stride), slice(None, None, band_step))
-    views = [read_view(view, part) for view in used]
+    thinning = Thinning.to(LONGEST_SIDE_PX, lenses, read_view, most_pooled=1)
+    views = [thinning.read(read_view, view) for view in used]
     features = dict(zip(used, view_features(views, generator), strict=True))
     pixels = {view: _busy_pixels(features[view], generator) for view in neighbours}
     drawn = torch.cat([features[view].flatten(0, 1)[pixels[view]] for view in neighbours])
@@ -101,7 +96,7 @@ def compare_conventions(poses: Poses, lenses: Cameras, read_view: ReadView) -> d
         return {}
     return {
         name: _disagreement(
-            thinned_cameras(meant, lenses, features[used[0]], stride), features, pixels, neighbours
+            thinned_cameras(meant, lenses, features[used[0]], thinning.stride), features, pixels, neighbours
         )
         / chance
         for name, meant in _meanings(poses).items()
@@ -155,16 +150,15 @@ def choose_neighbours(
 
 
 def view_features(
-    views: list[Float32[np.ndarray, "H W B"]], generator: torch.Generator
+    views: list[Float[Tensor, "H W B"]], generator: torch.Generator
 ) -> list[Float[Tensor, "H W F"]]:
     """Principal components of the spectra of all views, the first with a spread of 1, smoothed a little."""
-    cubes = [torch.from_numpy(np.ascontiguousarray(view)) for view in views]
-    spectra = torch.cat([cube.flatten(0, 1) for cube in cubes])
+    spectra = torch.cat([view.flatten(0, 1) for view in views])
     some = spectra[torch.randperm(len(spectra), generator=generator)[:5000]]
     mean = some.mean(dim=0)
     _, spreads, axes = torch.linalg.svd(some - mean, full_matrices=False)
     axes = axes[:NUM_FEATURES].T / (spreads[0] / len(some) ** 0.5).clamp(min=1e-12)
-    return [_smooth((cube - mean) @ axes) for cube in cubes]
+    return [_smooth((view - mean) @ axes) for view in views]
 
 
 def _smooth(image: Float[Tensor, "H W F"]) -> Float[Tensor, "H W F"]:

@@ -76,7 +76,7 @@ def sweep_depths(cameras: Cameras, box: SceneBox, read_view: ReadView) -> SweptD
     views = np.linspace(0, len(cameras) - 1, count).round().astype(int).tolist()
     if count < NUM_AGREEING + 1:
         return None
-    thinning = Thinning.to(cameras, LONGEST_SIDE_PX)
+    thinning = Thinning.to(LONGEST_SIDE_PX, cameras, read_view)
     if min(cameras.width, cameras.height) // thinning.stride < PIXEL_STRIDE:
         return None
     images = [thinning.read(read_view, view) for view in views]
@@ -103,7 +103,7 @@ def _sweep_all(
 ) -> Float[Tensor, "N h w"] | None:
     """Distances in all views, inf where unknown; None if the views are plain."""
     generator = torch.Generator().manual_seed(0)
-    features = view_features([image.numpy() for image in images], generator)
+    features = view_features(images, generator)
     pixels = torch.cat([image.flatten(0, 1) for image in features])
     drawn = pixels[torch.randperm(len(pixels), generator=generator)[:_CHANCE_PIXELS]]
     chance = float((drawn - drawn.roll(1, 0)).norm(dim=-1).median())

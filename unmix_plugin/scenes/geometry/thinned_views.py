@@ -17,7 +17,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 
 MOST_BANDS = 32
 """Of what is compared."""
-_POOLED = 4
+MOST_POOLED = 4
 """Pixels along an edge that are averaged, if there are so many; of more, every second or third is left out."""
 
 ReadView = Callable[[int, tuple[slice, ...]], Float32[np.ndarray, "H W B"]]
@@ -32,13 +32,18 @@ class Thinning:
     """Of so many pixels along an edge one is read."""
     pooled: int
     """Of so many that are read along an edge the mean is taken."""
+    band_step: int
+    """Of so many bands one is read."""
 
     @classmethod
-    def to(cls, cameras: Cameras, longest_side_px: int) -> Thinning:
-        """Of views to at most so many pixels along their longer side."""
+    def to(
+        cls, longest_side_px: int, cameras: Cameras, read_view: ReadView, most_pooled: int = MOST_POOLED
+    ) -> Thinning:
+        """Of views that show the same bands to at most so many pixels along their longer side, and `MOST_BANDS`."""
         stride = -(-max(cameras.width, cameras.height) // longest_side_px)
-        fine = max(1, stride // _POOLED)
-        return cls(fine, stride // fine)
+        fine = max(1, stride // most_pooled)
+        bands = read_view(0, (slice(1), slice(1))).shape[2]
+        return cls(fine, stride // fine, -(-bands // MOST_BANDS))
 
     @property
     def stride(self) -> int:
@@ -51,10 +56,9 @@ class Thinning:
         return self.fine * (self.pooled - 1) / 2
 
     def read(self, read_view: ReadView, view: int) -> Float[Tensor, "h w B"]:
-        """A view, with at most `MOST_BANDS` of its bands."""
-        bands = read_view(view, (slice(1), slice(1))).shape[2]
+        """A view thinned out."""
         some = slice(None, None, self.fine)
-        picture = read_view(view, (some, some, slice(None, None, -(-bands // MOST_BANDS))))
+        picture = read_view(view, (some, some, slice(None, None, self.band_step)))
         image = torch.from_numpy(np.ascontiguousarray(picture)).permute(2, 0, 1)
         return torch.nn.functional.avg_pool2d(image, self.pooled).permute(1, 2, 0)
 

@@ -27,7 +27,7 @@ from unmix_plugin.scenes.geometry.pose_check import (
     view_differences,
     view_features,
 )
-from unmix_plugin.scenes.geometry.thinned_views import MOST_BANDS, ReadView
+from unmix_plugin.scenes.geometry.thinned_views import ReadView, Thinning
 
 TILES = 12
 """Along each side of a view: a pixel of each part is asked, since what is far away may be a small part of a view."""
@@ -81,18 +81,15 @@ def find_world_evidence(box: SceneBox, cameras: Cameras, read_view: ReadView) ->
     neighbours = choose_neighbours(poses)
     generator = torch.Generator().manual_seed(0)
     used = sorted({*neighbours, *(other for others in neighbours.values() for other in others)})
-    bands = read_view(used[0], (slice(1), slice(1))).shape[2]
-    stride = -(-max(cameras.width, cameras.height) // LONGEST_SIDE_PX)
-    part = (slice(None, None, stride), slice(None, None, stride), slice(None, None, -(-bands // MOST_BANDS)))
-    features = dict(
-        zip(used, view_features([read_view(view, part) for view in used], generator), strict=True)
-    )
+    thinning = Thinning.to(LONGEST_SIDE_PX, cameras, read_view, most_pooled=1)
+    views = [thinning.read(read_view, view) for view in used]
+    features = dict(zip(used, view_features(views, generator), strict=True))
     pixels = {view: _spread_pixels(features[view]) for view in neighbours}
     drawn = torch.cat([features[view].flatten(0, 1)[pixels[view]] for view in neighbours])
     chance = float((drawn - drawn[torch.randperm(len(drawn), generator=generator)]).norm(dim=-1).median())
     if chance <= 0.0:  # nothing in the views changes
         return WorldEvidence(0, 0, 0, 0)
-    own = thinned_lenses(cameras, features[used[0]], stride)
+    own = thinned_lenses(cameras, features[used[0]], thinning.stride)
     found = [
         _least_disagreements(box, own, features, pixels[view], view, others)
         for view, others in neighbours.items()
