@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from unmix_plugin.alpha_preset import Auto
 from unmix_plugin.directions import (
     NUM_DIRECTION_FEATURES,
     NUM_SKY_FEATURES,
@@ -36,6 +37,8 @@ from unmix_plugin.rendering.hash_encoding import HashGridLayout, hash_encode
 
 _LARGEST_LOG_DENSITY = 15.0
 LARGEST_RESOLUTION = 4096
+_ROWS_PER_CELL_OF_A_FACE = 1 / 3
+_FEWEST_LOG2_ROWS, _MOST_LOG2_ROWS = 16, 19
 
 
 @dataclass(frozen=True)
@@ -52,8 +55,9 @@ class UnmixFieldConfig(InstantiateConfig):
     cells_per_pixel: float = 1.7
     """Cells of the finest level along the edge of a pixel where it meets the middle of the scene box: finer ones would
     fit what the views don't show."""
-    log2_rows_per_level: int = 16
-    """Largest number of vertices that a level stores, as a power of two; finer levels share rows by a hash."""
+    log2_rows_per_level: int | Auto = "auto"
+    """Largest number of vertices that a level stores, as a power of two; finer levels share rows by a hash. auto: from
+    16 to 19, about a third of the finest level's cells in a face of the scene box."""
     hidden_width: int = 64
     """Width of the hidden layers."""
     num_features: int = 15
@@ -76,7 +80,9 @@ class UnmixFieldConfig(InstantiateConfig):
             "features-per-level of 1 to 8": 1 <= self.features_per_level <= 8,
             "coarsest-resolution of 2 to 4096": 2 <= self.coarsest_resolution <= LARGEST_RESOLUTION,
             "cells-per-pixel of 0.001 to 100": 0.001 <= self.cells_per_pixel <= 100,
-            "log2-rows-per-level of 4 to 24": 4 <= self.log2_rows_per_level <= 24,
+            "log2-rows-per-level of 4 to 24 or auto": (
+                self.log2_rows_per_level == "auto" or 4 <= self.log2_rows_per_level <= 24
+            ),
             "hidden-width of 1 to 1024": 1 <= self.hidden_width <= 1024,
             "num-features of 1 to 256": 1 <= self.num_features <= 256,
             "a temperature of 0.01 to 100": 0.01 <= self.temperature <= 100,
@@ -88,6 +94,17 @@ class UnmixFieldConfig(InstantiateConfig):
         """Cells along the scene box's longest edge; `pixel_size` is as `UnmixField` takes it."""
         cells = math.ceil(self.cells_per_pixel * float(scene_box.size.max()) / pixel_size)
         return max(self.coarsest_resolution, min(cells, LARGEST_RESOLUTION))
+
+    def rows_of_level(self, finest_resolution: int) -> int:
+        """Log2 of the rows that a level may have, where the finest has so many cells along the longest edge.
+
+        A surface passes through as many cells as it has area, so the rows that large scenes need grow with the square
+        of their resolution; small ones would only learn more slowly with more rows.
+        """
+        if self.log2_rows_per_level != "auto":
+            return self.log2_rows_per_level
+        wanted = math.log2(finest_resolution**2 * _ROWS_PER_CELL_OF_A_FACE)
+        return max(_FEWEST_LOG2_ROWS, min(round(wanted), _MOST_LOG2_ROWS))
 
 
 class CoefficientField(Field):
@@ -179,12 +196,13 @@ class UnmixField(CoefficientField):
         self.num_endmembers, self.num_specular = num_endmembers, num_specular
         self.num_encoded = config.num_levels * config.features_per_level
         self.log_initial_density = math.log(initial_density)
+        finest_resolution = config.cells_of_finest_level(scene_box, pixel_size) * (2 if is_unbounded else 1)
         self.layout = HashGridLayout(
             config.num_levels,
             config.features_per_level,
             config.coarsest_resolution,
-            config.cells_of_finest_level(scene_box, pixel_size) * (2 if is_unbounded else 1),
-            config.log2_rows_per_level,
+            finest_resolution,
+            config.rows_of_level(finest_resolution),
         )
         self.register_buffer("aabb", scene_box.aabb.clone())
         self.is_unbounded = is_unbounded
