@@ -12,6 +12,7 @@ from tests.method_factory import (
     make_rays,
 )
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.spectral.losses import FAINT, relative_weights
 from unmix_plugin.training_losses import LossConfig
 
 
@@ -71,6 +72,31 @@ def test_brighter_than_a_saturated_sensor_is_no_error_but_darker_is():
         for v in (1.5, 0.5)
     ]
     assert error == [0.0, 0.25]
+
+
+@pytest.mark.parametrize("power", [0.0, 1.0, 2.0])
+def test_relative_errors_count_the_more_the_darker_the_rendered_pixel_is(power):
+    model = make_model(losses=LossConfig(background="black", rgb=0.0, abundances=0.0, relative=power))
+
+    def loss(rendered: float) -> float:
+        outputs = {"spectral": torch.full((1, NUM_BANDS), rendered), "accumulation": torch.ones(1)}
+        batch = {"spectra": torch.full((1, NUM_BANDS), 0.9 * rendered), "alpha": torch.ones(1)}
+        return float(model.get_loss_dict(outputs, batch)["spectral"])
+
+    faint = (0.2 + FAINT) / (0.1 + FAINT)
+    assert loss(0.2) == pytest.approx(0.02**2, rel=1e-4)
+    assert loss(0.1) == pytest.approx(0.01**2 * faint**power, rel=1e-4)
+
+
+def test_weights_of_relative_errors_pull_at_no_pixel():
+    rendered = torch.full((4, NUM_BANDS), 0.1, requires_grad=True)
+    assert not relative_weights(rendered, 2.0).requires_grad
+
+
+@pytest.mark.parametrize("power", [-0.5, 2.5])
+def test_impossible_powers_of_relative_errors_are_refused(power):
+    with pytest.raises(ConfigError, match=r"relative in \[0, 2\] or auto"):
+        LossConfig(relative=power)
 
 
 def test_transparency_is_penalised_only_where_no_alpha_says_what_is_solid():

@@ -89,7 +89,10 @@ def test_settings_without_auto_read_no_data():
         raise AssertionError
 
     config = UnmixModelConfig(
-        num_endmembers=4, light="fixed", poses="fixed", losses=LossConfig(exposure=1.0, band_weights=())
+        num_endmembers=4,
+        light="fixed",
+        poses="fixed",
+        losses=LossConfig(exposure=1.0, band_weights=(), relative=0.0),
     )
     assert config.resolve_auto(unread, torch.Generator()) == (config, "")
 
@@ -131,3 +134,12 @@ def test_the_light_and_the_exposure_follow_from_the_data():
 def test_a_bright_scene_in_a_fixed_light_is_left_as_it_is():
     config, reasons = UnmixModelConfig(num_endmembers=3).resolve_auto(initial_data, torch.Generator())
     assert (config.light, config.losses.exposure, reasons) == ("fixed", 1.0, "")
+    assert config.losses.relative == 0.0
+
+
+def test_errors_count_relatively_where_part_of_the_scene_is_much_brighter_than_the_rest():
+    uneven = dict(initial_data())
+    uneven["pixels"] = uneven["pixels"] * np.where(np.arange(len(uneven["pixels"])) % 4, 0.1, 1.0)[:, None]
+    config, reasons = UnmixModelConfig(num_endmembers=3).resolve_auto(lambda: uneven, torch.Generator())
+    assert config.losses.relative == 1.5
+    assert "squared errors are divided by the brightness to the power of 1.5 (relative)" in reasons

@@ -121,7 +121,8 @@ class BatchComparison:
             config.outlier,
         )
         colours, weights = self.seen_by.rgb_weights(part.sensor), self.balance.of(part.sensor)
-        losses = spectral_losses(pixels, exposure * measured, colours, wanted, weights)
+        relative = choose(config.relative, 0.0)
+        losses = spectral_losses(pixels, exposure * measured, colours, wanted, weights, relative)
         if "abundances" in wanted and self.seen_by.tells_materials(part.sensor, self.num_endmembers):
             abundances = pixel_mean(outputs["abundances"], len(measured))
             losses["abundances"] = self.guide.error(abundances, *self._guided(part))

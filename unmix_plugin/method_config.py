@@ -64,6 +64,7 @@ unmix_nerf_published = MethodSpecification(
                     exposure=1.0,
                     band_weights=(),
                     outlier=1e6,
+                    relative=0.0,
                 ),
             ),
         ),

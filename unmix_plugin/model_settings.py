@@ -18,7 +18,7 @@ from unmix_plugin.field import UnmixFieldConfig
 from unmix_plugin.lamp import NUM_LAMP_NUMBERS, Lamp
 from unmix_plugin.pose_settings import PoseConfig
 from unmix_plugin.renderer_settings import RendererConfig
-from unmix_plugin.spectral.evidence import exposure_of
+from unmix_plugin.spectral.evidence import exposure_of, relative_power_of
 from unmix_plugin.spectral.materials import SegmentationMethod
 from unmix_plugin.spectral.unmixing.endmembers import EndmemberMethod, drop_uninformative_pixels
 from unmix_plugin.spectral.unmixing.num_materials import propose_num_materials
@@ -135,17 +135,9 @@ class UnmixModelConfig(ModelConfig):
             count = propose_num_materials(pixels[kept], generator)
             found = replace(found, num_endmembers=count.number)
             reasons.append(count.evidence())
-        if self.losses.exposure == "auto":
-            exposure = round(exposure_of(torch.from_numpy(initial_data()["pixels"])), 3)
-            found = replace(found, losses=replace(found.losses, exposure=exposure))
-            if exposure > 1:
-                reasons.append(
-                    f"the scene is dark: training compares spectra multiplied by {exposure:.3g} (exposure)"
-                )
-        if self.losses.band_weights == "auto":
-            given = initial_data().get("band_weights", np.ones(1))
-            weights = () if bool((given == 1).all()) else tuple(round(float(w), 6) for w in given)
-            found = replace(found, losses=replace(found.losses, band_weights=weights))
+        losses, of_losses = _resolved_losses(self.losses, initial_data)
+        found = replace(found, losses=losses)
+        reasons += of_losses
         if self.light == "auto":
             light: Light = initial_data().get("light", np.array("fixed")).item()
             found = replace(found, light=light)
@@ -188,6 +180,33 @@ class UnmixModelConfig(ModelConfig):
         if self.num_specular_spectra == "auto":
             return 1 + num_endmembers if preset.specular_endmembers else 1
         return self.num_specular_spectra
+
+
+def _resolved_losses(
+    losses: LossConfig, initial_data: Callable[[], Mapping[str, np.ndarray]]
+) -> tuple[LossConfig, list[str]]:
+    """With what follows from the brightness and the noise of the scene, and the evidence for it."""
+    reasons = []
+    if losses.exposure == "auto":
+        exposure = round(exposure_of(torch.from_numpy(initial_data()["pixels"])), 3)
+        losses = replace(losses, exposure=exposure)
+        if exposure > 1:
+            reasons.append(
+                f"the scene is dark: training compares spectra multiplied by {exposure:.3g} (exposure)"
+            )
+    if losses.relative == "auto":
+        relative = round(relative_power_of(torch.from_numpy(initial_data()["pixels"])), 3)
+        losses = replace(losses, relative=relative)
+        if relative > 0:
+            reasons.append(
+                "part of the scene is much brighter than the rest: squared errors are divided by the "
+                f"brightness to the power of {relative:.2g} (relative)"
+            )
+    if losses.band_weights == "auto":
+        given = initial_data().get("band_weights", np.ones(1))
+        weights = () if bool((given == 1).all()) else tuple(round(float(w), 6) for w in given)
+        losses = replace(losses, band_weights=weights)
+    return losses, reasons
 
 
 def usual_num_endmembers(num_bands: int) -> int:

@@ -20,6 +20,7 @@ from unmix_plugin.spectral.losses import (
     bounded_square,
     forgive_saturation,
     over_background,
+    relative_weights,
     solid_evidence,
     srgb_error,
 )
@@ -75,6 +76,9 @@ class LossConfig:
     """Error of an exposed value above which it counts in proportion instead of squared. It matters in dark scenes
     only: a blown-out pixel would otherwise outweigh all others. What a saturated value misses is unknown anyway, so for
     such pixels the bound is divided by the exposure."""
+    relative: float | Auto = "auto"
+    """Power of a pixel's brightness by which squared errors of its spectrum are divided: 0 for absolute errors, 2 for
+    relative ones. Auto is 0 unless the brighter pixels of the scene are much brighter than the others."""
     mixing_penalty: float = 2.0
     """By how much a further material must improve the fit of such a spectrum, in multiples of the mean angle that
     mixtures of two leave unexplained where that is 0.02 rad; less where it is less, more where it is more."""
@@ -95,6 +99,7 @@ class LossConfig:
             or all(weight > 0 for weight in self.band_weights),
             "an exposure above 0 or auto": self.exposure == "auto" or self.exposure > 0,
             "outlier above 0": self.outlier > 0,
+            "relative in [0, 2] or auto": self.relative == "auto" or 0 <= self.relative <= 2,
             "spread-until in (0, 1]": 0 < self.spread_until <= 1,
             "surface-until in (0, 1]": 0 < self.surface_until <= 1,
             "normals-until in (0, 1]": 0 < self.normals_until <= 1,
@@ -173,10 +178,19 @@ def spectral_losses(
     rgb_weights: Float[Tensor, "B 3"],
     wanted: set[str],
     band_weights: Float[Tensor, "B"] | None = None,
+    relative: float = 0.0,
 ) -> dict[str, Tensor]:
-    """Those of `spectral`, `rgb` and `opacity` that are wanted, not yet weighted; bands count alike without weights."""
+    """Those of `spectral`, `rgb` and `opacity` that are wanted, not yet weighted; bands count alike without weights.
+
+    Args:
+        relative: As `LossConfig` has it.
+    """
     squares = bounded_square(pixels.predicted - pixels.target, pixels.outliers)
-    losses = {"spectral": (squares if band_weights is None else band_weights * squares).mean()}
+    if band_weights is not None:
+        squares = band_weights * squares
+    if relative > 0:
+        squares = relative_weights(pixels.predicted, relative)[:, None] * squares
+    losses = {"spectral": squares.mean()}
     if "rgb" in wanted:
         losses["rgb"] = srgb_error(pixels.predicted, pixels.target, rgb_weights, pixels.outliers)
     if "opacity" in wanted:

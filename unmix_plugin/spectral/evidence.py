@@ -9,6 +9,8 @@ mean square of its spectrum.
 
 from __future__ import annotations
 
+import math
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -27,6 +29,12 @@ _FAINTEST_SURPLUS = 0.02
 _PLAIN_BRIGHTNESS = 0.2
 """Median brightness of opaque pixels from which a scene counts as well exposed."""
 _LARGEST_EXPOSURE = 100.0
+_BRIGHTER_PART = 0.9
+"""Quantile of brightness that is compared with the median."""
+_PLAIN_CONTRAST = 2.75
+"""Brightness of that quantile, in medians, up to which absolute errors are right."""
+_LARGEST_POWER = 1.5
+"""Of brightness by which squared errors are divided, where that quantile is at least twice as bright as that."""
 
 
 def brightness(spectra: Float[Tensor, "R B"]) -> Float[Tensor, "R"]:
@@ -93,3 +101,20 @@ def exposure_of(pixels: Float[Tensor, "R B"]) -> float:
     """
     median = float(brightness(pixels).median()) if len(pixels) else _PLAIN_BRIGHTNESS
     return min(max(_PLAIN_BRIGHTNESS / max(median, 1e-9), 1.0), _LARGEST_EXPOSURE)
+
+
+def relative_power_of(pixels: Float[Tensor, "R B"]) -> float:
+    """Power of brightness by which squared errors should be divided, [0, 1.5], from how uneven the brightness is.
+
+    In most scenes the brighter tenth of the pixels is about twice as bright as the usual one, and absolute errors are
+    right: 0. Where it is more than five times as bright, they would hardly tell of the dark rest: 1.5.
+
+    Args:
+        pixels: Of the whole scene, opaque ones.
+    """
+    seen = brightness(pixels)
+    if len(seen) == 0 or (median := float(seen.median())) <= 0:
+        return 0.0
+    brighter = float(seen.kthvalue(math.ceil(_BRIGHTER_PART * len(seen))).values)
+    contrast = brighter / median
+    return _LARGEST_POWER * min(max(math.log2(contrast / _PLAIN_CONTRAST), 0.0), 1.0)

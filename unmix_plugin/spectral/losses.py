@@ -38,6 +38,23 @@ def bounded_square(errors: Float[Tensor, "R C"], outliers: Float[Tensor, "R 1"])
     return torch.where(size <= outliers, errors.square(), outliers * (2 * size - outliers))
 
 
+_PLAIN_BRIGHTNESS = 0.2
+"""Root mean square over bands of a pixel that keeps its weight."""
+FAINT = 0.02
+"""Brightness below which weights hardly grow: there is noise."""
+
+
+def relative_weights(pred_spectra: Float[Tensor, "R B"], power: float) -> Float[Tensor, "R"]:
+    """Weights of squared errors that fall with a power of the brightness of the rendered pixels, without gradient.
+
+    The rendered pixel, not the measured one, so that noise of the latter does not decide how much it counts.
+
+    Source: Mildenhall et al. 2022, NeRF in the Dark, section 4.2, for a power of 2.
+    """
+    brightness = pred_spectra.detach().square().mean(dim=-1).sqrt()
+    return ((_PLAIN_BRIGHTNESS + FAINT) / (brightness + FAINT)) ** power
+
+
 _SURELY_LIT = 0.05
 """Root mean square over bands from which a pixel surely shows something."""
 

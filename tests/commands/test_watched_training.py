@@ -1,0 +1,140 @@
+"""The viewer beside `unmix-train`: what is printed, what is served, and how both end."""
+
+import io
+import os
+import signal
+import threading
+
+import numpy as np
+import pytest
+
+from benchmarks._viewer_page import Page
+from tests.commands.running import SMALL_METHOD, run
+from tests.commands.watching import START_S, address, looking, started, visited
+from unmix_plugin.commands import train as train_module
+from unmix_plugin.commands.train import parse_all, train
+from unmix_plugin.engine.training.trainer import Trainer
+from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
+from unmix_plugin.viewer import server
+
+
+def training_argv(trained, folder, *words):
+    return [
+        *("unmix-nerf", "--data", trained.scene, "--output-dir", folder, *SMALL_METHOD),
+        *("--viewer.enabled", "--viewer.port", "0", *words),
+    ]
+
+
+def test_a_training_is_watched_while_it_runs_and_ends_as_without(trained, tmp_path):
+    words = training_argv(trained, tmp_path, "--max-num-iterations", "20")
+    with started("train", *words, "--viewer.keep-open") as command:
+        with looking(command.address) as page:
+            command.wait_for_line("the viewer stays open")
+            page.wait_until(lambda: ">done<" in page.texts, START_S)
+            count = len(page.pictures)
+            page.look_from(1.0)
+            page.wait_until(lambda: len(page.pictures) > count)
+        command.process.send_signal(signal.SIGINT)
+        assert command.end() == 0
+        assert command.lines[-1].startswith("run: ")
+        found = read_spectra_csv(
+            type(trained.run)(command.lines[-1].removeprefix("run: ")) / "endmembers.csv"
+        )
+        np.testing.assert_array_equal(found.spectra, read_spectra_csv(trained.run / "endmembers.csv").spectra)
+
+
+def test_without_keep_open_the_process_ends_with_the_training(trained, tmp_path):
+    ended = run(train, *training_argv(trained, tmp_path, "--max-num-iterations", 3))
+    assert ended.status == 0
+    assert "viewer: http://127.0.0.1:" in ended.out
+    assert ended.last_line.startswith("run: ")
+    assert not [thread for thread in threading.enumerate() if "viewer" in thread.name]
+
+
+def test_the_viewer_stays_as_long_as_a_page_is_open_and_the_run_is_printed_last(
+    trained, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(server, "_UNWATCHED_S", 1)
+    loop, is_page_open = Trainer._loop, threading.Event()
+
+    def loop_once_a_page_is_open(self, *args):  # not in a step: pages wait for the model while one is taken
+        assert is_page_open.wait(START_S)
+        loop(self, *args)
+
+    monkeypatch.setattr(Trainer, "_loop", loop_once_a_page_is_open)
+
+    def visit(printed):
+        with Page(address(printed)) as page:
+            page.look_from(0.3)
+            page.wait_until(lambda: bool(page.controls))
+            is_page_open.set()
+            printed("the viewer stays open while a page is; end it with Ctrl-C")
+            page.wait_until(lambda: ">done<" in page.texts, START_S)
+            with pytest.raises(TimeoutError):  # for longer than the viewer stays without a page
+                page.wait_until(lambda: page.is_closed, 3.0)
+
+    ended = visited(visit, train, *training_argv(trained, tmp_path, "--max-num-iterations", 3))
+    assert ended.status == 0
+    assert ended.last_line.startswith("run: ")
+
+
+def test_a_training_that_is_stopped_from_the_page_can_go_on(trained, tmp_path):
+    def visit(printed):
+        with looking(address(printed)) as page:
+            page.wait_until(lambda: any(one.get("label") == "really stop" for one in page.controls.values()))
+            page.set("really stop", True)
+            page.set("stop training", True)
+            page.wait_until(lambda: page.is_closed, START_S)
+            assert "stopped, and saved" in page.texts
+
+    stopped = visited(visit, train, *training_argv(trained, tmp_path, "--max-seconds", "300"))
+    assert stopped.status == 130
+    assert "go on with: unmix-train unmix-nerf --load-run" in stopped.err
+    path = stopped.last_line.removeprefix("run: ")
+    resumed = run(train, "unmix-nerf", "--load-run", path, "--max-num-iterations", 2)
+    assert resumed.status == 0
+
+
+def test_a_page_that_is_loaded_again_while_training_goes_on(trained, tmp_path):
+    def visit(printed):
+        for _ in range(3):
+            with looking(address(printed)):
+                pass
+        os.kill(os.getpid(), signal.SIGINT)
+
+    ended = visited(visit, train, *training_argv(trained, tmp_path, "--max-seconds", "300"))
+    assert ended.status == 130
+    assert "Traceback" not in ended.out + ended.err
+
+
+def test_the_viewer_is_off_where_the_output_is_no_terminal_and_on_where_it_is(tmp_path, monkeypatch):
+    words = ["unmix-nerf", "--data", str(tmp_path)]
+    monkeypatch.setattr(train_module.sys, "stdout", io.StringIO())
+    assert not parse_all(words)[1].enabled
+    monkeypatch.setattr(train_module.sys, "stdout", Terminal())
+    assert parse_all(words)[1].enabled
+    assert not parse_all([*words, "--viewer.no-enabled"])[1].enabled
+
+
+class Terminal:
+    """Says that it is one."""
+
+    def isatty(self):
+        return True
+
+
+def test_words_of_the_viewer_are_no_settings_of_the_training(trained):
+    words = ["unmix-nerf", "--data", str(trained.scene), "--viewer.host", "::1", "--viewer.share", "0.2"]
+    config, viewing = parse_all([*words, "--max-seconds", "7"])
+    assert (viewing.host, viewing.share, viewing.port, viewing.token) == ("::1", 0.2, 7007, None)
+    assert (config.max_seconds, config.max_num_iterations) == (7.0, None)
+    assert "viewer" not in (trained.run / "config.json").read_text()
+
+
+def test_impossible_words_of_the_viewer_end_before_training(trained, tmp_path):
+    ended = run(train, *training_argv(trained, tmp_path / "out", "--viewer.share", "2"))
+    assert ended.status == 2
+    assert "--viewer.share is a part" in ended.err
+    ended = run(train, *training_argv(trained, tmp_path / "out", "--viewer.host", "203.0.113.7"))
+    assert ended.status == 2
+    assert "can't listen" in ended.err
