@@ -5,7 +5,7 @@
 Of a rendered scene, the demo scene at 384 px if none is given, every other training view is kept as three broad
 channels at full size, the others as 12 bands at a quarter of the size. Two models are trained for equal steps, on all
 these views and on the spectral ones alone, and compared with the scene at full size in every band; so are the spectral
-camera's own pictures of the evaluation views, enlarged by cubic interpolation. About ten minutes on two quiet cores.
+camera's own pictures of the evaluation views, enlarged by cubic interpolation. About 35 minutes on two quiet cores.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Options:
 
     scene: Path | None = None
     """Scene folder with all bands in every view; None: the demo scene at 384 px with 12 bands."""
-    steps: int = 1500
+    steps: int = 10_000
     """Of each training."""
     quick: bool = False
     """A few steps, to see that the benchmark works."""

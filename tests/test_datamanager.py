@@ -20,6 +20,7 @@ from unmix_plugin.errors import ConfigError, RunError, SceneError
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.scenes.pixel_table import memory, pool
 from unmix_plugin.scenes.scene import SceneOptions
+from unmix_plugin.scenes.training_evidence import relative_power
 
 CONFIG = HyperspectralDataManagerConfig(train_num_rays_per_batch=64, grid_resolution=16, single_ray_until=0.0)
 
@@ -119,6 +120,20 @@ def test_initial_pixels_come_from_opaque_pixels_of_all_training_views(scene_fold
     assert data["reachable"].shape == (16, 16, 16)
     assert 0.02 < data["reachable"].mean() < 1
     assert len(make(scene_folder, max_initial_pixels=50).initial_data()["pixels"]) == 50
+
+
+@pytest.mark.parametrize(("has_alpha", "power"), [(True, 1.5), (False, 0.0)])
+def test_errors_are_relative_where_alpha_is_known_and_some_pixels_are_much_brighter(
+    scene_folder, has_alpha, power
+):
+    scene = replace(make(scene_folder).scene, has_alpha=has_alpha)
+    pixels = np.full((100, 6), 0.05, dtype=np.float32)
+    pixels[:20] = 0.5
+    assert relative_power(scene, pixels) == power
+
+
+def test_errors_of_an_evenly_lit_scene_are_absolute(scene_folder):
+    assert make(scene_folder).initial_data()["relative"] == 0.0
 
 
 def test_the_number_of_rays_can_be_changed(scene_folder):

@@ -44,6 +44,7 @@ from unmix_plugin.scenes.training_evidence import (
     band_weights,
     judge_sensors,
     noise_warnings,
+    relative_power,
     rig_warnings,
 )
 from unmix_plugin.sensor_batches import join_parts
@@ -162,7 +163,7 @@ class HyperspectralDataManager(DataManager):
         """`pixels`: spectra pooled over all training views; `reachable`: where something may be; `knots`: where cameras
         stand whose poses may be corrected; `light`: fixed, camera or per-view, as far as pictures with alpha tell;
         `lamp`: numbers of the lamp that moves with the camera, none if it is not known;
-        `band_weights`, of squared errors, mean 1.
+        `band_weights`, of squared errors, mean 1; `relative`, the power of brightness by which these are divided.
 
         Of a rig, pixels of the sensor with most channels, and of those the one with most pixels; `sensor`, which that
         is; and `typical`, a spectrum on all bands that fits the mean of each sensor's pixels.
@@ -175,9 +176,11 @@ class HyperspectralDataManager(DataManager):
         shares = self._pixels.shares
         chosen = max(shares, key=lambda sensor: (sensors[sensor].num_channels, shares[sensor]))
         reachable, _ = self._carved
+        opaque = self._pixels.sample_opaque(chosen, most, seed)
         found = {
             "knots": self._knots.positions(self.train_cameras).numpy(),
-            "pixels": self._pixels.sample_opaque(chosen, most, seed),
+            "pixels": opaque,
+            "relative": np.array(relative_power(self.scene, opaque)),
             "reachable": reachable,
             "band_weights": band_weights(self.scene, self._noise),
             **self._light(reachable),

@@ -18,7 +18,7 @@ from unmix_plugin.field import UnmixFieldConfig
 from unmix_plugin.lamp import NUM_LAMP_NUMBERS, Lamp
 from unmix_plugin.pose_settings import PoseConfig
 from unmix_plugin.renderer_settings import RendererConfig
-from unmix_plugin.spectral.evidence import exposure_of, relative_power_of
+from unmix_plugin.spectral.evidence import exposure_of
 from unmix_plugin.spectral.materials import SegmentationMethod
 from unmix_plugin.spectral.unmixing.endmembers import EndmemberMethod, drop_uninformative_pixels
 from unmix_plugin.spectral.unmixing.num_materials import propose_num_materials
@@ -195,7 +195,7 @@ def _resolved_losses(
                 f"the scene is dark: training compares spectra multiplied by {exposure:.3g} (exposure)"
             )
     if losses.relative == "auto":
-        relative = round(relative_power_of(torch.from_numpy(initial_data()["pixels"])), 3)
+        relative = round(float(initial_data().get("relative", 0.0)), 3)
         losses = replace(losses, relative=relative)
         if relative > 0:
             reasons.append(

@@ -78,7 +78,7 @@ class LossConfig:
     such pixels the bound is divided by the exposure."""
     relative: float | Auto = "auto"
     """Power of a pixel's brightness by which squared errors of its spectrum are divided: 0 for absolute errors, 2 for
-    relative ones. Auto is 0 unless the brighter pixels of the scene are much brighter than the others."""
+    relative ones. Auto is 0 unless alpha is known and the brighter pixels are much brighter than the others."""
     mixing_penalty: float = 2.0
     """By how much a further material must improve the fit of such a spectrum, in multiples of the mean angle that
     mixtures of two leave unexplained where that is 0.02 rad; less where it is less, more where it is more."""

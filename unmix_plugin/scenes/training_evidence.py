@@ -1,6 +1,6 @@
 """What training pixels are worth, band by band, and what a user should know of them before training.
 
-Notation: `B` bands of the scene, `P` points.
+Notation: `B` bands of the scene, `P` points, `R` pixels.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from unmix_plugin.scenes.pixel_table import PixelTable
 from unmix_plugin.scenes.reading.sensors import lonely_sensors
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.band_noise import BandNoise, judge_bands
+from unmix_plugin.spectral.evidence import relative_power_of
 
 _PIXELS_TO_JUDGE_BY = 20_000
 LEAST_OVERLAP = 0.1
@@ -39,6 +40,15 @@ def band_weights(scene: Scene, noise: dict[int, BandNoise]) -> Float[np.ndarray,
         bands = list(scene.sensors[sensor].bands or ())
         weights[bands] = np.minimum(weights[bands], found.weights.numpy())
     return np.where(np.isfinite(weights), weights, 1.0).astype(np.float32)
+
+
+def relative_power(scene: Scene, opaque: Float[np.ndarray, "R B"]) -> float:
+    """Of brightness, by which squared errors are divided.
+
+    Without alpha black may be nothing at all, so that errors of dark pixels must not count more: 0.
+    """
+    knows_empty = scene.has_alpha and not scene.is_unbounded
+    return relative_power_of(torch.from_numpy(opaque)) if knows_empty else 0.0
 
 
 def noise_warnings(scene: Scene, noise: dict[int, BandNoise], bad_share: float) -> list[str]:
