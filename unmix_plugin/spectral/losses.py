@@ -49,7 +49,7 @@ def relative_weights(pred_spectra: Float[Tensor, "R B"], power: float) -> Float[
 
     The rendered pixel, not the measured one, so that noise of the latter does not decide how much it counts.
 
-    Source: Mildenhall et al. 2022, NeRF in the Dark, section 4.2, for a power of 2.
+    Source: Mildenhall et al. 2022, NeRF in the Dark, for a power of 2.
     """
     brightness = pred_spectra.detach().square().mean(dim=-1).sqrt()
     return ((_PLAIN_BRIGHTNESS + FAINT) / (brightness + FAINT)) ** power
