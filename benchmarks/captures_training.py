@@ -46,7 +46,7 @@ LIMITS: dict[str, dict[str, _common.Limit]] = {
     },
 }
 SHOWN = (
-    *("psnr", "psnr_unsaturated", "psnr_matter", "psnr_matter_unsaturated"),
+    *("psnr", "psnr_unsaturated", "psnr_matter", "psnr_matter_unsaturated", "psnr_white"),
     *("ssim", "sam", "miou", "abundance_rmse", "endmember_angle", "train_seconds"),
 )
 

@@ -23,6 +23,7 @@ KEYS = [
         "psnr_matter",
         "psnr_unsaturated",
         "psnr_matter_unsaturated",
+        "psnr_white",
         "rmse",
         "ssim",
         "sam",

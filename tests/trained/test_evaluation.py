@@ -103,7 +103,7 @@ def test_figures_without_truth_are_unknown_and_the_others_stay(scene, view):
     evaluation = Evaluation(untold_scene, scene.endmembers)
     evaluation.add(untold_view, replace(perfect(view, [0, 1, 2]), spectra=view.spectra * 0.9))
     figures = finite_or_none(evaluation.figures())
-    unknown = {"miou", "macro_f1", "accuracy", "abundance_rmse", "endmember_angle"}
+    unknown = {"psnr_white", "miou", "macro_f1", "accuracy", "abundance_rmse", "endmember_angle"}
     assert {name for name, value in figures.items() if value is None} == unknown
 
 
@@ -245,6 +245,21 @@ def test_blown_out_pixels_count_in_one_psnr_and_not_in_the_other(scene, view):
     assert found["psnr_matter_unsaturated"] == pytest.approx(20.0, abs=1e-4)
     assert found["psnr_matter"] < 19.9
     assert found["psnr"] < found["psnr_unsaturated"] - 0.1
+
+
+def test_a_white_pixel_that_the_mask_calls_matter_is_right_over_white_if_nothing_is_there(scene, view):
+    """Gaps through which a white backdrop shows: an error on black, whatever a prediction without it does."""
+    measured, alpha = view.spectra.clone(), view.opacity.clone()
+    measured[4, 4], alpha[4, 4] = 1.0, 1.0
+    gap = replace(view, spectra=measured, alpha=alpha)
+    seen, opacity = view.spectra.clone(), view.opacity.clone()
+    seen[4, 4], opacity[4, 4] = 0.0, 0.0
+    predicted = replace(perfect(view, SHUFFLED), spectra=seen, accumulation=opacity)
+    found = evaluated(scene, gap, predicted, SHUFFLED).per_view["view"]
+    assert found["psnr"] == pytest.approx(10 * math.log10(120), abs=1e-4)
+    assert found["psnr_white"] == math.inf
+    bare = evaluated(scene, replace(gap, alpha=None), predicted, SHUFFLED).per_view["view"]
+    assert math.isnan(bare["psnr_white"])
 
 
 def test_psnr_of_matter_is_unknown_where_nothing_is(scene, view):

@@ -47,6 +47,7 @@ VIEW_FIGURES = (
     "psnr_matter",
     "psnr_unsaturated",
     "psnr_matter_unsaturated",
+    "psnr_white",
     "rmse",
     "ssim",
     "sam",
@@ -60,6 +61,8 @@ DEFINITIONS = {
     "psnr_matter": "dB, the same over valid pixels that are labelled or opaque only, background left out",
     "psnr_unsaturated": "dB, as psnr without blown-out pixels, in which a band was measured above 0.9",
     "psnr_matter_unsaturated": "dB, as psnr_matter without blown-out pixels",
+    "psnr_white": "dB, as psnr with both laid over white by their opacity, as results on objects are often published; "
+    "only of views with alpha",
     "rmse": "root mean squared error, all valid pixels and bands",
     "ssim": "mean over bands, 7 x 7 uniform window, data range 1",
     "sam": "mean spectral angle in radians over labelled or opaque pixels whose true spectrum is not dark "
@@ -176,6 +179,11 @@ class Evaluation:
             "psnr_matter": psnr(spectra, view.spectra, view.shows_matter),
             "psnr_unsaturated": psnr(spectra, view.spectra, view.valid & ~blown_out),
             "psnr_matter_unsaturated": psnr(spectra, view.spectra, view.shows_matter & ~blown_out),
+            "psnr_white": math.nan
+            if view.alpha is None
+            else psnr(
+                over_white(spectra, predicted.accumulation), over_white(view.spectra, view.alpha), valid
+            ),
             "rmse": rmse(spectra, view.spectra, valid),
             "ssim": ssim(spectra, view.spectra, valid) if fits_window else math.nan,
             "sam": sam(spectra, view.spectra, view.shows_matter),
@@ -240,6 +248,11 @@ class Evaluation:
         # Row by row, since float64 doubles the cube.
         linear = torch.stack([row.double().clamp(0, 1) @ matrix for row in spectra])
         return linear_to_srgb(linear.clamp(0, 1))
+
+
+def over_white(spectra: Float[Tensor, "H W b"], opacity: Float[Tensor, "H W"]) -> Float[Tensor, "H W b"]:
+    """Spectra on black, premultiplied by their opacity, as they look before something white."""
+    return spectra + (1 - opacity)[..., None]
 
 
 def scene_truth(scene: Scene) -> SceneTruth:
