@@ -227,8 +227,7 @@ class UnmixModel(Model):
                 self.field.get_density, shading, places, outputs["weights"], self.generator
             )
         if self.poses is not None:
-            settings = self.config.pose_refinement
-            weights["poses"], losses["poses"] = 1.0, self.poses.penalty(settings, self._progress)
+            weights["poses"], losses["poses"] = 1.0, self.poses.penalty(self.config.pose_refinement)
         return {name: weights[name] * losses[name] for name in weights if name in losses}
 
     def observe(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> None:

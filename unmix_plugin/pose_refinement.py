@@ -146,14 +146,13 @@ class PoseRefinement(nn.Module):
             "poses_doubted": (self.trust.weights < 0.5).float().mean(),
         }
 
-    def penalty(self, config: PoseConfig, progress: float) -> Float[Tensor, ""]:
-        """What large and rough corrections cost when that part of the training is over."""
+    def penalty(self, config: PoseConfig) -> Float[Tensor, ""]:
+        """What large and rough corrections cost."""
         steps = self._free_steps()
         bends = [steps[self.get_buffer(f"places_{count}")].diff(n=2, dim=1).flatten() for count in self.lines]
         bent = torch.cat([steps.new_zeros(0), *bends])
         large = steps.square().mean() + self.lens.square().sum()
-        rough = bent.square().sum() / max(1, len(bent))
-        return config.final_factor**progress * (config.penalty * large + config.roughness * rough)
+        return config.penalty * large + config.roughness * bent.square().sum() / max(1, len(bent))
 
     def nearest_knots(self, rays: RayBundle) -> Int[Tensor, " R"]:
         """Of rays as `forward` takes them."""

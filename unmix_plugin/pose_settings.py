@@ -30,9 +30,6 @@ class PoseConfig:
     roughness: float = 1.5
     """Weight of the mean squared bend (second difference between knots) of a line camera's corrections: what carries a
     camera moves smoothly, and rows that see little follow their neighbours."""
-    final_factor: float = 0.01
-    """Factor on the weights of `penalty` and `roughness` at the end of training, reached exponentially: at first they
-    hold rows together that tell little, later they would hold back what all views hardly show."""
 
     def __post_init__(self) -> None:
         """Refuse impossible settings.
@@ -47,7 +44,6 @@ class PoseConfig:
             "start in [0, 1]": 0 <= self.start <= 1,
             "a penalty of 0 to 1e6": 0 <= self.penalty <= 1e6,
             "a roughness of 0 to 1e6": 0 <= self.roughness <= 1e6,
-            "final-factor in (0, 1]": 0 < self.final_factor <= 1,
         }
         require("pose refinement", self, rules)
 
