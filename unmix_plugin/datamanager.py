@@ -155,6 +155,7 @@ class HyperspectralDataManager(DataManager):
             "pixel_size": min(self._rays.pixel_sizes.values()),
             "subpixels": self._final_subpixels,
             "num_train_views": len(self.train_cameras),
+            "num_train_pixels": self._num_train_pixels,
             **({} if self.train_cameras.key_poses is None else {"line_rows": list(self._knots.rows)}),
             **({"sensors": [sensor.to_json() for sensor in self.scene.sensors]} if self.scene.is_rig else {}),
         }
@@ -278,9 +279,12 @@ class HyperspectralDataManager(DataManager):
 
     @property
     def _final_subpixels(self) -> int:
+        return choose(self.options.subpixels, 1 if self._num_train_pixels > _MANY_PIXELS else 2)
+
+    @property
+    def _num_train_pixels(self) -> int:
         sizes = [self.train_cameras.size(index) for index in range(len(self.train_cameras))]
-        is_large = sum(width * height for width, height in sizes) > _MANY_PIXELS
-        return choose(self.options.subpixels, 1 if is_large else 2)
+        return sum(width * height for width, height in sizes)
 
     @property
     def _grid_resolution(self) -> int:

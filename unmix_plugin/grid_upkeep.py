@@ -27,6 +27,11 @@ surfaces are found."""
 _FIRST_CELLS_UNTIL = 0.5
 """That part."""
 
+_SHARE_OF_PIXELS = 0.07
+"""Of the pixels of the training views, that must be looked at before it is decided anew what is visible. In large
+pictures a cell has many pixels: fewer rays would by chance miss what few views see, and it would be left out for good.
+"""
+
 
 def is_due(step: int) -> bool:
     """Whether the grid is updated before this training step."""
@@ -40,6 +45,7 @@ def update_grid(
     processes: Processes,
     generator: torch.Generator | None,
     progress: float,
+    num_pixels: int = 0,
 ) -> None:
     """Probe the field in some cells, the same in each process, and decide anew what is occupied.
 
@@ -50,6 +56,7 @@ def update_grid(
         processes: That train together; they share which cells their rays saw.
         generator: Source of the cells.
         progress: Part of the training that is over.
+        num_pixels: Of the training views; 0 if it is not known.
     """
     device = torch.device("cpu") if generator is None else generator.device
     drawn = torch.randint(2**62, (1,), generator=generator, device=device)
@@ -64,6 +71,7 @@ def update_grid(
         num_cells=_PROBED_CELLS,
         generator=torch.Generator().manual_seed(seed),
         block=max(len(grid.occupied) // _FIRST_CELLS, 1) if begins_coarsely else 1,
+        fewest_rays=int(_SHARE_OF_PIXELS * num_pixels),
     )
 
 

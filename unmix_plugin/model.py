@@ -321,7 +321,13 @@ class UnmixModel(Model):
             self.field.level_weights.copy_(torch.tensor(levels))
         if is_due(step):
             update_grid(
-                self.grid, self.field, self._training_renderer, self.processes, self.generator, progress
+                self.grid,
+                self.field,
+                self._training_renderer,
+                self.processes,
+                self.generator,
+                progress,
+                self.metadata.get("num_train_pixels", 0),
             )
             self.processes.mean(self.guide.margin_variance)
             if self.poses is not None and self._fineness >= 1:

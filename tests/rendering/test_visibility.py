@@ -68,6 +68,16 @@ def test_nothing_is_left_out_before_enough_rays_were_cast():
     assert not cells.visible[4, 1, 1]
 
 
+def test_large_pictures_need_more_rays_before_anything_is_left_out():
+    cells = VisibleCells((SIDE, SIDE, SIDE))
+    record(cells, ((1, 1, 1), 0), ((1, 1, 1), 1))
+    cells.update(fewest_rays=ENOUGH_RAYS + 1)
+    assert cells.visible.all()
+    record(cells, ((1, 1, 1), 2), num_rays=1)
+    cells.update(fewest_rays=ENOUGH_RAYS + 1)
+    assert not cells.visible[4, 1, 1]
+
+
 def test_only_what_was_seen_since_the_last_update_counts_and_the_open_cells_follow_a_surface():
     cells = looked_at(((3, 3, 3), 0), ((3, 3, 3), 1))
     record(cells, ((4, 3, 3), 0), ((4, 3, 3), 1))

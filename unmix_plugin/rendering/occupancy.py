@@ -70,6 +70,7 @@ class OccupancyGrid(nn.Module):
         num_cells: int | None,
         generator: torch.Generator,
         block: int = 1,
+        fewest_rays: int = 0,
     ) -> None:
         """Probe one random point in each of some cells and decide anew what is occupied: dense and visible.
 
@@ -80,6 +81,7 @@ class OccupancyGrid(nn.Module):
             num_cells: Cells to probe: half drawn from the occupied ones, half from all reachable ones; None for all.
             generator: Source of the points and cells.
             block: Cells along the edge of blocks of which each counts as one cell, as dense as the densest in it.
+            fewest_rays: Rays to cast at least before visibility is decided anew.
         """
         cells = self._choose_cells(num_cells, generator)
         sides = torch.tensor(self.occupied.shape, device=cells.device)
@@ -91,7 +93,7 @@ class OccupancyGrid(nn.Module):
         is_known = torch.isfinite(reachable_peaks)
         known_peaks = reachable_peaks if bool(is_known.all()) else reachable_peaks[is_known]
         limit = min(threshold, float(known_peaks.mean())) if len(known_peaks) else threshold
-        self.visibility.update()
+        self.visibility.update(fewest_rays)
         is_visible = self.visibility.visible.view(-1)[self.reachable_cells]
         self.occupied.view(-1)[self.reachable_cells] = ((reachable_peaks > limit) & is_visible).byte()
         if self.opaque is not None and self.opaque_clearance is not None:

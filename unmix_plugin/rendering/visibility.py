@@ -65,14 +65,14 @@ class VisibleCells(nn.Module):
         self.num_rays += num_rays
 
     @torch.no_grad()
-    def update(self) -> None:
-        """Keep only what two views saw, if enough rays were cast, and start over.
+    def update(self, fewest_rays: int = 0) -> None:
+        """Keep only what two views saw, if `fewest_rays` and enough for each cell were cast, and start over.
 
         Where two views saw no cell, what one saw is kept; where none saw any, as in thin semi-transparent density, all
         that was visible.
         """
         sides = sorted(self.visible.shape)
-        if int(self.num_rays) < _RAYS_A_CELL * sides[1] * sides[2]:
+        if int(self.num_rays) < max(_RAYS_A_CELL * sides[1] * sides[2], fewest_rays):
             return
         seen_by_two = self.lowest_view < self.highest_view
         seen = seen_by_two if bool(seen_by_two.any()) else self.lowest_view <= self.highest_view

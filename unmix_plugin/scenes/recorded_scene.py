@@ -35,6 +35,7 @@ class RecordedScene:
     pixel_size: float = 1.0
     subpixels: int = 1
     num_train_views: int = 1
+    num_train_pixels: int = 0
     line_rows: tuple[int, ...] | None = None
     root: str = ""
     normalisation: RecordedFrame | None = None
@@ -68,6 +69,7 @@ def check_recorded_scene(values: Mapping[str, Any]) -> None:
         "a pixel_size above 0": scene.pixel_size > 0,
         "subpixels of 1 to 8": 1 <= scene.subpixels <= 8,
         "num_train_views of at least 1": scene.num_train_views >= 1,
+        "num_train_pixels of at least 0": scene.num_train_pixels >= 0,
         "line_rows of 0 to 65536, one a training view": scene.line_rows is None
         or (len(scene.line_rows) == scene.num_train_views and all(0 <= n <= 65536 for n in scene.line_rows)),
         "a name for each endmember": None in (scene.material_names, scene.endmembers)

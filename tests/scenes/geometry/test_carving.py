@@ -17,7 +17,7 @@ from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.scenes import carve, load_scene
 from unmix_plugin.scenes.geometry.bounds import find_bounds
 from unmix_plugin.scenes.geometry.carving import carve_box, foreground_mask, needed_witnesses
-from unmix_plugin.scenes.geometry.foreground_rays import foreground_rays
+from unmix_plugin.scenes.geometry.foreground_rays import MIN_EXPLAINED, foreground_rays, share_through
 
 
 def centres(box: SceneBox, cells: int) -> np.ndarray:
@@ -265,3 +265,22 @@ def test_a_hole_in_one_mask_does_not_carve_what_all_other_views_see():
     assert (true & ~spoilt).sum() > 0.1 * true.sum()
     assert not (true & ~kept).any()
     assert kept.sum() < 1.6 * true.sum()
+
+
+def test_where_many_views_look_through_what_the_others_see_more_must_agree():
+    """Leaves move between views; but no more than 0.3 of the views are asked to agree, if that is more than three."""
+    poses = ring_poses(24)
+    cameras, true = make_cameras(poses), ball_matter(poses, 0.5)
+    rays = foreground_rays(cameras, true)
+
+    def spoilt(num_views: int) -> list[np.ndarray]:
+        masks = [mask.copy() for mask in true]
+        for mask in masks[:num_views]:
+            mask[14:26, 14:26] = False
+        return masks
+
+    witnesses = needed_witnesses(cameras, spoilt(5), BOX, rays)
+    assert witnesses == 4
+    few, enough = (carve_box(cameras, spoilt(5), BOX, 64, witnesses=count) for count in (3, witnesses))
+    assert share_through(rays, BOX, few) < MIN_EXPLAINED <= share_through(rays, BOX, enough)
+    assert needed_witnesses(cameras, spoilt(20), BOX, rays) == 6

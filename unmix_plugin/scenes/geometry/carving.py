@@ -3,7 +3,7 @@
 A cell stays if enough training cameras see it and, where pictures have alpha, no training view looks through it: a view
 looks through a cell if the cell's whole footprint, widened by a margin, lies in the image on background. The footprint
 is the bounding rectangle of the cell's projection, rounded outwards, so the hull is never too small. Masks may err:
-where the hull leaves matter unexplained, two views must look through a cell, or three.
+where the hull leaves matter unexplained, two views must look through a cell, or more.
 
 What one or two views see is not held by the others, and what grows there fits single images only: with alpha half of
 the views must see a cell, unless that leaves pixels unexplained, without alpha a tenth.
@@ -51,8 +51,10 @@ FAIR_SHARE = 0.5
 FAIR_SHARE_OPEN = 0.1
 """The same without alpha, where nothing tells what it leaves unexplained: only what hardly any view sees is carved,
 since walls would be continued there into the void beside a room."""
-WITNESSES = (1, 2, 3)
+WITNESSES = (1, 2, 3, 4, 6, 8, 12)
 """Views that must look through a cell to carve it; more only where fewer leave foreground unexplained."""
+LARGEST_PART = 0.3
+"""Of the training views, that must look through a cell at most, if that is more than the third of these numbers."""
 BLOCK_CELLS = 1 << 15
 """Cells projected together; keeps temporaries within the processor's cache."""
 
@@ -96,10 +98,12 @@ def needed_witnesses(
 ) -> int:
     """Views that must agree that a cell is empty, so that the hull explains what single views show.
 
-    A hole in one mask carves away what all other views see; where masks are good, one view is enough.
+    A hole in one mask carves away what all other views see; where masks are good, one view is enough. Where things move
+    between views, as leaves do, many look through the place where some show a leaf.
     """
     shares: list[float] = []
-    for witnesses in WITNESSES:
+    most = max(WITNESSES[2], int(LARGEST_PART * len(cameras)))
+    for witnesses in [count for count in WITNESSES if count <= most]:
         hull = carve_box(cameras, foreground, box, WITNESS_CELLS, witnesses=witnesses)
         shares.append(share_through(rays, box, hull))
         if shares[-1] >= MIN_EXPLAINED:
