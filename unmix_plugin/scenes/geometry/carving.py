@@ -53,8 +53,8 @@ FAIR_SHARE_OPEN = 0.1
 since walls would be continued there into the void beside a room."""
 WITNESSES = (1, 2, 3, 4, 6, 8, 12)
 """Views that must look through a cell to carve it; more only where fewer leave foreground unexplained."""
-LARGEST_PART = 0.3
-"""Of the training views, that must look through a cell at most, if that is more than the third of these numbers."""
+MOST_WITNESSES, LARGEST_PART = 3, 0.3
+"""Views that are asked to agree at most: so many, or that share of the training views if it is more."""
 BLOCK_CELLS = 1 << 15
 """Cells projected together; keeps temporaries within the processor's cache."""
 
@@ -102,7 +102,7 @@ def needed_witnesses(
     between views, as leaves do, many look through the place where some show a leaf.
     """
     shares: list[float] = []
-    most = max(WITNESSES[2], int(LARGEST_PART * len(cameras)))
+    most = max(MOST_WITNESSES, int(LARGEST_PART * len(cameras)))
     for witnesses in [count for count in WITNESSES if count <= most]:
         hull = carve_box(cameras, foreground, box, WITNESS_CELLS, witnesses=witnesses)
         shares.append(share_through(rays, box, hull))
