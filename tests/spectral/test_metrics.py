@@ -17,6 +17,7 @@ from unmix_plugin.spectral.metrics import (
     endmember_angle,
     match_endmembers,
     psnr,
+    psnr_over_white,
     rmse,
     sam,
     spectral_angle,
@@ -38,6 +39,20 @@ def test_psnr_and_rmse_have_their_closed_forms():
     assert psnr(target + 0.01, target) == pytest.approx(40, abs=1e-4)
     assert rmse(target + 0.1, target) == pytest.approx(0.1, rel=1e-6)
     assert psnr(torch.full((2, 2, 3), 0.5), torch.full((2, 2, 3), 0.4)) == pytest.approx(20, abs=1e-5)
+
+
+def test_psnr_over_white_is_that_of_the_images_laid_over_white_few_rows_at_a_time(monkeypatch):
+    pred_opacity, target_opacity = image(3)[..., 0], image(4)[..., 0]
+    pred, target = (image(seed) * x[..., None] for seed, x in ((1, pred_opacity), (2, target_opacity)))
+    valid = image(5)[..., 0] > 0.3
+    pred_on_white, target_on_white = (
+        pred + 1 - pred_opacity[..., None],
+        target + 1 - target_opacity[..., None],
+    )
+    monkeypatch.setattr(metrics, "_VALUES_AT_ONCE", 150)
+    found = psnr_over_white(pred, pred_opacity, target, target_opacity, valid)
+    assert found == pytest.approx(psnr(pred_on_white, target_on_white, valid), rel=1e-12)
+    assert psnr_over_white(pred, pred_opacity, pred, pred_opacity) == math.inf
 
 
 def test_rmse_is_over_all_pixels_and_bands_not_a_mean_of_roots():

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import torch
@@ -35,8 +36,25 @@ def psnr(
     >>> psnr(torch.full((2, 2, 3), 0.6, dtype=torch.float64), torch.full((2, 2, 3), 0.5, dtype=torch.float64))
     20.0...
     """
-    error = rmse(pred_image, target_image, valid_mask)
-    return math.inf if error == 0 else -20 * math.log10(error)
+    return _decibels(rmse(pred_image, target_image, valid_mask))
+
+
+def psnr_over_white(
+    pred_image: Float[Tensor, "H W B"],
+    pred_opacity: Float[Tensor, "H W"],
+    target_image: Float[Tensor, "H W B"],
+    target_opacity: Float[Tensor, "H W"],
+    valid_mask: Bool[Tensor, "H W"] | None = None,
+) -> float:
+    """The same of two images on black, premultiplied by their opacities, laid over white."""
+    height, width, channels = pred_image.shape
+    valid = torch.ones(height, width, dtype=torch.bool) if valid_mask is None else valid_mask
+    step = max(1, _VALUES_AT_ONCE // max(1, width * channels))
+    images = (pred_image, pred_opacity, target_image, target_opacity, valid)
+    rows = (
+        _over_white(*(image[start : start + step] for image in images)) for start in range(0, height, step)
+    )
+    return _decibels(_root_mean_square(chain.from_iterable(rows)))
 
 
 def rmse(
@@ -188,6 +206,20 @@ def _rows(
     for start in range(0, height, step):
         pred, target, counts = (image[start : start + step] for image in (pred_image, target_image, mask))
         yield pred.detach().double().clamp(0, 1), target.double(), counts
+
+
+def _over_white(
+    pred: Float[Tensor, "h W C"],
+    pred_opacity: Float[Tensor, "h W"],
+    target: Float[Tensor, "h W C"],
+    target_opacity: Float[Tensor, "h W"],
+    valid: Bool[Tensor, "h W"],
+) -> Iterator[tuple[Float[Tensor, "h W C"], Float[Tensor, "h W C"], Bool[Tensor, "h W"]]]:
+    return _rows(pred + (1 - pred_opacity)[..., None], target + (1 - target_opacity)[..., None], valid)
+
+
+def _decibels(error: float) -> float:
+    return math.inf if error == 0 else -20 * math.log10(error)
 
 
 def _root_mean_square(

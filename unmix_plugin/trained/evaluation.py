@@ -28,6 +28,7 @@ from unmix_plugin.spectral.metrics import (
     endmember_angle,
     match_endmembers,
     psnr,
+    psnr_over_white,
     rmse,
     sam,
     ssim,
@@ -181,9 +182,7 @@ class Evaluation:
             "psnr_matter_unsaturated": psnr(spectra, view.spectra, view.shows_matter & ~blown_out),
             "psnr_white": math.nan
             if view.alpha is None
-            else psnr(
-                over_white(spectra, predicted.accumulation), over_white(view.spectra, view.alpha), valid
-            ),
+            else psnr_over_white(spectra, predicted.accumulation, view.spectra, view.alpha, valid),
             "rmse": rmse(spectra, view.spectra, valid),
             "ssim": ssim(spectra, view.spectra, valid) if fits_window else math.nan,
             "sam": sam(spectra, view.spectra, view.shows_matter),
@@ -248,11 +247,6 @@ class Evaluation:
         # Row by row, since float64 doubles the cube.
         linear = torch.stack([row.double().clamp(0, 1) @ matrix for row in spectra])
         return linear_to_srgb(linear.clamp(0, 1))
-
-
-def over_white(spectra: Float[Tensor, "H W b"], opacity: Float[Tensor, "H W"]) -> Float[Tensor, "H W b"]:
-    """Spectra on black, premultiplied by their opacity, as they look before something white."""
-    return spectra + (1 - opacity)[..., None]
 
 
 def scene_truth(scene: Scene) -> SceneTruth:
