@@ -65,7 +65,7 @@ class Options:
     only: tuple[str, ...] = ()
     """Names of the scenes to run, turntable and basil; all if none is given."""
     variants: tuple[str, ...] = tuple(VARIANTS)
-    """Which to train."""
+    """Which to train; if not all, what is written is named after them, too: captures_training-basil-defaults."""
     steps: int | None = None
     """Of each training; None: the seconds that are asked for."""
     runs: Path | None = None
@@ -104,7 +104,9 @@ def report(name: str, words: list[str], options: Options, place: Path) -> _commo
     }
     question = "Evaluation views of a capture, and what each part of training on it is worth"
     figures, tables = judge(name, measured), (details(name, measured),)
-    return _common.Report("captures_training", question, setting, machine, figures, measured, tables, name)
+    parts = [name, *(variants if options.variants != tuple(VARIANTS) else ())]
+    named = "-".join(parts).replace(" ", "-")
+    return _common.Report("captures_training", question, setting, machine, figures, measured, tables, named)
 
 
 def _scenes(options: Options, place: Path) -> dict[str, list[str]]:
