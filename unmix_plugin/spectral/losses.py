@@ -13,10 +13,12 @@ from unmix_plugin.spectral.colour.conversion import linear_to_srgb
 
 
 def over_background(
-    spectra: Float[Tensor, "R B"], opacities: Float[Tensor, "R"], background: Float[Tensor, "R 1"]
-) -> Float[Tensor, "R B"]:
+    spectra: Float[Tensor, "*pixels B"],
+    opacities: Float[Tensor, "*pixels"],
+    background: Float[Tensor, "*pixels 1"],
+) -> Float[Tensor, "*pixels B"]:
     """Spectra on black, premultiplied by their opacity, laid over a grey background."""
-    return spectra + (1 - opacities)[:, None] * background
+    return spectra + (1 - opacities)[..., None] * background
 
 
 def forgive_saturation(

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import chain
 from typing import Any
 
 import torch
@@ -19,6 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from unmix_plugin.errors import SpectrumError
+from unmix_plugin.spectral.losses import over_background
 from unmix_plugin.spectral.unmixing.endmembers import DARK_RMS
 
 SSIM_WINDOW_PX = 7
@@ -47,14 +47,8 @@ def psnr_over_white(
     valid_mask: Bool[Tensor, "H W"] | None = None,
 ) -> float:
     """The same of two images on black, premultiplied by their opacities, laid over white."""
-    height, width, channels = pred_image.shape
-    valid = torch.ones(height, width, dtype=torch.bool) if valid_mask is None else valid_mask
-    step = max(1, _VALUES_AT_ONCE // max(1, width * channels))
-    images = (pred_image, pred_opacity, target_image, target_opacity, valid)
-    rows = (
-        _over_white(*(image[start : start + step] for image in images)) for start in range(0, height, step)
-    )
-    return _decibels(_root_mean_square(chain.from_iterable(rows)))
+    opacities = (pred_opacity, target_opacity)
+    return _decibels(_root_mean_square(_rows(pred_image, target_image, valid_mask, opacities)))
 
 
 def rmse(
@@ -197,25 +191,26 @@ def _rows(
     pred_image: Float[Tensor, "H W C"],
     target_image: Float[Tensor, "H W C"],
     mask: Bool[Tensor, "H W"] | None,
+    opacities: tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]] | None = None,
 ) -> Iterator[tuple[Float[Tensor, "h W C"], Float[Tensor, "h W C"], Bool[Tensor, "h W"]]]:
-    """A few rows at a time: prediction clamped and truth, both in float64, and the pixels that count."""
+    """A few rows at a time: prediction clamped and truth, both in float64, and the pixels that count.
+
+    Args:
+        opacities: Of both images, to lay them over white; None leaves them on black.
+    """
     height, width, channels = pred_image.shape
     if mask is None:
         mask = torch.ones(height, width, dtype=torch.bool, device=target_image.device)
     step = max(1, _VALUES_AT_ONCE // max(1, width * channels))
     for start in range(0, height, step):
         pred, target, counts = (image[start : start + step] for image in (pred_image, target_image, mask))
+        if opacities is not None:
+            white = torch.ones_like(target[..., :1])
+            pred, target = (
+                over_background(image, opacity[start : start + step], white)
+                for image, opacity in zip((pred, target), opacities, strict=True)
+            )
         yield pred.detach().double().clamp(0, 1), target.double(), counts
-
-
-def _over_white(
-    pred: Float[Tensor, "h W C"],
-    pred_opacity: Float[Tensor, "h W"],
-    target: Float[Tensor, "h W C"],
-    target_opacity: Float[Tensor, "h W"],
-    valid: Bool[Tensor, "h W"],
-) -> Iterator[tuple[Float[Tensor, "h W C"], Float[Tensor, "h W C"], Bool[Tensor, "h W"]]]:
-    return _rows(pred + (1 - pred_opacity)[..., None], target + (1 - target_opacity)[..., None], valid)
 
 
 def _decibels(error: float) -> float:
