@@ -66,8 +66,18 @@ def frames_off(folder: Path, size: int, bands: int, views: int, error_px: float,
     return PosedScene(folder, truth, pose_error(truth, moved(scale)))
 
 
-def sweeps(folder: Path, size: int, bands: int, num_sweeps: int, error_px: float, seed: int) -> PosedScene:
-    """The scene swept by line cameras with a smooth wobble that its poses don't know; evaluation views are frames."""
+def sweeps(
+    folder: Path,
+    size: int,
+    bands: int,
+    num_sweeps: int,
+    error_px: float,
+    seed: int,
+    *,
+    sweeps_evaluation: bool = False,
+) -> PosedScene:
+    """The scene swept by line cameras with a smooth wobble that its poses don't know; evaluation views are frames with
+    true poses, or sweeps that wobble as well."""
     views = views_for(num_sweeps)
     make_demo_scene(folder, size, bands, views)
     frames, truth = demo_cameras(size, views), line_cameras(size, views)
@@ -82,8 +92,9 @@ def sweeps(folder: Path, size: int, bands: int, num_sweeps: int, error_px: float
 
     chosen = [index for index, train in enumerate(is_train) if train]
     scale = _scale_for(error_px, lambda x: pose_error(truth[chosen], wobbling(x)[chosen]))
-    _render_sweeps(folder, content["frames"], truth, chosen, bands)
-    _write_poses(folder, frames, {index: wobbling(scale) for index in chosen})
+    swept = range(views) if sweeps_evaluation else chosen
+    _render_sweeps(folder, content["frames"], truth, swept, bands)
+    _write_poses(folder, frames, {index: wobbling(scale) for index in swept})
     return PosedScene(folder, truth[chosen], pose_error(truth[chosen], wobbling(scale)[chosen]))
 
 

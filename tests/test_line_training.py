@@ -9,12 +9,17 @@ import torch
 from rich.console import Console
 from torch.testing import assert_close
 
+from tests.engine.stopped_runs import stop_at
 from tests.method_factory import CONFIG
 from tests.scenes.line_factory import make_line_scene
 from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
+from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.pipeline import PipelineConfig
+from unmix_plugin.engine.runs.load_run import load_config
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.method_config import unmix_nerf
+from unmix_plugin.pose_refinement import PoseRefinement
+from unmix_plugin.pose_settings import PoseConfig
 from unmix_plugin.trained.open_run import open_run
 
 
@@ -54,3 +59,44 @@ def test_a_run_gives_back_its_line_cameras_and_renders_all_bands(trainer):
     assert found["spectral"].shape == (16, 20, 4)
     assert bool(found["spectral"].isfinite().all())
     assert float(found["spectral"].std()) > 0
+
+
+def refining(folder: Path, steps: int) -> TrainerConfig:
+    """Training that registers its line cameras twice."""
+    refinement = PoseConfig(start=0.0, coarse_steps=2, register_from=0.4, register_every=0.3)
+    model = replace(CONFIG, num_endmembers=1, poses="refine", pose_refinement=refinement)
+    data = HyperspectralDataManagerConfig(train_num_rays_per_batch=64, grid_resolution=16)
+    return replace(
+        unmix_nerf.config,
+        data=folder / "scene",
+        output_dir=folder / "runs",
+        max_num_iterations=steps,
+        device="cpu",
+        pipeline=PipelineConfig(datamanager=data, model=model),
+    )
+
+
+def trained(config: TrainerConfig) -> Trainer:
+    trainer = Trainer(config, console=Console(file=io.StringIO()))
+    trainer.train()
+    return trainer
+
+
+def test_line_cameras_are_registered_while_poses_are_refined(tmp_path):
+    make_line_scene(tmp_path / "scene")
+    run = trained(refining(tmp_path, 10))
+    poses = run.pipeline.model.poses
+    assert isinstance(poses, PoseRefinement)
+    assert bool(poses.is_found.any())
+    assert bool(poses.corrections.isfinite().all())
+    given = run.pipeline.datamanager.train_cameras
+    assert not torch.equal(poses.refined(given).image_rays(0).directions, given.image_rays(0).directions)
+
+
+def test_training_on_line_cameras_goes_on_exactly_where_it_stopped(tmp_path):
+    make_line_scene(tmp_path / "scene")
+    whole = trained(refining(tmp_path, 10)).pipeline.model
+    stopped = stop_at(refining(tmp_path, 10), 6)
+    resumed = trained(load_config(stopped.run)).pipeline.model
+    for name, value in whole.state_dict().items():
+        assert torch.equal(value, resumed.state_dict()[name]), name

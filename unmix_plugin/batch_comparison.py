@@ -14,6 +14,7 @@ from torch import Tensor
 from unmix_plugin.abundance_guide import AbundanceGuide
 from unmix_plugin.alpha_preset import AlphaPreset, choose
 from unmix_plugin.band_balance import BandBalance
+from unmix_plugin.line_cameras import Swept
 from unmix_plugin.sensor_batches import SensorPart, mean_over_parts, split_parts
 from unmix_plugin.sensor_views import SensorViews
 from unmix_plugin.spectral.coefficients import Coefficients
@@ -105,6 +106,16 @@ class BatchComparison:
             if self.seen_by.tells_materials(part.sensor, self.num_endmembers):
                 abundances = pixel_mean(part.outputs["abundances"], len(part.batch["spectra"]))
                 self.guide.observe(abundances, *self._guided(part))
+
+    def through(self, view: Swept) -> Float[Tensor, "B C"]:
+        """From a spectrum on the scene's bands to the channels of a line camera that are compared, as `parts` makes
+        what its sensor sees."""
+        axes, gains = view.axes, self.view_gains
+        if gains is not None:
+            terms = self.seen_by.project(gains.terms, view.sensor)
+            index = torch.tensor([view.index], device=terms.device)
+            axes = axes * gains(index, terms / terms[:1]).T
+        return axes if view.sensor is None else self.seen_by.matrix(view.sensor).T @ axes
 
     def _part_losses(
         self, part: SensorPart, wanted: set[str], generator: torch.Generator | None

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from unmix_plugin.alpha_preset import choose, preset_for
@@ -126,6 +126,18 @@ class HyperspectralDataManager(DataManager):
             if array is not None
         }
         return self.eval_cameras[index], batch
+
+    def measured_in(self, index: int, columns: Int[Tensor, " W"]) -> dict[str, Tensor]:
+        """`spectra` (H, W, B), `valid` (H, W), `alpha` (H, W) where it is known, and of a rig `sensor`."""
+        view, chosen = self.scene.train_indices[index], columns.numpy()
+        alpha = self.scene.alpha(view)
+        found = {
+            "spectra": self.scene.cube(view, (slice(None), chosen)),
+            "valid": self.scene.valid_mask(view)[:, chosen],
+            **({} if alpha is None else {"alpha": alpha[:, chosen]}),
+            **({"sensor": np.array(self.scene.frames[view].sensor)} if self.scene.is_rig else {}),
+        }
+        return {name: torch.tensor(array, device=self.device) for name, array in found.items()}
 
     def get_train_rays_per_batch(self) -> int:
         """Rays of the next training batch."""

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -23,6 +24,7 @@ from unmix_plugin.abundance_guide import AbundanceGuide
 from unmix_plugin.alpha_preset import choose, preset_for
 from unmix_plugin.band_balance import BandBalance
 from unmix_plugin.batch_comparison import BatchComparison
+from unmix_plugin.engine.data_manager import DataManager
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.model import Model
@@ -31,6 +33,7 @@ from unmix_plugin.field import UnmixField
 from unmix_plugin.first_endmembers import first_endmembers, first_specular_spectra
 from unmix_plugin.grid_upkeep import is_due, record_seen, update_grid
 from unmix_plugin.lamp_shadows import ShadowDetail
+from unmix_plugin.line_cameras import LineCameras
 from unmix_plugin.model_parts import (
     make_field,
     make_grid,
@@ -103,6 +106,7 @@ class UnmixModel(Model):
             config.losses, self.preset, self.seen_by, self.balance, self.guide, self.view_gains
         )
         self._progress = self._fineness = 0.0
+        self._lines = None if self.poses is None else LineCameras(self.poses.knots.rows)
 
     def initialise(self, initial_data: Mapping[str, np.ndarray], generator: torch.Generator) -> None:
         """Endmembers from the training pixels or a file, the light in the dictionary, and the carved grid.
@@ -149,6 +153,19 @@ class UnmixModel(Model):
         self.poses.settle()
         if "reachable" in data:
             self.grid.empty_beyond(torch.from_numpy(data["reachable"]).to(self.device))
+
+    @torch.no_grad()
+    def look_again(self, step: int, progress: float, data: DataManager) -> None:
+        """Register line cameras to the scene, where poses are refined and it is time."""
+        if self.poses is None or self._lines is None or not self._lines.rows:
+            return
+        if not self.config.pose_refinement.registers(step, progress):
+            return
+        composite = partial(self.renderer.composite, self.field)
+        self._lines.register(
+            self.poses, data, self.scene_box, composite, self.materials, self.comparison.through
+        )
+        self.poses.agree(self.processes)
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """The hash table, the networks and the spectra."""

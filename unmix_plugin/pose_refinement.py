@@ -21,7 +21,7 @@ from dataclasses import replace
 from typing import Literal
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float64, Int
 from torch import Tensor, nn
 
 from unmix_plugin.engine.geometry.camera_distortion import undistort
@@ -30,6 +30,7 @@ from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.rotations import rotation_matrix
 from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.processes.processes import Processes
 from unmix_plugin.pose_knots import Knots, row_waves, similarities
 from unmix_plugin.pose_settings import PoseConfig
 from unmix_plugin.pose_trust import PoseTrust
@@ -66,6 +67,9 @@ class PoseRefinement(nn.Module):
     gauge: Tensor
     is_free: Tensor
     settled: Tensor
+    found: Tensor
+    """Corrections at the knots of line cameras that were registered to the scene, which hold in place of steps."""
+    is_found: Tensor
     counts: Tensor
     first: Tensor
     rows: Tensor
@@ -87,6 +91,8 @@ class PoseRefinement(nn.Module):
         self.register_buffer("gauge", torch.zeros(6 * total, 7))
         self.register_buffer("is_free", torch.ones(len(rows), dtype=torch.bool))
         self.register_buffer("settled", torch.zeros((), dtype=torch.bool))
+        self.register_buffer("found", torch.zeros(total, 6))
+        self.register_buffer("is_found", torch.zeros(len(rows), dtype=torch.bool))
         self.is_settled = False
         """Whether the scene was judged by the corrected cameras; the buffer keeps it, but reading that from a GPU in
         each step would take time."""
@@ -121,7 +127,37 @@ class PoseRefinement(nn.Module):
     @property
     def corrections(self) -> Float[Tensor, "M 6"]:
         """By how much the cameras are turned and moved at the knots."""
-        return self._free_steps() * self.scale[:, None]
+        is_found = self.is_found.repeat_interleave(self.counts)[:, None]
+        return torch.where(is_found, self.found, self._free_steps() * self.scale[:, None])
+
+    @torch.no_grad()
+    def steps_of(self, view: int, distance: float) -> Float64[Tensor, "n 6"]:
+        """The corrections of a line camera as `register` takes them: shifts are a share of `distance`."""
+        knots = self._knots_of(view)
+        steps = self.corrections[knots].double()
+        steps[:, 3:] *= self.reach[knots, None] / distance
+        return steps.cpu()
+
+    @torch.no_grad()
+    def take_registered(self, view: int, steps: Float64[Tensor, "n 6"], distance: float) -> None:
+        """Let a line camera have these corrections from now on, unless they go too far; as `steps_of` has them."""
+        knots, found = self._knots_of(view), steps.to(self.found)
+        sizes = found.view(-1, 2, 3).norm(dim=-1).amax(dim=1)
+        if float((sizes / self.bound[knots]).mean()) > 1:
+            return
+        found[:, 3:] *= distance / self.reach[knots, None]
+        self.found[knots] = found
+        self.is_found[view] = self.is_free[view] = True
+
+    @torch.no_grad()
+    def agree(self, processes: Processes) -> None:
+        """Let all processes have the first one's registered poses."""
+        processes.of_first(self.found)
+        for flags in (self.is_found, self.is_free):
+            flags.copy_(processes.of_first(flags.float()) > 0)
+
+    def _knots_of(self, view: int) -> slice:
+        return slice(int(self.first[view]), int(self.first[view] + self.counts[view]))
 
     def _free_steps(self) -> Float[Tensor, "M 6"]:
         """Steps without what moves all views alike; 0 for views that were undone."""
@@ -148,7 +184,7 @@ class PoseRefinement(nn.Module):
 
     def penalty(self, config: PoseConfig) -> Float[Tensor, ""]:
         """What large and rough corrections cost."""
-        steps = self._free_steps()
+        steps = self._free_steps() * ~self.is_found.repeat_interleave(self.counts)[:, None]
         bends = [steps[self.get_buffer(f"places_{count}")].diff(n=2, dim=1).flatten() for count in self.lines]
         bent = torch.cat([steps.new_zeros(0), *bends])
         large = steps.square().mean() + self.lens.square().sum()

@@ -187,6 +187,7 @@ def _evaluate_views(
     from unmix_plugin.products.evaluation_pictures import draw_colour, draw_matched_abundances, material_look
     from unmix_plugin.trained.evaluation import Evaluation, scene_truth, view_truth
     from unmix_plugin.trained.pose_alignment import align_pose
+    from unmix_plugin.trained.row_alignment import align_rows
     from unmix_plugin.trained.view_alignment import align_gain
     from unmix_plugin.trained.view_rendering import render_view, subpixels_for
 
@@ -201,6 +202,8 @@ def _evaluate_views(
         camera = scene.cameras[index]
         if subject.has_refined_poses:
             camera = align_pose(subject.scene, camera, truth)
+            if camera.is_line_camera(0):
+                camera = align_rows(subject.scene, camera, truth)
         predicted = render_view(subject.scene, camera, rays)
         if subject.has_view_gains and not scene.is_rig:
             predicted = align_gain(predicted, truth, torch.from_numpy(scene.wavelengths_nm))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -19,6 +19,9 @@ from unmix_plugin.engine.outputs import Output
 from unmix_plugin.engine.processes.processes import ALONE, Processes
 from unmix_plugin.engine.training.callbacks import TrainingCallback
 from unmix_plugin.errors import ConfigError
+
+if TYPE_CHECKING:
+    from unmix_plugin.engine.data_manager import DataManager
 
 
 @dataclass(frozen=True)
@@ -99,6 +102,10 @@ class Model(nn.Module, ABC):
 
     def take_in(self, data: Mapping[str, np.ndarray]) -> None:
         """Learn what the data manager's `judge_again` finds with `settled_cameras`."""
+
+    def look_again(self, step: int, progress: float, data: DataManager) -> None:
+        """Compare the scene with whole training views where something is learnt from them that single pixels don't
+        tell. Called before each training step, after the model's own callbacks."""
 
     @abstractmethod
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:

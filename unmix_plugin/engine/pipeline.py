@@ -111,7 +111,8 @@ class Pipeline(nn.Module):
         return self.model.get_param_groups()
 
     def get_training_callbacks(self) -> list[TrainingCallback]:
-        """The data manager's callbacks, then the model's, then what one tells the other of corrected cameras."""
+        """The data manager's callbacks, then the model's, then what one tells the other of corrected cameras
+        and whole views."""
         own = TrainingCallback(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, self._judge_again)
         return [*self.datamanager.get_training_callbacks(), *self.model.get_training_callbacks(), own]
 
@@ -120,6 +121,7 @@ class Pipeline(nn.Module):
         cameras = self.model.settled_cameras(self.datamanager.train_cameras)
         if cameras is not None:
             self.model.take_in(self.datamanager.judge_again(cameras))
+        self.model.look_again(step, progress, self.datamanager)
 
 
 def average_metrics(found: Sequence[Mapping[str, float]]) -> dict[str, float]:

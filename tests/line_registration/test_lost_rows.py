@@ -1,0 +1,60 @@
+"""Rows that are off by many pixels are found again from their neighbours."""
+
+import torch
+
+from tests.line_registration.textured_plane import ROWS, error, swept, wobble
+from unmix_plugin.line_registration.lost_rows import recover
+
+_USUAL = 1e-4
+
+
+def lost_from(knot: int, size_px: float) -> torch.Tensor:
+    """The true wobble, but from some knot on far off."""
+    steps = wobble(2.0)
+    steps[knot:, 1] += size_px / 60.0
+    return steps
+
+
+def test_the_lower_rows_of_a_sweep_come_back() -> None:
+    view = swept(wobble(2.0))
+    start = lost_from(11, 9.0)
+    found = recover(view, start, _USUAL)
+    assert found.num_lost > 8
+    assert found.is_better
+    assert error(view, found.steps) < 0.1 * error(view, start)
+
+
+def test_the_upper_rows_of_a_sweep_come_back() -> None:
+    view = swept(wobble(2.0))
+    start = wobble(2.0)
+    start[:6, 0] -= 8.0 / 60.0
+    found = recover(view, start, _USUAL)
+    assert found.is_better
+    assert error(view, found.steps) < 0.1 * error(view, start)
+
+
+def test_a_sweep_that_is_right_is_left_alone() -> None:
+    view = swept(wobble(2.0))
+    found = recover(view, wobble(2.0), _USUAL)
+    assert (found.num_lost, found.is_better) == (0, False)
+    assert bool((found.steps == wobble(2.0)).all())
+
+
+def test_a_sweep_without_a_run_of_good_rows_keeps_its_poses() -> None:
+    view = swept()
+    start = torch.zeros(view.num_knots, 6, dtype=torch.float64)
+    start[:, 1] = 15.0 / 60.0
+    found = recover(view, start, _USUAL)
+    assert found.num_lost > ROWS // 3
+    assert not found.is_better
+    assert bool((found.steps == start).all())
+
+
+def test_what_no_pose_explains_is_not_taken_for_better() -> None:
+    view = swept()
+    generator = torch.Generator().manual_seed(0)
+    view.wanted[40:56, :, :2] = torch.rand(16, 48, 2, generator=generator)
+    start = torch.zeros(view.num_knots, 6, dtype=torch.float64)
+    found = recover(view, start, _USUAL)
+    assert found.num_lost > 0
+    assert error(view, found.steps) <= error(view, start)

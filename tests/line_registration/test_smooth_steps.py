@@ -1,0 +1,44 @@
+"""Banded equations have the solution of dense ones, and smooth steps cost less."""
+
+import numpy as np
+import pytest
+
+from unmix_plugin.line_registration.smooth_steps import SmoothPrior, solve_banded
+
+
+@pytest.mark.parametrize("num_knots", [2, 3, 9])
+def test_the_banded_solution_is_the_dense_one(num_knots: int) -> None:
+    generator = np.random.default_rng(0)
+    blocks = np.zeros((3, num_knots, 6, 6))
+    dense = np.zeros((num_knots, 6, num_knots, 6))
+    for knot in range(num_knots - 1):
+        rows = generator.normal(size=(30, 12))
+        normal = (rows.T @ rows).reshape(2, 6, 2, 6)
+        dense[knot : knot + 2, :, knot : knot + 2] += normal
+        blocks[0, knot] += normal[0, :, 0]
+        blocks[0, knot + 1] += normal[1, :, 1]
+        blocks[1, knot] += normal[1, :, 0]
+    prior = SmoothPrior(num_knots, pixel=0.01)
+    prior.add_to(blocks)
+    dense += np.einsum("ab,ij->aibj", prior.matrix.toarray(), np.eye(6))
+    pull = generator.normal(size=(num_knots, 6))
+    matrix = dense.reshape(6 * num_knots, -1)
+    matrix[np.diag_indices_from(matrix)] *= 1.01
+    expected = np.linalg.solve(matrix, pull.ravel()).reshape(pull.shape)
+    np.testing.assert_allclose(solve_banded(blocks, pull, 0.01), expected, rtol=1e-8, atol=1e-12)
+
+
+def test_a_bend_costs_more_than_a_drift_and_a_drift_more_than_a_shift() -> None:
+    prior = SmoothPrior(9, pixel=0.01)
+    straight = np.linspace(0, 0.08, 9)[:, None] * np.ones(6)
+    shifted = np.full((9, 6), straight.mean())
+    bent = straight.copy()
+    bent[4] += 0.01
+    assert prior.cost(shifted) < prior.cost(straight) < prior.cost(bent)
+
+
+def test_the_slope_is_half_of_the_gradient_of_the_cost() -> None:
+    prior, generator = SmoothPrior(5, pixel=0.02), np.random.default_rng(1)
+    steps, change = generator.normal(size=(2, 5, 6))
+    difference = (prior.cost(steps + 1e-4 * change) - prior.cost(steps - 1e-4 * change)) / 2e-4
+    assert difference == pytest.approx(2 * float((prior.slope(steps) * change).sum()), rel=1e-6)

@@ -1,0 +1,1 @@
+"""Poses of line cameras, fitted row by row to what a scene shows."""

@@ -1,0 +1,84 @@
+"""Poses of an evaluation view's rows, fitted to its picture with the field as it is, where training corrected poses.
+
+A line camera's rows wobble, so no single turn and shift aligns such a view. Once these are found (pose_alignment.py),
+its rows are fitted to averages over squares of pixels, of ever smaller edges: rows that are off by ten pixels look
+alike there. Those that fit best then tell where their neighbours are.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.line_cameras import keep, shower, swept_view
+from unmix_plugin.line_registration.fit_rows import Fit, fit_rows
+from unmix_plugin.line_registration.lost_rows import track
+from unmix_plugin.line_registration.swept_view import SweptView, columns_compared
+
+if TYPE_CHECKING:
+    from unmix_plugin.trained.evaluation import ViewTruth
+    from unmix_plugin.trained.trained_scene import TrainedScene
+
+_MOST_PIXELS = 20_000
+_BLURS = (17, 9, 5, 3)
+"""Edges of the squares over which pictures are averaged at first, pixels."""
+_ITERATIONS, _REACH = 6, 30.0
+_ROUNDS = 4
+_RIGHT = 0.25
+"""Part of the rows that is right at least, once pictures that were averaged are alike."""
+_RUN = 12
+"""Rows in a row from which others are looked for."""
+_CLEARLY_BETTER = 0.98
+"""Part of the former error below which what was found is taken."""
+
+
+@torch.no_grad()
+def align_rows(scene: TrainedScene, camera: Cameras, truth: ViewTruth) -> Cameras:
+    """A line camera, its rows moved to where the scene looks most like what was measured."""
+    columns = columns_compared(*camera.size(0), _MOST_PIXELS)
+    alpha = None if truth.alpha is None else truth.alpha[:, columns]
+    kept = keep(camera.to(scene.device), columns, truth.spectra[:, columns], truth.valid[:, columns], alpha)
+    matrix = kept.axes
+    if truth.sensor is not None:
+        matrix = torch.from_numpy(truth.sensor.matrix).to(matrix).T @ matrix
+    composite = partial(scene.renderer.composite, scene.field)
+    show = shower(composite, scene.materials, matrix, has_opacity=kept.has_opacity)
+    view = swept_view(kept, scene.scene_box, show)
+    steps = torch.zeros(view.num_knots, 6, dtype=torch.float64)
+    for blur in _BLURS:
+        steps = fit_rows(view, steps, Fit(_ITERATIONS, _REACH, blur=blur))
+    return view.moved(camera, _tracked(view, fit_rows(view, steps, Fit())))
+
+
+def _tracked(view: SweptView, steps: Float64[Tensor, "n 6"]) -> Float64[Tensor, "n 6"]:
+    """Steps after the rows were looked for from those outwards that fit best, until that makes nothing better."""
+    errors, tried = view.row_errors(steps), set[int]()
+    if not bool((errors > 0).any()):
+        return steps
+    for _ in range(_ROUNDS):
+        usual = float(errors[errors > 0].quantile(_RIGHT))
+        row = _best_run(errors, view.shows_matter, tried)
+        if row is None:
+            return steps
+        tried.add(row)
+        found = fit_rows(view, track(view, steps, slice(row, row + _RUN), usual), Fit())
+        seen = view.row_errors(found)
+        if float(seen.sqrt().mean()) < _CLEARLY_BETTER * float(errors.sqrt().mean()):
+            steps, errors = found, seen
+    return steps
+
+
+def _best_run(errors: Float[Tensor, " H"], shown: slice, tried: set[int]) -> int | None:
+    """First of the rows in a row that fit best, away from those that were tried; None where there are no more."""
+    if shown.stop - shown.start < _RUN:
+        return None
+    means = errors[shown].unfold(0, _RUN, 1).mean(dim=1)
+    for row in means.argsort().tolist():
+        if all(abs(row + shown.start - other) >= _RUN for other in tried):
+            return int(row + shown.start)
+    return None
