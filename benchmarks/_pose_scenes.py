@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from unmix_plugin.engine.geometry.rotations import rotation_matrix
 from unmix_plugin.scenes.demo.materials import band_centers_nm, lamp_power, reflectances
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.scenes.demo.shading import render_view
-from unmix_plugin.scenes.demo.views import demo_cameras, radiance_cube
+from unmix_plugin.scenes.demo.views import demo_cameras, label_image, radiance_cube
 
 _TRANSFORMS = "transforms.json"
 _NUM_POINTS = 300
@@ -28,6 +28,8 @@ _POINTS_BOX = ((-0.7, -0.7, 0.0), (0.7, 0.7, 0.6))
 """Where the demo scene's things are."""
 SWEEP_LENGTH = 2.4
 """How far a line camera moves during a sweep, world units."""
+SWEPT = "eval_swept_"
+"""With which names of evaluation views begin that are sweeps."""
 WOBBLES = (1.0, 2.0, 3.0)
 """Waves of a line camera's wobble over a sweep."""
 
@@ -66,18 +68,11 @@ def frames_off(folder: Path, size: int, bands: int, views: int, error_px: float,
     return PosedScene(folder, truth, pose_error(truth, moved(scale)))
 
 
-def sweeps(
-    folder: Path,
-    size: int,
-    bands: int,
-    num_sweeps: int,
-    error_px: float,
-    seed: int,
-    *,
-    sweeps_evaluation: bool = False,
-) -> PosedScene:
-    """The scene swept by line cameras with a smooth wobble that its poses don't know; evaluation views are frames with
-    true poses, or sweeps that wobble as well."""
+def sweeps(folder: Path, size: int, bands: int, num_sweeps: int, error_px: float, seed: int) -> PosedScene:
+    """The scene swept by line cameras with a smooth wobble that its poses don't know.
+
+    Evaluation views are frames with true poses, and the same views as sweeps that wobble as well (`SWEPT`).
+    """
     views = views_for(num_sweeps)
     make_demo_scene(folder, size, bands, views)
     frames, truth = demo_cameras(size, views), line_cameras(size, views)
@@ -92,9 +87,11 @@ def sweeps(
 
     chosen = [index for index, train in enumerate(is_train) if train]
     scale = _scale_for(error_px, lambda x: pose_error(truth[chosen], wobbling(x)[chosen]))
-    swept = range(views) if sweeps_evaluation else chosen
-    _render_sweeps(folder, content["frames"], truth, swept, bands)
-    _write_poses(folder, frames, {index: wobbling(scale) for index in swept})
+    _render_sweeps(folder, dict(enumerate(content["frames"])), truth, chosen, bands)
+    _write_poses(folder, frames, {index: wobbling(scale) for index in chosen})
+    _add_evaluation_sweeps(
+        folder, truth, wobbling(scale), [i for i in range(views) if i not in chosen], bands
+    )
     return PosedScene(folder, truth[chosen], pose_error(truth[chosen], wobbling(scale)[chosen]))
 
 
@@ -218,7 +215,11 @@ def _waves(size: int, views: int, seed: int) -> Float[Tensor, "V H 6"]:
 
 
 def _render_sweeps(
-    folder: Path, frames: Sequence[dict[str, Any]], cameras: Cameras, chosen: Sequence[int], bands: int
+    folder: Path,
+    frames: Mapping[int, dict[str, Any]],
+    cameras: Cameras,
+    chosen: Sequence[int],
+    bands: int,
 ) -> None:
     """Cubes and pictures with alpha of the line cameras, in place of the frames'."""
     from PIL import Image
@@ -245,6 +246,33 @@ def _write_poses(folder: Path, frames: Cameras, lines: dict[int, Cameras] | None
             for gone in ("transform_matrix", "seg_file_path"):
                 frame.pop(gone, None)
             frame["row_poses"] = [_matrix(pose) for pose in keys.of(index).poses]
+    (folder / _TRANSFORMS).write_text(json.dumps(content) + "\n")
+
+
+def _add_evaluation_sweeps(
+    folder: Path, truth: Cameras, given: Cameras, chosen: Sequence[int], bands: int
+) -> None:
+    """Sweeps beside the evaluation frames, with the poses that are given."""
+    from PIL import Image
+
+    content = json.loads((folder / _TRANSFORMS).read_text())
+    assert given.key_poses is not None
+    added = []
+    for index in chosen:
+        name = f"{SWEPT}{index:03d}"
+        entry = {
+            "file_path": f"images/{name}.png",
+            "hyperspectral_file_path": f"cubes/{name}.npy",
+            "seg_file_path": f"labels/{name}.png",
+            "row_poses": [_matrix(pose) for pose in given.key_poses.of(index).poses],
+        }
+        Image.fromarray(label_image(render_view(truth, index))).save(folder / entry["seg_file_path"])
+        added.append(entry)
+    _render_sweeps(folder, dict(zip(chosen, added, strict=True)), truth, chosen, bands)
+    for key, value in content.items():
+        if key.startswith(("val", "test")) and isinstance(value, list):
+            content[key] = value + [entry["file_path"] for entry in added]
+    content["frames"] += added
     (folder / _TRANSFORMS).write_text(json.dumps(content) + "\n")
 
 

@@ -4,8 +4,9 @@
 
 The demo scene with the poses of all views off by 10 px in the mean is trained with `--poses refine`, beside the same
 scene with its true poses and beside the wrong poses taken as they are. Then 16 sweeps of line cameras, with a slow
-wobble of 10 px that their poses don't know, against 16 frames of as many pixels with true poses; their evaluation views
-are frames. Poses are compared after a similarity; all trainings of a part take equally many steps.
+wobble of 10 px that their poses don't know, against 16 frames of as many pixels with true poses. They are evaluated on
+frames, which see how far the world was bent, and on sweeps that wobble as well, as users of line cameras have them.
+Poses are compared after a similarity; all trainings of a part take equally many steps.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import _common
 import _machine
 import torch
 import tyro
-from _pose_scenes import PosedScene, frames_off, pose_error, sweeps, views_for
+from _pose_scenes import SWEPT, PosedScene, frames_off, pose_error, sweeps, views_for
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 
@@ -49,7 +50,9 @@ class Options:
     samples_per_step: int = 25_000
     """Samples marched in a training step."""
     only: tuple[str, ...] = ()
-    """Which parts to run, frames and lines; both if none is given."""
+    """Which parts to run, frames and lines; both if none is given. A part has a record of its own."""
+    variants: tuple[str, ...] = ()
+    """Which trainings of a part to run, such as "frames" "sweeps with wobble, refined"; all if none is given."""
     results: Path | None = None
     """Folder for poses.json and poses.md; None: beside the benchmarks."""
     quick: bool = False
@@ -73,7 +76,7 @@ def main(options: Options) -> None:
     question = "Poses off by 10 px, refined while training, and sweeps of line cameras, at equal steps"
     tables = tuple(_details(name, found) for name, found in measured.items())
     report = _common.Report(
-        "poses",
+        "-".join(("poses", *options.only)),
         question,
         {**setting, "error_px": ERROR_PX, "sweeps": NUM_SWEEPS},
         machine,
@@ -90,11 +93,12 @@ def run_frames(options: Options, place: Path) -> dict[str, Any]:
         frames_off(place / f"{error:g}", *_size(options), options.views, error, options.seed)
         for error in (0, ERROR_PX)
     ]
-    return {
-        "true poses": measure(off[0], (), options, options.steps, place),
-        "off, as they are": measure(off[1], (), options, options.steps, place),
-        "off, refined": measure(off[1], REFINE, options, options.steps, place),
+    trainings = {
+        "true poses": (off[0], ()),
+        "off, as they are": (off[1], ()),
+        "off, refined": (off[1], REFINE),
     }
+    return measure_all(trainings, options, options.steps, place)
 
 
 def run_lines(options: Options, place: Path) -> dict[str, Any]:
@@ -102,11 +106,23 @@ def run_lines(options: Options, place: Path) -> dict[str, Any]:
     wobbling = sweeps(place / "wobble", *_size(options), NUM_SWEEPS, ERROR_PX, options.seed)
     steady = sweeps(place / "steady", *_size(options), NUM_SWEEPS, 0.0, options.seed)
     frames = frames_off(place / "frames", *_size(options), views_for(NUM_SWEEPS), 0.0, options.seed)
+    trainings = {
+        "frames": (frames, ()),
+        "sweeps": (steady, ()),
+        "sweeps with wobble, as they are": (wobbling, ()),
+        "sweeps with wobble, refined": (wobbling, REFINE),
+    }
+    return measure_all(trainings, options, options.line_steps, place)
+
+
+def measure_all(
+    trainings: dict[str, tuple[PosedScene, tuple[str, ...]]], options: Options, steps: int, place: Path
+) -> dict[str, Any]:
+    """Those trainings that are wanted, each with its scene and the words that it is trained with."""
     return {
-        "frames": measure(frames, (), options, options.line_steps, place),
-        "sweeps": measure(steady, (), options, options.line_steps, place),
-        "sweeps with wobble, as they are": measure(wobbling, (), options, options.line_steps, place),
-        "sweeps with wobble, refined": measure(wobbling, REFINE, options, options.line_steps, place),
+        name: measure(scene, words, options, steps, place)
+        for name, (scene, words) in trainings.items()
+        if not options.variants or name in options.variants
     }
 
 
@@ -133,7 +149,7 @@ def measure(
     run = trainer.run.path
     _common.run_command([_common.console_script("unmix-eval"), "--run", str(run), "--device", "cpu"])
     metrics = json.loads((run / "eval" / "metrics.json").read_text(encoding="utf-8"))
-    found = {name: metrics[name] for name in SHOWN}
+    found = {name: metrics[name] for name in SHOWN} | _by_kind(metrics["per_view"])
     found |= {
         "aligned": metrics.get("aligned", []),
         "poses_px": trained_error(scene, run),
@@ -144,6 +160,20 @@ def measure(
         flush=True,
     )
     return found
+
+
+def _by_kind(views: list[dict[str, Any]]) -> dict[str, float]:
+    """Figures of evaluation views that are frames, and PSNR of those that are sweeps, where there are any."""
+    swept = [view for view in views if view["name"].startswith(SWEPT)]
+    frames = [view for view in views if not view["name"].startswith(SWEPT)]
+
+    def mean(chosen: list[dict[str, Any]], name: str) -> float:
+        return sum(view[name] for view in chosen) / len(chosen)
+
+    if not swept:
+        return {}
+    own = {name: mean(frames, name) for name in ("psnr", "psnr_matter", "ssim", "sam")}
+    return own | {"psnr_of_sweeps": mean(swept, "psnr")}
 
 
 def trained_error(scene: PosedScene, run: Path) -> float:
@@ -213,6 +243,10 @@ def judge_lines(found: dict[str, Any]) -> list[_common.Figure]:
         _common.Limit(1.5, is_upper=True, unit=" dB").judge(
             "sweeps with wobble, refined: PSNR below frames", _lost(found, "frames", refined, "psnr")
         ),
+        _common.reported(
+            "the same, evaluation views swept too",
+            "" if refined not in found else f"{found[refined]['psnr_of_sweeps']:.2f} dB",
+        ),
         _common.Limit(1.0, is_upper=True, unit=" px").judge(
             "sweeps, refined: wobble left", found.get(refined, {}).get("poses_px")
         ),
@@ -233,7 +267,7 @@ def _size(options: Options) -> tuple[int, int]:
 
 
 def _details(name: str, found: dict[str, Any]) -> _common.DetailTable:
-    keys = (*SHOWN, "given_px", "poses_px", "aligned")
+    keys = (*SHOWN, "psnr_of_sweeps", "given_px", "poses_px", "aligned")
     rows = [[key, *(_text(values.get(key)) for values in found.values())] for key in keys]
     return _common.DetailTable(name, ["metric", *found], rows)
 

@@ -63,7 +63,9 @@ def test_a_run_gives_back_its_line_cameras_and_renders_all_bands(trainer):
 
 def refining(folder: Path, steps: int) -> TrainerConfig:
     """Training that registers its line cameras twice."""
-    refinement = PoseConfig(start=0.0, coarse_steps=2, register_from=0.4, register_every=0.3)
+    refinement = PoseConfig(
+        start=0.0, coarse_steps=2, register_from=0.4, register_every=0.3, register_steps=1
+    )
     model = replace(CONFIG, num_endmembers=1, poses="refine", pose_refinement=refinement)
     data = HyperspectralDataManagerConfig(train_num_rays_per_batch=64, grid_resolution=16)
     return replace(

@@ -391,8 +391,15 @@ def test_parts_of_the_training_that_are_none_are_refused(wrong):
 
 
 def test_line_cameras_are_not_registered_while_the_grid_is_coarse():
-    config = PoseConfig(coarse_until=0.5, coarse_steps=10**6, register_from=0.0, register_every=0.25)
+    config = PoseConfig(
+        coarse_until=0.5, coarse_steps=10**6, register_from=0.0, register_every=0.25, register_steps=1
+    )
     assert [step for step in range(100) if config.registers(step, step / 100)] == [50, 75]
+
+
+def test_short_trainings_are_registered_more_seldom():
+    config = PoseConfig(coarse_steps=0, register_from=0.2, register_every=0.1, register_steps=30)
+    assert [step for step in range(1, 100) if config.registers(step, step / 100)] == [20, 50, 80]
 
 
 def test_registration_from_the_end_on_is_none_at_all():

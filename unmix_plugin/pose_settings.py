@@ -30,11 +30,13 @@ class PoseConfig:
     roughness: float = 1.5
     """Weight of the mean squared bend (second difference between knots) of a line camera's corrections: what carries a
     camera moves smoothly, and rows that see little follow their neighbours."""
-    register_from: float = 0.2
-    """Part of the training after which line cameras are registered to the scene row by row, in place of gradients; 1
-    leaves them to these."""
+    register_from: float = 0.6
+    """Part of the training after which line cameras are registered to the scene row by row; 1 leaves them to
+    gradients, which move poses and scene together until then."""
     register_every: float = 0.1
     """Part of the training after which they are registered anew."""
+    register_steps: int = 100
+    """Steps after which they are registered anew at the earliest: it takes as long as hundreds of steps."""
 
     def __post_init__(self) -> None:
         """Refuse impossible settings.
@@ -49,6 +51,7 @@ class PoseConfig:
             "start in [0, 1]": 0 <= self.start <= 1,
             "register-from in [0, 1]": 0 <= self.register_from <= 1,
             "register-every in [0.001, 1]": 0.001 <= self.register_every <= 1,
+            "register-steps of at least 1": self.register_steps >= 1,
             "a penalty of 0 to 1e6": 0 <= self.penalty <= 1e6,
             "a roughness of 0 to 1e6": 0 <= self.roughness <= 1e6,
         }
@@ -73,8 +76,9 @@ class PoseConfig:
         """
         if step == 0 or self.fineness(step, progress) < 1:
             return False
+        every = max(self.register_every, self.register_steps * progress / step)
         rounds, before = (
-            math.floor((part - self.register_from) / self.register_every + 1e-9)
+            math.floor((part - self.register_from) / every + 1e-9)
             for part in (progress, progress * (step - 1) / step)
         )
         return rounds >= 0 and rounds > before

@@ -22,6 +22,8 @@ LOST = 8.0
 """Mean squared error of a row over the usual one, from which it is lost."""
 _LARGEST = 50.0
 """Beyond which it is not worse."""
+_FEWEST_LOST = 4
+"""Rows, as many as lie between two knots: fewer are not worth the time."""
 _FEWEST_ROWS = 12
 """In a run that tells where its neighbours are."""
 _UNSURE_ROWS = 2
@@ -58,16 +60,17 @@ def recover(view: SweptView, steps: Float64[Tensor, "n 6"], usual: float) -> Rec
     shown = view.shows_matter
     good = ~lost
     good[: shown.start] = good[shown.stop :] = False
-    run = _longest_run(good)
-    if not bool(lost.any()) or run.stop - run.start < _FEWEST_ROWS:
-        return Recovery(steps, int(lost.sum()), is_better=False)
+    run, num_lost = _longest_run(good), int(lost.sum())
+    is_hopeless = 2 * num_lost > len(lost) or run.stop - run.start < _FEWEST_ROWS
+    if num_lost < _FEWEST_LOST or is_hopeless:
+        return Recovery(steps, num_lost, is_better=False)
     found = track(view, steps, slice(run.start + _UNSURE_ROWS, run.stop - _UNSURE_ROWS), usual)
 
     def mean_error(steps: Float64[Tensor, "n 6"]) -> float:
         return float(view.row_errors(steps).clamp(max=_LARGEST * usual).mean())
 
     is_better = mean_error(found) < _CLEARLY_BETTER * mean_error(steps)
-    return Recovery(found if is_better else steps, int(lost.sum()), is_better)
+    return Recovery(found if is_better else steps, num_lost, is_better)
 
 
 def track(view: SweptView, steps: Float64[Tensor, "n 6"], run: slice, usual: float) -> Float64[Tensor, "n 6"]:
