@@ -35,11 +35,12 @@ class Swept:
 
     camera: Cameras
     """As it was given; one camera."""
+    columns: Int[Tensor, " W"]
+    """Of its image."""
     index: int
     """Among the training views."""
     sensor: int | None
     """Of a rig, what took it."""
-    rays: RayBundle
     wanted: Float[Tensor, "H W D"]
     counts: Float[Tensor, "H W 1"]
     axes: Float[Tensor, "b C"]
@@ -83,7 +84,7 @@ class LineCameras:
         views = []
         for kept in self._kept:
             show = shower(composite, materials, through(kept), has_opacity=kept.has_opacity)
-            views.append(swept_view(kept, box, show))
+            views.append(swept_view(kept, poses.with_lens(kept.camera).to(data.device), box, show))
         steps = [
             poses.steps_of(kept.index, view.distance) for kept, view in zip(self._kept, views, strict=True)
         ]
@@ -114,8 +115,7 @@ def keep(
     counts = valid.float()[..., None]
     values = [spectra.float() @ axes] + ([] if alpha is None else [alpha.float()[..., None]])
     wanted = (torch.cat(values, dim=-1) * counts).cpu()
-    rays = rays_through(camera, 0, columns).to(spectra.device)
-    return Swept(camera, index, sensor, rays, wanted, counts.cpu(), axes, alpha is not None)
+    return Swept(camera, columns, index, sensor, wanted, counts.cpu(), axes, alpha is not None)
 
 
 def main_axes(spectra: Float[Tensor, "P b"], most: int) -> Float[Tensor, "b C"]:
@@ -142,9 +142,9 @@ def shower(
     return show
 
 
-def swept_view(kept: Swept, box: SceneBox, show: Show) -> SweptView:
-    """A view beside the scene as it is now."""
-    rays, camera = kept.rays, kept.camera
+def swept_view(kept: Swept, camera: Cameras, box: SceneBox, show: Show) -> SweptView:
+    """A view beside the scene as it is now, from a camera on the scene's device, from which steps start."""
+    rays = rays_through(camera, 0, kept.columns)
     assert rays.image_y is not None
     distances = (rays.origins - box.aabb.mean(dim=0).to(rays.origins)).norm(dim=1)
     return SweptView(
@@ -154,7 +154,7 @@ def swept_view(kept: Swept, box: SceneBox, show: Show) -> SweptView:
         rays.image_y[:: kept.wanted.shape[1]].cpu(),
         camera.size(0)[1],
         max(float(distances.mean()), 1e-6),
-        1 / float(camera.focal_px.mean()),
+        1 / float(camera.focal_px[0, 0]),
         show,
         kept.has_opacity,
     )

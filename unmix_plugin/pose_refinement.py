@@ -226,17 +226,20 @@ class PoseRefinement(nn.Module):
         return replace(rays, origins=rays.origins + moves, directions=directions, axes=axes)
 
     @torch.no_grad()
+    def with_lens(self, cameras: Cameras) -> Cameras:
+        """Training cameras where they were given, with the lens as it is corrected."""
+        lens = self.lens.to(cameras.focal_px)
+        change = cameras.distortion.new_zeros(cameras.distortion.shape[1])
+        change[:2] = lens[1:]
+        return replace(
+            cameras, focal_px=cameras.focal_px * lens[0].exp(), distortion=cameras.distortion + change
+        )
+
+    @torch.no_grad()
     def refined(self, cameras: Cameras) -> Cameras:
         """The training cameras, corrected: key poses of line cameras stand at the given heights and at the knots."""
-        own = cameras.to(self.steps.device)
-        change = own.distortion.new_zeros(own.distortion.shape[1])
-        change[:2] = self.lens[1:]
-        moved = replace(
-            own,
-            camera_to_world=self._moved(own, torch.arange(len(own)), self._middles(own)),
-            focal_px=own.focal_px * self.lens[0].exp(),
-            distortion=own.distortion + change,
-        )
+        own = self.with_lens(cameras.to(self.steps.device))
+        moved = replace(own, camera_to_world=self._moved(own, torch.arange(len(own)), self._middles(own)))
         if own.key_poses is not None:
             moved = replace(
                 moved, key_poses=KeyPoses.join([self._keys(own, view) for view in range(len(own))])

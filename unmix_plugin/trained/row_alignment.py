@@ -42,13 +42,13 @@ def align_rows(scene: TrainedScene, camera: Cameras, truth: ViewTruth) -> Camera
     """A line camera, its rows moved to where the scene looks most like what was measured."""
     columns = columns_compared(*camera.size(0), _MOST_PIXELS)
     alpha = None if truth.alpha is None else truth.alpha[:, columns]
-    kept = keep(camera.to(scene.device), columns, truth.spectra[:, columns], truth.valid[:, columns], alpha)
+    kept = keep(camera, columns, truth.spectra[:, columns], truth.valid[:, columns], alpha)
     matrix = kept.axes
     if truth.sensor is not None:
         matrix = torch.from_numpy(truth.sensor.matrix).to(matrix).T @ matrix
     composite = partial(scene.renderer.composite, scene.field)
     show = shower(composite, scene.materials, matrix, has_opacity=kept.has_opacity)
-    view = swept_view(kept, scene.scene_box, show)
+    view = swept_view(kept, camera.to(scene.device), scene.scene_box, show)
     steps = torch.zeros(view.num_knots, 6, dtype=torch.float64)
     for blur in _BLURS:
         steps = fit_rows(view, steps, Fit(_ITERATIONS, _REACH, blur=blur))
