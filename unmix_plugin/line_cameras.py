@@ -119,7 +119,9 @@ def keep(
 
 
 def main_axes(spectra: Float[Tensor, "P b"], most: int) -> Float[Tensor, "b C"]:
-    """The few directions in which spectra vary most."""
+    """The few directions in which spectra vary most; without spectra, some bands."""
+    if len(spectra) == 0:
+        return torch.eye(spectra.shape[1], min(most, spectra.shape[1]), device=spectra.device)
     some = spectra[:: max(1, len(spectra) // 20_000)].float()
     _, _, axes = torch.linalg.svd(some, full_matrices=False)
     return axes[:most].T
