@@ -12,6 +12,7 @@ from torch.testing import assert_close
 from tests.engine.stopped_runs import stop_at
 from tests.method_factory import CONFIG
 from tests.scenes.line_factory import make_line_scene
+from tests.test_pose_training import trained
 from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.pipeline import PipelineConfig
@@ -76,12 +77,6 @@ def refining(folder: Path, steps: int) -> TrainerConfig:
         device="cpu",
         pipeline=PipelineConfig(datamanager=data, model=model),
     )
-
-
-def trained(config: TrainerConfig) -> Trainer:
-    trainer = Trainer(config, console=Console(file=io.StringIO()))
-    trainer.train()
-    return trainer
 
 
 def test_line_cameras_are_registered_while_poses_are_refined(tmp_path):

@@ -17,7 +17,7 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.line_cameras import keep, shower, swept_view
 from unmix_plugin.line_registration.fit_rows import Fit, fit_rows
-from unmix_plugin.line_registration.lost_rows import track
+from unmix_plugin.line_registration.lost_rows import LOST, track
 from unmix_plugin.line_registration.swept_view import SweptView, columns_compared
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def _tracked(view: SweptView, steps: Float64[Tensor, "n 6"]) -> Float64[Tensor, 
     for _ in range(_ROUNDS):
         usual = float(errors[errors > 0].quantile(_RIGHT))
         row = _best_run(errors, view.shows_matter, tried)
-        if row is None:
+        if row is None or float(errors.max()) <= LOST * usual:
             return steps
         tried.add(row)
         found = fit_rows(view, track(view, steps, slice(row, row + _RUN), usual), Fit())
