@@ -8,10 +8,13 @@ Notation: `n` knots; a step has 6 numbers, so there are 6 n unknowns, coupled ov
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-import scipy.linalg
-import scipy.sparse
 from jaxtyping import Float64
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 BEND_PX = 1.0
 DRIFT_PX = 2.0
@@ -26,11 +29,13 @@ class SmoothPrior:
 
     def __init__(self, num_knots: int, pixel: float) -> None:
         """`pixel` is its angle in radians."""
+        from scipy.sparse import identity
+
         drifts, bends = (_differences(num_knots, order) for order in (1, 2))
         total = (
             (bends.T @ bends) / BEND_PX**2
             + (drifts.T @ drifts) / DRIFT_PX**2
-            + scipy.sparse.identity(num_knots) / SIZE_PX**2
+            + identity(num_knots) / SIZE_PX**2
         )
         self.matrix = (total / pixel**2).tocsr()
 
@@ -49,9 +54,11 @@ class SmoothPrior:
             blocks[apart, : len(diagonal)] += diagonal[:, None, None] * np.eye(_NUMBERS)
 
 
-def _differences(num_knots: int, order: int) -> scipy.sparse.csr_matrix:
+def _differences(num_knots: int, order: int) -> csr_matrix:
     """The matrix that takes differences between neighbours so many times."""
-    found = scipy.sparse.csr_matrix(scipy.sparse.identity(num_knots))
+    from scipy.sparse import csr_matrix, identity
+
+    found = csr_matrix(identity(num_knots))
     for _ in range(min(order, num_knots - 1)):
         found = found[1:] - found[:-1]
     return found if order < num_knots else found[:0]
@@ -67,6 +74,8 @@ def solve_banded(
         pull: Right-hand side.
         damping: The share.
     """
+    from scipy.linalg import solveh_banded
+
     num_knots = blocks.shape[1]
     band = np.zeros((_BANDWIDTH + 1, _NUMBERS * num_knots))
     for apart in range(min(3, num_knots)):
@@ -78,4 +87,4 @@ def solve_banded(
                         apart, : num_knots - apart, row, column
                     ]
     band[0] *= 1 + damping
-    return scipy.linalg.solveh_banded(band, pull.ravel(), lower=True).reshape(pull.shape)
+    return solveh_banded(band, pull.ravel(), lower=True).reshape(pull.shape)
