@@ -2,7 +2,8 @@
 
 A correction is a function of the view and of the row: one step for a frame camera, and for a line camera a sum of
 waves, computed at knots a few rows apart, between which it is interpolated linearly. Given poses stay what they are;
-rays are moved.
+rays are moved. Line cameras that were registered to the scene (line_cameras.py) have the corrections that were found
+then, in place of steps.
 
 What moves all views alike (a similarity of the world about the scene's middle) can't be seen in pictures, so it is
 taken out of the corrections. A view that goes farther than `LARGEST_STEP` has lost its way: it gets its given pose
