@@ -57,7 +57,7 @@ class LineCameras:
 
     def __init__(self, rows: Sequence[int]) -> None:
         """`rows` as `Knots` has them."""
-        self.rows = {view: count for view, count in enumerate(rows) if count > 0}
+        self.views = [view for view, count in enumerate(rows) if count > 0]
         self._kept: list[Swept] = []
 
     @torch.no_grad()
@@ -80,7 +80,7 @@ class LineCameras:
             materials: Of the scene.
             through: See `ThroughSensor`.
         """
-        self._kept = self._kept or [self._keep(view, data) for view in self.rows]
+        self._kept = self._kept or [self._keep(view, data) for view in self.views]
         views = []
         for kept in self._kept:
             show = shower(composite, materials, through(kept), has_opacity=kept.has_opacity)
@@ -93,7 +93,7 @@ class LineCameras:
 
     def _keep(self, view: int, data: DataManager) -> Swept:
         camera = data.train_cameras[view]
-        columns = columns_compared(*camera.size(0), MOST_PIXELS // len(self.rows))
+        columns = columns_compared(*camera.size(0), MOST_PIXELS // len(self.views))
         measured = data.measured_in(view, columns)
         sensor = int(measured["sensor"]) if "sensor" in measured else None
         return keep(
@@ -111,20 +111,20 @@ def keep(
     index: int = 0,
 ) -> Swept:
     """What is kept of one line camera's image, of which some columns are given."""
-    axes = main_axes(spectra[valid], _CHANNELS)
+    axes = main_axes(spectra[valid])
     counts = valid.float()[..., None]
     values = [spectra.float() @ axes] + ([] if alpha is None else [alpha.float()[..., None]])
     wanted = (torch.cat(values, dim=-1) * counts).cpu()
     return Swept(camera, columns, index, sensor, wanted, counts.cpu(), axes, alpha is not None)
 
 
-def main_axes(spectra: Float[Tensor, "P b"], most: int) -> Float[Tensor, "b C"]:
+def main_axes(spectra: Float[Tensor, "P b"]) -> Float[Tensor, "b C"]:
     """The few directions in which spectra vary most; without spectra, some bands."""
     if len(spectra) == 0:
-        return torch.eye(spectra.shape[1], min(most, spectra.shape[1]), device=spectra.device)
+        return torch.eye(spectra.shape[1], min(_CHANNELS, spectra.shape[1]), device=spectra.device)
     some = spectra[:: max(1, len(spectra) // 20_000)].float()
     _, _, axes = torch.linalg.svd(some, full_matrices=False)
-    return axes[:most].T
+    return axes[:_CHANNELS].T
 
 
 def shower(

@@ -157,7 +157,7 @@ class UnmixModel(Model):
     @torch.no_grad()
     def look_again(self, step: int, progress: float, data: DataManager) -> None:
         """Register line cameras to the scene, where poses are refined and it is time."""
-        if self.poses is None or self._lines is None or not self._lines.rows:
+        if self.poses is None or self._lines is None or not self._lines.views:
             return
         if not self.config.pose_refinement.registers(step, progress):
             return

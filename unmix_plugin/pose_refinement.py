@@ -22,7 +22,7 @@ from dataclasses import replace
 from typing import Literal
 
 import torch
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor, nn
 
 from unmix_plugin.engine.geometry.camera_distortion import undistort
@@ -128,8 +128,7 @@ class PoseRefinement(nn.Module):
     @property
     def corrections(self) -> Float[Tensor, "M 6"]:
         """By how much the cameras are turned and moved at the knots."""
-        is_found = self.is_found.repeat_interleave(self.counts)[:, None]
-        return torch.where(is_found, self.found, self._free_steps() * self.scale[:, None])
+        return torch.where(self._is_found_at_knots, self.found, self._free_steps() * self.scale[:, None])
 
     @torch.no_grad()
     def steps_of(self, view: int, distance: float) -> Float64[Tensor, "n 6"]:
@@ -156,6 +155,10 @@ class PoseRefinement(nn.Module):
         processes.of_first(self.found)
         for flags in (self.is_found, self.is_free):
             flags.copy_(processes.of_first(flags.float()) > 0)
+
+    @property
+    def _is_found_at_knots(self) -> Bool[Tensor, "M 1"]:
+        return self.is_found.repeat_interleave(self.counts)[:, None]
 
     def _knots_of(self, view: int) -> slice:
         return slice(int(self.first[view]), int(self.first[view] + self.counts[view]))
@@ -185,7 +188,7 @@ class PoseRefinement(nn.Module):
 
     def penalty(self, config: PoseConfig) -> Float[Tensor, ""]:
         """What large and rough corrections cost."""
-        steps = self._free_steps() * ~self.is_found.repeat_interleave(self.counts)[:, None]
+        steps = self._free_steps() * ~self._is_found_at_knots
         bends = [steps[self.get_buffer(f"places_{count}")].diff(n=2, dim=1).flatten() for count in self.lines]
         bent = torch.cat([steps.new_zeros(0), *bends])
         large = steps.square().mean() + self.lens.square().sum()

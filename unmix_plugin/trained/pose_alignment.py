@@ -28,6 +28,7 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.rotations import rotation_matrix
+from unmix_plugin.line_cameras import main_axes
 from unmix_plugin.pose_refinement import LARGEST_STEP
 from unmix_plugin.trained.material_view import MaterialView
 
@@ -49,7 +50,6 @@ _CLEARLY_BETTER = 0.8
 """Part of the squared error to which the given pose leads, below which another is taken."""
 _APART_PX = 1.0
 """How far the other start is from the given pose on the smallest picture, at least: a nearer one leads there too."""
-_CHANNELS = 3
 _DAMPING = 1e-3
 _TRIES = 6
 """Dampings of a step that are tried, each ten times the one before."""
@@ -64,7 +64,7 @@ Residuals = Callable[[Float[Tensor, "m 6"]], Float[Tensor, "m n"]]
 @torch.no_grad()
 def align_pose(scene: TrainedScene, camera: Cameras, truth: ViewTruth) -> Cameras:
     """The camera, moved to where the scene looks most like what was measured; one camera, of a frame or of lines."""
-    axes = _channels(truth)
+    axes = main_axes(truth.spectra[truth.valid])
     step = torch.zeros(6)
     for side, count in zip(SIDES_PX, STEPS, strict=True):
         if side > max(camera.width, camera.height) and side > SIDES_PX[0]:
@@ -187,13 +187,6 @@ def _fit(
         else:
             return best
     return best
-
-
-def _channels(truth: ViewTruth) -> Float[Tensor, "B C"]:
-    """The few directions in which the spectra of a view vary most."""
-    spectra = truth.spectra[truth.valid].float()
-    _, _, axes = torch.linalg.svd(spectra[:: max(1, len(spectra) // 20_000)], full_matrices=False)
-    return axes[:_CHANNELS].T
 
 
 def _shrunk(camera: Cameras, side: int) -> Cameras:
