@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 from torch.testing import assert_close
 
-from tests.test_pose_refinement import HEIGHT, WIDTH, cameras
+from tests.pose_factory import HEIGHT, WIDTH, cameras
 from tests.test_view_gains import make_lit_model
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.line_cameras import Swept, keep, swept_view

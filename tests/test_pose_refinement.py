@@ -3,60 +3,20 @@
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from torch.testing import assert_close
 
 from tests.method_factory import BOX, CONFIG, initial_data, make_model, make_rays
+from tests.pose_factory import HEIGHT, MIDDLE, box_around, cameras, refinement, some_pixels
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.engine.geometry.rays import RayBundle
-from unmix_plugin.engine.geometry.rotations import rotation_matrix
-from unmix_plugin.engine.geometry.scene_box import SceneBox
-from unmix_plugin.engine.processes.processes import Processes
-from unmix_plugin.errors import ConfigError
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.lamp_shading import Lamplight
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.pose_knots import Knots, row_waves
 from unmix_plugin.pose_refinement import COARSEST_PIXEL, LARGEST_STEP, PoseRefinement
 from unmix_plugin.pose_settings import PoseConfig
-
-WIDTH, HEIGHT = 12, 40
-MIDDLE = torch.tensor([0.1, -0.2, 0.3])
-
-
-def box_around(middle: torch.Tensor, half: float = 3.0) -> SceneBox:
-    return SceneBox(torch.stack([middle - half, middle + half]))
-
-
-def cameras() -> Cameras:
-    """Two frame cameras and between them a line camera, all looking at the origin from around it."""
-    turns = torch.tensor([[0.0, 0.2, 0.0], [0.1, 2.0, 0.0], [-0.3, -2.1, 0.2]])
-    rotations = rotation_matrix(turns)
-    poses = torch.cat([rotations, 4.0 * rotations[:, :, 2:]], dim=-1)
-    ends = poses[[1, 1]].clone()
-    ends[:, :, 3] += torch.tensor([[1.0], [-1.0]]) * poses[1, :, 1]
-    keys = KeyPoses(torch.cat([poses[:1], ends, poses[2:]]), torch.tensor([0.5, 0.5, 39.5, 0.5]), (1, 2, 1))
-    focal, center = torch.full((3, 2), 20.0), torch.tensor([[6.0, 20.0]]).repeat(3, 1)
-    return Cameras(poses, focal, center, torch.zeros(3, 4), WIDTH, HEIGHT, key_poses=keys)
-
-
-def refinement(lens: str = "fixed", size: float = 0.04, pixel_size: float = 0.1) -> PoseRefinement:
-    own, knots = cameras(), Knots.of(cameras())
-    found = PoseRefinement(knots.rows, lens)  # type: ignore[arg-type]
-    found.begin(knots.positions(own), box_around(MIDDLE), pixel_size)
-    with torch.no_grad():
-        found.steps.copy_(size * torch.randn(found.steps.shape, generator=torch.Generator().manual_seed(1)))
-        found.lens[: found.num_lens] = torch.tensor([0.05, -0.08, 0.03])[: found.num_lens]
-    return found
-
-
-def some_pixels(view: int) -> tuple[torch.Tensor, torch.Tensor]:
-    generator = torch.Generator().manual_seed(view)
-    coords = torch.rand(50, 2, generator=generator) * torch.tensor([WIDTH, HEIGHT])
-    return torch.full((50,), view), coords
 
 
 def test_a_line_camera_has_knots_a_few_rows_apart_and_a_frame_camera_one():
@@ -98,10 +58,10 @@ def test_gradients_of_moved_rays_are_those_of_finite_differences():
     )
 
     def moved(steps: torch.Tensor, lens: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        out = torch.func.functional_call(found, {"steps": steps, "lens": lens}, (rays,))
+        out = torch.func.functional_call(found, {"steps": steps, "lens.steps": lens}, (rays,))
         return out.origins, out.directions
 
-    inputs = (found.steps.detach().requires_grad_(), found.lens.detach().requires_grad_())
+    inputs = (found.steps.detach().requires_grad_(), found.lens.steps.detach().requires_grad_())
     assert torch.autograd.gradcheck(moved, inputs, eps=1e-6, atol=1e-5)
 
 
@@ -287,22 +247,6 @@ def test_the_gradient_of_a_picture_by_a_pose_is_that_of_finite_differences():
     assert torch.equal(steps.grad[1:], torch.zeros(2, 6))
 
 
-def test_levels_of_the_grid_join_the_coarsest_first():
-    weights = [PoseConfig().level_weights(5, share) for share in np.linspace(0, 1, 9)]
-    assert weights[0] == [1.0, 0.0, 0.0, 0.0, 0.0]
-    assert weights[-1] == [1.0] * 5
-    assert (np.diff(np.array(weights), axis=0) >= 0).all()
-    assert (np.diff(np.array(weights), axis=1) <= 0).all()
-
-
-def test_the_coarse_part_is_a_part_of_the_training_and_never_longer_than_its_steps():
-    config = PoseConfig(coarse_until=0.4, coarse_steps=500)
-    assert [config.fineness(step, step / 1000) for step in (0, 100, 200, 400, 900)] == [0, 0.25, 0.5, 1, 1]
-    assert [config.fineness(step, step / 10_000) for step in (0, 125, 250, 500)] == [0, 0.25, 0.5, 1]
-    assert PoseConfig(coarse_until=0.0).fineness(0, 0.0) == 1.0
-    assert PoseConfig(coarse_steps=0).fineness(0, 0.0) == 1.0
-
-
 def test_levels_without_weight_change_nothing():
     model = refining_model()
     points = torch.rand(20, 3, generator=torch.Generator().manual_seed(0))
@@ -314,102 +258,3 @@ def test_levels_without_weight_change_nothing():
         field.table[int(field.layout.levels[1, 1]) :] += 1.0
         assert_close(model.field.get_density(points)[1], coarse)
     assert float((whole - coarse).abs().max()) > 1e-2
-
-
-def test_impossible_settings_are_refused():
-    with pytest.raises(ConfigError, match="coarse-until in"):
-        PoseConfig(coarse_until=1.5)
-
-
-def registered(size: float) -> PoseRefinement:
-    """The line camera's poses as a registration found them."""
-    found = refinement()
-    steps = size * torch.ones(11, 6, dtype=torch.float64)
-    found.take_registered(1, steps, distance=4.0)
-    return found
-
-
-def test_a_registered_line_camera_has_the_poses_that_were_found():
-    found = registered(0.02)
-    assert_close(found.steps_of(1, 4.0), 0.02 * torch.ones(11, 6, dtype=torch.float64), atol=1e-7, rtol=0)
-    views, coords = some_pixels(1)
-    given = cameras().generate_rays(views, coords)
-    turn = rotation_matrix(torch.full((1, 3), 0.02))[0]
-    moved = found(given)
-    assert_close(moved.origins, given.origins + 4.0 * 0.02, atol=1e-5, rtol=0)
-    assert_close(moved.directions, given.directions @ turn.T, atol=1e-5, rtol=0)
-
-
-def test_gradients_and_penalties_leave_a_registered_line_camera_alone():
-    found = registered(0.02)
-    views, coords = some_pixels(1)
-    moved = found(cameras().generate_rays(views, coords))
-    found.is_free[[0, 2]] = False
-    loss = moved.directions.sum() + moved.origins.sum() + found.penalty(PoseConfig(penalty=1.0))
-    assert float(loss.detach()) != 0
-    (slope,) = torch.autograd.grad(loss, found.steps)
-    assert bool((slope[1:12] == 0).all())
-
-
-def test_registration_looks_through_the_lens_as_it_is_corrected():
-    found, given = refinement("radial"), cameras()
-    seen = found.with_lens(given)
-    assert_close(seen.focal_px, given.focal_px * float(found.lens[0].detach().exp()))
-    assert_close(seen.distortion[:, :2], found.lens[1:].detach().expand(3, 2))
-    assert torch.equal(seen.camera_to_world, given.camera_to_world)
-
-
-def test_a_registration_that_leads_too_far_is_not_taken():
-    found = registered(2 * LARGEST_STEP)
-    assert not bool(found.is_found.any())
-    assert_close(found.corrections, refinement().corrections)
-
-
-def test_a_line_camera_that_was_undone_is_free_again_once_it_is_registered():
-    found = refinement()
-    found.is_free[1] = False
-    found.take_registered(1, torch.zeros(11, 6, dtype=torch.float64), distance=4.0)
-    assert bool(found.is_free[1])
-    found.undo_runaways()
-    assert bool(found.is_found[1])
-
-
-def test_registered_poses_are_those_of_the_first_process():
-    found, others = registered(0.02), refinement()
-
-    class First(Processes):
-        """Hands on what the first process has."""
-
-        def of_first(self, values: torch.Tensor) -> torch.Tensor:
-            source = {78: found.found, 3: found.is_found.float()}[values.numel()]
-            return values.copy_(source)
-
-    others.agree(First())
-    assert torch.equal(others.found, found.found)
-    assert torch.equal(others.is_found, found.is_found)
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [{"register_from": -0.1}, {"register_from": 1.5}, {"register_every": 0.0}, {"register_every": 2.0}],
-)
-def test_parts_of_the_training_that_are_none_are_refused(wrong):
-    with pytest.raises(ConfigError, match=r"register-(from|every)"):
-        PoseConfig(**wrong)
-
-
-def test_line_cameras_are_not_registered_while_the_grid_is_coarse():
-    config = PoseConfig(
-        coarse_until=0.5, coarse_steps=10**6, register_from=0.0, register_every=0.25, register_steps=1
-    )
-    assert [step for step in range(100) if config.registers(step, step / 100)] == [50, 75]
-
-
-def test_short_trainings_are_registered_more_seldom():
-    config = PoseConfig(coarse_steps=0, register_from=0.2, register_every=0.1, register_steps=30)
-    assert [step for step in range(1, 100) if config.registers(step, step / 100)] == [20, 50, 80]
-
-
-def test_registration_from_the_end_on_is_none_at_all():
-    config = PoseConfig(coarse_steps=0, register_from=1.0)
-    assert not any(config.registers(step, step / 100) for step in range(100))

@@ -6,7 +6,7 @@ import torch
 from torch.testing import assert_close
 
 from tests.method_factory import make_model
-from tests.test_pose_refinement import cameras, refinement, some_pixels
+from tests.pose_factory import cameras, refinement, some_pixels
 from unmix_plugin.engine.processes.processes import Processes
 from unmix_plugin.pose_trust import LARGEST_RATIO, PoseTrust
 

@@ -84,7 +84,7 @@ class LineCameras:
         views = []
         for kept in self._kept:
             show = shower(composite, materials, through(kept), has_opacity=kept.has_opacity)
-            views.append(swept_view(kept, poses.with_lens(kept.camera).to(data.device), box, show))
+            views.append(swept_view(kept, poses.lens.of(kept.camera).to(data.device), box, show))
         steps = [
             poses.steps_of(kept.index, view.distance) for kept, view in zip(self._kept, views, strict=True)
         ]

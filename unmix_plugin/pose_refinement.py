@@ -1,4 +1,4 @@
-"""Poses corrected while training: small tangent steps of rotation and position, and of the lens that all views share.
+"""Poses corrected while training: small tangent steps of rotation and position.
 
 A correction is a function of the view and of the row: one step for a frame camera, and for a line camera a sum of
 waves, computed at knots a few rows apart, between which it is interpolated linearly. Given poses stay what they are;
@@ -12,7 +12,7 @@ back, and keeps it unless the grid is still coarse.
 Notation: `V` training views, `M` knots of all views, `R` rays. A step is (w, m): the camera turns by the rotation
 vector w in world axes about itself, and moves by m times its reach, both times its scale.
 
-Source: Lin et al. 2021, BARF (joint refinement, coarse to fine); Wang et al. 2021, NeRF-- (focal length).
+Source: Lin et al. 2021, BARF (joint refinement, coarse to fine).
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor, nn
 
-from unmix_plugin.engine.geometry.camera_distortion import undistort
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.rotations import rotation_matrix
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.engine.processes.processes import Processes
+from unmix_plugin.lens_refinement import LensRefinement
 from unmix_plugin.pose_knots import Knots, row_waves, similarities
 from unmix_plugin.pose_settings import PoseConfig
 from unmix_plugin.pose_trust import PoseTrust
@@ -78,11 +78,11 @@ class PoseRefinement(nn.Module):
     def __init__(self, rows: Sequence[int], lens: Literal["fixed", "focal", "radial"] = "fixed") -> None:
         """`rows` as `Knots` has them."""
         super().__init__()
-        self.knots, self.num_lens = Knots(tuple(rows)), {"fixed": 0, "focal": 1, "radial": 3}[lens]
+        self.knots = Knots(tuple(rows))
         counts = torch.tensor(self.knots.counts)
         total = int(counts.sum())
         self.steps = nn.Parameter(torch.zeros(total, 6))
-        self.lens = nn.Parameter(torch.zeros(3), requires_grad=self.num_lens > 0)
+        self.lens = LensRefinement(lens)
         self.trust = PoseTrust(total)
         self.register_buffer("reach", torch.ones(total))
         self.register_buffer("scale", torch.ones(total))
@@ -191,7 +191,7 @@ class PoseRefinement(nn.Module):
         steps = self._free_steps() * ~self._is_found_at_knots
         bends = [steps[self.get_buffer(f"places_{count}")].diff(n=2, dim=1).flatten() for count in self.lines]
         bent = torch.cat([steps.new_zeros(0), *bends])
-        large = steps.square().mean() + self.lens.square().sum()
+        large = steps.square().mean() + self.lens.penalty()
         return config.penalty * large + config.roughness * bent.square().sum() / max(1, len(bent))
 
     def nearest_knots(self, rays: RayBundle) -> Int[Tensor, " R"]:
@@ -225,24 +225,12 @@ class PoseRefinement(nn.Module):
         pull = 1 / self.trust.weights[self.nearest_knots(rays)][:, None]
         turns, moves = scale_gradient(turns, pull[:, :, None]), scale_gradient(moves, pull)
         directions, axes = ((turns @ x[:, :, None])[:, :, 0] for x in (rays.directions, rays.axes))
-        if self.num_lens:
-            directions = self._through_lens(directions, axes)
-        return replace(rays, origins=rays.origins + moves, directions=directions, axes=axes)
-
-    @torch.no_grad()
-    def with_lens(self, cameras: Cameras) -> Cameras:
-        """Training cameras where they were given, with the lens as it is corrected."""
-        lens = self.lens.to(cameras.focal_px)
-        change = cameras.distortion.new_zeros(cameras.distortion.shape[1])
-        change[:2] = lens[1:]
-        return replace(
-            cameras, focal_px=cameras.focal_px * lens[0].exp(), distortion=cameras.distortion + change
-        )
+        return replace(rays, origins=rays.origins + moves, directions=self.lens(directions, axes), axes=axes)
 
     @torch.no_grad()
     def refined(self, cameras: Cameras) -> Cameras:
         """The training cameras, corrected: key poses of line cameras stand at the given heights and at the knots."""
-        own = self.with_lens(cameras.to(self.steps.device))
+        own = self.lens.of(cameras.to(self.steps.device))
         moved = replace(own, camera_to_world=self._moved(own, torch.arange(len(own)), self._middles(own)))
         if own.key_poses is not None:
             moved = replace(
@@ -297,20 +285,6 @@ class PoseRefinement(nn.Module):
     def _place(self, views: Int[Tensor, " R"], y: Float[Tensor, " R"]) -> Float[Tensor, " R"]:
         """Where rays start among the knots of their views, from 0."""
         return y / self.rows[views].clamp(min=1) * (self.counts[views] - 1)
-
-    def _through_lens(
-        self, directions: Float[Tensor, "R 3"], axes: Float[Tensor, "R 3"]
-    ) -> Float[Tensor, "R 3"]:
-        """Rays as a lens of another focal length and bending sends them."""
-        along = (directions * axes).sum(dim=1, keepdim=True)
-        across = directions / along - axes
-        scale = (-self.lens[0]).exp()
-        if self.num_lens > 1:
-            radius = across.norm(dim=1).clamp(min=1e-9) * scale
-            bent = torch.stack([radius, torch.zeros_like(radius)], dim=1)
-            bending = torch.cat([self.lens[1:], self.lens.new_zeros(2)])[None]
-            scale = scale * (undistort(bent, bending)[:, :1] / bent[:, :1])
-        return nn.functional.normalize(axes + across * scale, dim=1)
 
     def _middles(self, cameras: Cameras) -> Float[Tensor, " V"]:
         sizes = [cameras.size(index)[1] for index in range(len(cameras))]
