@@ -221,7 +221,7 @@ def _render_sweeps(
     chosen: Sequence[int],
     bands: int,
 ) -> None:
-    """Cubes and pictures with alpha of the line cameras, in place of the frames'."""
+    """Cubes, pictures with alpha and labels of the line cameras, in place of the frames'."""
     from PIL import Image
 
     wavelengths = band_centers_nm(bands)
@@ -234,6 +234,7 @@ def _render_sweeps(
         )
         rgba = np.repeat(view.alpha[..., None], 4, axis=-1)
         Image.fromarray((rgba * 255).round().astype(np.uint8)).save(folder / frames[index]["file_path"])
+        Image.fromarray(label_image(view)).save(folder / frames[index]["seg_file_path"])
 
 
 def _write_poses(folder: Path, frames: Cameras, lines: dict[int, Cameras] | None = None) -> None:
@@ -243,8 +244,7 @@ def _write_poses(folder: Path, frames: Cameras, lines: dict[int, Cameras] | None
         if lines and index in lines:
             keys = lines[index].key_poses
             assert keys is not None
-            for gone in ("transform_matrix", "seg_file_path"):
-                frame.pop(gone, None)
+            del frame["transform_matrix"]
             frame["row_poses"] = [_matrix(pose) for pose in keys.of(index).poses]
     (folder / _TRANSFORMS).write_text(json.dumps(content) + "\n")
 
@@ -253,8 +253,6 @@ def _add_evaluation_sweeps(
     folder: Path, truth: Cameras, given: Cameras, chosen: Sequence[int], bands: int
 ) -> None:
     """Sweeps beside the evaluation frames, with the poses that are given."""
-    from PIL import Image
-
     content = json.loads((folder / _TRANSFORMS).read_text())
     assert given.key_poses is not None
     added = []
@@ -266,7 +264,6 @@ def _add_evaluation_sweeps(
             "seg_file_path": f"labels/{name}.png",
             "row_poses": [_matrix(pose) for pose in given.key_poses.of(index).poses],
         }
-        Image.fromarray(label_image(render_view(truth, index))).save(folder / entry["seg_file_path"])
         added.append(entry)
     _render_sweeps(folder, dict(zip(chosen, added, strict=True)), truth, chosen, bands)
     for key, value in content.items():
