@@ -122,7 +122,7 @@ def test_initial_pixels_come_from_opaque_pixels_of_all_training_views(scene_fold
     assert len(make(scene_folder, max_initial_pixels=50).initial_data()["pixels"]) == 50
 
 
-@pytest.mark.parametrize(("has_alpha", "power"), [(True, 2.0), (False, 0.0)])
+@pytest.mark.parametrize(("has_alpha", "power"), [(True, 1.5), (False, 0.0)])
 def test_errors_are_relative_where_alpha_is_known_and_some_pixels_are_much_brighter(
     scene_folder, has_alpha, power
 ):

@@ -33,7 +33,7 @@ _BRIGHTER_PART = 0.9
 """Quantile of brightness that is compared with the median."""
 _PLAIN_CONTRAST = 2.75
 """Brightness of that quantile, in medians, up to which absolute errors are right."""
-_LARGEST_POWER = 2.0
+_LARGEST_POWER = 1.5
 """Of brightness by which squared errors are divided, where that quantile is at least twice as bright as that."""
 
 
@@ -104,11 +104,10 @@ def exposure_of(pixels: Float[Tensor, "R B"]) -> float:
 
 
 def relative_power_of(pixels: Float[Tensor, "R B"]) -> float:
-    """Power of brightness by which squared errors should be divided, [0, 2], from how uneven the brightness is.
+    """Power of brightness by which squared errors should be divided, [0, 1.5], from how uneven the brightness is.
 
     In most scenes the brighter tenth of the pixels is about twice as bright as the usual one, and absolute errors are
-    right: 0. Where it is more than five times as bright, they would hardly tell of the dark rest: 2, with which errors
-    are those of logarithms.
+    right: 0. Where it is more than five times as bright, they would hardly tell of the dark rest: 1.5.
 
     Args:
         pixels: Of the whole scene, opaque ones.
