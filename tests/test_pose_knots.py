@@ -1,9 +1,12 @@
 """Corrections of a line camera's poses: waves over its rows, and knots close enough for them."""
 
+import numpy as np
+import pytest
 import torch
+from scipy.interpolate import BSpline
 from torch.testing import assert_close
 
-from unmix_plugin.pose_knots import row_waves
+from unmix_plugin.pose_knots import row_waves, spline_weights
 from unmix_plugin.pose_refinement import PoseRefinement
 from unmix_plugin.pose_settings import PoseConfig
 
@@ -25,21 +28,44 @@ def test_a_line_camera_is_corrected_by_waves_over_its_rows():
     assert torch.equal(half[:13].abs().sum() + half[24:].abs().sum(), torch.tensor(0.0))
 
 
-def test_knots_follow_a_wobble_of_three_waves_of_10_px_within_a_fifth_of_a_pixel():
+def dense_weights(place: torch.Tensor, count: int) -> torch.Tensor:
+    """One row a place, one column a knot."""
+    first, weights = spline_weights(place, torch.full_like(place, count, dtype=torch.int64))
+    return torch.zeros(len(place), count).scatter(1, first[:, None] + torch.arange(4), weights)
+
+
+def test_corrections_between_inner_knots_are_a_cubic_b_spline():
+    place = torch.linspace(1.0, 7.0, 50)
+    values = np.random.default_rng(0).normal(size=9)
+    theirs = BSpline(np.arange(-2, 11), values, 3)(place.numpy())
+    assert_close(
+        dense_weights(place, 9).double() @ torch.from_numpy(values),
+        torch.from_numpy(theirs),
+        atol=1e-5,
+        rtol=0,
+    )
+
+
+@pytest.mark.parametrize("count", [4, 5, 9])
+def test_a_straight_drift_stays_straight_up_to_both_ends(count):
+    place = torch.linspace(0, count - 1, 40)
+    assert_close(dense_weights(place, count) @ torch.arange(float(count)), place, atol=1e-5, rtol=0)
+    assert_close(dense_weights(place, count).sum(dim=1), torch.ones(40))
+
+
+def test_knots_follow_a_wobble_of_three_waves_of_10_px_within_a_fraction_of_a_pixel():
     y = torch.linspace(0.5, 95.5, 96)
     wobble = 10 * torch.sin(2 * torch.pi * 3 * y / 96 + 0.4)
-    found = PoseRefinement((96,))
-    place = y / 96 * (found.knots.counts[0] - 1)
-    shares = (1 - (place[:, None] - torch.arange(found.knots.counts[0])).abs()).clamp(min=0)
-    fitted = shares @ torch.linalg.lstsq(shares, wobble[:, None]).solution
-    assert float((fitted[:, 0] - wobble).square().mean().sqrt()) < 0.2
+    weights = dense_weights(y / 96 * 24, 25)
+    fitted = weights @ torch.linalg.lstsq(weights, wobble[:, None]).solution
+    assert float((fitted[:, 0] - wobble).square().mean().sqrt()) < 0.03
 
 
 def test_a_bend_of_a_line_camera_costs_and_a_drift_does_not():
-    found, config = PoseRefinement((0, 40, 40, 4)), PoseConfig(penalty=0.0, roughness=2.0)
+    found, config = PoseRefinement((0, 40, 40)), PoseConfig(penalty=0.0, roughness=2.0)
 
     def cost(*shapes: torch.Tensor) -> float:
-        """Of corrections of the two long sweeps; the frame and the short sweep have their own."""
+        """Of corrections of the two sweeps; the frame has its own."""
         with torch.no_grad():
             found.steps.fill_(0.1)
             for first, shape in zip((1, 12), shapes, strict=True):

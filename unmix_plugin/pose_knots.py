@@ -10,13 +10,15 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 
 KNOT_ROWS = 4
 """Rows between the knots of a line camera."""
+FEWEST_KNOTS = 4
+"""Of a line camera: a piece of a cubic spline has as many."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,7 @@ class Knots:
     @property
     def counts(self) -> list[int]:
         """Knots of each view."""
-        return [1 if rows == 0 else max(2, round(rows / KNOT_ROWS) + 1) for rows in self.rows]
+        return [1 if rows == 0 else max(FEWEST_KNOTS, round(rows / KNOT_ROWS) + 1) for rows in self.rows]
 
     def heights(self, view: int) -> Float[Tensor, " n"]:
         """y of the knots of a view, pixels; the middle of the image counts for a frame camera."""
@@ -49,6 +51,39 @@ class Knots:
             y = self.heights(view)
             found.append(cameras.poses_at(torch.full((len(y),), view), y)[:, :, 3])
         return torch.cat(found)
+
+
+def spline_weights(
+    place: Float[Tensor, " R"], count: Int[Tensor, " R"]
+) -> tuple[Int[Tensor, " R"], Float[Tensor, "R 4"]]:
+    """What corrections at places between knots are made of: a cubic B-spline, whose ends go on straight.
+
+    Straight lines from knot to knot would be off by a hundredth of a wobble of three waves over a hundred rows, which
+    is a tenth of a pixel of ten.
+
+    Args:
+        place: Among the knots of a view, [0, count - 1].
+        count: Knots of that view, at least 4.
+
+    Returns:
+        The first of four knots in a row, and their weights.
+    """
+    piece = torch.minimum(place.long(), count - 2).clamp(min=0)
+    u = place - piece
+    a, b, c, d = (
+        (1 - u) ** 3 / 6,
+        (3 * u**3 - 6 * u**2 + 4) / 6,
+        (-3 * u**3 + 3 * u**2 + 3 * u + 1) / 6,
+        u**3 / 6,
+    )
+    zero = torch.zeros_like(u)
+    inner = torch.stack([a, b, c, d], dim=1)
+    first = torch.stack([b + 2 * a, c - a, d, zero], dim=1)
+    last = torch.stack([zero, a, b - d, c + 2 * d], dim=1)
+    weights = torch.where(
+        (piece == 0)[:, None], first, torch.where((piece == count - 2)[:, None], last, inner)
+    )
+    return torch.minimum((piece - 1).clamp(min=0), count - 4), weights
 
 
 def row_waves(count: int) -> Float[Tensor, "n n"]:

@@ -1,7 +1,7 @@
 """Poses corrected while training: small tangent steps of rotation and position.
 
 A correction is a function of the view and of the row: one step for a frame camera, and for a line camera a sum of
-waves, computed at knots a few rows apart, between which it is interpolated linearly. Given poses stay what they are;
+waves, computed at the knots of a cubic spline a few rows apart. Given poses stay what they are;
 rays are moved. Line cameras that were registered to the scene (line_cameras.py) have the corrections that were found
 then, in place of steps.
 
@@ -32,7 +32,7 @@ from unmix_plugin.engine.geometry.rotations import rotation_matrix
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.engine.processes.processes import Processes
 from unmix_plugin.lens_refinement import LensRefinement
-from unmix_plugin.pose_knots import Knots, row_waves, similarities
+from unmix_plugin.pose_knots import FEWEST_KNOTS, Knots, row_waves, similarities, spline_weights
 from unmix_plugin.pose_settings import PoseConfig
 from unmix_plugin.pose_trust import PoseTrust
 from unmix_plugin.rendering.gradients import scale_gradient
@@ -229,7 +229,8 @@ class PoseRefinement(nn.Module):
 
     @torch.no_grad()
     def refined(self, cameras: Cameras) -> Cameras:
-        """The training cameras, corrected: key poses of line cameras stand at the given heights and at the knots."""
+        """The training cameras, corrected: key poses of line cameras stand at the given heights, in the middle of each
+        row and at the ends."""
         own = self.lens.of(cameras.to(self.steps.device))
         moved = replace(own, camera_to_world=self._moved(own, torch.arange(len(own)), self._middles(own)))
         if own.key_poses is not None:
@@ -272,14 +273,22 @@ class PoseRefinement(nn.Module):
         self, views: Int[Tensor, " R"], y: Float[Tensor, " R"]
     ) -> tuple[Float[Tensor, "R 3 3"], Float[Tensor, "R 3"]]:
         """Rotation and shift of each ray's camera."""
-        place = self._place(views, y)
-        knot = torch.minimum(place.long(), (self.counts[views] - 2).clamp(min=0)).clamp(min=0)
-        share = torch.where(self.rows[views] > 0, place - knot, 0.0)[:, None]
-        low = self.first[views] + knot
-        high = torch.minimum(low + 1, self.first[views] + self.counts[views] - 1)
         turns, moves = self.corrections.split(3, dim=1)
         scaled = torch.cat([turns, moves * self.reach[:, None]], dim=1)
-        step = scaled.index_select(0, low) * (1 - share) + scaled.index_select(0, high) * share
+        first = self.first[views]
+        if not self.lines:
+            step = scaled.index_select(0, first)
+        else:
+            start, weights = spline_weights(self._place(views, y), self.counts[views].clamp(min=FEWEST_KNOTS))
+            is_line = self.rows[views] > 0
+            first = first + torch.where(is_line, start, 0)
+            weights = torch.where(is_line[:, None], weights, weights.new_tensor([1.0, 0.0, 0.0, 0.0]))
+            own = (first[:, None] + torch.arange(FEWEST_KNOTS, device=first.device)).clamp(
+                max=len(scaled) - 1
+            )
+            step = (scaled.index_select(0, own.flatten()).view(*own.shape, 6) * weights[:, :, None]).sum(
+                dim=1
+            )
         return rotation_matrix(step[:, :3]), step[:, 3:]
 
     def _place(self, views: Int[Tensor, " R"], y: Float[Tensor, " R"]) -> Float[Tensor, " R"]:
@@ -300,7 +309,9 @@ class PoseRefinement(nn.Module):
         assert cameras.key_poses is not None
         heights = cameras.key_poses.of(view).heights
         if self.knots.rows[view]:
-            heights = torch.cat([heights, self.knots.heights(view).to(heights)]).unique()
+            rows = self.knots.rows[view]
+            middles = torch.arange(rows).to(heights) + 0.5
+            heights = torch.cat([heights, middles, heights.new_tensor([0.0, rows])]).unique()
         poses = self._moved(cameras, torch.full((len(heights),), view, device=heights.device), heights)
         return KeyPoses(poses, heights, (len(heights),))
 

@@ -6,18 +6,18 @@ import pytest
 from unmix_plugin.line_registration.smooth_steps import SmoothPrior, solve_banded
 
 
-@pytest.mark.parametrize("num_knots", [2, 3, 9])
+@pytest.mark.parametrize("num_knots", [4, 5, 9])
 def test_the_banded_solution_is_the_dense_one(num_knots: int) -> None:
     generator = np.random.default_rng(0)
-    blocks = np.zeros((3, num_knots, 6, 6))
+    blocks = np.zeros((4, num_knots, 6, 6))
     dense = np.zeros((num_knots, 6, num_knots, 6))
-    for knot in range(num_knots - 1):
-        rows = generator.normal(size=(30, 12))
-        normal = (rows.T @ rows).reshape(2, 6, 2, 6)
-        dense[knot : knot + 2, :, knot : knot + 2] += normal
-        blocks[0, knot] += normal[0, :, 0]
-        blocks[0, knot + 1] += normal[1, :, 1]
-        blocks[1, knot] += normal[1, :, 0]
+    for knot in range(num_knots - 3):
+        rows = generator.normal(size=(30, 24))
+        normal = (rows.T @ rows).reshape(4, 6, 4, 6)
+        dense[knot : knot + 4, :, knot : knot + 4] += normal
+        for low in range(4):
+            for high in range(low, 4):
+                blocks[high - low, knot + low] += normal[high, :, low]
     prior = SmoothPrior(num_knots, pixel=0.01)
     prior.add_to(blocks)
     dense += np.einsum("ab,ij->aibj", prior.matrix.toarray(), np.eye(6))

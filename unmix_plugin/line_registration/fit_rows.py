@@ -119,19 +119,19 @@ def _equations(
     found: Float64[Tensor, "h W D"],
     weights: Float64[Tensor, "h W"],
     rows: slice,
-) -> tuple[Float64[np.ndarray, "3 n 6 6"], Float64[np.ndarray, "n 6"]]:
-    """Normal equations of the knots: each row adds to the two between which it lies."""
+) -> tuple[Float64[np.ndarray, "4 n 6 6"], Float64[np.ndarray, "n 6"]]:
+    """Normal equations of the knots: each row adds to the four that tell of it."""
     channels, count = found.shape[-1], view.num_knots
     weighed = slopes * (weights / channels)[..., None, None]
     normal = torch.einsum("hwdi,hwdj->hij", weighed, slopes)
     pull = torch.einsum("hwdi,hwd->hi", weighed, found)
-    before, share = (x[rows] for x in view.places())
-    low, high = (1 - share), share
-    blocks, pulls = torch.zeros(3, count, 6, 6).double(), torch.zeros(count, 6).double()
-    blocks[0].index_add_(0, before, normal * low.square()[:, None, None])
-    blocks[0].index_add_(0, before + 1, normal * high.square()[:, None, None])
-    blocks[1].index_add_(0, before, normal * (low * high)[:, None, None])
-    pulls.index_add_(0, before, pull * low[:, None]).index_add_(0, before + 1, pull * high[:, None])
+    first, shares = (x[rows] for x in view.places())
+    blocks, pulls = torch.zeros(4, count, 6, 6).double(), torch.zeros(count, 6).double()
+    for low in range(4):
+        pulls.index_add_(0, first + low, pull * shares[:, low, None])
+        for high in range(low, 4):
+            both = (shares[:, low] * shares[:, high])[:, None, None]
+            blocks[high - low].index_add_(0, first + low, normal * both)
     return blocks.numpy(), pulls.numpy()
 
 

@@ -91,23 +91,23 @@ def _downwards(
     view: SweptView, steps: Float64[Tensor, "n 6"], row: int, end: int, how: Fit
 ) -> Float64[Tensor, "n 6"]:
     """Steps whose rows from `row` on were fitted one after the other, those beyond `end` going on straight."""
-    before, _ = view.places()
+    first, _ = view.places()
     while True:
         rows = slice(max(row - _ROWS_HELD, 0), row)
-        steps = fit_rows(view, steps, how, rows, slice(int(before[rows.start]) + 1, view.num_knots))
-        if row >= min(end + _ROWS_A_TIME, len(before)):
+        steps = fit_rows(view, steps, how, rows, slice(int(first[rows.start]) + 3, view.num_knots))
+        if row >= min(end + _ROWS_A_TIME, len(first)):
             return steps
-        row = min(row + _ROWS_A_TIME, len(before))
+        row = min(row + _ROWS_A_TIME, len(first))
 
 
 def _upwards(
     view: SweptView, steps: Float64[Tensor, "n 6"], row: int, end: int, how: Fit
 ) -> Float64[Tensor, "n 6"]:
     """The same towards the first row: `row` is the first of those that are right."""
-    before, _ = view.places()
+    first, _ = view.places()
     while True:
-        rows = slice(row, min(row + _ROWS_HELD, len(before)))
-        steps = fit_rows(view, steps, how, rows, slice(0, int(before[rows.stop - 1]) + 1))
+        rows = slice(row, min(row + _ROWS_HELD, len(first)))
+        steps = fit_rows(view, steps, how, rows, slice(0, int(first[rows.stop - 1]) + 1))
         if row <= max(end - _ROWS_A_TIME, 0):
             return steps
         row = max(row - _ROWS_A_TIME, 0)

@@ -3,7 +3,7 @@
 What carries a line camera moves smoothly: the second difference between knots is small (`BEND_PX`), so what no row
 tells of goes on straight, and the first difference is not large (`DRIFT_PX`), so it does not go far.
 
-Notation: `n` knots; a step has 6 numbers, so there are 6 n unknowns, coupled over 3 knots in a row.
+Notation: `n` knots; a step has 6 numbers, so there are 6 n unknowns, coupled over 4 knots in a row.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ DRIFT_PX = 2.0
 SIZE_PX = 100.0
 """Standard deviations in pixels: of the bend at a knot, of the drift from a knot to the next, and of a step."""
 _NUMBERS = 6
-_BANDWIDTH = 2 * _NUMBERS
+_BANDWIDTH = 4 * _NUMBERS - 1
 
 
 class SmoothPrior:
@@ -47,7 +47,7 @@ class SmoothPrior:
         """Sum of squares, each over its variance."""
         return float((steps * self.slope(steps)).sum())
 
-    def add_to(self, blocks: Float64[np.ndarray, "3 n 6 6"]) -> None:
+    def add_to(self, blocks: Float64[np.ndarray, "4 n 6 6"]) -> None:
         """Add it to normal equations: block (d, a) couples knot a with knot a + d."""
         for apart in range(min(3, self.matrix.shape[0])):
             diagonal = self.matrix.diagonal(apart)
@@ -65,7 +65,7 @@ def _differences(num_knots: int, order: int) -> csr_matrix:
 
 
 def solve_banded(
-    blocks: Float64[np.ndarray, "3 n 6 6"], pull: Float64[np.ndarray, "n 6"], damping: float
+    blocks: Float64[np.ndarray, "4 n 6 6"], pull: Float64[np.ndarray, "n 6"], damping: float
 ) -> Float64[np.ndarray, "n 6"]:
     """Solution of normal equations whose diagonal is larger by a share (Levenberg-Marquardt).
 
@@ -78,7 +78,7 @@ def solve_banded(
 
     num_knots = blocks.shape[1]
     band = np.zeros((_BANDWIDTH + 1, _NUMBERS * num_knots))
-    for apart in range(min(3, num_knots)):
+    for apart in range(min(4, num_knots)):
         for row in range(_NUMBERS):
             for column in range(_NUMBERS):
                 below = _NUMBERS * apart + row - column

@@ -17,7 +17,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.rotations import rotation_matrix
-from unmix_plugin.pose_knots import Knots
+from unmix_plugin.pose_knots import Knots, spline_weights
 
 Show = Callable[[RayBundle], Float[Tensor, "R D"]]
 """What a scene shows along rays, in the channels that are compared."""
@@ -56,16 +56,15 @@ class SweptView:
         """n."""
         return Knots((self.rows,)).counts[0]
 
-    def places(self) -> tuple[Int[Tensor, " H"], Float64[Tensor, " H"]]:
-        """Of each row the knot before it, and how far it is on the way to the next, [0, 1]."""
+    def places(self) -> tuple[Int[Tensor, " H"], Float64[Tensor, "H 4"]]:
+        """Of each row the first of the four knots that tell of it, and their weights."""
         place = self.heights.double() / self.rows * (self.num_knots - 1)
-        before = place.long().clamp(0, self.num_knots - 2)
-        return before, place - before
+        return spline_weights(place, torch.full_like(self.heights, self.num_knots, dtype=torch.int64))
 
     def at_rows(self, steps: Float64[Tensor, "n 6"]) -> Float64[Tensor, "H 6"]:
         """Steps at knots, interpolated."""
-        before, share = self.places()
-        return steps[before] * (1 - share)[:, None] + steps[before + 1] * share[:, None]
+        first, weights = self.places()
+        return (steps[first[:, None] + torch.arange(4)] * weights[:, :, None]).sum(dim=1)
 
     def shown(self, steps: Float64[Tensor, "m H 6"], rows: slice) -> Float[Tensor, "m h W D"]:
         """What some rows show after each of some ways to move all of them."""
