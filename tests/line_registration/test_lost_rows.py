@@ -40,14 +40,14 @@ def test_a_sweep_that_is_right_is_left_alone() -> None:
     assert bool((found.steps == wobble(2.0)).all())
 
 
-def test_a_sweep_without_a_run_of_good_rows_keeps_its_poses() -> None:
-    view = swept()
-    start = torch.zeros(view.num_knots, 6, dtype=torch.float64)
-    start[:, 1] = 15.0 / 60.0
+def test_a_sweep_without_a_run_of_good_rows_is_looked_for_around_its_given_poses() -> None:
+    view = swept(wobble(6.0))
+    start = wobble(6.0)
+    start[:, 1] += 15.0 / 60.0
     found = recover(view, start, _USUAL)
     assert found.num_lost > ROWS // 3
-    assert not found.is_better
-    assert bool((found.steps == start).all())
+    assert found.is_better
+    assert error(view, found.steps) < 0.1 * error(view, start)
 
 
 def test_what_no_pose_explains_is_not_taken_for_better() -> None:

@@ -42,3 +42,14 @@ def test_the_slope_is_half_of_the_gradient_of_the_cost() -> None:
     steps, change = generator.normal(size=(2, 5, 6))
     difference = (prior.cost(steps + 1e-4 * change) - prior.cost(steps - 1e-4 * change)) / 2e-4
     assert difference == pytest.approx(2 * float((prior.slope(steps) * change).sum()), rel=1e-6)
+
+
+def test_the_smoothest_steps_through_some_knots_cost_least() -> None:
+    prior, generator = SmoothPrior(8, pixel=0.02), np.random.default_rng(2)
+    steps, is_free = generator.normal(size=(8, 6)), np.isin(np.arange(8), [0, 3, 4])
+    found = prior.smoothest(steps, is_free)
+    np.testing.assert_array_equal(found[~is_free], steps[~is_free])
+    for _ in range(5):
+        change = generator.normal(size=(8, 6)) * is_free[:, None]
+        assert prior.cost(found + 0.1 * change) > prior.cost(found)
+    np.testing.assert_array_equal(prior.smoothest(steps, np.zeros(8, dtype=bool)), steps)

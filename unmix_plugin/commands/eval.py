@@ -201,9 +201,8 @@ def _evaluate_views(
         rays = subpixels_for(scene, index, subject.scene.subpixels, subject.scene.pixel_size)
         camera = scene.cameras[index]
         if subject.has_refined_poses:
-            camera = align_pose(subject.scene, camera, truth)
-            if camera.is_line_camera(0):
-                camera = align_rows(subject.scene, camera, truth)
+            align = align_rows if camera.is_line_camera(0) else align_pose
+            camera = align(subject.scene, camera, truth)
         predicted = render_view(subject.scene, camera, rays)
         if subject.has_view_gains and not scene.is_rig:
             predicted = align_gain(predicted, truth, torch.from_numpy(scene.wavelengths_nm))

@@ -88,7 +88,7 @@ def fit_rows(
 def _residuals(
     view: SweptView, steps: Float64[Tensor, "n 6"], rows: slice, blur: int
 ) -> Float64[Tensor, "h W D"]:
-    return _blurred(view.residuals(view.at_rows(steps)[None], rows), blur)[0].double()
+    return blurred(view.residuals(view.at_rows(steps)[None], rows), blur)[0].double()
 
 
 def _slopes(
@@ -100,11 +100,12 @@ def _slopes(
     moves = difference * torch.eye(6, dtype=torch.float64)
     here = view.at_rows(steps)
     ahead, behind = view.shown(here + torch.cat([moves, -moves])[:, None], rows).chunk(2)
-    slopes = _blurred((ahead - behind) / (2 * difference) * view.counts[rows], blur)
+    slopes = blurred((ahead - behind) / (2 * difference) * view.counts[rows], blur)
     return slopes.double().permute(1, 2, 3, 0)
 
 
-def _blurred(pictures: Float[Tensor, "m h W D"], edge: int) -> Float[Tensor, "m h W D"]:
+def blurred(pictures: Float[Tensor, "m h W D"], edge: int) -> Float[Tensor, "m h W D"]:
+    """Pictures averaged over squares of pixels of an odd edge."""
     if edge == 1:
         return pictures
     flat = pictures.permute(0, 3, 1, 2)

@@ -16,13 +16,14 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from unmix_plugin.line_registration.fit_rows import Fit, fit_rows
+from unmix_plugin.line_registration.sought_rows import sought
 from unmix_plugin.line_registration.swept_view import SweptView
 
 LOST = 8.0
 """Mean squared error of a row over the usual one, from which it is lost."""
 _LARGEST = 50.0
 """Beyond which it is not worse."""
-_FEWEST_LOST = 4
+FEWEST_LOST = 4
 """Rows, as many as lie between two knots: fewer are not worth the time."""
 _FEWEST_ROWS = 12
 """In a run that tells where its neighbours are."""
@@ -62,9 +63,12 @@ def recover(view: SweptView, steps: Float64[Tensor, "n 6"], usual: float) -> Rec
     good[: shown.start] = good[shown.stop :] = False
     run, num_lost = _longest_run(good), int(lost.sum())
     is_hopeless = 2 * num_lost > len(lost) or run.stop - run.start < _FEWEST_ROWS
-    if num_lost < _FEWEST_LOST or is_hopeless:
+    if num_lost < FEWEST_LOST:
         return Recovery(steps, num_lost, is_better=False)
-    found = track(view, steps, slice(run.start + _UNSURE_ROWS, run.stop - _UNSURE_ROWS), usual)
+    if is_hopeless:
+        found = sought(view, torch.zeros_like(steps))
+    else:
+        found = track(view, steps, slice(run.start + _UNSURE_ROWS, run.stop - _UNSURE_ROWS), usual)
 
     def mean_error(steps: Float64[Tensor, "n 6"]) -> float:
         return float(view.row_errors(steps).clamp(max=_LARGEST * usual).mean())

@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -46,6 +46,20 @@ class SmoothPrior:
     def cost(self, steps: Float64[np.ndarray, "n 6"]) -> float:
         """Sum of squares, each over its variance."""
         return float((steps * self.slope(steps)).sum())
+
+    def smoothest(
+        self, steps: Float64[np.ndarray, "n 6"], is_free: Bool[np.ndarray, " n"]
+    ) -> Float64[np.ndarray, "n 6"]:
+        """Steps that cost least among those that differ at the free knots alone."""
+        from scipy.sparse.linalg import spsolve
+
+        found = steps.copy()
+        if not is_free.any():
+            return found
+        found[is_free] = 0.0
+        own = self.matrix[is_free][:, is_free].tocsc()
+        found[is_free] = -spsolve(own, self.slope(found)[is_free]).reshape(-1, _NUMBERS)
+        return found
 
     def add_to(self, blocks: Float64[np.ndarray, "4 n 6 6"]) -> None:
         """Add it to normal equations: block (d, a) couples knot a with knot a + d."""

@@ -2,7 +2,8 @@
 
 A line camera's rows wobble, so no single turn and shift aligns such a view. Once these are found (pose_alignment.py),
 its rows are fitted to averages over squares of pixels, of ever smaller edges: rows that are off by ten pixels look
-alike there. Those that fit best then tell where their neighbours are.
+alike there. Those that fit best then tell where their neighbours are. Where rows are still lost, they are looked for
+all around (sought_rows.py).
 """
 
 from __future__ import annotations
@@ -17,8 +18,10 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.line_cameras import keep, shower, swept_view
 from unmix_plugin.line_registration.fit_rows import Fit, fit_rows
-from unmix_plugin.line_registration.lost_rows import LOST, track
+from unmix_plugin.line_registration.lost_rows import FEWEST_LOST, LOST, track
+from unmix_plugin.line_registration.sought_rows import sought
 from unmix_plugin.line_registration.swept_view import SweptView, columns_compared
+from unmix_plugin.trained.pose_alignment import align_pose
 
 if TYPE_CHECKING:
     from unmix_plugin.trained.evaluation import ViewTruth
@@ -48,11 +51,31 @@ def align_rows(scene: TrainedScene, camera: Cameras, truth: ViewTruth) -> Camera
         matrix = torch.from_numpy(truth.sensor.matrix).to(matrix).T @ matrix
     composite = partial(scene.renderer.composite, scene.field)
     show = shower(composite, scene.materials, matrix, has_opacity=kept.has_opacity)
-    view = swept_view(kept, camera.to(scene.device), scene.scene_box, show)
-    steps = torch.zeros(view.num_knots, 6, dtype=torch.float64)
+    turned = align_pose(scene, camera, truth)
+    found: list[tuple[float, SweptView, Float64[Tensor, "n 6"], Cameras]] = []
+    for start, find in ((turned, _fitted), (turned, sought), (camera, sought)):
+        view = swept_view(kept, start.to(scene.device), scene.scene_box, show)
+        steps = find(view, torch.zeros(view.num_knots, 6, dtype=torch.float64))
+        errors = view.row_errors(steps)
+        found.append((float(errors.sqrt().mean()), view, steps, start))
+        if _num_lost(errors) < FEWEST_LOST:
+            break
+    _, view, steps, start = min(found, key=lambda candidate: candidate[0])
+    return view.moved(start, _tracked(view, steps))
+
+
+def _fitted(view: SweptView, steps: Float64[Tensor, "n 6"]) -> Float64[Tensor, "n 6"]:
+    """Steps from others on, by ever sharper pictures."""
     for blur in _BLURS:
         steps = fit_rows(view, steps, Fit(_ITERATIONS, _REACH, blur=blur))
-    return view.moved(camera, _tracked(view, fit_rows(view, steps, Fit())))
+    return fit_rows(view, steps, Fit())
+
+
+def _num_lost(errors: Float[Tensor, " H"]) -> int:
+    """Rows that fit far worse than those that fit well."""
+    if not bool((errors > 0).any()):
+        return 0
+    return int((errors > LOST * errors[errors > 0].quantile(_RIGHT)).sum())
 
 
 def _tracked(view: SweptView, steps: Float64[Tensor, "n 6"]) -> Float64[Tensor, "n 6"]:
