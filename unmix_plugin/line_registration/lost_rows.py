@@ -2,7 +2,8 @@
 
 Gradients draw a row to the nearest likeness, and a row that is off by ten pixels has another near. But next to rows
 that are right a row is off by little, since what carries the camera moves smoothly. So from the longest run of rows
-that look right, rows are fitted a few at a time, outwards, the others going on straight until their turn comes.
+that look right, rows are fitted a few at a time, outwards, the others going on straight until their turn comes. Where
+most rows are lost, they are looked for around the given poses (sought_rows.py).
 
 Notation: as in swept_view.py.
 """
@@ -62,13 +63,12 @@ def recover(view: SweptView, steps: Float64[Tensor, "n 6"], usual: float) -> Rec
     good = ~lost
     good[: shown.start] = good[shown.stop :] = False
     run, num_lost = _longest_run(good), int(lost.sum())
-    is_hopeless = 2 * num_lost > len(lost) or run.stop - run.start < _FEWEST_ROWS
     if num_lost < FEWEST_LOST:
         return Recovery(steps, num_lost, is_better=False)
-    if is_hopeless:
-        found = sought(view, torch.zeros_like(steps))
-    else:
+    if 2 * num_lost <= len(lost) and run.stop - run.start >= _FEWEST_ROWS:
         found = track(view, steps, slice(run.start + _UNSURE_ROWS, run.stop - _UNSURE_ROWS), usual)
+    else:
+        found = sought(view, torch.zeros_like(steps))
 
     def mean_error(steps: Float64[Tensor, "n 6"]) -> float:
         return float(view.row_errors(steps).clamp(max=_LARGEST * usual).mean())

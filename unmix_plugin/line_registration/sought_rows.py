@@ -1,8 +1,7 @@
 """Rows looked for all around where they are thought to be, where no neighbours tell.
 
-A few rows at a time are compared with the scene under turns of up to 18 pixels in both directions. The best turns are
-fitted; what is found in one place hardly depends on what is found in others. A smooth way through all that fits then
-leads to the rows between.
+A few rows at a time are compared with the scene under turns of up to 18 pixels in both directions, and the best turns
+are fitted, whatever was found for other rows. The smoothest way through all that fit then leads to the rows between.
 
 Notation: as in swept_view.py.
 """
@@ -39,7 +38,8 @@ _WELL = 0.25
 
 @dataclass(frozen=True)
 class _Place:
-    rows: slice
+    """Some rows, where they fit best."""
+
     knots: slice
     """That tell of these rows."""
     steps: Float64[Tensor, "k 6"]
@@ -86,7 +86,7 @@ def _seek(view: SweptView, steps: Float64[Tensor, "n 6"], rows: slice) -> _Place
         error = float(view.row_errors(tried)[rows].mean())
         # The outer knots tell of the outermost rows alone.
         inner = slice(knots.start + 1, knots.stop - 1)
-        found.append(_Place(rows, inner, tried[inner], error))
+        found.append(_Place(inner, tried[inner], error))
     return min(found, key=lambda place: place.error)
 
 
