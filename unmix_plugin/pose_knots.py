@@ -17,7 +17,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 
 KNOT_ROWS = 4
 """Rows between the knots of a line camera."""
-FEWEST_KNOTS = 4
+_FEWEST_KNOTS = 4
 """Of a line camera: a piece of a cubic spline has as many."""
 
 
@@ -37,7 +37,7 @@ class Knots:
     @property
     def counts(self) -> list[int]:
         """Knots of each view."""
-        return [1 if rows == 0 else max(FEWEST_KNOTS, round(rows / KNOT_ROWS) + 1) for rows in self.rows]
+        return [1 if rows == 0 else max(_FEWEST_KNOTS, round(rows / KNOT_ROWS) + 1) for rows in self.rows]
 
     def heights(self, view: int) -> Float[Tensor, " n"]:
         """y of the knots of a view, pixels; the middle of the image counts for a frame camera."""
@@ -63,7 +63,7 @@ def spline_weights(
 
     Args:
         place: Among the knots of a view, [0, count - 1].
-        count: Knots of that view, at least 4.
+        count: Knots of that view: at least 4, or 1 of a frame camera, which stands alone.
 
     Returns:
         The first of four knots in a row, and their weights.
@@ -83,7 +83,22 @@ def spline_weights(
     weights = torch.where(
         (piece == 0)[:, None], first, torch.where((piece == count - 2)[:, None], last, inner)
     )
-    return torch.minimum((piece - 1).clamp(min=0), count - 4), weights
+    return torch.minimum(piece - 1, count - _FEWEST_KNOTS).clamp(min=0), weights
+
+
+def on_spline(
+    values: Float[Tensor, "M C"], first: Int[Tensor, " R"], weights: Float[Tensor, "R 4"]
+) -> Float[Tensor, "R C"]:
+    """What values at knots make of places between them.
+
+    Args:
+        values: Of all knots.
+        first, weights: Of each place, as `spline_weights` has them; `first` among all knots.
+    """
+    # Behind the last knot weights are 0: only a frame camera reaches so far.
+    knots = (first[:, None] + torch.arange(_FEWEST_KNOTS, device=first.device)).clamp(max=len(values) - 1)
+    own = values.index_select(0, knots.flatten()).unflatten(0, knots.shape)
+    return (own * weights[:, :, None]).sum(dim=1)
 
 
 def row_waves(count: int) -> Float[Tensor, "n n"]:

@@ -1,9 +1,9 @@
 """Poses corrected while training: small tangent steps of rotation and position.
 
 A correction is a function of the view and of the row: one step for a frame camera, and for a line camera a sum of
-waves, computed at the knots of a cubic spline a few rows apart. Given poses stay what they are;
-rays are moved. Line cameras that were registered to the scene (line_cameras.py) have the corrections that were found
-then, in place of steps.
+waves, computed at the knots of a cubic spline a few rows apart. Given poses stay what they are; rays are moved. Line
+cameras that were registered to the scene (line_cameras.py) have the corrections that were found then, in place of
+steps.
 
 What moves all views alike (a similarity of the world about the scene's middle) can't be seen in pictures, so it is
 taken out of the corrections. A view that goes farther than `LARGEST_STEP` has lost its way: it gets its given pose
@@ -32,7 +32,7 @@ from unmix_plugin.engine.geometry.rotations import rotation_matrix
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.engine.processes.processes import Processes
 from unmix_plugin.lens_refinement import LensRefinement
-from unmix_plugin.pose_knots import FEWEST_KNOTS, Knots, row_waves, similarities, spline_weights
+from unmix_plugin.pose_knots import Knots, on_spline, row_waves, similarities, spline_weights
 from unmix_plugin.pose_settings import PoseConfig
 from unmix_plugin.pose_trust import PoseTrust
 from unmix_plugin.rendering.gradients import scale_gradient
@@ -275,20 +275,11 @@ class PoseRefinement(nn.Module):
         """Rotation and shift of each ray's camera."""
         turns, moves = self.corrections.split(3, dim=1)
         scaled = torch.cat([turns, moves * self.reach[:, None]], dim=1)
-        first = self.first[views]
-        if not self.lines:
-            step = scaled.index_select(0, first)
+        if self.lines:
+            start, weights = spline_weights(self._place(views, y), self.counts[views])
+            step = on_spline(scaled, self.first[views] + start, weights)
         else:
-            start, weights = spline_weights(self._place(views, y), self.counts[views].clamp(min=FEWEST_KNOTS))
-            is_line = self.rows[views] > 0
-            first = first + torch.where(is_line, start, 0)
-            weights = torch.where(is_line[:, None], weights, weights.new_tensor([1.0, 0.0, 0.0, 0.0]))
-            own = (first[:, None] + torch.arange(FEWEST_KNOTS, device=first.device)).clamp(
-                max=len(scaled) - 1
-            )
-            step = (scaled.index_select(0, own.flatten()).view(*own.shape, 6) * weights[:, :, None]).sum(
-                dim=1
-            )
+            step = scaled.index_select(0, self.first[views])
         return rotation_matrix(step[:, :3]), step[:, 3:]
 
     def _place(self, views: Int[Tensor, " R"], y: Float[Tensor, " R"]) -> Float[Tensor, " R"]:
@@ -308,8 +299,7 @@ class PoseRefinement(nn.Module):
     def _keys(self, cameras: Cameras, view: int) -> KeyPoses:
         assert cameras.key_poses is not None
         heights = cameras.key_poses.of(view).heights
-        if self.knots.rows[view]:
-            rows = self.knots.rows[view]
+        if rows := self.knots.rows[view]:
             middles = torch.arange(rows).to(heights) + 0.5
             heights = torch.cat([heights, middles, heights.new_tensor([0.0, rows])]).unique()
         poses = self._moved(cameras, torch.full((len(heights),), view, device=heights.device), heights)

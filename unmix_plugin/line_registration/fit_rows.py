@@ -9,7 +9,8 @@ Notation: as in swept_view.py.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -82,6 +83,20 @@ def fit_rows(
             damping *= 10
         else:
             return steps
+    return steps
+
+
+def fit_ever_sharper(
+    view: SweptView,
+    steps: Float64[Tensor, "n 6"],
+    how: Fit,
+    blurs: Sequence[int],
+    rows: slice | None = None,
+    knots: slice | None = None,
+) -> Float64[Tensor, "n 6"]:
+    """Steps fitted with one `blur` after the other. Other arguments as above."""
+    for blur in blurs:
+        steps = fit_rows(view, steps, replace(how, blur=blur), rows, knots)
     return steps
 
 

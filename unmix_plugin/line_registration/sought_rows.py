@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from unmix_plugin.line_registration.fit_rows import Fit, blurred, fit_rows
+from unmix_plugin.line_registration.fit_rows import Fit, blurred, fit_ever_sharper
 from unmix_plugin.line_registration.smooth_steps import SmoothPrior
 from unmix_plugin.line_registration.swept_view import SweptView
 
@@ -29,7 +29,7 @@ _BLUR = 5
 _BEST = 3
 """Turns that are fitted."""
 _NEAR_BLURS, _WAY_BLURS = (5, 3, 1), (9, 5, 3, 1)
-_ITERATIONS, _REACH = 5, 30.0
+_HOW = Fit(iterations=5, reach=30.0)
 _FITS = 8.0
 """Mean squared error over that of the places that fit well, up to which a place does."""
 _WELL = 0.25
@@ -67,9 +67,7 @@ def sought(view: SweptView, steps: Float64[Tensor, "n 6"]) -> Float64[Tensor, "n
             found[place.knots], is_known[place.knots] = place.steps, True
     prior = SmoothPrior(view.num_knots, view.pixel)
     found = torch.from_numpy(prior.smoothest(found.numpy(), ~is_known))
-    for blur in _WAY_BLURS:
-        found = fit_rows(view, found, Fit(_ITERATIONS, _REACH, blur=blur))
-    return found
+    return fit_ever_sharper(view, found, _HOW, _WAY_BLURS)
 
 
 def _seek(view: SweptView, steps: Float64[Tensor, "n 6"], rows: slice) -> _Place:
@@ -81,8 +79,7 @@ def _seek(view: SweptView, steps: Float64[Tensor, "n 6"], rows: slice) -> _Place
     for turn in _best_turns(view, base, rows):
         tried = steps.clone()
         tried[knots] = base + turn
-        for blur in _NEAR_BLURS:
-            tried = fit_rows(view, tried, Fit(_ITERATIONS, _REACH, blur=blur), rows, knots)
+        tried = fit_ever_sharper(view, tried, _HOW, _NEAR_BLURS, rows, knots)
         error = float(view.row_errors(tried)[rows].mean())
         # The outer knots tell of the outermost rows alone.
         inner = slice(knots.start + 1, knots.stop - 1)

@@ -17,7 +17,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.rotations import rotation_matrix
-from unmix_plugin.pose_knots import Knots, spline_weights
+from unmix_plugin.pose_knots import Knots, on_spline, spline_weights
 
 Show = Callable[[RayBundle], Float[Tensor, "R D"]]
 """What a scene shows along rays, in the channels that are compared."""
@@ -63,8 +63,7 @@ class SweptView:
 
     def at_rows(self, steps: Float64[Tensor, "n 6"]) -> Float64[Tensor, "H 6"]:
         """Steps at knots, interpolated."""
-        first, weights = self.places()
-        return (steps[first[:, None] + torch.arange(4)] * weights[:, :, None]).sum(dim=1)
+        return on_spline(steps, *self.places())
 
     def shown(self, steps: Float64[Tensor, "m H 6"], rows: slice) -> Float[Tensor, "m h W D"]:
         """What some rows show after each of some ways to move all of them."""

@@ -2,8 +2,8 @@
 
 A line camera's rows wobble, so no single turn and shift aligns such a view. Once these are found (pose_alignment.py),
 its rows are fitted to averages over squares of pixels, of ever smaller edges: rows that are off by ten pixels look
-alike there. Those that fit best then tell where their neighbours are. Where rows are still lost, they are looked for
-all around (sought_rows.py).
+alike there. Where rows are lost then, they are looked for all around (sought_rows.py). At last, those that fit best
+tell where their neighbours are.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.line_cameras import keep, shower, swept_view
-from unmix_plugin.line_registration.fit_rows import Fit, fit_rows
+from unmix_plugin.line_registration.fit_rows import Fit, fit_ever_sharper, fit_rows
 from unmix_plugin.line_registration.lost_rows import FEWEST_LOST, LOST, track
 from unmix_plugin.line_registration.sought_rows import sought
 from unmix_plugin.line_registration.swept_view import SweptView, columns_compared
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 _MOST_PIXELS = 20_000
 _BLURS = (17, 9, 5, 3)
 """Edges of the squares over which pictures are averaged at first, pixels."""
-_ITERATIONS, _REACH = 6, 30.0
+_HOW = Fit(iterations=6, reach=30.0)
 _ROUNDS = 4
 _RIGHT = 0.25
 """Part of the rows that is right at least, once pictures that were averaged are alike."""
@@ -58,7 +58,7 @@ def align_rows(scene: TrainedScene, camera: Cameras, truth: ViewTruth) -> Camera
         steps = find(view, torch.zeros(view.num_knots, 6, dtype=torch.float64))
         errors = view.row_errors(steps)
         found.append((float(errors.sqrt().mean()), view, steps, start))
-        if _num_lost(errors) < FEWEST_LOST:
+        if int((errors > LOST * _usual(errors)).sum()) < FEWEST_LOST:
             break
     _, view, steps, start = min(found, key=lambda candidate: candidate[0])
     return view.moved(start, _tracked(view, steps))
@@ -66,25 +66,20 @@ def align_rows(scene: TrainedScene, camera: Cameras, truth: ViewTruth) -> Camera
 
 def _fitted(view: SweptView, steps: Float64[Tensor, "n 6"]) -> Float64[Tensor, "n 6"]:
     """Steps from others on, by ever sharper pictures."""
-    for blur in _BLURS:
-        steps = fit_rows(view, steps, Fit(_ITERATIONS, _REACH, blur=blur))
-    return fit_rows(view, steps, Fit())
+    return fit_rows(view, fit_ever_sharper(view, steps, _HOW, _BLURS), Fit())
 
 
-def _num_lost(errors: Float[Tensor, " H"]) -> int:
-    """Rows that fit far worse than those that fit well."""
-    if not bool((errors > 0).any()):
-        return 0
-    return int((errors > LOST * errors[errors > 0].quantile(_RIGHT)).sum())
+def _usual(errors: Float[Tensor, " H"]) -> float:
+    """Error of a row that fits well; 0 where no row shows anything."""
+    shown = errors[errors > 0]
+    return float(shown.quantile(_RIGHT)) if len(shown) else 0.0
 
 
 def _tracked(view: SweptView, steps: Float64[Tensor, "n 6"]) -> Float64[Tensor, "n 6"]:
     """Steps after the rows were looked for from those outwards that fit best, until that makes nothing better."""
     errors, tried = view.row_errors(steps), set[int]()
-    if not bool((errors > 0).any()):
-        return steps
     for _ in range(_ROUNDS):
-        usual = float(errors[errors > 0].quantile(_RIGHT))
+        usual = _usual(errors)
         row = _best_run(errors, view.shows_matter, tried)
         if row is None or float(errors.max()) <= LOST * usual:
             return steps
