@@ -20,6 +20,8 @@ _GRID_DECAY = 0.5
 """Factor on the remembered density of a probed cell: lower forgets emptied space sooner."""
 _OCCUPIED_OPACITY = 0.03
 """Opacity of one sample's interval from which a cell counts as occupied."""
+_OPACITY_ACROSS = 0.08
+"""The same of a cell that is several samples wide: without it soft edges would end in steps as large as cells."""
 
 _FIRST_CELLS = 64
 """Along an edge of the grid of a world without end, in the first part of the training: smaller cells are emptied before
@@ -66,13 +68,28 @@ def update_grid(
     begins_coarsely = renderer.is_unbounded and progress < _FIRST_CELLS_UNTIL
     grid.update(
         lambda points: field.get_density(space.from_unit(points))[0],
-        threshold=-math.log1p(-_OCCUPIED_OPACITY) / renderer.step,
+        threshold=occupied_density(renderer, max(grid.occupied.shape)),
         decay=_GRID_DECAY,
         num_cells=_PROBED_CELLS,
         generator=torch.Generator().manual_seed(seed),
         block=max(len(grid.occupied) // _FIRST_CELLS, 1) if begins_coarsely else 1,
         fewest_rays=int(_SHARE_OF_PIXELS * num_pixels),
     )
+
+
+def occupied_density(renderer: VolumeRenderer, num_cells: int) -> float:
+    """Density from which a cell counts as occupied.
+
+    Args:
+        renderer: With the distance of samples.
+        num_cells: Along an edge of the grid.
+
+    Returns:
+        Optical depth per model unit.
+    """
+    by_sample = -math.log1p(-_OCCUPIED_OPACITY) / renderer.step
+    across = -math.log1p(-_OPACITY_ACROSS) / (float(renderer.space.longest_edge) / num_cells)
+    return min(by_sample, across)
 
 
 def share_sights(grid: OccupancyGrid, processes: Processes) -> None:

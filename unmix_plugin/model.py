@@ -33,7 +33,6 @@ from unmix_plugin.field import UnmixField
 from unmix_plugin.first_endmembers import first_endmembers, first_specular_spectra
 from unmix_plugin.grid_upkeep import is_due, record_seen, update_grid
 from unmix_plugin.lamp_shadows import ShadowDetail
-from unmix_plugin.line_cameras import LineCameras
 from unmix_plugin.model_parts import (
     make_field,
     make_grid,
@@ -43,6 +42,7 @@ from unmix_plugin.model_parts import (
 )
 from unmix_plugin.model_settings import UnmixModelConfig
 from unmix_plugin.normal_guide import normals_error
+from unmix_plugin.pose_training import PoseTraining
 from unmix_plugin.ray_outputs import met_by_rays, ray_outputs
 from unmix_plugin.renderer import VolumeRenderer
 from unmix_plugin.sensor_views import SensorViews
@@ -105,8 +105,8 @@ class UnmixModel(Model):
         self.comparison = BatchComparison(
             config.losses, self.preset, self.seen_by, self.balance, self.guide, self.view_gains
         )
-        self._progress = self._fineness = 0.0
-        self._lines = None if self.poses is None else LineCameras(self.poses.knots.rows)
+        self._pose_training = PoseTraining(config.pose_refinement, self.poses)
+        self._progress = 0.0
 
     def initialise(self, initial_data: Mapping[str, np.ndarray], generator: torch.Generator) -> None:
         """Endmembers from the training pixels or a file, the light in the dictionary, and the carved grid.
@@ -134,38 +134,35 @@ class UnmixModel(Model):
         seen = self.balance.scaled(self.seen_by.project(endmembers, sensor), sensor)
         self.guide.start(pixels, endmembers, self.config.losses.mixing_penalty, seen)
         self.specular_spectra.copy_(first_specular_spectra(len(self.specular_spectra), lamp, endmembers))
-        reachable = torch.from_numpy(initial_data["reachable"])
-        if self.poses is not None:
-            knots = torch.from_numpy(initial_data["knots"])
-            self.poses.begin(knots, self.scene_box, self.metadata["pixel_size"])
-            reachable = torch.ones_like(reachable)  # poses that are off carve away what is there
+        knots = torch.from_numpy(initial_data["knots"]) if "knots" in initial_data else None
+        reachable = self._pose_training.begin(
+            knots, self.scene_box, self.metadata["pixel_size"], torch.from_numpy(initial_data["reachable"])
+        )
         self.grid = make_grid(self.config, reachable, self.is_unbounded).to(self.device)
 
     def settled_cameras(self, cameras: Cameras) -> Cameras | None:
         """The corrected cameras once the levels of the grid have joined."""
-        if self.poses is None or self.poses.is_settled or self._fineness < 1:
-            return None
-        return self.poses.refined(cameras)
+        return self._pose_training.settled(cameras)
 
     def take_in(self, data: Mapping[str, np.ndarray]) -> None:
         """Keep empty what the masks carve away as seen by the corrected cameras."""
-        assert self.poses is not None
-        self.poses.settle()
+        self._pose_training.settle()
         if "reachable" in data:
             self.grid.empty_beyond(torch.from_numpy(data["reachable"]).to(self.device))
 
     @torch.no_grad()
     def look_again(self, step: int, progress: float, data: DataManager) -> None:
         """Register line cameras to the scene, where poses are refined and it is time."""
-        if self.poses is None or self._lines is None or not self._lines.views:
-            return
-        if not self.config.pose_refinement.registers(step, progress):
-            return
-        composite = partial(self.renderer.composite, self.field)
-        self._lines.register(
-            self.poses, data, self.scene_box, composite, self.materials, self.comparison.through
+        self._pose_training.register(
+            step,
+            progress,
+            data,
+            self.scene_box,
+            partial(self.renderer.composite, self.field),
+            self.materials,
+            self.comparison,
+            self.processes,
         )
-        self.poses.agree(self.processes)
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """The hash table, the networks and the spectra."""
@@ -203,8 +200,8 @@ class UnmixModel(Model):
         """`spectral` (R, B) on black (of a rig `coefficients`, from which follows what its sensors see), all that
         `ray_outputs` gives, and what `met_by_rays` gives where the grid records it."""
         generator = self.generator if self.training else None
-        if self.poses is not None and self.training and self._fineness >= self.config.pose_refinement.start:
-            ray_bundle = self.poses(ray_bundle)
+        if self.training:
+            ray_bundle = self._pose_training.corrected(ray_bundle)
         renderer = self._training_renderer if self.training else self.renderer
         rendered = renderer.render(self.field, ray_bundle, generator)
         coefficients = rendered.coefficients
@@ -218,9 +215,7 @@ class UnmixModel(Model):
         if self.training and self.grid.met is not None:
             seen.update(met_by_rays(rendered, self.renderer.space))
         outputs = {**seen, **ray_outputs(rendered, ray_bundle)}
-        if self.poses is not None and self.training and self._fineness >= 1:
-            outputs = self.poses.believed(outputs, ray_bundle)
-        return outputs
+        return self._pose_training.believed(outputs, ray_bundle) if self.training else outputs
 
     def get_loss_dict(
         self,
@@ -243,9 +238,8 @@ class UnmixModel(Model):
             losses["normals"] = normals_error(
                 self.field.get_density, shading, places, outputs["weights"], self.generator
             )
-        if self.poses is not None:
-            weights["poses"], losses["poses"] = 1.0, self.poses.penalty(self.config.pose_refinement)
-        return {name: weights[name] * losses[name] for name in weights if name in losses}
+        weighed = {name: weights[name] * losses[name] for name in weights if name in losses}
+        return weighed | self._pose_training.penalty()
 
     def observe(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> None:
         """Note which cells the views see, and how far margins of abundances are from those of measured spectra."""
@@ -254,9 +248,7 @@ class UnmixModel(Model):
         if "met_densities" in outputs:
             self.grid.record_met(outputs["met_positions"], outputs["met_densities"])
         self.comparison.observe(outputs, batch)
-        if self.poses is not None and "knots" in outputs:
-            parts = self.comparison.parts(outputs, batch, self.materials)
-            self.poses.trust.observe(*self.comparison.errors_of_poses(parts))
+        self._pose_training.observe(outputs, batch, self.comparison, self.materials)
 
     def warnings(self) -> list[str]:
         """Sensors whose pixels can't be unmixed into so many endmembers one by one."""
@@ -265,8 +257,7 @@ class UnmixModel(Model):
     def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """`psnr` of the batch in dB, on black; of poses that are corrected by how much, and how many were undone."""
         parts = self.comparison.parts(outputs, batch, self.materials)
-        found = {"psnr": self.comparison.psnr(parts)}
-        return found if self.poses is None else {**found, **self.poses.figures()}
+        return {"psnr": self.comparison.psnr(parts), **self._pose_training.figures()}
 
     @torch.no_grad()
     def get_outputs_for_camera(
@@ -332,10 +323,7 @@ class UnmixModel(Model):
 
     def _begin_step(self, step: int, progress: float) -> None:
         self._progress = progress
-        self._fineness = self.config.pose_refinement.fineness(step, progress)
-        if isinstance(self.field, UnmixField) and self.field.level_weights is not None:
-            levels = self.config.pose_refinement.level_weights(len(self.field.level_weights), self._fineness)
-            self.field.level_weights.copy_(torch.tensor(levels))
+        self._pose_training.begin_step(step, progress, self.field)
         if is_due(step):
             update_grid(
                 self.grid,
@@ -347,12 +335,10 @@ class UnmixModel(Model):
                 self.metadata.get("num_train_pixels", 0),
             )
             self.processes.mean(self.guide.margin_variance)
-            if self.poses is not None and self._fineness >= 1:
-                self.poses.trust.judge(self.processes)
+            self._pose_training.judge(self.processes)
 
     @torch.no_grad()
     def _bound_spectra(self, step: int, progress: float) -> None:
         self.endmembers.clamp_(min=0.0).clamp_(max=self.endmember_bound)
         self.specular_spectra.clamp_(0, 1)
-        if self.poses is not None:
-            self.poses.undo_runaways(is_final=self._fineness >= 1)
+        self._pose_training.end_step()

@@ -52,6 +52,11 @@ class UnitSpace:
         """Half of the box's longest edge, model units: what r = 1 is."""
         return self.box.size.max() / 2
 
+    @property
+    def longest_edge(self) -> Float[Tensor, ""]:
+        """Of what the unit cube holds, model units; far from the box a unit there is longer."""
+        return self.half_edge * (_SPAN if self.is_unbounded else 2.0)
+
     def centred(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
         """Coordinates u."""
         return (points - self.box.aabb.mean(dim=0)) / self.half_edge
