@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from torch.testing import assert_close
 
 from unmix_plugin.figures.picture_grid import (
     NEUTRAL,
@@ -18,7 +19,7 @@ from unmix_plugin.figures.picture_grid import (
     paint,
     premultiplied_over_neutral,
 )
-from unmix_plugin.products.abundances import Abundances, draw_abundances
+from unmix_plugin.products.abundances import Abundances, colour_panel, draw_abundances
 from unmix_plugin.products.endmembers import draw_endmembers
 from unmix_plugin.products.evaluation_pictures import (
     draw_colour,
@@ -92,6 +93,17 @@ def test_where_nothing_is_pictures_are_neutral():
     np.testing.assert_allclose(premultiplied_over_neutral(white, all_there), 1.0, atol=1e-6)
     np.testing.assert_allclose(premultiplied_over_neutral(black, all_there), 0.0, atol=1e-6)
     np.testing.assert_allclose(paint_ids(np.full((2, 2), 255, np.uint8), {0: (0.0, 0.0, 0.0)}), NEUTRAL)
+
+
+def test_a_sky_is_seen_rather_than_what_pictures_lie_on():
+    given = materials(3)
+    view = rendered(given)
+    assert_close(view.coverage, view.accumulation)
+    flat = colour_panel(view, given.bands).image
+    np.testing.assert_allclose(flat[:, :4], NEUTRAL, atol=1e-6)
+    world = colour_panel(replace(view, has_sky=True), given.bands).image
+    np.testing.assert_allclose(world[:, :4], 0.0, atol=1e-6)
+    np.testing.assert_allclose(world[:, 4:], flat[:, 4:], atol=1e-6)
 
 
 def test_a_scale_gives_its_ends_to_values_beyond_them():

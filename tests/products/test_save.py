@@ -1,5 +1,6 @@
 """One output of a view as a file: the same numbers, and words where it can't be."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,17 @@ def test_png_is_a_picture_of_the_views_size_or_of_tiles_of_it(view, tmp_path, na
         width, height = picture.size
     assert (width, height) >= (view.camera.width, view.camera.height)
     assert name == "abundances" or (width, height) == (view.camera.width, view.camera.height)
+
+
+def test_pixels_of_a_world_with_a_sky_are_opaque_where_they_show_light(view, tmp_path):
+    world = replace(view, scene=replace(view.scene, renderer=replace(view.scene.renderer, is_unbounded=True)))
+    with Image.open(save(world, "rgb", tmp_path / "world.png")) as picture:
+        pixels = np.asarray(picture) / 255
+    assert (pixels[..., 3] == 1).all()
+    np.testing.assert_allclose(pixels[..., :3], view["rgb"].numpy(), atol=0.51 / 255)
+    for name in ("rgb", "abundances"):
+        with Image.open(save(view if name == "rgb" else world, name, tmp_path / "table.png")) as picture:
+            assert np.asarray(picture)[..., 3].min() < 255
 
 
 def test_a_file_that_is_there_is_replaced(view, tmp_path):

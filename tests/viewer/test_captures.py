@@ -68,7 +68,7 @@ def test_spectra_of_strips_are_those_of_the_whole(services, source, monkeypatch)
     assert reason == ""
     frame = make_frame(source, camera)
     np.testing.assert_allclose(canvas.spectra, frame["spectral"].numpy(), atol=1e-5)
-    np.testing.assert_allclose(canvas.opacity, frame.coefficients.accumulation.numpy(), atol=1e-5)
+    np.testing.assert_allclose(canvas.coverage, frame.coverage.numpy(), atol=1e-5)
 
 
 def test_a_strip_that_cannot_be_taken_ends_the_capture(services, caplog):

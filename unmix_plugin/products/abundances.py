@@ -76,7 +76,7 @@ def view_paths(folder: Path, view: str, kind: str) -> list[Path]:
 def colour_panel(view: RenderedView, bands: Bands) -> TitledPicture:
     """A view as an eye, or a camera with these bands, sees it."""
     title = "colour" if colour_mode(bands) == "true-colour" else "false colour"
-    return TitledPicture(picture(view.spectra, view.accumulation, bands), title)
+    return TitledPicture(picture(view.spectra, view.coverage, bands), title)
 
 
 def draw_abundances(name: str, view: RenderedView, materials: Materials) -> bytes:

@@ -45,7 +45,5 @@ class Cubes(ViewProduct):
                 write_envi_cube(folder / view, spectra, bands, names, about)
             else:
                 preview = (rendered.spectra.float().clamp(0, 1) @ rgb_matrix(bands)).clamp(0, 1).numpy()
-                write_spectral_exr(
-                    path, spectra, bands, preview, rendered.accumulation.float().numpy(), about
-                )
+                write_spectral_exr(path, spectra, bands, preview, rendered.coverage.float().numpy(), about)
         return self.paths(folder, view)

@@ -82,10 +82,10 @@ def draw_colour(view: ViewTruth, predicted: RenderedView, bands: Bands, psnr_db:
     """True colour, predicted colour, and their difference; in false colours for sensors without all bands."""
     weights, spectra = view.colour_weights(bands), view.seen(predicted.spectra)
     error = np.abs(_srgb_on_black(spectra, weights) - _srgb_on_black(view.spectra, weights)).mean(axis=-1)
-    seen = np.maximum(as_numpy(view.opacity), as_numpy(predicted.accumulation))
+    seen = np.maximum(as_numpy(view.opacity), as_numpy(predicted.coverage))
     panels = [
         TitledPicture(coloured_picture(view.spectra, view.opacity, weights), "true"),
-        TitledPicture(coloured_picture(spectra, predicted.accumulation, weights), "predicted"),
+        TitledPicture(coloured_picture(spectra, predicted.coverage, weights), "predicted"),
         TitledPicture(over_neutral(paint(error, _ERROR_SCALE), (seen > 0.01).astype(np.float64)), "error"),
     ]
     colours = describe_colour(bands).split(":")[0] if view.sensor is None else f"seen by {view.sensor.name}"

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.products.render.files import RenderSetting, Rows, still_at
+from unmix_plugin.products.render.files import COVERAGE, RenderSetting, Rows, still_at
 from unmix_plugin.products.render.formats import choose_formats
 from unmix_plugin.products.render.job import channel_names
 from unmix_plugin.products.render.pictures import Palette
@@ -51,6 +51,7 @@ def save(view: MaterialView, name: str, path: str | Path) -> Path:
     )
     values: dict[str, np.ndarray] = {
         "accumulation": view.opacity.cpu().numpy(),
+        COVERAGE: view.coverage.cpu().numpy(),
         name: view[name].cpu().numpy(),
     }
     with still_at(path, formatted, setting) as add:

@@ -42,6 +42,11 @@ class MaterialView:
         return self.coefficients.accumulation
 
     @property
+    def coverage(self) -> Float[Tensor, "H W"]:
+        """How much of a pixel shows something, [0, 1]: where the world has no end, the sky is behind all."""
+        return torch.ones_like(self.opacity) if self.scene.renderer.is_unbounded else self.opacity
+
+    @property
     def spectra(self) -> Float[Tensor, "H W B"]:
         """Radiance on black."""
         return self.materials.spectra(self.coefficients)

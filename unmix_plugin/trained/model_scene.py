@@ -51,6 +51,11 @@ class ModelView:
         first = next(iter(self.tensors.values()))
         return torch.ones(self.camera.height, self.camera.width, device=first.device)
 
+    @property
+    def coverage(self) -> Tensor:
+        """The opacity."""
+        return self.opacity
+
     def __getitem__(self, name: str) -> Tensor:
         """An output by its name."""
         return self.tensors[name]

@@ -62,6 +62,11 @@ class RenderedView(Protocol):
         """(H, W), [0, 1]."""
         ...
 
+    @property
+    def coverage(self) -> Tensor:
+        """(H, W), [0, 1]: how much of a pixel shows something, a sky included; nothing shines through that part."""
+        ...
+
     def __getitem__(self, name: str) -> Tensor:
         """An output by its name.
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
@@ -36,6 +37,13 @@ class RenderedView:
     """Material ids, 255 where nothing is."""
     material_scores: Float[Tensor, "H W K"]
     """Cosine of the spectrum to each endmember."""
+    has_sky: bool = False
+    """Whether a sky is behind all that is seen."""
+
+    @property
+    def coverage(self) -> Float[Tensor, "H W"]:
+        """How much of a pixel shows something, the sky included, [0, 1]."""
+        return torch.ones_like(self.accumulation) if self.has_sky else self.accumulation
 
     @property
     def shares(self) -> Float[Tensor, "H W K"]:
@@ -47,7 +55,8 @@ def render_view(scene: TrainedScene, camera: Cameras, subpixels: int | None = No
     """Render all that is written about a view; `subpixels` squared rays a pixel, None for as many as in training."""
     names = ("spectral", "accumulation", "abundances", "segmentation", "material_scores")
     view = scene.look(camera, subpixels)
-    return RenderedView(*(view[name].detach().cpu() for name in names))
+    has_sky = scene.renderer.is_unbounded
+    return RenderedView(*(view[name].detach().cpu() for name in names), has_sky=has_sky)
 
 
 def subpixels_for(scene: Scene, index: int, subpixels: int, pixel_size: float) -> int:
@@ -63,17 +72,17 @@ def subpixels_for(scene: Scene, index: int, subpixels: int, pixel_size: float) -
     return subpixels * min(max(1, round(edge / pixel_size)), MOST_SENSOR_SUBPIXELS)
 
 
-def picture(spectra: Float[Tensor, "H W B"], opacity: Float[Tensor, "H W"], bands: Bands) -> Picture:
+def picture(spectra: Float[Tensor, "H W B"], coverage: Float[Tensor, "H W"], bands: Bands) -> Picture:
     """Spectra seen on black as an sRGB picture over neutral grey."""
-    return coloured_picture(spectra, opacity, rgb_matrix(bands))
+    return coloured_picture(spectra, coverage, rgb_matrix(bands))
 
 
 def coloured_picture(
-    spectra: Float[Tensor, "H W b"], opacity: Float[Tensor, "H W"], weights: Float[Tensor, "b 3"]
+    spectra: Float[Tensor, "H W b"], coverage: Float[Tensor, "H W"], weights: Float[Tensor, "b 3"]
 ) -> Picture:
     """The same with other weights of the channels in red, green and blue."""
     linear = spectra.double().clamp(min=0) @ weights.double()
-    return premultiplied_over_neutral(linear.clamp(0, 1).numpy(), as_numpy(opacity))
+    return premultiplied_over_neutral(linear.clamp(0, 1).numpy(), as_numpy(coverage))
 
 
 def as_numpy(values: Tensor) -> np.ndarray:

@@ -137,7 +137,7 @@ class SpectraCanvas:
         shape = (camera.height, camera.width)
         self.spectra: Float32[np.ndarray, "H W B"] = np.zeros((*shape, num_bands), np.float32)
         self.linear_rgb: Float32[np.ndarray, "H W 3"] = np.zeros((*shape, 3), np.float32)
-        self.opacity: Float32[np.ndarray, "H W"] = np.zeros(shape, np.float32)
+        self.coverage: Float32[np.ndarray, "H W"] = np.zeros(shape, np.float32)
         self._bands = None
 
     def take(self, first_row: int, frame: RenderedView) -> None:
@@ -149,7 +149,7 @@ class SpectraCanvas:
         self.linear_rgb[rows] = (
             frame.materials.through(frame.coefficients, rgb_matrix(self._bands)).cpu().numpy()
         )
-        self.opacity[rows] = frame.coefficients.accumulation.cpu().numpy()
+        self.coverage[rows] = frame.coverage.cpu().numpy()
 
     def write(self, path: Path) -> Path:
         """Write a spectral EXR.
@@ -163,7 +163,7 @@ class SpectraCanvas:
             self.spectra,
             self._bands,
             self.linear_rgb,
-            self.opacity,
+            self.coverage,
             "radiance on black, 1 = full scale",
         )
 

@@ -43,6 +43,10 @@ class Glow:
     def opacity(self):
         return torch.ones(self.camera.height, self.camera.width)
 
+    @property
+    def coverage(self):
+        return self.opacity
+
     def __getitem__(self, name):
         rays = self.camera.image_rays(0).directions.unflatten(0, (self.camera.height, self.camera.width))
         if name == "classes":

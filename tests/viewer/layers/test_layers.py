@@ -75,6 +75,20 @@ def test_colour_is_the_output_of_renders(frame, aids):
     assert legend.text.startswith("true colour")
 
 
+@pytest.mark.parametrize("layer", ["rgb", "false-colour", "band", "diffuse"])
+def test_nothing_shines_through_a_sky(frame, aids, layer):
+    renderer = replace(frame.scene.renderer, is_unbounded=True)
+    world = replace(frame, scene=replace(frame.scene, renderer=renderer))
+    for view, is_alike in ((frame, False), (world, True)):
+        black, white = (
+            painted(view, aids, layer, background=name, value_range=(0.0, 1.0), colour_map="gray")[0]
+            for name in ("black", "white")
+        )
+        assert torch.equal(black, white) is is_alike
+    expected = painted(frame, aids, layer, background="black", value_range=(0.0, 1.0), colour_map="gray")[0]
+    assert_close(black, expected, atol=0.02, rtol=0)
+
+
 def test_light_through_a_matrix_is_light_of_the_spectra(frame):
     materials, coefficients = frame.materials, frame.coefficients
     matrix = band_composite_matrix(materials.bands, (650, 550, 450))

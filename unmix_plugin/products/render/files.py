@@ -23,12 +23,22 @@ from unmix_plugin.formats.png import indexed_png_bytes, rgba_png_bytes
 from unmix_plugin.formats.spectral_exr import write_spectral_exr
 from unmix_plugin.formats.video import FrameSink, video_frames
 from unmix_plugin.products.render.formats import FormattedOutput, file_name
-from unmix_plugin.products.render.pictures import Palette, opaque_band, opaque_tiles, transparent_tiles
+from unmix_plugin.products.render.pictures import (
+    LIGHT_KINDS,
+    Palette,
+    opaque_band,
+    opaque_tiles,
+    transparent_tiles,
+)
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
 from unmix_plugin.spectral.segmentation import NOTHING_ID
 
 _SWEEP_SECONDS, _SWEEP_FPS = 6.0, (4.0, 24.0)
+
+
+COVERAGE = "coverage"
+"""Name among the values of rows of how much of each pixel shows something, a sky included."""
 
 
 @dataclass(frozen=True)
@@ -38,12 +48,21 @@ class Rows:
     first: int
     """Row of the first of them."""
     values: dict[str, np.ndarray]
-    """Outputs by name, (h, W, ...) float32, ids uint8; `accumulation` is always there."""
+    """Outputs by name, (h, W, ...) float32, ids uint8; `accumulation` and `coverage` are always there."""
 
     @property
     def opacity(self) -> np.ndarray:
         """(h, W) float32, [0, 1]."""
         return self.values["accumulation"]
+
+    @property
+    def coverage(self) -> np.ndarray:
+        """(h, W) float32, [0, 1]."""
+        return self.values[COVERAGE]
+
+    def filled_by(self, output: Output) -> np.ndarray:
+        """(h, W) float32, [0, 1]: how much of each pixel an output fills: light also comes from the sky."""
+        return self.coverage if output.kind in (*LIGHT_KINDS, "channels") else self.opacity
 
 
 RowsSink: TypeAlias = Callable[[Rows], None]
@@ -132,12 +151,13 @@ def frame(output: Output, progress: float, setting: RenderSetting, add: FrameSin
         band = round(progress * (len(names) - 1))
         canvas = Canvas(_layout(output, setting), 3, [names[band]])
         yield lambda rows: canvas.put(
-            rows.first, opaque_band(rows.values[output.name][..., band], rows.opacity)
+            rows.first, opaque_band(rows.values[output.name][..., band], rows.coverage)
         )
     else:
         canvas = _canvas(output, setting, 3)
         yield lambda rows: canvas.put(
-            rows.first, opaque_tiles(output, rows.values[output.name], rows.opacity, setting.palette)
+            rows.first,
+            opaque_tiles(output, rows.values[output.name], rows.filled_by(output), setting.palette),
         )
     add(canvas.pixels)
 
@@ -182,7 +202,7 @@ def _exr(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSin
         values = rows.values[output.name].reshape(-1, width, len(planes))
         place = slice(rows.first, rows.first + len(values))
         planes[:, place] = np.moveaxis(values, -1, 0)
-        opacity[place] = rows.opacity
+        opacity[place] = rows.filled_by(output)
         if to_rgb is not None:
             preview[:, place] = np.moveaxis(np.clip(np.clip(values, 0, None) @ to_rgb, 0, 1), -1, 0)
 
@@ -211,7 +231,7 @@ def _png(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSin
         return
     canvas = _canvas(output, setting, 4)
     yield lambda rows: canvas.put(
-        rows.first, transparent_tiles(output, rows.values[output.name], rows.opacity, palette)
+        rows.first, transparent_tiles(output, rows.values[output.name], rows.filled_by(output), palette)
     )
     write_file(path, rgba_png_bytes(canvas.pixels, palette.describe(output)))
 
@@ -226,7 +246,7 @@ def _sweep(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsS
     def add(rows: Rows) -> None:
         values = rows.values[output.name]
         for band, radiance in enumerate(np.moveaxis(values, -1, 0)):
-            painted = opaque_band(radiance, rows.opacity)
+            painted = opaque_band(radiance, rows.coverage)
             frames[band, rows.first : rows.first + len(values)] = painted[:, :, 0]
 
     yield add

@@ -22,6 +22,7 @@ from unmix_plugin.engine.outputs import Output
 from unmix_plugin.engine.processes.processes import ALONE, Processes
 from unmix_plugin.products.render.cameras import RenderCameras
 from unmix_plugin.products.render.files import (
+    COVERAGE,
     RenderSetting,
     Rows,
     RowsSink,
@@ -201,6 +202,7 @@ class RenderJob:
         view = self._scene.look(camera)
         rendered = {name: view[name] for name in self._asked}
         rendered["accumulation"] = opacity = view.opacity
+        rendered[COVERAGE] = view.coverage
         if self._survey.pca is not None:
             seen = (opacity > OCCUPIED_ACCUMULATION)[..., None]
             rendered["pca"] = self._survey.pca(rendered["spectral"].cpu()) * seen.cpu()

@@ -27,7 +27,7 @@ from unmix_plugin.spectral.colour.conversion import linear_to_srgb, srgb_to_line
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.run_materials import endmember_colours
 
-_LIGHT_KINDS = frozenset({"srgb", "linear", "grey"})
+LIGHT_KINDS = frozenset({"srgb", "linear", "grey"})
 """Outputs seen on black, hence multiplied by opacity already."""
 
 
@@ -83,7 +83,7 @@ def opaque_tiles(
     output: Output, values: np.ndarray, opacity: Float[np.ndarray, "h W"], palette: Palette
 ) -> UInt8[np.ndarray, "h W T 3"]:
     """Colours over the neutral grey."""
-    if output.kind in _LIGHT_KINDS:
+    if output.kind in LIGHT_KINDS:
         return _over_grey(_linear(output, values), opacity)
     tiles = _symbols(output, values, opacity, palette)
     if output.name == "accumulation":
@@ -103,7 +103,7 @@ def transparent_tiles(
     output: Output, values: np.ndarray, opacity: Float[np.ndarray, "h W"], palette: Palette
 ) -> UInt8[np.ndarray, "h W T 4"]:
     """Colours with opacity as the fourth channel; black where nothing is."""
-    if output.kind in _LIGHT_KINDS:
+    if output.kind in LIGHT_KINDS:
         straight = _linear(output, values) / np.maximum(opacity, 1e-6)[..., None]
         tiles = _encoded(straight)[:, :, None]
     else:

@@ -76,7 +76,7 @@ class ReportViews:
         """Count a view, and make its pictures."""
         self._amounts += as_numpy(view.abundances).sum(axis=(0, 1))
         shares = self._share_pictures(view) if name in self._with_shares else ()
-        predicted = _eight_bits(picture(view.spectra, view.accumulation, self.materials.bands))
+        predicted = _eight_bits(picture(view.spectra, view.coverage, self.materials.bands))
         ids = view.segmentation.numpy()
         if truth is None or self.evaluation is None:
             self.shown.append(ShownView(name, predicted, ids, shares=shares))
@@ -116,7 +116,7 @@ class ReportViews:
         self._offsets += difference[matter].sum(axis=0)
         self._pixels += int(matter.sum())
         painted = paint(np.sqrt((difference**2).mean(axis=-1)), ERROR_SCALE)
-        seen = np.maximum(as_numpy(view.accumulation), as_numpy(truth.opacity)) > 0.01
+        seen = np.maximum(as_numpy(view.coverage), as_numpy(truth.opacity)) > 0.01
         return _eight_bits(over_neutral(painted, seen.astype(np.float64)))
 
     def _share_pictures(self, view: RenderedView) -> tuple[EightBits, ...]:

@@ -45,8 +45,8 @@ def _paint_colour(diffuse: bool, specular: bool) -> Painter:
             frame.coefficients, rgb_matrix(bands), diffuse=diffuse, specular=specular
         )
         # The view-dependent part is light added to what is there: it has no opacity of its own.
-        opacity = frame.coefficients.accumulation if diffuse else torch.ones_like(light[..., 0])
-        return tone_mapped(light, opacity, settings), TextLegend(describe_colour(bands))
+        part = frame.coverage if diffuse else torch.ones_like(light[..., 0])
+        return tone_mapped(light, part, settings), TextLegend(describe_colour(bands))
 
     return paint
 
@@ -57,7 +57,7 @@ def _paint_false_colour(frame: MaterialView, settings: LayerSettings, _: LayerAi
     light = frame.materials.through(frame.coefficients, band_composite_matrix(bands, wavelengths))
     shown = [f"{bands.centers_nm[bands.nearest(value)]:.0f} nm" for value in wavelengths]
     legend = TextLegend(f"red {shown[0]}, green {shown[1]}, blue {shown[2]}")
-    return tone_mapped(light, frame.coefficients.accumulation, settings), legend
+    return tone_mapped(light, frame.coverage, settings), legend
 
 
 def _paint_band(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
@@ -68,20 +68,16 @@ def _paint_band(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -
     solid = frame.materials.through(reference, column)[:, 0] / reference.accumulation.clamp(min=1e-3)
     scale = aids.reference.range_of(solid)
     label = f"radiance at {bands.centers_nm[band]:.0f} nm"
-    return _paint_seen(
-        _unpremultiplied(frame.materials.through(frame.coefficients, column), frame)[..., 0],
-        frame,
-        settings,
-        scale,
-        label,
-    )
+    light = frame.materials.through(frame.coefficients, column)[..., 0]
+    values = light / frame.coverage.clamp(min=1e-3)
+    return _paint_seen(values, frame.coverage, settings, scale, label)
 
 
 def _paint_abundance(frame: MaterialView, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
     index = min(max(settings.endmember, 0), len(frame.materials.names) - 1)
     values = _unpremultiplied(frame.coefficients.abundances[..., index], frame)[..., 0]
     label = f"abundance of {frame.materials.names[index]}"
-    return _paint_seen(values, frame, settings, (0.0, 1.0), label)
+    return _paint_seen(values, frame.coefficients.accumulation, settings, (0.0, 1.0), label)
 
 
 def _paint_abundances(
@@ -133,16 +129,16 @@ def _paint_error(frame: MaterialView, settings: LayerSettings, aids: LayerAids) 
 
 def _paint_seen(
     values: Float[Tensor, "H W"],
-    frame: MaterialView,
+    part: Float[Tensor, "H W"],
     settings: LayerSettings,
     scale: tuple[float, float],
     label: str,
 ) -> tuple[Picture, Legend]:
-    """Values of what is seen in the colours of a scale, over the background."""
+    """Values of what is seen in the colours of a scale, over the background where it fills but a part of a pixel."""
     shown = settings.value_range or scale
     picture = paint_values(values, shown, settings.colour_map)
     legend = ColourMapLegend(settings.colour_map, *shown, label)
-    return over_background(picture, frame.coefficients.accumulation, settings), legend
+    return over_background(picture, part, settings), legend
 
 
 def _unpremultiplied(values: Tensor, frame: MaterialView) -> Tensor:

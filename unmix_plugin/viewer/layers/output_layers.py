@@ -55,7 +55,7 @@ def _paint_srgb(
 def _paint_linear(
     values: Tensor, frame: RenderedView, settings: LayerSettings, output: Output
 ) -> tuple[Picture, Legend]:
-    return tone_mapped(values, frame.opacity, settings), TextLegend(output.what)
+    return tone_mapped(values, frame.coverage, settings), TextLegend(output.what)
 
 
 def _paint_picture(
