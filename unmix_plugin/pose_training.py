@@ -46,8 +46,9 @@ class PoseTraining:
     ) -> Bool[Tensor, "X Y Z"]:
         """Take in where the cameras stand, and say which cells can be reached at first: poses that are off carve away
         what is there."""
-        if self._poses is None or knots is None:
+        if self._poses is None:
             return reachable
+        assert knots is not None
         self._poses.begin(knots, box, pixel_size)
         return torch.ones_like(reachable)
 

@@ -62,7 +62,7 @@ class Rows:
 
     def filled_by(self, output: Output) -> np.ndarray:
         """(h, W) float32, [0, 1]: how much of each pixel an output fills: light also comes from the sky."""
-        return self.coverage if output.kind in (*LIGHT_KINDS, "channels") else self.opacity
+        return self.coverage if output.kind in LIGHT_KINDS | {"channels"} else self.opacity
 
 
 RowsSink: TypeAlias = Callable[[Rows], None]
