@@ -134,10 +134,7 @@ class UnmixModel(Model):
         seen = self.balance.scaled(self.seen_by.project(endmembers, sensor), sensor)
         self.guide.start(pixels, endmembers, self.config.losses.mixing_penalty, seen)
         self.specular_spectra.copy_(first_specular_spectra(len(self.specular_spectra), lamp, endmembers))
-        knots = torch.from_numpy(initial_data["knots"]) if "knots" in initial_data else None
-        reachable = self._pose_training.begin(
-            knots, self.scene_box, self.metadata["pixel_size"], torch.from_numpy(initial_data["reachable"])
-        )
+        reachable = self._pose_training.begin(initial_data, self.scene_box, self.metadata["pixel_size"])
         self.grid = make_grid(self.config, reachable, self.is_unbounded).to(self.device)
 
     def settled_cameras(self, cameras: Cameras) -> Cameras | None:
@@ -153,16 +150,11 @@ class UnmixModel(Model):
     @torch.no_grad()
     def look_again(self, step: int, progress: float, data: DataManager) -> None:
         """Register line cameras to the scene, where poses are refined and it is time."""
-        self._pose_training.register(
-            step,
-            progress,
-            data,
-            self.scene_box,
-            partial(self.renderer.composite, self.field),
-            self.materials,
-            self.comparison,
-            self.processes,
-        )
+        if self._pose_training.is_to_register(step, progress):
+            composite = partial(self.renderer.composite, self.field)
+            self._pose_training.register(
+                data, self.scene_box, composite, self.materials, self.comparison, self.processes
+            )
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """The hash table, the networks and the spectra."""

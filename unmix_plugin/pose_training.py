@@ -3,13 +3,14 @@
 The levels of the field's grid join in the coarse part of the training, a little after whose start poses begin to move;
 at its end space is carved by the corrected cameras, and line cameras are registered later.
 
-Notation: `M` knots of all views, `R` rays, `X x Y x Z` cells.
+Notation: `X x Y x Z` cells of the occupancy grid.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -34,22 +35,18 @@ class PoseTraining:
     def __init__(self, config: PoseConfig, poses: PoseRefinement | None) -> None:
         """`poses` is None where they are taken as they are."""
         self._config, self._poses = config, poses
-        self._lines = None if poses is None else LineCameras(poses.knots.rows)
+        self._lines = LineCameras(() if poses is None else poses.knots.rows)
         self._fineness = 0.0
 
     def begin(
-        self,
-        knots: Float[Tensor, "M 3"] | None,
-        box: SceneBox,
-        pixel_size: float,
-        reachable: Bool[Tensor, "X Y Z"],
+        self, initial_data: Mapping[str, np.ndarray], box: SceneBox, pixel_size: float
     ) -> Bool[Tensor, "X Y Z"]:
         """Take in where the cameras stand, and say which cells can be reached at first: poses that are off carve away
         what is there."""
+        reachable = torch.from_numpy(initial_data["reachable"])
         if self._poses is None:
             return reachable
-        assert knots is not None
-        self._poses.begin(knots, box, pixel_size)
+        self._poses.begin(torch.from_numpy(initial_data["knots"]), box, pixel_size)
         return torch.ones_like(reachable)
 
     def begin_step(self, step: int, progress: float, field: CoefficientField) -> None:
@@ -75,11 +72,12 @@ class PoseTraining:
         assert self._poses is not None
         self._poses.settle()
 
-    @torch.no_grad()
+    def is_to_register(self, step: int, progress: float) -> bool:
+        """Whether there are line cameras, and it is time to register them to the scene."""
+        return bool(self._lines.views) and self._config.registers(step, progress)
+
     def register(
         self,
-        step: int,
-        progress: float,
         data: DataManager,
         box: SceneBox,
         composite: Callable[[RayBundle], Coefficients],
@@ -87,12 +85,10 @@ class PoseTraining:
         comparison: BatchComparison,
         processes: Processes,
     ) -> None:
-        """Register line cameras to the scene, where there are any and it is time."""
-        if self._poses is None or self._lines is None or not self._lines.views:
-            return
-        if self._config.registers(step, progress):
-            self._lines.register(self._poses, data, box, composite, materials, comparison.through)
-            self._poses.agree(processes)
+        """Register line cameras to the scene."""
+        assert self._poses is not None
+        self._lines.register(self._poses, data, box, composite, materials, comparison.through)
+        self._poses.agree(processes)
 
     def corrected(self, rays: RayBundle) -> RayBundle:
         """Training rays as their corrected cameras send them."""

@@ -50,19 +50,9 @@ class Rows:
     values: dict[str, np.ndarray]
     """Outputs by name, (h, W, ...) float32, ids uint8; `accumulation` and `coverage` are always there."""
 
-    @property
-    def opacity(self) -> np.ndarray:
-        """(h, W) float32, [0, 1]."""
-        return self.values["accumulation"]
-
-    @property
-    def coverage(self) -> np.ndarray:
-        """(h, W) float32, [0, 1]."""
-        return self.values[COVERAGE]
-
     def filled_by(self, output: Output) -> np.ndarray:
         """(h, W) float32, [0, 1]: how much of each pixel an output fills: light also comes from the sky."""
-        return self.coverage if output.kind in LIGHT_KINDS | {"channels"} else self.opacity
+        return self.values[COVERAGE if output.kind in LIGHT_KINDS | {"channels"} else "accumulation"]
 
 
 RowsSink: TypeAlias = Callable[[Rows], None]
@@ -151,7 +141,7 @@ def frame(output: Output, progress: float, setting: RenderSetting, add: FrameSin
         band = round(progress * (len(names) - 1))
         canvas = Canvas(_layout(output, setting), 3, [names[band]])
         yield lambda rows: canvas.put(
-            rows.first, opaque_band(rows.values[output.name][..., band], rows.coverage)
+            rows.first, opaque_band(rows.values[output.name][..., band], rows.filled_by(output))
         )
     else:
         canvas = _canvas(output, setting, 3)
@@ -246,7 +236,7 @@ def _sweep(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsS
     def add(rows: Rows) -> None:
         values = rows.values[output.name]
         for band, radiance in enumerate(np.moveaxis(values, -1, 0)):
-            painted = opaque_band(radiance, rows.coverage)
+            painted = opaque_band(radiance, rows.filled_by(output))
             frames[band, rows.first : rows.first + len(values)] = painted[:, :, 0]
 
     yield add

@@ -68,23 +68,22 @@ def _paint_band(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -
     solid = frame.materials.through(reference, column)[:, 0] / reference.accumulation.clamp(min=1e-3)
     scale = aids.reference.range_of(solid)
     label = f"radiance at {bands.centers_nm[band]:.0f} nm"
-    light = frame.materials.through(frame.coefficients, column)[..., 0]
-    values = light / frame.coverage.clamp(min=1e-3)
+    values = _unpremultiplied(frame.materials.through(frame.coefficients, column), frame.coverage)[..., 0]
     return _paint_seen(values, frame.coverage, settings, scale, label)
 
 
 def _paint_abundance(frame: MaterialView, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
     index = min(max(settings.endmember, 0), len(frame.materials.names) - 1)
-    values = _unpremultiplied(frame.coefficients.abundances[..., index], frame)[..., 0]
+    values = _unpremultiplied(frame.coefficients.abundances, frame.opacity)[..., index]
     label = f"abundance of {frame.materials.names[index]}"
-    return _paint_seen(values, frame.coefficients.accumulation, settings, (0.0, 1.0), label)
+    return _paint_seen(values, frame.opacity, settings, (0.0, 1.0), label)
 
 
 def _paint_abundances(
     frame: MaterialView, settings: LayerSettings, aids: LayerAids
 ) -> tuple[Picture, Legend]:
     colours = aids.colours_of(frame.materials)
-    picture = _unpremultiplied(frame.coefficients.abundances, frame) @ colours
+    picture = _unpremultiplied(frame.coefficients.abundances, frame.opacity) @ colours
     return over_background(picture, frame.coefficients.accumulation, settings), _swatches(frame, colours)
 
 
@@ -101,7 +100,7 @@ def _paint_segmentation(
 def _paint_pca(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
     colours = aids.pca_of(frame.materials)
     components = (
-        _unpremultiplied(frame.materials.through(frame.coefficients, colours.axes), frame)
+        _unpremultiplied(frame.materials.through(frame.coefficients, colours.axes), frame.opacity)
         - colours.mean @ colours.axes
     )
     stretched = (components - colours.low) / (colours.high - colours.low).clamp(min=1e-9)
@@ -141,10 +140,9 @@ def _paint_seen(
     return over_background(picture, part, settings), legend
 
 
-def _unpremultiplied(values: Tensor, frame: MaterialView) -> Tensor:
-    """Values of what is seen, channels last, rather than of what is seen on black."""
-    channels = values if values.ndim > frame.coefficients.accumulation.ndim else values[..., None]
-    return channels / frame.coefficients.accumulation.clamp(min=1e-3)[..., None]
+def _unpremultiplied(values: Float[Tensor, "H W C"], part: Float[Tensor, "H W"]) -> Float[Tensor, "H W C"]:
+    """Values of what is seen in a part of each pixel, rather than of what is seen on black."""
+    return values / part.clamp(min=1e-3)[..., None]
 
 
 def _swatches(frame: MaterialView, colours: Float[Tensor, "K 3"]) -> SwatchLegend:
