@@ -12,6 +12,8 @@ from unmix_plugin.renderer import VolumeRenderer
 from unmix_plugin.rendering.grid_cells import clearance_of
 
 CELLS = 10
+SHORT_WAY = 0.15
+"""Across a cell of the box below, model units."""
 RENDERER = VolumeRenderer(
     SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 0.5]])),
     clearance_of(torch.ones(CELLS, CELLS, CELLS) > 0),
@@ -25,10 +27,10 @@ def test_a_cell_as_wide_as_a_sample_is_occupied_from_an_opacity_of_3_percent():
     assert 1 - math.exp(-occupied_density(RENDERER, CELLS) * RENDERER.step) == pytest.approx(0.03)
 
 
-def test_a_cell_of_many_samples_is_occupied_from_an_opacity_of_8_percent_across():
+def test_a_cell_of_many_samples_is_occupied_from_an_opacity_of_8_percent_across_it_the_short_way():
     for step in (0.05, 0.02, 0.001):
         density = occupied_density(replace(RENDERER, step=step), CELLS)
-        assert 1 - math.exp(-density * 0.2) == pytest.approx(0.08)
+        assert 1 - math.exp(-density * SHORT_WAY) == pytest.approx(0.08)
 
 
 def test_cells_of_an_unbounded_world_are_twice_as_wide():

@@ -21,7 +21,8 @@ _GRID_DECAY = 0.5
 _OCCUPIED_OPACITY = 0.03
 """Opacity of one sample's interval from which a cell counts as occupied."""
 _OPACITY_ACROSS = 0.08
-"""The same of a cell that is several samples wide: without it soft edges would end in steps as large as cells."""
+"""The same of a cell that is several samples wide even the short way: without it soft edges would end in steps as large
+as cells. Cells of a flat box are thin, and rays cross them the short way."""
 
 _FIRST_CELLS = 64
 """Along an edge of the grid of a world without end, in the first part of the training: smaller cells are emptied before
@@ -88,7 +89,7 @@ def occupied_density(renderer: VolumeRenderer, num_cells: int) -> float:
         Optical depth per model unit.
     """
     by_sample = -math.log1p(-_OCCUPIED_OPACITY) / renderer.step
-    across = -math.log1p(-_OPACITY_ACROSS) / (float(renderer.space.longest_edge) / num_cells)
+    across = -math.log1p(-_OPACITY_ACROSS) / (float(renderer.space.shortest_edge) / num_cells)
     return min(by_sample, across)
 
 

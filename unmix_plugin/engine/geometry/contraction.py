@@ -53,9 +53,9 @@ class UnitSpace:
         return self.box.size.max() / 2
 
     @property
-    def longest_edge(self) -> Float[Tensor, ""]:
+    def shortest_edge(self) -> Float[Tensor, ""]:
         """Of what the unit cube holds, model units; far from the box a unit there is longer."""
-        return self.half_edge * (_SPAN if self.is_unbounded else 2.0)
+        return _SPAN * self.half_edge if self.is_unbounded else self.box.size.min()
 
     def centred(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
         """Coordinates u."""
