@@ -29,7 +29,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.model import Model
 from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
-from unmix_plugin.field import UnmixField
+from unmix_plugin.field import CoefficientField, UnmixField
 from unmix_plugin.first_endmembers import first_endmembers, first_specular_spectra
 from unmix_plugin.grid_upkeep import is_due, record_seen, update_grid
 from unmix_plugin.lamp_shadows import ShadowDetail
@@ -84,15 +84,7 @@ class UnmixModel(Model):
         self.step = config.renderer.sample_distance(
             metadata["pixel_size"], float(self.scene_box.size.max()), metadata["has_alpha"]
         )
-        num_specular = len(self.bands) if config.specular == "full" else num_dictionary
-        self.field = make_field(
-            config,
-            self.preset,
-            self.scene_box,
-            metadata,
-            (self.num_endmembers, num_specular),
-            self.step * self._coarseness(0.0),
-        )
+        self.field = self._untrained_field()
         self.register_buffer("rgb_weights", rgb_matrix(self.bands), persistent=False)
         self.register_buffer("every_band", torch.eye(len(self.bands)), persistent=False)
         self.register_buffer("endmember_bound", torch.ones(()))
@@ -136,6 +128,24 @@ class UnmixModel(Model):
         self.specular_spectra.copy_(first_specular_spectra(len(self.specular_spectra), lamp, endmembers))
         reachable = self._pose_training.begin(initial_data, self.scene_box, self.metadata["pixel_size"])
         self.grid = make_grid(self.config, reachable, self.is_unbounded).to(self.device)
+
+    def begins_anew(self, step: int, progress: float) -> bool:
+        """Whether poses that were off are nearly right now."""
+        return self._pose_training.begins_anew(step, progress)
+
+    def begin_anew(self, initial_data: Mapping[str, np.ndarray], generator: torch.Generator) -> None:
+        """Keep poses and gains of views alone: a field keeps some of what it learnt from poses that were off."""
+        for own, first in zip(self.field.parameters(), self._untrained_field().parameters(), strict=True):
+            own.copy_(first)
+        self._pose_training.begin_anew()
+        self.initialise(initial_data, generator)
+
+    def group_progress(self, progress: float) -> dict[str, float]:
+        """All groups but that of the poses, once the scene is learnt anew."""
+        if not self._pose_training.has_begun_anew:
+            return {}
+        own = self._pose_training.scene_progress(progress)
+        return {name: own for name in self.get_param_groups() if name != "poses"}
 
     def settled_cameras(self, cameras: Cameras) -> Cameras | None:
         """The corrected cameras once the levels of the grid have joined."""
@@ -313,8 +323,20 @@ class UnmixModel(Model):
         config = self.config.renderer
         return config.coarseness(samples, choose(config.coarse_samples, self.preset.coarse_samples), progress)
 
+    def _untrained_field(self) -> CoefficientField:
+        config = self.config
+        num_specular = len(self.bands) if config.specular == "full" else len(self.specular_spectra)
+        return make_field(
+            config,
+            self.preset,
+            self.scene_box,
+            self.metadata,
+            (self.num_endmembers, num_specular),
+            self.step * self._coarseness(0.0),
+        )
+
     def _begin_step(self, step: int, progress: float) -> None:
-        self._progress = progress
+        self._progress = self._pose_training.scene_progress(progress)
         self._pose_training.begin_step(step, progress, self.field)
         if is_due(step):
             update_grid(
@@ -323,7 +345,7 @@ class UnmixModel(Model):
                 self._training_renderer,
                 self.processes,
                 self.generator,
-                progress,
+                self._progress,
                 self.metadata.get("num_train_pixels", 0),
             )
             self.processes.mean(self.guide.margin_variance)

@@ -68,6 +68,7 @@ class PoseRefinement(nn.Module):
     gauge: Tensor
     is_free: Tensor
     settled: Tensor
+    anew: Tensor
     found: Tensor
     """Corrections at the knots of line cameras that were registered to the scene, which hold in place of steps."""
     is_found: Tensor
@@ -92,11 +93,14 @@ class PoseRefinement(nn.Module):
         self.register_buffer("gauge", torch.zeros(6 * total, 7))
         self.register_buffer("is_free", torch.ones(len(rows), dtype=torch.bool))
         self.register_buffer("settled", torch.zeros((), dtype=torch.bool))
+        self.register_buffer("anew", torch.zeros((), dtype=torch.bool))
         self.register_buffer("found", torch.zeros(total, 6))
         self.register_buffer("is_found", torch.zeros(len(rows), dtype=torch.bool))
         self.is_settled = False
         """Whether the scene was judged by the corrected cameras; the buffer keeps it, but reading that from a GPU in
         each step would take time."""
+        self.is_anew = False
+        """Whether the scene was begun anew; the same."""
         self.register_load_state_dict_post_hook(_after_loading)
         self.register_buffer("counts", counts, persistent=False)
         self.register_buffer("first", counts.cumsum(0) - counts, persistent=False)
@@ -124,6 +128,12 @@ class PoseRefinement(nn.Module):
         """Note that the scene was judged by the corrected cameras."""
         self.settled.fill_(True)
         self.is_settled = True
+
+    def begin_anew(self) -> None:
+        """Note that the scene is learnt anew, and is to be judged once more."""
+        self.anew.fill_(True)
+        self.settled.fill_(False)
+        self.is_anew, self.is_settled = True, False
 
     @property
     def corrections(self) -> Float[Tensor, "M 6"]:
@@ -307,4 +317,4 @@ class PoseRefinement(nn.Module):
 
 
 def _after_loading(poses: PoseRefinement, _: object) -> None:
-    poses.is_settled = bool(poses.settled)
+    poses.is_settled, poses.is_anew = bool(poses.settled), bool(poses.anew)

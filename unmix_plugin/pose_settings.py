@@ -37,6 +37,9 @@ class PoseConfig:
     """Part of the training after which they are registered anew."""
     register_steps: int = 100
     """Steps after which they are registered anew at the earliest: it takes as long as hundreds of steps."""
+    anew_from: float = 0.6
+    """Part of the training after which the scene is learnt anew, since it keeps some of what it learnt from poses that
+    were off; 1: never."""
 
     def __post_init__(self) -> None:
         """Refuse impossible settings.
@@ -52,6 +55,7 @@ class PoseConfig:
             "register-from in [0, 1]": 0 <= self.register_from <= 1,
             "register-every in [0.001, 1]": 0.001 <= self.register_every <= 1,
             "register-steps of at least 1": self.register_steps >= 1,
+            "anew-from in [0, 1]": 0 <= self.anew_from <= 1,
             "a penalty of 0 to 1e6": 0 <= self.penalty <= 1e6,
             "a roughness of 0 to 1e6": 0 <= self.roughness <= 1e6,
         }
@@ -66,6 +70,18 @@ class PoseConfig:
         if progress >= self.coarse_until or step >= self.coarse_steps:
             return 1.0
         return max(progress / self.coarse_until, step / self.coarse_steps)
+
+    def begins_anew(self, step: int, progress: float) -> bool:
+        """Whether the scene is to be learnt anew before a step, unless that was done before."""
+        return self.anew_from <= progress < 1 and self.fineness(step, progress) >= 1
+
+    def progress_anew(self, progress: float) -> float:
+        """How far the scene is on its way after it was begun anew.
+
+        >>> PoseConfig(anew_from=0.5).progress_anew(0.75)
+        0.5
+        """
+        return min(max((progress - self.anew_from) / max(1 - self.anew_from, 1e-6), 0.0), 1.0)
 
     def registers(self, step: int, progress: float) -> bool:
         """Whether line cameras are registered before a step, at that part of the training.

@@ -1,7 +1,8 @@
 """What a training does with poses that are corrected, step by step; nothing where they are taken as they are.
 
 The levels of the field's grid join in the coarse part of the training, a little after whose start poses begin to move;
-at its end space is carved by the corrected cameras, and line cameras are registered later.
+at its end space is carved by the corrected cameras, and line cameras are registered later. Then the scene is learnt
+anew: it keeps some of what it learnt from poses that were off.
 
 Notation: `X x Y x Z` cells of the occupancy grid.
 """
@@ -48,6 +49,26 @@ class PoseTraining:
             return reachable
         self._poses.begin(torch.from_numpy(initial_data["knots"]), box, pixel_size)
         return torch.ones_like(reachable)
+
+    def begins_anew(self, step: int, progress: float) -> bool:
+        """Whether the scene is to be learnt anew: poses are nearly right, and it was not done before."""
+        if self._poses is None or self._poses.is_anew:
+            return False
+        return self._config.begins_anew(step, progress)
+
+    def begin_anew(self) -> None:
+        """Note that the scene is learnt anew."""
+        assert self._poses is not None
+        self._poses.begin_anew()
+
+    @property
+    def has_begun_anew(self) -> bool:
+        """Whether the scene was begun anew."""
+        return self._poses is not None and self._poses.is_anew
+
+    def scene_progress(self, progress: float) -> float:
+        """How far the scene is on its way, [0, 1], at that part of the training."""
+        return self._config.progress_anew(progress) if self.has_begun_anew else progress
 
     def begin_step(self, step: int, progress: float, field: CoefficientField) -> None:
         """Let as many levels of the field's grid join as it is time for."""

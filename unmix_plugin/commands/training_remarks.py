@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -39,8 +40,7 @@ def remarks(lines: Sequence[Mapping[str, Any]]) -> list[str]:
     known = [line for line in lines if line.get("loss") is not None]
     if len(known) < _FEWEST_LINES:
         return []
-    last_step = known[-1]["step"]
-    first, third, last = (_typical_loss(known, quarter, last_step) for quarter in (1, 3, 4))
+    first, third, last = (_typical_loss(_since_anew(known), quarter) for quarter in (1, 3, 4))
     if None in (first, third, last) or not first or not third or last is None:
         return []
     found = []
@@ -71,8 +71,18 @@ def remarks(lines: Sequence[Mapping[str, Any]]) -> list[str]:
     return found
 
 
-def _typical_loss(lines: Sequence[Mapping[str, Any]], quarter: int, last_step: int) -> float | None:
-    """Median over a quarter of the training, 1 to 4; None without lines in it."""
-    low, high = (quarter - 1) * last_step / 4, quarter * last_step / 4
+def _since_anew(lines: Sequence[Mapping[str, Any]]) -> Sequence[Mapping[str, Any]]:
+    """Lines since the scene was learnt anew; all if it never was. Rates of learning only fall meanwhile."""
+    start = 0
+    for number, (before, line) in enumerate(pairwise(lines), start=1):
+        if any(line[name] > before.get(name, line[name]) for name in line if name.startswith("lr/")):
+            start = number
+    return lines[start:]
+
+
+def _typical_loss(lines: Sequence[Mapping[str, Any]], quarter: int) -> float | None:
+    """Median over a quarter of the lines' time, 1 to 4; None without lines in it."""
+    start, end = (lines[at]["step"] for at in (0, -1))
+    low, high = (start + (end - start) * part / 4 for part in (quarter - 1, quarter))
     losses = [float(line["loss"]) for line in lines if low < line["step"] <= high]
     return median(losses) if losses else None

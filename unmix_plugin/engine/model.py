@@ -107,6 +107,19 @@ class Model(nn.Module, ABC):
         """Compare the scene with whole training views where something is learnt from them that single pixels don't
         tell. Called before each training step, after the model's own callbacks."""
 
+    def begins_anew(self, step: int, progress: float) -> bool:
+        """Whether to learn the scene anew from this training step on, since what is known of its cameras is better now.
+        Asked before each step, after `look_again`."""
+        return False
+
+    def begin_anew(self, initial_data: Mapping[str, np.ndarray], generator: torch.Generator) -> None:
+        """Fill parameters and buffers as at the start of the run, but for what is to be kept; arguments as of
+        `initialise`. torch's global generator is seeded."""
+
+    def group_progress(self, progress: float) -> dict[str, float]:
+        """How far those parameter groups are on their way, [0, 1], that are not where the training is."""
+        return {}
+
     @abstractmethod
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Parameters to train, by the name of the optimizer config that they use."""

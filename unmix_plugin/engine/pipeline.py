@@ -113,15 +113,27 @@ class Pipeline(nn.Module):
     def get_training_callbacks(self) -> list[TrainingCallback]:
         """The data manager's callbacks, then the model's, then what one tells the other of corrected cameras
         and whole views."""
-        own = TrainingCallback(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, self._judge_again)
+        own = TrainingCallback(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, self._look_again)
         return [*self.datamanager.get_training_callbacks(), *self.model.get_training_callbacks(), own]
 
     @torch.no_grad()
-    def _judge_again(self, step: int, progress: float) -> None:
+    def begin_anew(self, step: int, progress: float) -> list[str]:
+        """Let the model learn the scene anew where it is time; names of the parameter groups that were set back."""
+        if not self.model.begins_anew(step, progress):
+            return []
+        self.model.begin_anew(self.datamanager.initial_data(), torch.Generator().manual_seed(self.seed))
+        self._judge_again()
+        return list(self.model.group_progress(progress))
+
+    @torch.no_grad()
+    def _look_again(self, step: int, progress: float) -> None:
+        self._judge_again()
+        self.model.look_again(step, progress, self.datamanager)
+
+    def _judge_again(self) -> None:
         cameras = self.model.settled_cameras(self.datamanager.train_cameras)
         if cameras is not None:
             self.model.take_in(self.datamanager.judge_again(cameras))
-        self.model.look_again(step, progress, self.datamanager)
 
 
 def average_metrics(found: Sequence[Mapping[str, float]]) -> dict[str, float]:

@@ -11,6 +11,7 @@ from torch import nn
 from unmix_plugin.engine.training.optimizers import (
     OptimizerConfig,
     build_optimizer,
+    forget_gradients,
     learning_rate,
     set_learning_rates,
 )
@@ -56,6 +57,31 @@ def test_each_group_has_its_own_settings_and_rate():
     found = {group["name"]: group for group in optimizer.param_groups}
     assert found["a"]["lr"] == rates["a"]
     assert (found["a"]["weight_decay"], found["b"]["weight_decay"]) == (0.5, 0.0)
+
+
+def test_a_group_may_be_at_another_place_of_its_way():
+    params = {name: [nn.Parameter(torch.ones(2))] for name in "ab"}
+    configs = {name: OptimizerConfig(lr=1.0, final_factor=0.25) for name in "ab"}
+    optimizer = build_optimizer(params, configs)
+    assert set_learning_rates(optimizer, configs, 1.0, {"b": 0.5}) == {"a": 0.25, "b": pytest.approx(0.5)}
+
+
+def test_a_group_whose_gradients_are_forgotten_steps_as_at_first():
+    params = {name: [nn.Parameter(torch.zeros(1))] for name in "ab"}
+    configs = {name: OptimizerConfig(lr=0.1) for name in "ab"}
+    optimizer = build_optimizer(params, configs)
+    for _ in range(20):
+        for [param] in params.values():
+            param.grad = torch.tensor([100.0])
+        optimizer.step()
+    before = {name: float(param.detach()) for name, [param] in params.items()}
+    forget_gradients(optimizer, {"b"})
+    for [param] in params.values():
+        param.grad = torch.tensor([-1e-3])
+    optimizer.step()
+    moved = {name: float(param.detach()) - before[name] for name, [param] in params.items()}
+    assert moved["a"] < 0  # what was seen before still counts
+    assert moved["b"] == pytest.approx(0.1)
 
 
 def test_a_step_is_adams():

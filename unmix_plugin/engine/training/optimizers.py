@@ -5,7 +5,7 @@ seconds, a run has.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -78,15 +78,26 @@ def build_optimizer(
 
 
 def set_learning_rates(
-    optimizer: torch.optim.Optimizer, configs: Mapping[str, OptimizerConfig], progress: float
+    optimizer: torch.optim.Optimizer,
+    configs: Mapping[str, OptimizerConfig],
+    progress: float,
+    group_progress: Mapping[str, float] | None = None,
 ) -> dict[str, float]:
-    """Set every group's step size for `progress`; returns them by group name."""
-    rates = {
-        group["name"]: learning_rate(configs[group["name"]], progress) for group in optimizer.param_groups
-    }
+    """Set every group's step size for `progress`, or for its own in `group_progress`; returns them by group name."""
+    own = group_progress or {}
+    names = [group["name"] for group in optimizer.param_groups]
+    rates = {name: learning_rate(configs[name], own.get(name, progress)) for name in names}
     for group in optimizer.param_groups:
         group["lr"] = rates[group["name"]]
     return rates
+
+
+def forget_gradients(optimizer: torch.optim.Optimizer, names: Collection[str]) -> None:
+    """Let some groups step as if no gradient had been seen before."""
+    for group in optimizer.param_groups:
+        if group["name"] in names:
+            for param in group["params"]:
+                optimizer.state.pop(param, None)
 
 
 def _all_fusable(param_groups: Mapping[str, list[nn.Parameter]]) -> bool:

@@ -30,9 +30,11 @@ from unmix_plugin.engine.training.training_state import (
     collect_tensors,
     part,
 )
-from unmix_plugin.engine.training.training_steps import prepare_steps
+from unmix_plugin.engine.training.training_steps import StepResult, prepare_steps
 from unmix_plugin.engine.training.writers import MetricsWriter, RunLog
 from unmix_plugin.errors import RunError
+
+_ANEW = "the scene is learnt anew, as its cameras are known better now"
 
 
 class Trainer:
@@ -181,7 +183,10 @@ class Trainer:
 
     def _iterate(self, display: ProgressDisplay) -> None:
         """A step, and whatever is shown, written or measured after it."""
-        loss, metrics = self._train_step()
+        result = self._train_step()
+        loss, metrics = result.loss, result.values
+        if result.is_anew:
+            display.message(f"step {self.step - 1}: {_ANEW}")
         if self.control.is_status_due or self.progress >= 1.0:
             self.control.show(self._status(loss, metrics))
         if display.is_due or self.progress >= 1.0:
@@ -196,19 +201,22 @@ class Trainer:
     def _is_at_limit(self) -> bool:
         return self.limits.reached(self.step, self.clock.seconds)
 
-    def _train_step(self) -> tuple[float, dict[str, Tensor]]:
-        """One step; its loss, and all losses and metrics without their graphs."""
+    def _train_step(self) -> StepResult:
         with self.clock.running():
             step, progress = self.step, self.progress
             self.processes.announce(progress)
             result = self.steps.take(step, progress)
             self.step += 1
             self.total_rays += result.num_rays
+            if result.is_anew:
+                self.average = self._new_average()
             if self.average is not None:
                 self.average.update(self.step)  # after the callbacks, which keep parameters in their bounds
         if result.is_refused:
             self.log.write(f"step {step} skipped: non-finite loss ({result.loss:g}) or gradient")
-        return result.loss, result.values
+        if result.is_anew:
+            self.log.write(f"step {step}: {_ANEW}")
+        return result
 
     def _evaluate(self, display: ProgressDisplay) -> None:
         if not self._is_time_for(self.config.steps_per_eval_all_images):
