@@ -69,7 +69,7 @@ def test_poses_that_are_taken_as_they_are_leave_training_as_it_was(folder):
     assert torch.equal(first, model.get_outputs(bare)["spectral"])
 
 
-def test_space_is_carved_by_the_corrected_cameras_and_again_where_the_scene_is_learnt_anew(folder):
+def test_space_is_carved_once_by_the_corrected_cameras(folder):
     asked = []
 
     class Watched(PoseRefinement):
@@ -83,8 +83,8 @@ def test_space_is_carved_by_the_corrected_cameras_and_again_where_the_scene_is_l
     model.poses.__class__ = Watched
     trainer.train()
     datamanager: Any = trainer.pipeline.datamanager
-    assert [step for step, _ in asked] == [6, 12]
-    cameras = asked[-1][1]
+    [(step, cameras)] = asked
+    assert step == 6
     hull = torch.from_numpy(datamanager.judge_again(cameras)["reachable"])
     assert 0 < hull.float().mean() < 1
     assert torch.equal(model.grid.reachable, hull)
@@ -103,55 +103,9 @@ def test_nothing_is_carved_by_cameras_that_contradict_each_other(folder):
     assert datamanager.judge_again(replace(right, camera_to_world=turned)) == {}
 
 
-def test_a_scene_is_learnt_anew_once_with_the_poses_that_were_found(folder):
-    trainer = Trainer(config_for(folder, steps=20), console=Console(file=io.StringIO()))
-    model: Any = trainer.pipeline.model
-    steps, begin = list[int](), model.begin_anew
-
-    def watched(*given: Any) -> None:
-        steps.append(trainer.step)
-        corrections = model.poses.corrections.clone()
-        begin(*given)
-        assert torch.equal(model.poses.corrections, corrections)
-        assert float(corrections.abs().max()) > 0
-        assert float(model.field.table.abs().max()) < 1e-3  # as drawn at first
-        assert torch.equal(model.field.level_weights, torch.ones_like(model.field.level_weights))
-
-    model.begin_anew = watched
-    trainer.train()
-    assert steps == [12]
-    assert "step 12: the scene is learnt anew" in trainer.run.log_path.read_text()
-    assert len(trainer.optimizer.state) == sum(len(x["params"]) for x in trainer.optimizer.param_groups)
-    ages = {
-        x["name"]: float(trainer.optimizer.state[x["params"][0]]["step"])
-        for x in trainer.optimizer.param_groups
-    }
-    assert ages == {"grid": 8, "networks": 8, "spectra": 8, "poses": 20}
-
-
-def test_rates_of_learning_begin_anew_with_the_scene(folder):
-    trainer = trained(replace(config_for(folder, steps=20), steps_per_log=1))
-    lines = [json.loads(line) for line in trainer.run.metrics_path.read_text().splitlines()]
-    grid, poses = (
-        [line[f"lr/{name}"] for line in lines if line["split"] == "train"] for name in ("grid", "poses")
-    )
-    assert grid[12] == grid[0] > grid[11]
-    assert grid[16] == pytest.approx(grid[10])  # half of the way
-    assert poses == sorted(poses, reverse=True)
-
-
-def test_a_scene_may_be_kept_to_the_end(folder):
-    config = config_for(folder)
-    model = replace(config.pipeline.model, pose_refinement=PoseConfig(start=0.0, anew_from=1.0))
-    trainer = trained(replace(config, pipeline=replace(config.pipeline, model=model)))
-    assert "anew" not in trainer.run.log_path.read_text()
-
-
-@pytest.mark.parametrize("stop", [6, 8, 9])
-def test_a_resumed_refinement_is_the_one_that_was_never_stopped(folder, stop):
-    """The scene is learnt anew in step 8."""
+def test_a_resumed_refinement_is_the_one_that_was_never_stopped(folder):
     straight = trained(config_for(folder))
-    stopped = stop_at(config_for(folder), stop)
+    stopped = stop_at(config_for(folder), 6)
     resumed = trained(load_config(stopped.run))
     expected, found = straight.pipeline.model.state_dict(), resumed.pipeline.model.state_dict()
     assert float(expected["poses.steps"].abs().max()) > 0

@@ -130,7 +130,7 @@ class UnmixModel(Model):
         self.grid = make_grid(self.config, reachable, self.is_unbounded).to(self.device)
 
     def begins_anew(self, step: int, progress: float) -> bool:
-        """Whether poses that were off are nearly right now."""
+        """Whether line cameras that were off are nearly right now."""
         return self._pose_training.begins_anew(step, progress)
 
     def begin_anew(self, initial_data: Mapping[str, np.ndarray], generator: torch.Generator) -> None:

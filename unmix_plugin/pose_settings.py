@@ -38,8 +38,8 @@ class PoseConfig:
     register_steps: int = 100
     """Steps after which they are registered anew at the earliest: it takes as long as hundreds of steps."""
     anew_from: float = 0.6
-    """Part of the training after which the scene is learnt anew, since it keeps some of what it learnt from poses that
-    were off; 1: never."""
+    """Part of the training after which line cameras learn the scene anew, since it keeps some of what it learnt from
+    poses that were off; 1: never."""
 
     def __post_init__(self) -> None:
         """Refuse impossible settings.

@@ -1,8 +1,9 @@
 """What a training does with poses that are corrected, step by step; nothing where they are taken as they are.
 
 The levels of the field's grid join in the coarse part of the training, a little after whose start poses begin to move;
-at its end space is carved by the corrected cameras, and line cameras are registered later. Then the scene is learnt
-anew: it keeps some of what it learnt from poses that were off.
+at its end space is carved by the corrected cameras, and line cameras are registered later. Then these learn the
+scene anew: it keeps some of what it learnt from poses that were off. Frames, whose poses settle sooner, gain nothing by
+that.
 
 Notation: `X x Y x Z` cells of the occupancy grid.
 """
@@ -51,8 +52,8 @@ class PoseTraining:
         return torch.ones_like(reachable)
 
     def begins_anew(self, step: int, progress: float) -> bool:
-        """Whether the scene is to be learnt anew: poses are nearly right, and it was not done before."""
-        if self._poses is None or self._poses.is_anew:
+        """Whether the scene is to be learnt anew: line cameras were registered to it, and it was not done before."""
+        if not self._lines.views or self.has_begun_anew:
             return False
         return self._config.begins_anew(step, progress)
 
