@@ -38,8 +38,8 @@ class PoseConfig:
     register_steps: int = 100
     """Steps after which they are registered anew at the earliest: it takes as long as hundreds of steps."""
     anew_from: float = 0.6
-    """Part of the training after which line cameras learn the scene anew, since it keeps some of what it learnt from
-    poses that were off; 1: never."""
+    """Part of the training after which line cameras, once registered, learn the scene anew, since it keeps some of what
+    it learnt from poses that were off; 1: never."""
 
     def __post_init__(self) -> None:
         """Refuse impossible settings.
@@ -73,15 +73,19 @@ class PoseConfig:
 
     def begins_anew(self, step: int, progress: float) -> bool:
         """Whether the scene is to be learnt anew before a step, unless that was done before."""
-        return self.anew_from <= progress < 1 and self.fineness(step, progress) >= 1
+        return self._first_anew <= progress < 1 and self.fineness(step, progress) >= 1
 
     def progress_anew(self, progress: float) -> float:
         """How far the scene is on its way after it was begun anew.
 
-        >>> PoseConfig(anew_from=0.5).progress_anew(0.75)
+        >>> PoseConfig(register_from=0.5, anew_from=0.5).progress_anew(0.75)
         0.5
         """
-        return min(max((progress - self.anew_from) / max(1 - self.anew_from, 1e-6), 0.0), 1.0)
+        return min(max((progress - self._first_anew) / max(1 - self._first_anew, 1e-6), 0.0), 1.0)
+
+    @property
+    def _first_anew(self) -> float:
+        return max(self.anew_from, self.register_from)
 
     def registers(self, step: int, progress: float) -> bool:
         """Whether line cameras are registered before a step, at that part of the training.

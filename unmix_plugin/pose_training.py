@@ -53,9 +53,9 @@ class PoseTraining:
 
     def begins_anew(self, step: int, progress: float) -> bool:
         """Whether the scene is to be learnt anew: line cameras were registered to it, and it was not done before."""
-        if not self._lines.views or self.has_begun_anew:
+        if self._poses is None or not self._lines.views or self._poses.is_anew:
             return False
-        return self._config.begins_anew(step, progress)
+        return self._config.begins_anew(step, progress) and bool(self._poses.is_found.any())
 
     def begin_anew(self) -> None:
         """Note that the scene is learnt anew."""
