@@ -32,6 +32,7 @@ from unmix_plugin.scenes.alpha_evidence import AlphaEvidence
 from unmix_plugin.scenes.geometry.carving import carve
 from unmix_plugin.scenes.geometry.lighting import judge_light
 from unmix_plugin.scenes.geometry.mask_agreement import mask_warning, share_explained
+from unmix_plugin.scenes.geometry.parallax_check import parallax_warning
 from unmix_plugin.scenes.geometry.pose_check import check_scene_poses
 from unmix_plugin.scenes.identity import scene_identity
 from unmix_plugin.scenes.pixel_rays import PixelRays
@@ -225,10 +226,11 @@ class HyperspectralDataManager(DataManager):
         check_recorded_scene(summary)
 
     def warnings(self) -> list[str]:
-        """Poses that seem to follow another convention, masks that contradict each other, sensors that share no band or
-        no place with another, and bad bands and values."""
+        """Poses that seem to follow another convention, cameras at one place, masks that contradict each other, sensors
+        that share no band or no place with another, and bad bands and values."""
         wrong_poses = check_scene_poses(self.scene)
         found = [self._carved[1] if wrong_poses is None else wrong_poses, *self._pixels.notes]
+        found.append(parallax_warning(self._initial_data["knots"], self.scene_box))
         found += noise_warnings(self.scene, self._noise, self._pixels.bad_share)
         found += rig_warnings(self.scene, self._initial_data["reachable"]) if self.scene.is_rig else []
         return [warning for warning in found if warning is not None]
