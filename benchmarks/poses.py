@@ -243,9 +243,8 @@ def judge_lines(found: dict[str, Any]) -> list[_common.Figure]:
         _common.Limit(1.5, is_upper=True, unit=" dB").judge(
             "sweeps with wobble, refined: PSNR below frames", _lost(found, "frames", refined, "psnr")
         ),
-        _common.reported(
-            "the same, evaluation views swept too",
-            "" if refined not in found else f"{found[refined]['psnr_of_sweeps']:.2f} dB",
+        _common.Limit(1.5, is_upper=True, unit=" dB").judge(
+            "the same, evaluation views swept too", _lost(found, "frames", refined, "psnr", "psnr_of_sweeps")
         ),
         _common.Limit(1.0, is_upper=True, unit=" px").judge(
             "sweeps, refined: wobble left", found.get(refined, {}).get("poses_px")
@@ -253,9 +252,11 @@ def judge_lines(found: dict[str, Any]) -> list[_common.Figure]:
     ]
 
 
-def _lost(found: dict[str, Any], best: str, other: str, figure: str) -> float | None:
+def _lost(
+    found: dict[str, Any], best: str, other: str, figure: str, other_figure: str | None = None
+) -> float | None:
     """By how much one training is below another; None where one of them was not measured."""
-    values = [found.get(name, {}).get(figure) for name in (best, other)]
+    values = [found.get(best, {}).get(figure), found.get(other, {}).get(other_figure or figure)]
     return None if None in values else values[0] - values[1]
 
 
