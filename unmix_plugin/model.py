@@ -133,11 +133,13 @@ class UnmixModel(Model):
         """Whether line cameras that were off are nearly right now."""
         return self._pose_training.begins_anew(step, progress)
 
-    def begin_anew(self, initial_data: Mapping[str, np.ndarray], generator: torch.Generator) -> None:
+    def begin_anew(
+        self, progress: float, initial_data: Mapping[str, np.ndarray], generator: torch.Generator
+    ) -> None:
         """Keep poses and gains of views alone: a field keeps some of what it learnt from poses that were off."""
         for own, first in zip(self.field.parameters(), self._untrained_field().parameters(), strict=True):
             own.copy_(first)
-        self._pose_training.begin_anew()
+        self._pose_training.begin_anew(progress)
         self.initialise(initial_data, generator)
 
     def group_progress(self, progress: float) -> dict[str, float]:

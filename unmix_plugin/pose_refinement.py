@@ -68,7 +68,7 @@ class PoseRefinement(nn.Module):
     gauge: Tensor
     is_free: Tensor
     settled: Tensor
-    anew: Tensor
+    anew_at: Tensor
     found: Tensor
     """Corrections at the knots of line cameras that were registered to the scene, which hold in place of steps."""
     is_found: Tensor
@@ -93,14 +93,14 @@ class PoseRefinement(nn.Module):
         self.register_buffer("gauge", torch.zeros(6 * total, 7))
         self.register_buffer("is_free", torch.ones(len(rows), dtype=torch.bool))
         self.register_buffer("settled", torch.zeros((), dtype=torch.bool))
-        self.register_buffer("anew", torch.zeros((), dtype=torch.bool))
+        self.register_buffer("anew_at", torch.ones((), dtype=torch.float64))
         self.register_buffer("found", torch.zeros(total, 6))
         self.register_buffer("is_found", torch.zeros(len(rows), dtype=torch.bool))
         self.is_settled = False
         """Whether the scene was judged by the corrected cameras; the buffer keeps it, but reading that from a GPU in
         each step would take time."""
-        self.is_anew = False
-        """Whether the scene was begun anew; the same."""
+        self.began_anew_at = 1.0
+        """Part of the training after which the scene was begun anew, 1 before; the same."""
         self.register_load_state_dict_post_hook(_after_loading)
         self.register_buffer("counts", counts, persistent=False)
         self.register_buffer("first", counts.cumsum(0) - counts, persistent=False)
@@ -129,11 +129,11 @@ class PoseRefinement(nn.Module):
         self.settled.fill_(True)
         self.is_settled = True
 
-    def begin_anew(self) -> None:
-        """Note that the scene is learnt anew, and is to be judged once more."""
-        self.anew.fill_(True)
+    def begin_anew(self, progress: float) -> None:
+        """Note that the scene is learnt anew from that part of the training on, and is to be judged once more."""
+        self.anew_at.fill_(progress)
         self.settled.fill_(False)
-        self.is_anew, self.is_settled = True, False
+        self.began_anew_at, self.is_settled = progress, False
 
     @property
     def corrections(self) -> Float[Tensor, "M 6"]:
@@ -317,4 +317,4 @@ class PoseRefinement(nn.Module):
 
 
 def _after_loading(poses: PoseRefinement, _: object) -> None:
-    poses.is_settled, poses.is_anew = bool(poses.settled), bool(poses.anew)
+    poses.is_settled, poses.began_anew_at = bool(poses.settled), float(poses.anew_at)

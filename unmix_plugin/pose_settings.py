@@ -72,29 +72,23 @@ class PoseConfig:
         return max(progress / self.coarse_until, step / self.coarse_steps)
 
     def begins_anew(self, step: int, progress: float) -> bool:
-        """Whether the scene is to be learnt anew before a step, unless that was done before."""
-        return self._first_anew <= progress < 1 and self.fineness(step, progress) >= 1
+        """Whether the scene is to be learnt anew before a step, unless that was done before.
 
-    def progress_anew(self, progress: float) -> float:
-        """How far the scene is on its way after it was begun anew.
-
-        >>> PoseConfig(register_from=0.5, anew_from=0.5).progress_anew(0.75)
-        0.5
+        Registration takes its time: where it took more than half of what was left, a new scene would come too late.
         """
-        return min(max((progress - self._first_anew) / max(1 - self._first_anew, 1e-6), 0.0), 1.0)
-
-    @property
-    def _first_anew(self) -> float:
-        return max(self.anew_from, self.register_from)
+        first = max(self.anew_from, self.register_from)
+        is_enough_left = 1 - progress >= 0.5 * (1 - first)
+        return first <= progress < 1 and is_enough_left and self.fineness(step, progress) >= 1
 
     def registers(self, step: int, progress: float) -> bool:
-        """Whether line cameras are registered before a step, at that part of the training.
+        """Whether line cameras are registered before a step, at that part of the training: not before `coarse_steps`, a
+        scene that shows little.
 
         >>> config = PoseConfig(coarse_steps=100, register_from=0.2, register_every=0.1)
         >>> [step for step in range(1000) if config.registers(step, step / 1000)]
         [200, 300, 400, 500, 600, 700, 800, 900]
         """
-        if step == 0 or self.fineness(step, progress) < 1:
+        if step < max(self.coarse_steps, 1) or self.fineness(step, progress) < 1:
             return False
         every = max(self.register_every, self.register_steps * progress / step)
         rounds, before = (

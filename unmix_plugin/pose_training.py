@@ -53,23 +53,26 @@ class PoseTraining:
 
     def begins_anew(self, step: int, progress: float) -> bool:
         """Whether the scene is to be learnt anew: line cameras were registered to it, and it was not done before."""
-        if self._poses is None or not self._lines.views or self._poses.is_anew:
+        if self._poses is None or not self._lines.views or self.has_begun_anew:
             return False
         return self._config.begins_anew(step, progress) and bool(self._poses.is_found.any())
 
-    def begin_anew(self) -> None:
-        """Note that the scene is learnt anew."""
+    def begin_anew(self, progress: float) -> None:
+        """Note that the scene is learnt anew from that part of the training on."""
         assert self._poses is not None
-        self._poses.begin_anew()
+        self._poses.begin_anew(progress)
 
     @property
     def has_begun_anew(self) -> bool:
         """Whether the scene was begun anew."""
-        return self._poses is not None and self._poses.is_anew
+        return self._poses is not None and self._poses.began_anew_at < 1
 
     def scene_progress(self, progress: float) -> float:
         """How far the scene is on its way, [0, 1], at that part of the training."""
-        return self._config.progress_anew(progress) if self.has_begun_anew else progress
+        if self._poses is None or not self.has_begun_anew:
+            return progress
+        start = self._poses.began_anew_at
+        return max((progress - start) / (1 - start), 0.0)
 
     def begin_step(self, step: int, progress: float, field: CoefficientField) -> None:
         """Let as many levels of the field's grid join as it is time for."""

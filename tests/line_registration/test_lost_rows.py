@@ -3,7 +3,9 @@
 import torch
 
 from tests.line_registration.textured_plane import ROWS, error, swept, wobble
-from unmix_plugin.line_registration.lost_rows import recover
+from unmix_plugin.line_registration.lost_rows import Recovery, recover
+from unmix_plugin.line_registration.register import register
+from unmix_plugin.line_registration.swept_view import SweptView
 
 _USUAL = 1e-4
 
@@ -38,6 +40,20 @@ def test_a_sweep_that_is_right_is_left_alone() -> None:
     found = recover(view, wobble(2.0), _USUAL)
     assert (found.num_lost, found.is_better) == (0, False)
     assert bool((found.steps == wobble(2.0)).all())
+
+
+def test_rows_are_looked_for_in_a_quarter_of_the_sweeps_those_with_most_of_them_lost(monkeypatch) -> None:
+    near = wobble(2.3)
+    starts = [near, lost_from(17, 9.0), near, lost_from(11, 9.0), near, lost_from(14, 9.0), near, near]
+    looked_for = []
+
+    def watched(_view: SweptView, steps: torch.Tensor, _usual: float) -> Recovery:
+        looked_for.append(next(i for i, start in enumerate(starts) if start is steps))
+        return Recovery(steps, 0, is_better=False)
+
+    monkeypatch.setattr("unmix_plugin.line_registration.register.recover", watched)
+    register([swept(wobble(2.0)) for _ in starts], starts)
+    assert looked_for == [3, 5]
 
 
 def test_a_sweep_without_a_run_of_good_rows_is_looked_for_around_its_given_poses() -> None:

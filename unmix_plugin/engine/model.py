@@ -109,12 +109,14 @@ class Model(nn.Module, ABC):
 
     def begins_anew(self, step: int, progress: float) -> bool:
         """Whether to learn the scene anew from this training step on, since what is known of its cameras is better now.
-        Asked before each step, after `look_again`."""
+        Asked before each step, before anything else."""
         return False
 
-    def begin_anew(self, initial_data: Mapping[str, np.ndarray], generator: torch.Generator) -> None:
-        """Fill parameters and buffers as at the start of the run, but for what is to be kept; arguments as of
-        `initialise`. torch's global generator is seeded."""
+    def begin_anew(
+        self, progress: float, initial_data: Mapping[str, np.ndarray], generator: torch.Generator
+    ) -> None:
+        """Fill parameters and buffers as at the start of the run, but for what is to be kept; `progress` is the part of
+        the training that is over, the other arguments are those of `initialise`. torch's global generator is seeded."""
 
     def group_progress(self, progress: float) -> dict[str, float]:
         """How far those parameter groups are on their way, [0, 1], that are not where the training is."""

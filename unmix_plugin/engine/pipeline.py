@@ -121,7 +121,8 @@ class Pipeline(nn.Module):
         """Let the model learn the scene anew where it is time; names of the parameter groups that were set back."""
         if not self.model.begins_anew(step, progress):
             return []
-        self.model.begin_anew(self.datamanager.initial_data(), torch.Generator().manual_seed(self.seed))
+        generator = torch.Generator().manual_seed(self.seed)
+        self.model.begin_anew(progress, self.datamanager.initial_data(), generator)
         self._judge_again()
         return list(self.model.group_progress(progress))
 

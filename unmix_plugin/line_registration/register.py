@@ -12,8 +12,12 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from unmix_plugin.line_registration.fit_rows import Fit, fit_rows
-from unmix_plugin.line_registration.lost_rows import recover
+from unmix_plugin.line_registration.lost_rows import LOST, recover
 from unmix_plugin.line_registration.swept_view import SweptView
+
+_MOST_SOUGHT = 0.25
+"""Share of the views in which lost rows are looked for, those with most of them. Where more are lost, the scene is not
+ready; and each view takes as long as all that are only fitted."""
 
 
 def register(
@@ -25,9 +29,17 @@ def register(
         views: Of line cameras, at least one.
         steps: Of each, where to start.
     """
-    errors = torch.cat([view.row_errors(own) for view, own in zip(views, steps, strict=True)])
-    if not bool((errors > 0).any()):
+    errors = [view.row_errors(own) for view, own in zip(views, steps, strict=True)]
+    known = torch.cat(errors)
+    if not bool((known > 0).any()):
         return list(steps)
-    usual = float(errors[errors > 0].median())
-    found = [recover(view, own, usual).steps for view, own in zip(views, steps, strict=True)]
+    usual, found = float(known[known > 0].median()), list(steps)
+    for number in _most_lost([int((own > LOST * usual).sum()) for own in errors]):
+        found[number] = recover(views[number], steps[number], usual).steps
     return [fit_rows(view, own, Fit()) for view, own in zip(views, found, strict=True)]
+
+
+def _most_lost(counts: Sequence[int]) -> list[int]:
+    """Views in which most rows are lost, of their counts."""
+    order = sorted(range(len(counts)), key=lambda view: -counts[view])
+    return order[: max(1, round(_MOST_SOUGHT * len(counts)))]

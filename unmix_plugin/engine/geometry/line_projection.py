@@ -48,16 +48,19 @@ def _first_stripes(
 ) -> tuple[Int[Tensor, " P"], Bool[Tensor, " P"]]:
     """The first stripe between neighbouring poses that passes over each point, and whether there is one."""
     stripes = torch.zeros(len(points), dtype=torch.int64, device=points.device)
-    found = torch.zeros_like(stripes, dtype=torch.bool)
-    # One product gives each point's coordinate in each pose; a chunk of points keeps it small.
-    up, back = ((poses[:, :, axis].T, (poses[:, :, 3] * poses[:, :, axis]).sum(dim=1)) for axis in (1, 2))
+    # One product gives each point's coordinate in each pose; a chunk of points keeps it small. Poses lie along the
+    # first axis, so that comparing neighbours takes whole rows of memory.
+    up, back = (
+        (poses[:, :, axis], (poses[:, :, 3] * poses[:, :, axis]).sum(dim=1, keepdim=True)) for axis in (1, 2)
+    )
+    count = len(poses) - 1
+    left = torch.arange(count, 0, -1, dtype=torch.int16, device=points.device)[:, None]
     for first in range(0, len(points), _CHUNK):
-        chosen = slice(first, first + _CHUNK)
-        is_above = points[chosen] @ up[0] > up[1]
-        is_before = points[chosen] @ back[0] < back[1]
-        passes = (is_above[:, 1:] != is_above[:, :-1]) & is_before[:, 1:] & is_before[:, :-1]
-        found[chosen], stripes[chosen] = passes.max(dim=1)
-    return stripes, found
+        chosen = points[first : first + _CHUNK].T.contiguous()
+        is_above, is_before = up[0] @ chosen > up[1], back[0] @ chosen < back[1]
+        passes = (is_above[1:] ^ is_above[:-1]) & is_before[1:] & is_before[:-1]
+        stripes[first : first + _CHUNK] = count - (passes * left).amax(dim=0).long()
+    return stripes.clamp(max=count - 1), stripes < count
 
 
 def _local(points: Float[Tensor, "P 3"], poses: Float[Tensor, "P 3 4"]) -> Float[Tensor, "P 3"]:

@@ -125,11 +125,11 @@ class TrainingSteps:
             RunError: loss and gradients stay non-finite, or another process has ended.
         """
         pipeline, datamanager = self.pipeline, self.pipeline.datamanager
-        num_rays = datamanager.get_train_rays_per_batch()
         pipeline.train()  # a guest may have left it in evaluation mode
         pipeline.seed_step(step)
-        run_callbacks(self.callbacks, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, step, progress)
         is_anew = self._begin_anew(step, progress)
+        run_callbacks(self.callbacks, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, step, progress)
+        num_rays = datamanager.get_train_rays_per_batch()
         rates = pipeline.model.group_progress(progress)
         self.learning_rates = set_learning_rates(self.optimizer, self.configs, progress, rates)
         outputs, losses, metrics = pipeline.get_train_loss_dict(step)
