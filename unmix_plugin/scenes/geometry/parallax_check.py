@@ -24,6 +24,6 @@ def parallax_warning(positions: Float[np.ndarray, "N 3"], box: SceneBox) -> str 
         return None
     return (
         "all training cameras stand at one place: turned about itself, a camera sees nothing of how far away things "
-        "are, so no other place can be rendered from such views. Move it between views; if it was moved, look at the "
-        "last column of each transform_matrix"
+        "are, so no other place can be rendered from such views. Move it between views; if it was moved, look whether "
+        "each 'transform_matrix' is camera to world: read the other way, all cameras around an object stand at one"
     )
