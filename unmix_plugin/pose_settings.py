@@ -81,8 +81,8 @@ class PoseConfig:
         return first <= progress < 1 and is_enough_left and self.fineness(step, progress) >= 1
 
     def registers(self, step: int, progress: float) -> bool:
-        """Whether line cameras are registered before a step, at that part of the training: not before `coarse_steps`, a
-        scene that shows little.
+        """Whether line cameras are registered before a step, at that part of the training; not before `coarse_steps`,
+        when a scene shows little.
 
         >>> config = PoseConfig(coarse_steps=100, register_from=0.2, register_every=0.1)
         >>> [step for step in range(1000) if config.registers(step, step / 1000)]

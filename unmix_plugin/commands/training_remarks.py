@@ -40,7 +40,8 @@ def remarks(lines: Sequence[Mapping[str, Any]]) -> list[str]:
     known = [line for line in lines if line.get("loss") is not None]
     if len(known) < _FEWEST_LINES:
         return []
-    first, third, last = (_typical_loss(_since_anew(known), quarter) for quarter in (1, 3, 4))
+    judged = _since_anew(known)
+    first, third, last = (_typical_loss(judged, quarter) for quarter in (1, 3, 4))
     if None in (first, third, last) or not first or not third or last is None:
         return []
     found = []

@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from unmix_plugin.line_registration.fit_rows import Fit, fit_rows
@@ -49,6 +49,11 @@ class Recovery:
     """Whether the steps are others than before."""
 
 
+def num_lost(errors: Float[Tensor, " H"], usual: float) -> int:
+    """Rows that look lost, of their mean squared errors and that of a row that is right."""
+    return int((errors > LOST * usual).sum())
+
+
 def recover(view: SweptView, steps: Float64[Tensor, "n 6"], usual: float) -> Recovery:
     """Steps under which lost rows fit as well as others, if such are found.
 
@@ -62,10 +67,10 @@ def recover(view: SweptView, steps: Float64[Tensor, "n 6"], usual: float) -> Rec
     shown = view.shows_matter
     good = ~lost
     good[: shown.start] = good[shown.stop :] = False
-    run, num_lost = _longest_run(good), int(lost.sum())
-    if num_lost < FEWEST_LOST:
-        return Recovery(steps, num_lost, is_better=False)
-    if 2 * num_lost <= len(lost) and run.stop - run.start >= _FEWEST_ROWS:
+    run, count = _longest_run(good), int(lost.sum())
+    if count < FEWEST_LOST:
+        return Recovery(steps, count, is_better=False)
+    if 2 * count <= len(lost) and run.stop - run.start >= _FEWEST_ROWS:
         found = track(view, steps, slice(run.start + _UNSURE_ROWS, run.stop - _UNSURE_ROWS), usual)
     else:
         found = sought(view, torch.zeros_like(steps))
@@ -74,7 +79,7 @@ def recover(view: SweptView, steps: Float64[Tensor, "n 6"], usual: float) -> Rec
         return float(view.row_errors(steps).clamp(max=_LARGEST * usual).mean())
 
     is_better = mean_error(found) < _CLEARLY_BETTER * mean_error(steps)
-    return Recovery(found if is_better else steps, num_lost, is_better)
+    return Recovery(found if is_better else steps, count, is_better)
 
 
 def track(view: SweptView, steps: Float64[Tensor, "n 6"], run: slice, usual: float) -> Float64[Tensor, "n 6"]:

@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from unmix_plugin.line_registration.fit_rows import Fit, fit_rows
-from unmix_plugin.line_registration.lost_rows import LOST, recover
+from unmix_plugin.line_registration.lost_rows import num_lost, recover
 from unmix_plugin.line_registration.swept_view import SweptView
 
 _MOST_SOUGHT = 0.25
@@ -34,7 +34,7 @@ def register(
     if not bool((known > 0).any()):
         return list(steps)
     usual, found = float(known[known > 0].median()), list(steps)
-    for number in _most_lost([int((own > LOST * usual).sum()) for own in errors]):
+    for number in _most_lost([num_lost(own, usual) for own in errors]):
         found[number] = recover(views[number], steps[number], usual).steps
     return [fit_rows(view, own, Fit()) for view, own in zip(views, found, strict=True)]
 

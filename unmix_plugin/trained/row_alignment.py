@@ -18,7 +18,7 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.line_cameras import keep, shower, swept_view
 from unmix_plugin.line_registration.fit_rows import Fit, fit_ever_sharper, fit_rows
-from unmix_plugin.line_registration.lost_rows import FEWEST_LOST, LOST, track
+from unmix_plugin.line_registration.lost_rows import FEWEST_LOST, LOST, num_lost, track
 from unmix_plugin.line_registration.sought_rows import sought
 from unmix_plugin.line_registration.swept_view import SweptView, columns_compared
 from unmix_plugin.trained.pose_alignment import align_pose
@@ -58,7 +58,7 @@ def align_rows(scene: TrainedScene, camera: Cameras, truth: ViewTruth) -> Camera
         steps = find(view, torch.zeros(view.num_knots, 6, dtype=torch.float64))
         errors = view.row_errors(steps)
         found.append((float(errors.sqrt().mean()), view, steps, start))
-        if int((errors > LOST * _usual(errors)).sum()) < FEWEST_LOST:
+        if num_lost(errors, _usual(errors)) < FEWEST_LOST:
             break
     _, view, steps, start = min(found, key=lambda candidate: candidate[0])
     return view.moved(start, _tracked(view, steps))

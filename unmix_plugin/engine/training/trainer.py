@@ -34,8 +34,6 @@ from unmix_plugin.engine.training.training_steps import StepResult, prepare_step
 from unmix_plugin.engine.training.writers import MetricsWriter, RunLog
 from unmix_plugin.errors import RunError
 
-_ANEW = "the scene is learnt anew, as its cameras are known better now"
-
 
 class Trainer:
     """Trains one pipeline into one run folder.
@@ -186,7 +184,9 @@ class Trainer:
         result = self._train_step()
         loss, metrics = result.loss, result.values
         if result.is_anew:
-            display.message(f"step {self.step - 1}: {_ANEW}")
+            said = f"step {self.step - 1}: the scene is learnt anew, as its cameras are known better now"
+            self.log.write(said)
+            display.message(said)
         if self.control.is_status_due or self.progress >= 1.0:
             self.control.show(self._status(loss, metrics))
         if display.is_due or self.progress >= 1.0:
@@ -214,8 +214,6 @@ class Trainer:
                 self.average.update(self.step)  # after the callbacks, which keep parameters in their bounds
         if result.is_refused:
             self.log.write(f"step {step} skipped: non-finite loss ({result.loss:g}) or gradient")
-        if result.is_anew:
-            self.log.write(f"step {step}: {_ANEW}")
         return result
 
     def _evaluate(self, display: ProgressDisplay) -> None:
