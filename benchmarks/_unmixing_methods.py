@@ -16,6 +16,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from unmix_plugin.losses.training_losses import LossConfig
 from unmix_plugin.spectral.segmentation import material_scores
 from unmix_plugin.spectral.unmixing.abundance_estimation import fcls, nnls, sunsal
 from unmix_plugin.spectral.unmixing.endmembers import (
@@ -26,7 +27,6 @@ from unmix_plugin.spectral.unmixing.endmembers import (
 from unmix_plugin.spectral.unmixing.mixture_guide import mixing_penalty
 from unmix_plugin.spectral.unmixing.pixel_unmixing import comparable_brightness
 from unmix_plugin.spectral.unmixing.sparse_unmixing import sparse_abundances
-from unmix_plugin.training_losses import LossConfig
 
 Explain = Callable[[Tensor, Tensor], Tensor]
 """From pixels (N, B) and endmembers (K, B) to amounts (N, K)."""

@@ -28,9 +28,9 @@ from torch import Tensor
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.field import UnmixField
 from unmix_plugin.model import UnmixModel
-from unmix_plugin.rendering import compositing, hash_encoding, marching
-from unmix_plugin.rendering.hash_encoding import HashGridLayout
-from unmix_plugin.rendering.marching import PackedSamples
+from unmix_plugin.operators import compositing, hash_encoding, marching
+from unmix_plugin.operators.hash_encoding import HashGridLayout
+from unmix_plugin.operators.marching import PackedSamples
 from unmix_plugin.scenes.demo.scene import DEFAULT_SIZE, DEFAULT_VIEWS, make_demo_scene
 
 SPEED_UP = _common.Limit(8.0, unit=" x")

@@ -6,8 +6,8 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.engine.geometry.rotations import rotation_matrix
 from unmix_plugin.engine.geometry.scene_box import SceneBox
-from unmix_plugin.pose_knots import Knots
-from unmix_plugin.pose_refinement import PoseRefinement
+from unmix_plugin.poses.knots import Knots
+from unmix_plugin.poses.refinement import PoseRefinement
 
 WIDTH, HEIGHT = 12, 40
 MIDDLE = torch.tensor([0.1, -0.2, 0.3])

@@ -14,9 +14,9 @@ from tests.method_factory import (
     make_rays,
 )
 from unmix_plugin.engine.geometry.rays import RayBundle
-from unmix_plugin.lit_samples import points_of
 from unmix_plugin.model import UnmixModel
-from unmix_plugin.rendering.compositing import volume_weights_twin
+from unmix_plugin.operators.compositing import volume_weights_twin
+from unmix_plugin.rendering.lit_samples import points_of
 
 
 def naive_spectra(model: UnmixModel, rays) -> torch.Tensor:

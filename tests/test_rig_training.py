@@ -11,9 +11,9 @@ from tests.method_factory import BOX, CONFIG, NUM_BANDS, WAVELENGTHS_NM, initial
 from tests.scenes.rig_factory import make_rig
 from unmix_plugin.datamanager import HyperspectralDataManager
 from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
+from unmix_plugin.losses.training_losses import LossConfig
 from unmix_plugin.model import UnmixModel
-from unmix_plugin.sensor_batches import join_parts, split_parts
-from unmix_plugin.training_losses import LossConfig
+from unmix_plugin.sensors.batches import join_parts, split_parts
 
 BANDS = [2, 0, 3, 1]
 RESPONSES = [[0.5, 0.5, 0.0, 0.0, 0.0], [0.0, 0.0, 0.2, 0.3, 0.5]]

@@ -18,7 +18,6 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from unmix_plugin.alpha_preset import choose, preset_for
 from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
 from unmix_plugin.engine.data_manager import DataManager
 from unmix_plugin.engine.geometry.cameras import Cameras
@@ -26,8 +25,9 @@ from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.engine.training.seeding import step_generator
 from unmix_plugin.errors import SceneError
-from unmix_plugin.lamp_search import find_lamp
-from unmix_plugin.pose_knots import Knots
+from unmix_plugin.light.search import find_lamp
+from unmix_plugin.poses.knots import Knots
+from unmix_plugin.presets import choose, preset_for
 from unmix_plugin.scenes.alpha_evidence import AlphaEvidence
 from unmix_plugin.scenes.geometry.carving import carve
 from unmix_plugin.scenes.geometry.lighting import judge_light
@@ -48,7 +48,7 @@ from unmix_plugin.scenes.training_evidence import (
     relative_power,
     rig_warnings,
 )
-from unmix_plugin.sensor_batches import join_parts
+from unmix_plugin.sensors.batches import join_parts
 from unmix_plugin.spectral.band_noise import BandNoise
 from unmix_plugin.spectral.unmixing.partial_bands import typical_spectrum
 

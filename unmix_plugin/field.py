@@ -18,22 +18,22 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from unmix_plugin.alpha_preset import Auto
-from unmix_plugin.directions import (
-    NUM_DIRECTION_FEATURES,
-    NUM_SKY_FEATURES,
-    direction_features,
-    sky_features,
-)
 from unmix_plugin.engine.field import Field
 from unmix_plugin.engine.geometry.contraction import contracted_unit
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.engine.instantiate import InstantiateConfig, Target
 from unmix_plugin.errors import require
-from unmix_plugin.lamp import Lamp, MovingLamp
-from unmix_plugin.lamp_shading import LOBES, Lamplight, LampShading, LitSurface
-from unmix_plugin.networks import bias_free_network, in_parts, rows_of_outputs
-from unmix_plugin.rendering.hash_encoding import HashGridLayout, hash_encode
+from unmix_plugin.light.directions import (
+    NUM_DIRECTION_FEATURES,
+    NUM_SKY_FEATURES,
+    direction_features,
+    sky_features,
+)
+from unmix_plugin.light.lamp import Lamp, MovingLamp
+from unmix_plugin.light.networks import bias_free_network, in_parts, rows_of_outputs
+from unmix_plugin.light.shading import LOBES, Lamplight, LampShading, LitSurface
+from unmix_plugin.operators.hash_encoding import HashGridLayout, hash_encode
+from unmix_plugin.presets import Auto
 
 _LARGEST_LOG_DENSITY = 15.0
 LARGEST_RESOLUTION = 4096

@@ -7,11 +7,11 @@ from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.pipeline import PipelineConfig
 from unmix_plugin.engine.registry import MethodSpecification
 from unmix_plugin.engine.training.optimizers import OptimizerConfig
+from unmix_plugin.losses.training_losses import LossConfig
 from unmix_plugin.model_settings import UnmixModelConfig
-from unmix_plugin.published_field import PublishedFieldConfig
-from unmix_plugin.renderer_settings import RendererConfig
+from unmix_plugin.rendering.published_field import PublishedFieldConfig
+from unmix_plugin.rendering.settings import RendererConfig
 from unmix_plugin.trained.snapshot import unmix_scene
-from unmix_plugin.training_losses import LossConfig
 
 unmix_nerf = MethodSpecification(
     config=TrainerConfig(

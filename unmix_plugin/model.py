@@ -20,37 +20,37 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from unmix_plugin.abundance_guide import AbundanceGuide
-from unmix_plugin.alpha_preset import choose, preset_for
-from unmix_plugin.band_balance import BandBalance
-from unmix_plugin.batch_comparison import BatchComparison
 from unmix_plugin.engine.data_manager import DataManager
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.model import Model
 from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.field import CoefficientField, UnmixField
-from unmix_plugin.first_endmembers import first_endmembers, first_specular_spectra
-from unmix_plugin.grid_upkeep import is_due, record_seen, update_grid
-from unmix_plugin.lamp_shadows import ShadowDetail
-from unmix_plugin.model_parts import (
+from unmix_plugin.light.shadows import ShadowDetail
+from unmix_plugin.losses.abundance_guide import AbundanceGuide
+from unmix_plugin.losses.batch_comparison import BatchComparison
+from unmix_plugin.losses.first_endmembers import first_endmembers, first_specular_spectra
+from unmix_plugin.losses.normals import normals_error
+from unmix_plugin.losses.surfaces import surface_loss
+from unmix_plugin.model_settings import UnmixModelConfig
+from unmix_plugin.poses.training import PoseTraining
+from unmix_plugin.presets import choose, preset_for
+from unmix_plugin.rendering.grid_upkeep import is_due, record_seen, update_grid
+from unmix_plugin.rendering.model_parts import (
     make_field,
     make_grid,
     make_pose_refinement,
     make_renderer,
     make_view_gains,
 )
-from unmix_plugin.model_settings import UnmixModelConfig
-from unmix_plugin.normal_guide import normals_error
-from unmix_plugin.pose_training import PoseTraining
-from unmix_plugin.ray_outputs import met_by_rays, ray_outputs
-from unmix_plugin.renderer import VolumeRenderer
-from unmix_plugin.sensor_views import SensorViews
+from unmix_plugin.rendering.ray_outputs import met_by_rays, ray_outputs
+from unmix_plugin.rendering.renderer import VolumeRenderer
+from unmix_plugin.sensors.band_balance import BandBalance
+from unmix_plugin.sensors.views import SensorViews
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.metrics import psnr
-from unmix_plugin.surface_guide import surface_loss
 
 _FEWEST_RAYS, _MOST_RAYS = 64, 8192
 

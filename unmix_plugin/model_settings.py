@@ -10,19 +10,19 @@ from typing import Annotated, Literal
 import numpy as np
 import torch
 
-from unmix_plugin.alpha_preset import AlphaPreset, Auto
 from unmix_plugin.engine.instantiate import Common, Target, short
 from unmix_plugin.engine.model import Model, ModelConfig
 from unmix_plugin.errors import ConfigError, require
 from unmix_plugin.field import UnmixFieldConfig
-from unmix_plugin.lamp import NUM_LAMP_NUMBERS, Lamp
-from unmix_plugin.pose_settings import PoseConfig
-from unmix_plugin.renderer_settings import RendererConfig
+from unmix_plugin.light.lamp import NUM_LAMP_NUMBERS, Lamp
+from unmix_plugin.losses.training_losses import LossConfig
+from unmix_plugin.poses.settings import PoseConfig
+from unmix_plugin.presets import AlphaPreset, Auto
+from unmix_plugin.rendering.settings import RendererConfig
 from unmix_plugin.spectral.evidence import exposure_of
 from unmix_plugin.spectral.materials import SegmentationMethod
 from unmix_plugin.spectral.unmixing.endmembers import EndmemberMethod, drop_uninformative_pixels
 from unmix_plugin.spectral.unmixing.num_materials import propose_num_materials
-from unmix_plugin.training_losses import LossConfig
 
 Light = Literal["fixed", "camera", "per-view"]
 

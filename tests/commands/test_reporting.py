@@ -8,7 +8,7 @@ from rich.console import Console
 
 from unmix_plugin.commands import reporting
 from unmix_plugin.commands.reporting import announce_kernel_compilation
-from unmix_plugin.rendering.launching import warp
+from unmix_plugin.operators.launching import warp
 
 
 @pytest.mark.parametrize("compiles", [True, False])

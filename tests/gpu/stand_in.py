@@ -19,7 +19,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
 
-from unmix_plugin.rendering import launching
+from unmix_plugin.operators import launching
 
 NAME = "standin"
 _setup_privateuseone_for_python_backend(NAME)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 
 from tests.method_factory import CAMERA, make_model
-from unmix_plugin.rendering import (
+from unmix_plugin.operators import (
     _compositing_kernels,
     _hash_kernels,
     _marching_kernels,
     _merging_kernels,
 )
-from unmix_plugin.rendering.launching import warp
+from unmix_plugin.operators.launching import warp
 
 
 @pytest.fixture(scope="module")

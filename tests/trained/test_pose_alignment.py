@@ -7,7 +7,7 @@ from torch.testing import assert_close
 from tests.method_factory import make_scene
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
-from unmix_plugin.pose_refinement import LARGEST_STEP
+from unmix_plugin.poses.refinement import LARGEST_STEP
 from unmix_plugin.trained import pose_alignment
 from unmix_plugin.trained.evaluation import ViewTruth
 from unmix_plugin.trained.pose_alignment import align_pose, moved

@@ -39,7 +39,7 @@ def working(console: Console, doing: str) -> Iterator[None]:
 @contextmanager
 def announce_kernel_compilation(console: Console) -> Iterator[None]:
     """Context that says so if the kernels it needs are not in Warp's cache, as happens once on a machine."""
-    from unmix_plugin.rendering.launching import warp
+    from unmix_plugin.operators.launching import warp
 
     cache, is_over = Path(warp().config.kernel_cache_dir), threading.Event()
     known = set(cache.glob("*"))

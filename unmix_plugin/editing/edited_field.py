@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from unmix_plugin.field import CoefficientField
-from unmix_plugin.lamp import MovingLamp
-from unmix_plugin.lamp_shading import Lamplight
+from unmix_plugin.light.lamp import MovingLamp
+from unmix_plugin.light.shading import Lamplight
 
 _GONE_SHARE, _WHOLE_SHARE = 0.25, 0.75
 """Kept share of a point up to which nothing of it is left, and from which it is as dense as before."""

@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from unmix_plugin.atomic_files import write_errors_as, write_file
+from unmix_plugin.engine.runs.atomic_files import write_errors_as, write_file
 from unmix_plugin.formats.raw_rows import RowSink, raw_rows
 from unmix_plugin.spectral.bands import Bands
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from unmix_plugin.atomic_files import cannot_write, whole_file
+from unmix_plugin.engine.runs.atomic_files import cannot_write, whole_file
 
 
 def write_exr(path: Path, channels: Mapping[str, np.ndarray], attributes: Mapping[str, str | float]) -> Path:

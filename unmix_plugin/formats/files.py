@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from unmix_plugin.atomic_files import make_folder, write_file
+from unmix_plugin.engine.runs.atomic_files import make_folder, write_file
 from unmix_plugin.errors import ConfigError
 
 __all__ = ["array_bytes", "make_folder", "refuse_to_overwrite", "write_file"]

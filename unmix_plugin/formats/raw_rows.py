@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from unmix_plugin.atomic_files import whole_file, write_all, write_errors_as
+from unmix_plugin.engine.runs.atomic_files import whole_file, write_all, write_errors_as
 
 RowSink: TypeAlias = Callable[[np.ndarray], None]
 """Takes the next rows of an image, (rows, W, ...), from the top down."""

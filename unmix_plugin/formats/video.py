@@ -16,7 +16,7 @@ from typing import IO, TypeAlias
 
 import numpy as np
 
-from unmix_plugin.atomic_files import cannot_write, whole_file
+from unmix_plugin.engine.runs.atomic_files import cannot_write, whole_file
 from unmix_plugin.errors import RunError
 
 FrameSink: TypeAlias = Callable[[np.ndarray], None]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from unmix_plugin.atomic_files import whole_file, write_errors_as
+from unmix_plugin.engine.runs.atomic_files import whole_file, write_errors_as
 from unmix_plugin.products.product import Job, Product
 
 if TYPE_CHECKING:

@@ -1,1 +1,1 @@
-"""Differentiable rendering operators, each a Warp kernel and a PyTorch twin that defines it."""
+"""From rays and a field to composited coefficients."""

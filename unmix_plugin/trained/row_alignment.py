@@ -16,11 +16,11 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.line_cameras import keep, shower, swept_view
-from unmix_plugin.line_registration.fit_rows import Fit, fit_ever_sharper, fit_rows
-from unmix_plugin.line_registration.lost_rows import FEWEST_LOST, LOST, num_lost, track
-from unmix_plugin.line_registration.sought_rows import sought
-from unmix_plugin.line_registration.swept_view import SweptView, columns_compared
+from unmix_plugin.poses.line_cameras import keep, shower, swept_view
+from unmix_plugin.poses.line_registration.fit_rows import Fit, fit_ever_sharper, fit_rows
+from unmix_plugin.poses.line_registration.lost_rows import FEWEST_LOST, LOST, num_lost, track
+from unmix_plugin.poses.line_registration.sought_rows import sought
+from unmix_plugin.poses.line_registration.swept_view import SweptView, columns_compared
 from unmix_plugin.trained.pose_alignment import align_pose
 
 if TYPE_CHECKING:

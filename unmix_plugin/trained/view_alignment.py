@@ -14,10 +14,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from unmix_plugin.light.view_gains import smooth_terms
 from unmix_plugin.spectral.evidence import is_blown_out
 from unmix_plugin.trained.evaluation import ViewTruth
 from unmix_plugin.trained.view_rendering import RenderedView
-from unmix_plugin.view_gains import smooth_terms
 
 _NUM_STEPS = 20
 

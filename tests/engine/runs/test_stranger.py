@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from unmix_plugin.atomic_files import whole_file, write_file
 from unmix_plugin.engine.configs import TrainerConfig
+from unmix_plugin.engine.runs.atomic_files import whole_file, write_file
 from unmix_plugin.engine.runs.load_run import load_config, load_model
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.training.trainer import Trainer

@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float64
 
 from unmix_plugin import __version__
-from unmix_plugin.atomic_files import write_file
 from unmix_plugin.captures.calibration.calibration import Calibration
 from unmix_plugin.captures.capture import CaptureView
 from unmix_plugin.captures.checks.report import Checked, check_views, report_text
@@ -28,6 +27,7 @@ from unmix_plugin.captures.writing.sources import hashes
 from unmix_plugin.captures.writing.transforms import WrittenView, transforms_json
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, ViewRecord
 from unmix_plugin.captures.writing.work_folder import RECORD_NAME, SCENE_NAME
+from unmix_plugin.engine.runs.atomic_files import write_file
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 

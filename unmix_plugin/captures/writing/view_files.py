@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8, UInt16
 
-from unmix_plugin.atomic_files import whole_file, write_errors_as, write_file
 from unmix_plugin.captures.calibration.calibration import CalibratedRows, Calibration
 from unmix_plugin.captures.capture import CaptureView
 from unmix_plugin.captures.masks import BackgroundRule, clean
 from unmix_plugin.captures.pictures import Colours, detail
 from unmix_plugin.captures.view_masks import HALF, OPAQUE, ViewMasks, read_labels, read_view_masks
+from unmix_plugin.engine.runs.atomic_files import whole_file, write_errors_as, write_file
 from unmix_plugin.formats.png import indexed_png_bytes, rgba_png_bytes
 
 FULL_SCALE = 65535

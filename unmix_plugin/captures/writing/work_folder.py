@@ -9,8 +9,13 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from unmix_plugin.atomic_files import make_folder, remove_stale_temporaries, write_errors_as, write_file
 from unmix_plugin.captures.writing.view_files import ViewRecord
+from unmix_plugin.engine.runs.atomic_files import (
+    make_folder,
+    remove_stale_temporaries,
+    write_errors_as,
+    write_file,
+)
 from unmix_plugin.errors import ConfigError
 
 PLAN_NAME, RECORD_NAME, SCENE_NAME = "plan.json", "process.json", "transforms.json"

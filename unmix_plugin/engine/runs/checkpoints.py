@@ -14,7 +14,7 @@ import safetensors.torch
 from safetensors import SafetensorError
 from torch import Tensor
 
-from unmix_plugin.atomic_files import remove_stale_temporaries, write_file
+from unmix_plugin.engine.runs.atomic_files import remove_stale_temporaries, write_file
 from unmix_plugin.engine.runs.run_files import OtherFormatError, read_run_json, write_run_json
 from unmix_plugin.errors import RunError
 

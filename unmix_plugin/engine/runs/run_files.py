@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from unmix_plugin.atomic_files import write_file
+from unmix_plugin.engine.runs.atomic_files import write_file
 from unmix_plugin.errors import RunError
 
 RUN_FORMAT = 2

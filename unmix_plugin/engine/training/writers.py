@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from unmix_plugin.atomic_files import write_file
+from unmix_plugin.engine.runs.atomic_files import write_file
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.errors import RunError
 

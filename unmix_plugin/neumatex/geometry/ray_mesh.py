@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from unmix_plugin.neumatex.geometry.mesh import Mesh
-from unmix_plugin.rendering.launching import as_warp, launch, vector_type, warp
+from unmix_plugin.operators.launching import as_warp, launch, vector_type, warp
 
 _LONGEST = 1e30
 """Distance of a ray that hits nothing."""

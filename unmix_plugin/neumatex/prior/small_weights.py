@@ -13,7 +13,7 @@ from typing import Any
 import safetensors.torch
 from safetensors import SafetensorError
 
-from unmix_plugin.atomic_files import write_file
+from unmix_plugin.engine.runs.atomic_files import write_file
 from unmix_plugin.errors import RunError
 from unmix_plugin.neumatex.materials import decoder_weights
 from unmix_plugin.neumatex.prior.small_network import MaterialName, SmallPrior

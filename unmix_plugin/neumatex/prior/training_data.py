@@ -14,7 +14,7 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 from torch.nn import functional
 
-from unmix_plugin.atomic_files import write_file
+from unmix_plugin.engine.runs.atomic_files import write_file
 from unmix_plugin.neumatex.demo.layered_surface import LayeredSurface
 from unmix_plugin.neumatex.demo.shapes import demo_mesh
 from unmix_plugin.neumatex.geometry.ray_mesh import RayMesh, SurfacePoints

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.atomic_files import write_file
+from unmix_plugin.engine.runs.atomic_files import write_file
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands, require_nanometres
 

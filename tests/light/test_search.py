@@ -1,0 +1,66 @@
+"""Where the lamp that moves with the camera is, found from pictures of a ball and of things on a table."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.scenes.geometry.ball_views import LAMP, ball_views, make_cameras
+from tests.scenes.scene_factory import ring_poses
+from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.light import search as lamp_search
+from unmix_plugin.light.search import LampEvidence, best_lamp, find_lamp, turning_axis
+from unmix_plugin.scenes.demo.shading import LAMP_POSITION, render_view
+from unmix_plugin.scenes.demo.views import LOOK_AT, demo_cameras
+from unmix_plugin.scenes.geometry.carving import carve_box
+from unmix_plugin.scenes.geometry.hull_places import local_log_brightness, seen_places
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_the_brightness_of_a_turned_ball_tells_the_direction_of_its_lamp(noise):
+    cameras, images, hull, box = ball_views(True, noise)
+    evidence = LampEvidence.of(cameras, *seen_places(cameras, images, hull, box), hull, box)
+    share, lamp = best_lamp(evidence, cameras)
+    place = np.array(lamp.place) / np.linalg.norm(lamp.place)
+    assert share > 0.15
+    assert np.degrees(np.arccos(place @ LAMP / np.linalg.norm(LAMP))) < 12
+
+
+def test_a_lamp_whose_shadows_explain_nothing_is_not_believed(monkeypatch):
+    views = ball_views(True)
+    assert find_lamp(*views) is None
+    monkeypatch.setattr(lamp_search, "LEAST_SHADOWS", -1.0)
+    lamp = find_lamp(*views)
+    assert lamp is not None
+    assert np.dot(lamp.place, LAMP) / np.linalg.norm(lamp.place) / np.linalg.norm(LAMP) > 0.97
+
+
+def test_a_lamp_that_halves_of_the_places_disagree_about_is_not_believed(monkeypatch):
+    monkeypatch.setattr(lamp_search, "LEAST_SHADOWS", -1.0)
+    monkeypatch.setattr(lamp_search, "LEAST_AGREEMENT", 1.01)
+    assert find_lamp(*ball_views(True)) is None
+
+
+def test_things_on_a_table_tell_in_which_frame_the_lamp_stands():
+    cameras = demo_cameras(96, 24)
+    shading, matter = [], []
+    for index in range(24):
+        x, y = cameras.camera_to_world[index, :2, 3].tolist()
+        turn = np.array([[x, -y], [y, x]]) / np.hypot(x, y)
+        lamp = (*(turn @ LAMP_POSITION[:2]).tolist(), LAMP_POSITION[2])
+        view = render_view(cameras, index, subpixels=1, lamp=lamp)
+        shading.append(local_log_brightness(torch.from_numpy(view.diffuse.sum(axis=-1)).float()))
+        matter.append(view.alpha > 0)
+    box = SceneBox(torch.tensor([[-1.4, -1.4, -0.15], [1.4, 1.4, 1.2]]))
+    hull = carve_box(cameras, matter, box, 64)
+    evidence = LampEvidence.of(cameras, *seen_places(cameras, shading, hull, box), hull, box)
+    found = best_lamp(evidence, cameras)[1]
+    true = np.array([LAMP_POSITION[1], LAMP_POSITION[2] - LOOK_AT[2], LAMP_POSITION[0]])
+    cosine = np.dot(found.place, true) / np.linalg.norm(found.place) / np.linalg.norm(true)
+    assert found.frame == "turntable"
+    assert np.degrees(np.arccos(cosine)) < 20
+
+
+def test_the_axis_is_what_cameras_stand_upright_to():
+    middle, axis = turning_axis(make_cameras(ring_poses(9)))
+    np.testing.assert_allclose(middle, (0, 0, 0), atol=1e-4)
+    np.testing.assert_allclose(axis, (0, 0, 1), atol=1e-4)

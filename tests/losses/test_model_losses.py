@@ -1,0 +1,207 @@
+"""What the losses of the model ask for, with alpha and without."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from tests.method_factory import (
+    NUM_BANDS,
+    make_model,
+    make_rays,
+)
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.losses.training_losses import LossConfig
+from unmix_plugin.spectral.losses import FAINT, relative_weights
+
+
+def test_a_last_colour_background_closes_every_ray_that_meets_something():
+    outputs = make_model(losses=LossConfig(background="last")).get_outputs(make_rays(20))
+    assert_close(outputs["accumulation"][:-1], torch.ones(19))
+    assert outputs["accumulation"][-1] == 0
+
+
+@pytest.mark.parametrize("background", ["random", "black", "white"])
+def test_a_perfect_prediction_has_no_loss_over_any_background(background):
+    model = make_model(losses=LossConfig(background=background, rgb=1.0, abundances=0.0))
+    spectra, alpha = torch.rand(8, NUM_BANDS), torch.rand(8)
+    losses = model.get_loss_dict(
+        {"spectral": spectra, "accumulation": alpha}, {"spectra": spectra, "alpha": alpha}
+    )
+    assert set(losses) == {"spectral", "rgb"}
+    assert all(float(loss) < 1e-12 for loss in losses.values())
+
+
+def test_colours_count_by_default_where_alpha_tells_black_from_the_void():
+    spectra, alpha = torch.rand(8, NUM_BANDS), torch.ones(8)
+    outputs = {"spectral": spectra / 2, "accumulation": alpha, "spread": torch.zeros(())}
+    losses = {
+        has_alpha: make_model(has_alpha=has_alpha, losses=LossConfig(abundances=0.0)).get_loss_dict(
+            outputs, {"spectra": spectra, "alpha": alpha}
+        )
+        for has_alpha in (True, False)
+    }
+    assert float(losses[True]["rgb"]) > 0
+    assert "rgb" not in losses[False]
+
+
+def test_a_bright_background_penalises_missing_opacity():
+    batch = {"spectra": torch.zeros(4, NUM_BANDS), "alpha": torch.ones(4)}
+    outputs = {"spectral": torch.zeros(4, NUM_BANDS), "accumulation": torch.zeros(4)}
+    losses = {
+        b: float(
+            make_model(losses=LossConfig(background=b, abundances=0.0)).get_loss_dict(outputs, batch)[
+                "spectral"
+            ]
+        )
+        for b in ("black", "white")
+    }
+    assert losses == {"black": 0.0, "white": 1.0}
+
+
+def test_brighter_than_a_saturated_sensor_is_no_error_but_darker_is():
+    model = make_model(losses=LossConfig(background="black", abundances=0.0))
+    batch = {"spectra": torch.ones(1, NUM_BANDS), "alpha": torch.ones(1)}
+    error = [
+        float(
+            model.get_loss_dict(
+                {"spectral": torch.full((1, NUM_BANDS), v), "accumulation": torch.ones(1)}, batch
+            )["spectral"]
+        )
+        for v in (1.5, 0.5)
+    ]
+    assert error == [0.0, 0.25]
+
+
+@pytest.mark.parametrize("power", [0.0, 1.0, 2.0])
+def test_relative_errors_count_the_more_the_darker_the_rendered_pixel_is(power):
+    model = make_model(losses=LossConfig(background="black", rgb=0.0, abundances=0.0, relative=power))
+
+    def loss(rendered: float) -> float:
+        outputs = {"spectral": torch.full((1, NUM_BANDS), rendered), "accumulation": torch.ones(1)}
+        batch = {"spectra": torch.full((1, NUM_BANDS), 0.9 * rendered), "alpha": torch.ones(1)}
+        return float(model.get_loss_dict(outputs, batch)["spectral"])
+
+    faint = (0.2 + FAINT) / (0.1 + FAINT)
+    assert loss(0.2) == pytest.approx(0.02**2, rel=1e-4)
+    assert loss(0.1) == pytest.approx(0.01**2 * faint**power, rel=1e-4)
+
+
+def test_weights_of_relative_errors_pull_at_no_pixel():
+    rendered = torch.full((4, NUM_BANDS), 0.1, requires_grad=True)
+    assert not relative_weights(rendered, 2.0).requires_grad
+
+
+@pytest.mark.parametrize("power", [-0.5, 2.5])
+def test_impossible_powers_of_relative_errors_are_refused(power):
+    with pytest.raises(ConfigError, match=r"relative in \[0, 2\] or auto"):
+        LossConfig(relative=power)
+
+
+def test_transparency_is_penalised_only_where_no_alpha_says_what_is_solid():
+    spectra = torch.tensor([0.5, 0.5, 0.0])[:, None].repeat(
+        1, NUM_BANDS
+    )  # the last pixel is black: it may be void
+    batch = {"spectra": spectra, "alpha": torch.ones(3)}
+    outputs = {"spectral": spectra, "accumulation": torch.tensor([1.0, 0.5, 0.0])}
+    closed = make_model(
+        has_alpha=False, losses=LossConfig(opacity=0.2, spread=0.0, abundances=0.0)
+    ).get_loss_dict(outputs, batch)
+    assert float(closed["spectral"]) == 0
+    assert_close(closed["opacity"], torch.tensor(0.2 * 0.25 / 3))
+    with_alpha = make_model(losses=LossConfig(abundances=0.0)).get_loss_dict(outputs, batch)
+    assert "opacity" not in with_alpha
+
+
+def test_the_automatic_background_is_black_without_alpha_and_random_with_it():
+    batch = {"spectra": torch.zeros(50, NUM_BANDS), "alpha": torch.ones(50)}
+    outputs = {"spectral": torch.zeros(50, NUM_BANDS), "accumulation": torch.zeros(50)}
+    losses = [
+        float(
+            make_model(has_alpha=has, losses=LossConfig(abundances=0.0, spread=0.0)).get_loss_dict(
+                outputs, batch
+            )["spectral"]
+        )
+        for has in (False, True)
+    ]
+    assert losses[0] == 0
+    assert 0.2 < losses[1] < 0.5  # the mean square of a grey drawn evenly from [0, 1]
+
+
+def test_spread_density_is_penalised_early_and_only_where_no_alpha_says_what_is_empty():
+    batch = {"spectra": torch.zeros(4, NUM_BANDS), "alpha": torch.ones(4)}
+    outputs = {
+        "spectral": torch.zeros(4, NUM_BANDS),
+        "accumulation": torch.zeros(4),
+        "spread": torch.tensor(3.0),
+    }
+    losses = LossConfig(spread=0.2, spread_until=0.5, abundances=0.0)
+    model = make_model(has_alpha=False, losses=losses)
+    begin_step = model.get_training_callbacks()[0].func
+    found = []
+    for progress in (0.0, 0.25, 0.5, 1.0):
+        begin_step(1, progress)
+        found.append(float(model.get_loss_dict(outputs, batch).get("spread", 0.0)))
+    assert found == pytest.approx([0.6, 0.15, 0.0, 0.0])
+    with_alpha = make_model(losses=replace(losses, spread="auto"))
+    assert "spread" not in with_alpha.get_loss_dict(outputs, batch)
+
+
+def test_abundances_are_drawn_to_those_that_measured_spectra_show():
+    model = make_model(losses=LossConfig(abundances=0.5))
+    shown = torch.tensor([0, 2, 1])
+    spectra = 0.5 * model.guide.endmembers[shown]
+    batch = {"spectra": spectra, "alpha": torch.ones(3), "pixels": torch.arange(3)}
+    right = torch.eye(3)[shown]
+    losses = [
+        float(
+            model.get_loss_dict(
+                {"spectral": spectra, "accumulation": torch.ones(3), "abundances": abundances}, batch
+            )["abundances"]
+        )
+        for abundances in (right, right.roll(1, dims=1))
+    ]
+    assert losses[0] < 1e-6
+    assert_close(losses[1], 0.5 * 2.0, atol=1e-2, rtol=0)
+
+
+def test_the_guide_of_abundances_lets_go_of_them_as_training_goes_on():
+    model = make_model(losses=LossConfig(abundances=0.5, abundances_final_factor=0.01))
+    begin_step = model.get_training_callbacks()[0].func
+    batch = {
+        "spectra": 0.5 * model.guide.endmembers,
+        "alpha": torch.ones(3),
+        "pixels": torch.arange(3),
+    }
+    outputs = {
+        "spectral": batch["spectra"],
+        "accumulation": torch.ones(3),
+        "abundances": torch.eye(3).roll(1, dims=1),
+    }
+    found = []
+    for progress in (0.0, 0.5, 1.0):
+        begin_step(1, progress)
+        found.append(float(model.get_loss_dict(outputs, batch)["abundances"]))
+    assert found == pytest.approx([1.0, 0.1, 0.01], rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"rgb": -1.0}, r"rgb of at least 0 \(got -1.0\)$"),
+        ({"mixing_penalty": -0.1}, r"mixing-penalty of at least 0 \(got -0.1\)$"),
+        ({"spread_until": 0.0}, r"spread-until in \(0, 1\]"),
+    ],
+)
+def test_impossible_losses_are_refused(settings, message):
+    with pytest.raises(ConfigError, match=message):
+        LossConfig(**settings)
+
+
+def test_where_alpha_is_not_trusted_missing_opacity_costs_nothing():
+    spectra = torch.full((2, NUM_BANDS), 0.3)
+    batch = {"spectra": spectra, "alpha": torch.tensor([1.0, 1.0]), "alpha_trust": torch.tensor([1.0, 0.0])}
+    model = make_model(losses=LossConfig(background="white", abundances=0.0, rgb=0.0))
+    outputs = {"spectral": spectra, "accumulation": torch.zeros(2)}
+    assert float(model.get_loss_dict(outputs, batch)["spectral"]) == pytest.approx(0.5)

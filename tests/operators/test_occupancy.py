@@ -1,0 +1,133 @@
+"""What the occupancy grid keeps and discards."""
+
+import torch
+
+from unmix_plugin.operators.grid_cells import clearance_of
+from unmix_plugin.operators.occupancy import OccupancyGrid
+
+
+def ball(points: torch.Tensor) -> torch.Tensor:
+    return 100.0 * ((points - 0.5).norm(dim=-1) < 0.25)
+
+
+def updated(
+    grid: OccupancyGrid, density_fn, times: int = 1, num_cells=None, seed=0, block=1
+) -> OccupancyGrid:
+    generator = torch.Generator().manual_seed(seed)
+    for _ in range(times):
+        grid.update(
+            density_fn, threshold=1.0, decay=0.5, num_cells=num_cells, generator=generator, block=block
+        )
+    return grid
+
+
+def full(side: int = 8) -> OccupancyGrid:
+    return OccupancyGrid(torch.ones(side, side, side, dtype=torch.bool))
+
+
+def test_cells_are_occupied_where_there_is_density_and_empty_elsewhere():
+    grid = updated(full(), ball, times=10)
+    centres = (torch.stack(torch.meshgrid(*[torch.arange(8)] * 3, indexing="ij"), -1) + 0.5) / 8
+    distance = (centres - 0.5).norm(dim=-1)
+    assert grid.occupied[distance < 0.2].all()
+    assert not grid.occupied[distance > 0.4].any()
+
+
+def test_unreachable_cells_stay_empty_whatever_the_density():
+    reachable = torch.ones(4, 4, 4, dtype=torch.bool)
+    reachable[0] = False
+    grid = updated(OccupancyGrid(reachable), lambda points: torch.full((len(points),), 50.0), times=3)
+    assert not grid.occupied[0].any()
+    assert grid.occupied[1:].all()
+
+
+def test_what_is_emptied_later_stays_empty_and_all_else_is_as_it_was():
+    reachable = torch.ones(8, 8, 8, dtype=torch.bool)
+    reachable[:4] = False
+    grid, other = updated(full(), ball, times=3), updated(full(), ball, times=3)
+    grid.empty_beyond(reachable)
+    assert torch.equal(grid.occupied[4:], other.occupied[4:])
+    assert not grid.occupied[:4].any()
+    assert torch.equal(grid.clearance, clearance_of(grid.occupied != 0))
+    updated(grid, ball, times=3, seed=1)
+    assert not grid.occupied[:4].any()
+    assert grid.occupied[4:].any()
+
+
+def test_a_cell_is_forgotten_once_its_density_has_decayed():
+    grid = updated(full(4), lambda points: torch.full((len(points),), 8.0))
+    assert grid.occupied.all()
+    updated(grid, lambda points: torch.zeros(len(points)), times=2)
+    assert grid.occupied.all()
+    updated(grid, lambda points: torch.zeros(len(points)), times=2)
+    assert not grid.occupied.any()
+
+
+def test_a_cell_that_gains_density_is_occupied_again():
+    grid = updated(full(4), lambda points: torch.zeros(len(points)), times=2)
+    assert not grid.occupied.any()
+    updated(grid, ball, times=4)
+    assert grid.occupied[1:3, 1:3, 1:3].all()
+
+
+def test_probing_some_cells_at_a_time_finds_the_same_ball():
+    grid = updated(full(), ball, times=60, num_cells=128)
+    reference = updated(full(), ball, times=60)
+    assert (grid.occupied != reference.occupied).float().mean() < 0.05
+
+
+def test_a_thin_density_everywhere_stays_visible():
+    """The threshold never exceeds the mean, so a faint scene isn't taken for empty space."""
+    grid = updated(full(4), lambda points: 0.01 + 0.01 * points[:, 0], times=3)
+    assert 0 < grid.occupied.float().mean() < 1
+
+
+def test_a_grid_that_was_loaded_goes_on_like_the_one_that_was_saved():
+    reachable = torch.rand(6, 6, 6, generator=torch.Generator().manual_seed(0)) < 0.5
+    saved = updated(OccupancyGrid(reachable), ball, times=3, num_cells=40)
+    loaded = full(6)
+    loaded.load_state_dict(saved.state_dict())
+    for grid in (saved, loaded):
+        updated(grid, ball, times=5, num_cells=40, seed=1)
+    assert torch.equal(loaded.peak_densities, saved.peak_densities)
+    assert torch.equal(loaded.occupied, saved.occupied)
+    assert not loaded.occupied[~reachable].any()
+
+
+def met_by_rays(grid: OccupancyGrid, density_fn, num_points: int, generator: torch.Generator) -> None:
+    points = torch.rand(num_points, 3, generator=generator)
+    grid.record_met(points, density_fn(points))
+
+
+def test_cells_in_which_rays_met_nothing_are_empty_without_being_probed():
+    generator = torch.Generator().manual_seed(3)
+    known, unknown = OccupancyGrid(torch.ones(8, 8, 8) > 0, records_met=True), full()
+    for _ in range(8):
+        for grid in (known, unknown):
+            met_by_rays(grid, ball, 4000, generator)
+            updated(grid, ball, num_cells=2)
+    reference = updated(full(), ball, times=10)
+    assert unknown.occupied.float().mean() > 0.9
+    assert (known.occupied != reference.occupied).float().mean() < 0.05
+
+
+def test_what_rays_met_counts_once_and_the_largest_in_a_cell():
+    grid = OccupancyGrid(torch.ones(2, 2, 2) > 0, records_met=True)
+    updated(grid, lambda points: torch.zeros(len(points)))
+    points = torch.tensor([[0.1, 0.1, 0.1], [0.2, 0.3, 0.1], [0.9, 0.9, 0.9]])
+    grid.record_met(points, torch.tensor([3.0, 8.0, 0.5]))
+    updated(grid, lambda points: torch.zeros(len(points)), num_cells=0)
+    assert float(grid.peak_densities[0, 0, 0]) == 8.0
+    assert float(grid.peak_densities[1, 1, 1]) == 0.5
+    updated(grid, lambda points: torch.zeros(len(points)), num_cells=0)
+    assert float(grid.peak_densities[0, 0, 0]) == 8.0
+
+
+def test_cells_of_a_block_stay_while_one_of_them_is_dense():
+    """Small cells are soon emptied by chance; blocks of them only where nothing was met in any."""
+    for block, expected in ((1, 1), (2, 8), (3, 27)):
+        grid = OccupancyGrid(torch.ones(5, 5, 5) > 0, records_met=True)
+        updated(grid, lambda points: torch.zeros(len(points)))
+        grid.record_met(torch.tensor([[0.5, 0.5, 0.5]]), torch.tensor([8.0]))
+        updated(grid, lambda points: torch.zeros(len(points)), num_cells=0, block=block)
+        assert int(grid.occupied.sum()) == expected

@@ -1,0 +1,260 @@
+"""Poses corrected while training: rays and cameras agree, what can't be seen stays, what runs away is undone."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from tests.method_factory import BOX, CONFIG, initial_data, make_model, make_rays
+from tests.pose_factory import HEIGHT, MIDDLE, box_around, cameras, refinement, some_pixels
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.rays import RayBundle
+from unmix_plugin.field import CoefficientField
+from unmix_plugin.light.shading import Lamplight
+from unmix_plugin.model import UnmixModel
+from unmix_plugin.poses.knots import Knots, row_waves
+from unmix_plugin.poses.refinement import COARSEST_PIXEL, LARGEST_STEP, PoseRefinement
+from unmix_plugin.poses.settings import PoseConfig
+
+
+def test_a_line_camera_has_knots_a_few_rows_apart_and_a_frame_camera_one():
+    knots = Knots.of(cameras())
+    assert knots.rows == (0, HEIGHT, 0)
+    assert knots.counts == [1, 11, 1]
+    assert_close(knots.heights(1), torch.linspace(0, 40, 11))
+    assert_close(knots.positions(cameras())[[0, 12]], cameras().camera_to_world[[0, 2], :, 3])
+
+
+def test_nothing_changes_before_a_step_is_taken():
+    views, coords = some_pixels(1)
+    rays = cameras().generate_rays(views, coords)
+    moved = refinement(size=0.0)(rays)
+    assert torch.equal(moved.origins, rays.origins)
+    assert torch.equal(moved.directions, rays.directions)
+
+
+@pytest.mark.parametrize("lens", ["fixed", "focal", "radial"])
+@pytest.mark.parametrize("view", [0, 1, 2])
+def test_corrected_cameras_send_the_rays_of_training(lens, view):
+    views, coords = some_pixels(view)
+    mine = refinement(lens)(cameras().generate_rays(views, coords))
+    theirs = refinement(lens).refined(cameras()).generate_rays(views, coords)
+    # Key poses turn about one axis between knots, corrections add up: they differ by products of small angles.
+    assert_close(mine.origins, theirs.origins, atol=2e-4, rtol=0)
+    assert_close(mine.directions, theirs.directions, atol=4e-4, rtol=0)
+    given = cameras().generate_rays(views, coords)
+    assert (mine.directions - given.directions).norm(dim=1).mean() > 0.01
+
+
+def test_gradients_of_moved_rays_are_those_of_finite_differences():
+    found = refinement("radial").double()
+    views = torch.tensor([0, 1, 1, 2])
+    rays = cameras().generate_rays(views, torch.tensor([[2.0, 3.0], [4.0, 11.0], [9.0, 39.0], [1.0, 30.0]]))
+    assert rays.axes is not None
+    rays = replace(
+        rays, origins=rays.origins.double(), directions=rays.directions.double(), axes=rays.axes.double()
+    )
+
+    def moved(steps: torch.Tensor, lens: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        out = torch.func.functional_call(found, {"steps": steps, "lens.steps": lens}, (rays,))
+        return out.origins, out.directions
+
+    inputs = (found.steps.detach().requires_grad_(), found.lens.steps.detach().requires_grad_())
+    assert torch.autograd.gradcheck(moved, inputs, eps=1e-6, atol=1e-5)
+
+
+def steps_to(corrections: torch.Tensor, knots: Knots) -> torch.Tensor:
+    """Steps that add up to these corrections at the knots."""
+    parts = corrections.split(knots.counts)
+    return torch.cat(
+        [part if len(part) == 1 else torch.linalg.solve(row_waves(len(part)), part) for part in parts]
+    )
+
+
+@pytest.mark.parametrize("pixel_size", [0.1, 0.003])
+def test_what_moves_all_views_alike_is_no_correction(pixel_size):
+    """Turning, moving and scaling the world about its middle leaves nothing; the rest stays."""
+    knots, own = Knots.of(cameras()), cameras()
+    found, offsets = refinement(pixel_size=pixel_size), Knots.of(own).positions(own) - MIDDLE
+    before = found.corrections.detach()
+    turn, shift, growth = torch.tensor([0.1, -0.2, 0.3]), torch.tensor([0.3, 0.1, -0.2]), 0.2
+    moves = torch.linalg.cross(turn.expand_as(offsets), offsets) + shift + growth * offsets
+    similar = torch.cat([turn.expand_as(offsets), moves / found.reach[:, None]], dim=1)
+    with torch.no_grad():
+        found.steps.add_(steps_to(similar / found.scale[:, None], knots))
+    assert_close(found.corrections.detach(), before, atol=1e-6, rtol=0)
+    assert before.norm() > 0.05 * float(found.scale.min())
+    with torch.no_grad():
+        found.steps.copy_(steps_to(before / found.scale[:, None], knots))
+    assert_close(found.corrections.detach(), before, atol=1e-6, rtol=0)
+    assert sum(knots.counts) == len(before)
+
+
+def test_a_view_that_runs_away_gets_its_pose_back_and_keeps_it():
+    rows = (0,) * 6
+    found = PoseRefinement(rows)
+    places = 4 * torch.nn.functional.normalize(
+        torch.randn(6, 3, generator=torch.Generator().manual_seed(0)), dim=1
+    )
+    found.begin(places, box_around(torch.zeros(3)), 0.1)
+    found.gauge.zero_()
+    with torch.no_grad():
+        found.steps.fill_(0.01)
+        found.steps[2, 0] = 2 * LARGEST_STEP
+    found.undo_runaways()
+    assert found.is_free.tolist() == [True, True, False, True, True, True]
+    assert found.num_undone == 1
+    with torch.no_grad():
+        found.steps[2, 1] = 0.1
+    assert torch.equal(found.corrections[2].detach(), torch.zeros(6))
+    assert bool((found.corrections[0] != 0).all())
+
+
+def test_steps_are_a_share_of_a_pixel_and_bounds_a_share_of_the_picture():
+    """The cameras stand at 2, 4, 16 and 16 from a scene of half edge 1; at its middle a pixel is 0.0272 wide."""
+    found = PoseRefinement((0,) * 4)
+    directions = torch.eye(3)[[0, 1, 2, 0]]
+    distances = torch.tensor([2.0, 4.0, 16.0, 16.0])
+    found.begin(distances[:, None] * directions, box_around(torch.zeros(3), 1.0), 4 * COARSEST_PIXEL)
+    found.gauge.zero_()
+    with torch.no_grad():
+        found.steps.fill_(0.1)
+        found.steps[3] = 0.3  # 0.075 radians about each axis, where the scene spans 0.0625
+    turns = found.corrections.detach()[:3, :3].norm(dim=1)
+    assert_close(turns / turns[0], torch.tensor([1.0, 1.0, 0.25]))
+    found.undo_runaways()
+    assert found.is_free.tolist() == [True, True, True, False]
+
+
+def test_when_most_views_run_away_all_are_undone():
+    found = PoseRefinement((0,) * 4)
+    with torch.no_grad():
+        found.steps.fill_(0.01)
+        found.steps[1:, 0] = 1.0
+    found.undo_runaways()
+    assert found.num_undone == 4
+    assert torch.equal(found.corrections.detach(), torch.zeros(4, 6))
+
+
+def test_while_the_grid_is_coarse_a_view_that_runs_away_may_try_again():
+    found = PoseRefinement((0,) * 4)
+    with torch.no_grad():
+        found.steps.fill_(0.01)
+        found.steps[2, 0] = 1.0
+    found.undo_runaways(is_final=False)
+    assert found.num_undone == 0
+    assert torch.equal(found.corrections[2].detach(), torch.zeros(6))
+    assert bool((found.corrections[[0, 1, 3]] != 0).all())
+    with torch.no_grad():
+        found.steps[2, 0] = 0.1
+    assert float(found.corrections[2, 0].detach()) == pytest.approx(0.1)
+
+
+def test_a_shift_counts_by_the_distance_to_the_middle_of_the_scene():
+    found = PoseRefinement((0, 0))
+    found.begin(torch.tensor([[4.0, 0.0, 0.0], [0.0, 2.0, 0.0]]), box_around(torch.zeros(3)), 0.1)
+    found.gauge.zero_()
+    rays = RayBundle(torch.zeros(2, 3), torch.eye(3)[:2], torch.arange(2))
+    rays = replace(rays, axes=rays.directions, image_y=torch.zeros(2))
+    with torch.no_grad():
+        found.steps[:, 5] = 0.2
+        moved = found(rays).origins.norm(dim=1)
+    assert_close(float(found.figures()["pose_shift"]), float((moved / torch.tensor([4.0, 2.0])).mean()))
+    assert float(moved[0]) > 0.1
+
+
+def refining_model() -> UnmixModel:
+    torch.manual_seed(0)
+    config = replace(CONFIG, poses="refine", pose_refinement=PoseConfig(start=0.0, coarse_until=0.5))
+    model: UnmixModel = config.setup(scene_box=BOX, metadata=make_model().metadata)
+    places = torch.tensor([[0.0, 0.0, 4.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0]])
+    with torch.no_grad():
+        model.initialise({**initial_data(), "knots": places.numpy()}, torch.Generator().manual_seed(0))
+        model.field.get_parameter("table").normal_(std=0.5)
+    return model
+
+
+def test_what_rays_meet_counts_as_probed_since_nothing_is_carved():
+    model = refining_model().train()
+    model.generator = torch.Generator().manual_seed(0)
+    assert bool(model.grid.reachable.all())
+    rays = make_rays(200)
+    rays = replace(rays, axes=rays.directions, image_y=torch.zeros(200))
+    batch = {"spectra": torch.rand(200, 5), "alpha": torch.ones(200), "pixels": torch.arange(200)}
+    model.observe(model.get_outputs(rays), batch)
+    nothing = torch.Generator().manual_seed(0)
+    model.grid.update(lambda points: torch.zeros(len(points)), 0.1, 0.5, 0, nothing)
+    assert 0.1 < model.grid.peak_densities.isfinite().float().mean() < 1
+
+
+class Blob(CoefficientField):
+    """A soft ball whose materials change smoothly; nothing of it reaches the box."""
+
+    def encode(self, positions: torch.Tensor, known: torch.Tensor | None = None) -> torch.Tensor:
+        return positions
+
+    def density_of(self, encoded: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return 20 * (-12 * encoded.square().sum(dim=1)).exp(), encoded
+
+    def abundances_of(self, features: torch.Tensor) -> torch.Tensor:
+        return torch.softmax(3 * torch.sin(4 * features + torch.arange(3)), dim=-1)
+
+    def get_outputs(
+        self,
+        positions: torch.Tensor,
+        directions: torch.Tensor,
+        features: torch.Tensor,
+        light: Lamplight | None = None,
+    ) -> dict[str, torch.Tensor]:
+        abundances = self.abundances_of(features)
+        specular = 0.3 * (1 + directions[:, :1] * directions[:, 1:2])
+        return {
+            "abundances": abundances,
+            "scaled_abundances": 0.7 * abundances,
+            "specular_coefficients": specular,
+        }
+
+
+def test_the_gradient_of_a_picture_by_a_pose_is_that_of_finite_differences():
+    model: Any = refining_model().train()
+    model.field, model.step = Blob(), 0.01
+    model.config = replace(model.config, renderer=replace(model.config.renderer, coarse_samples=4096))
+    model.poses.gauge.zero_()
+    steps = model.poses.steps
+    pose = torch.tensor([[[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4.0]]])
+    camera = Cameras(pose, torch.full((1, 2), 40.0), torch.full((1, 2), 8.0), torch.zeros(1, 4), 16, 16)
+    rays = camera.image_rays(0)
+    weights = torch.randn(len(rays), 5, generator=torch.Generator().manual_seed(3))
+
+    def seen() -> torch.Tensor:
+        model.generator = torch.Generator().manual_seed(0)
+        return (model.get_outputs(rays)["spectral"] * weights).sum() / len(rays)
+
+    seen().backward()
+    expected = []
+    with torch.no_grad():
+        for number in range(6):
+            values = []
+            for side in (-1, 1):
+                steps[0, number] = side * 4e-3
+                values.append(float(seen()))
+            steps[0, number] = 0.0
+            expected.append((values[1] - values[0]) / 8e-3)
+    wanted = torch.tensor(expected)
+    assert float((steps.grad[0] - wanted).norm() / wanted.norm()) < 0.02
+    assert torch.equal(steps.grad[1:], torch.zeros(2, 6))
+
+
+def test_levels_without_weight_change_nothing():
+    model = refining_model()
+    points = torch.rand(20, 3, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        whole = model.field.get_density(points)[1]
+        model._begin_step(1, 0.0)
+        coarse = model.field.get_density(points)[1]
+        field: Any = model.field
+        field.table[int(field.layout.levels[1, 1]) :] += 1.0
+        assert_close(model.field.get_density(points)[1], coarse)
+    assert float((whole - coarse).abs().max()) > 1e-2

@@ -1,0 +1,127 @@
+"""Training that corrects poses: it carves by corrected cameras, goes on where it stopped, and moves its views."""
+
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import pytest
+import torch
+from rich.console import Console
+from torch.testing import assert_close
+
+from tests.engine.stopped_runs import stop_at
+from tests.method_factory import CONFIG
+from tests.scenes.scene_factory import make_scene
+from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
+from unmix_plugin.engine.configs import TrainerConfig
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.rotations import rotation_matrix
+from unmix_plugin.engine.pipeline import PipelineConfig
+from unmix_plugin.engine.runs.load_run import load_config, load_model
+from unmix_plugin.engine.training.trainer import Trainer
+from unmix_plugin.method_config import unmix_nerf
+from unmix_plugin.poses.refinement import PoseRefinement
+from unmix_plugin.poses.settings import PoseConfig
+from unmix_plugin.trained.open_run import open_run
+
+
+def config_for(folder: Path, poses: Literal["fixed", "refine"] = "refine", steps: int = 12) -> TrainerConfig:
+    data = HyperspectralDataManagerConfig(train_num_rays_per_batch=64, grid_resolution=16)
+    model = replace(CONFIG, num_endmembers=1, poses=poses, pose_refinement=PoseConfig(start=0.0))
+    return replace(
+        unmix_nerf.config,
+        data=folder / "scene",
+        output_dir=folder / "runs",
+        max_num_iterations=steps,
+        steps_per_log=4,
+        device="cpu",
+        pipeline=PipelineConfig(datamanager=data, model=model),
+    )
+
+
+def trained(config: TrainerConfig) -> Trainer:
+    trainer = Trainer(config, console=Console(file=io.StringIO()))
+    trainer.train()
+    return trainer
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    place = tmp_path_factory.mktemp("refined")
+    make_scene(place / "scene")
+    return place
+
+
+def test_poses_that_are_taken_as_they_are_leave_training_as_it_was(folder):
+    model = trained(config_for(folder, "fixed")).pipeline.model
+    assert model.poses is None
+    assert not [name for name, _ in model.named_parameters() if name.startswith("poses")]
+    assert "field.level_weights" not in model.state_dict()
+    rays, _ = Trainer(
+        config_for(folder, "fixed"), console=Console(file=io.StringIO())
+    ).pipeline.datamanager.next_train(0)
+    bare = replace(rays, axes=None, image_y=None)
+    model.generator = torch.Generator().manual_seed(0)
+    first = model.train().get_outputs(rays)["spectral"]
+    model.generator = torch.Generator().manual_seed(0)
+    assert torch.equal(first, model.get_outputs(bare)["spectral"])
+
+
+def test_space_is_carved_once_by_the_corrected_cameras(folder):
+    asked = []
+
+    class Watched(PoseRefinement):
+        def refined(self, cameras: Cameras) -> Cameras:
+            asked.append((trainer.step, super().refined(cameras)))
+            return asked[-1][1]
+
+    trainer = Trainer(config_for(folder, steps=20), console=Console(file=io.StringIO()))
+    model: Any = trainer.pipeline.model
+    assert bool(model.grid.reachable.all())
+    model.poses.__class__ = Watched
+    trainer.train()
+    datamanager: Any = trainer.pipeline.datamanager
+    [(step, cameras)] = asked
+    assert step == 6
+    hull = torch.from_numpy(datamanager.judge_again(cameras)["reachable"])
+    assert 0 < hull.float().mean() < 1
+    assert torch.equal(model.grid.reachable, hull)
+    assert not torch.equal(hull, torch.from_numpy(datamanager.initial_data()["reachable"]))
+    assert not bool((model.grid.occupied.bool() & ~model.grid.reachable).any())
+
+
+def test_nothing_is_carved_by_cameras_that_contradict_each_other(folder):
+    trainer = Trainer(config_for(folder), console=Console(file=io.StringIO()))
+    datamanager: Any = trainer.pipeline.datamanager
+    right = datamanager.train_cameras
+    turned = right.camera_to_world.clone()
+    turns = 0.3 * torch.randn(len(right), 3, generator=torch.Generator().manual_seed(0))
+    turned[:, :, :3] = rotation_matrix(turns) @ turned[:, :, :3]
+    assert set(datamanager.judge_again(right)) == {"reachable"}
+    assert datamanager.judge_again(replace(right, camera_to_world=turned)) == {}
+
+
+def test_a_resumed_refinement_is_the_one_that_was_never_stopped(folder):
+    straight = trained(config_for(folder))
+    stopped = stop_at(config_for(folder), 6)
+    resumed = trained(load_config(stopped.run))
+    expected, found = straight.pipeline.model.state_dict(), resumed.pipeline.model.state_dict()
+    assert float(expected["poses.steps"].abs().max()) > 0
+    for name, tensor in expected.items():
+        assert torch.equal(found[name], tensor), name
+
+
+def test_refined_poses_are_the_run_s_training_cameras(folder):
+    trainer = trained(config_for(folder))
+    loaded = load_model(trainer.run.path)
+    poses: Any = loaded.model.poses
+    expected = poses.refined(loaded.scene.train_cameras)
+    views = [view for view in open_run(trainer.run.path, "cpu").views if view.split == "train"]
+    found = torch.cat([view.camera.camera_to_world for view in views])
+    assert_close(found, expected.camera_to_world)
+    given = trainer.pipeline.datamanager.train_cameras.camera_to_world
+    assert float((found - given).abs().max()) > 1e-5
+    lines = (trainer.run.path / "metrics.jsonl").read_text().splitlines()
+    assert "poses" in json.loads(lines[-1])

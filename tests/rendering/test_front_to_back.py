@@ -1,0 +1,99 @@
+"""Pictures looked at from the front are those of the careful way, but for a stated error."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from tests.test_renderer import make, rays
+from tests.test_unbounded import make as make_unbounded
+from tests.test_unbounded import rays as rays_without_end
+from torch.testing import assert_close
+
+from unmix_plugin.rendering import front_to_back
+
+
+def textured(smallest_weight: float, opacity: float):
+    """A renderer and a field of as many different densities and materials as a table holds."""
+    renderer, field = make(smallest_weight=smallest_weight, pixel=0.03)
+    with torch.no_grad():
+        field.table.normal_(std=1.0, generator=torch.Generator().manual_seed(2))
+        field.log_initial_density = math.log(-math.log1p(-opacity) / renderer.step)
+    return renderer, field
+
+
+@pytest.mark.parametrize("opacity", [1e-4, 0.05, 0.9, 1 - 1e-10])
+def test_with_nothing_left_out_both_ways_are_equal(opacity):
+    renderer, field = textured(0.0, opacity)
+    bundle = rays(40)
+    with torch.no_grad():
+        careful = renderer.render(field, bundle).coefficients.packed
+    assert_close(renderer.composite(field, bundle).packed, careful, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("smallest_weight", "opacity"), [(1e-3, 0.05), (4e-3, 0.01), (4e-3, 0.3), (1e-3, 0.9)]
+)
+def test_what_is_left_out_costs_no_more_than_the_careful_way_and_a_few_smallest_weights(
+    smallest_weight, opacity
+):
+    """Light behind the end, samples that carry too little, and the bend of a network within merged samples."""
+    renderer, field = textured(smallest_weight, opacity)
+    bundle = rays(80)
+    with torch.no_grad():
+        careful = renderer.render(field, bundle).coefficients
+        exact = replace(renderer, smallest_weight=0.0).render(field, bundle).coefficients.packed
+    fast = renderer.composite(field, bundle)
+    assert_close(fast.abundances.sum(-1), fast.accumulation)
+    unit = torch.ones_like(exact[0])
+    unit[1] = 3.0  # distances: of the middle of the box
+    errors = [((x.packed - exact).abs() / unit).mean(dim=0) for x in (fast, careful)]
+    assert (errors[0] < errors[1] + 2 * smallest_weight).all()
+
+
+def test_a_ray_ends_where_hardly_any_light_is_left_and_counts_as_opaque(monkeypatch):
+    renderer, field = textured(4e-3, 0.9)
+    looked_at = []
+    encode = type(field).encode
+
+    def counted(self, positions, known=None):
+        looked_at.append(len(positions))
+        return encode(self, positions, known)
+
+    monkeypatch.setattr(type(field), "encode", counted)
+    with torch.no_grad():
+        field.table.zero_()
+    found = renderer.composite(field, rays(50))
+    assert sum(looked_at) == 50 * front_to_back._SAMPLES_AT_ONCE
+    assert_close(found.accumulation, torch.ones(50))
+
+
+@pytest.mark.parametrize("residual", [False, True])
+def test_rays_that_miss_see_nothing(residual):
+    renderer, field = make()
+    bundle = rays(3)
+    away = replace(bundle, directions=-bundle.directions)
+    found = replace(renderer, residual_on_last_sample=residual).composite(field, away)
+    assert found.packed.shape[0] == 3
+    assert (found.packed == 0).all()
+
+
+@pytest.mark.parametrize("opacity", [1e-3, 0.05])
+def test_the_last_sample_takes_all_the_light_that_is_left_as_in_the_careful_way(opacity):
+    renderer, field = textured(0.0, opacity)
+    renderer = replace(renderer, residual_on_last_sample=True)
+    bundle = rays(40)
+    with torch.no_grad():
+        careful = renderer.render(field, bundle).coefficients
+    found = renderer.composite(field, bundle)
+    assert_close(found.packed, careful.packed, rtol=1e-4, atol=1e-5)
+    assert_close(found.accumulation, torch.ones(40))
+
+
+@pytest.mark.parametrize("density", [1e-9, 0.3, 30.0])
+def test_a_world_without_end_and_its_sky_are_those_of_the_careful_way(density):
+    renderer, field = make_unbounded(density)
+    bundle = rays_without_end(30)
+    with torch.no_grad():
+        careful = renderer.render(field, bundle).coefficients.packed
+    assert_close(renderer.composite(field, bundle).packed, careful, rtol=1e-3, atol=1e-4)

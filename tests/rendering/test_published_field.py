@@ -1,0 +1,114 @@
+"""The field as published, and the method registered with it."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from tests.method_factory import BOX, NUM_BANDS, make_model, make_rays, scene_of
+from unmix_plugin.engine.runs.config_json import config_from_json, config_to_json
+from unmix_plugin.method_config import unmix_nerf_published
+from unmix_plugin.model_settings import UnmixModelConfig
+from unmix_plugin.rendering.published_field import PublishedField, PublishedFieldConfig
+
+SMALL = PublishedFieldConfig(num_levels=3, log2_rows_per_level=8, finest_resolution=32, hidden_width=16)
+
+
+@pytest.fixture
+def field() -> PublishedField:
+    torch.manual_seed(0)
+    made: PublishedField = SMALL.setup(
+        scene_box=BOX, num_endmembers=3, num_specular=NUM_BANDS, initial_density=2.0, pixel_size=0.1
+    )
+    with torch.no_grad():
+        made.table.normal_(std=0.5)
+    return made
+
+
+def points(count: int = 50) -> tuple[torch.Tensor, torch.Tensor]:
+    g = torch.Generator().manual_seed(1)
+    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=g), dim=-1)
+    return torch.rand(count, 3, generator=g) * 2 - 1, directions
+
+
+def test_abundances_sum_to_one_and_scales_only_darken(field):
+    positions, directions = points()
+    density, features = field.get_density(positions)
+    outputs = field.get_outputs(positions, directions, features)
+    assert_close(outputs["abundances"].sum(-1), torch.ones(50))
+    assert (outputs["scaled_abundances"] < outputs["abundances"]).all()
+    assert density.min() > 0
+    assert_close(field.abundances_of(features), outputs["abundances"])
+
+
+def test_scales_differ_between_endmembers_and_specular_spectra_between_bands(field):
+    positions, directions = points()
+    outputs = field.get_outputs(positions, directions, field.get_density(positions)[1])
+    scales = outputs["scaled_abundances"] / outputs["abundances"]
+    assert (scales.std(dim=-1) > 1e-4).all()
+    assert (outputs["specular_coefficients"].std(dim=-1) > 1e-4).all()
+
+
+def test_the_view_dependent_part_sees_the_direction_and_materials_do_not(field):
+    positions, directions = points()
+    features = field.get_density(positions)[1]
+    one, other = (field.get_outputs(positions, along, features) for along in (directions, -directions))
+    assert torch.equal(one["scaled_abundances"], other["scaled_abundances"])
+    assert not torch.allclose(one["specular_coefficients"], other["specular_coefficients"])
+
+
+def test_a_known_encoding_changes_no_value_and_no_gradient(field):
+    positions, _ = points()
+    with torch.no_grad():
+        known = field.encode(positions)
+    found = []
+    for encoded in (field.encode(positions), field.encode(positions, known)):
+        density, features = field.density_of(encoded)
+        (gradient,) = torch.autograd.grad(density.sum() + features.sum(), field.table)
+        found.append((density.detach(), gradient))
+    assert_close(found[0], found[1])
+
+
+def test_the_registered_settings_are_written_down_and_read_back():
+    config = unmix_nerf_published.config
+    restored = config_from_json(config_to_json(config), config)
+    assert restored == config
+    model = restored.pipeline.model
+    assert isinstance(model, UnmixModelConfig)
+    assert isinstance(model.field, PublishedFieldConfig)
+
+
+def test_a_model_as_published_has_one_specular_value_a_band_and_the_probe_chooses():
+    published = unmix_nerf_published.config.pipeline.model
+    assert isinstance(published, UnmixModelConfig)
+    model = make_model(
+        field=SMALL, specular=published.specular, segmentation=published.segmentation, losses=published.losses
+    )
+    assert model.field.num_specular == NUM_BANDS
+    assert model.materials.margin_error is None
+    batch = {"spectra": torch.rand(8, NUM_BANDS), "alpha": torch.ones(8), "pixels": torch.arange(8)}
+    losses = model.get_loss_dict(model.get_outputs(make_rays(8)), batch)
+    assert set(losses) == {"spectral", "rgb"}
+    scene = scene_of(model)
+    view = scene.look(scene.views[0].camera)
+    probabilities, scores = view["probe_probabilities"], view["material_scores"]
+    assert_close(probabilities.sum(-1), torch.ones(probabilities.shape[:2]))
+    assert torch.equal(probabilities.argmax(-1), scores.argmax(-1))
+    seen = view.opacity > 0.5
+    assert torch.equal(view["segmentation"][seen].long(), probabilities.argmax(-1)[seen])
+
+
+def test_a_scene_is_not_changed_by_what_becomes_of_its_model():
+    model = make_model()
+    scene = scene_of(model)
+    camera = scene.views[0].camera
+    before = scene.render(camera, ["spectral"])["spectral"]
+    with torch.no_grad():
+        model.field.get_parameter("table").mul_(-2)
+        model.endmembers.mul_(0.5)
+        model.grid.clearance.fill_(1)
+    assert torch.equal(scene.render(camera, ["spectral"])["spectral"], before)
+    dark = replace(scene, materials=replace(scene.materials, endmembers=0 * scene.materials.endmembers))
+    assert dark.render(camera, ["diffuse"])["diffuse"].max() == 0
+    assert torch.equal(scene.render(camera, ["spectral"])["spectral"], before)

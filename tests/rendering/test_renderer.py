@@ -1,0 +1,132 @@
+"""The renderer of coefficients, apart from the model that owns it."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from unmix_plugin.engine.geometry.rays import RayBundle
+from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.field import UnmixField, UnmixFieldConfig
+from unmix_plugin.operators.grid_cells import clearance_of
+from unmix_plugin.presets import WITH_ALPHA, WITHOUT_ALPHA
+from unmix_plugin.rendering.renderer import VolumeRenderer
+from unmix_plugin.rendering.settings import RendererConfig
+
+BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
+PIXEL = 0.1
+
+
+def make(
+    box: SceneBox = BOX, smallest_weight: float = WITH_ALPHA.smallest_weight, pixel: float = PIXEL
+) -> tuple[VolumeRenderer, UnmixField]:
+    torch.manual_seed(0)
+    field = UnmixField(UnmixFieldConfig(log2_rows_per_level=8), box, 3, 1, 1.0, PIXEL)
+    cells = torch.ones(8, 8, 8)
+    step = pixel / 1.5
+    return VolumeRenderer(
+        box, clearance_of(cells > 0), cells > 0, step, smallest_weight, rays_per_chunk=7
+    ), field
+
+
+def rays(num_rays: int) -> RayBundle:
+    generator = torch.Generator().manual_seed(1)
+    targets = torch.rand(num_rays, 3, generator=generator) - 0.5
+    origins = torch.tensor([0.0, 0.0, 3.0]).repeat(num_rays, 1)
+    directions = torch.nn.functional.normalize(targets - origins, dim=-1)
+    return RayBundle(origins, directions, torch.zeros(num_rays, dtype=torch.int64))
+
+
+def test_a_homogeneous_box_absorbs_what_beer_lambert_says():
+    renderer, field = make()
+    bundle = rays(20)
+    with torch.no_grad():
+        field.table.zero_()  # then the network's output is zero, and the density its initial value
+        rendered = renderer.render(field, bundle)
+    t_near, t_far = BOX.intersect(bundle.origins, bundle.directions)
+    assert rendered.num_samples == pytest.approx(((t_far - t_near) / renderer.step).sum().item(), rel=0.02)
+    found = rendered.coefficients
+    assert_close(found.accumulation, 1 - torch.exp(-(t_far - t_near)), atol=0.02, rtol=0)
+    assert_close(found.abundances.sum(-1), found.accumulation)
+
+
+@pytest.mark.parametrize("density", [0.1, 10.0])
+def test_spread_counts_the_samples_that_density_is_spread_over(density):
+    """Closed form in a homogeneous box; a sample of depth 10 counts a few times one of depth 0.1, not 100 times."""
+    renderer, field = make()
+    bundle = rays(20)
+    with torch.no_grad():
+        field.table.zero_()
+        field.log_initial_density = math.log(density / renderer.step)
+        spread = renderer.render(field, bundle).spread
+    t_near, t_far = BOX.intersect(bundle.origins, bundle.directions)
+    carrying = [
+        sum(
+            math.exp(-i * density) * (1 - math.exp(-density)) > renderer.smallest_weight
+            for i in range(int(length / renderer.step))
+        )
+        for length in (t_far - t_near).tolist()
+    ]
+    expected = sum(carrying) / 20 * math.log1p(density / 0.03)
+    assert float(spread) == pytest.approx(expected, rel=0.05)
+
+
+def test_without_alpha_an_untrained_scene_can_grow_dense_along_the_whole_of_a_ray():
+    """Every sample takes part although it starts behind semi-transparent density; with alpha, far ones are left out."""
+    bundle, found = rays(20), {}
+    for preset in (WITHOUT_ALPHA, WITH_ALPHA):
+        renderer, field = make(smallest_weight=preset.smallest_weight, pixel=0.02)
+        with torch.no_grad():
+            field.table.zero_()
+            field.log_initial_density = math.log(-math.log1p(-0.01) / renderer.step)
+            rendered = renderer.render(field, bundle)
+        spread_a_sample = math.log1p(-math.log1p(-0.01) / 0.03)
+        found[preset] = float(rendered.spread) * 20 / spread_a_sample / rendered.num_samples
+    assert found[WITHOUT_ALPHA] == pytest.approx(1, rel=0.01)
+    assert found[WITH_ALPHA] < 0.8
+
+
+def test_rays_rendered_in_chunks_are_those_rendered_together():
+    renderer, field = make()
+    bundle = rays(20)
+    together = replace(renderer, rays_per_chunk=20).composite(field, bundle)
+    assert_close(renderer.composite(field, bundle).packed, together.packed)
+
+
+def test_rendering_changes_nothing_and_draws_nothing_from_the_global_generator():
+    renderer, field = make()
+    before = {name: value.clone() for name, value in field.state_dict().items()}
+    torch.manual_seed(3)
+    expected = torch.rand(1)
+    torch.manual_seed(3)
+    generator = torch.Generator().manual_seed(4)
+    jittered = renderer.render(field, rays(20), generator).coefficients.packed
+    assert torch.equal(torch.rand(1), expected)
+    assert all(torch.equal(value, before[name]) for name, value in field.state_dict().items())
+    assert not torch.equal(jittered, renderer.render(field, rays(20)).coefficients.packed)
+    again = renderer.render(field, rays(20), torch.Generator().manual_seed(4)).coefficients.packed
+    assert torch.equal(jittered, again)
+
+
+def test_points_are_asked_cell_by_cell_and_outside_the_box_is_nothing():
+    renderer, _ = make()
+    renderer.clearance[:4] = 1
+    points = torch.tensor([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0], [1.5, 0.0, 0.0]])
+    assert renderer.is_occupied(points).tolist() == [False, True, False]
+    assert renderer.is_reachable(points).tolist() == [True, True, False]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"samples_per_pixel": 0.0}, "samples-per-pixel of 0.01 to 100 or auto"),
+        ({"smallest_weight": 1.0}, r"smallest-weight in \[0, 1\) or auto"),
+        ({"visible_weight": 0.0}, r"visible-weight in \(0, 1\] or auto"),
+    ],
+)
+def test_impossible_settings_are_refused(settings, message):
+    with pytest.raises(ConfigError, match=message):
+        RendererConfig(**settings)

@@ -1,0 +1,156 @@
+"""Rendering an unbounded world: what rays see outside the box, and the sky that fills what is left."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from tests.method_factory import BOX as SMALL_BOX
+from tests.method_factory import CONFIG, initial_data, make_model, make_rays
+from unmix_plugin.editing.edited_field import EditedField
+from unmix_plugin.engine.geometry.rays import RayBundle
+from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.processes.processes import Processes
+from unmix_plugin.field import UnmixField, UnmixFieldConfig
+from unmix_plugin.operators.gradients import scale_gradient
+from unmix_plugin.operators.grid_cells import clearance_of
+from unmix_plugin.operators.occupancy import OccupancyGrid
+from unmix_plugin.rendering.grid_upkeep import update_grid
+from unmix_plugin.rendering.renderer import VolumeRenderer
+
+BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
+
+
+def make(density: float = 1e-6) -> tuple[VolumeRenderer, UnmixField]:
+    """A field that is as dense everywhere."""
+    torch.manual_seed(0)
+    field = UnmixField(UnmixFieldConfig(log2_rows_per_level=8), BOX, 3, 1, density, 0.1, is_unbounded=True)
+    with torch.no_grad():
+        field.table.zero_()
+    cells = torch.ones(16, 16, 16)
+    return VolumeRenderer(BOX, clearance_of(cells > 0), cells > 0, 0.05, 0.0, is_unbounded=True), field
+
+
+def rays(num_rays: int) -> RayBundle:
+    generator = torch.Generator().manual_seed(1)
+    directions = torch.nn.functional.normalize(torch.randn(num_rays, 3, generator=generator), dim=-1)
+    origins = torch.tensor([0.3, -0.2, 0.4]).repeat(num_rays, 1)
+    return RayBundle(origins, directions, torch.zeros(num_rays, dtype=torch.int64))
+
+
+def test_the_sky_fills_what_matter_leaves_and_is_no_matter():
+    bundle = rays(20)
+    for density in (1e-9, 0.3, 30.0):
+        renderer, field = make(density)
+        with torch.no_grad():
+            found = renderer.render(field, bundle)
+            sky = field.sky(bundle.directions)
+            bare = renderer.render(_WithoutSky(field), bundle)
+        assert sky is not None
+        left = 1 - found.coefficients.accumulation[:, None]
+        assert_close(found.coefficients.accumulation, bare.coefficients.accumulation)
+        assert_close(found.coefficients.abundances, bare.coefficients.abundances)
+        light = found.coefficients.scaled_abundances - bare.coefficients.scaled_abundances
+        assert_close(light, left * sky[:, -1:] * sky[:, :-1], atol=1e-6, rtol=0)
+        assert_close(found.mixtures.sum(-1), torch.ones(20), atol=1e-5, rtol=0)
+        assert_close(found.coefficients.abundances.sum(-1), found.coefficients.accumulation)
+
+
+class _WithoutSky(EditedField):
+    """The same field before nothing."""
+
+    def __init__(self, field: UnmixField) -> None:
+        super().__init__(field, torch.ones(3, dtype=torch.bool), torch.ones(1, 3))
+
+    def sky(self, directions):
+        return None
+
+
+def test_a_world_without_end_absorbs_a_finite_part_of_the_light():
+    """Optical depth of a density of 1 from the middle outwards: 1 in the cube, ln 2 up to r = 2, 1 beyond."""
+    renderer, field = make(0.2)
+    bundle = RayBundle(torch.zeros(1, 3), torch.tensor([[1.0, 0.0, 0.0]]), torch.zeros(1, dtype=torch.int64))
+    with torch.no_grad():
+        found = replace(renderer, step=0.005).render(field, bundle).coefficients
+    expected = 1 - math.exp(-0.2 * (2 + math.log(2)))
+    assert float(found.accumulation) == pytest.approx(expected, abs=0.02)
+    assert 0 < float(found.ray_distance) < 512
+
+
+def test_rays_end_on_what_stands_outside_the_box():
+    renderer, field = make(50.0)
+    inner = renderer.is_occupied(torch.tensor([[3.0, 0.0, 0.0]]))
+    assert bool(inner)
+    occupied = renderer.occupied.clone()
+    occupied[4:12, 4:12, 4:12] = False  # nothing in the box
+    shell = VolumeRenderer(BOX, clearance_of(occupied), occupied, 0.05, 0.0, is_unbounded=True)
+    with torch.no_grad():
+        found = shell.render(field, rays(30)).coefficients
+    assert (found.accumulation > 0.99).all()
+    assert (found.ray_distance > 0.5).all()
+    assert found.ray_distance.isfinite().all()
+
+
+def test_removing_a_material_takes_its_light_out_of_the_sky():
+    _, field = make()
+    edited = EditedField(field, torch.tensor([True, False, True]), torch.ones(1, 3))
+    before, after = field.sky(rays(5).directions), edited.sky(rays(5).directions)
+    assert before is not None
+    assert after is not None
+    assert (after[:, 1] == 0).all()
+    assert_close(after[:, [0, 2, 3]], before[:, [0, 2, 3]])
+
+
+def test_a_bounded_field_has_no_sky_and_no_parameters_for_one():
+    field = UnmixField(UnmixFieldConfig(log2_rows_per_level=8), BOX, 3, 1, 1.0, 0.1)
+    assert field.sky(rays(2).directions) is None
+    assert not [name for name in field.state_dict() if "sky" in name]
+
+
+def test_what_is_near_a_camera_learns_more_slowly_but_looks_the_same():
+    values = torch.tensor([1.5, 2.5], requires_grad=True)
+    scaled = scale_gradient(values, torch.tensor([0.25, 1.0]))
+    assert torch.equal(scaled, values)
+    scaled.sum().backward()
+    assert values.grad is not None
+    assert values.grad.tolist() == [0.25, 1.0]
+
+
+def test_training_tells_the_grid_what_rays_meet_in_a_world_without_end_and_only_there():
+    boxed = make_model(has_alpha=False).train()
+    metadata = {**boxed.metadata, "is_unbounded": True}
+    world = CONFIG.setup(scene_box=SMALL_BOX, metadata=metadata).train()
+    with torch.no_grad():
+        world.initialise(initial_data(), torch.Generator().manual_seed(0))
+    rays = make_rays(200)
+    batch = {"spectra": torch.rand(200, 5), "alpha": torch.ones(200), "pixels": torch.arange(200)}
+    for model in (boxed, world):
+        model.generator = torch.Generator().manual_seed(0)
+        model.observe(model.get_outputs(rays), batch)
+    assert boxed.grid.met is None
+    assert world.grid.met is not None
+    is_met = world.grid.met >= 0
+    centre = world.renderer.space.to_unit(torch.zeros(1, 3))
+    assert 0.5 < is_met.float().mean() < 1
+    assert bool(is_met[tuple((centre[0] * 8).long())])
+    density = world.field.get_density(torch.zeros(1, 3))[0]
+    assert_close(world.grid.met[is_met].mean(), density[0], rtol=0.5, atol=0)
+
+
+def test_a_world_without_end_begins_with_cells_as_large_as_those_of_a_coarse_grid():
+    """And with its own in the second half; a bounded scene has its own from the start."""
+    blocks: list[int] = []
+
+    class Watched(OccupancyGrid):
+        def update(self, *args: Any, block: int = 1, **words: Any) -> None:
+            blocks.append(block)
+
+    for is_unbounded in (True, False):
+        renderer = replace(make()[0], is_unbounded=is_unbounded)
+        grid = Watched(torch.ones(128, 128, 128) > 0)
+        for progress in (0.0, 0.4, 0.6):
+            update_grid(grid, make()[1], renderer, Processes(), None, progress)
+    assert blocks == [2, 2, 1, 1, 1, 1]

@@ -1,0 +1,1 @@
+"""All that light does: lamp, shading, shadows, gains of views."""

@@ -1,0 +1,1 @@
+"""What a training asks for, and how it is compared with what was measured."""

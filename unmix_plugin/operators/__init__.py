@@ -1,0 +1,1 @@
+"""Differentiable rendering operators, each a Warp kernel and a PyTorch twin that defines it."""

@@ -1,0 +1,1 @@
+"""All that moves cameras while training."""

@@ -1,0 +1,114 @@
+"""Keeps the occupancy grid up to date while training: which cells are probed, and which count as occupied."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from unmix_plugin.engine.processes.processes import Processes
+from unmix_plugin.field import CoefficientField
+from unmix_plugin.operators.occupancy import OccupancyGrid
+from unmix_plugin.rendering.renderer import VolumeRenderer
+
+_GRID_INTERVAL = 16
+"""Steps between updates of the occupancy grid."""
+_PROBED_CELLS = 32_768
+"""Cells of the grid that an update probes."""
+_GRID_DECAY = 0.5
+"""Factor on the remembered density of a probed cell: lower forgets emptied space sooner."""
+_OCCUPIED_OPACITY = 0.03
+"""Opacity of one sample's interval from which a cell counts as occupied."""
+_OPACITY_ACROSS = 0.08
+"""The same of a cell that is several samples wide even the short way: without it soft edges would end in steps as large
+as cells. Cells of a flat box are thin, and rays cross them the short way."""
+
+_FIRST_CELLS = 64
+"""Along an edge of the grid of a world without end, in the first part of the training: smaller cells are emptied before
+surfaces are found."""
+_FIRST_CELLS_UNTIL = 0.5
+"""That part."""
+
+_SHARE_OF_PIXELS = 0.07
+"""Of the pixels of the training views, that must be looked at before it is decided anew what is visible. In large
+pictures a cell has many pixels: fewer rays would by chance miss what few views see, and it would be left out for good.
+"""
+
+
+def is_due(step: int) -> bool:
+    """Whether the grid is updated before this training step."""
+    return step % _GRID_INTERVAL == 0
+
+
+def update_grid(
+    grid: OccupancyGrid,
+    field: CoefficientField,
+    renderer: VolumeRenderer,
+    processes: Processes,
+    generator: torch.Generator | None,
+    progress: float,
+    num_pixels: int = 0,
+) -> None:
+    """Probe the field in some cells, the same in each process, and decide anew what is occupied.
+
+    Args:
+        grid: What is updated in place.
+        field: Whose densities are probed.
+        renderer: With the distance of samples of the present training step.
+        processes: That train together; they share which cells their rays saw.
+        generator: Source of the cells.
+        progress: Part of the training that is over.
+        num_pixels: Of the training views; 0 if it is not known.
+    """
+    device = torch.device("cpu") if generator is None else generator.device
+    drawn = torch.randint(2**62, (1,), generator=generator, device=device)
+    seed = int(processes.of_first(drawn))
+    share_sights(grid, processes)
+    space = renderer.space
+    begins_coarsely = renderer.is_unbounded and progress < _FIRST_CELLS_UNTIL
+    grid.update(
+        lambda points: field.get_density(space.from_unit(points))[0],
+        threshold=occupied_density(renderer, max(grid.occupied.shape)),
+        decay=_GRID_DECAY,
+        num_cells=_PROBED_CELLS,
+        generator=torch.Generator().manual_seed(seed),
+        block=max(len(grid.occupied) // _FIRST_CELLS, 1) if begins_coarsely else 1,
+        fewest_rays=int(_SHARE_OF_PIXELS * num_pixels),
+    )
+
+
+def occupied_density(renderer: VolumeRenderer, num_cells: int) -> float:
+    """Density from which a cell counts as occupied.
+
+    Args:
+        renderer: With the distance of samples.
+        num_cells: Along an edge of the grid.
+
+    Returns:
+        Optical depth per model unit.
+    """
+    by_sample = -math.log1p(-_OCCUPIED_OPACITY) / renderer.step
+    across = -math.log1p(-_OPACITY_ACROSS) / (float(renderer.space.shortest_edge) / num_cells)
+    return min(by_sample, across)
+
+
+def share_sights(grid: OccupancyGrid, processes: Processes) -> None:
+    """Take in which cells the rays of all processes saw, and what they met; twice is as good as once."""
+    visibility = grid.visibility
+    processes.smallest(visibility.lowest_view)
+    processes.largest(visibility.highest_view)
+    processes.largest(visibility.num_rays)
+    if grid.met is not None:
+        processes.largest(grid.met)
+
+
+def record_seen(
+    grid: OccupancyGrid, outputs: dict[str, Tensor], visible_weight: float, processes: Processes
+) -> None:
+    """Note which cells the rays of a batch saw, from the model's outputs; nothing where all cells stay visible."""
+    if visible_weight >= 1:
+        return
+    is_seen = outputs["weights"] > visible_weight
+    num_rays = len(outputs["accumulation"]) * processes.count
+    grid.visibility.record(outputs["positions"], outputs["views"], is_seen, num_rays)

@@ -1,0 +1,108 @@
+"""The field as the method's paper and its authors' code have it, for the method `unmix-nerf-published`.
+
+Notation: `S` samples, `K` endmembers, `B` bands. A hash grid gives density and geometry features g; with a positional
+encoding PE of the point, one network gives abundances and the tint h, another a scale for each endmember in (0, 1).
+The view-dependent spectrum sees direction and PE only, one value a band.
+
+Source: Perez et al. 2025, section 3, and the authors' code. docs/method.md lists what still differs.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.instantiate import Target
+from unmix_plugin.field import (
+    NUM_DIRECTION_FEATURES,
+    UnmixField,
+    UnmixFieldConfig,
+    direction_features,
+)
+from unmix_plugin.light.networks import bias_free_network
+from unmix_plugin.light.shading import Lamplight
+
+_NUM_FREQUENCIES = 2
+_NUM_POSITION_FEATURES = 3 * 2 * _NUM_FREQUENCIES
+
+
+@dataclass(frozen=True)
+class PublishedFieldConfig(UnmixFieldConfig):
+    """Sizes as published; `cells_per_pixel`, `scale` and `specular_bias` have no effect here."""
+
+    _target: Target = field(default_factory=lambda: PublishedField)
+    num_levels: int = 16
+    features_per_level: int = 2
+    log2_rows_per_level: int = 19
+    finest_resolution: int = 2048
+    """Cells along the scene box's longest edge on the finest level."""
+    temperature: float = 0.4
+
+    def cells_of_finest_level(self, scene_box: SceneBox, pixel_size: float) -> int:
+        """As published, whatever the images."""
+        return max(self.coarsest_resolution, self.finest_resolution)
+
+
+class PublishedField(UnmixField):
+    """Density, abundances, scales and one view-dependent value a band (J = B), of points in a scene box."""
+
+    def _make_networks(self) -> None:
+        width, num_features = self.config.hidden_width, self.config.num_features + _NUM_POSITION_FEATURES
+        self.density_network = bias_free_network(self.num_encoded, width, 1 + self.config.num_features)
+        self.material_network = bias_free_network(num_features, width, width, self.num_endmembers + 1)
+        self.scale_network = bias_free_network(num_features, width, width, self.num_endmembers)
+        if self.num_specular:
+            seen = NUM_DIRECTION_FEATURES + 1 + _NUM_POSITION_FEATURES
+            self.specular_network = bias_free_network(seen, 16, self.num_specular)
+
+    def encode(
+        self, positions: Float[Tensor, "S 3"], known: Float[Tensor, "S L"] | None = None
+    ) -> Float[Tensor, "S L"]:
+        """The hash grid's encoding of positions, then PE; `known` as `hash_encode` takes it."""
+        first = None if known is None else known[:, : self.num_encoded].contiguous()
+        return torch.cat([super().encode(positions, first), _position_features(positions)], -1)
+
+    def density_of(self, encoded: Float[Tensor, "S L"]) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
+        """Density per scene unit; g and PE."""
+        density, features = super().density_of(encoded[:, : self.num_encoded])
+        return density, torch.cat([features[:, 1:], encoded[:, self.num_encoded :]], dim=-1)
+
+    def get_outputs(
+        self,
+        positions: Float[Tensor, "S 3"],
+        directions: Float[Tensor, "S 3"],
+        features: Float[Tensor, "S G"],
+        light: Lamplight | None = None,
+    ) -> dict[str, Tensor]:
+        """As `UnmixField.get_outputs`, with the tint from the network of the abundances."""
+        logits = self.material_network(features)
+        abundances = torch.softmax(logits[:, :-1] / self.config.temperature, dim=-1)
+        return {
+            "abundances": abundances,
+            "scaled_abundances": torch.sigmoid(self.scale_network(features)) * abundances,
+            "specular_coefficients": self._tinted(directions, features, torch.sigmoid(logits[:, -1:])),
+        }
+
+    def abundances_of(self, features: Float[Tensor, "S G"]) -> Float[Tensor, "S K"]:
+        """Abundances a of points with these features, summing to 1."""
+        return torch.softmax(self.material_network(features)[:, :-1] / self.config.temperature, dim=-1)
+
+    def _tinted(
+        self, directions: Float[Tensor, "S 3"], features: Float[Tensor, "S G"], tint: Float[Tensor, "S 1"]
+    ) -> Float[Tensor, "S B"]:
+        if self.num_specular == 0:
+            return features.new_zeros(len(features), 0)
+        places = features[:, -_NUM_POSITION_FEATURES:]
+        seen = [torch.ones_like(tint), direction_features(directions), places]
+        return tint * torch.sigmoid(self.specular_network(torch.cat(seen, dim=-1)))
+
+
+def _position_features(positions: Float[Tensor, "S 3"]) -> Float[Tensor, "S 12"]:
+    """Sines and cosines of 2 pi times 1 and 2 periods a unit, of uncontracted positions."""
+    angles = torch.cat([2 * math.pi * 2.0**power * positions for power in range(_NUM_FREQUENCIES)], dim=-1)
+    return torch.cat([angles.sin(), angles.cos()], dim=-1)

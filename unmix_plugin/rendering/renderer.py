@@ -1,0 +1,284 @@
+"""From rays to composited coefficients: which samples are taken, which carry weight, and what they sum to.
+
+Notation: `R` rays, `S` samples, `K` endmembers, `J` specular coefficients; w_i = T_i (1 - exp(-sigma_i delta)). Rays
+are marched through the occupied cells of a grid; a first pass without gradient finds the samples that carry weight, and
+only those go through the heads and the backward pass. The cost of a sample doesn't depend on the number of bands.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.contraction import UnitSpace
+from unmix_plugin.engine.geometry.rays import RayBundle
+from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.field import CoefficientField
+from unmix_plugin.light.shading import Lamplight
+from unmix_plugin.light.shadows import FINEST, ShadowDetail, lamplight
+from unmix_plugin.operators.compositing import accumulate, volume_weights
+from unmix_plugin.operators.contracted_marching import march_contracted, march_contracted_first
+from unmix_plugin.operators.gradients import scale_gradient
+from unmix_plugin.operators.grid_cells import cells_at
+from unmix_plugin.operators.marching import FirstSamples, PackedSamples, march, march_first
+from unmix_plugin.rendering.front_to_back import FrontToBack, composite_front_to_back
+from unmix_plugin.rendering.lit_samples import LitSamples, points_of, samples_carrying_weight
+from unmix_plugin.spectral.coefficients import Coefficients
+
+_SPREAD_DEPTH = 0.03
+"""Optical depth of a sample from which on its part of the spread grows slower than the depth."""
+
+
+@dataclass(frozen=True)
+class RenderedRays:
+    """What rendering a bundle of rays gives."""
+
+    coefficients: Coefficients
+    mixtures: Float[Tensor, "R K"]
+    """Abundances of all that a ray sees, the sky included."""
+    num_samples: int
+    """Samples looked at of all rays: those that light may reach."""
+    spread: Float[Tensor, ""]
+    """Sum of log(1 + tau / 0.03) over the samples of a ray that carry weight, tau their optical depth; mean over rays.
+    The same light stopped by few samples gives less of it than by many: surfaces little, floaters much."""
+    positions: Float[Tensor, "S 3"]
+    """Samples that carry weight, in the unit cube."""
+    weights: Float[Tensor, "S"]
+    """Share of its ray's light that each contributes."""
+    ray_indices: Int[Tensor, "S"]
+    """Ray of each."""
+    looked_at: LitSamples
+    """What is known of all samples that light may reach."""
+
+
+@dataclass(frozen=True)
+class VolumeRenderer:
+    """Volume renderer of a field's coefficients: pure functions of its values, the field and the rays."""
+
+    box: SceneBox
+    """What is rendered, model space."""
+    clearance: UInt8[Tensor, "X Y Z"]
+    """0 in the cells of the box that rays are sampled in; others are empty, and have what `clearance_of` says."""
+    reachable: Bool[Tensor, "X Y Z"]
+    """Cells that were not carved away before training."""
+    step: float
+    """Distance of samples, model units; larger outside the box of a world without end."""
+    smallest_weight: float
+    """Samples that contribute less are left out."""
+    is_unbounded: bool = False
+    """Whether rays go on outside the box, through contracted space, and end on the sky."""
+    residual_on_last_sample: bool = False
+    """Whether the last sample of a ray takes all the light that is left."""
+    rays_per_chunk: int = 32_768
+    """Rays under way at once for a whole image; fewer take less memory."""
+    opaque_clearance: UInt8[Tensor, "X Y Z"] | None = None
+    """0 in the cells that cast shadows in the light of a lamp that moves with the camera, in others what `clearance_of`
+    says; None without such a lamp."""
+    shadow_detail: ShadowDetail = FINEST
+    """How sharp those shadows are."""
+
+    def render(
+        self, field: CoefficientField, ray_bundle: RayBundle, generator: torch.Generator | None = None
+    ) -> RenderedRays:
+        """Composited coefficients of each ray.
+
+        Args:
+            field: What is rendered.
+            ray_bundle: R rays.
+            generator: Shifts the samples of each ray at random, as training wants it; None takes them as they are.
+        """
+        samples = self._march(ray_bundle, generator)
+        seen = samples_carrying_weight(field, samples, ray_bundle, self.step, self.smallest_weight)
+        kept = seen.samples
+        positions, along = points_of(kept, ray_bundle)
+        if torch.is_grad_enabled():
+            densities, features = field.density_of(field.encode(positions, seen.encoded()))
+        else:
+            densities, features = seen.densities(), seen.features()
+        origins = ray_bundle.origins.index_select(0, kept.ray_indices)
+        light = self._lamplight(field, origins, positions, generator)
+        outputs = field.get_outputs(positions, along, features, light)
+        if self.is_unbounded:
+            near = self._near_cameras(kept.t)
+            densities = scale_gradient(densities, near)
+            outputs = {name: scale_gradient(values, near[:, None]) for name, values in outputs.items()}
+        depths = densities * self.step
+        weights = volume_weights(depths, kept.packed_info)
+        ones = torch.ones_like(kept.t)
+        values = Coefficients.of(
+            ones,
+            kept.t,
+            outputs["abundances"],
+            outputs["scaled_abundances"],
+            outputs["specular_coefficients"],
+        )
+        totals = accumulate(weights, values.packed, kept.packed_info)
+        if self.residual_on_last_sample:
+            totals = totals + _residual_transmittance(totals[:, 0], values.packed, kept)
+        matter = Coefficients(totals, values.num_endmembers)
+        coefficients, mixtures = _before_sky(matter, field.sky(ray_bundle.directions))
+        return RenderedRays(
+            coefficients,
+            mixtures,
+            seen.num_looked_at,
+            torch.log1p(depths / _SPREAD_DEPTH).sum() / max(len(ray_bundle), 1),
+            self.space.to_unit(positions).detach(),
+            weights,
+            kept.ray_indices,
+            seen,
+        )
+
+    @torch.no_grad()
+    def composite(self, field: CoefficientField, ray_bundle: RayBundle) -> Coefficients:
+        """Coefficients (R, ...) of each ray, few rays at a time in memory.
+
+        Those of `render` but for what front_to_back.py says, in less time.
+        """
+        how = FrontToBack(
+            self._march_first,
+            self.step,
+            self.smallest_weight,
+            lambda starts, positions: self._lamplight(field, starts, positions),
+            self.residual_on_last_sample,
+            self.rays_per_chunk,
+        )
+        found = composite_front_to_back(field, ray_bundle, how)
+        parts = [field.sky(along) for along in ray_bundle.directions.split(self.rays_per_chunk)]
+        skies = [sky for sky in parts if sky is not None]
+        return _before_sky(found, torch.cat(skies) if skies else None)[0]
+
+    @torch.no_grad()
+    def composite_view(self, field: CoefficientField, camera: Cameras, subpixels: int = 1) -> Coefficients:
+        """Coefficients (H, W, ...) of a whole view: every picture of it follows from them.
+
+        Args:
+            field: What is rendered.
+            camera: One camera.
+            subpixels: Rays through a pixel along each of its edges, averaged: all outputs but ratios are linear.
+        """
+        camera = camera.to(self.clearance.device)
+        centres = [(i + 0.5) / subpixels for i in range(subpixels)]
+        total: Coefficients | None = None
+        for offset in [(x, y) for y in centres for x in centres]:
+            found = self.composite(field, camera.image_rays(0, offset))
+            total = found if total is None else found.map(total.packed.add_)
+        assert total is not None
+        return total.map(lambda packed: packed / subpixels**2).unflatten(camera.height, camera.width)
+
+    @torch.no_grad()
+    def normals(
+        self, field: CoefficientField, ray_bundle: RayBundle, ray_distance: Float[Tensor, "R"]
+    ) -> Float[Tensor, "R 3"]:
+        """Unit normals in model space where the rays end: against the gradient of the log density."""
+        chunk, parts = self.rays_per_chunk, []
+        for i in range(0, len(ray_bundle), chunk):
+            rays, distance = ray_bundle[i : i + chunk], ray_distance[i : i + chunk]
+            with torch.enable_grad():
+                positions = (rays.origins + distance[:, None] * rays.directions).detach().requires_grad_()
+                log_density = field.get_density(positions)[0].clamp(min=1e-20).log().sum()
+                (gradient,) = torch.autograd.grad(log_density, positions)
+            parts.append(torch.nn.functional.normalize(-gradient, dim=-1))
+        return torch.cat(parts)
+
+    @property
+    def occupied(self) -> Bool[Tensor, "X Y Z"]:
+        """Cells of the box that rays are sampled in."""
+        return self.clearance == 0
+
+    def is_occupied(self, positions: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
+        """Points in the box, in cells that rays are sampled in."""
+        return self._lie_in(self.occupied, positions)
+
+    def is_reachable(self, positions: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
+        """Points in the box, in cells that were not carved away before training."""
+        return self._lie_in(self.reachable, positions)
+
+    def _lie_in(self, cells: Bool[Tensor, "X Y Z"], positions: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
+        unit = self.space.to_unit(positions)
+        return self.space.contains(positions) & cells[cells_at(unit, cells.shape).unbind(-1)]
+
+    @property
+    def space(self) -> UnitSpace:
+        """Where the cells of the grid lie."""
+        return UnitSpace(self.box, self.is_unbounded)
+
+    def _near_cameras(self, t: Float[Tensor, "S"]) -> Float[Tensor, "S"]:
+        """Factor on gradients: what is near a camera fills more of its pixels than what is far, so it would learn
+        faster, and from one view alone.
+
+        Source: Philip and Deschaintre 2023, Floaters No More.
+        """
+        return (t / self.space.half_edge).square().clamp(max=1.0)
+
+    def _lamplight(
+        self,
+        field: CoefficientField,
+        origins: Float[Tensor, "S 3"],
+        positions: Float[Tensor, "S 3"],
+        generator: torch.Generator | None = None,
+    ) -> Lamplight | None:
+        if field.moving_lamp is None or self.opaque_clearance is None:
+            return None
+        lamp, clearance = field.moving_lamp, self.opaque_clearance
+        return lamplight(lamp, origins, positions, self.box, clearance, self.shadow_detail, generator)
+
+    def _march(self, ray_bundle: RayBundle, generator: torch.Generator | None) -> PackedSamples:
+        """All samples of rays; a generator shifts those of each ray at random."""
+        origins, directions = ray_bundle.origins.detach(), ray_bundle.directions.detach()
+        jitter = torch.full_like(origins[:, 0], 0.5)
+        if generator is not None:
+            jitter = torch.rand(jitter.shape, generator=generator, device=generator.device).to(jitter)
+        starts, along = self._in_grid(origins, directions)
+        if self.is_unbounded:
+            return march_contracted(starts, along, jitter, self.clearance, self.step)
+        t_near, t_far = self.box.intersect(origins, directions)
+        return march(starts, along, t_near, t_far, jitter, self.clearance, self.step)
+
+    def _march_first(
+        self,
+        origins: Float[Tensor, "R 3"],
+        directions: Float[Tensor, "R 3"],
+        behind: Float[Tensor, "R"],
+        most: int,
+    ) -> FirstSamples:
+        """The first samples of rays behind these distances, at most so many of each."""
+        starts, along = self._in_grid(origins, directions)
+        if self.is_unbounded:
+            return march_contracted_first(starts, along, behind, self.clearance, self.step, most)
+        t_near, t_far = self.box.intersect(origins, directions)
+        t_near = torch.maximum(t_near, behind)
+        return march_first(starts, along, t_near, t_far, self.clearance, self.step, most)
+
+    def _in_grid(
+        self, origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"]
+    ) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]:
+        """Rays in the coordinates that they are marched in."""
+        if self.is_unbounded:
+            return self.space.centred(origins), directions / self.space.half_edge
+        return self.box.normalise(origins), directions / self.box.size
+
+
+def _before_sky(
+    matter: Coefficients, sky: Float[Tensor, "R C"] | None
+) -> tuple[Coefficients, Float[Tensor, "R K"]]:
+    """With the light of what is infinitely far away, as `CoefficientField.sky` gives it; and abundances with its."""
+    if sky is None:
+        return matter, matter.abundances
+    left = (1 - matter.accumulation)[:, None]
+    mixtures = matter.abundances + left * sky[:, :-1]
+    return matter.with_light(left * sky[:, -1:] * sky[:, :-1]), mixtures
+
+
+def _residual_transmittance(
+    accumulation: Float[Tensor, "R"], values: Float[Tensor, "S C"], samples: PackedSamples
+) -> Float[Tensor, "R C"]:
+    """What the last sample of each ray adds if it takes all the light left; 0 for rays without samples."""
+    starts, counts = samples.packed_info.unbind(-1)
+    if len(values) == 0:
+        return values.new_zeros(len(starts), values.shape[1])
+    last = values.index_select(0, (starts + counts - 1).clamp(min=0))
+    return torch.where(counts > 0, 1 - accumulation, 0.0)[:, None] * last
