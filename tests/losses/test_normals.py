@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from tests.test_lamp import model_with_lamp
 from torch import nn
 
+from tests.light.test_lamp import model_with_lamp
 from tests.method_factory import NUM_BANDS, make_model, make_rays
 from unmix_plugin.light.shading import LampShading
 from unmix_plugin.losses.normals import normals_error

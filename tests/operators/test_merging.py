@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from tests.rendering.test_compositing import BATCHES, pack
 from torch.testing import assert_close
 
+from tests.operators.test_compositing import BATCHES, pack
 from unmix_plugin.operators.compositing import accumulate, volume_weights
 from unmix_plugin.operators.merging import MergeLimits, merge_samples, merge_samples_twin
 

@@ -3,9 +3,9 @@
 from dataclasses import replace
 
 import torch
-from tests.test_view_gains import make_lit_model
 from torch.testing import assert_close
 
+from tests.light.test_view_gains import make_lit_model
 from tests.pose_factory import HEIGHT, WIDTH, cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.poses.line_cameras import Swept, keep, swept_view

@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 import torch
 from rich.console import Console
-from tests.test_pose_training import trained
 from torch import Tensor
 from torch.testing import assert_close
 
 from tests.engine.stopped_runs import stop_at
 from tests.method_factory import CONFIG
+from tests.poses.test_training import trained
 from tests.scenes.line_factory import make_line_scene
 from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
 from unmix_plugin.engine.configs import TrainerConfig

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tests.test_renderer import make, rays
-from tests.test_unbounded import make as make_unbounded
-from tests.test_unbounded import rays as rays_without_end
 from torch.testing import assert_close
 
+from tests.rendering.test_renderer import make, rays
+from tests.rendering.test_unbounded import make as make_unbounded
+from tests.rendering.test_unbounded import rays as rays_without_end
 from unmix_plugin.rendering import front_to_back
 
 

@@ -4,9 +4,9 @@ import math
 
 import pytest
 import torch
-from tests.test_renderer import make, rays
 from torch.testing import assert_close
 
+from tests.rendering.test_renderer import make, rays
 from unmix_plugin.operators.compositing import volume_weights
 from unmix_plugin.rendering.lit_samples import points_of, samples_carrying_weight
 

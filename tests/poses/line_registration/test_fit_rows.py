@@ -1,8 +1,8 @@
 """Rows move until the scene looks like what they measured."""
 
 import torch
-from tests.line_registration.textured_plane import ROWS, error, swept, wobble
 
+from tests.poses.line_registration.textured_plane import ROWS, error, swept, wobble
 from unmix_plugin.poses.line_registration.fit_rows import Fit, fit_rows
 from unmix_plugin.poses.line_registration.register import register
 

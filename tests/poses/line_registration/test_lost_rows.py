@@ -1,8 +1,8 @@
 """Rows that are off by many pixels are found again from their neighbours."""
 
 import torch
-from tests.line_registration.textured_plane import ROWS, error, swept, wobble
 
+from tests.poses.line_registration.textured_plane import ROWS, error, swept, wobble
 from unmix_plugin.poses.line_registration.lost_rows import Recovery, recover
 from unmix_plugin.poses.line_registration.register import register
 from unmix_plugin.poses.line_registration.swept_view import SweptView

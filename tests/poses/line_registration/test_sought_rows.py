@@ -1,8 +1,8 @@
 """Rows that are off by many pixels are found by looking all around."""
 
 import torch
-from tests.line_registration.textured_plane import error, swept, wobble
 
+from tests.poses.line_registration.textured_plane import error, swept, wobble
 from unmix_plugin.poses.line_registration.sought_rows import sought
 
 
