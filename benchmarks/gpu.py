@@ -23,7 +23,7 @@ import _common
 import _machine
 import tyro
 
-TESTS = ("tests/gpu", "tests/rendering", "tests/test_model.py", "tests/engine/test_second_method.py")
+TESTS = ("tests/gpu", "tests/operators", "tests/test_model.py", "tests/engine/test_second_method.py")
 SIDE = 512
 FRAME_RATE = _common.Limit(30, unit=" frames/s")
 SAMPLES_PER_SECOND = _common.Limit(10e6, unit=" samples/s")
