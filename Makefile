@@ -9,11 +9,12 @@ BENCHMARKS := $(sort $(wildcard benchmarks/[a-z]*.py))
 MINIMUM := .venv-minimum
 MINIMUM_TESTS := tests/engine tests/spectral tests/editing tests/formats tests/scenes tests/figures tests/viewer/test_server.py
 
-.PHONY: demo test test-minimum lint format bench clean help
+.PHONY: demo test test-all test-minimum lint format bench clean help
 
 help:
 	@echo "make demo    train on the built-in scene, evaluate, export abundance maps"
-	@echo "make test    run every test"
+	@echo "make test    run the tests, less the slow ones"
+	@echo "make test-all   run every test, and check each shape annotation while they run"
 	@echo "make test-minimum   run the core of the tests on the lowest versions that are allowed"
 	@echo "make lint    check format, lint rules, types and the import law"
 	@echo "make format  rewrite the code in the one format"
@@ -46,7 +47,10 @@ $(VENV)/.system-packages: scripts/install_system_packages.sh | $(BIN)/python
 	@touch $@
 
 test: $(VENV)/.installed-dev $(VENV)/.system-packages
-	$(BIN)/python -m pytest --numprocesses 2
+	$(BIN)/python -m pytest --numprocesses 2 -m "not slow"
+
+test-all: $(VENV)/.installed-dev $(VENV)/.system-packages
+	$(BIN)/python -m pytest --numprocesses 2 --jaxtyping-packages=unmix_plugin,beartype.beartype
 
 # Deprecations that old releases warn of are no failures here, and old checkers of shapes are left out.
 test-minimum:
