@@ -1,6 +1,7 @@
-"""What users can ask for: commands, products, flags, outputs, layouts and public names, as `public_surface.txt` lists them.
+"""What users can ask for: commands, products, flags, outputs, layouts and public names, listed in public_surface.txt.
 
-A change of the list is a change for users: `python -m tests.test_public_surface` writes it anew, and the commit shows it.
+A change of the list is a change for users: `python -m tests.test_public_surface` writes it anew, and the commit that
+changes it shows it.
 """
 
 from __future__ import annotations
