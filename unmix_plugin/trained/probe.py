@@ -94,7 +94,7 @@ def one_pixel(camera: Cameras, column: int, row: int) -> Cameras:
             f"pixel {column},{row} (column, row) is outside the image; "
             f"columns are 0 to {camera.width - 1}, rows 0 to {camera.height - 1}"
         )
-    return camera.pixel(column, row)
+    return camera.crop(column, row, 1, 1)
 
 
 def _row(values: Tensor) -> Float64[np.ndarray, " n"]:

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from unmix_plugin.engine.geometry.camera_paths import rows_of
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.formats.files import write_file
@@ -75,7 +74,7 @@ class StripCapture:
         """Begin with the first strip, or go on with the next."""
         camera = self._request.camera
         last = min(self._first_row + self._rows, camera.height)
-        strip = rows_of(camera, self._first_row, last)
+        strip = camera.crop(0, self._first_row, camera.width, last - self._first_row)
         render = FrameRender(strip, self._request.subpixels, is_finished=True)
         share = (last - self._first_row) / camera.height
         begun = self._first_row / camera.height

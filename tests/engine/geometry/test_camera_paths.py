@@ -6,7 +6,7 @@ import torch
 
 from tests.scenes.scene_factory import look_at
 from tests.trained.camera_files.camera_scenes import BOX, around, cameras_at, in_front
-from unmix_plugin.engine.geometry.camera_paths import interpolated, orbit, rows_of
+from unmix_plugin.engine.geometry.camera_paths import interpolated, orbit
 from unmix_plugin.errors import ConfigError
 
 
@@ -134,14 +134,6 @@ def test_a_shifted_principal_point_stays_shifted_when_resized():
         camera.camera_to_world, camera.focal_px, torch.tensor([[23.0, 12.0]]), camera.distortion, 40, 30
     )
     torch.testing.assert_close(shifted.resized(80, 60).center_px, torch.tensor([[46.0, 24.0]]))
-
-
-def test_rows_of_a_camera_have_the_rays_of_these_rows():
-    camera = around(1)
-    rows = rows_of(camera, 7, 19)
-    assert (rows.width, rows.height) == (40, 12)
-    whole, part = camera.image_rays(0), rows.image_rays(0)
-    torch.testing.assert_close(part.directions, whole.directions[7 * 40 : 19 * 40], atol=1e-6, rtol=0)
 
 
 def test_a_shrunk_camera_has_few_pixels_of_the_same_view():

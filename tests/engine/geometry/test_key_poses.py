@@ -125,13 +125,23 @@ def test_what_no_row_passes_over_is_not_seen():
     assert (depths > 0).tolist() == [False, False, True]
 
 
-def test_other_sizes_and_single_pixels_see_the_same_directions():
+@pytest.mark.parametrize("index", [0, 1, 2], ids=["frame", "sweep", "nod"])
+@pytest.mark.parametrize(("left", "top", "width", "height"), [(0, 7, WIDTH, 12), (4, 17, 1, 1), (3, 30, 5, 10)])
+def test_a_part_of_an_image_has_the_rays_of_its_pixels(index, left, top, width, height):
+    camera = keys(-0.1)[index]
+    part = camera.crop(left, top, width, height)
+    assert (part.width, part.height) == (width, height)
+    pixels = torch.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH)[top : top + height, left : left + width]
+    whole, found = camera.image_rays(0)[pixels.flatten()], part.image_rays(0)
+    assert_close(found.directions, whole.directions, atol=1e-6, rtol=0)
+    assert_close(found.origins, whole.origins, atol=1e-6, rtol=0)
+    assert found.axes is not None
+    assert_close(found.axes, whole.axes, atol=1e-6, rtol=0)
+
+
+def test_other_sizes_see_the_same_directions():
     camera = keys()[1]
-    whole = camera.image_rays(0)
-    row, column = 17, 4
-    one = camera.pixel(column, row).image_rays(0)
-    assert_close(one.directions[0], whole.directions[row * WIDTH + column], atol=1e-6, rtol=0)
-    assert_close(one.origins[0], whole.origins[row * WIDTH + column], atol=1e-6, rtol=0)
+    whole, row, column = camera.image_rays(0), 17, 4
     larger = camera.resized(3 * WIDTH, 3 * HEIGHT).image_rays(0)
     middle = (3 * row + 1) * 3 * WIDTH + 3 * column + 1
     assert_close(larger.directions[middle], whole.directions[row * WIDTH + column], atol=1e-5, rtol=0)

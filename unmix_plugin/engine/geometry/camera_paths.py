@@ -79,19 +79,6 @@ def interpolated(cameras: Cameras, box: SceneBox, num_frames: int) -> Cameras:
     return _with_lens(cameras, _straight_path(poses, along, at) if path is None else path)
 
 
-def rows_of(camera: Cameras, start: int, stop: int) -> Cameras:
-    """The camera of rows `start` to `stop` of the image, the last excluded."""
-    above = torch.tensor([0.0, float(start)]).to(camera.center_px)
-    return Cameras(
-        camera.camera_to_world,
-        camera.focal_px,
-        camera.center_px - above,
-        camera.distortion,
-        camera.width,
-        stop - start,
-    )
-
-
 def _looked_at(
     poses: Float64[np.ndarray, "N 3 4"], aabb: Float64[np.ndarray, "2 3"]
 ) -> Float64[np.ndarray, "3"]:

@@ -115,16 +115,16 @@ class Cameras:
             key_poses=keys,
         )
 
-    def pixel(self, column: int, row: int) -> Cameras:
-        """A view of one pixel of an image: what is rendered of it is that pixel."""
-        corner = self.center_px.new_tensor([float(column), float(row)])
+    def crop(self, left: int, top: int, width: int, height: int) -> Cameras:
+        """The same cameras of a part of each image, pixels: what is rendered of it is that part of the image."""
         keys = self.key_poses
         return replace(
             self,
-            center_px=self.center_px - corner,
-            width=1,
-            height=1,
-            key_poses=None if keys is None else keys.with_heights(keys.heights - row),
+            center_px=self.center_px - self.center_px.new_tensor([float(left), float(top)]),
+            width=width,
+            height=height,
+            sizes=None,
+            key_poses=None if keys is None else keys.with_heights(keys.heights - top),
         )
 
     def poses_at(self, camera_indices: Int[Tensor, " R"], y: Float[Tensor, " R"]) -> Float[Tensor, "R 3 4"]:

@@ -16,7 +16,6 @@ from types import TracebackType
 
 import numpy as np
 
-from unmix_plugin.engine.geometry.camera_paths import rows_of
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.outputs import Output
 from unmix_plugin.engine.processes.processes import ALONE, Processes
@@ -121,7 +120,7 @@ class RenderJob:
         own = list(enumerate(self._cameras.views))[self._processes.rank :: self._processes.count]
         return [
             Block(
-                index, first, rows_of(view.camera, first, min(first + rows, height)), first + rows >= height
+                index, first, view.camera.crop(0, first, width, min(rows, height - first)), first + rows >= height
             )
             for index, view in own
             for first in range(0, height, rows)

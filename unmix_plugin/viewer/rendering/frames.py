@@ -10,7 +10,6 @@ import math
 import torch
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.camera_paths import rows_of
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.spectral.coefficients import Coefficients
 from unmix_plugin.spectral.materials import Materials
@@ -90,7 +89,7 @@ class FrameRender:
         width, turns = self.camera.width, len(self._offsets)
         first = self._rays_done // (width * turns)
         last = min(first + max(1, num_rays // (width * turns)), self.camera.height)
-        camera = rows_of(self.camera, first, last).to(scene.device)
+        camera = self.camera.crop(0, first, width, last - first).to(scene.device)
         if isinstance(scene, EstimatedScene) and self._is_finished:
             strip = scene.look(camera, self._subpixels)
         elif isinstance(scene, EstimatedScene):
