@@ -126,7 +126,9 @@ def test_what_no_row_passes_over_is_not_seen():
 
 
 @pytest.mark.parametrize("index", [0, 1, 2], ids=["frame", "sweep", "nod"])
-@pytest.mark.parametrize(("left", "top", "width", "height"), [(0, 7, WIDTH, 12), (4, 17, 1, 1), (3, 30, 5, 10)])
+@pytest.mark.parametrize(
+    ("left", "top", "width", "height"), [(0, 7, WIDTH, 12), (4, 17, 1, 1), (3, 30, 5, 10)]
+)
 def test_a_part_of_an_image_has_the_rays_of_its_pixels(index, left, top, width, height):
     camera = keys(-0.1)[index]
     part = camera.crop(left, top, width, height)

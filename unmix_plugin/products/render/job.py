@@ -120,7 +120,10 @@ class RenderJob:
         own = list(enumerate(self._cameras.views))[self._processes.rank :: self._processes.count]
         return [
             Block(
-                index, first, view.camera.crop(0, first, width, min(rows, height - first)), first + rows >= height
+                index,
+                first,
+                view.camera.crop(0, first, width, min(rows, height - first)),
+                first + rows >= height,
             )
             for index, view in own
             for first in range(0, height, rows)
