@@ -16,6 +16,7 @@ from unmix_plugin.scenes.reading.loader import load_scene
 SIZE, BANDS, VIEWS = 192, 12, 24
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_wait_for_the_disk")
 def test_estimated_poses_are_those_of_the_truth(tmp_path, monkeypatch):
     pytest.importorskip("pycolmap")
@@ -33,7 +34,9 @@ def test_estimated_poses_are_those_of_the_truth(tmp_path, monkeypatch):
     names = {name: f"{Path(name).stem}.hdr" for name in found.cameras}
     assert len(names) >= 0.8 * VIEWS
     assert align_poses(found, truth, names).rms_px < 0.5
-    assert len(load_scene(scene).frames) == len(names)
+    loaded = load_scene(scene)
+    assert len(loaded.frames) == len(names)
+    assert loaded.placement.is_identity, "exports come out in the upright world of transforms.json"
     report = (scene / "report.txt").read_text()
     assert "- bands left out: 400 nm, 509.091 nm (marked as bad in the file)\n" in report
     assert "- bands left out: 618.182 nm (noisy)\n" in report

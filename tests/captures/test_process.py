@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,9 @@ from tests.captures.capture_factory import (
     write_cube,
     write_poses,
 )
+from tests.captures.poses.test_alignment import elsewhere
+from unmix_plugin.captures import process as process_module
+from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.writing.view_files import FULL_SCALE
 from unmix_plugin.scenes.reading.loader import load_scene
 
@@ -54,6 +58,25 @@ def test_background_is_cut_out_at_the_threshold_of_the_border(tmp_path: Path):
         assert alpha is not None
         np.testing.assert_array_equal(alpha > 0.5, expected)
         assert scene.cube(index)[~expected].max() == 0.0
+
+
+def test_a_scene_with_estimated_poses_has_its_own_upright_world(tmp_path: Path, monkeypatch):
+    capture = make_capture(tmp_path / "capture", views=12)
+    tilted = elsewhere(read_poses(capture.root / "transforms.json"))
+    cameras = {Path(name).stem: camera for name, camera in tilted.cameras.items()}
+    estimated = replace(tilted, cameras=cameras, up=None, has_world=False)
+    monkeypatch.setattr(process_module, "estimated_poses", lambda *_: estimated)
+
+    process(capture.root, tmp_path / "scene", poses="estimate")
+
+    scene = load_scene(tmp_path / "scene")
+    written = read_poses(tmp_path / "scene" / "transforms.json").cameras
+    model = scene.cameras.camera_to_world[:, :, 3].double().numpy()
+    world = scene.normalisation.to_world(model)
+    expected = [written[f"images/{frame.name}.png"].camera_to_world for frame in scene.frames]
+    np.testing.assert_allclose(world, [pose[:, 3] for pose in expected], atol=1e-6)
+    np.testing.assert_allclose([pose[2, 0] for pose in expected], 0.0, atol=1e-9)  # cameras stand upright
+    assert min(pose[2, 1] for pose in expected) > 0.5
 
 
 def test_crop_and_binning_move_the_lens_with_the_pixels(tmp_path: Path):

@@ -32,7 +32,8 @@ class PosedViews:
     poses: PoseSet
     """In the scene's world, with the sparse points."""
     keys: dict[str, Any]
-    """What transforms.json records of the way from the source's world to the scene's."""
+    """What transforms.json records of the way from the source's world to the scene's; nothing where the poses were
+    estimated: the scene's world, which stands upright, is then the one that exports return to."""
     notes: tuple[str, ...]
 
     def lens(self, view: str) -> Lens:
@@ -91,7 +92,7 @@ def pose_views(views: Sequence[CaptureView], poses: PoseSet) -> PosedViews:
         posed,
         placed.poses.cameras,
         placed.poses,
-        placed.placement.to_json(),
+        placed.placement.to_json() if poses.has_world else {},
         (*poses.notes, *matched, *completed, *placed.notes),
     )
 

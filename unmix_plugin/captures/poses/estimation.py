@@ -53,8 +53,8 @@ def estimate_poses(
         masks: True on matter; features are found there, but not on its rim.
         threads: None takes those of the machine, at most 8; with 1 the same pictures give the same poses to the bit.
     Returns:
-        Poses by the name of the view, in a world of no certain scale; `notes` say how many views were registered and
-        the reprojection error.
+        Poses by the name of the view, in an arbitrary world (`has_world` is False); `notes` say how many views were
+        registered and the reprojection error.
     Raises:
         CaptureError: pycolmap is not installed, or fewer than half of the views, or than 3, could be registered.
     """
@@ -136,4 +136,5 @@ def _best(models: list[dict], files: Mapping[str, str], folder: Path) -> PoseSet
     notes = [f"COLMAP registered {registered} of {len(files)} views with {error}"]
     if missing:
         notes.append(f"views without pose: {name_some(missing)}")
-    return replace(poses, cameras=cameras, source="estimated by COLMAP", notes=(*notes, *poses.notes))
+    notes += poses.notes
+    return replace(poses, cameras=cameras, source="estimated by COLMAP", has_world=False, notes=tuple(notes))

@@ -53,7 +53,8 @@ def place_poses(poses: PoseSet, is_flight: bool = False) -> PlacedPoses:
     inner = Placement(rotation, -rotation @ middle, scale)
     cameras = {name: moved(camera, inner) for name, camera in poses.cameras.items()}
     points = None if poses.points is None else inner.to_scene(poses.points)
-    notes = (how_up, how_middle, f"1 unit of the scene is {1.0 / scale:.6g} of the source")
+    how_large = [f"1 unit of the scene is {1.0 / scale:.6g} of the source"] if poses.has_world else []
+    notes = (how_up, how_middle, *how_large)
     placed = replace(poses, cameras=cameras, points=points, offset=np.zeros(3), up=np.array([0.0, 0.0, 1.0]))
     return PlacedPoses(placed, replace(inner, offset=poses.offset), notes)
 

@@ -65,5 +65,7 @@ class PoseSet:
     """Add this to positions and points to get the source's coordinates."""
     up: Float64[np.ndarray, "3"] | None = None
     """Unit vector against gravity, where the source's coordinates tell it (geo-referenced, or +z by convention)."""
+    has_world: bool = True
+    """Whether the coordinates mean something to the user. Those of estimated poses don't."""
     notes: tuple[str, ...] = ()
     """What was changed or is odd: rotations made rigid, frames without files, ..."""
