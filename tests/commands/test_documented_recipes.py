@@ -21,7 +21,7 @@ def recipes_of(page: str) -> list[str]:
 
 RECIPES = [
     pytest.param(recipe, id=f"{page}-{position}")
-    for page in ("README.md", "docs/editing.md")
+    for page in ("README.md", "docs/guides/editing.md")
     for position, recipe in enumerate(recipes_of(page))
 ]
 
@@ -39,7 +39,7 @@ def five_materials(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_both_pages_have_recipes():
     assert len(recipes_of("README.md")) == 1
-    assert len(recipes_of("docs/editing.md")) >= 2
+    assert len(recipes_of("docs/guides/editing.md")) >= 2
 
 
 @pytest.mark.parametrize("recipe", RECIPES)

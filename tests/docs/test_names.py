@@ -17,7 +17,7 @@ from unmix_plugin.commands.render import render
 from unmix_plugin.commands.train import train
 from unmix_plugin.commands.view import view
 
-PAGES = ["README.md", *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md")))]
+PAGES = ["README.md", *(path.relative_to(ROOT).as_posix() for path in sorted((ROOT / "docs").rglob("*.md")))]
 OF_OTHERS = {
     "--debug",
     "--constraint",

@@ -1,4 +1,4 @@
-"""docs/python.md: its names are the public ones, and its code and the notebook's run as they stand."""
+"""docs/guides/python.md: its names are the public ones, and its code and the notebook's run as they stand."""
 
 import inspect
 import json
@@ -14,7 +14,7 @@ from unmix_plugin import read_recipe
 
 
 def test_the_public_names_are_those_that_the_page_lists():
-    table = text_of("docs/python.md").split("\n## ")[0]
+    table = text_of("docs/guides/python.md").split("\n## ")[0]
     assert sorted(re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)) == sorted(unmix_plugin.__all__)
     assert len(unmix_plugin.__all__) <= 10
     assert sorted(unmix_plugin._MODULES) == sorted(unmix_plugin.__all__)
@@ -38,8 +38,8 @@ def test_no_other_name_is_public():
 
 def test_the_examples_run_one_after_the_other(home):
     names = {}
-    for code in blocks_of("docs/python.md", "python"):
-        exec(compile(code, "docs/python.md", "exec"), names)
+    for code in blocks_of("docs/guides/python.md", "python"):
+        exec(compile(code, "docs/guides/python.md", "exec"), names)
     height, width = names["rgb"].shape[:2]
     assert names["cube"].shape == (height, width, len(names["wavelengths"]))
     assert names["edited"].materials.names[2] == "wood"
@@ -50,9 +50,9 @@ def test_the_examples_run_one_after_the_other(home):
 
 
 def test_the_example_of_editing_runs(home):
-    (code,) = blocks_of("docs/editing.md", "python")
+    (code,) = blocks_of("docs/guides/editing.md", "python")
     names = {}
-    exec(compile(code, "docs/editing.md", "exec"), names)
+    exec(compile(code, "docs/guides/editing.md", "exec"), names)
     assert read_recipe(home / "edits.yml") == names["recipe"]
     assert names["views"]["rgb"].shape == (16, 16, 3)
 
@@ -60,9 +60,9 @@ def test_the_example_of_editing_runs(home):
 @pytest.mark.usefixtures("home")
 def test_the_page_lists_every_output_and_each_has_the_shape_that_it_says():
     names = {}
-    exec(blocks_of("docs/python.md", "python")[0], names)
+    exec(blocks_of("docs/guides/python.md", "python")[0], names)
     scene = names["scene"]
-    section = text_of("docs/python.md").split("| output | shape | |\n")[1].split("\n\n")[0]
+    section = text_of("docs/guides/python.md").split("| output | shape | |\n")[1].split("\n\n")[0]
     rows = [row.split("|")[1:3] for row in section.splitlines()[1:]]
     shapes = {name: shape.strip() for named, shape in rows for name in re.findall(r"`([^`]+)`", named)}
     assert {name for name in shapes if ":" not in name} == {output.name for output in scene.outputs}
@@ -80,7 +80,7 @@ def test_the_page_lists_every_output_and_each_has_the_shape_that_it_says():
 
 
 def test_the_notebook_runs_and_holds_no_outputs(home, monkeypatch):
-    notebook = json.loads(text_of("docs/example.ipynb"))
+    notebook = json.loads(text_of("docs/guides/example.ipynb"))
     assert (notebook["nbformat"], notebook["nbformat_minor"]) == (4, 5)
     assert len({cell["id"] for cell in notebook["cells"]}) == len(notebook["cells"])
     (run,) = home.glob("outputs/*/*/*")

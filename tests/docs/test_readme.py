@@ -16,7 +16,11 @@ from unmix_plugin.commands.render import render
 from unmix_plugin.commands.train import train
 
 README = text_of("README.md")
-PAGES = ["README.md", "CHANGELOG.md", *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md")))]
+PAGES = [
+    "README.md",
+    "CHANGELOG.md",
+    *(path.relative_to(ROOT).as_posix() for path in sorted((ROOT / "docs").rglob("*.md"))),
+]
 COMMANDS = {
     "unmix-process": process,
     "unmix-train": train,
@@ -99,6 +103,9 @@ def test_links_lead_to_a_page_and_to_a_heading(page):
 
 
 def test_the_index_lists_every_page():
-    listed = set(re.findall(r"\]\(([\w.-]+\.(?:md|ipynb))", text_of("docs/index.md")))
-    there = {path.name for path in (ROOT / "docs").iterdir() if path.suffix in (".md", ".ipynb")}
-    assert listed == there - {"index.md"}
+    listed = set(re.findall(r"\]\(((?:[\w-]+/)?[\w-]+\.(?:md|ipynb))", text_of("docs/index.md")))
+    docs = ROOT / "docs"
+    pages = {
+        path.relative_to(docs).as_posix() for path in docs.rglob("*") if path.suffix in (".md", ".ipynb")
+    }
+    assert listed == pages - {"index.md"}

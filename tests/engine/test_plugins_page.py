@@ -1,4 +1,4 @@
-"""docs/plugins.md: the public names that it lists are those there are, and its example trains."""
+"""docs/guides/plugins.md: the public names that it lists are those there are, and its example trains."""
 
 import importlib.metadata
 import re
@@ -15,7 +15,7 @@ from unmix_plugin.engine import registry
 from unmix_plugin.engine.runs.load_run import load_model
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 
-PAGE = (Path(__file__).parents[2] / "docs" / "plugins.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "guides" / "plugins.md").read_text(encoding="utf-8")
 
 
 def test_the_public_names_are_those_that_the_page_lists():

@@ -4,7 +4,7 @@ Notation: `S` samples, `K` endmembers, `B` bands. A hash grid gives density and 
 encoding PE of the point, one network gives abundances and the tint h, another a scale for each endmember in (0, 1).
 The view-dependent spectrum sees direction and PE only, one value a band.
 
-Source: Perez et al. 2025, section 3, and the authors' code. docs/method.md lists what still differs.
+Source: Perez et al. 2025, section 3, and the authors' code. docs/background/method.md lists what still differs.
 """
 
 from __future__ import annotations

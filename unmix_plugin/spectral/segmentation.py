@@ -3,7 +3,7 @@
 Notation: `K` endmembers, predicted material ids 0..K-1; `M` true materials, labels 0..M-1; 255 says "nothing here" in a
 prediction and "unlabelled" in the truth.
 
-The protocol (docs/evaluation.md): pixels with the true label 255 are ignored. Predicted ids are matched to true
+The protocol (docs/reference/figures.md): pixels with the true label 255 are ignored. Predicted ids are matched to true
 materials one to one, once per scene, on intersection over union over all views. On a labelled pixel, a predicted 255
 and an id without a partner are misses of the true material. A true material without a partner has IoU and F1 of 0.
 One that occurs in no view is left out of the matching and of the means.

@@ -184,7 +184,7 @@ def test_spectra_of_another_sampling_are_refused():
 
 
 def test_the_page_of_docs_lists_every_named_index_as_it_is_computed():
-    page = (Path(__file__).parents[3] / "docs" / "indices.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[3] / "docs" / "guides" / "indices.md").read_text(encoding="utf-8")
     for name, named in NAMED_INDICES.items():
         low, high = named.usual_range
         assert f"| {named.title} | `{named.formula}` | {named.source} | {low:g} to {high:g} |" in page
