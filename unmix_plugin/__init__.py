@@ -1,7 +1,7 @@
 """From posed spectral images to a 3-D scene that knows what it is made of.
 
-The public names, for scripts and notebooks; docs/guides/python.md shows each. They are imported when first used, so that
-`import unmix_plugin` costs nothing.
+The public names, for scripts and notebooks; docs/guides/python.md shows each. They are imported when first used,
+so that `import unmix_plugin` costs nothing.
 """
 
 from importlib import import_module

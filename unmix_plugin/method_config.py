@@ -70,6 +70,6 @@ unmix_nerf_published = MethodSpecification(
         ),
         optimizers=dict.fromkeys(("grid", "networks", "spectra"), _AS_PUBLISHED),
     ),
-    description="UnMix-NeRF as its authors publish it, for comparison; docs/background/method.md says what still differs",
+    description="UnMix-NeRF as its authors publish it, for comparison; docs/background/method.md says what differs",
     scene=unmix_scene,
 )
