@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from unmix_plugin.errors import CaptureError
-from unmix_plugin.scenes.reading.json_values import UnreadableJsonError, read_json_file
+from unmix_plugin.scenes.reading.faults import UnreadableJsonError, read_json_file
 
 
 def load_json(path: Path) -> Any:

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float64
 
-from unmix_plugin.scenes.reading.faults import Faults
-from unmix_plugin.scenes.reading.json_values import describe, read_number
+from unmix_plugin.scenes.reading.faults import Faults, describe, read_number
 
 TRANSFORM_KEY, SCALE_KEY, OFFSET_KEY = "applied_transform", "applied_scale", "offset"
 ROTATION_TOLERANCE = 1e-5

@@ -14,7 +14,7 @@ from unmix_plugin.captures.layouts.registry import LayoutOptions
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.spectral_file import BandTable, SpectralFile
 from unmix_plugin.errors import CaptureError, counted
-from unmix_plugin.scenes.reading.json_values import describe
+from unmix_plugin.scenes.reading.faults import describe
 
 Split: TypeAlias = Literal["train", "eval"]
 SPLIT_OF_FILE: dict[str, Split] = {"train": "train", "val": "eval", "eval": "eval", "test": "eval"}

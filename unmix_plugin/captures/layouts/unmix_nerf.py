@@ -26,7 +26,7 @@ from unmix_plugin.captures.layouts.frames import (
 from unmix_plugin.captures.layouts.registry import LayoutOptions
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import BandTable, SpectralFile
-from unmix_plugin.scenes.reading.json_values import read_number
+from unmix_plugin.scenes.reading.faults import read_number
 
 CUBE_KEY = "hyperspectral_file_path"
 SCALE_8_BITS = 255.0

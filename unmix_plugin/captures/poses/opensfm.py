@@ -16,7 +16,7 @@ from unmix_plugin.captures.poses.pose_set import Lens, PoseSet
 from unmix_plugin.captures.poses.raw_poses import RawCamera, SparsePoints, make_pose_set
 from unmix_plugin.captures.poses.rigid import FLIP, name_some
 from unmix_plugin.errors import CaptureError
-from unmix_plugin.scenes.reading.json_values import describe, read_number
+from unmix_plugin.scenes.reading.faults import describe, read_number
 
 PLAIN = ("perspective", "simple_radial", "radial", "brown")
 FISHEYES = ("fisheye", "fisheye_opencv")

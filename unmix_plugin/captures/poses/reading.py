@@ -19,7 +19,7 @@ from unmix_plugin.captures.poses.sizes import PictureSizes, Size
 from unmix_plugin.captures.poses.transforms_json import has_frames, read_transforms
 from unmix_plugin.captures.poses.xml_text import load_xml
 from unmix_plugin.errors import CaptureError
-from unmix_plugin.scenes.reading.json_values import describe
+from unmix_plugin.scenes.reading.faults import describe
 
 KNOWN = (
     "transforms.json, a COLMAP model (.bin or .txt), Metashape's cameras as XML, OpenSfM's reconstruction.json, "

@@ -18,8 +18,7 @@ from unmix_plugin.captures.poses.transforms_lens import lens_numbers, make_lens,
 from unmix_plugin.errors import CaptureError, SceneError
 from unmix_plugin.formats.ply import read_ply_points
 from unmix_plugin.scenes.placement import Placement, read_placement
-from unmix_plugin.scenes.reading.faults import Faults
-from unmix_plugin.scenes.reading.json_values import describe, read_number
+from unmix_plugin.scenes.reading.faults import Faults, describe, read_number
 
 NAME_KEYS = ("file_path", "hyperspectral_file_path", "name")
 """Of a frame: the first that is there names its image."""

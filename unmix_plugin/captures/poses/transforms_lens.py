@@ -9,7 +9,7 @@ from typing import Any
 from unmix_plugin.captures.poses.lens_fit import fit_lens, project_fisheye
 from unmix_plugin.captures.poses.pose_set import Lens
 from unmix_plugin.errors import CaptureError
-from unmix_plugin.scenes.reading.json_values import describe, read_number
+from unmix_plugin.scenes.reading.faults import describe, read_number
 
 RADIAL_KEYS, TANGENTIAL_KEYS = ("k1", "k2", "k3", "k4"), ("p1", "p2")
 PLAIN_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from unmix_plugin.errors import CaptureError
-from unmix_plugin.scenes.reading.scene_paths import sha256_of
+from unmix_plugin.scenes.reading.faults import sha256_of
 
 
 def stamps(paths: Iterable[Path]) -> list[list[Any]]:

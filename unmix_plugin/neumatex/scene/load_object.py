@@ -29,9 +29,14 @@ from unmix_plugin.neumatex.scene.spectral_light import SpectralLight, spectral_l
 from unmix_plugin.neumatex.scene.true_materials import read_true_materials
 from unmix_plugin.neumatex.tone.curves import TONE_MAPPINGS, ToneMapping
 from unmix_plugin.scenes.placement import Placement
-from unmix_plugin.scenes.reading.faults import Faults
-from unmix_plugin.scenes.reading.json_values import describe, read_json_file, read_number
-from unmix_plugin.scenes.reading.scene_paths import resolve_path, sha256_of
+from unmix_plugin.scenes.reading.faults import (
+    Faults,
+    describe,
+    read_json_file,
+    read_number,
+    resolve_path,
+    sha256_of,
+)
 from unmix_plugin.scenes.reading.splits import split_frames
 from unmix_plugin.scenes.reading.transforms_json import FILE_NAME, SceneEntry, read_transforms
 from unmix_plugin.scenes.scene import Normalisation

@@ -15,8 +15,7 @@ from unmix_plugin.errors import SceneError
 from unmix_plugin.neumatex.lighting.environment import Environment
 from unmix_plugin.neumatex.lighting.lamp import mean_spectrum, read_lamp
 from unmix_plugin.neumatex.scene.posed_pictures import PosedPictures
-from unmix_plugin.scenes.reading.faults import Faults
-from unmix_plugin.scenes.reading.scene_paths import resolve_path
+from unmix_plugin.scenes.reading.faults import Faults, resolve_path
 from unmix_plugin.scenes.reading.transforms_json import FILE_NAME, SceneEntry
 from unmix_plugin.spectral.bands import Bands
 

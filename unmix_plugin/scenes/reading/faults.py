@@ -1,8 +1,15 @@
-"""Collect every fault of a scene, so that a user mends them in one go and not one a start."""
+"""What a scene's files say, of unknown origin: JSON values, paths that may be followed, and every fault collected.
+
+A user mends all faults in one go and not one a start.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
+import math
 from pathlib import Path
+from typing import Any
 
 from unmix_plugin.errors import SceneError
 
@@ -61,3 +68,96 @@ def _name_places(places: list[str]) -> str:
     shown = ", ".join(places[:MAX_PLACES])
     hidden = len(places) - MAX_PLACES
     return f"{shown} and {hidden} more" if hidden > 0 else shown
+
+
+class UnreadableJsonError(ValueError):
+    """A file holds no JSON; the text says why."""
+
+
+def read_json_file(path: Path) -> Any:
+    """The value in a JSON file.
+
+    Raises:
+        UnreadableJsonError: it is not UTF-8, not JSON, nested too deeply, or has text that is not Unicode.
+        OSError: it cannot be opened.
+    """
+    data = path.read_bytes()
+    if not data.strip(b"\xef\xbb\xbf\t\r\n "):
+        raise UnreadableJsonError("is empty; expected JSON")
+    try:
+        content = json.loads(data.decode("utf-8-sig"))
+        json.dumps(
+            content, ensure_ascii=False
+        ).encode()  # fails on lone surrogates, which no file name can hold
+    except json.JSONDecodeError as error:
+        at = f"line {error.lineno}, column {error.colno}"
+        raise UnreadableJsonError(f"is not valid JSON ({error.msg} at {at}); was it cut short?") from error
+    except (
+        ValueError,
+        RecursionError,
+    ) as error:  # not UTF-8, surrogates, numbers of thousands of digits, nesting
+        raise UnreadableJsonError(f"is not readable as JSON ({type(error).__name__})") from error
+    return content
+
+
+def describe(value: Any) -> str:
+    """A JSON value in a few words, for messages."""
+    if isinstance(value, dict | list):
+        return "an object" if isinstance(value, dict) else f"a list of {len(value)}"
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= 40 else text[:37] + "..."
+
+
+def read_number(value: Any) -> float | None:
+    """A finite number, or None; true and false don't count as numbers."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return number if math.isfinite(number) else None
+
+
+HASH_BLOCK_BYTES = 1 << 20
+
+
+def resolve_path(
+    root: Path, text: str, allow_outside: bool | None, where: str, faults: Faults
+) -> Path | None:
+    """Find the file a scene names; None and a noted fault if it is missing, no plain file, or out of bounds.
+
+    A path is out of bounds if it is absolute or if it leads out of the scene folder, be it by `..` or through a
+    symbolic link. Such a path is followed with `allow_outside`; None is for those who can't be asked to, to whom the
+    setting is not named.
+    """
+    path = root / text
+    try:
+        inside = path.resolve().is_relative_to(root.resolve()) and not Path(text).is_absolute()
+        is_file = path.is_file()
+    except (OSError, RuntimeError, ValueError) as error:  # a name too long, a loop of links, a zero byte
+        faults.add(
+            where,
+            f"{text!r} cannot be followed ({type(error).__name__}); expected a file in the scene folder",
+        )
+        return None
+    if not inside and not allow_outside:
+        or_allow = (
+            "" if allow_outside is None else ", or allow it with allow_outside_paths if you trust this scene"
+        )
+        faults.add(where, f"{text!r} leaves the scene folder; copy the file into it{or_allow}")
+        return None
+    if not is_file:
+        found = "is not a plain file" if path.exists() else "is missing"
+        faults.add(where, f"{text!r} {found}; add the file or drop the entry")
+        return None
+    return path
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file of any size, read in small blocks."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(HASH_BLOCK_BYTES):
+            digest.update(block)
+    return digest.hexdigest()

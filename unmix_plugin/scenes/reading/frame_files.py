@@ -13,10 +13,9 @@ import numpy as np
 from jaxtyping import Bool
 
 from unmix_plugin.scenes.reading.cube_checks import check_abundances, check_cube_headers, check_cube_values
-from unmix_plugin.scenes.reading.faults import Faults
+from unmix_plugin.scenes.reading.faults import Faults, resolve_path
 from unmix_plugin.scenes.reading.images import Size
 from unmix_plugin.scenes.reading.picture_checks import check_colours, check_labels, check_masks
-from unmix_plugin.scenes.reading.scene_paths import resolve_path
 from unmix_plugin.scenes.reading.sensors import group_by_sensor, read_operators
 from unmix_plugin.scenes.reading.transforms_json import SceneEntry
 from unmix_plugin.scenes.scene import SceneOptions

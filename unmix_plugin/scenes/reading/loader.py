@@ -8,12 +8,11 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.scenes.reading.faults import Faults
+from unmix_plugin.scenes.reading.faults import Faults, resolve_path, sha256_of
 from unmix_plugin.scenes.reading.frame_files import CheckedFiles, check_files, locate_files
 from unmix_plugin.scenes.reading.images import Size
 from unmix_plugin.scenes.reading.model_space import find_model_space
 from unmix_plugin.scenes.reading.scene_cameras import make_cameras
-from unmix_plugin.scenes.reading.scene_paths import resolve_path, sha256_of
 from unmix_plugin.scenes.reading.sensors import check_coverage
 from unmix_plugin.scenes.reading.spectra_files import read_endmembers, read_illuminant
 from unmix_plugin.scenes.reading.splits import Split, split_frames

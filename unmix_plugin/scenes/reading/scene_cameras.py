@@ -9,8 +9,7 @@ from jaxtyping import Float, Float64
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.scenes.reading.images import Size
-from unmix_plugin.scenes.reading.intrinsics import Intrinsics
-from unmix_plugin.scenes.reading.transforms_json import SceneEntry
+from unmix_plugin.scenes.reading.transforms_json import Intrinsics, SceneEntry
 from unmix_plugin.scenes.scene import Normalisation
 
 

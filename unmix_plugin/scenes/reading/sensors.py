@@ -13,9 +13,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.scenes.reading.faults import Faults
+from unmix_plugin.scenes.reading.faults import Faults, describe
 from unmix_plugin.scenes.reading.images import Size
-from unmix_plugin.scenes.reading.json_values import describe
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.scene_sensor import SceneSensor
 from unmix_plugin.spectral.sensor import read_sensor

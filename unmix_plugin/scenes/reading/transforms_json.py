@@ -1,26 +1,349 @@
 """transforms.json in nerfstudio's form with the keys of UnMix-NeRF: from text of unknown origin to typed entries.
 
-Nothing here opens a file other than transforms.json; a value of the wrong type becomes a noted fault and None.
+Nothing here opens a file other than transforms.json; a value of the wrong type becomes a noted fault and None. Keys of
+a frame come before those of the whole scene (nerfstudio's rule).
+
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float64
 
+from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.scenes.placement import Placement, read_placement
-from unmix_plugin.scenes.reading.faults import Faults
-from unmix_plugin.scenes.reading.intrinsics import Intrinsics, read_intrinsics
-from unmix_plugin.scenes.reading.json_values import UnreadableJsonError, describe, read_json_file, read_number
-from unmix_plugin.scenes.reading.line_poses import LinePoses, read_line_poses
-from unmix_plugin.scenes.reading.poses import read_pose
+from unmix_plugin.scenes.reading.faults import (
+    Faults,
+    UnreadableJsonError,
+    describe,
+    read_json_file,
+    read_number,
+)
 from unmix_plugin.scenes.reading.sensors import SensorEntry, read_sensor_entry
 from unmix_plugin.spectral.bands import require_nanometres
+
+SUPPORTED_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")
+GREATEST_PX = 1e9
+"""Of focal lengths and principal points; beyond, and below its inverse, float32 loses what is projected."""
+SMALLEST_ANGLE = 1e-6
+"""Field of view in radians that is still one, and how much less than pi it must be."""
+BENDING_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
+"""Also the order of nerfstudio's `distortion_params`."""
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Lens of one frame. Sizes in pixels; None where the cube decides."""
+
+    width: int | None
+    height: int | None
+    focal_px: tuple[float, float] | None
+    """None where `camera_angle_x` is given and the width not yet known."""
+    angle_x: float | None
+    """Horizontal field of view in radians."""
+    center_px: tuple[float | None, float | None]
+    """None is the middle of the image."""
+    distortion: tuple[float, float, float, float]
+    """k1, k2, p1, p2."""
+    higher_radial: tuple[float, float]
+    """k3, k4: radial terms of the sixth and eighth power."""
+
+    @property
+    def coefficients(self) -> tuple[float, ...]:
+        """k1, k2, p1, p2, and k3, k4 where one of them is not 0."""
+        return (*self.distortion, *(self.higher_radial if any(self.higher_radial) else ()))
+
+    def focal_at(self, width: int) -> tuple[float, float]:
+        """Focal lengths x, y in pixels for images of this width."""
+        if self.focal_px is not None:
+            return self.focal_px
+        focal = 0.5 * width / math.tan(0.5 * (self.angle_x or 1.0))
+        return (focal, focal)
+
+
+def read_intrinsics(
+    content: dict[str, Any], frame: dict[str, Any], where: str, faults: Faults
+) -> Intrinsics | None:
+    """Read the lens of a frame; None and noted faults if it is not to be used."""
+    noted_before = faults.noted
+    numbers = _Numbers(content, frame, where, faults)
+    model = frame.get("camera_model", content.get("camera_model", "OPENCV"))
+    if model not in SUPPORTED_MODELS:
+        names = ", ".join(SUPPORTED_MODELS)
+        owner = where if "camera_model" in frame else "transforms.json"
+        faults.add(
+            owner,
+            f"camera_model {describe(model)} is not supported; expected one of {names}: undistort first",
+        )
+    width, height = numbers.read_size("w"), numbers.read_size("h")
+    focal_x, focal_y = numbers.read("fl_x"), numbers.read("fl_y")
+    angle_x = numbers.read("camera_angle_x")
+    _check_focal(focal_x, focal_y, angle_x, numbers, where, faults)
+    bending = numbers.read_bending()
+    if model in ("PINHOLE", "SIMPLE_PINHOLE") and any(bending.values()):
+        faults.add(where, f"camera_model {model} comes with distortion {bending}; expected OPENCV or zeros")
+    if faults.noted > noted_before:
+        return None
+    focal_px = None if focal_x is None else (focal_x, focal_x if focal_y is None else focal_y)
+    return Intrinsics(
+        width=width,
+        height=height,
+        focal_px=focal_px,
+        angle_x=angle_x,
+        center_px=(numbers.read("cx"), numbers.read("cy")),
+        distortion=(bending["k1"], bending["k2"], bending["p1"], bending["p2"]),
+        higher_radial=(bending["k3"], bending["k4"]),
+    )
+
+
+def _check_focal(
+    focal_x: float | None,
+    focal_y: float | None,
+    angle_x: float | None,
+    numbers: _Numbers,
+    where: str,
+    faults: Faults,
+) -> None:
+    for key, focal in (("fl_x", focal_x), ("fl_y", focal_y)):
+        if focal is not None and not 1.0 / GREATEST_PX <= focal <= GREATEST_PX:
+            faults.add(where, f"'{key}' is {focal:g}; expected a focal length above 0 in pixels")
+    if angle_x is not None and not SMALLEST_ANGLE <= angle_x <= math.pi - SMALLEST_ANGLE:
+        faults.add(where, f"'camera_angle_x' is {angle_x:g}; expected radians between 0 and pi")
+    if not numbers.has("fl_x") and not numbers.has("camera_angle_x"):
+        faults.add(
+            where, "'fl_x' is absent; expected the focal length in pixels, for a frame or the whole scene"
+        )
+
+
+class _Numbers:
+    """Numbers of a frame, or of the scene where the frame has none; each fault is noted where the number is."""
+
+    def __init__(self, content: dict[str, Any], frame: dict[str, Any], where: str, faults: Faults) -> None:
+        self._content, self._frame, self._where, self._faults = content, frame, where, faults
+
+    def has(self, key: str) -> bool:
+        return self._frame.get(key) is not None or self._content.get(key) is not None
+
+    def read(self, key: str) -> float | None:
+        source = self._frame if self._frame.get(key) is not None else self._content
+        value = source.get(key)
+        if value is None:
+            return None
+        number = read_number(value)
+        if number is None or abs(number) > GREATEST_PX:
+            where = self._where if source is self._frame else "transforms.json"
+            self._faults.add(where, f"'{key}' is {describe(value)}; expected a finite number, at most 1e9")
+            return None
+        return number
+
+    def read_size(self, key: str) -> int | None:
+        number = self.read(key)
+        if number is not None and (number < 1 or number != int(number)):
+            self._faults.add(self._where, f"'{key}' is {number:g}; expected a whole number of pixels")
+            return None
+        return None if number is None else int(number)
+
+    def read_bending(self) -> dict[str, float]:
+        bending = {key: self.read(key) or 0.0 for key in BENDING_KEYS}
+        listed = self._frame.get("distortion_params", self._content.get("distortion_params"))
+        if listed is None:
+            return bending
+        values = [read_number(value) for value in listed] if isinstance(listed, list) else []
+        if len(values) != len(BENDING_KEYS) or any(
+            value is None or abs(value) > GREATEST_PX for value in values
+        ):
+            names = ", ".join(BENDING_KEYS)
+            self._faults.add(
+                self._where, f"'distortion_params' is {describe(listed)}; expected the numbers {names}"
+            )
+            return bending
+        return {key: value or 0.0 for key, value in zip(BENDING_KEYS, values, strict=True)}
+
+
+RIGID_TOLERANCE = 5e-3
+"""Largest element of R^T R - 1 that passes as rounding of printed digits; the rotation nearest to R is then taken."""
+
+MAX_DISTANCE = 1e9
+"""Camera positions beyond this are damage; squares of larger ones would leave float32."""
+
+
+def read_pose(
+    matrix: Any, where: str, faults: Faults, name: str = "'transform_matrix'"
+) -> Float64[np.ndarray, "3 4"] | None:
+    """Check a `transform_matrix` (4x4 or 3x4, OpenGL camera to world); None and a noted fault if it is not a pose.
+
+    Args:
+        name: What messages call it.
+    """
+    rows = _read_rows(matrix)
+    if rows is None:
+        found = "is absent" if matrix is None else f"is {_found(matrix)}"
+        faults.add(where, f"{name} {found}; expected 4 (or 3) rows of 4 finite numbers, camera to world")
+        return None
+    if len(rows) == 4 and np.abs(rows[3] - np.array([0.0, 0.0, 0.0, 1.0])).max() > 1e-6:
+        last = ", ".join(f"{value:g}" for value in rows[3])
+        faults.add(where, f"{name} is not rigid: its last row is ({last}); expected (0, 0, 0, 1)")
+        return None
+    rotation, position = rows[:3, :3], rows[:3, 3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        deviation = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if not deviation <= RIGID_TOLERANCE:
+        lengths = ", ".join(f"{math.hypot(*axis):.4g}" for axis in rotation.T)  # hypot does not overflow
+        message = f"{name} is not rigid: its axes have lengths ({lengths}) and R^T R is off the identity"
+        faults.add(where, f"{message} by {deviation:.3g}; expected a rotation without scale or shear")
+        return None
+    if np.linalg.det(rotation) < 0.0:
+        faults.add(where, f"{name} is a reflection (determinant -1); expected a rotation, flip one axis")
+        return None
+    if np.abs(position).max() > MAX_DISTANCE:
+        faults.add(
+            where,
+            f"{name} puts the camera at {position.tolist()}; expected less than 1e9 units away",
+        )
+        return None
+    u, _, vt = np.linalg.svd(rotation)
+    return np.concatenate([u @ vt, position[:, None]], axis=1)
+
+
+def _read_rows(matrix: Any) -> Float64[np.ndarray, "rows 4"] | None:
+    if not isinstance(matrix, list) or len(matrix) not in (3, 4):
+        return None
+    if not all(isinstance(row, list) and len(row) == 4 for row in matrix):
+        return None
+    numbers = [[read_number(value) for value in row] for row in matrix]
+    if any(number is None for row in numbers for number in row):
+        return None
+    return np.array(numbers, dtype=np.float64)
+
+
+def _found(matrix: Any) -> str:
+    """What stands in place of rows of numbers: a value that is no number, or else the whole."""
+    if isinstance(matrix, list):
+        for number, row in enumerate(matrix):
+            if not isinstance(row, list) or len(row) != 4:
+                return f"{describe(matrix)} whose row {number} is {describe(row)}"
+            for value in row:
+                if read_number(value) is None:
+                    return f"{describe(matrix)} rows with {describe(value)} in row {number}"
+    return describe(matrix)
+
+
+ROW_POSES, KEY_POSES = "row_poses", "key_poses"
+GREATEST_TURN_DEG = 90.0
+"""Between neighbouring key poses: beyond, it is unclear which way the camera turned."""
+
+
+@dataclass(frozen=True)
+class LinePoses:
+    """Checked poses of one line camera."""
+
+    rows: Float64[np.ndarray, " n"]
+    """Row of each pose, increasing."""
+    poses: Float64[np.ndarray, "n 3 4"]
+    """Camera to world, rotations orthonormal."""
+    is_by_row: bool
+    """Whether they were given row by row."""
+
+    @property
+    def middle(self) -> Float64[np.ndarray, "3 4"]:
+        """The pose halfway through the image."""
+        keys = KeyPoses(torch.from_numpy(self.poses), torch.from_numpy(self.rows), (len(self.rows),))
+        y = torch.tensor([0.5 * (self.rows[0] + self.rows[-1])], dtype=torch.float64)
+        return keys.at(torch.zeros(1, dtype=torch.int64), y)[0].numpy()
+
+    def fault(self, num_rows: int) -> str | None:
+        """Why the poses don't fit an image of so many rows; None if they do."""
+        if self.is_by_row:
+            if len(self.rows) == num_rows:
+                return None
+            found = f"'{ROW_POSES}' has {len(self.rows)} poses, but the cube has {num_rows} rows"
+            return f"{found}; expected one pose a row"
+        first, last = float(self.rows[0]), float(self.rows[-1])
+        if first <= 0 and last >= num_rows - 1:
+            return None
+        return (
+            f"'{KEY_POSES}' reach from row {first:g} to row {last:g}, but the cube has rows 0 to {num_rows - 1}; "
+            "expected the first key pose at row 0 or before it, and the last at the last row or after it"
+        )
+
+
+def read_line_poses(frame: dict[str, Any], where: str, faults: Faults) -> LinePoses | None:
+    """The poses of a line camera; None for a frame camera, and with a noted fault where they are wrong."""
+    given = [key for key in (ROW_POSES, KEY_POSES) if frame.get(key) is not None]
+    if not given:
+        return None
+    if len(given) == 2 or frame.get("transform_matrix") is not None:
+        named = [*given, *(["transform_matrix"] if frame.get("transform_matrix") is not None else [])]
+        faults.add(where, f"has {' and '.join(repr(key) for key in named)}; expected one of them")
+        return None
+    entries = frame[given[0]]
+    if not isinstance(entries, list) or len(entries) < 2:
+        faults.add(where, f"'{given[0]}' is {describe(entries)}; expected a list of at least two poses")
+        return None
+    is_by_row = given[0] == ROW_POSES
+    found = _row_poses(entries, where, faults) if is_by_row else _key_poses(entries, where, faults)
+    return None if found is None else _checked(*found, is_by_row, where, faults)
+
+
+def _row_poses(entries: list[Any], where: str, faults: Faults) -> tuple[list[float], list[np.ndarray]] | None:
+    poses = []
+    for row, matrix in enumerate(entries):
+        pose = read_pose(matrix, f"{where} '{ROW_POSES}'[{row}]", faults, "the pose")
+        if pose is None:  # one is enough: a list of a thousand rows has them all wrong in one way
+            return None
+        poses.append(pose)
+    return [float(row) for row in range(len(poses))], poses
+
+
+def _key_poses(entries: list[Any], where: str, faults: Faults) -> tuple[list[float], list[np.ndarray]] | None:
+    rows, poses = [], []
+    for index, entry in enumerate(entries):
+        here = f"{where} '{KEY_POSES}'[{index}]"
+        row = read_number(entry.get("row")) if isinstance(entry, dict) else None
+        if row is None:
+            found = (
+                f"has the row {describe(entry.get('row'))}"
+                if isinstance(entry, dict)
+                else f"is {describe(entry)}"
+            )
+            faults.add(here, f"{found}; expected an object with 'row' (a number) and 'transform_matrix'")
+            return None
+        pose = read_pose(entry.get("transform_matrix"), here, faults)
+        if pose is None:
+            return None
+        rows.append(row)
+        poses.append(pose)
+    return rows, poses
+
+
+def _checked(
+    rows: list[float], poses: list[np.ndarray], is_by_row: bool, where: str, faults: Faults
+) -> LinePoses | None:
+    for before, after in pairwise(rows):
+        if not after > before:
+            faults.add(where, f"the rows of '{KEY_POSES}' must increase; got {before:g} then {after:g}")
+            return None
+    stacked = np.stack(poses)
+    products = np.einsum("nab,nab->n", stacked[1:, :, :3], stacked[:-1, :, :3])
+    turns = np.rad2deg(np.arccos(np.clip((products - 1) / 2, -1, 1)))
+    largest = int(turns.argmax())
+    if turns[largest] > GREATEST_TURN_DEG:
+        faults.add(
+            where,
+            f"the camera turns by {turns[largest]:.0f} degrees from row {rows[largest]:g} to row "
+            f"{rows[largest + 1]:g}; expected at most {GREATEST_TURN_DEG:g}, give more key poses",
+        )
+        return None
+    return LinePoses(np.array(rows), stacked, is_by_row)
+
 
 FILE_NAME = "transforms.json"
 SPLIT_KEYS = ("train_filenames", "val_filenames", "test_filenames")

@@ -19,9 +19,8 @@ from jaxtyping import Float64
 
 from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.scenes.placement import read_placement
-from unmix_plugin.scenes.reading.faults import Faults
-from unmix_plugin.scenes.reading.intrinsics import Intrinsics, read_intrinsics
-from unmix_plugin.scenes.reading.json_values import describe, read_number
+from unmix_plugin.scenes.reading.faults import Faults, describe, read_number
+from unmix_plugin.scenes.reading.transforms_json import Intrinsics, read_intrinsics
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.trained.camera_files.camera_json import (
     FORMAT_VERSION,

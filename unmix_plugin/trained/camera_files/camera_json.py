@@ -13,9 +13,14 @@ from jaxtyping import Float64
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError, SceneError
-from unmix_plugin.scenes.reading.faults import Faults
-from unmix_plugin.scenes.reading.json_values import UnreadableJsonError, describe, read_json_file, read_number
-from unmix_plugin.scenes.reading.poses import read_pose
+from unmix_plugin.scenes.reading.faults import (
+    Faults,
+    UnreadableJsonError,
+    describe,
+    read_json_file,
+    read_number,
+)
+from unmix_plugin.scenes.reading.transforms_json import read_pose
 from unmix_plugin.trained.run_views import RunView
 
 FORMAT_VERSION = 1

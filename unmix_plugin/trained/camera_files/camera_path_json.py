@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.scenes.reading.json_values import describe, read_number
+from unmix_plugin.scenes.reading.faults import describe, read_number
 from unmix_plugin.trained.camera_files.camera_json import (
     CameraFile,
     camera_entries,
