@@ -16,11 +16,10 @@ from tests.fuzz.mutation import mutate_json, mutate_png
 from tests.fuzz.reader import Reader
 from tests.scenes.scene_factory import look_at
 from unmix_plugin.errors import ConfigError, SceneError, SpectrumError
-from unmix_plugin.scenes.reading.arrays import UnreadableArrayError, read_array_header
-from unmix_plugin.scenes.reading.cube_values import measure_cube
+from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, measure_cube, read_array_header
 from unmix_plugin.scenes.reading.faults import Faults
-from unmix_plugin.scenes.reading.frame_files import locate_files
 from unmix_plugin.scenes.reading.images import UnreadableImageError, read_colour, read_labels, read_mask
+from unmix_plugin.scenes.reading.loader import locate_files
 from unmix_plugin.scenes.reading.splits import split_frames
 from unmix_plugin.scenes.reading.transforms_json import read_transforms
 from unmix_plugin.scenes.scene import Normalisation, SceneOptions

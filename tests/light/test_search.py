@@ -12,7 +12,7 @@ from unmix_plugin.light.search import LampEvidence, best_lamp, find_lamp, turnin
 from unmix_plugin.scenes.demo.shading import LAMP_POSITION, render_view
 from unmix_plugin.scenes.demo.views import LOOK_AT, demo_cameras
 from unmix_plugin.scenes.geometry.carving import carve_box
-from unmix_plugin.scenes.geometry.hull_places import local_log_brightness, seen_places
+from unmix_plugin.scenes.geometry.lighting import local_log_brightness, seen_places
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.3])

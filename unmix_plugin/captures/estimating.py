@@ -14,7 +14,7 @@ from unmix_plugin.captures.poses.contrast import contrast_picture, mean_weights
 from unmix_plugin.captures.poses.estimation import estimate_poses
 from unmix_plugin.captures.poses.pose_set import PoseSet
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, ViewRecord
-from unmix_plugin.scenes.reading.arrays import map_array
+from unmix_plugin.scenes.reading.cubes import map_array
 
 
 def estimated_poses(plan: Plan, records: Mapping[str, ViewRecord], scene: Path, work: Path) -> PoseSet:

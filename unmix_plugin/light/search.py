@@ -25,7 +25,7 @@ from torch.nn.functional import normalize
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.light.lamp import Lamp, LampFrame, MovingLamp, Triple
-from unmix_plugin.scenes.geometry.hull_places import Places, coarse_hull, seen_places
+from unmix_plugin.scenes.geometry.lighting import Places, coarse_hull, seen_places
 
 LEAST_SHARE = 0.15
 """Of the changes of brightness within places, that a lamp must explain to be accepted."""

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from unmix_plugin.scenes.geometry.hull_places import local_log_brightness
+from unmix_plugin.scenes.geometry.lighting import local_log_brightness
 from unmix_plugin.scenes.pixel_table import DrawnPixels, PixelTable
 from unmix_plugin.scenes.pixel_table.block import PixelBlock
 from unmix_plugin.spectral.evidence import alpha_trust, background_level, brightness, may_show_matter

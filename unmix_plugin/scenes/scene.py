@@ -18,13 +18,9 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.engine.instantiate import Common, short
 from unmix_plugin.scenes.placement import Placement
-from unmix_plugin.scenes.reading.arrays import map_array
-from unmix_plugin.scenes.reading.cube_values import InvalidPixels, read_cube, read_invalid
+from unmix_plugin.scenes.reading.cubes import InvalidPixels, map_array, read_cube, read_invalid
 from unmix_plugin.scenes.reading.images import read_colour, read_labels, read_mask
 from unmix_plugin.spectral.scene_sensor import SceneSensor
-
-UNLABELLED = 255
-"""Label of a pixel whose material is unknown."""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from tests.scenes.scene_factory import ball_alpha, ring_poses
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.scenes.geometry.carving import carve_box
-from unmix_plugin.scenes.geometry.hull_places import local_log_brightness
+from unmix_plugin.scenes.geometry.lighting import local_log_brightness
 
 BOX = SceneBox(torch.tensor([[-1.0, -1.2, -0.9], [1.1, 1.0, 1.0]]))
 SIDE, FOCAL = 40, 60.0

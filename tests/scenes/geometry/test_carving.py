@@ -16,8 +16,14 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.scenes import carve, load_scene
 from unmix_plugin.scenes.geometry.bounds import find_bounds
-from unmix_plugin.scenes.geometry.carving import carve_box, foreground_mask, needed_witnesses
-from unmix_plugin.scenes.geometry.foreground_rays import MIN_EXPLAINED, foreground_rays, share_through
+from unmix_plugin.scenes.geometry.carving import (
+    MIN_EXPLAINED,
+    carve_box,
+    foreground_mask,
+    foreground_rays,
+    needed_witnesses,
+    share_through,
+)
 
 
 def centres(box: SceneBox, cells: int) -> np.ndarray:

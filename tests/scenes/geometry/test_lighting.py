@@ -7,8 +7,14 @@ import torch
 from tests.scenes.geometry.ball_views import BOX, RADIUS, SIDE, ball_matter, ball_views, make_cameras
 from tests.scenes.scene_factory import ring_poses
 from unmix_plugin.scenes.geometry.carving import carve_box
-from unmix_plugin.scenes.geometry.hull_places import hull_places, seen_places
-from unmix_plugin.scenes.geometry.lighting import foretold_share, gain_spread, judge_light, view_gains
+from unmix_plugin.scenes.geometry.lighting import (
+    foretold_share,
+    gain_spread,
+    hull_places,
+    judge_light,
+    seen_places,
+    view_gains,
+)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.5])

@@ -9,8 +9,7 @@ import torch
 from unmix_plugin.engine.geometry.rotations import rotation_matrix
 from unmix_plugin.scenes import load_scene
 from unmix_plugin.scenes.demo.scene import make_demo_scene
-from unmix_plugin.scenes.geometry.carving import foreground_mask
-from unmix_plugin.scenes.geometry.mask_agreement import mask_warning, share_explained
+from unmix_plugin.scenes.geometry.carving import foreground_mask, mask_warning, share_explained
 from unmix_plugin.scenes.scene import Scene
 
 

@@ -17,10 +17,13 @@ from unmix_plugin.scenes.demo.places import WORLD
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.scenes.demo.shading import render_view
 from unmix_plugin.scenes.demo.shapes import first_hits
-from unmix_plugin.scenes.geometry.seen_through import seen_through
-from unmix_plugin.scenes.geometry.swept_depths import SweptDepths, sweep_depths
+from unmix_plugin.scenes.geometry.surface_evidence import (
+    SurfaceEvidence,
+    SweptDepths,
+    seen_through,
+    sweep_depths,
+)
 from unmix_plugin.scenes.pixel_table import PixelTable
-from unmix_plugin.scenes.surface_evidence import SurfaceEvidence
 
 BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 CPU = torch.device("cpu")

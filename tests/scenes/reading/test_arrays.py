@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from unmix_plugin.scenes.reading import arrays
+from unmix_plugin.scenes.reading import cubes as arrays
 
 
 def test_headers_are_parsed_one_at_a_time(tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ from unmix_plugin.captures.poses.matching import BY_ORDER
 from unmix_plugin.captures.poses.pose_set import Lens, PoseSet
 from unmix_plugin.captures.poses.raw_poses import RawCamera, make_pose_set
 from unmix_plugin.errors import CaptureError
-from unmix_plugin.scenes.reading.arrays import UnreadableArrayError, map_array, read_array_header
+from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array, read_array_header
 
 FILE_NAME = "poses_bounds.npy"
 PICTURE_FOLDERS = ("images", "exr")

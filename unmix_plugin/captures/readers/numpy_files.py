@@ -13,7 +13,7 @@ from unmix_plugin.captures.readers.loaded_arrays import loaded
 from unmix_plugin.captures.readers.read_options import ReadOptions
 from unmix_plugin.captures.spectral_file import SpectralFile
 from unmix_plugin.errors import CaptureError
-from unmix_plugin.scenes.reading.arrays import (
+from unmix_plugin.scenes.reading.cubes import (
     READ_HEADER,
     UnreadableArrayError,
     map_array,

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from unmix_plugin.errors import CaptureError, SceneError, counted
-from unmix_plugin.scenes.reading.arrays import UnreadableArrayError, map_array, read_array_header
+from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array, read_array_header
 from unmix_plugin.scenes.reading.images import FORMATS, UnreadableImageError, read_colour
 
 LIGHT_SUFFIXES = (".exr", ".npy")

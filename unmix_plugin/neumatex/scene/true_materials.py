@@ -13,9 +13,9 @@ from jaxtyping import Float32, Float64
 
 from unmix_plugin.errors import SceneError
 from unmix_plugin.neumatex.scene.spectral_light import SpectralLight
-from unmix_plugin.scenes.reading.arrays import UnreadableArrayError, map_array
+from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array
 from unmix_plugin.scenes.reading.faults import Faults, resolve_path
-from unmix_plugin.scenes.reading.spectra_files import read_endmembers
+from unmix_plugin.scenes.reading.loader import read_endmembers
 from unmix_plugin.scenes.reading.transforms_json import SceneEntry
 
 

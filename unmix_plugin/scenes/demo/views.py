@@ -13,9 +13,7 @@ from jaxtyping import Float, Float32, UInt8
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.upright_cameras import upright_cameras
 from unmix_plugin.scenes.demo.shading import ViewCoefficients
-
-UNLABELLED = 255
-"""Label of pixels that are covered to less than half."""
+from unmix_plugin.scenes.reading.images import UNLABELLED
 
 VIEW_ANGLE_DEG = 38.0
 CAMERA_DISTANCE = 4.1

@@ -26,8 +26,7 @@ from unmix_plugin.engine.geometry.focus import focus_point
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.errors import SceneError
-from unmix_plugin.scenes.geometry.carving import carve_box
-from unmix_plugin.scenes.geometry.foreground_rays import MIN_EXPLAINED, foreground_rays, share_through
+from unmix_plugin.scenes.geometry.carving import MIN_EXPLAINED, carve_box, foreground_rays, share_through
 from unmix_plugin.scenes.geometry.matched_points import MatchedPoints
 
 OUTLIERS = 0.005

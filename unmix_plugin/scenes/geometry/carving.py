@@ -1,4 +1,20 @@
-"""Which cells of space may be occupied, judged by the training views alone and before any training.
+"""Rays through the foreground of pictures, and whether a hull explains them.
+
+What a line camera sees of cells of space, and which it looks through: see `carving`.
+
+The ball around a cell is looked up: where its middle is seen, and how far it reaches along the line and, as fast as the
+camera moves there, across it.
+
+Notation: `M` cells.
+
+Which cells of contracted space may be occupied: those that enough training views see.
+
+What one view alone sees is not held by the others: before each camera lies such a space, and what grows there is fog.
+Far away, where a small part of a world fits into a view, two views are enough; near a camera more must agree.
+
+Notation: `R` cells along an edge of the contracted cube, `N` cameras.
+
+Which cells of space may be occupied, judged by the training views alone and before any training.
 
 A cell stays if enough training cameras see it and, where pictures have alpha, no training view looks through it: a view
 looks through a cell if the cell's whole footprint, widened by a margin, lies in the image on background. The footprint
@@ -9,6 +25,10 @@ What one or two views see is not held by the others, and what grows there fits s
 the views must see a cell, unless that leaves pixels unexplained, without alpha a tenth.
 
 Notation: `M` cells, `R` cells along an edge; cells are indexed [x, y, z] from the box's smallest corner.
+
+Whether the masks of the training views fit together: what one view shows, no other may look through.
+
+They don't where poses are off by more than a few pixels, and where masks err.
 """
 
 from __future__ import annotations
@@ -24,17 +44,160 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.camera_distortion import distort, undistort
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.contraction import UnitSpace
 from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.engine.geometry.scene_box import SceneBox
-from unmix_plugin.scenes.geometry.foreground_rays import (
-    MIN_EXPLAINED,
-    foreground_rays,
-    share_through,
-    without_specks,
-)
-from unmix_plugin.scenes.geometry.line_footprints import LineView
-from unmix_plugin.scenes.geometry.world_carving import carve_world
 from unmix_plugin.scenes.scene import Scene
+
+MAX_RAYS = 20_000
+"""Pixels that are asked for whether a hull explains them."""
+MIN_EXPLAINED = 0.999
+"""Share of the foreground pixels whose rays must cross what is kept."""
+
+
+def foreground_rays(cameras: Cameras, foreground: list[Bool[np.ndarray, "_ _"]]) -> RayBundle:
+    """Rays through foreground pixels, evenly thinned out to at most `MAX_RAYS`."""
+    flat = np.flatnonzero(np.concatenate([mask.reshape(-1) for mask in foreground]))
+    chosen = flat[:: max(1, -(-len(flat) // MAX_RAYS))]
+    starts = np.cumsum([0, *(mask.size for mask in foreground)])
+    views = np.searchsorted(starts, chosen, side="right") - 1
+    widths = np.array([mask.shape[1] for mask in foreground])[views]
+    rows, columns = np.divmod(chosen - starts[views], widths)
+    coords = torch.from_numpy(np.stack([columns, rows], axis=-1)).float() + 0.5
+    return cameras.generate_rays(torch.from_numpy(views), coords)
+
+
+def share_through(rays: RayBundle, box: SceneBox, hull: Bool[np.ndarray, "R R R"]) -> float:
+    """Share of the rays that meet a cell of the hull; 0 without rays."""
+    if len(rays) == 0:
+        return 0.0
+    cells = hull.shape[0]
+    t_near, t_far = box.intersect(rays.origins, rays.directions)
+    kept = torch.from_numpy(hull)
+    meets = torch.zeros(len(rays), dtype=torch.bool)
+    for step in torch.linspace(0.0, 1.0, 2 * cells):
+        points = rays.origins + (t_near + step * (t_far - t_near))[:, None] * rays.directions
+        x, y, z = (box.normalise(points) * cells).long().clamp(0, cells - 1).unbind(-1)
+        meets |= kept[x, y, z] & (t_far > t_near)
+    return float(meets.double().mean())
+
+
+def without_specks(foreground: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """Foreground that has neighbours: single pixels in the air need no hull behind them."""
+    from scipy.ndimage import binary_opening  # slow to import, and most commands carve nothing
+
+    return binary_opening(foreground, np.ones((2, 2), dtype=bool))
+
+
+_MARGIN_PX = 1.5
+
+
+@dataclass(frozen=True)
+class LineFootprint:
+    """Rectangles of pixels around projected cells, and their depths; NaN where no row sees a cell's middle."""
+
+    low: Float32[np.ndarray, "2 M"]
+    high: Float32[np.ndarray, "2 M"]
+    depths: Float32[np.ndarray, " M"]
+
+
+class LineView:
+    """One line camera with the running sum of its foreground pixels."""
+
+    def __init__(self, cameras: Cameras, index: int, covered: Int32[np.ndarray, " pixels"] | None) -> None:
+        """`covered` holds sums over rectangles from the first pixel, (H + 1) x (W + 1) of them, row after row."""
+        self._camera = cameras[index]
+        self._columns, self._rows = cameras.size(index)
+        self.covered = covered
+        y = torch.arange(self._rows + 1, dtype=torch.float32)
+        poses = self._camera.poses_at(torch.zeros(len(y), dtype=torch.int64), y)
+        up, back, places = poses[1:, :, 1], poses[:-1, :, 2], poses[:, :, 3]
+        # From one row to the next, a point at depth d moves across the line by shift - d turn.
+        self._shift = ((places[:-1] - places[1:]) * up).sum(dim=1)
+        self._turn = (back * up).sum(dim=1)
+
+    def footprint(self, centres: Float32[np.ndarray, "3 M"], half: Float32[np.ndarray, "3"]) -> LineFootprint:
+        """Where cells of these half edges are seen."""
+        points, radius = torch.from_numpy(np.ascontiguousarray(centres.T)), float(np.linalg.norm(half))
+        middle, depths = self._camera.project(points, 0)
+        rows = middle[:, 1].long().clamp(0, self._rows - 1)
+        speed = (self._shift[rows] - depths * self._turn[rows]).abs().clamp(min=1e-9)
+        across = radius * self._camera.focal_px[0, 0] / depths.clamp(min=1e-6)
+        reach = torch.stack([across, radius / speed]) + _MARGIN_PX
+        unseen = depths <= 0
+        low, high = ((middle.T + side * reach).masked_fill(unseen, torch.nan).numpy() for side in (-1, 1))
+        return LineFootprint(low, high, depths.numpy())
+
+    def sees(self, footprint: LineFootprint, near: float) -> Bool[np.ndarray, " M"]:
+        """Cells of which at least a part may be in the image and beyond the near plane."""
+        inside = (footprint.high[0] > 0) & (footprint.low[0] < self._columns)
+        return inside & (footprint.depths > near)
+
+    def looks_through(self, footprint: LineFootprint) -> Bool[np.ndarray, " M"]:
+        """Cells whose whole footprint lies in the image, on background pixels."""
+        assert self.covered is not None
+        low, high = footprint.low, footprint.high
+        inside = (low >= 0).all(axis=0) & (high[0] < self._columns) & (high[1] < self._rows)
+        chosen = np.flatnonzero(inside)
+        x0, y0 = low[:, chosen].astype(np.int32)
+        x1, y1 = high[:, chosen].astype(np.int32) + 1
+        sums = self.covered.reshape(self._rows + 1, self._columns + 1)
+        empty = np.zeros(len(inside), dtype=bool)
+        empty[chosen] = sums[y1, x1] - sums[y0, x1] - sums[y1, x0] + sums[y0, x0] == 0
+        return empty
+
+
+SEEN_CELLS = 64
+"""Cells along an edge in which visibility is judged; finer grids repeat it."""
+SHARE = 0.05
+"""Share of the training views that must see a cell, but two of them at least."""
+NEAR_SHARE = 0.2
+"""The same of cells near a camera."""
+NEAR = 0.6
+"""What is near, in distances from the cameras to the middle of the box, median over cameras."""
+_BLOCK = 1 << 16
+
+
+def carve_world(cameras: Cameras, box: SceneBox, resolution: int) -> Bool[np.ndarray, "R R R"]:
+    """Cells that may be occupied.
+
+    Args:
+        cameras: Of the training views.
+        box: The scene box, which the world is contracted around.
+        resolution: Cells along each edge of the grid.
+    """
+    cells = min(resolution, SEEN_CELLS)
+    unit = (torch.cartesian_prod(*[torch.arange(cells)] * 3) + 0.5) / cells
+    points = UnitSpace(box, is_unbounded=True).from_unit(unit)
+    seen_by = torch.cat([_count_views(cameras, part) for part in points.split(_BLOCK)])
+    positions = cameras.camera_to_world[:, :, 3]
+    limit = NEAR * float((positions - box.aabb.mean(dim=0)).norm(dim=-1).median())
+    nearest = torch.cat([torch.cdist(part, positions).amin(dim=1) for part in points.split(_BLOCK)])
+    fewest = torch.where(nearest < limit, _number(NEAR_SHARE, cameras), _number(SHARE, cameras))
+    kept = _with_neighbours((seen_by >= fewest).view(cells, cells, cells))
+    index = torch.arange(resolution) * cells // resolution
+    return kept[index][:, index][:, :, index].numpy()
+
+
+def _number(share: float, cameras: Cameras) -> int:
+    """Of views: a share of all, but two at least if there are two."""
+    return min(max(2, math.ceil(share * len(cameras))), len(cameras))
+
+
+def _count_views(cameras: Cameras, points: torch.Tensor) -> torch.Tensor:
+    count = torch.zeros(len(points), dtype=torch.int64)
+    for index in range(len(cameras)):
+        pixels, depths = cameras.project(points, index)
+        limits = torch.tensor(cameras.size(index), dtype=torch.float32)
+        count += ((pixels >= 0.0) & (pixels <= limits)).all(dim=-1) & (depths > 0.0)
+    return count
+
+
+def _with_neighbours(cells: torch.Tensor) -> torch.Tensor:
+    """A cell counts by its centre, so those beside one that is seen may be seen in part."""
+    grown = torch.nn.functional.max_pool3d(cells.float()[None, None], 3, stride=1, padding=1)
+    return grown[0, 0] > 0
+
 
 PIXEL_MARGIN = 1.0
 """Pixels around a footprint that must be empty too: alpha is quantised and poses are not exact."""
@@ -298,3 +461,40 @@ def _bend(
     points = np.stack(np.broadcast_arrays(columns[:, None], rows[None, :]), axis=-1)
     bent = distort(torch.from_numpy(points), distortion).numpy().reshape(9, -1, 2)
     return bent.min(axis=0).T, bent.max(axis=0).T
+
+
+LEAST_AGREEMENT = 0.98
+"""Share of the foreground that all masks together must leave. Scenes with true poses have 1, with masks of which some
+err 0.984 to 0.996, the demo scene with poses off by 3 px 0.993 and by 5 px 0.968."""
+
+
+def share_explained(
+    scene: Scene,
+    hull: Bool[np.ndarray, "R R R"],
+    foreground: list[Bool[np.ndarray, "_ _"]],
+    cameras: Cameras,
+) -> float:
+    """Share of the training views' foreground behind which a hull has something.
+
+    Args:
+        scene: In whose box the hull lies.
+        foreground: For each training view True on pixels that may show something.
+        cameras: Of the training views.
+    """
+    rays = foreground_rays(cameras, [without_specks(mask) for mask in foreground])
+    return share_through(rays, scene.scene_box, hull)
+
+
+def mask_warning(scene: Scene, foreground: list[Bool[np.ndarray, "_ _"]]) -> str | None:
+    """What to say of masks that contradict each other; None if they don't. For bounded scenes with alpha."""
+    cameras = scene.cameras[list(scene.train_indices)]
+    share = share_explained(
+        scene, carve_box(cameras, foreground, scene.scene_box, WITNESS_CELLS), foreground, cameras
+    )
+    if share >= LEAST_AGREEMENT:
+        return None
+    return (
+        f"the masks of the training views contradict each other: behind {1 - share:.1%} of what they show, other views "
+        f"see only background (expected at most {1 - LEAST_AGREEMENT:.0%}). Poses may be off by some pixels "
+        "(--poses refine corrects them), or masks have holes"
+    )

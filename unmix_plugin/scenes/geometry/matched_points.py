@@ -19,7 +19,7 @@ from jaxtyping import Float, Float32, Int
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.scenes.geometry.thinned_views import ReadView, Thinning
+from unmix_plugin.scenes.geometry.pose_check import ReadView, Thinning
 
 LONGEST_SIDE_PX = 320
 """Of the views that are compared."""

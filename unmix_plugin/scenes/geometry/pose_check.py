@@ -1,4 +1,8 @@
-"""Do the poses mean what we take them for? Views are compared under this convention and under three common others.
+"""Views with fewer pixels, for what is sought in them before training.
+
+Notation: `H x W` pixels of a view, `h x w` of it thinned out, `B` bands.
+
+Do the poses mean what we take them for? Views are compared under this convention and under three common others.
 
 A point of the scene looks alike in all views that see it. So points along the rays of some pixels are projected into
 neighbouring views, and the best agreement along each ray counts. With the right poses it is close, with wrong ones
@@ -7,20 +11,75 @@ convention under which views agree.
 
 Notation: `N` views, `F` features of a pixel, `P` pixels of one view, `D` points along a ray. Poses are camera to world
 with OpenGL axes, in world units, float64.
+
+Whether the cameras stand far enough apart to tell how far away things are.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Float, Float32, Float64, Int
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.scenes.geometry.thinned_views import ReadView, Thinning
+from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.scenes.scene import Scene
+
+MOST_BANDS = 32
+"""Of what is compared."""
+MOST_POOLED = 4
+"""Pixels along an edge that are averaged, if there are so many; of more, every second or third is left out."""
+
+ReadView = Callable[[int, tuple[slice, ...]], Float32[np.ndarray, "H W B"]]
+"""From a view, and the rows, columns and bands wanted, to its picture."""
+
+
+@dataclass(frozen=True)
+class Thinning:
+    """Which pixels of a view are averaged to one."""
+
+    fine: int
+    """Of so many pixels along an edge one is read."""
+    pooled: int
+    """Of so many that are read along an edge the mean is taken."""
+    band_step: int
+    """Of so many bands one is read."""
+
+    @classmethod
+    def to(
+        cls, longest_side_px: int, cameras: Cameras, read_view: ReadView, most_pooled: int = MOST_POOLED
+    ) -> Thinning:
+        """Of views that show the same bands to at most so many pixels along their longer side, and `MOST_BANDS`."""
+        stride = -(-max(cameras.width, cameras.height) // longest_side_px)
+        fine = max(1, stride // most_pooled)
+        bands = read_view(0, (slice(1), slice(1))).shape[2]
+        return cls(fine, stride // fine, -(-bands // MOST_BANDS))
+
+    @property
+    def stride(self) -> int:
+        """Pixels of the whole view from one pixel of the thinned-out one to the next."""
+        return self.fine * self.pooled
+
+    @property
+    def first(self) -> float:
+        """Where in the whole view the first lies, from the centre of its first pixel on."""
+        return self.fine * (self.pooled - 1) / 2
+
+    def read(self, read_view: ReadView, view: int) -> Float[Tensor, "h w B"]:
+        """A view thinned out."""
+        some = slice(None, None, self.fine)
+        picture = read_view(view, (some, some, slice(None, None, self.band_step)))
+        image = torch.from_numpy(np.ascontiguousarray(picture)).permute(2, 0, 1)
+        return torch.nn.functional.avg_pool2d(image, self.pooled).permute(1, 2, 0)
+
+    def whole(self, coords: Float[Tensor, "P 2"]) -> Float[Tensor, "P 2"]:
+        """Coordinates in the whole view of those in the thinned-out one; pixel centres are at + 0.5 in both."""
+        return (coords - 0.5) * self.stride + self.first + 0.5
+
 
 NUM_REFERENCES, NUM_NEIGHBOURS, NUM_AGREEING = 8, 4, 3
 """Views whose pixels are looked for, others that each is looked for in, and of these how many must agree: the one
@@ -249,3 +308,25 @@ def view_differences(
     shown = sampled[0, :, :, 0].T.reshape(len(own), -1, own.shape[-1])
     differences = (shown - own[:, None]).norm(dim=-1)
     return differences.masked_fill(~is_seen.reshape(differences.shape), torch.inf)
+
+
+_SMALLEST_BASE = 2e-3
+"""Distance between two cameras over that of what they see, below which it moves by hardly more than a pixel."""
+
+
+def parallax_warning(positions: Float[np.ndarray, "N 3"], box: SceneBox) -> str | None:
+    """A warning if all cameras stand at one place.
+
+    Args:
+        positions: Of the cameras, of a line camera at several rows; model space.
+        box: Of the scene.
+    """
+    apart = np.linalg.norm(positions - positions[0], axis=1).max()
+    away = np.linalg.norm(np.abs(box.aabb.cpu().numpy() - positions[0]).max(axis=0))
+    if apart > _SMALLEST_BASE * away:
+        return None
+    return (
+        "all training cameras stand at one place: turned about itself, a camera sees nothing of how far away things "
+        "are, so no other place can be rendered from such views. Move it between views; if it was moved, look whether "
+        "each 'transform_matrix' is camera to world: read the other way, all cameras around an object stand at one"
+    )

@@ -21,13 +21,14 @@ from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.scenes.geometry.pose_check import (
     LONGEST_SIDE_PX,
     NUM_AGREEING,
+    ReadView,
+    Thinning,
     choose_neighbours,
     local_change,
     thinned_lenses,
     view_differences,
     view_features,
 )
-from unmix_plugin.scenes.geometry.thinned_views import ReadView, Thinning
 
 TILES = 12
 """Along each side of a view: a pixel of each part is asked, since what is far away may be a small part of a view."""

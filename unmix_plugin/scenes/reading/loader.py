@@ -1,4 +1,8 @@
-"""From a scene folder to a validated `Scene`."""
+"""From a scene folder to a validated `Scene`.
+
+Each check notes its faults and goes on, so that one reading names them all. Only one frame's values are in memory at a
+time.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +10,133 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
+from unmix_plugin.errors import SpectrumError
+from unmix_plugin.scenes.reading.cubes import check_abundances, check_cube_headers, check_cube_values
 from unmix_plugin.scenes.reading.faults import Faults, resolve_path, sha256_of
-from unmix_plugin.scenes.reading.frame_files import CheckedFiles, check_files, locate_files
-from unmix_plugin.scenes.reading.images import Size
-from unmix_plugin.scenes.reading.model_space import find_model_space
-from unmix_plugin.scenes.reading.scene_cameras import make_cameras
-from unmix_plugin.scenes.reading.sensors import check_coverage
-from unmix_plugin.scenes.reading.spectra_files import read_endmembers, read_illuminant
+from unmix_plugin.scenes.reading.images import Size, check_colours, check_labels, check_masks
+from unmix_plugin.scenes.reading.model_space import find_model_space, make_cameras
+from unmix_plugin.scenes.reading.sensors import check_coverage, group_by_sensor, read_operators
 from unmix_plugin.scenes.reading.splits import Split, split_frames
 from unmix_plugin.scenes.reading.transforms_json import FILE_NAME, SceneEntry, read_transforms
 from unmix_plugin.scenes.scene import Frame, Scene, SceneOptions
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.library.spectra_csv import SpectraTable, read_illuminant_csv, read_spectra_csv
+from unmix_plugin.spectral.scene_sensor import SceneSensor
+
+
+def read_illuminant(
+    path: Path, wavelengths_nm: Float64[np.ndarray, " B"], where: str, faults: Faults
+) -> Float64[np.ndarray, " B"] | None:
+    """Relative power of the light, greatest value 1; None and a noted fault if it cannot be had at these bands."""
+    try:
+        return read_illuminant_csv(path, Bands(wavelengths_nm))
+    except SpectrumError as error:
+        faults.add(where, str(error))
+        return None
+
+
+def read_endmembers(
+    path: Path,
+    wavelengths_nm: Float64[np.ndarray, " B"],
+    materials: tuple[str, ...] | None,
+    where: str,
+    faults: Faults,
+) -> SpectraTable | None:
+    """True endmembers in the order of `materials`, matched by name; None and a noted fault if they do not fit."""
+    try:
+        table = read_spectra_csv(path).resampled(Bands(wavelengths_nm))
+    except SpectrumError as error:
+        faults.add(where, str(error))
+        return None
+    if materials is None:
+        return table
+    if sorted(materials) != sorted(table.names):
+        faults.add(where, f"{path} names {list(table.names)}; expected the 'materials' {list(materials)}")
+        return None
+    order = [table.names.index(name) for name in materials]
+    return SpectraTable(table.bands, materials, table.spectra[order])
+
+
+@dataclass(frozen=True)
+class CheckedFiles:
+    """What the checks found on their way through the files."""
+
+    sizes: list[Size]
+    """Of each frame's images."""
+    sensors: tuple[SceneSensor, ...]
+    sensor_indices: tuple[int, ...]
+    """Which sensor took each frame."""
+    foreground: tuple[Bool[np.ndarray, "_ _"], ...] | None
+    """For each frame the pixels that may show something: not fully transparent, or not to be trusted. None where the
+    scene has no alpha."""
+    cube_hashes: dict[Path, str]
+    """SHA-256 of each cube, in the order of the frames."""
+
+
+def locate_files(
+    root: Path, entry: SceneEntry, options: SceneOptions, faults: Faults
+) -> tuple[dict[str, Path], ...]:
+    """The files of each frame by the key that names them; a file that two frames share as their cube is a fault."""
+    located: list[dict[str, Path]] = []
+    owner: dict[Path, str] = {}
+    for frame in entry.frames:
+        paths: dict[str, Path] = {}
+        for key, text in frame.paths.items():
+            path = resolve_path(root, text, options.allow_outside_paths, frame.where, faults)
+            if path is not None:
+                paths[key] = path
+        cube = paths.get("hyperspectral_file_path")
+        if cube is not None:
+            first = owner.setdefault(cube.resolve(), frame.where)
+            if first != frame.where:
+                text = frame.paths["hyperspectral_file_path"]
+                faults.add(frame.where, f"is a duplicate: its cube {text!r} is that of {first} too; drop one")
+        located.append(paths)
+    return tuple(located)
+
+
+def check_files(
+    entry: SceneEntry,
+    located: tuple[dict[str, Path], ...],
+    num_materials: int | None,
+    options: SceneOptions,
+    faults: Faults,
+) -> CheckedFiles | None:
+    """Read and check all files of all frames; None with noted faults if no cube is sound."""
+    entries = [
+        (frame.where, frame.sensor, paths.get("responses_path"))
+        for frame, paths in zip(entry.frames, located, strict=True)
+    ]
+    operators = read_operators(entries, entry.wavelengths_nm, faults)
+    sizes, headers = check_cube_headers(entry, located, operators, faults)
+    values = check_cube_values(entry, located, headers, options.value_scale, options.invalid_pixels, faults)
+    seen = check_colours(entry, located, sizes, faults)
+    masks = check_masks(entry, located, sizes, faults)
+    check_labels(entry, located, sizes, num_materials, faults)
+    for frame, paths, size in zip(entry.frames, located, sizes, strict=True):
+        if "abundance_file_path" in paths:
+            where = frame.name_of("abundance_file_path")
+            check_abundances(paths["abundance_file_path"], size, num_materials, where, faults)
+    cubes = [cube for cube in values if cube is not None]
+    known_sizes = [size for size in sizes if size is not None]
+    known_operators = [operator for operator in operators if operator is not None]
+    if len(cubes) != len(values) or len(known_operators) != len(operators) or not cubes:
+        return None
+    foreground = None
+    if seen is not None:
+        foreground = tuple(
+            (np.ones(size, bool) if shown is None else shown)
+            | (False if cube.invalid is None else cube.invalid)
+            | (False if mask is None else ~mask)
+            for shown, cube, mask, size in zip(seen, cubes, masks, known_sizes, strict=True)
+        )
+    paths = [paths["hyperspectral_file_path"] for paths in located]
+    sensors, indices = group_by_sensor(entries, known_operators, known_sizes, faults)
+    hashes = {path: cube.sha256 for path, cube in zip(paths, cubes, strict=True)}
+    return CheckedFiles(known_sizes, sensors, indices, foreground, hashes)
+
 
 SCALE_RANGE = (1e-30, 1e30)
 """Of `value_scale`: what float32 can divide by."""

@@ -5,47 +5,18 @@ Notation: `B` bands of the scene, `b` channels of a frame's cube.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.scenes.reading.faults import Faults, describe
+from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.images import Size
+from unmix_plugin.scenes.reading.transforms_json import SensorEntry
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.scene_sensor import SceneSensor
 from unmix_plugin.spectral.sensor import read_sensor
-
-
-@dataclass(frozen=True)
-class SensorEntry:
-    """What a frame says of its sensor; None where it says nothing."""
-
-    name: str | None = None
-    bands: tuple[int, ...] | None = None
-    """Bands of the scene, one a channel, in the order of the channels."""
-
-
-def read_sensor_entry(frame: dict[str, Any], where: str, faults: Faults) -> SensorEntry:
-    """The keys `sensor` and `bands` of a frame; whether the bands exist is asked later."""
-    name, bands = frame.get("sensor"), frame.get("bands")
-    if name is not None and (not isinstance(name, str) or not name.strip()):
-        faults.add(where, f"'sensor' is {describe(name)}; expected a name")
-        name = None
-    if bands is None:
-        return SensorEntry(name)
-    if frame.get("responses_path") is not None:
-        faults.add(where, "has 'bands' and 'responses_path'; a sensor has one of them, drop the other")
-    if not isinstance(bands, list) or not bands or not all(type(band) is int for band in bands):
-        faults.add(where, f"'bands' is {describe(bands)}; expected indices into 'wavelengths', one a channel")
-        return SensorEntry(name)
-    repeated = sorted({band for band in bands if bands.count(band) > 1})
-    if repeated:
-        faults.add(where, f"'bands' repeats {', '.join(map(str, repeated))}; expected each band once")
-    return SensorEntry(name, tuple(bands))
 
 
 def read_operators(

@@ -27,7 +27,6 @@ from unmix_plugin.scenes.reading.faults import (
     read_json_file,
     read_number,
 )
-from unmix_plugin.scenes.reading.sensors import SensorEntry, read_sensor_entry
 from unmix_plugin.spectral.bands import require_nanometres
 
 SUPPORTED_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")
@@ -345,6 +344,34 @@ def _checked(
     return LinePoses(np.array(rows), stacked, is_by_row)
 
 
+@dataclass(frozen=True)
+class SensorEntry:
+    """What a frame says of its sensor; None where it says nothing."""
+
+    name: str | None = None
+    bands: tuple[int, ...] | None = None
+    """Bands of the scene, one a channel, in the order of the channels."""
+
+
+def _read_sensor_entry(frame: dict[str, Any], where: str, faults: Faults) -> SensorEntry:
+    """The keys `sensor` and `bands` of a frame; whether the bands exist is asked later."""
+    name, bands = frame.get("sensor"), frame.get("bands")
+    if name is not None and (not isinstance(name, str) or not name.strip()):
+        faults.add(where, f"'sensor' is {describe(name)}; expected a name")
+        name = None
+    if bands is None:
+        return SensorEntry(name)
+    if frame.get("responses_path") is not None:
+        faults.add(where, "has 'bands' and 'responses_path'; a sensor has one of them, drop the other")
+    if not isinstance(bands, list) or not bands or not all(type(band) is int for band in bands):
+        faults.add(where, f"'bands' is {describe(bands)}; expected indices into 'wavelengths', one a channel")
+        return SensorEntry(name)
+    repeated = sorted({band for band in bands if bands.count(band) > 1})
+    if repeated:
+        faults.add(where, f"'bands' repeats {', '.join(map(str, repeated))}; expected each band once")
+    return SensorEntry(name, tuple(bands))
+
+
 FILE_NAME = "transforms.json"
 SPLIT_KEYS = ("train_filenames", "val_filenames", "test_filenames")
 FILE_KEYS = (
@@ -472,7 +499,7 @@ def _read_frame(
         paths={key: path for key, path in paths.items() if path is not None},
         pose=pose if lines is None else lines.middle,
         intrinsics=read_intrinsics(content, frame, where, faults),
-        sensor=read_sensor_entry(frame, where, faults),
+        sensor=_read_sensor_entry(frame, where, faults),
         line_poses=lines,
     )
 

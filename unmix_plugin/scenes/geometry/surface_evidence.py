@@ -7,6 +7,17 @@ in mirrors and in what one view alone shows it stays unknown.
 Notation: `N` views, `h x w` pixels of a view that are asked, `P` = h w, `D` distances along a ray, `F` features.
 
 Source: Collins 1996, A Space-Sweep Approach to True Multi-Image Matching.
+
+Which cells of contracted space are empty, since several views see what is behind them.
+
+A view looks through a cell if it lies clearly before all known distances of the pixels around it. Known distances may
+be wrong in places, so three views must look through a cell, and few may see their surface in it.
+
+Notation: `C` cells along an edge, `P` = C^3 cells, `h x w` pixels of a view with known distances.
+
+Where surfaces are in an unbounded world, as far as the training views agree on it before any training.
+
+Notation: `R` drawn pixels, `N` training views, `h x w` pixels of a view that were asked.
 """
 
 from __future__ import annotations
@@ -15,20 +26,24 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.contraction import UnitSpace
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.scenes.geometry.pose_check import (
     LONGEST_SIDE_PX,
     NUM_AGREEING,
+    ReadView,
+    Thinning,
     choose_neighbours,
     thinned_lenses,
     view_differences,
     view_features,
 )
-from unmix_plugin.scenes.geometry.thinned_views import ReadView, Thinning
+from unmix_plugin.scenes.pixel_table import DrawnPixels
+from unmix_plugin.scenes.scene import Scene
 
 MOST_VIEWS = 64
 """Of a scene with more, so many are swept."""
@@ -165,3 +180,99 @@ def _patch_means(differences: Float[Tensor, "P D"], own: Float[Tensor, "h w F"])
     total, share = torch.nn.functional.avg_pool2d(images.unflatten(2, (height, width)), 3, 1, 1)
     means = torch.where(share > 0.5, total / share.clamp(min=0.1), torch.inf)
     return means.flatten(1).T
+
+
+WITNESSES = 3
+"""Views that must look through a cell."""
+MOST_CONTRADICTION = 0.15
+"""Views that may see a surface in it, over those that look through it."""
+MARGIN = 1.5
+"""Between a cell's centre and a surface behind it, in edges of the cell."""
+
+
+def seen_through(depths: SweptDepths, cameras: Cameras, box: SceneBox, cells: int) -> Bool[Tensor, "C C C"]:
+    """Cells of the contracted world that are empty.
+
+    Args:
+        depths: Of views of `cameras`.
+        cameras: Of the training views.
+        box: That the world is contracted around.
+        cells: Along each edge.
+    """
+    space = UnitSpace(box, is_unbounded=True)
+    unit = (torch.cartesian_prod(*[torch.arange(cells)] * 3) + 0.5) / cells
+    points = space.from_unit(unit)
+    radii = space.centred(points).abs().amax(dim=-1).clamp(min=1.0)
+    margins = MARGIN * 4.0 / cells * float(space.half_edge) * radii.square()
+    through, surfaces = torch.zeros(2, len(points))
+    for view, distances in zip(depths.views, depths.distances, strict=True):
+        nearest, own, away = _looked_up(cameras, view, points, distances, depths.stride)
+        through += torch.isfinite(own) & (away + margins < nearest)
+        surfaces += (away - own).abs() <= margins
+    is_empty = (through >= WITNESSES) & (surfaces <= MOST_CONTRADICTION * through)
+    return is_empty.view(cells, cells, cells)
+
+
+def _looked_up(
+    cameras: Cameras, view: int, points: Float[Tensor, "P 3"], distances: Float[Tensor, "h w"], stride: int
+) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"], Float[Tensor, " P"]]:
+    """Of the pixel that a point falls on: the least distance of those around it, its own, and the point's."""
+    pixels, depths = cameras.project(points, view)
+    limits = torch.tensor([cameras.width, cameras.height])
+    is_seen = (depths > 0.0) & ((pixels >= 0.0) & (pixels < limits)).all(dim=-1)
+    least = -torch.nn.functional.max_pool2d(-distances[None], 3, stride=1, padding=1)[0]
+    columns, rows = (pixels / stride).nan_to_num(0.0).clamp(0.0, 1e6).long().unbind(-1)
+    rows, columns = rows.clamp(max=len(distances) - 1), columns.clamp(max=distances.shape[1] - 1)
+    own = distances[rows, columns].masked_fill(~is_seen, torch.inf)
+    away = (points - cameras.camera_to_world[view, :, 3]).norm(dim=-1)
+    return least[rows, columns], own, away
+
+
+_CELLS = 64
+"""Along an edge of the grid in which empty space is sought; finer grids repeat it."""
+
+
+class SurfaceEvidence:
+    """Distances of pixels that views agree on, and the space that they show to be empty."""
+
+    def __init__(self, scene: Scene) -> None:
+        """Compare the training views; of rigs and line cameras, and of bounded scenes, nothing is known."""
+        self._cameras = scene.cameras[list(scene.train_indices)]
+        self._box = scene.scene_box
+        self._depths: SweptDepths | None = None
+        if scene.is_unbounded and not scene.is_rig and self._cameras.key_poses is None:
+            train = scene.train_indices
+            self._depths = sweep_depths(
+                self._cameras, self._box, lambda view, part: scene.cube(train[view], part)
+            )
+
+    @property
+    def is_known(self) -> bool:
+        """Whether views could be compared."""
+        return self._depths is not None
+
+    def carved(self, reachable: Bool[np.ndarray, "X X X"]) -> Bool[np.ndarray, "X X X"]:
+        """Cells that may be occupied, without those that views look through."""
+        if self._depths is None:
+            return reachable
+        cells = min(len(reachable), _CELLS)
+        index = torch.arange(len(reachable)) * cells // len(reachable)
+        empty = seen_through(self._depths, self._cameras, self._box, cells)
+        return reachable & ~empty[index][:, index][:, :, index].numpy()
+
+    def points(self, pixels: DrawnPixels) -> Float[Tensor, "R 3"]:
+        """Places that drawn pixels show, model space; NaN where unknown."""
+        assert self._depths is not None
+        depths, device = self._depths, pixels.corners.device
+        swept = torch.full((len(self._cameras),), -1)
+        swept[list(depths.views)] = torch.arange(len(depths.views))
+        views, corners = pixels.cameras.cpu(), pixels.corners.cpu()
+        rays = self._cameras.generate_rays(views, corners + 0.5)
+        columns, rows = (corners // depths.stride).unbind(-1)
+        rows, columns = (
+            at.clamp(max=side - 1)
+            for at, side in zip((rows, columns), depths.distances.shape[1:], strict=True)
+        )
+        found = depths.distances[swept[views], rows, columns].masked_fill(swept[views] < 0, torch.inf)
+        known = torch.where(torch.isfinite(found), found, torch.nan)
+        return (rays.origins + known[:, None] * rays.directions).to(device)
