@@ -41,9 +41,14 @@ def write_disturbed(source: Path, target: Path, change: Change) -> Path:
 
 def write_lit_by_camera(source: Path, target: Path) -> Path:
     """The scene with a lamp that keeps its place beside the camera, in all views; size and bands as in the source."""
-    from unmix_plugin.scenes.demo.materials import band_centers_nm, lamp_power, reflectances
-    from unmix_plugin.scenes.demo.shading import LAMP_POSITION, render_view
-    from unmix_plugin.scenes.demo.views import demo_cameras, frame_name, radiance_cube
+    from unmix_plugin.scenes.demo.scene import demo_cameras, frame_name, radiance_cube
+    from unmix_plugin.scenes.demo.shading import (
+        LAMP_POSITION,
+        band_centers_nm,
+        lamp_power,
+        reflectances,
+        render_view,
+    )
 
     shutil.copytree(source, target)
     content = json.loads((target / "transforms.json").read_text(encoding="utf-8"))

@@ -17,15 +17,14 @@ import numpy as np
 from jaxtyping import Float16
 from PIL import Image
 
-from unmix_plugin.scenes.demo.materials import band_centers_nm, lamp_power, reflectances
-from unmix_plugin.scenes.demo.shading import render_view
-from unmix_plugin.scenes.demo.views import (
+from unmix_plugin.scenes.demo.scene import (
     demo_cameras,
     frame_name,
     lens_entries,
     radiance_cube,
     transform_matrix,
 )
+from unmix_plugin.scenes.demo.shading import band_centers_nm, lamp_power, reflectances, render_view
 
 BLOCK = 4
 """Pixels along an edge that look alike."""

@@ -17,10 +17,8 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.engine.geometry.rotations import rotation_matrix
-from unmix_plugin.scenes.demo.materials import band_centers_nm, lamp_power, reflectances
-from unmix_plugin.scenes.demo.scene import make_demo_scene
-from unmix_plugin.scenes.demo.shading import render_view
-from unmix_plugin.scenes.demo.views import demo_cameras, label_image, radiance_cube
+from unmix_plugin.scenes.demo.scene import demo_cameras, label_image, make_demo_scene, radiance_cube
+from unmix_plugin.scenes.demo.shading import band_centers_nm, lamp_power, reflectances, render_view
 
 _TRANSFORMS = "transforms.json"
 _NUM_POINTS = 300

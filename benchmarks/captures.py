@@ -125,10 +125,8 @@ def pose_errors(scene: Path, capture: Path, views: int) -> dict[str, float]:
 def reflectance_errors(scene: Path, size: int, views: int) -> dict[str, float]:
     """Mean absolute difference between the scene's cubes and what was rendered, without noise, on matter."""
     from unmix_plugin.captures.demo.capture import view_name
-    from unmix_plugin.scenes.demo.materials import reflectances
-    from unmix_plugin.scenes.demo.shading import render_view
-    from unmix_plugin.scenes.demo.texture import speckled_things
-    from unmix_plugin.scenes.demo.views import demo_cameras, reflected
+    from unmix_plugin.scenes.demo.scene import demo_cameras, reflected
+    from unmix_plugin.scenes.demo.shading import reflectances, render_view, speckled_things
 
     record = json.loads((scene / "process.json").read_text(encoding="utf-8"))["stored"]
     content = json.loads((scene / "transforms.json").read_text(encoding="utf-8"))
@@ -171,7 +169,7 @@ def add_truth(scene: Path, capture: Path) -> None:
 
 def materials() -> tuple[str, ...]:
     """What the demo scene is made of."""
-    from unmix_plugin.scenes.demo.materials import MATERIALS
+    from unmix_plugin.scenes.demo.shading import MATERIALS
 
     return MATERIALS
 

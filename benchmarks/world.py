@@ -95,7 +95,7 @@ def look(run: Path, name: str, place: Path) -> tuple[float, float]:
     """PSNR over the pixels of the objects, and fog: means over the evaluation views."""
     from unmix_plugin import open_run
     from unmix_plugin.scenes import load_scene
-    from unmix_plugin.scenes.demo.places import PLACES
+    from unmix_plugin.scenes.demo.scene import PLACES
     from unmix_plugin.scenes.demo.shading import THINGS
     from unmix_plugin.scenes.demo.shapes import first_hits
     from unmix_plugin.trained.view_rendering import render_view

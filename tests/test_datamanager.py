@@ -17,10 +17,11 @@ from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.runs.scene_record import SceneRecord, check_same_scene, scene_record_to_json
 from unmix_plugin.errors import ConfigError, RunError, SceneError
+from unmix_plugin.scenes import pixel_block as pool
+from unmix_plugin.scenes import pixel_table as memory
 from unmix_plugin.scenes.demo.scene import make_demo_scene
-from unmix_plugin.scenes.pixel_table import memory, pool
+from unmix_plugin.scenes.evidence import relative_power
 from unmix_plugin.scenes.scene import SceneOptions
-from unmix_plugin.scenes.training_evidence import relative_power
 
 CONFIG = HyperspectralDataManagerConfig(train_num_rays_per_batch=64, grid_resolution=16, single_ray_until=0.0)
 

@@ -28,24 +28,21 @@ from unmix_plugin.errors import SceneError
 from unmix_plugin.light.search import find_lamp
 from unmix_plugin.poses.knots import Knots
 from unmix_plugin.presets import choose, preset_for
-from unmix_plugin.scenes.alpha_evidence import AlphaEvidence
-from unmix_plugin.scenes.geometry.carving import carve, mask_warning, share_explained
-from unmix_plugin.scenes.geometry.lighting import judge_light
-from unmix_plugin.scenes.geometry.pose_check import check_scene_poses, parallax_warning
-from unmix_plugin.scenes.geometry.surface_evidence import SurfaceEvidence
-from unmix_plugin.scenes.identity import scene_identity
-from unmix_plugin.scenes.pixel_rays import PixelRays
-from unmix_plugin.scenes.pixel_table import PixelTable
-from unmix_plugin.scenes.reading.loader import load_scene
-from unmix_plugin.scenes.recorded_scene import check_recorded_scene
-from unmix_plugin.scenes.scene import Scene, SceneOptions
-from unmix_plugin.scenes.training_evidence import (
+from unmix_plugin.scenes.evidence import (
+    AlphaEvidence,
     band_weights,
     judge_sensors,
     noise_warnings,
     relative_power,
     rig_warnings,
 )
+from unmix_plugin.scenes.geometry.carving import carve, mask_warning, share_explained
+from unmix_plugin.scenes.geometry.lighting import judge_light
+from unmix_plugin.scenes.geometry.pose_check import check_scene_poses, parallax_warning
+from unmix_plugin.scenes.geometry.surface_evidence import SurfaceEvidence
+from unmix_plugin.scenes.pixel_table import PixelRays, PixelTable
+from unmix_plugin.scenes.reading.loader import load_scene
+from unmix_plugin.scenes.scene import Scene, SceneOptions, check_recorded_scene, scene_identity
 from unmix_plugin.sensors.batches import join_parts
 from unmix_plugin.spectral.band_noise import BandNoise
 from unmix_plugin.spectral.unmixing.partial_bands import typical_spectrum

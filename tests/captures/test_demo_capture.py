@@ -16,10 +16,14 @@ from unmix_plugin.captures.demo.line_camera import (
     demo_line_camera,
 )
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.scenes.demo.materials import band_centers_nm, lamp_power, reflectances
-from unmix_plugin.scenes.demo.shading import render_view
-from unmix_plugin.scenes.demo.texture import speckled_things
-from unmix_plugin.scenes.demo.views import demo_cameras, label_image, reflected
+from unmix_plugin.scenes.demo.scene import demo_cameras, label_image, reflected
+from unmix_plugin.scenes.demo.shading import (
+    band_centers_nm,
+    lamp_power,
+    reflectances,
+    render_view,
+    speckled_things,
+)
 
 SIZE, BANDS, VIEWS = 48, 12, 5
 GOOD = [band for band in range(BANDS) if band not in BadBands.of(BANDS).all]

@@ -9,8 +9,8 @@ from tests.scenes.scene_factory import ring_poses
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.light import search as lamp_search
 from unmix_plugin.light.search import LampEvidence, best_lamp, find_lamp, turning_axis
+from unmix_plugin.scenes.demo.scene import LOOK_AT, demo_cameras
 from unmix_plugin.scenes.demo.shading import LAMP_POSITION, render_view
-from unmix_plugin.scenes.demo.views import LOOK_AT, demo_cameras
 from unmix_plugin.scenes.geometry.carving import carve_box
 from unmix_plugin.scenes.geometry.lighting import local_log_brightness, seen_places
 

@@ -7,10 +7,10 @@ import torch
 from tests.scenes.scene_factory import make_scene
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes import SceneOptions, load_scene
-from unmix_plugin.scenes.pixel_table import PixelTable, memory
-from unmix_plugin.scenes.pixel_table import block as block_module
-from unmix_plugin.scenes.pixel_table.block import PixelBlock
-from unmix_plugin.scenes.pixel_table.memory import available_bytes
+from unmix_plugin.scenes import pixel_block as block_module
+from unmix_plugin.scenes import pixel_table as memory
+from unmix_plugin.scenes.pixel_block import PixelBlock
+from unmix_plugin.scenes.pixel_table import PixelTable, available_bytes
 
 CPU = torch.device("cpu")
 

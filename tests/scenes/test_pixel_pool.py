@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from unmix_plugin.scenes.pixel_table import pool as pool_module
-from unmix_plugin.scenes.pixel_table.pool import PixelPool
+from unmix_plugin.scenes import pixel_block as pool_module
+from unmix_plugin.scenes.pixel_block import PixelPool
 
 PIXELS = 1000
 

@@ -7,9 +7,10 @@ import torch
 from tests.scenes.scene_factory import make_scene
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.scenes import load_scene
-from unmix_plugin.scenes.pixel_table import PixelTable, memory
-from unmix_plugin.scenes.pixel_table import table as table_module
-from unmix_plugin.scenes.pixel_table.projection import ProjectedPixels, Projection
+from unmix_plugin.scenes import pixel_table as memory
+from unmix_plugin.scenes import pixel_table as table_module
+from unmix_plugin.scenes.pixel_block import ProjectedPixels, Projection
+from unmix_plugin.scenes.pixel_table import PixelTable
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.subspace import find_subspace
 

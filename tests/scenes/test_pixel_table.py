@@ -6,8 +6,8 @@ import torch
 
 from tests.scenes.rig_factory import make_rig
 from unmix_plugin.scenes import SceneOptions, load_scene
+from unmix_plugin.scenes import pixel_table as table_module
 from unmix_plugin.scenes.pixel_table import PixelTable
-from unmix_plugin.scenes.pixel_table import table as table_module
 
 CPU = torch.device("cpu")
 

@@ -20,9 +20,8 @@ from unmix_plugin.captures.demo.capture import (
 )
 from unmix_plugin.commands.entry import run_command
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.scenes.demo.materials import LAMP
-from unmix_plugin.scenes.demo.places import PLACES
-from unmix_plugin.scenes.demo.scene import DEFAULT_BANDS, DEFAULT_SIZE, DEFAULT_VIEWS, make_demo_scene
+from unmix_plugin.scenes.demo.scene import DEFAULT_BANDS, DEFAULT_SIZE, DEFAULT_VIEWS, PLACES, make_demo_scene
+from unmix_plugin.scenes.demo.shading import LAMP
 from unmix_plugin.spectral.colour.illuminants import parse_light
 
 

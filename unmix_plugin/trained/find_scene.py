@@ -8,9 +8,8 @@ from typing import Any
 
 from unmix_plugin.engine.runs.same_scene import differences, name_differences
 from unmix_plugin.errors import RunError, SceneError
-from unmix_plugin.scenes.identity import scene_identity
 from unmix_plugin.scenes.reading.loader import load_scene
-from unmix_plugin.scenes.scene import Scene, SceneOptions
+from unmix_plugin.scenes.scene import Scene, SceneOptions, scene_identity
 
 
 def find_scene(summary: Mapping[str, Any], run: Path, data: Path | None) -> Scene | None:

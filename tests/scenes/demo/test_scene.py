@@ -10,10 +10,14 @@ from PIL import Image
 
 from unmix_plugin.errors import ConfigError, SceneError, SpectrumError
 from unmix_plugin.scenes.demo import scene as demo_scene
-from unmix_plugin.scenes.demo.materials import MATERIALS, band_centers_nm, lamp_power
-from unmix_plugin.scenes.demo.scene import demo_scene_path, is_complete, make_demo_scene
-from unmix_plugin.scenes.demo.shading import render_view
-from unmix_plugin.scenes.demo.views import CAMERA_DISTANCE, frame_name
+from unmix_plugin.scenes.demo.scene import (
+    CAMERA_DISTANCE,
+    demo_scene_path,
+    frame_name,
+    is_complete,
+    make_demo_scene,
+)
+from unmix_plugin.scenes.demo.shading import MATERIALS, band_centers_nm, lamp_power, render_view
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 
 

@@ -5,9 +5,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from tests.scenes.demo.demo_parts import LAMP
-from unmix_plugin.scenes.demo.shading import THINGS, trace
-from unmix_plugin.scenes.demo.texture import solid_noise, speckled_things
-from unmix_plugin.scenes.demo.views import demo_cameras
+from unmix_plugin.scenes.demo.scene import demo_cameras
+from unmix_plugin.scenes.demo.shading import THINGS, solid_noise, speckled_things, trace
 
 
 @pytest.fixture(scope="module")

@@ -5,10 +5,16 @@ import pytest
 from numpy.testing import assert_allclose
 
 from tests.scenes.demo.demo_parts import LAMP, PLACEMENTS
-from unmix_plugin.scenes.demo.materials import MATERIALS, band_centers_nm, lamp_power, reflectances
-from unmix_plugin.scenes.demo.shading import render_view, trace
+from unmix_plugin.scenes.demo.scene import demo_cameras, label_image, radiance_cube
+from unmix_plugin.scenes.demo.shading import (
+    MATERIALS,
+    band_centers_nm,
+    lamp_power,
+    reflectances,
+    render_view,
+    trace,
+)
 from unmix_plugin.scenes.demo.shapes import first_hits
-from unmix_plugin.scenes.demo.views import demo_cameras, label_image, radiance_cube
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,7 @@ from unmix_plugin.engine.geometry.contraction import UnitSpace
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.scenes import SceneOptions, carve, load_scene
 from unmix_plugin.scenes.demo import scene as demo_scene
-from unmix_plugin.scenes.demo.places import WORLD
-from unmix_plugin.scenes.demo.scene import make_demo_scene
+from unmix_plugin.scenes.demo.scene import WORLD, make_demo_scene
 from unmix_plugin.scenes.demo.shading import render_view
 from unmix_plugin.scenes.demo.shapes import first_hits
 from unmix_plugin.scenes.geometry.surface_evidence import (

@@ -14,8 +14,7 @@ from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes import SceneOptions, carve, load_scene
 from unmix_plugin.scenes.demo import scene as demo_scene
-from unmix_plugin.scenes.demo.places import ROOM, TABLE, WORLD
-from unmix_plugin.scenes.demo.scene import make_demo_scene
+from unmix_plugin.scenes.demo.scene import ROOM, TABLE, WORLD, make_demo_scene
 from unmix_plugin.scenes.demo.shading import render_view
 from unmix_plugin.scenes.geometry.carving import carve_world
 from unmix_plugin.scenes.geometry.world_evidence import WorldEvidence

@@ -18,17 +18,24 @@ from jaxtyping import UInt16
 
 from unmix_plugin.captures.demo.line_camera import demo_line_camera
 from unmix_plugin.formats.envi_header import HeaderValue, beside, header_bytes, wavelength_entries
-from unmix_plugin.scenes.demo.folders import check_bounds, staging_for
-from unmix_plugin.scenes.demo.materials import MATERIALS, band_centers_nm, lamp_power, reflectances
-from unmix_plugin.scenes.demo.scene import SIZE_BOUNDS, VIEWS_BOUNDS
-from unmix_plugin.scenes.demo.shading import render_view
-from unmix_plugin.scenes.demo.texture import speckled_things
-from unmix_plugin.scenes.demo.views import (
+from unmix_plugin.scenes.demo.scene import (
+    SIZE_BOUNDS,
+    VIEWS_BOUNDS,
+    check_bounds,
     demo_cameras,
     label_image,
     lens_entries,
     reflected,
+    staging_for,
     transform_matrix,
+)
+from unmix_plugin.scenes.demo.shading import (
+    MATERIALS,
+    band_centers_nm,
+    lamp_power,
+    reflectances,
+    render_view,
+    speckled_things,
 )
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv

@@ -34,9 +34,14 @@ from unmix_plugin.neumatex.lighting.environment import Environment
 from unmix_plugin.neumatex.surface import Surface
 from unmix_plugin.neumatex.tracing.primary_hits import pixel_hits
 from unmix_plugin.neumatex.tracing.render_view import render_view
-from unmix_plugin.scenes.demo.folders import check_bounds, staging_for, written_once
-from unmix_plugin.scenes.demo.scene import user_cache
-from unmix_plugin.scenes.demo.views import lens_entries, transform_matrix
+from unmix_plugin.scenes.demo.scene import (
+    check_bounds,
+    lens_entries,
+    staging_for,
+    transform_matrix,
+    user_cache,
+    written_once,
+)
 
 DEFAULT_SIZE, DEFAULT_VIEWS, DEFAULT_LIGHTS = 96, 24, 4
 SIZE_BOUNDS, VIEWS_BOUNDS, LIGHTS_BOUNDS = (16, 1024), (2, 1000), (0, len(NAMES) - 1)

@@ -42,9 +42,8 @@ from unmix_plugin.neumatex.lighting.built_in import NAMES, built_in_environment
 from unmix_plugin.neumatex.lighting.environment import Environment
 from unmix_plugin.neumatex.lighting.lamp import of_lamp, read_lamp
 from unmix_plugin.neumatex.tracing.primary_hits import pixel_hits
-from unmix_plugin.scenes.demo.folders import check_bounds, staging_for
-from unmix_plugin.scenes.demo.materials import band_centers_nm
-from unmix_plugin.scenes.demo.views import lens_entries, transform_matrix
+from unmix_plugin.scenes.demo.scene import check_bounds, lens_entries, staging_for, transform_matrix
+from unmix_plugin.scenes.demo.shading import band_centers_nm
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv

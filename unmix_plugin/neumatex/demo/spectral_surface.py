@@ -12,7 +12,7 @@ from torch import Tensor
 
 from unmix_plugin.neumatex.demo.noise import Noise
 from unmix_plugin.neumatex.materials.spectral import SpectralFamily
-from unmix_plugin.scenes.demo.materials import MATERIALS, reflectances
+from unmix_plugin.scenes.demo.shading import MATERIALS, reflectances
 
 NUM_MATERIALS = 4
 _ROUNDS = 30

@@ -18,7 +18,7 @@ from unmix_plugin.neumatex.scene.picture_files import LIGHT_SUFFIXES, Picture, r
 from unmix_plugin.neumatex.tone.curves import ToneMapping
 from unmix_plugin.scenes.reading.faults import Faults, resolve_path, sha256_of
 from unmix_plugin.scenes.reading.images import UnreadableImageError, read_mask
-from unmix_plugin.scenes.reading.model_space import make_cameras
+from unmix_plugin.scenes.reading.loader import make_cameras
 from unmix_plugin.scenes.reading.transforms_json import FrameEntry, SceneEntry
 from unmix_plugin.scenes.scene import Normalisation
 

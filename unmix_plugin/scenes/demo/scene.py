@@ -1,4 +1,14 @@
-"""The built-in demo scene as a folder: a ray-traced picnic table with true labels, abundances and endmembers.
+"""Where a demo scene or a demo capture goes: what is asked of the folder, and how files get there whole.
+
+The demo scene's views: where its cameras are, and pixels from the coefficients that rays gathered.
+
+Notation: `B` bands, `K` materials, `H`, `W` rows and columns.
+
+Where the demo scene is: in front of nothing, on a ground that runs to the horizon under a sky, or in a room.
+
+Notation: `R` rays, `P` points, `K` materials.
+
+The built-in demo scene as a folder: a ray-traced picnic table with true labels, abundances and endmembers.
 
 The layout is that of any scene of ours: transforms.json, cubes (radiance in [0, 1], black where nothing is), sRGB
 images with alpha, labels (255 = unlabelled) and, for evaluation views, abundances. Writing it twice gives the same
@@ -12,28 +22,306 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float32, UInt8
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.scenes.demo.folders import check_bounds, staging_for, written_once
-from unmix_plugin.scenes.demo.materials import LAMP, MATERIALS, band_centers_nm, lamp_power, reflectances
-from unmix_plugin.scenes.demo.places import TABLE, Place
-from unmix_plugin.scenes.demo.shading import ViewCoefficients, render_view
-from unmix_plugin.scenes.demo.views import (
-    frame_name,
-    label_image,
-    lens_entries,
-    radiance_cube,
-    transform_matrix,
+from unmix_plugin.engine.geometry.upright_cameras import upright_cameras
+from unmix_plugin.errors import ConfigError, SceneError
+from unmix_plugin.scenes.demo.shading import (
+    LAMP,
+    MATERIALS,
+    THINGS,
+    Blend,
+    Sky,
+    Surface,
+    Thing,
+    ViewCoefficients,
+    band_centers_nm,
+    lamp_power,
+    plain,
+    reflectances,
+    render_view,
+    smooth_step,
 )
+from unmix_plugin.scenes.demo.shapes import Placement
+from unmix_plugin.scenes.reading.images import UNLABELLED
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
+
+
+def check_bounds(what: str, numbers: Mapping[str, tuple[int, tuple[int, int]]]) -> None:
+    """Refuse numbers out of bounds.
+
+    Args:
+        what: What is made, for the message.
+        numbers: By name of the flag: the value and its bounds, both allowed.
+    Raises:
+        ConfigError: a number is out of bounds.
+    """
+    for name, (value, (low, high)) in numbers.items():
+        if not low <= value <= high:
+            raise ConfigError(f"--{name} of {what} must be {low} to {high}; found {value}")
+
+
+@contextmanager
+def staging_for(directory: Path, what: str, overwrite: bool) -> Iterator[Path]:
+    """A temporary folder in which to build what then moves to `directory`.
+
+    Args:
+        what: What is made, for messages.
+        overwrite: Whether a folder with something in it is accepted.
+    Raises:
+        ConfigError: a folder with something in it, or no folder at all.
+        SceneError: the folder can't be written, or the disk is full.
+    """
+    if directory.exists() and not directory.is_dir():
+        raise ConfigError(f"{directory} is a file; give a folder for {what}")
+    if not overwrite and directory.is_dir() and any(directory.iterdir()):
+        raise ConfigError(
+            f"{directory} is not empty; choose another folder, or replace what is there with --overwrite"
+        )
+    try:
+        with staging_beside(directory) as staging:
+            yield staging
+    except OSError as error:  # NumPy's own has no strerror
+        raise SceneError(
+            f"can't write {what} to {directory}: {error.strerror or error}; make room there or choose another folder"
+        ) from error
+
+
+@contextmanager
+def staging_beside(directory: Path) -> Iterator[Path]:
+    """A temporary folder on the same disk, so that what is built there can be renamed into place."""
+    directory.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{directory.name}-", dir=directory.parent) as folder:
+        yield Path(folder)
+
+
+def written_once(
+    target: Path,
+    what: str,
+    write: Callable[[Path], None],
+    is_complete: Callable[[Path], bool],
+    remedy: str = "set XDG_CACHE_HOME to a folder that can be written",
+) -> Path:
+    """A folder of a cache, written on first use and again if a file of it is missing.
+
+    Args:
+        target: The folder.
+        what: What is made, for the message.
+        write: Makes it in a folder that is not there yet.
+        is_complete: Whether a folder holds all of it.
+        remedy: What to do where the folder can't be written, for the message.
+    Raises:
+        SceneError: the cache can't be written.
+    """
+    if is_complete(target):
+        return target
+    try:
+        with staging_beside(target) as staging:
+            write(staging / target.name)
+            if target.exists() and not is_complete(target):
+                target.rename(staging / "incomplete")
+            (staging / target.name).rename(target)
+    except OSError as error:
+        # Another process may have been quicker; what it wrote is as good.
+        if not is_complete(target):
+            raise SceneError(
+                f"can't write {what} to {target}: {error.strerror or error}; {remedy}"
+            ) from error
+    return target
+
+
+VIEW_ANGLE_DEG = 38.0
+CAMERA_DISTANCE = 4.1
+LOOK_AT = (0.0, 0.0, 0.22)
+ELEVATIONS_DEG = (16.0, 68.0)
+
+
+def demo_cameras(size: int, views: int) -> Cameras:
+    """Cameras on a dome around the table, azimuths spread by the golden angle."""
+    i = np.arange(views)
+    azimuths = i * np.pi * (3 - np.sqrt(5))
+    # A second irrational stride decouples elevation from order, so that every 4th view samples the whole dome.
+    shares = (i * np.sqrt(2) + 0.5 / views) % 1
+    low, high = np.sin(np.deg2rad(ELEVATIONS_DEG))
+    heights = low + (high - low) * shares
+    flat = np.sqrt(1 - heights**2)
+    backward = np.stack([flat * np.cos(azimuths), flat * np.sin(azimuths), heights], axis=1)
+    positions = np.asarray(LOOK_AT) + CAMERA_DISTANCE * backward
+    return upright_cameras(positions, backward, size, np.deg2rad(VIEW_ANGLE_DEG))
+
+
+def lens_entries(cameras: Cameras) -> dict[str, Any]:
+    """What transforms.json says of the lens that all of the cameras have."""
+    focal_px, center_px = float(cameras.focal_px[0, 0]), float(cameras.center_px[0, 0])
+    return {
+        "camera_model": "OPENCV",
+        "w": cameras.width,
+        "h": cameras.height,
+        "fl_x": focal_px,
+        "fl_y": focal_px,
+        "cx": center_px,
+        "cy": center_px,
+        **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
+    }
+
+
+def transform_matrix(cameras: Cameras, index: int) -> list[list[float]]:
+    """Camera to world as the four rows that transforms.json has."""
+    return [*cameras.camera_to_world[index].double().tolist(), [0.0, 0.0, 0.0, 1.0]]
+
+
+def frame_name(index: int) -> str:
+    """`train_000`, `train_001`, `eval_002`, ...: every 4th view is for evaluation."""
+    return f"{'eval' if index % 4 == 2 else 'train'}_{index:03d}"
+
+
+def radiance_cube(
+    view: ViewCoefficients, spectra: Float[np.ndarray, "K B"], lamp: Float[np.ndarray, " B"]
+) -> Float[np.ndarray, "H W B"]:
+    """Spectral radiance of every pixel in [0, 1]: what exceeds 1 saturates, as in a sensor."""
+    return (reflected(view, spectra) * lamp.astype(np.float32)).clip(0, 1)
+
+
+def reflected(view: ViewCoefficients, spectra: Float[np.ndarray, "K B"]) -> Float32[np.ndarray, "H W B"]:
+    """What every pixel reflects of the lamp, highlights included; 1 is a white matt panel in irradiance 1."""
+    return view.diffuse @ spectra.astype(np.float32) + view.specular[..., None]
+
+
+def label_image(view: ViewCoefficients) -> UInt8[np.ndarray, "H W"]:
+    """The material with the largest abundance where at least half a pixel is covered, otherwise 255."""
+    return np.where(view.alpha >= 0.5, view.abundances.argmax(axis=-1), UNLABELLED).astype(np.uint8)
+
+
+_GROUND_HEIGHT = -0.12
+"""The table's underside."""
+_GROUND_EDGE = 400.0
+"""Half of the ground's edge, scene units: its end is a tenth of a pixel below the horizon."""
+_SKY_BRIGHTNESS = 0.75
+_PHONE_ANGLE_DEG = 62.0
+
+
+@dataclass(frozen=True)
+class Place:
+    """What there is to see, and from where."""
+
+    things: Sequence[Thing]
+    cameras: Callable[[int, int], Cameras]
+    """From the pixels along an edge of a view and the number of views."""
+    sky: Sky | None = None
+    """What is behind all things; None leaves their pictures an alpha."""
+
+
+def open_sky(directions: Float[np.ndarray, "R 3"]) -> Float[np.ndarray, "R K"]:
+    """Cyan above, white at the horizon, with broad clouds."""
+    x, y, z = directions.T
+    haze = np.exp(-4.0 * z.clip(0))
+    clouds = smooth_step(np.sin(4.0 * x + 1.0) * np.sin(5.0 * y) + np.sin(7.0 * (x - y)) / 2, 0.1, 0.9)
+    white = np.maximum(haze, 0.7 * clouds * (1 - haze))
+    found = np.zeros((len(directions), len(MATERIALS)), np.float32)
+    found[:, MATERIALS.index("white")] = _SKY_BRIGHTNESS * white
+    found[:, MATERIALS.index("cyan")] = _SKY_BRIGHTNESS * (1 - white)
+    return found
+
+
+def patches(period: float, seed: float, fade: float = np.inf) -> Blend:
+    """Smooth patches of a surface, about `period` of its own units wide, which fade at distances around `fade`."""
+
+    def blend(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
+        x, y = (points[:, :2] * (2 * np.pi / period)).T
+        z = points[:, 2] * (2 * np.pi / period)
+        waves = np.sin(x + seed) * np.sin(y + z) + np.sin(0.37 * x - 0.61 * y + z + seed)
+        waves += np.sin(1.7 * y + 0.4 * x - 0.8 * z)
+        contrast = np.exp(-(points[:, :2] ** 2).sum(axis=1) / fade**2)
+        return (0.5 + contrast * (smooth_step(waves, -0.6, 0.6) - 0.5)).astype(points.dtype)
+
+    return blend
+
+
+def _ground() -> Thing:
+    # A cylinder's or a box's own coordinates are over its half sizes.
+    period, fade = 1.3 / _GROUND_EDGE, 9.0 / _GROUND_EDGE
+    placement = Placement("box", (0.0, 0.0, _GROUND_HEIGHT - 0.5), (_GROUND_EDGE, _GROUND_EDGE, 0.5))
+    return Thing(placement, Surface("green", "yellow", patches(period, 0.7, fade)))
+
+
+def _far_things(count: int = 14, seed: int = 5) -> list[Thing]:
+    """Huts and trees around the table, 6 to 60 units away."""
+    generator, found = np.random.default_rng(seed), []
+    for index in range(count):
+        angle = 2 * np.pi * (index + 0.6 * generator.random()) / count
+        distance = 6.0 * 10.0 ** (index * 5 % count / count)
+        size = distance * generator.uniform(0.06, 0.12)
+        center = (distance * np.cos(angle), distance * np.sin(angle), _GROUND_HEIGHT + size)
+        names = [str(name) for name in generator.choice(MATERIALS, 2, replace=False)]
+        primitive = ("box", "sphere", "cylinder")[index % 3]
+        placement = Placement(primitive, center, (size, size, size), turn_deg=float(generator.uniform(0, 90)))
+        blend = plain if index % 2 else patches(1.3, float(index))
+        found.append(Thing(placement, Surface(names[0], names[1], blend)))
+    return found
+
+
+def _room() -> list[Thing]:
+    """Floor, ceiling and walls around the table, one wall with two windows."""
+    slabs = [
+        ((0.0, 0.0, _GROUND_HEIGHT - 0.09), (3.6, 3.6, 0.1), "yellow", "red"),
+        ((0.0, 0.0, 5.0), (3.6, 3.6, 0.1), "white", "white"),
+        ((-3.6, 0.0, 2.4), (0.1, 3.6, 2.6), "cyan", "white"),
+        ((3.6, 0.0, 2.4), (0.1, 3.6, 2.6), "white", "purple"),
+        ((0.0, -3.6, 2.4), (3.6, 0.1, 2.6), "white", "green"),
+        # The wall with windows: below, above, and the posts between.
+        ((0.0, 3.6, 0.4), (3.6, 0.1, 0.6), "white", "green"),
+        ((0.0, 3.6, 3.8), (3.6, 0.1, 1.2), "white", "green"),
+        ((-3.0, 3.6, 1.8), (0.6, 0.1, 0.8), "white", "green"),
+        ((0.0, 3.6, 1.8), (0.4, 0.1, 0.8), "white", "green"),
+        ((3.0, 3.6, 1.8), (0.6, 0.1, 0.8), "white", "green"),
+        ((-2.4, 2.4, 0.5), (0.6, 0.5, 0.7), "purple", "white"),
+        ((1.9, 2.2, 0.9), (0.35, 0.35, 1.1), "green", "yellow"),
+    ]
+    return [
+        Thing(
+            Placement("box", center, half), Surface(first, second, _in_world(half, patches(0.9, 1.3 * index)))
+        )
+        for index, (center, half, first, second) in enumerate(slabs)
+    ]
+
+
+def _in_world(half_sizes: tuple[float, float, float], blend: Blend) -> Blend:
+    """A blend of points in scene units, though a shape's own coordinates are over its half sizes."""
+    sizes = np.asarray(half_sizes, np.float32)
+    return lambda points: blend(points * sizes)
+
+
+def room_cameras(size: int, views: int, seed: int = 11) -> Cameras:
+    """Cameras as of a hand-held phone on one side of the room, turned towards the table and the windows behind it."""
+    generator = np.random.default_rng(seed)
+    shifts = generator.uniform(-1, 1, (views, 3))
+    positions = np.array([0.0, -2.3, 1.5]) + shifts * (1.2, 0.5, 0.6)
+    targets = np.array([0.0, 1.2, 0.9]) + generator.uniform(-1, 1, (views, 3)) * (1.0, 0.3, 0.4)
+    backward = positions - targets
+    backward /= np.linalg.norm(backward, axis=1, keepdims=True)
+    return upright_cameras(positions, backward, size, np.deg2rad(_PHONE_ANGLE_DEG))
+
+
+TABLE = Place(THINGS, demo_cameras)
+"""The table before nothing."""
+WORLD = Place((*THINGS, _ground(), *_far_things()), demo_cameras, open_sky)
+"""The table on a ground that runs to the horizon, with huts and trees, under a sky."""
+ROOM = Place((*THINGS, *_room(), _ground(), *_far_things(20, seed=8)), room_cameras, open_sky)
+"""The table in a room with windows onto the same world."""
+PLACES: Mapping[str, Place] = {"table": TABLE, "world": WORLD, "room": ROOM}
+
 
 DEFAULT_SIZE, DEFAULT_BANDS, DEFAULT_VIEWS = 96, 31, 32
 SIZE_BOUNDS, BANDS_BOUNDS, VIEWS_BOUNDS = (16, 1024), (3, 512), (4, 1000)

@@ -1,31 +1,141 @@
-"""The demo scene's objects and light: what a camera ray gathers, as coefficients that no band enters.
+"""What the demo scene is made of: measured reflectances, the lamp's spectrum, and how two materials blend on a surface.
+
+Notation: `B` bands, `K` materials, `P` points. Reflectances are in [0, 1]; the lamp's power is relative, largest
+band 1. Abundances of a point are fractions of its area, >= 0, summing to 1.
+
+The demo scene's objects and light: what a camera ray gathers, as coefficients that no band enters.
 
 Notation: `R` rays, `P` points, `K` materials, `H`, `W` rows and columns. The radiance of a point is
 lamp * (diffuse @ reflectances + specular): `diffuse` (K) is abundance times irradiance, `specular` a number, since a
 clear coat mirrors the lamp in the lamp's own colour. Both are linear, so pixels average coefficients and the spectrum
 is applied once a pixel. Nothing is random: every subpixel sees the lamp's disc at a fixed point of it, and the sky's
 occlusion has a closed form.
+
+Speckled surfaces for the demo scene: two materials mixed at random in space, as in terrazzo or printed paper.
+
+Structure from motion finds nothing on plain surfaces. Speckles change abundances only: light, forms and gloss stay,
+and every point is still a mixture of two of the scene's materials.
+
+Notation: `P` points.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.scenes.demo.materials import (
-    MATERIALS,
-    Surface,
-    blush,
-    candy_stripes,
-    gingham,
-    plain,
-    ribbon,
-)
 from unmix_plugin.scenes.demo.shapes import Placement, dot, first_hits
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.colour.illuminants import illuminant_power
+
+MATERIALS = ("white", "red", "yellow", "green", "cyan", "purple")
+"""Six patches of the ColorChecker chart; the spectral angle between any two under the lamp is at least 0.45 rad."""
+
+_PATCHES = ("white 9.5 (.05 D)", "red", "yellow", "green", "cyan", "purple")
+
+RANGE_NM = (400.0, 700.0)
+
+LAMP = "D50"
+"""CIE illuminant of the lamp and of the sky."""
+
+Blend = Callable[[Float[np.ndarray, "P 3"]], Float[np.ndarray, " P"]]
+"""Share of the second material at points in a shape's own coordinates."""
+
+
+def band_centers_nm(bands: int) -> Float[np.ndarray, " B"]:
+    """Evenly spaced band centres over 400-700 nm, ends included."""
+    return np.linspace(*RANGE_NM, bands)
+
+
+def reflectances(wavelengths_nm: Float[np.ndarray, " B"]) -> Float[np.ndarray, "K B"]:
+    """Reflectance of every material, in the order of `MATERIALS`.
+
+    Source:
+        The average of 30 ColorChecker charts measured by BabelColor, 380-730 nm in steps of 10 nm.
+    """
+    # Imported here because colour-science takes more than a second.
+    from colour.characterisation import SDS_COLOURCHECKERS
+
+    chart = SDS_COLOURCHECKERS["BabelColor Average"]
+    return np.stack(
+        [np.interp(wavelengths_nm, chart[name].wavelengths, chart[name].values) for name in _PATCHES]
+    )
+
+
+def lamp_power(
+    wavelengths_nm: Float[np.ndarray, " B"], illuminant: str | Path = LAMP
+) -> Float[np.ndarray, " B"]:
+    """Relative power of the lamp and of the sky, which share one spectrum: largest value 1.
+
+    Args:
+        wavelengths_nm: Band centres.
+        illuminant: Name of a known light, or a CSV file, as `spectral.colour.illuminants.illuminant_power` takes it.
+    Raises:
+        SpectrumError: an unknown light, or one that is not known at all bands.
+    """
+    return illuminant_power(illuminant, Bands.of(wavelengths_nm))
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Two materials and where on a shape which of them shows."""
+
+    first: str
+    second: str
+    blend: Blend
+    roughness: float | None = None
+    """GGX alpha of the clear coat; None is matt."""
+
+    def abundances(self, local_points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P K"]:
+        """Abundances at points in the shape's own coordinates."""
+        share = self.blend(local_points)
+        result = np.zeros((len(local_points), len(MATERIALS)), dtype=local_points.dtype)
+        result[:, MATERIALS.index(self.first)] += 1 - share
+        result[:, MATERIALS.index(self.second)] += share
+        return result
+
+
+def smooth_step(values: Float[np.ndarray, " P"], low: float, high: float) -> Float[np.ndarray, " P"]:
+    """0 below `low`, 1 above `high`, a cubic with level ends between."""
+    t = ((values - low) / (high - low)).clip(0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def gingham(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
+    """Woven squares: warp and weft each carry half of the second material; a plain rim below the top."""
+    stripes = [smooth_step(np.sin(points[:, axis] * 10.5 + 0.8), -0.25, 0.25) for axis in (0, 1)]
+    on_top = points[:, 2] > 0.999
+    return np.where(on_top, (stripes[0] + stripes[1]) / 2, 1)
+
+
+def blush(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
+    """A slow gradient over one side."""
+    return smooth_step(points @ np.array([0.75, 0.5, 0.43], dtype=points.dtype), -0.15, 1.1)
+
+
+def ribbon(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
+    """A parcel's crossed ribbons, with slightly soft borders."""
+    across = np.minimum(np.abs(points[:, 0]), np.abs(points[:, 1]))
+    return 1 - smooth_step(across, 0.2, 0.27)
+
+
+def candy_stripes(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
+    """A soft helix around the side; a plain top."""
+    angle = np.arctan2(points[:, 1], points[:, 0])
+    share = smooth_step(np.sin(2 * angle + points[:, 2] * 4.5), -0.45, 0.45)
+    return np.where(np.abs(points[:, 2]) > 0.999, 0, share)
+
+
+def plain(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
+    """The first material alone."""
+    return np.zeros(len(points), dtype=points.dtype)
+
 
 LAMP_POSITION = (2.6, -2.2, 4.2)
 LAMP_RADIUS = 0.55
@@ -277,3 +387,63 @@ def coat_highlight(
         shadowing = shadowing / (cosine + np.sqrt(a2 + (1 - a2) * cosine**2))
     fresnel = COAT_REFLECTANCE + (1 - COAT_REFLECTANCE) * (1 - dot(halfway, towards_eye).clip(0, 1)) ** 5
     return np.pi * distribution * shadowing * fresnel
+
+
+_LATTICE = 96
+"""Cells along each side of the random block, after which it repeats."""
+
+_OCTAVES = ((6.0, 0.25), (17.0, 0.3), (45.0, 0.45))
+"""Cells per scene unit, and share of the sum. The smallest cells are 3 pixels of a view of 400."""
+
+_CONTRAST = (0.35, 0.65)
+"""Sums below the first are one material alone, above the second the other."""
+
+
+def speckled_things() -> Sequence[Thing]:
+    """The demo scene's objects with speckles on every surface."""
+    return tuple(
+        replace(thing, surface=replace(thing.surface, second=second, blend=_speckled(thing, strength, seed)))
+        for seed, (thing, second, strength) in enumerate(zip(THINGS, _SECOND, _STRENGTH, strict=True))
+    )
+
+
+_SECOND = ("red", "yellow", "white", "yellow", "green")
+"""The second material of each of `THINGS`: its own, but for the last, which is of one material."""
+
+_STRENGTH = (1.0, 0.8, 0.8, 0.8, 0.9)
+"""How far speckles replace the pattern of each thing, in [0, 1]."""
+
+
+def solid_noise(points: Float[np.ndarray, "P 3"], seed: int) -> Float32[np.ndarray, " P"]:
+    """Smooth random values in [0, 1], the same for the same place.
+
+    Args:
+        points: In units of the scene.
+        seed: Another one gives another pattern.
+    """
+    from scipy.ndimage import map_coordinates
+
+    total = np.zeros(len(points), np.float32)
+    for octave, (cells, share) in enumerate(_OCTAVES):
+        # An irrational offset keeps the lattices of the octaves from meeting.
+        places = points.T * cells + np.sqrt(2) * (1 + octave + 7 * seed)
+        total += share * map_coordinates(
+            _random_block(), places, order=1, mode="grid-wrap", output=np.float32
+        )
+    return total
+
+
+def _speckled(thing: Thing, strength: float, seed: int) -> Blend:
+    """The thing's blend with speckles over it."""
+    sizes = np.asarray(thing.placement.half_sizes, np.float32)
+
+    def blend(local_points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
+        speckles = smooth_step(solid_noise(local_points * sizes, seed), *_CONTRAST)
+        return (1 - strength) * thing.surface.blend(local_points) + strength * speckles
+
+    return blend
+
+
+@lru_cache(maxsize=1)
+def _random_block() -> Float32[np.ndarray, "X Y Z"]:
+    return np.random.default_rng(20).random((_LATTICE,) * 3, dtype=np.float32)

@@ -42,7 +42,7 @@ from unmix_plugin.scenes.geometry.pose_check import (
     view_differences,
     view_features,
 )
-from unmix_plugin.scenes.pixel_table import DrawnPixels
+from unmix_plugin.scenes.pixel_block import DrawnPixels
 from unmix_plugin.scenes.scene import Scene
 
 MOST_VIEWS = 64

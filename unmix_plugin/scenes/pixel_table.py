@@ -1,10 +1,23 @@
-"""All pixels of some views, drawn evenly from the valid ones: of each sensor a block, one after the other."""
+"""How much memory pixels take, and how much of them to hold.
+
+All pixels of some views, drawn evenly from the valid ones: of each sensor a block, one after the other.
+
+From pixels of any size to rays: as many through the pixels of a coarse sensor as through those of a sharp one.
+
+A coarse pixel is the mean of many fine ones, but one ray through each of those would leave a batch with a few coarse
+pixels: too few to learn from, and all their rays end in the same cells, so that the other cells seem to be seen by no
+view.
+
+Notation: `R` pixels, `P` rays through each.
+"""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from functools import cached_property
 from itertools import accumulate
+from pathlib import Path
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -12,13 +25,70 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.rays import RayBundle
+from unmix_plugin.engine.processes.joining import processes_here
 from unmix_plugin.engine.training.seeding import step_generator
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.scenes.pixel_table import memory
-from unmix_plugin.scenes.pixel_table.block import DrawnPixels, PixelBlock
-from unmix_plugin.scenes.pixel_table.projection import FEWEST_CHANNELS, Projection
+from unmix_plugin.scenes.pixel_block import FEWEST_CHANNELS, DrawnPixels, PixelBlock, Projection
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bad_values import FEWEST_BANDS, deviation_limits, deviations
+
+_GIB = 2**30
+_USABLE_SHARE = 0.8
+"""Of the memory that is left."""
+_LARGEST_POOL = 2**30
+"""Of pixels on disk; more in memory would not be drawn from more evenly."""
+
+
+def available_bytes(device: torch.device) -> int | None:
+    """Memory that a device has left, as far as the system says; None where it doesn't."""
+    if device.type == "cuda":
+        return int(torch.cuda.mem_get_info(device)[0])
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        free = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
+    except (OSError, ValueError, StopIteration):
+        names = getattr(os, "sysconf_names", {})
+        if not {"SC_PHYS_PAGES", "SC_PAGE_SIZE"} <= names.keys():
+            return None
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    try:  # a container may have less than its machine
+        group = Path("/sys/fs/cgroup")
+        limit, used = (int((group / name).read_text()) for name in ("memory.max", "memory.current"))
+    except (OSError, ValueError):
+        return free
+    return min(free, max(0, limit - used))
+
+
+def budget_bytes(device: torch.device, memory_gb: float | None) -> int | None:
+    """Memory that pixels may take; None where nothing limits it.
+
+    Args:
+        memory_gb: In GiB; None: most of what the device has left.
+    """
+    if memory_gb is not None:
+        return int(memory_gb * _GIB)
+    available = available_bytes(device)
+    if available is not None and device.type == "cpu":
+        available //= processes_here()
+    return None if available is None else int(_USABLE_SHARE * available)
+
+
+def pool_bytes(budget: int, memory_gb: float | None) -> int:
+    """How much of pixels on disk to hold at a time; arguments as above."""
+    return budget if memory_gb is not None else min(_LARGEST_POOL, budget)
+
+
+def describe_pool(blocks: tuple[PixelBlock, ...]) -> str:
+    """What stays on disk, in words."""
+    held = sum(block.pool.num_bytes for block in blocks if block.pool is not None)
+    what, needed = " and ".join(block.description for block in blocks), sum(b.num_bytes for b in blocks)
+    return (
+        f"the training pixels stay on disk: {what} are {needed / _GIB:.3g} GiB; {held / _GIB:.3g} GiB of them are in "
+        "memory at a time, and others are read while training goes on (memory-gb)"
+    )
+
 
 Components: TypeAlias = int | Literal["auto", "none"]
 OPAQUE_ALPHA = 0.99
@@ -189,3 +259,47 @@ class PixelTable:
         opaque = pool[block.alpha.cpu()[pool] > OPAQUE_ALPHA]
         chosen = opaque[torch.randperm(len(opaque), generator=step_generator(seed, 0))[:count]]
         return block.spectra(chosen.to(block.alpha.device)).cpu().numpy()
+
+
+class PixelRays:
+    """Rays through pixels of a scene's training views."""
+
+    def __init__(self, scene: Scene, device: torch.device) -> None:
+        self._scene = scene
+        self._cameras = scene.cameras[list(scene.train_indices)]
+        self._device_cameras: Cameras = self._cameras.to(device)
+
+    @cached_property
+    def pixel_sizes(self) -> dict[int, float]:
+        """Of each sensor, the edge of a pixel where it looks at the middle of the scene box, median over its views."""
+        centre = self._scene.scene_box.aabb.mean(dim=0)
+        distances = (self._cameras.camera_to_world[:, :, 3] - centre).norm(dim=-1)
+        if self._scene.is_unbounded:  # cameras may be in the middle of what they see
+            distances = distances.clamp(min=float(self._scene.scene_box.size.max()) / 2)
+        edges = distances / self._cameras.focal_px.mean(dim=-1)
+        sensors = torch.tensor([self._scene.frames[view].sensor for view in self._scene.train_indices])
+        return {sensor: float(edges[sensors == sensor].median()) for sensor in set(sensors.tolist())}
+
+    def shares(self, valid: Mapping[int, float]) -> dict[int, float]:
+        """Of the pixels of a batch, by sensor: in proportion to the area that the pixels of its views cover.
+
+        Drawn evenly, the pixels of a sharp sensor, which are many, would leave hardly any of a coarse one.
+
+        Args:
+            valid: Of all valid pixels, the share of each sensor.
+        """
+        areas = {sensor: share * self.pixel_sizes[sensor] ** 2 for sensor, share in valid.items()}
+        return {sensor: area / sum(areas.values()) for sensor, area in areas.items()}
+
+    def through(self, pixels: DrawnPixels, subpixels: int, generator: torch.Generator) -> RayBundle:
+        """Rays scattered over pixels of one sensor, those of a pixel one after the other."""
+        offsets = _scattered_offsets(len(pixels.cameras), subpixels, generator).to(pixels.corners.device)
+        points = (pixels.corners[:, None] + offsets).flatten(0, 1)
+        return self._device_cameras.generate_rays(pixels.cameras.repeat_interleave(subpixels**2), points)
+
+
+def _scattered_offsets(num_pixels: int, subpixels: int, generator: torch.Generator) -> Float[Tensor, "R P 2"]:
+    """One random point in each cell of a subpixels x subpixels grid on every pixel, (x, y) in [0, 1)."""
+    cells = torch.arange(subpixels)
+    grid = torch.stack(torch.meshgrid(cells, cells, indexing="xy"), dim=-1).reshape(1, -1, 2)
+    return (grid + torch.rand(num_pixels, subpixels**2, 2, generator=generator)) / subpixels

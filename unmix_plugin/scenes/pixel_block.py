@@ -1,4 +1,20 @@
-"""The pixels of one sensor in memory, as small as they were stored.
+"""A part of a block's pixels in memory, renewed from disk while training goes on, for scenes larger than memory.
+
+The block is cut into chunks of neighbouring pixels, and the chunks are put in a random order, again and again. The pool
+holds a run of that order and moves along it as steps go by, one chunk at a time: so the disk is read in large pieces,
+every chunk stays as long as any other, and what the pool holds at a step follows from the step alone. A thread reads
+the chunks that come next.
+
+Notation: `R` drawn pixels, `b` channels.
+
+Pixels of many bands kept as few numbers each: what their subspace misses is less than the noise, or kept too.
+
+A pixel that the subspace misses by more than noise can explain, or that is saturated in some band, is kept whole: it
+may show what no other pixel shows, and of a saturated value one must know that it is.
+
+Notation: `R` pixels, `b` channels of a sensor.
+
+The pixels of one sensor in memory, as small as they were stored.
 
 Cubes of 8 or 16 bits stay as they are in their files and become float32 when pixels are drawn: half or a quarter of the
 memory for the same numbers. Cubes of other types are kept as float32.
@@ -9,6 +25,7 @@ Notation: `b` channels of the sensor, `R` drawn pixels.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,11 +34,194 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from unmix_plugin.errors import SceneError
-from unmix_plugin.scenes.pixel_table.pool import PixelPool
-from unmix_plugin.scenes.pixel_table.projection import ProjectedPixels
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bad_values import repaired
-from unmix_plugin.spectral.subspace import SpectralSubspace
+from unmix_plugin.spectral.subspace import SpectralSubspace, find_subspace
+
+CHUNK_BYTES = 4 << 20
+"""Of values read at once."""
+PIXELS_PER_STEP = 2048
+"""Drawn in a usual step: so many pixels are renewed in it, too."""
+_CHUNKS_AHEAD = 4
+"""Read before they are needed."""
+_ORDER_SEED = 23
+
+
+class PixelPool:
+    """Values of some of a block's pixels at each step."""
+
+    def __init__(
+        self,
+        valid: Bool[Tensor, " pixels"],
+        pixel_bytes: int,
+        num_bytes: int,
+        read: Callable[[int, int], Tensor],
+    ) -> None:
+        """
+        Args:
+            valid: Pixels of the block that may be drawn, on the CPU; at least one.
+            pixel_bytes: Of a pixel's values.
+            num_bytes: Memory of the pool; at least two chunks are held.
+            read: Stored values (pixels, b) from a first pixel to one before a last, called in another thread.
+        """
+        self._chunk_pixels = max(1, min(CHUNK_BYTES // pixel_bytes, len(valid)))
+        firsts = range(0, len(valid), self._chunk_pixels)
+        self._firsts = [first for first in firsts if bool(valid[first : first + self._chunk_pixels].any())]
+        self._num_held = min(len(self._firsts), max(2, num_bytes // (self._chunk_pixels * pixel_bytes)))
+        self._steps_per_chunk = max(1, self._chunk_pixels // PIXELS_PER_STEP)
+        self._valid, self._read, self._pixel_bytes = valid, read, pixel_bytes
+        self._reader = ThreadPoolExecutor(1, thread_name_prefix="pixels")
+        self._arriving: dict[int, Future[Tensor]] = {}
+        self._held: list[int] = []
+        """Position in the order of the chunk in each slot; empty before the first draw."""
+
+    @property
+    def num_bytes(self) -> int:
+        """Memory that the values held take."""
+        return self._num_held * self._chunk_pixels * self._pixel_bytes
+
+    def draw(self, count: int, step: int, generator: torch.Generator) -> tuple[Int[Tensor, " R"], Tensor]:
+        """Random valid pixels of the block by their index in it, and their stored values (R, b)."""
+        self._move_to(step // self._steps_per_chunk)
+        chosen = torch.randint(len(self._drawable), (count,), generator=generator)
+        return self._numbers[self._drawable[chosen]], self._values[self._drawable[chosen]]
+
+    def _move_to(self, first: int) -> None:
+        """Hold the chunks of the order from `first` on; where that is no step ahead, all are read again."""
+        wanted = range(first, first + self._num_held)
+        if self._held and sorted(self._held) == list(wanted):
+            return
+        for position in [*wanted, *range(wanted.stop, wanted.stop + _CHUNKS_AHEAD)]:
+            if position not in self._held and position not in self._arriving:
+                self._arriving[position] = self._reader.submit(self._read, *self._range(position))
+        if not self._held:
+            self._allocate(self._arriving[first].result())
+        for position in wanted:
+            if position not in self._held:
+                self._put(position, self._arriving.pop(position).result())
+        for position in [p for p in self._arriving if p < first or p >= wanted.stop + _CHUNKS_AHEAD]:
+            self._arriving.pop(position).cancel()
+        self._drawable = (self._numbers >= 0).nonzero()[:, 0]
+
+    def _allocate(self, example: Tensor) -> None:
+        self._values = example.new_empty(self._num_held * self._chunk_pixels, example.shape[1])
+        self._numbers = torch.full((len(self._values),), -1)
+        self._held = [-1] * self._num_held
+
+    def _put(self, position: int, values: Tensor) -> None:
+        """A chunk in its slot; numbers of pixels that can't be drawn are -1."""
+        slot = position % self._num_held
+        start = slot * self._chunk_pixels
+        first, last = self._range(position)
+        self._values[start : start + len(values)] = values
+        numbers = torch.arange(first, last)
+        self._numbers[start : start + self._chunk_pixels] = -1
+        self._numbers[start : start + len(values)] = torch.where(self._valid[first:last], numbers, -1)
+        self._held[slot] = position
+
+    def _range(self, position: int) -> tuple[int, int]:
+        """First pixel of the chunk at a position of the order, and the one after its last."""
+        turn, place = divmod(position, len(self._firsts))
+        generator = torch.Generator().manual_seed(_ORDER_SEED + turn)
+        first = self._firsts[int(torch.randperm(len(self._firsts), generator=generator)[place])]
+        return first, min(first + self._chunk_pixels, len(self._valid))
+
+
+FEWEST_CHANNELS = 100
+"""Of a sensor whose pixels are projected without being asked for."""
+LARGEST_SHARE = 0.25
+"""Of the memory of whole pixels that projected ones may take for that."""
+LARGEST_RESIDUAL = 2.0
+"""In multiples of the noise; of a pixel that is kept whole it is more. Noise alone makes about 1."""
+_UNSATURATED = 0.9999
+"""Largest value of a pixel that isn't kept whole: 1 stands for a saturated one."""
+
+
+@dataclass(frozen=True)
+class Projection:
+    """How pixels are projected, and what that leaves."""
+
+    subspace: SpectralSubspace
+    residual: float
+    """Root mean square over some pixels that are not kept whole, in multiples of the noise."""
+    whole_share: float
+    """Of the pixels, that are kept whole."""
+
+    @staticmethod
+    def of(pixels: Float[Tensor, "N b"], num_components: int | None) -> Projection:
+        """Judged by the even ones of some pixels, of a subspace that the odd ones are in.
+
+        Args:
+            num_components: None finds how many are needed.
+        Raises:
+            SpectrumError: too few pixels, or too many components.
+        """
+        subspace = find_subspace(pixels[1::2], num_components)
+        seen = pixels[::2]
+        residuals = subspace.residuals(seen, subspace.components(seen))
+        is_whole = _must_stay_whole(seen, residuals)
+        kept = residuals[~is_whole]
+        residual = float(kept.square().mean().sqrt()) if len(kept) else float("inf")
+        return Projection(subspace, residual, float(is_whole.float().mean()))
+
+    def pixel_bytes(self, num_channels: int) -> float:
+        """Memory that a pixel takes in the mean."""
+        return 2 * len(self.subspace) + self.whole_share * (2 * num_channels + 8)
+
+    def pays(self, whole_bytes: int) -> bool:
+        """Whether results stay what they are and pixels need much less memory than `whole_bytes` each."""
+        num_channels = self.subspace.basis.shape[1]
+        return self.residual <= 1 and self.pixel_bytes(num_channels) <= LARGEST_SHARE * whole_bytes
+
+    def describe(self, num_channels: int) -> str:
+        """What a user should know."""
+        return (
+            f"training pixels are kept as {len(self.subspace)} numbers instead of {num_channels} (target-components): "
+            f"what they leave out is {self.residual:.2g} of the noise; {self.whole_share:.2%} of the pixels, where it "
+            "would be more or which are saturated, are kept whole"
+        )
+
+
+class ProjectedPixels:
+    """Spectra of a block's pixels by the components that they have in a subspace."""
+
+    def __init__(
+        self, subspace: SpectralSubspace, num_pixels: int, num_channels: int, device: torch.device
+    ) -> None:
+        self._subspace = subspace.to(device)
+        self._components = torch.zeros(num_pixels, len(subspace), dtype=torch.float16, device=device)
+        self._whole = torch.zeros(0, dtype=torch.int64, device=device)
+        self._spectra = torch.zeros(0, num_channels, dtype=torch.float16, device=device)
+
+    @property
+    def num_bytes(self) -> int:
+        """Memory that the values take."""
+        held = (self._components, self._whole, self._spectra)
+        return sum(values.numel() * values.element_size() for values in held)
+
+    def put(self, first: int, spectra: Float[Tensor, "R b"]) -> None:
+        """Keep pixels that follow each other, the first of which has the number `first`; later ones later."""
+        spectra = spectra.to(self._components.device)
+        components = self._subspace.components(spectra).half()
+        self._components[first : first + len(spectra)] = components
+        residuals = self._subspace.residuals(spectra, components.float())
+        whole = _must_stay_whole(spectra, residuals).nonzero()[:, 0]
+        self._whole = torch.cat([self._whole, first + whole])
+        self._spectra = torch.cat([self._spectra, spectra[whole].half()])
+
+    def spectra(self, pixels: Int[Tensor, " R"]) -> Float[Tensor, "R b"]:
+        """Spectra of some pixels in [0, 1]."""
+        found = self._subspace.spectra(self._components[pixels].float()).clamp_(0, _UNSATURATED)
+        if len(self._whole):
+            places = torch.searchsorted(self._whole, pixels.contiguous()).clamp_(max=len(self._whole) - 1)
+            rows = (self._whole[places] == pixels).nonzero()[:, 0]
+            found[rows] = self._spectra[places[rows]].float()
+        return found
+
+
+def _must_stay_whole(spectra: Float[Tensor, "R b"], residuals: Float[Tensor, " R"]) -> Bool[Tensor, " R"]:
+    return (residuals > LARGEST_RESIDUAL) | (spectra > _UNSATURATED).any(dim=-1)
+
 
 COMPACT_TYPES = ("f2", "u1", "i1", "i2", "u2")
 """Of NumPy, at most half as large as float32."""

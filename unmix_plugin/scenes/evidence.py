@@ -1,0 +1,255 @@
+"""What alpha and light of the training views are evidence of, sensor by sensor; see `spectral.evidence`.
+
+What training pixels are worth, band by band, and what a user should know of them before training.
+
+Notation: `B` bands of the scene, `P` points, `R` pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from unmix_plugin.scenes.geometry.lighting import local_log_brightness
+from unmix_plugin.scenes.pixel_block import DrawnPixels, PixelBlock
+from unmix_plugin.scenes.pixel_table import PixelTable
+from unmix_plugin.scenes.reading.sensors import lonely_sensors
+from unmix_plugin.scenes.scene import Scene
+from unmix_plugin.spectral.band_noise import BandNoise, judge_bands
+from unmix_plugin.spectral.evidence import (
+    alpha_trust,
+    background_level,
+    brightness,
+    may_show_matter,
+    relative_power_of,
+)
+
+_PIXELS_OF_BACKGROUND = 100_000
+"""Pixels of a sensor by which the brightness of its background is judged."""
+_OPAQUE_ALPHA = 0.99
+_PIXELS_TO_GROUP = 20_000
+_COLOUR_GROUPS = 24
+_LIT_BEST = 0.9
+"""Quantile of a group's brightness that stands for full light."""
+
+
+class AlphaEvidence:
+    """Where alpha can be trusted, and what may show something."""
+
+    def __init__(self, table: PixelTable, has_alpha: bool) -> None:
+        """Judge the background of each sensor; without alpha nothing contradicts anything."""
+        self._blocks = table.blocks
+        self._levels = {block.sensor: _level(block) if has_alpha else None for block in self._blocks}
+
+    def trust(self, pixels: DrawnPixels) -> Float[Tensor, " R"]:
+        """How far the alpha of drawn pixels can be trusted, 0 or 1."""
+        return alpha_trust(pixels.spectra, pixels.alpha, self._levels[pixels.sensor])
+
+    def foreground(self) -> list[Bool[np.ndarray, "_ _"]]:
+        """For each training view True on pixels that may show something, or are not valid."""
+        found: dict[int, np.ndarray] = {}
+        for block in self._blocks:
+            level = self._levels[block.sensor]
+
+            def shows(spectra: Tensor, alpha: Tensor, valid: Tensor, level: float | None = level) -> Tensor:
+                return may_show_matter(spectra, alpha, level) | ~valid
+
+            for camera, picture in zip(block.cameras, block.pictures(shows), strict=True):
+                found[camera] = picture.numpy()
+        return [found[camera] for camera in sorted(found)]
+
+    def log_brightness(self) -> tuple[list[int], list[Float[np.ndarray, "H W"]]]:
+        """The views of the sensor that took most, and of each the logarithm of its brightness.
+
+        NaN where a pixel is not opaque, not valid or saturated.
+        """
+        block = self._largest_block
+        return list(block.cameras), [local_log_brightness(seen) for seen in block.pictures(_clear_brightness)]
+
+    @property
+    def _largest_block(self) -> PixelBlock:
+        """Of the sensor that took most views."""
+        return max(self._blocks, key=lambda block: len(block.cameras))
+
+    def log_shading(self) -> list[Float[np.ndarray, "H W"]]:
+        """The same without the brightness of what pixels show, by groups of pixels of like spectra."""
+        block = self._largest_block
+        colours = ColourGroups.of(block)
+        return [local_log_brightness(seen) for seen in block.pictures(colours.shading)]
+
+
+@dataclass(frozen=True)
+class ColourGroups:
+    """Groups of pixels whose spectra are multiples of each other, more or less."""
+
+    middles: Float[Tensor, "G B"]
+    """Spectra of length 1."""
+    brightest: Float[Tensor, " G"]
+    """Brightness of those of each group that are lit best."""
+
+    @staticmethod
+    def of(block: PixelBlock) -> ColourGroups:
+        """From some of a block's opaque pixels."""
+        from scipy.cluster.vq import kmeans2  # slow to import
+
+        stride = max(1, len(block) // _PIXELS_TO_GROUP)
+        chosen = torch.arange(0, len(block), stride)
+        valid, on_device = block.valid[chosen], chosen.to(block.alpha.device)
+        spectra = block.spectra(on_device)
+        spectra = spectra[_is_clear(spectra, block.alpha[on_device], valid.to(spectra.device))]
+        if len(spectra) < _COLOUR_GROUPS:
+            return ColourGroups(spectra.new_zeros(0, spectra.shape[1]), spectra.new_zeros(0))
+        rng = np.random.default_rng(0)
+        middles, group = kmeans2(
+            normalize(spectra, dim=-1).cpu().numpy(), _COLOUR_GROUPS, minit="++", rng=rng
+        )
+        bright = brightness(spectra)
+        best = [
+            torch.quantile(bright[mask], _LIT_BEST)
+            if bool((mask := torch.from_numpy(group == k)).any())
+            else 1.0
+            for k in range(_COLOUR_GROUPS)
+        ]
+        return ColourGroups(torch.from_numpy(middles).to(spectra), torch.tensor(best).to(spectra))
+
+    def shading(self, spectra: Tensor, alpha: Tensor, valid: Tensor) -> Tensor:
+        """Brightness in that of the best lit pixels of the same group; 0 for pixels that say nothing."""
+        if len(self.middles) == 0:
+            return torch.zeros_like(alpha)
+        group = torch.cdist(normalize(spectra, dim=-1), self.middles).argmin(dim=-1)
+        return _clear_brightness(spectra, alpha, valid) / self.brightest[group].clamp(min=1e-6)
+
+
+def _is_clear(spectra: Tensor, alpha: Tensor, valid: Tensor) -> Tensor:
+    return (alpha > _OPAQUE_ALPHA) & valid & (spectra.amax(dim=-1) < 1)
+
+
+def _clear_brightness(spectra: Tensor, alpha: Tensor, valid: Tensor) -> Tensor:
+    """Of pixels that are opaque, valid and not saturated; 0 for others."""
+    return torch.where(_is_clear(spectra, alpha, valid), brightness(spectra), 0.0)
+
+
+def _level(block: PixelBlock) -> float | None:
+    stride = max(1, int(block.valid.sum()) // _PIXELS_OF_BACKGROUND)
+    is_whole = bool(block.valid.all())  # then a list of all of them would take eight bytes a pixel
+    pixels = torch.arange(0, len(block), stride) if is_whole else block.valid.nonzero()[::stride, 0]
+    chosen = pixels.to(block.alpha.device)
+    return background_level(block.spectra(chosen), block.alpha[chosen])
+
+
+_PIXELS_TO_JUDGE_BY = 20_000
+LEAST_OVERLAP = 0.1
+"""Share of what a sensor sees that another must see too."""
+_MOST_POINTS = 4000
+_FEWEST_BAD = 1e-5
+"""Share of bad values below which nothing is said."""
+
+
+def judge_sensors(scene: Scene, table: PixelTable, seed: int) -> dict[int, BandNoise]:
+    """The bands of each sensor that has bands of the scene for channels."""
+    found = {}
+    for sensor in table.shares:
+        if scene.sensors[sensor].bands is not None:
+            pixels = torch.from_numpy(table.sample_opaque(sensor, _PIXELS_TO_JUDGE_BY, seed))
+            found[sensor] = judge_bands(pixels)
+    return found
+
+
+def band_weights(scene: Scene, noise: dict[int, BandNoise]) -> Float[np.ndarray, " B"]:
+    """Of squared errors in each band; where several sensors see a band, the least."""
+    weights = np.full(len(scene.wavelengths_nm), np.inf, dtype=np.float32)
+    for sensor, found in noise.items():
+        bands = list(scene.sensors[sensor].bands or ())
+        weights[bands] = np.minimum(weights[bands], found.weights.numpy())
+    return np.where(np.isfinite(weights), weights, 1.0).astype(np.float32)
+
+
+def relative_power(scene: Scene, opaque: Float[np.ndarray, "R B"]) -> float:
+    """Of brightness, by which squared errors are divided.
+
+    Without alpha black may be nothing at all, so that errors of dark pixels must not count more: 0.
+    """
+    knows_empty = scene.has_alpha and not scene.is_unbounded
+    return relative_power_of(torch.from_numpy(opaque)) if knows_empty else 0.0
+
+
+def noise_warnings(scene: Scene, noise: dict[int, BandNoise], bad_share: float) -> list[str]:
+    """Bands that are mostly noise or dead, and how many values were replaced."""
+    said = []
+    for sensor, found in noise.items():
+        bands = scene.wavelengths_nm[list(scene.sensors[sensor].bands or ())]
+        whose = f" of sensor {scene.sensors[sensor].name!r}" if scene.is_rig else ""
+        for chosen, what, why in (
+            (found.mostly_noise, "mostly noise", "hardly count in training"),
+            (found.dead, "dead", "show one value everywhere and hardly count in training"),
+        ):
+            if bool(chosen.any()):
+                named = ", ".join(f"{nm:g}" for nm in bands[chosen.numpy()])
+                verb = "bands at {} nm{} are {}" if int(chosen.sum()) > 1 else "band {} nm{} is {}"
+                said.append(
+                    f"{verb.format(named, whose, what)}: its errors {why}; leave it out where you can"
+                )
+    if bad_share > _FEWEST_BAD:
+        said.append(
+            f"{bad_share:.2g} of all measured values stand out from the bands and pixels around them (stripes, "
+            "spikes); training uses what is around them instead (--pipeline.datamanager.no-mend-values keeps them)"
+        )
+    return said
+
+
+def rig_warnings(scene: Scene, reachable: Bool[np.ndarray, "R R R"]) -> list[str]:
+    """Sensors of a rig that share no band with another, or look at other parts of the scene.
+
+    Args:
+        reachable: Cells of the scene box where something may be.
+    """
+    used = {scene.frames[view].sensor for view in scene.train_indices}
+    alone = lonely_sensors(scene.sensors, used)
+    said = []
+    if alone:
+        said.append(
+            f"no other sensor shares a band with {', '.join(alone)}: only their poses hold their spectra together"
+        )
+    for name, share in _overlaps(scene, sorted(used), reachable):
+        if share < LEAST_OVERLAP:
+            said.append(
+                f"of what sensor {name!r} sees, the other sensors see {share:.0%} (expected at least "
+                f"{LEAST_OVERLAP:.0%}): nothing joins their spectra; check the poses and lenses of the rig"
+            )
+    return said
+
+
+def _overlaps(
+    scene: Scene, sensors: list[int], reachable: Bool[np.ndarray, "R R R"]
+) -> list[tuple[str, float]]:
+    """Names of sensors, and of the places that each sees the share that another sees too."""
+    cells = np.argwhere(reachable)
+    cells = cells[:: max(1, -(-len(cells) // _MOST_POINTS))]
+    unit = torch.from_numpy((cells + 0.5) / np.array(reachable.shape)).float()
+    points = scene.scene_box.aabb[0] + unit * scene.scene_box.size
+    seen = {sensor: _seen(scene, sensor, points) for sensor in sensors}
+    found = []
+    for sensor in sensors if len(sensors) > 1 else []:
+        others = np.any([seen[other] for other in sensors if other != sensor], axis=0)
+        share = float((seen[sensor] & others).sum() / max(seen[sensor].sum(), 1))
+        found.append((scene.sensors[sensor].name, share))
+    return found
+
+
+def _seen(scene: Scene, sensor: int, points: Float[torch.Tensor, "P 3"]) -> Bool[np.ndarray, " P"]:
+    """Points that lie within some training picture of a sensor."""
+    seen = torch.zeros(len(points), dtype=torch.bool)
+    for view in scene.train_indices:
+        if scene.frames[view].sensor == sensor:
+            coords, depths = scene.cameras.project(points, view)
+            seen |= (
+                (depths > 0)
+                & (coords >= 0).all(dim=-1)
+                & (coords < torch.tensor(scene.cameras.size(view))).all(dim=-1)
+            )
+    return seen.numpy()
