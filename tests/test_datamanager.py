@@ -17,8 +17,7 @@ from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.runs.scene_record import SceneRecord, check_same_scene, scene_record_to_json
 from unmix_plugin.errors import ConfigError, RunError, SceneError
-from unmix_plugin.scenes import pixel_block as pool
-from unmix_plugin.scenes import pixel_table as memory
+from unmix_plugin.scenes import pixel_block, pixel_table
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.scenes.evidence import relative_power
 from unmix_plugin.scenes.scene import SceneOptions
@@ -62,9 +61,9 @@ def test_the_rays_of_a_pixel_lie_within_it_one_in_each_cell(scene_folder):
 
 
 def test_batches_from_disk_depend_on_seed_and_step_and_hold_what_was_measured(scene_folder, monkeypatch):
-    monkeypatch.setattr(pool, "CHUNK_BYTES", 12 * 40)
-    monkeypatch.setattr(pool, "PIXELS_PER_STEP", 8)
-    monkeypatch.setattr(memory, "available_bytes", lambda _: 4000)
+    monkeypatch.setattr(pixel_block, "CHUNK_BYTES", 12 * 40)
+    monkeypatch.setattr(pixel_block, "PIXELS_PER_STEP", 8)
+    monkeypatch.setattr(pixel_table, "available_bytes", lambda _: 4000)
     going_on, resumed = make(scene_folder), make(scene_folder)
     assert any("stay on disk" in warning for warning in going_on.warnings())
     bundle, batch = [going_on.next_train(step) for step in range(30)][-1]

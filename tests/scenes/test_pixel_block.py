@@ -6,9 +6,7 @@ import torch
 
 from tests.scenes.scene_factory import make_scene
 from unmix_plugin.errors import SceneError
-from unmix_plugin.scenes import SceneOptions, load_scene
-from unmix_plugin.scenes import pixel_block as block_module
-from unmix_plugin.scenes import pixel_table as memory
+from unmix_plugin.scenes import SceneOptions, load_scene, pixel_block, pixel_table
 from unmix_plugin.scenes.pixel_block import PixelBlock
 from unmix_plugin.scenes.pixel_table import PixelTable, available_bytes
 
@@ -88,7 +86,7 @@ def test_pixels_on_disk_are_the_same_as_those_in_memory(tmp_path, monkeypatch, s
     for name in ("numbers", "cameras", "corners", "spectra", "alpha"):
         assert torch.equal(getattr(found, name), getattr(expected, name))
     assert torch.equal(mapped.spectra(pixels), expected.spectra)
-    monkeypatch.setattr(block_module, "_CHUNK_VALUES", 3 * 20 * 4)
+    monkeypatch.setattr(pixel_block, "_CHUNK_VALUES", 3 * 20 * 4)
 
     def sums(spectra: torch.Tensor, alpha: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
         return spectra.sum(dim=1) + 10 * alpha + 100 * valid
@@ -104,12 +102,12 @@ def test_pixels_on_disk_are_the_same_as_those_in_memory(tmp_path, monkeypatch, s
 def test_pixels_are_held_unless_they_need_more_than_the_budget(tmp_path, monkeypatch):
     scene = load_scene(make_scene(tmp_path / "scene").root)
     needed = 5 * 320 * (4 * 2 + 5)
-    monkeypatch.setattr(memory, "available_bytes", lambda _: 2 * needed)
+    monkeypatch.setattr(pixel_table, "available_bytes", lambda _: 2 * needed)
     assert PixelTable(scene, CPU, scene.train_indices).notes == []
     assert PixelTable(scene, CPU, scene.train_indices, memory_gb=(needed + 1) / 2**30).notes == []
     [note] = PixelTable(scene, CPU, scene.train_indices, memory_gb=(needed - 1) / 2**30).notes
     assert "5 views x 16 x 20 pixels x 4 bands x 2 bytes are 1.94e-05 GiB" in note
-    monkeypatch.setattr(memory, "available_bytes", lambda _: needed)
+    monkeypatch.setattr(pixel_table, "available_bytes", lambda _: needed)
     assert PixelTable(scene, CPU, scene.train_indices).notes != []
 
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from unmix_plugin.scenes import pixel_block as pool_module
+from unmix_plugin.scenes import pixel_block
 from unmix_plugin.scenes.pixel_block import PixelPool
 
 PIXELS = 1000
@@ -12,8 +12,8 @@ PIXELS = 1000
 @pytest.fixture(autouse=True)
 def small_chunks(monkeypatch):
     """Chunks of 40 pixels of 4 bytes, each of two steps."""
-    monkeypatch.setattr(pool_module, "CHUNK_BYTES", 160)
-    monkeypatch.setattr(pool_module, "PIXELS_PER_STEP", 20)
+    monkeypatch.setattr(pixel_block, "CHUNK_BYTES", 160)
+    monkeypatch.setattr(pixel_block, "PIXELS_PER_STEP", 20)
 
 
 def make_pool(valid=None, num_bytes=800, reads=None) -> PixelPool:

@@ -6,9 +6,7 @@ import torch
 
 from tests.scenes.scene_factory import make_scene
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.scenes import load_scene
-from unmix_plugin.scenes import pixel_table as memory
-from unmix_plugin.scenes import pixel_table as table_module
+from unmix_plugin.scenes import load_scene, pixel_table
 from unmix_plugin.scenes.pixel_block import ProjectedPixels, Projection
 from unmix_plugin.scenes.pixel_table import PixelTable
 from unmix_plugin.scenes.scene import Scene
@@ -24,7 +22,7 @@ WHOLE = 5 * 320 * (2 * BANDS + 5)
 @pytest.fixture(autouse=True)
 def few_bands_are_enough(monkeypatch):
     """So that the few opaque pixels of a tiny scene tell their subspace."""
-    monkeypatch.setattr(table_module, "FEWEST_CHANNELS", BANDS)
+    monkeypatch.setattr(pixel_table, "FEWEST_CHANNELS", BANDS)
 
 
 def spectra_of(cube: np.ndarray, change=None) -> np.ndarray:
@@ -68,7 +66,7 @@ def test_odd_and_saturated_pixels_are_kept_whole():
 def test_pixels_that_do_not_fit_are_projected_and_drawn_as_if_they_were_held(tmp_path, monkeypatch):
     scene = make(tmp_path / "scene")
     plain = PixelTable(scene, CPU, VIEWS)
-    monkeypatch.setattr(memory, "available_bytes", lambda _: WHOLE)
+    monkeypatch.setattr(pixel_table, "available_bytes", lambda _: WHOLE)
     few = PixelTable(scene, CPU, VIEWS, components="auto")
     [note] = few.notes
     assert f"instead of {BANDS} (target-components)" in note
@@ -92,7 +90,7 @@ def test_auto_projects_neither_what_fits_nor_what_has_no_subspace(tmp_path, monk
         fits.blocks[0].spectra(torch.arange(1600)),
         PixelTable(scene, CPU, VIEWS).blocks[0].spectra(torch.arange(1600)),
     )
-    monkeypatch.setattr(memory, "available_bytes", lambda _: WHOLE)
+    monkeypatch.setattr(pixel_table, "available_bytes", lambda _: WHOLE)
     [note] = PixelTable(make(tmp_path / "rough", rough), CPU, VIEWS, components="auto").notes
     assert "stay on disk" in note
 

@@ -134,7 +134,7 @@ class PixelTable:
         if not any(bool(block.valid.any()) for block in self.blocks):
             raise ConfigError("no valid pixel is left in the training views: masks leave out every one")
         self._scene, self._seed, self._mends = scene, seed, mends
-        self.notes = self._read(memory.budget_bytes(device, memory_gb), memory_gb, components)
+        self.notes = self._read(budget_bytes(device, memory_gb), memory_gb, components)
         """What a user should know of pixels that are not held as they were stored."""
 
     def _read(self, budget: int | None, memory_gb: float | None, components: Components) -> list[str]:
@@ -144,10 +144,10 @@ class PixelTable:
         for sensor, (projection, block) in found.items():
             needed[sensor] = int(len(block) * (5 + projection.pixel_bytes(block.num_channels)))
         if budget is not None and sum(needed.values()) > budget:
-            held, total = memory.pool_bytes(budget, memory_gb), sum(block.num_bytes for block in self.blocks)
+            held, total = pool_bytes(budget, memory_gb), sum(block.num_bytes for block in self.blocks)
             for block in self.blocks:
                 block.hold_part(held * block.num_bytes // total)
-            return [memory.describe_pool(self.blocks)]
+            return [describe_pool(self.blocks)]
         for block in self.blocks:
             limits = self._limits(block)
             if block.sensor in found:
