@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from unmix_plugin.editing.recipe import Recipe
     from unmix_plugin.scenes.scene import Scene
     from unmix_plugin.spectral.bands import Bands
-    from unmix_plugin.spectral.coefficients import Coefficients
+    from unmix_plugin.spectral.materials import Coefficients
     from unmix_plugin.trained.material_view import MaterialView
     from unmix_plugin.trained.open_run import LoadedRun
     from unmix_plugin.trained.trained_scene import TrainedScene

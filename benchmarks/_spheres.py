@@ -15,7 +15,7 @@ from unmix_plugin.neumatex.lighting.built_in import built_in_environment
 from unmix_plugin.neumatex.lighting.environment import Environment
 from unmix_plugin.neumatex.materials.family import MaterialFamily
 from unmix_plugin.neumatex.materials.shading_frame import frames, to_local, to_world
-from unmix_plugin.spectral.colour.agx import agx
+from unmix_plugin.spectral.colour.conversion import agx
 
 ENVIRONMENTS = ("studio", "window-room", "overcast", "sunset")
 _DIRECTIONAL = ((0.5, -0.7, 0.6, 2.5), (-0.9, -0.3, 0.2, 0.8), (0.2, 0.9, 0.5, 1.5))

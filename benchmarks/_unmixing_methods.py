@@ -18,15 +18,14 @@ from torch import Tensor
 
 from unmix_plugin.losses.training_losses import LossConfig
 from unmix_plugin.spectral.segmentation import material_scores
-from unmix_plugin.spectral.unmixing.abundance_estimation import fcls, nnls, sunsal
+from unmix_plugin.spectral.unmixing.abundances import fcls, nnls, sparse_abundances, sunsal
 from unmix_plugin.spectral.unmixing.endmembers import (
     EndmemberMethod,
+    comparable_brightness,
     drop_uninformative_pixels,
     initialise_endmembers,
 )
 from unmix_plugin.spectral.unmixing.mixture_guide import mixing_penalty
-from unmix_plugin.spectral.unmixing.pixel_unmixing import comparable_brightness
-from unmix_plugin.spectral.unmixing.sparse_unmixing import sparse_abundances
 
 Explain = Callable[[Tensor, Tensor], Tensor]
 """From pixels (N, B) and endmembers (K, B) to amounts (N, K)."""

@@ -44,8 +44,8 @@ from unmix_plugin.scenes.pixel_table import PixelRays, PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import Scene, SceneOptions, check_recorded_scene, scene_identity
 from unmix_plugin.sensors.batches import join_parts
-from unmix_plugin.spectral.band_noise import BandNoise
-from unmix_plugin.spectral.unmixing.partial_bands import typical_spectrum
+from unmix_plugin.spectral.bad_values import BandNoise
+from unmix_plugin.spectral.unmixing.endmembers import typical_spectrum
 
 _MANY_PIXELS = 4_000_000
 """Pixels of all training views beyond which one ray a pixel is enough."""

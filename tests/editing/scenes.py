@@ -9,7 +9,7 @@ from tests.method_factory import make_model, scene_of
 from unmix_plugin.editing import Recipe, edit_scene, recipe_from_yaml
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.field import UnmixField
-from unmix_plugin.spectral.coefficients import Coefficients
+from unmix_plugin.spectral.materials import Coefficients
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 LIGHT = [0.5, 0.7, 1.0, 0.9, 0.6]

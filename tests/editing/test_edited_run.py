@@ -15,7 +15,7 @@ from unmix_plugin.editing.apply import edit_scene, light_factors
 from unmix_plugin.editing.edited_run import load_edited_run, requested_recipe
 from unmix_plugin.errors import ConfigError, RunError, SpectrumError
 from unmix_plugin.scenes.demo.scene import make_demo_scene
-from unmix_plugin.spectral.colour.illuminants import illuminant_power
+from unmix_plugin.spectral.colour.conversion import illuminant_power
 from unmix_plugin.trained.model_scene import ModelScene
 from unmix_plugin.trained.open_run import load_run
 

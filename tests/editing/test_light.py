@@ -8,8 +8,7 @@ from unmix_plugin.editing import Light, relight
 from unmix_plugin.editing.light import relighting_factors
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.conversion import xyz_matrix
-from unmix_plugin.spectral.colour.illuminants import illuminant_power
+from unmix_plugin.spectral.colour.conversion import illuminant_power, xyz_matrix
 
 VISIBLE = Bands.of(np.linspace(400, 700, 31))
 INFRARED = Bands.of(np.linspace(750, 1000, 26))

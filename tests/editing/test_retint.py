@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 
 from unmix_plugin.editing.retint import LitReflectance, retinted
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
-from unmix_plugin.spectral.colour.illuminants import illuminant_power
+from unmix_plugin.spectral.colour.conversion import illuminant_power, linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.library.material_library import measured_library
 
 BANDS = Bands.of(np.linspace(400, 700, 31))

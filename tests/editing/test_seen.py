@@ -12,8 +12,8 @@ from unmix_plugin.editing import sample_seen
 from unmix_plugin.editing.material_state import MaterialState
 from unmix_plugin.editing.seen import Appearance, appearance_of
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.spectral.coefficients import Coefficients
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.materials import Coefficients
 from unmix_plugin.trained.run_views import RunView
 
 

@@ -13,7 +13,7 @@ from tests.method_factory import (
 )
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.losses.training_losses import LossConfig
-from unmix_plugin.spectral.losses import FAINT, relative_weights
+from unmix_plugin.spectral.evidence import FAINT, relative_weights
 
 
 def test_a_last_colour_background_closes_every_ray_that_meets_something():

@@ -17,9 +17,8 @@ from unmix_plugin.products.metamerism import (
     write_metamerism,
 )
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.conversion import xyz_matrix
+from unmix_plugin.spectral.colour.conversion import illuminant_power, xyz_matrix
 from unmix_plugin.spectral.colour.difference import lab_to_srgb, reflectance_to_lab
-from unmix_plugin.spectral.colour.illuminants import illuminant_power
 from unmix_plugin.spectral.library.material_library import MaterialLibrary
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable
 from unmix_plugin.spectral.materials import Materials

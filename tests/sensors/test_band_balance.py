@@ -12,7 +12,7 @@ from unmix_plugin.errors import ConfigError
 from unmix_plugin.losses.training_losses import LossConfig
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.model_settings import UnmixModelConfig
-from unmix_plugin.spectral.unmixing.sparse_unmixing import sparse_abundances
+from unmix_plugin.spectral.unmixing.abundances import sparse_abundances
 
 WEIGHTS = (1.24, 1.24, 0.04, 1.24, 1.24)
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from unmix_plugin.spectral.band_noise import BandNoise, judge_bands
+from unmix_plugin.spectral.bad_values import BandNoise, judge_bands
 
 NUM_BANDS, NUM_PIXELS = 20, 4000
 

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
-from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION, Coefficients
+from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients
 
 PARTS = ("accumulation", "distance", "abundances", "scaled_abundances", "specular")
 counts = st.integers(0, 4)

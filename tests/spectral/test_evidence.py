@@ -7,13 +7,13 @@ from torch.testing import assert_close
 from unmix_plugin.spectral.evidence import (
     alpha_trust,
     background_level,
+    bounded_square,
     brightness,
     exposure_of,
     is_blown_out,
     may_show_matter,
     relative_power_of,
 )
-from unmix_plugin.spectral.losses import bounded_square
 
 GENERATOR = torch.Generator().manual_seed(0)
 

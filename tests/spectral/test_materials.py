@@ -8,9 +8,8 @@ from torch.testing import assert_close
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.coefficients import Coefficients
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
-from unmix_plugin.spectral.materials import Materials, default_names
+from unmix_plugin.spectral.materials import Coefficients, Materials, default_names
 
 BANDS = Bands.of([450, 500, 550, 600, 650])
 

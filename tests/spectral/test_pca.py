@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from unmix_plugin.spectral.pca import PcaColours
+from unmix_plugin.spectral.subspace import PcaColours
 
 
 def spectra(count=400, bands=6):

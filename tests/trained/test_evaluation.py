@@ -13,7 +13,7 @@ from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import SceneOptions
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.metrics import abundance_rmse, psnr, sam
-from unmix_plugin.spectral.scene_sensor import SceneSensor
+from unmix_plugin.spectral.sensor import SceneSensor
 from unmix_plugin.trained.evaluation import (
     VIEW_FIGURES,
     Evaluation,

@@ -11,7 +11,7 @@ from tests.viewer.view_factory import source_of_model
 from unmix_plugin.editing import Light, Recipe, Retint
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.illuminants import illuminant_names
+from unmix_plugin.spectral.colour.conversion import illuminant_names
 from unmix_plugin.viewer.rendering.edits import Edit
 
 

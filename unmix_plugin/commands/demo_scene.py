@@ -22,7 +22,7 @@ from unmix_plugin.commands.entry import run_command
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.demo.scene import DEFAULT_BANDS, DEFAULT_SIZE, DEFAULT_VIEWS, PLACES, make_demo_scene
 from unmix_plugin.scenes.demo.shading import LAMP
-from unmix_plugin.spectral.colour.illuminants import parse_light
+from unmix_plugin.spectral.colour.conversion import parse_light
 
 
 @dataclass(frozen=True)

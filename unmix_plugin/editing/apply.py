@@ -20,7 +20,7 @@ from unmix_plugin.editing.operations import Gloss, Replace, Retint
 from unmix_plugin.editing.recipe import Light, Recipe
 from unmix_plugin.editing.seen import sample_seen
 from unmix_plugin.errors import ConfigError, SpectrumError
-from unmix_plugin.spectral.coefficients import Coefficients
+from unmix_plugin.spectral.materials import Coefficients
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 

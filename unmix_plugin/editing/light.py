@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float64
 from unmix_plugin.editing.recipe import Light
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.illuminants import brightness, covered_bands, illuminant_power
+from unmix_plugin.spectral.colour.conversion import brightness, covered_bands, illuminant_power
 from unmix_plugin.spectral.library.material_library import DARK_LIGHT
 
 

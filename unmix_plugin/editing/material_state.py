@@ -14,8 +14,7 @@ from jaxtyping import Bool, Float64
 from unmix_plugin.editing.operations import Colour, Endmember
 from unmix_plugin.errors import ConfigError, did_you_mean
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.coefficients import Coefficients
-from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.spectral.materials import Coefficients, Materials
 
 
 @dataclass

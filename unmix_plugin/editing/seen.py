@@ -21,8 +21,8 @@ from torch import Tensor
 from unmix_plugin.editing.material_state import MaterialState
 from unmix_plugin.editing.operations import Colour
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION, Coefficients
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 _NUM_VIEWS = 8

@@ -21,7 +21,7 @@ from unmix_plugin.editing.recipe import LightName
 from unmix_plugin.editing.yaml_nodes import fault
 from unmix_plugin.errors import UnmixError
 from unmix_plugin.figures.plotting import css_colour
-from unmix_plugin.spectral.colour.illuminants import parse_light
+from unmix_plugin.spectral.colour.conversion import parse_light
 
 T = TypeVar("T")
 

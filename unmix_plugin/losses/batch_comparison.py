@@ -19,8 +19,7 @@ from unmix_plugin.presets import AlphaPreset, choose
 from unmix_plugin.sensors.band_balance import BandBalance
 from unmix_plugin.sensors.batches import SensorPart, mean_over_parts, split_parts
 from unmix_plugin.sensors.views import SensorViews
-from unmix_plugin.spectral.coefficients import Coefficients
-from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.spectral.materials import Coefficients, Materials
 
 _MATTER = 0.01
 """Opacity of pixels that show matter."""

@@ -16,9 +16,12 @@ from unmix_plugin.model_settings import UnmixModelConfig
 from unmix_plugin.sensors.band_balance import BandBalance
 from unmix_plugin.sensors.views import SensorViews
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.unmixing.endmembers import initialise_endmembers
-from unmix_plugin.spectral.unmixing.given_endmembers import given_endmembers
-from unmix_plugin.spectral.unmixing.partial_bands import distinct_spectra, fill_bands
+from unmix_plugin.spectral.unmixing.endmembers import (
+    distinct_spectra,
+    fill_bands,
+    given_endmembers,
+    initialise_endmembers,
+)
 
 
 def first_endmembers(

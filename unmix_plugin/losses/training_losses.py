@@ -15,10 +15,10 @@ from torch import Tensor
 
 from unmix_plugin.errors import require
 from unmix_plugin.presets import AlphaPreset, Auto, choose
-from unmix_plugin.spectral.evidence import is_blown_out
-from unmix_plugin.spectral.losses import (
+from unmix_plugin.spectral.evidence import (
     bounded_square,
     forgive_saturation,
+    is_blown_out,
     over_background,
     relative_weights,
     solid_evidence,

@@ -26,7 +26,7 @@ from unmix_plugin.neumatex.scene.object_scene import ObjectScene
 from unmix_plugin.neumatex.scene.pixel_list import PixelList
 from unmix_plugin.neumatex.traced_object import SeenPoints, TracedObject
 from unmix_plugin.neumatex.triplane import Triplane
-from unmix_plugin.spectral.unmixing.abundance_estimation import fcls
+from unmix_plugin.spectral.unmixing.abundances import fcls
 from unmix_plugin.spectral.unmixing.endmembers import drop_uninformative_pixels, initialise_endmembers
 from unmix_plugin.spectral.unmixing.num_materials import propose_num_materials
 

@@ -21,8 +21,7 @@ from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.poses.line_registration.register import register
 from unmix_plugin.poses.line_registration.swept_view import Show, SweptView, columns_compared, rays_through
 from unmix_plugin.poses.refinement import PoseRefinement
-from unmix_plugin.spectral.coefficients import Coefficients
-from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.spectral.materials import Coefficients, Materials
 
 MOST_PIXELS = 150_000
 """Compared, of all views together."""

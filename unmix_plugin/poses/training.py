@@ -27,8 +27,7 @@ from unmix_plugin.losses.batch_comparison import BatchComparison
 from unmix_plugin.poses.line_cameras import LineCameras
 from unmix_plugin.poses.refinement import PoseRefinement
 from unmix_plugin.poses.settings import PoseConfig
-from unmix_plugin.spectral.coefficients import Coefficients
-from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.spectral.materials import Coefficients, Materials
 
 
 class PoseTraining:

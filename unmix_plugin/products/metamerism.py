@@ -21,9 +21,13 @@ from unmix_plugin.figures.plotting import draw_swatch, figure_bytes
 from unmix_plugin.formats.files import write_file
 from unmix_plugin.products.product import Job, Product
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.difference import lab_to_srgb, reflectance_to_lab
-from unmix_plugin.spectral.colour.illuminants import illuminant_power, parse_light
-from unmix_plugin.spectral.colour.metamerism import MetamericPair, metameric_pairs
+from unmix_plugin.spectral.colour.conversion import illuminant_power, parse_light
+from unmix_plugin.spectral.colour.difference import (
+    MetamericPair,
+    lab_to_srgb,
+    metameric_pairs,
+    reflectance_to_lab,
+)
 from unmix_plugin.spectral.library.material_library import MaterialLibrary
 from unmix_plugin.spectral.materials import Materials
 

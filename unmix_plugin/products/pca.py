@@ -22,9 +22,8 @@ from unmix_plugin.figures.picture_grid import over_neutral
 from unmix_plugin.formats.files import write_file
 from unmix_plugin.formats.png import rgba_png_bytes
 from unmix_plugin.products.product import Job, Product
-from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION
-from unmix_plugin.spectral.materials import Materials
-from unmix_plugin.spectral.pca import PcaColours
+from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Materials
+from unmix_plugin.spectral.subspace import PcaColours
 from unmix_plugin.trained.run_views import ViewChoice, resized_views
 from unmix_plugin.trained.view_rendering import RenderedView, as_numpy
 

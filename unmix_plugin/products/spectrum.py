@@ -19,10 +19,9 @@ from unmix_plugin.errors import ConfigError
 from unmix_plugin.figures.plotting import figure_bytes, plain_axes
 from unmix_plugin.formats.files import make_folder, write_file
 from unmix_plugin.products.product import Job, Product
-from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION
 from unmix_plugin.spectral.library.material_library import Comparison
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
-from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Materials
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.run_views import RunView, find_view
 

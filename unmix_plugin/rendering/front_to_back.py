@@ -24,7 +24,7 @@ from unmix_plugin.light.shading import Lamplight
 from unmix_plugin.operators.compositing import accumulate
 from unmix_plugin.operators.marching import FirstSamples
 from unmix_plugin.operators.merging import MergedSamples, MergeLimits, merge_samples
-from unmix_plugin.spectral.coefficients import Coefficients
+from unmix_plugin.spectral.materials import Coefficients
 
 _ENDING_LIGHT = 3.0
 """Share of its light at which a ray ends, in multiples of the smallest weight of a sample."""

@@ -27,7 +27,7 @@ from unmix_plugin.operators.grid_cells import cells_at
 from unmix_plugin.operators.marching import FirstSamples, PackedSamples, march, march_first
 from unmix_plugin.rendering.front_to_back import FrontToBack, composite_front_to_back
 from unmix_plugin.rendering.lit_samples import LitSamples, points_of, samples_carrying_weight
-from unmix_plugin.spectral.coefficients import Coefficients
+from unmix_plugin.spectral.materials import Coefficients
 
 _SPREAD_DEPTH = 0.03
 """Optical depth of a sample from which on its part of the spread grows slower than the depth."""

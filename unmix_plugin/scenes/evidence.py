@@ -20,7 +20,7 @@ from unmix_plugin.scenes.pixel_block import DrawnPixels, PixelBlock
 from unmix_plugin.scenes.pixel_table import PixelTable
 from unmix_plugin.scenes.reading.sensors import lonely_sensors
 from unmix_plugin.scenes.scene import Scene
-from unmix_plugin.spectral.band_noise import BandNoise, judge_bands
+from unmix_plugin.spectral.bad_values import BandNoise, judge_bands
 from unmix_plugin.spectral.evidence import (
     alpha_trust,
     background_level,

@@ -27,7 +27,7 @@ from unmix_plugin.scenes.placement import Placement
 from unmix_plugin.scenes.reading.cubes import InvalidPixels, map_array, read_cube, read_invalid
 from unmix_plugin.scenes.reading.images import read_colour, read_labels, read_mask
 from unmix_plugin.scenes.reading.transforms_json import FILE_NAME
-from unmix_plugin.spectral.scene_sensor import SceneSensor
+from unmix_plugin.spectral.sensor import SceneSensor
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from unmix_plugin.spectral.scene_sensor import SceneSensor
+from unmix_plugin.spectral.sensor import SceneSensor
 
 _FEWEST_CHANNELS = 3
 """Of a sensor whose spectra tell materials apart."""

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.spectral.losses import over_background
+from unmix_plugin.spectral.evidence import over_background
 from unmix_plugin.spectral.unmixing.endmembers import DARK_RMS
 
 SSIM_WINDOW_PX = 7

@@ -33,8 +33,8 @@ from unmix_plugin.spectral.metrics import (
     sam,
     ssim,
 )
-from unmix_plugin.spectral.scene_sensor import SceneSensor
 from unmix_plugin.spectral.segmentation import NOTHING_ID, SegmentationScores, SegmentationTally
+from unmix_plugin.spectral.sensor import SceneSensor
 from unmix_plugin.trained.view_rendering import RenderedView
 
 OPAQUE_ALPHA = 0.99

@@ -14,8 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.spectral.coefficients import Coefficients
-from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.spectral.materials import Coefficients, Materials
 
 if TYPE_CHECKING:
     from unmix_plugin.trained.trained_scene import TrainedScene

@@ -18,8 +18,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.rays import RayBundle
-from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION, Coefficients
-from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 SOLID_ACCUMULATION = 0.9

@@ -17,8 +17,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION
-from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Materials
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 

@@ -16,8 +16,7 @@ from unmix_plugin.editing.light import relighting_factors
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
-from unmix_plugin.spectral.colour.illuminants import illuminant_names
+from unmix_plugin.spectral.colour.conversion import illuminant_names, linear_to_srgb, rgb_matrix
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.relighting import LightChoice, RelightableScene, relit
 from unmix_plugin.trained.run_views import RunView, recorded_views

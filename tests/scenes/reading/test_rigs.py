@@ -9,7 +9,7 @@ from tests.scenes.rig_factory import RESPONSES, halve, make_rig
 from tests.scenes.scene_factory import fault_of, make_scene, set_frame
 from unmix_plugin.scenes import load_scene
 from unmix_plugin.scenes.scene import check_recorded_scene, scene_identity
-from unmix_plugin.spectral.scene_sensor import SceneSensor
+from unmix_plugin.spectral.sensor import SceneSensor
 
 
 def test_frames_have_the_size_and_bands_of_their_sensor(tmp_path):

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.colour.conversion import illuminant_power
 from unmix_plugin.spectral.colour.difference import ciede2000, lab_to_srgb, reflectance_to_lab, srgb_to_lab
-from unmix_plugin.spectral.colour.illuminants import illuminant_power
 
 VISIBLE = Bands.of(np.linspace(380, 780, 81))
 

@@ -5,7 +5,7 @@ import pytest
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.illuminants import (
+from unmix_plugin.spectral.colour.conversion import (
     brightness,
     illuminant_names,
     illuminant_power,

@@ -6,9 +6,8 @@ import torch
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.conversion import xyz_matrix
-from unmix_plugin.spectral.colour.illuminants import illuminant_power
-from unmix_plugin.spectral.colour.metamerism import metameric_pairs, pair_differences
+from unmix_plugin.spectral.colour.conversion import illuminant_power, xyz_matrix
+from unmix_plugin.spectral.colour.difference import metameric_pairs, pair_differences
 
 BANDS = Bands.of(np.linspace(400, 700, 31))
 LIGHTS = np.stack([illuminant_power(name, BANDS) for name in ("D65", "A")])

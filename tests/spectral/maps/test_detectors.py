@@ -10,7 +10,7 @@ from spectral import matched_filter as spy_matched_filter
 from torch.testing import assert_close
 
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.spectral.maps.detectors import LOADING, Background, adaptive_coherence, matched_filter
+from unmix_plugin.spectral.maps.targets import LOADING, Background, adaptive_coherence, matched_filter
 
 # Mean (0.4, 0.3), sample covariance diag(0.02, 0.08) / 3.
 FOUR = torch.tensor([[0.5, 0.3], [0.3, 0.3], [0.4, 0.5], [0.4, 0.1]], dtype=torch.float64)

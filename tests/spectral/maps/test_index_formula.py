@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.spectral.maps.index_formula import parse_formula
+from unmix_plugin.spectral.maps.indices import parse_formula
 
 VALUES = {450.0: 0.05, 550.0: 0.12, 670.0: 0.3, 800.0: 0.7}
 

@@ -7,7 +7,7 @@ from torch.testing import assert_close
 
 from tests.spectral.mixtures import seeded, smooth_endmembers
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.spectral.unmixing.abundance_estimation import fcls, nnls, sunsal
+from unmix_plugin.spectral.unmixing.abundances import fcls, nnls, sunsal
 
 
 def random_problem(num_endmembers, num_pixels=40, num_bands=9, seed=0):

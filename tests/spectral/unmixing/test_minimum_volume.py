@@ -7,7 +7,7 @@ from torch.testing import assert_close
 from tests.spectral.mixtures import mixed_pixels, seeded, smooth_endmembers
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.metrics import spectral_angle
-from unmix_plugin.spectral.unmixing.minimum_volume import minimum_volume_simplex
+from unmix_plugin.spectral.unmixing.endmembers import minimum_volume_simplex
 from unmix_plugin.spectral.unmixing.nfindr_winter1999 import nfindr
 
 

@@ -4,6 +4,7 @@ import torch
 from torch.testing import assert_close
 
 from tests.spectral.mixtures import seeded, smooth_endmembers
+from unmix_plugin.spectral.unmixing.abundances import sparse_abundances
 from unmix_plugin.spectral.unmixing.endmembers import drop_uninformative_pixels, has_spectral_shape
 from unmix_plugin.spectral.unmixing.mixture_guide import (
     MixtureCache,
@@ -12,7 +13,6 @@ from unmix_plugin.spectral.unmixing.mixture_guide import (
     margin_variance,
     mixing_penalty,
 )
-from unmix_plugin.spectral.unmixing.sparse_unmixing import sparse_abundances
 from unmix_plugin.spectral.unmixing.two_material_mixtures import mean_pair_distance
 
 ENDMEMBERS = smooth_endmembers(4).float() * 0.8

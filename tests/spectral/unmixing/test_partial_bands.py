@@ -3,7 +3,7 @@
 import torch
 from torch.testing import assert_close
 
-from unmix_plugin.spectral.unmixing.partial_bands import distinct_spectra, fill_bands, typical_spectrum
+from unmix_plugin.spectral.unmixing.endmembers import distinct_spectra, fill_bands, typical_spectrum
 
 TYPICAL = torch.tensor([0.1, 0.2, 0.4, 0.3, 0.2, 0.1])
 

@@ -3,7 +3,7 @@ from torch.testing import assert_close
 
 from tests.spectral.mixtures import seeded, smooth_endmembers
 from unmix_plugin.spectral.metrics import spectral_angle
-from unmix_plugin.spectral.unmixing.pixel_unmixing import comparable_brightness, unmix_pixels
+from unmix_plugin.spectral.unmixing.endmembers import comparable_brightness, unmix_pixels
 
 
 def landscape(dark, seed=0):

@@ -6,9 +6,8 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from tests.spectral.mixtures import seeded, smooth_endmembers
-from unmix_plugin.spectral.unmixing import sparse_unmixing
-from unmix_plugin.spectral.unmixing.abundance_estimation import nnls
-from unmix_plugin.spectral.unmixing.sparse_unmixing import sparse_abundances
+from unmix_plugin.spectral.unmixing import abundances as sparse_unmixing
+from unmix_plugin.spectral.unmixing.abundances import nnls, sparse_abundances
 
 
 def endmembers_of(num_endmembers):

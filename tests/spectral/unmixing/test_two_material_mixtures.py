@@ -12,7 +12,7 @@ from tests.spectral.mixtures import seeded, smooth_endmembers
 from tests.spectral.unmixing.surface_pixels import surface_pixels
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.metrics import spectral_angle
-from unmix_plugin.spectral.unmixing.abundance_estimation import nnls
+from unmix_plugin.spectral.unmixing.abundances import nnls
 from unmix_plugin.spectral.unmixing.two_material_mixtures import (
     distances_to_pairs,
     two_material_endmembers,

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.viewer.view_factory import make_aids
-from unmix_plugin.spectral.maps.index_formula import MAX_LENGTH
+from unmix_plugin.spectral.maps.indices import MAX_LENGTH
 from unmix_plugin.viewer.layers.layer_settings import (
     BACKGROUNDS,
     COLOUR_MAPS,

@@ -10,8 +10,8 @@ from torch.testing import assert_close
 
 from tests.viewer.view_factory import make_aids, make_frame, make_source, paint_layer
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.spectral.coefficients import Coefficients
 from unmix_plugin.spectral.colour.conversion import band_composite_matrix, linear_to_srgb
+from unmix_plugin.spectral.materials import Coefficients
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings
 from unmix_plugin.viewer.layers.layers import LAYERS

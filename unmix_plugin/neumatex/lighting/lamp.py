@@ -21,7 +21,7 @@ from unmix_plugin.errors import SceneError, SpectrumError
 from unmix_plugin.neumatex.lighting.environment import Environment
 from unmix_plugin.neumatex.lighting.read_environment import check_environment, read_environment
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.illuminants import illuminant_power, parse_light
+from unmix_plugin.spectral.colour.conversion import illuminant_power, parse_light
 from unmix_plugin.spectral.library.material_library import read_library_table
 from unmix_plugin.spectral.library.spectra_csv import resample_spectra
 

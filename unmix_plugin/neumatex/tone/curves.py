@@ -13,8 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from unmix_plugin.neumatex.tone.response import CameraResponse
-from unmix_plugin.spectral.colour.agx import agx
-from unmix_plugin.spectral.colour.conversion import linear_to_srgb
+from unmix_plugin.spectral.colour.conversion import agx, linear_to_srgb
 
 ToneMapping = Literal["linear", "srgb", "agx", "camera"]
 """How pictures were made of light: `linear` is light itself, `camera` an unknown response."""
@@ -40,7 +39,7 @@ class Srgb(nn.Module):
 
 
 class Agx(nn.Module):
-    """Light as AgX encodes it: see `unmix_plugin.spectral.colour.agx`; RGB only."""
+    """Light as AgX encodes it: see `unmix_plugin.spectral.colour.conversion`; RGB only."""
 
     def forward(self, light: Float[Tensor, "*pixels 3"]) -> Float[Tensor, "*pixels 3"]:
         """Numbers in [0, 1]."""

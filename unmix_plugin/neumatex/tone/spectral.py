@@ -12,8 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.agx import agx
-from unmix_plugin.spectral.colour.conversion import rgb_matrix
+from unmix_plugin.spectral.colour.conversion import agx, rgb_matrix
 
 _DARK = 0.25
 """Brightness, as a part of the mean, far below which pixels count alike."""

@@ -36,7 +36,7 @@ from unmix_plugin.products.render.frame_exchange import FrameExchange
 from unmix_plugin.products.render.pictures import Palette
 from unmix_plugin.products.render.survey import Survey
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION
+from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
 from unmix_plugin.trained.probe import one_pixel
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.trained_scene import TrainedScene

@@ -12,9 +12,9 @@ from torch import Tensor
 from unmix_plugin.engine.outputs import Output
 from unmix_plugin.figures.picture_grid import ColourScale
 from unmix_plugin.products.render.pictures import scale_of
-from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION
 from unmix_plugin.spectral.maps.reflectance_maps import Score, is_reflectance_map, parse_reflectance_map
-from unmix_plugin.spectral.pca import PcaColours
+from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
+from unmix_plugin.spectral.subspace import PcaColours
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.run_views import RunView
 from unmix_plugin.trained.trained_scene import TrainedScene

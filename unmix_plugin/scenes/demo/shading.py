@@ -32,7 +32,7 @@ from jaxtyping import Bool, Float, Float32
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.scenes.demo.shapes import Placement, dot, first_hits
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.illuminants import illuminant_power
+from unmix_plugin.spectral.colour.conversion import illuminant_power
 
 MATERIALS = ("white", "red", "yellow", "green", "cyan", "purple")
 """Six patches of the ColorChecker chart; the spectral angle between any two under the lamp is at least 0.45 rad."""

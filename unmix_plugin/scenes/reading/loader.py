@@ -39,7 +39,7 @@ from unmix_plugin.scenes.reading.transforms_json import FILE_NAME, Intrinsics, S
 from unmix_plugin.scenes.scene import Frame, Normalisation, Scene, SceneOptions
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, read_illuminant_csv, read_spectra_csv
-from unmix_plugin.spectral.scene_sensor import SceneSensor
+from unmix_plugin.spectral.sensor import SceneSensor
 
 
 def make_cameras(entry: SceneEntry, sizes: list[Size], normalisation: Normalisation) -> Cameras:

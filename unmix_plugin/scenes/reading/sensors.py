@@ -15,8 +15,7 @@ from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.images import Size
 from unmix_plugin.scenes.reading.transforms_json import SensorEntry
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.scene_sensor import SceneSensor
-from unmix_plugin.spectral.sensor import read_sensor
+from unmix_plugin.spectral.sensor import SceneSensor, read_sensor
 
 
 def read_operators(

@@ -1,4 +1,10 @@
-"""From spectra to colour, as one matrix for each sampling of the spectrum.
+"""Lights: relative power over wavelength, by the name of a standard illuminant or from a CSV file.
+
+Notation: `B` bands. Power is relative, greatest band 1. A band sees the mean of the light over its interval, so that
+narrow lines of a lamp count wherever they lie between band centres; in the outer halves of the outermost bands a light
+that is known only up to the band centre is taken to continue at its last value.
+
+From spectra to colour, as one matrix for each sampling of the spectrum.
 
 Notation: `B` bands; a spectrum is radiance in [0, 1], bands last. `xyz` is CIE 1931 2 degree; `linear_rgb` is linear
 light in sRGB primaries; `srgb` is encoded for a display. A matrix has shape (B, 3) and is applied as
@@ -12,21 +18,140 @@ stays yellow. Of the conventions tried (no adaptation, Bradford from E or from t
 reproduces the sRGB images that come with path-traced cubes, to within their 8 bits.
 
 Sensors whose bands cannot tell colours get a false-colour composite instead: see `colour_mode`.
+
+AgX in its basic look: a tone curve that compresses 16.5 stops as film does, and lets bright colours fade to white.
+
+Source: Sobotka 2022; the polynomial fit of its contrast curve is Wrensch's, 2023.
 """
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Sequence
 from functools import lru_cache
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.spectral.bands import VISIBLE_RANGE_NM, Bands
+from unmix_plugin.spectral.bands import VISIBLE_RANGE_NM, Bands, integrals_up_to
+from unmix_plugin.spectral.library.spectra_csv import TOLERANCE_NM, read_spectra_csv, resample_spectra
+
+_FORMULA_RANGE_NM = (250.0, 3000.0)
+"""Where the lights that are defined by a formula are given."""
+
+
+def parse_light(text: str) -> str | Path:
+    """A light as a user writes it: the name of a known one, or the path of a CSV file.
+
+    Raises:
+        SpectrumError: neither; the message has the nearest names.
+
+    >>> parse_light("d65")
+    'D65'
+    """
+    spelled = {name.casefold(): name for name in illuminant_names()}
+    wanted = text.strip().casefold()
+    if wanted in spelled:
+        return spelled[wanted]
+    if wanted.endswith(".csv"):
+        return Path(text.strip())
+    near = [spelled[key] for key in difflib.get_close_matches(wanted, spelled, n=3, cutoff=0.5)]
+    hint = f"nearest: {', '.join(near)}" if near else "known are, among others, A, D50, D65, E, FL2, FL11"
+    raise SpectrumError(f"there is no light {text!r}; {hint}; or give a .csv file (wavelength,power)")
+
+
+def illuminant_names() -> tuple[str, ...]:
+    """Names of known lights: CIE illuminants (A, C, D50, D65, E, FL1, LED-B1, ...) and measured lamps."""
+    return tuple(_tables())
+
+
+def illuminant_power(
+    light: str | Path, bands: Bands, beyond: Literal["refuse", "hold"] = "refuse"
+) -> Float64[np.ndarray, " B"]:
+    """Relative power of a light in each band, greatest 1.
+
+    Args:
+        light: A name as `parse_light` gives it, or a CSV file, `wavelength,power`.
+        bands: Of the sensor.
+        beyond: What to do in bands at whose centres the light is not known: refuse, or hold its outermost value.
+    Raises:
+        SpectrumError: an unknown name; a file that is missing, malformed or not one light; a light that is not known at
+            all bands (the message says by how much) or that is zero there.
+    """
+    source, power = _table(light)
+    if beyond == "refuse":
+        try:
+            resample_spectra(power, source, bands)
+        except SpectrumError as error:
+            raise SpectrumError(f"light {light}: {error}") from error
+    means = _band_means(power, source, bands)
+    if not means.max() > 0:
+        raise SpectrumError(f"light {light} has no power in any of {bands}; choose one that shines there")
+    return means / means.max()
+
+
+def covered_bands(light: str | Path, bands: Bands) -> Bool[np.ndarray, " B"]:
+    """Bands at whose centres a light is known; errors are those of `illuminant_power`."""
+    source = _table(light)[0].centers_nm
+    return (bands.centers_nm >= source[0] - TOLERANCE_NM) & (bands.centers_nm <= source[-1] + TOLERANCE_NM)
+
+
+def brightness(power: Float64[np.ndarray, " B"], bands: Bands) -> float:
+    """How bright a perfect white is in a light: its luminance where the bands see colours, otherwise its mean
+    radiance."""
+    if colour_mode(bands) == "true-colour":
+        return float(power @ xyz_matrix(bands).double().numpy()[:, 1])
+    return float(power @ bands.widths_nm / bands.widths_nm.sum())
+
+
+def _table(light: str | Path) -> tuple[Bands, Float64[np.ndarray, " N"]]:
+    return _read(light) if isinstance(light, Path) else _tables()[str(parse_light(light))]
+
+
+def _read(path: Path) -> tuple[Bands, Float64[np.ndarray, " N"]]:
+    table = read_spectra_csv(path)
+    if len(table.names) != 1:
+        raise SpectrumError(
+            f"{path}: a light has two columns, wavelength and power; found {len(table.names) + 1}"
+        )
+    return table.bands, table.spectra[0]
+
+
+def _band_means(power: Float64[np.ndarray, " N"], source: Bands, bands: Bands) -> Float64[np.ndarray, " B"]:
+    """Means of the piecewise linear function through the table over each band's interval, exactly."""
+    edges = bands.edges_nm
+    [integrals] = integrals_up_to(edges, power[None], source.centers_nm)
+    return np.diff(integrals) / np.diff(edges)
+
+
+@lru_cache(maxsize=1)
+def _tables() -> dict[str, tuple[Bands, Float64[np.ndarray, " N"]]]:
+    """Every known light as colour-science has it, but A and E as their definitions, which no table cuts off."""
+    # Guarded because importing colour-science changes how NumPy prints.
+    with np.printoptions():
+        from colour.colorimetry import SDS_ILLUMINANTS, SDS_LIGHT_SOURCES
+    tables = {
+        name: (Bands.of(found.wavelengths), np.asarray(found.values, dtype=np.float64))
+        for group in (SDS_LIGHT_SOURCES, SDS_ILLUMINANTS)
+        for name, found in group.items()
+    }
+    low, high = _FORMULA_RANGE_NM
+    wavelengths = np.arange(low, high + 1, 5.0)
+    tables["A"] = (Bands.of(wavelengths), _incandescent(wavelengths))
+    tables["E"] = (Bands.of([low, high]), np.ones(2))
+    return tables
+
+
+def _incandescent(wavelengths_nm: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
+    """CIE illuminant A, 100 at 560 nm: the black body of CIE 15:2018, given there for 300-830 nm, and good beyond."""
+    radiation = np.expm1(1.435e7 / (2848.0 * 560.0)) / np.expm1(1.435e7 / (2848.0 * wavelengths_nm))
+    return 100.0 * (560.0 / wavelengths_nm) ** 5 * radiation
+
 
 ColourMode = Literal["true-colour", "false-colour"]
 
@@ -180,3 +305,39 @@ def _thirds_of_range(bands: Bands) -> Float64[np.ndarray, "B 3"]:
     overlaps = np.minimum(high, thirds[1:]) - np.maximum(low, thirds[:-1])
     overlaps = overlaps.clip(min=0)[:, ::-1]
     return overlaps / overlaps.sum(axis=0)
+
+
+# Inset and outset keep saturated colours from clipping in one channel: bright ones fade to white instead. Rows sum to
+# 1, so greys stay grey.
+_INSET = (
+    (0.842479062253094, 0.0784335999999992, 0.0792237451477643),
+    (0.0423282422610123, 0.878468636469772, 0.0791661274605434),
+    (0.0423756549057051, 0.0784336, 0.879142973793104),
+)
+_OUTSET = (
+    (1.19687900512017, -0.0980208811401368, -0.0990297440797205),
+    (-0.0528968517574562, 1.15190312990417, -0.0989611768448433),
+    (-0.0529716355144438, -0.0980434501171241, 1.15107367264116),
+)
+_LOG2_BOUNDS = (-12.47393, 4.026069)
+"""Light that becomes black and white: 10 stops below and 6.5 above middle grey, 0.18."""
+
+_CURVE = (15.5, -40.14, 31.96, -6.868, 0.4298, 0.1191, -0.00232)
+"""Polynomial of the contrast curve, highest power first."""
+
+
+def agx(light: Float[Tensor, "*pixels 3"]) -> Float[Tensor, "*pixels 3"]:
+    """Light as AgX encodes it for an sRGB display; differentiable between its black and its white.
+
+    Args:
+        light: Linear RGB in sRGB primaries, 0 and up.
+    Returns:
+        About [0, 1]; saturated colours may leave it a little.
+    """
+    low, high = _LOG2_BOUNDS
+    inset = light.clamp(min=0) @ light.new_tensor(_INSET).T
+    x = ((inset.clamp(min=2.0**low).log2() - low) / (high - low)).clamp(0, 1)
+    curve = torch.zeros_like(x)
+    for coefficient in _CURVE:
+        curve = curve * x + coefficient
+    return curve @ light.new_tensor(_OUTSET).T

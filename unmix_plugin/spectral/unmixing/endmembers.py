@@ -1,23 +1,137 @@
-"""First guess of a scene's endmembers from the pixels of all its training views.
+"""Minimum volume: the smallest simplex that holds nearly all pixels, where pure pixels may be missing.
+
+Source: J. M. Bioucas-Dias, "A variable splitting augmented Lagrangian approach to linear spectral unmixing" (SISAL),
+WHISPERS 2009: least -log|det Q| plus a hinge on negative abundances, so that a few outliers may stay outside. The
+objective is that of the paper, with the hinge rounded near zero, which lets a quasi-Newton method minimise it.
+
+Notation: `N` pixels, `B` bands, `K` endmembers. Pixels are scaled to sum 1, which removes shading, and lie near a plane
+of K - 1 dimensions; `lifted` are their coordinates on it, a 1 in front. Abundances are `lifted @ Q`, the corners of the
+simplex are the rows of the inverse of Q. Abundances sum to 1 if the columns of Q sum to (1, 0, ..., 0).
+
+First guess of a scene's endmembers from the pixels of all its training views.
 
 Notation: `N` pixels pooled over views, `B` bands, `K` endmembers; spectra in [0, 1], bands last.
+
+Spectra on all bands of a scene from what sensors saw of some of them: a start, which training completes.
+
+Notation: `K` spectra, `b` channels of a sensor, `B` bands of the scene.
+
+Endmembers from a file, brought to the brightness of a scene.
+
+Notation: `N` pixels, `B` bands, `K` endmembers.
+
+Endmembers and abundances of pixels taken one by one: an image without its scene.
+
+Notation: `N` pixels, `B` bands, `K` endmembers.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from unmix_plugin.errors import SpectrumError
+from unmix_plugin.errors import ConfigError, SpectrumError
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
+from unmix_plugin.spectral.unmixing.abundances import nnls
 from unmix_plugin.spectral.unmixing.kmeans_normalised import normalised_kmeans, scale_to_lit_pixels
-from unmix_plugin.spectral.unmixing.minimum_volume import minimum_volume_simplex
 from unmix_plugin.spectral.unmixing.nfindr_winter1999 import nfindr
-from unmix_plugin.spectral.unmixing.pooled_pairs import pooled_pair_endmembers
-from unmix_plugin.spectral.unmixing.two_material_mixtures import two_material_endmembers
+from unmix_plugin.spectral.unmixing.two_material_mixtures import (
+    pooled_pair_endmembers,
+    two_material_endmembers,
+)
 from unmix_plugin.spectral.unmixing.vca_nascimento2005 import vca
+
+_ROUNDING = 0.01
+"""Abundance below which the hinge is a parabola."""
+
+_HEAD_START = 1.2
+"""How much larger than N-FINDR's simplex the first one is."""
+
+
+def minimum_volume_simplex(
+    pixels: Float[Tensor, "N B"],
+    num_endmembers: int,
+    generator: torch.Generator,
+    outlier_penalty: float = 50.0,
+    max_iterations: int = 200,
+) -> Float[Tensor, "K B"]:
+    """Corners of the smallest simplex around the shapes of the pixels, each with a sum over bands of 1.
+
+    Args:
+        pixels: Spectra of positive sum, in any unit. Drop dark ones first: noise is all the shape they have.
+        generator: On the CPU; seeds the start, the only source of randomness.
+        outlier_penalty: Price of a mean negative abundance, against the logarithm of the volume. Small values let many
+            pixels stay outside, large ones reach for every noisy one: about K / penalty of them stay outside.
+    Raises:
+        SpectrumError: K below 2, above the bands or the pixels; pixels without light; a simplex that is flat.
+    """
+    sums = pixels.double().sum(dim=1, keepdim=True)
+    if not bool((sums > 0).all()):
+        raise SpectrumError(
+            f"the minimum volume needs spectra of positive sum; found {int((sums <= 0).sum())} others"
+        )
+    shapes = pixels.double() / sums
+    first = nfindr(shapes, num_endmembers, generator)
+    mean, axes = _plane(shapes, num_endmembers - 1)
+    lifted = _lift((shapes - mean) @ torch.linalg.pinv(axes))
+    corners = _minimise(lifted, _enlarged(lifted[first]), outlier_penalty, max_iterations)
+    spectra = (mean + corners[:, 1:] @ axes).clamp(min=0)
+    return (spectra / spectra.sum(dim=1, keepdim=True)).to(pixels.dtype)
+
+
+def _plane(
+    shapes: Float[Tensor, "N B"], num_dimensions: int
+) -> tuple[Float[Tensor, " B"], Float[Tensor, "D B"]]:
+    """Mean, and principal axes as long as the spread along them."""
+    mean = shapes.mean(dim=0)
+    centred = shapes - mean
+    eigen = torch.linalg.eigh(centred.T @ centred / len(shapes))
+    spreads = eigen.eigenvalues.flip(0)[:num_dimensions].clamp(min=0).sqrt()
+    return mean, (eigen.eigenvectors.flip(1)[:, :num_dimensions] * spreads).T
+
+
+def _lift(coordinates: Float[Tensor, "N D"]) -> Float[Tensor, "N K"]:
+    return torch.cat([torch.ones_like(coordinates[:, :1]), coordinates], dim=1)
+
+
+def _enlarged(corners: Float[Tensor, "K K"]) -> Float[Tensor, "K K"]:
+    centre = corners.mean(dim=0)
+    return centre + _HEAD_START * (corners - centre)
+
+
+def _minimise(
+    lifted: Float[Tensor, "N K"], corners: Float[Tensor, "K K"], outlier_penalty: float, max_iterations: int
+) -> Float[Tensor, "K K"]:
+    """Lifted corners of the best simplex, found from the given ones."""
+    unit = torch.eye(len(corners), dtype=lifted.dtype, device=lifted.device)[:, :1]
+    free = torch.linalg.inv(corners)[:, :-1].contiguous().requires_grad_(True)
+    optimizer = torch.optim.LBFGS(
+        [free],
+        max_iter=max_iterations,
+        history_size=20,
+        tolerance_change=1e-10,
+        line_search_fn="strong_wolfe",
+    )
+
+    def objective() -> Tensor:
+        optimizer.zero_grad()
+        unmixing = torch.cat([free, unit - free.sum(dim=1, keepdim=True)], dim=1)
+        missing = (-(lifted @ unmixing)).clamp(min=0)
+        hinge = torch.where(missing < _ROUNDING, missing.square() / (2 * _ROUNDING), missing - _ROUNDING / 2)
+        loss = outlier_penalty * hinge.sum(dim=1).mean() - torch.linalg.slogdet(unmixing).logabsdet
+        loss.backward()
+        return loss
+
+    with torch.enable_grad():
+        optimizer.step(objective)  # type: ignore[arg-type] - the closure may return a tensor
+    free = free.detach()
+    return torch.linalg.inv(torch.cat([free, unit - free.sum(dim=1, keepdim=True)], dim=1))
+
 
 EndmemberMethod = Literal["kmeans", "vca", "nfindr", "minimum-volume", "pairs", "pooled-pairs"]
 
@@ -145,3 +259,151 @@ def _count_distinct(pixels: Tensor, enough: int) -> int:
 
 def _most_similar(pixels: Float[Tensor, "N B"], spectra: Float[Tensor, "K B"]) -> Int[Tensor, " N"]:
     return (pixels @ torch.nn.functional.normalize(spectra, dim=1).T).argmax(dim=1)
+
+
+_SMOOTHNESS = 1e-3
+"""Weight of differences between neighbouring bands, against that of what was seen."""
+_CONTRAST = 0.6
+"""Of distinct spectra: how far they are from the typical one, in both directions."""
+
+
+def fill_bands(
+    seen: Float[Tensor, "K b"], matrix: Float[Tensor, "b B"], typical: Float[Tensor, "B"]
+) -> Float[Tensor, "K B"]:
+    """The spectra that a sensor saw as `seen`, their ratio to a typical spectrum as smooth over bands as may be.
+
+    Args:
+        seen: Values of the channels.
+        matrix: The sensor's operator.
+        typical: Of the scene, positive; what is not seen of a spectrum follows it.
+    """
+    operator = matrix.double() * typical.double()
+    differences = torch.diff(torch.eye(len(typical), dtype=torch.float64), dim=0)
+    square = operator.T @ operator
+    smooth = _SMOOTHNESS * square.diagonal().mean() * (differences.T @ differences)
+    ratios = torch.linalg.lstsq(square + smooth, operator.T @ seen.double().T).solution
+    return (ratios.T * typical.double()).clamp(min=0).to(seen)
+
+
+def typical_spectrum(
+    means: list[Float[Tensor, " _"]], matrices: list[Float[Tensor, "_ B"]]
+) -> Float[Tensor, "B"]:
+    """A smooth positive spectrum that sensors see as the means of their pixels.
+
+    Args:
+        means: Of each sensor's channels.
+        matrices: The sensors' operators.
+    """
+    seen, matrix = torch.cat(means)[None], torch.cat(matrices)
+    filled = fill_bands(seen, matrix, torch.ones(matrix.shape[1], dtype=seen.dtype))[0]
+    return filled.clamp(min=0.01 * float(filled.max().clamp(min=1e-6)))
+
+
+def distinct_spectra(typical: Float[Tensor, "B"], count: int) -> Float[Tensor, "K B"]:
+    """Spectra around a typical one that differ in shape, for scenes of which no sensor tells the materials.
+
+    Args:
+        count: At most as many as bands.
+    """
+    bands = (torch.arange(len(typical)) + 0.5) / len(typical)
+    middles = (torch.arange(count)[:, None] + 0.5) / count
+    shapes = 1 - _CONTRAST + 2 * _CONTRAST * torch.exp(-0.5 * ((bands - middles) * count) ** 2)
+    return (shapes.to(typical) * typical).clamp(0, 1)
+
+
+_LIT_QUANTILE = 0.99
+_LIT_SCALE = 0.75
+"""Scale that fully lit pixels should need: a sigmoid near 1 hardly learns (vnir-pots, 500 steps: +0.9 dB against 1)."""
+_MOST_PIXELS = 5000
+
+
+def brightness_factor(
+    endmembers: Float[Tensor, "K B"], pixels: Float[Tensor, "N B"], generator: torch.Generator
+) -> float:
+    """The one factor on all endmembers with which nearly every pixel is a mixture of amounts that sum to at most 0.75.
+
+    Spectra from a file are as bright as a white surface in the brightest band of the lamp; a scene's exposure is
+    anything. Ratios between endmembers, which the file gives, stay.
+
+    Args:
+        endmembers: Reflectance times the lamp's relative power.
+        pixels: Spectra of all training views.
+        generator: On the CPU; chooses at most 5000 of them.
+    Raises:
+        SpectrumError: no pixel is a mixture of them.
+    """
+    usable = drop_uninformative_pixels(pixels)
+    usable = usable[torch.randperm(len(usable), generator=generator)[:_MOST_PIXELS]]
+    amounts = nnls(usable.double(), endmembers.double()).sum(dim=1)
+    factor = float(torch.quantile(amounts, _LIT_QUANTILE)) / _LIT_SCALE if len(amounts) else 0.0
+    if not factor > 0:
+        raise SpectrumError("the given endmembers explain no pixel of the training views")
+    return factor
+
+
+def given_endmembers(
+    path: Path,
+    count: int,
+    bands: Bands,
+    lamp: Float[Tensor, "B"],
+    pixels: Float[Tensor, "N B"],
+    generator: torch.Generator,
+) -> Float[Tensor, "K B"]:
+    """Radiance of the reflectances in a CSV (wavelength,name,...), as bright as the scene.
+
+    Args:
+        path: The file.
+        count: K, which must be the number of its spectra.
+        bands: To resample to.
+        lamp: Relative power of the scene's light.
+        pixels: Spectra of all training views.
+        generator: On the CPU.
+    Raises:
+        ConfigError: another number of spectra.
+        SpectrumError: they don't cover the bands, or explain no pixel.
+    """
+    table = read_spectra_csv(path).resampled(bands)
+    if len(table.names) != count:
+        raise ConfigError(
+            f"{path} has {len(table.names)} spectra but num-endmembers is {count}; give both the same number"
+        )
+    radiance = (torch.as_tensor(table.spectra, dtype=torch.float32) * lamp).clamp(min=0)
+    return radiance * brightness_factor(radiance, pixels, generator)
+
+
+_DARK_MATERIAL = 0.25
+"""Length of the darkest endmember, as a share of the brightest, below which brightness does not decide amounts."""
+
+
+def unmix_pixels(
+    pixels: Float[Tensor, "N B"],
+    num_endmembers: int,
+    generator: torch.Generator,
+    method: EndmemberMethod = "pooled-pairs",
+) -> tuple[Float[Tensor, "K B"], Float[Tensor, "N K"]]:
+    """Endmembers of these pixels, and their abundances, at least 0 with sum 1; zeros for black pixels.
+
+    Shading is ignored: abundances are shares of the non-negative least squares amounts.
+
+    Args:
+        pixels: In [0, 1]; saturated ones (1 or above) do not decide the endmembers.
+        generator: On the CPU; the only source of randomness.
+    Raises:
+        SpectrumError: as `initialise_endmembers`.
+    """
+    endmembers = comparable_brightness(initialise_endmembers(pixels, num_endmembers, method, generator))
+    amounts = nnls(pixels, endmembers)
+    return endmembers, amounts / amounts.sum(dim=1, keepdim=True).clamp(min=1e-12)
+
+
+def comparable_brightness(endmembers: Float[Tensor, "K B"]) -> Float[Tensor, "K B"]:
+    """The endmembers; all with the largest peak of any if one is less than a quarter as long as the longest.
+
+    Amounts are in units of their endmember. In units of one that is nearly black, such as water in the near infrared,
+    haze, glint and light from the neighbourhood become large amounts, so shares are then counted between spectra of
+    one peak, as the reference maps of Samson count them.
+    """
+    lengths, peaks = endmembers.norm(dim=1), endmembers.amax(dim=1, keepdim=True)
+    if bool(lengths.min() >= _DARK_MATERIAL * lengths.max()):
+        return endmembers
+    return endmembers * (peaks.max() / peaks.clamp(min=1e-12))

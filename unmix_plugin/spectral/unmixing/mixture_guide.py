@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from unmix_plugin.spectral.unmixing.abundances import sparse_abundances
 from unmix_plugin.spectral.unmixing.endmembers import drop_uninformative_pixels
-from unmix_plugin.spectral.unmixing.sparse_unmixing import sparse_abundances
 from unmix_plugin.spectral.unmixing.two_material_mixtures import mean_pair_distance
 
 _PLAIN_UNEXPLAINED = 0.02

@@ -15,8 +15,8 @@ from unmix_plugin.engine.outputs import Output, no_output
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.materials import Materials
-from unmix_plugin.spectral.pca import PcaColours
 from unmix_plugin.spectral.segmentation import material_scores
+from unmix_plugin.spectral.subspace import PcaColours
 from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.trained.outputs.families import FAMILIES
 

@@ -11,9 +11,8 @@ from torch import Tensor
 
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.coefficients import Coefficients
 from unmix_plugin.spectral.maps.indices import SpectralIndex, parse_index
-from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.spectral.materials import Coefficients, Materials
 from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.viewer.layers.layer_aids import LayerAids
 from unmix_plugin.viewer.layers.layer_settings import LayerSettings

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.scene_box import SceneBox
 from unmix_plugin.spectral.materials import Materials
-from unmix_plugin.spectral.pca import PcaColours
+from unmix_plugin.spectral.subspace import PcaColours
 from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.viewer.rendering.reference import Reference

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from unmix_plugin.engine.outputs import Output, OutputKind
-from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION
 from unmix_plugin.spectral.colour.conversion import srgb_to_linear
+from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
 from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.trained.protocol import RenderedView
 from unmix_plugin.viewer.layers.layer import Layer

@@ -12,8 +12,7 @@ from typing import Literal
 from jaxtyping import Float
 from torch import Tensor
 
-from unmix_plugin.spectral.colour.agx import agx
-from unmix_plugin.spectral.colour.conversion import linear_to_srgb
+from unmix_plugin.spectral.colour.conversion import agx, linear_to_srgb
 
 ViewTransform = Literal["srgb", "agx"]
 VIEW_TRANSFORMS: dict[ViewTransform, str] = {

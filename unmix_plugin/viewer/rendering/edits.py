@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from unmix_plugin.editing import Recipe, changes_geometry, edit_scene
-from unmix_plugin.spectral.coefficients import Coefficients
+from unmix_plugin.spectral.materials import Coefficients
 from unmix_plugin.trained.open_run import require_materials
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.relighting import LightChoice, relit

@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.spectral.coefficients import Coefficients
-from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.spectral.materials import Coefficients, Materials
 from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.trained.model_scene import ModelView
 from unmix_plugin.trained.protocol import RenderableScene, RenderedView

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.scenes.scene import Scene
-from unmix_plugin.spectral.coefficients import OCCUPIED_ACCUMULATION
+from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
 from unmix_plugin.trained.library_matches import relit
 from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.trained.trained_scene import TrainedScene

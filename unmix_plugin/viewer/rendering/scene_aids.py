@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from unmix_plugin.editing import sample_seen
-from unmix_plugin.spectral.coefficients import Coefficients
+from unmix_plugin.spectral.materials import Coefficients
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.layers.layer_aids import LayerAids
 from unmix_plugin.viewer.rendering.measured import MeasuredViews
