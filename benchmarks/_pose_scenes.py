@@ -15,8 +15,7 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.key_poses import KeyPoses
-from unmix_plugin.engine.geometry.rotations import rotation_matrix
+from unmix_plugin.engine.geometry.key_poses import KeyPoses, rotation_matrix
 from unmix_plugin.scenes.demo.scene import demo_cameras, label_image, make_demo_scene, radiance_cube
 from unmix_plugin.scenes.demo.shading import band_centers_nm, lamp_power, reflectances, render_view
 

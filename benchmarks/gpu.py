@@ -50,7 +50,7 @@ class Options:
 
 def main(options: Options) -> None:
     """Measure and publish, or say why not."""
-    from unmix_plugin.engine.devices import resolve_device
+    from unmix_plugin.engine.machine import resolve_device
     from unmix_plugin.errors import ConfigError
 
     try:

@@ -9,8 +9,7 @@ import numpy as np
 import torch
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.rays import RayBundle
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.field import UnmixFieldConfig
 from unmix_plugin.model import UnmixModel

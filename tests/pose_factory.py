@@ -3,9 +3,8 @@
 import torch
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.key_poses import KeyPoses
-from unmix_plugin.engine.geometry.rotations import rotation_matrix
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.key_poses import KeyPoses, rotation_matrix
+from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.poses.knots import Knots
 from unmix_plugin.poses.refinement import PoseRefinement
 

@@ -13,7 +13,7 @@ from tests.method_factory import (
     make_model,
     make_rays,
 )
-from unmix_plugin.engine.geometry.rays import RayBundle
+from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.operators.compositing import volume_weights_twin
 from unmix_plugin.rendering.lit_samples import points_of

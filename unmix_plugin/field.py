@@ -18,10 +18,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from unmix_plugin.engine.configs import InstantiateConfig, Target
 from unmix_plugin.engine.field import Field
-from unmix_plugin.engine.geometry.contraction import contracted_unit
-from unmix_plugin.engine.geometry.scene_box import SceneBox
-from unmix_plugin.engine.instantiate import InstantiateConfig, Target
+from unmix_plugin.engine.geometry.space import SceneBox, contracted_unit
 from unmix_plugin.errors import require
 from unmix_plugin.light.directions import (
     NUM_DIRECTION_FEATURES,

@@ -3,10 +3,8 @@
 from pathlib import Path
 
 from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
-from unmix_plugin.engine.configs import TrainerConfig
-from unmix_plugin.engine.pipeline import PipelineConfig
+from unmix_plugin.engine.configs import OptimizerConfig, PipelineConfig, TrainerConfig
 from unmix_plugin.engine.registry import MethodSpecification
-from unmix_plugin.engine.training.optimizers import OptimizerConfig
 from unmix_plugin.losses.training_losses import LossConfig
 from unmix_plugin.model_settings import UnmixModelConfig
 from unmix_plugin.rendering.published_field import PublishedFieldConfig

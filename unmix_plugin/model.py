@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from unmix_plugin.engine.data_manager import DataManager
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.rays import RayBundle
+from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.engine.model import Model
 from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.field import CoefficientField, UnmixField

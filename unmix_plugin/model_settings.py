@@ -10,8 +10,8 @@ from typing import Annotated, Literal
 import numpy as np
 import torch
 
-from unmix_plugin.engine.instantiate import Common, Target, short
-from unmix_plugin.engine.model import Model, ModelConfig
+from unmix_plugin.engine.configs import Common, ModelConfig, Target, short
+from unmix_plugin.engine.model import Model
 from unmix_plugin.errors import ConfigError, require
 from unmix_plugin.field import UnmixFieldConfig
 from unmix_plugin.light.lamp import NUM_LAMP_NUMBERS, Lamp

@@ -12,8 +12,8 @@ from rich.console import Console
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.runs.checkpoints import Checkpoint, newest_complete_checkpoint
 from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
-from unmix_plugin.engine.training.interrupts import Interrupted
 from unmix_plugin.engine.training.trainer import Trainer
+from unmix_plugin.engine.training.training_control import Interrupted
 
 
 def quiet_trainer(config: TrainerConfig) -> Trainer:

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from unmix_plugin.engine.devices import resolve_device
+from unmix_plugin.engine.machine import resolve_device
 from unmix_plugin.errors import ConfigError
 
 

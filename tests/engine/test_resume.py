@@ -13,9 +13,9 @@ import torch
 
 from tests.engine.stopped_runs import call_after_step, newest, quiet_trainer, stop_at
 from unmix_plugin.engine.configs import TrainerConfig
-from unmix_plugin.engine.runs.checkpoints import checkpoint_steps
 from unmix_plugin.engine.runs.load_run import load_config, load_model
-from unmix_plugin.engine.training.interrupts import Interrupted
+from unmix_plugin.engine.runs.run_folder import checkpoint_steps
+from unmix_plugin.engine.training.training_control import Interrupted
 from unmix_plugin.errors import RunError
 
 
@@ -146,7 +146,9 @@ def test_a_requested_stop_is_no_failure_in_the_log(short_config: TrainerConfig):
 def test_a_run_is_trained_by_one_process_at_a_time(short_config: TrainerConfig):
     run = stop_at(short_config, 6).run
     before = (run / "metrics.jsonl").read_bytes()
-    holding = "import sys; from pathlib import Path; from unmix_plugin.engine.runs.run_lock import RunLock; "
+    holding = (
+        "import sys; from pathlib import Path; from unmix_plugin.engine.runs.run_folder import RunLock; "
+    )
     holding += "lock = RunLock(Path(sys.argv[1])); print('held', flush=True); sys.stdin.read()"
     with subprocess.Popen(
         [sys.executable, "-c", holding, str(run / "run.lock")],

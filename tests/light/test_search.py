@@ -6,7 +6,7 @@ import torch
 
 from tests.scenes.geometry.ball_views import LAMP, ball_views, make_cameras
 from tests.scenes.scene_factory import ring_poses
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.light import search as lamp_search
 from unmix_plugin.light.search import LampEvidence, best_lamp, find_lamp, turning_axis
 from unmix_plugin.scenes.demo.scene import LOOK_AT, demo_cameras

@@ -16,7 +16,7 @@ from tests.method_factory import (
     make_model,
     make_rays,
 )
-from unmix_plugin.engine.geometry.rays import RayBundle
+from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.light.view_gains import ViewGains, smooth_terms
 from unmix_plugin.losses.training_losses import LossConfig
 from unmix_plugin.model import UnmixModel

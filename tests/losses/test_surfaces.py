@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from tests.method_factory import NUM_BANDS, make_model
-from unmix_plugin.engine.geometry.contraction import UnitSpace
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import SceneBox, UnitSpace
 from unmix_plugin.losses.surfaces import stray_light
 from unmix_plugin.losses.training_losses import LossConfig
 

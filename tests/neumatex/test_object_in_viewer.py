@@ -8,7 +8,7 @@ from tests.neumatex.trained_factory import RECORD, make_object
 from tests.viewer.pages import decoded, has_control, opened, serving, show_layer
 from tests.viewer.view_factory import make_source, no_scene
 from unmix_plugin.engine.runs.run_folder import RunFolder
-from unmix_plugin.engine.training.device_share import DeviceShare
+from unmix_plugin.engine.training.training_control import DeviceShare
 from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.formats.exr import write_exr
 from unmix_plugin.trained.model_scene import ModelView

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from unmix_plugin.engine.geometry.contraction import contracted_unit
+from unmix_plugin.engine.geometry.space import contracted_unit
 from unmix_plugin.operators.contracted_marching import (
     FAR_RADIUS,
     LINEAR_RADIUS,

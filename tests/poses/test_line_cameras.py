@@ -7,7 +7,7 @@ from torch.testing import assert_close
 
 from tests.light.test_view_gains import make_lit_model
 from tests.pose_factory import HEIGHT, WIDTH, cameras
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.poses.line_cameras import Swept, keep, swept_view
 from unmix_plugin.poses.line_registration.swept_view import columns_compared
 

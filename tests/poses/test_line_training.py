@@ -17,8 +17,7 @@ from tests.method_factory import CONFIG
 from tests.poses.test_training import trained
 from tests.scenes.line_factory import make_line_scene
 from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
-from unmix_plugin.engine.configs import TrainerConfig
-from unmix_plugin.engine.pipeline import PipelineConfig
+from unmix_plugin.engine.configs import PipelineConfig, TrainerConfig
 from unmix_plugin.engine.runs.load_run import load_config
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.method_config import unmix_nerf

@@ -10,7 +10,7 @@ from torch.testing import assert_close
 from tests.method_factory import BOX, CONFIG, initial_data, make_model, make_rays
 from tests.pose_factory import HEIGHT, MIDDLE, box_around, cameras, refinement, some_pixels
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.rays import RayBundle
+from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.light.shading import Lamplight
 from unmix_plugin.model import UnmixModel

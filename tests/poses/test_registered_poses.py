@@ -4,7 +4,7 @@ import torch
 from torch.testing import assert_close
 
 from tests.pose_factory import cameras, refinement, some_pixels
-from unmix_plugin.engine.geometry.rotations import rotation_matrix
+from unmix_plugin.engine.geometry.key_poses import rotation_matrix
 from unmix_plugin.engine.processes.processes import Processes
 from unmix_plugin.poses.refinement import LARGEST_STEP, PoseRefinement
 from unmix_plugin.poses.settings import PoseConfig

@@ -15,10 +15,9 @@ from tests.engine.stopped_runs import stop_at
 from tests.method_factory import CONFIG
 from tests.scenes.scene_factory import make_scene
 from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
-from unmix_plugin.engine.configs import TrainerConfig
+from unmix_plugin.engine.configs import PipelineConfig, TrainerConfig
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.rotations import rotation_matrix
-from unmix_plugin.engine.pipeline import PipelineConfig
+from unmix_plugin.engine.geometry.key_poses import rotation_matrix
 from unmix_plugin.engine.runs.load_run import load_config, load_model
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.method_config import unmix_nerf

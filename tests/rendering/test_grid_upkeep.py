@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.operators.grid_cells import clearance_of
 from unmix_plugin.rendering.grid_upkeep import occupied_density
 from unmix_plugin.rendering.renderer import VolumeRenderer

@@ -7,8 +7,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from unmix_plugin.engine.geometry.rays import RayBundle
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.field import UnmixField, UnmixFieldConfig
 from unmix_plugin.operators.grid_cells import clearance_of

@@ -5,7 +5,7 @@ import torch
 
 from tests.trained.camera_files.camera_scenes import around
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.trained.run_views import RunView, find_view, recorded_views, views_of

@@ -10,7 +10,7 @@ from tests.viewer.view_factory import BOX, ring
 from unmix_plugin.engine.outputs import Output
 from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.engine.runs.run_folder import RunFolder
-from unmix_plugin.engine.training.device_share import DeviceShare
+from unmix_plugin.engine.training.training_control import DeviceShare
 from unmix_plugin.trained.model_scene import ModelScene
 from unmix_plugin.trained.run_views import recorded_views
 from unmix_plugin.trained.world_frame import world_frame

@@ -15,8 +15,7 @@ from tests.scenes.scene_factory import ring_poses
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.engine.runs.run_folder import RunFolder
-from unmix_plugin.engine.training.device_share import DeviceShare
-from unmix_plugin.engine.training.training_control import TrainingControl
+from unmix_plugin.engine.training.training_control import DeviceShare, TrainingControl
 from unmix_plugin.errors import SceneError
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.scenes.scene import Scene

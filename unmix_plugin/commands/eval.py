@@ -63,8 +63,8 @@ def evaluate(argv: list[str]) -> None:
     """
     options = tyro.cli(EvalOptions, prog="unmix-eval", args=argv)
 
-    from unmix_plugin.engine.processes.joining import joined
     from unmix_plugin.engine.processes.launching import start_together
+    from unmix_plugin.engine.processes.processes import joined
 
     start_together("unmix_plugin.commands.eval", argv, options.num_devices)
     with joined(options.device) as processes:

@@ -74,8 +74,8 @@ def export(argv: list[str]) -> None:
     product: RunProduct = tyro.cli(
         choices, prog="unmix-export", description="Write products of a run as files.", args=argv
     )
-    from unmix_plugin.engine.processes.joining import joined
     from unmix_plugin.engine.processes.launching import start_together
+    from unmix_plugin.engine.processes.processes import joined
 
     count = product.num_devices if isinstance(product, ViewProduct) else 1
     start_together("unmix_plugin.commands.export", argv, count)

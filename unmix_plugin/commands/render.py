@@ -94,8 +94,8 @@ def render(argv: list[str]) -> None:
     options = tyro.cli(RenderOptions, prog="unmix-render", args=argv)
     request = _camera_request(options)
 
-    from unmix_plugin.engine.processes.joining import joined
     from unmix_plugin.engine.processes.launching import start_together
+    from unmix_plugin.engine.processes.processes import joined
 
     start_together("unmix_plugin.commands.render", argv, options.num_devices)
     with joined(options.device) as processes:

@@ -88,7 +88,7 @@ def _run(trainer: Trainer, console: Console) -> None:
     from unmix_plugin.commands.reporting import say
     from unmix_plugin.commands.run_choice import spectral_scene
     from unmix_plugin.commands.training_remarks import read_remarks
-    from unmix_plugin.engine.training.interrupts import Interrupted
+    from unmix_plugin.engine.training.training_control import Interrupted
 
     try:
         record = trainer.train()

@@ -10,8 +10,7 @@ from typing import Annotated, Any, get_type_hints
 
 import tyro
 
-from unmix_plugin.engine.configs import TrainerConfig
-from unmix_plugin.engine.instantiate import Common
+from unmix_plugin.engine.configs import Common, TrainerConfig
 from unmix_plugin.engine.registry import MethodSpecification, discover_methods, find_method
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.viewer.options import TrainingViewerOptions

@@ -10,39 +10,49 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from unmix_plugin.engine.configs import TrainerConfig
-    from unmix_plugin.engine.data_manager import DataManager, DataManagerConfig
+    from unmix_plugin.engine.configs import (
+        DataManagerConfig,
+        InstantiateConfig,
+        ModelConfig,
+        OptimizerConfig,
+        PipelineConfig,
+        Target,
+        TrainerConfig,
+    )
+    from unmix_plugin.engine.data_manager import DataManager
     from unmix_plugin.engine.field import Field
     from unmix_plugin.engine.geometry.cameras import Cameras
-    from unmix_plugin.engine.geometry.rays import RayBundle
-    from unmix_plugin.engine.geometry.scene_box import SceneBox
-    from unmix_plugin.engine.instantiate import InstantiateConfig, Target
-    from unmix_plugin.engine.model import Model, ModelConfig
+    from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
+    from unmix_plugin.engine.machine import step_generator
+    from unmix_plugin.engine.model import Model
     from unmix_plugin.engine.outputs import Output
-    from unmix_plugin.engine.pipeline import Pipeline, PipelineConfig
+    from unmix_plugin.engine.pipeline import Pipeline
     from unmix_plugin.engine.registry import MethodSpecification, discover_methods, find_method
     from unmix_plugin.engine.runs.load_run import LoadedModel, load_config, load_model, load_pipeline
     from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
-    from unmix_plugin.engine.training.optimizers import OptimizerConfig
-    from unmix_plugin.engine.training.seeding import step_generator
     from unmix_plugin.engine.training.trainer import Trainer
 
 _MODULES = {
-    "configs": ("TrainerConfig",),
-    "data_manager": ("DataManager", "DataManagerConfig"),
+    "configs": (
+        "DataManagerConfig",
+        "InstantiateConfig",
+        "ModelConfig",
+        "OptimizerConfig",
+        "PipelineConfig",
+        "Target",
+        "TrainerConfig",
+    ),
+    "data_manager": ("DataManager",),
     "field": ("Field",),
     "geometry.cameras": ("Cameras",),
-    "geometry.rays": ("RayBundle",),
-    "geometry.scene_box": ("SceneBox",),
-    "instantiate": ("InstantiateConfig", "Target"),
-    "model": ("Model", "ModelConfig"),
+    "geometry.space": ("RayBundle", "SceneBox"),
+    "machine": ("step_generator",),
+    "model": ("Model",),
     "outputs": ("Output",),
-    "pipeline": ("Pipeline", "PipelineConfig"),
+    "pipeline": ("Pipeline",),
     "registry": ("MethodSpecification", "discover_methods", "find_method"),
     "runs.load_run": ("LoadedModel", "load_config", "load_model", "load_pipeline"),
     "training.callbacks": ("TrainingCallback", "TrainingCallbackLocation"),
-    "training.optimizers": ("OptimizerConfig",),
-    "training.seeding": ("step_generator",),
     "training.trainer": ("Trainer",),
 }
 

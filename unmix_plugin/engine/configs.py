@@ -1,23 +1,158 @@
-"""Settings of a whole training run: the root of what the command line and `config.json` spell out."""
+"""Settings of a training: frozen, plain values, and which class each part is for.
+
+A config is a frozen dataclass of plain values (numbers, strings, paths, tuples, further configs); `config.json` and the
+command line spell out the same tree. The string under each field is its help. Nothing here imports what it configures,
+so that the help of a command is quick.
+"""
+
+from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from unmix_plugin.engine.instantiate import Common, InstantiateConfig, Target, require_in_range
-from unmix_plugin.engine.pipeline import PipelineConfig
-from unmix_plugin.engine.processes.launching import MOST_PROCESSES
-from unmix_plugin.engine.training.optimizers import OptimizerConfig
-from unmix_plugin.errors import require
+from unmix_plugin.errors import ConfigError, require
 
-__all__ = ["DeviceName", "InstantiateConfig", "OptimizerConfig", "Target", "TrainerConfig"]
+if TYPE_CHECKING:
+    import numpy as np
+    import torch
+
+Target = tyro.conf.Suppress[type | str]
+"""Annotation of `_target`: the class that a config sets up, or where it is, "package.module:Class", which is imported
+when it is needed. Neither shown on the command line nor written to a file."""
+
+Common = "common"
+"""Annotation of a setting that most people need: `Annotated[int, Common, short("name")]`; --help shows only these."""
+
+
+def short(name: str) -> Any:
+    """Annotation that gives a setting the flag `--name` beside its long one."""
+    return tyro.conf.arg(aliases=(f"--{name}",))
+
+
+@dataclass(frozen=True)
+class InstantiateConfig:
+    """Settings of one object, and the class that takes them."""
+
+    _target: Target = object
+    """Class that `setup` calls. Subclasses write `_target: Target = field(default_factory=lambda: TheirClass)`, or
+    `_target: Target = "package.module:TheirClass"`."""
+
+    @property
+    def target(self) -> Any:
+        """The class that `setup` calls, imported."""
+        if not isinstance(self._target, str):
+            return self._target
+        module, _, name = self._target.partition(":")
+        return getattr(import_module(module), name)
+
+    def setup(self, **kwargs: Any) -> Any:
+        """The configured object: `target(self, **kwargs)`."""
+        return self.target(self, **kwargs)
+
+
+def require_in_range(name: str, value: int | float, low: int | float, high: int | float) -> None:
+    """Refuse a setting outside [low, high].
+
+    Raises:
+        ConfigError: it is outside, or not a number.
+    """
+    if not low <= value <= high:
+        raise ConfigError(f"{name} must be from {low} to {high}; got {value}")
+
+
+MOST_PROCESSES = 1024
+"""That train one model together."""
 
 DeviceName = Literal["auto", "cpu", "cuda"]
 """`auto` is CUDA where there is one."""
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """Adam for one group of parameters, and its learning-rate schedule."""
+
+    lr: float = 1e-2
+    """Step size at the start of training."""
+    final_factor: float = 0.1
+    """Step size at the end of training as a part of `lr`; between, it falls by equal factors. 1 keeps it constant."""
+    weight_decay: float = 0.0
+    """Times the parameters, added to their gradient: draws what the data leaves open to 0."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible settings.
+
+        Raises:
+            ConfigError: a number out of its range.
+        """
+        rules = {
+            "lr above 0 and finite": 0 < self.lr < math.inf,
+            "final-factor in (0, 1]": 0 < self.final_factor <= 1,
+            "weight-decay of at least 0 and finite": 0 <= self.weight_decay < math.inf,
+        }
+        require("an optimizer", self, rules)
+
+
+@dataclass(frozen=True)
+class DataManagerConfig(InstantiateConfig):
+    """Settings that every data manager has."""
+
+    _target: Target = "unmix_plugin.engine.data_manager:DataManager"
+    train_num_rays_per_batch: int = 4096
+    """Rays of the first training step; a model may adapt the number later."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible settings; a subclass with rules of its own calls this too.
+
+        Raises:
+            ConfigError: a number out of its range.
+        """
+        require_in_range("train_num_rays_per_batch", self.train_num_rays_per_batch, 1, 2**22)
+
+
+@dataclass(frozen=True)
+class ModelConfig(InstantiateConfig):
+    """Settings that every model has."""
+
+    _target: Target = "unmix_plugin.engine.model:Model"
+    eval_num_rays_per_chunk: int = 32_768
+    """Rays rendered at once for a whole image; fewer take less memory."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible settings; a subclass with rules of its own calls this too.
+
+        Raises:
+            ConfigError: a number out of its range.
+        """
+        require_in_range("eval_num_rays_per_chunk", self.eval_num_rays_per_chunk, 1, 2**22)
+
+    def resolve_auto(
+        self,
+        initial_data: Callable[[], Mapping[str, np.ndarray]],
+        generator: torch.Generator,
+    ) -> tuple[ModelConfig, str]:
+        """These settings with every `auto` replaced by a value, and the reasons in words.
+
+        Called for new runs and for loaded ones, which have no `auto` left: call `initial_data`, which takes seconds,
+        only to decide something. `generator` is on the CPU.
+        """
+        return self, ""
+
+
+@dataclass(frozen=True)
+class PipelineConfig(InstantiateConfig):
+    """Settings of the data and of the model."""
+
+    _target: Target = "unmix_plugin.engine.pipeline:Pipeline"
+    datamanager: DataManagerConfig = field(default_factory=DataManagerConfig)
+    """How the scene is read and sampled."""
+    model: ModelConfig = field(default_factory=ModelConfig)
+    """What is trained."""
 
 
 @dataclass(frozen=True)

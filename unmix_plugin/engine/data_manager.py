@@ -2,7 +2,6 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,28 +10,10 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from unmix_plugin.engine.configs import DataManagerConfig
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.rays import RayBundle
-from unmix_plugin.engine.geometry.scene_box import SceneBox
-from unmix_plugin.engine.instantiate import InstantiateConfig, Target, require_in_range
+from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.engine.training.callbacks import TrainingCallback
-
-
-@dataclass(frozen=True)
-class DataManagerConfig(InstantiateConfig):
-    """Settings that every data manager has."""
-
-    _target: Target = field(default_factory=lambda: DataManager)
-    train_num_rays_per_batch: int = 4096
-    """Rays of the first training step; a model may adapt the number later."""
-
-    def __post_init__(self) -> None:
-        """Refuse impossible settings; a subclass with rules of its own calls this too.
-
-        Raises:
-            ConfigError: a number out of its range.
-        """
-        require_in_range("train_num_rays_per_batch", self.train_num_rays_per_batch, 1, 2**22)
 
 
 class DataManager(ABC):

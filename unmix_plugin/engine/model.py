@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from unmix_plugin.engine.configs import ModelConfig
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.rays import RayBundle
-from unmix_plugin.engine.geometry.scene_box import SceneBox
-from unmix_plugin.engine.instantiate import InstantiateConfig, Target, require_in_range
+from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.engine.outputs import Output
 from unmix_plugin.engine.processes.processes import ALONE, Processes
 from unmix_plugin.engine.training.callbacks import TrainingCallback
@@ -22,35 +20,6 @@ from unmix_plugin.errors import ConfigError
 
 if TYPE_CHECKING:
     from unmix_plugin.engine.data_manager import DataManager
-
-
-@dataclass(frozen=True)
-class ModelConfig(InstantiateConfig):
-    """Settings that every model has."""
-
-    _target: Target = field(default_factory=lambda: Model)
-    eval_num_rays_per_chunk: int = 32_768
-    """Rays rendered at once for a whole image; fewer take less memory."""
-
-    def __post_init__(self) -> None:
-        """Refuse impossible settings; a subclass with rules of its own calls this too.
-
-        Raises:
-            ConfigError: a number out of its range.
-        """
-        require_in_range("eval_num_rays_per_chunk", self.eval_num_rays_per_chunk, 1, 2**22)
-
-    def resolve_auto(
-        self,
-        initial_data: Callable[[], Mapping[str, np.ndarray]],
-        generator: torch.Generator,
-    ) -> tuple[ModelConfig, str]:
-        """These settings with every `auto` replaced by a value, and the reasons in words.
-
-        Called for new runs and for loaded ones, which have no `auto` left: call `initial_data`, which takes seconds,
-        only to decide something. `generator` is on the CPU.
-        """
-        return self, ""
 
 
 class Model(nn.Module, ABC):

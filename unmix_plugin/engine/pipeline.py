@@ -3,34 +3,23 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
 import torch
 from torch import Tensor, nn
 
-from unmix_plugin.engine.data_manager import DataManager, DataManagerConfig
-from unmix_plugin.engine.instantiate import InstantiateConfig, Target
-from unmix_plugin.engine.model import Model, ModelConfig
+from unmix_plugin.engine.configs import PipelineConfig
+from unmix_plugin.engine.data_manager import DataManager
+from unmix_plugin.engine.machine import step_generator, step_seed
+from unmix_plugin.engine.model import Model
 from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
-from unmix_plugin.engine.training.seeding import step_generator, step_seed
 
 MODEL_STREAM = 1
 """Stream of randomness of the model's own draws in a step; data managers draw from stream 0."""
 _PROCESS_STREAM = 2
 """From which the other processes of a training take their seeds."""
-
-
-@dataclass(frozen=True)
-class PipelineConfig(InstantiateConfig):
-    """Settings of the data and of the model."""
-
-    _target: Target = field(default_factory=lambda: Pipeline)
-    datamanager: DataManagerConfig = field(default_factory=DataManagerConfig)
-    """How the scene is read and sampled."""
-    model: ModelConfig = field(default_factory=ModelConfig)
-    """What is trained."""
 
 
 TrainOutputs: TypeAlias = tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Tensor]]

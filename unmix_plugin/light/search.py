@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.light.lamp import Lamp, LampFrame, MovingLamp, Triple
 from unmix_plugin.scenes.geometry.lighting import Places, coarse_hull, seen_places
 

@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.light.lamp import MovingLamp
 from unmix_plugin.light.shading import Lamplight
 from unmix_plugin.operators.marching import count_samples

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.contraction import UnitSpace
+from unmix_plugin.engine.geometry.space import UnitSpace
 
 SURFACE_CELLS = 64.0
 """Along an edge of contracted space: the unit of the two bounds below."""

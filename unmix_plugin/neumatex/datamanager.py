@@ -26,7 +26,7 @@ from unmix_plugin.engine import (
     TrainingCallback,
     step_generator,
 )
-from unmix_plugin.engine.instantiate import Common
+from unmix_plugin.engine.configs import Common
 from unmix_plugin.errors import require
 from unmix_plugin.neumatex.lighting.environment import Environment
 from unmix_plugin.neumatex.object_record import ObjectRecord

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from unmix_plugin.engine import Model, ModelConfig, Target
-from unmix_plugin.engine.instantiate import Common, short
+from unmix_plugin.engine.configs import Common, short
 from unmix_plugin.errors import require
 from unmix_plugin.neumatex.material_surface import MaterialName
 from unmix_plugin.neumatex.tone.curves import LightCurve

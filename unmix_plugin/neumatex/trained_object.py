@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.outputs import Output, named_output
 from unmix_plugin.errors import ConfigError, did_you_mean
 from unmix_plugin.neumatex.geometry.mesh import Mesh

@@ -14,8 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from unmix_plugin.engine.geometry.camera_distortion import undistort
-from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.cameras import Cameras, undistort
 
 
 class LensRefinement(nn.Module):

@@ -16,8 +16,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.data_manager import DataManager
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.rays import RayBundle
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.poses.line_registration.register import register
 from unmix_plugin.poses.line_registration.swept_view import Show, SweptView, columns_compared, rays_through
 from unmix_plugin.poses.refinement import PoseRefinement

@@ -26,10 +26,8 @@ from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor, nn
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.key_poses import KeyPoses
-from unmix_plugin.engine.geometry.rays import RayBundle
-from unmix_plugin.engine.geometry.rotations import rotation_matrix
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.key_poses import KeyPoses, rotation_matrix
+from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.engine.processes.processes import Processes
 from unmix_plugin.operators.gradients import scale_gradient
 from unmix_plugin.poses.knots import Knots, on_spline, row_waves, similarities, spline_weights

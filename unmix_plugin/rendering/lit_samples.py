@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.rays import RayBundle
+from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.operators.compositing import volume_weights
 from unmix_plugin.operators.marching import PackedSamples

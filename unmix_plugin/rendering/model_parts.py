@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.light.view_gains import ViewGains
 from unmix_plugin.model_settings import UnmixModelConfig

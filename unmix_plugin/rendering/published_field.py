@@ -16,8 +16,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.scene_box import SceneBox
-from unmix_plugin.engine.instantiate import Target
+from unmix_plugin.engine.configs import Target
+from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.field import (
     NUM_DIRECTION_FEATURES,
     UnmixField,

@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.contraction import UnitSpace
-from unmix_plugin.engine.geometry.rays import RayBundle
+from unmix_plugin.engine.geometry.space import RayBundle, UnitSpace
 from unmix_plugin.rendering.renderer import RenderedRays
 
 

@@ -14,9 +14,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.contraction import UnitSpace
-from unmix_plugin.engine.geometry.rays import RayBundle
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import RayBundle, SceneBox, UnitSpace
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.light.shading import Lamplight
 from unmix_plugin.light.shadows import FINEST, ShadowDetail, lamplight

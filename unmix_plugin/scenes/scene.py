@@ -19,9 +19,9 @@ from typing import Annotated, Any, Literal, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Shaped, UInt8
 
+from unmix_plugin.engine.configs import Common, short
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.scene_box import SceneBox
-from unmix_plugin.engine.instantiate import Common, short
+from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.runs.config_json import config_from_json
 from unmix_plugin.scenes.placement import Placement
 from unmix_plugin.scenes.reading.cubes import InvalidPixels, map_array, read_cube, read_invalid

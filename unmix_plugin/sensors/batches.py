@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.rays import RayBundle
+from unmix_plugin.engine.geometry.space import RayBundle
 
 _OF_BATCH = ("sensors", "sensor_pixels", "sensor_rays")
 

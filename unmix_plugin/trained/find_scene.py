@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from unmix_plugin.engine.runs.same_scene import differences, name_differences
+from unmix_plugin.engine.runs.scene_record import differences, name_differences
 from unmix_plugin.errors import RunError, SceneError
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import Scene, SceneOptions, scene_identity

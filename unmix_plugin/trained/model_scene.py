@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.model import Model
 from unmix_plugin.engine.outputs import Output, named_output
 from unmix_plugin.engine.runs.load_run import SceneRecord

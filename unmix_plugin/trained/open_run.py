@@ -8,9 +8,9 @@ from pathlib import Path
 
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.registry import discover_methods
+from unmix_plugin.engine.runs.checkpoints import TrainingRecord
 from unmix_plugin.engine.runs.load_run import SceneRecord, load_model
 from unmix_plugin.engine.runs.run_folder import RunFolder
-from unmix_plugin.engine.training.training_state import TrainingRecord
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.snapshot import snapshot

@@ -26,8 +26,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.rays import RayBundle
-from unmix_plugin.engine.geometry.rotations import rotation_matrix
+from unmix_plugin.engine.geometry.key_poses import rotation_matrix
+from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.poses.line_cameras import main_axes
 from unmix_plugin.poses.refinement import LARGEST_STEP
 from unmix_plugin.trained.material_view import MaterialView

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.rays import RayBundle
+from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials
 from unmix_plugin.trained.trained_scene import TrainedScene
 

@@ -16,7 +16,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.rendering.renderer import VolumeRenderer
 from unmix_plugin.scenes.scene import Normalisation

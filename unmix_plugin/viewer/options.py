@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from unmix_plugin.engine.training.device_share import SHARE_BOUNDS
+from unmix_plugin.engine.training.training_control import SHARE_BOUNDS
 from unmix_plugin.errors import ConfigError
 
 LOCAL_HOST = "127.0.0.1"

@@ -17,8 +17,7 @@ from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.rays import RayBundle
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
-from unmix_plugin.engine.geometry.camera_distortion import distort, undistort
-from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.cameras import Cameras, distort, undistort
 
 WIDTH, HEIGHT = 64, 48
 

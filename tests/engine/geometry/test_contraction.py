@@ -5,8 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
-from unmix_plugin.engine.geometry.contraction import UnitSpace, contract, uncontract
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import SceneBox, UnitSpace, contract, uncontract
 
 BOX = SceneBox(torch.tensor([[-1.0, 0.0, 2.0], [3.0, 1.0, 5.0]]))
 POINTS = st.lists(st.floats(-100, 100, width=32), min_size=3, max_size=3).map(torch.tensor)

@@ -5,7 +5,7 @@ import pytest
 
 from tests.scenes.geometry.ground_views import flight_poses
 from tests.scenes.scene_factory import look_at, ring_poses
-from unmix_plugin.engine.geometry.focus import focus_point, meeting_point
+from unmix_plugin.engine.geometry.camera_paths import focus_point, meeting_point
 
 
 def stacked(poses):

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.key_poses import KeyPoses
-from unmix_plugin.engine.geometry.rotations import rotation_matrix, rotation_vector
+from unmix_plugin.engine.geometry.key_poses import KeyPoses, rotation_matrix, rotation_vector
 
 WIDTH, HEIGHT = 12, 40
 angles = st.tuples(*[st.floats(-1.6, 1.6)] * 3)

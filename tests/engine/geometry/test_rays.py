@@ -2,7 +2,7 @@
 
 import torch
 
-from unmix_plugin.engine.geometry.rays import RayBundle
+from unmix_plugin.engine.geometry.space import RayBundle
 
 
 def make_bundle(count: int) -> RayBundle:

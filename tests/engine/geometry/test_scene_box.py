@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import SceneBox
 
 BOX = SceneBox(torch.tensor([[-1.0, -2.0, 0.0], [1.0, 3.0, 0.5]]))
 numbers = st.floats(-4.0, 4.0, width=32)

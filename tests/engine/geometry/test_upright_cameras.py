@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch.testing import assert_close
 
-from unmix_plugin.engine.geometry.upright_cameras import upright_cameras
+from unmix_plugin.engine.geometry.camera_paths import upright_cameras
 
 
 def test_cameras_look_along_the_view_are_level_and_see_the_angle():

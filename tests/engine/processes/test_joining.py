@@ -4,8 +4,7 @@ import pytest
 import torch
 from torch import distributed
 
-from unmix_plugin.engine.processes.joining import join
-from unmix_plugin.engine.processes.processes import ALONE, Follower
+from unmix_plugin.engine.processes.processes import ALONE, Follower, join
 from unmix_plugin.errors import ConfigError
 
 

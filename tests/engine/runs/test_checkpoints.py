@@ -14,8 +14,9 @@ import torch
 from torch import Tensor
 
 from unmix_plugin.engine.runs import atomic_files
-from unmix_plugin.engine.runs.checkpoints import checkpoint_steps, newest_complete_checkpoint, save_checkpoint
-from unmix_plugin.engine.runs.run_files import RUN_FORMAT
+from unmix_plugin.engine.runs.atomic_files import RUN_FORMAT
+from unmix_plugin.engine.runs.checkpoints import newest_complete_checkpoint, save_checkpoint
+from unmix_plugin.engine.runs.run_folder import checkpoint_steps
 from unmix_plugin.errors import RunError
 
 CALLS = ("open", "write", "fsync", "replace", "unlink")

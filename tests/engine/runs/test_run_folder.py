@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from unmix_plugin.engine.configs import TrainerConfig
+from unmix_plugin.engine.runs.atomic_files import RUN_FORMAT, write_run_json
 from unmix_plugin.engine.runs.checkpoints import save_checkpoint
 from unmix_plugin.engine.runs.load_run import load_config, load_model, load_pipeline
-from unmix_plugin.engine.runs.run_files import RUN_FORMAT, write_run_json
 from unmix_plugin.engine.runs.run_folder import RunFolder, create_run_folder, newest_run, open_run_folder
 from unmix_plugin.engine.runs.scene_record import read_scene_record
 from unmix_plugin.engine.training.trainer import Trainer

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from unmix_plugin.engine.runs.same_scene import differences, name_differences
+from unmix_plugin.engine.runs.scene_record import differences, name_differences
 
 SCENE = {
     "wavelengths_nm": [450.0, 550.0, 650.0],

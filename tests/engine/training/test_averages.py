@@ -10,8 +10,8 @@ from torch import nn
 
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.runs.load_run import load_model
-from unmix_plugin.engine.training.averages import ParameterAverage
 from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
+from unmix_plugin.engine.training.optimizers import ParameterAverage
 from unmix_plugin.engine.training.trainer import Trainer
 
 

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from unmix_plugin.engine.training import device_share
-from unmix_plugin.engine.training.device_share import SHARE_BOUNDS, DeviceShare
+from unmix_plugin.engine.training import training_control as device_share
+from unmix_plugin.engine.training.training_control import SHARE_BOUNDS, DeviceShare
 
 STEP_S = 0.004
 

@@ -8,12 +8,11 @@ import torch
 from rich.console import Console
 from torch import nn
 
-from unmix_plugin.engine.configs import TrainerConfig
+from unmix_plugin.engine.configs import OptimizerConfig, TrainerConfig
 from unmix_plugin.engine.runs.checkpoints import newest_complete_checkpoint
-from unmix_plugin.engine.training import guards
+from unmix_plugin.engine.training import optimizers as guards
 from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
-from unmix_plugin.engine.training.guards import GradientGuard
-from unmix_plugin.engine.training.optimizers import OptimizerConfig, build_optimizer
+from unmix_plugin.engine.training.optimizers import GradientGuard, build_optimizer
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.errors import RunError
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.runs.load_run import load_config
-from unmix_plugin.engine.training import limits as limits_module
-from unmix_plugin.engine.training.limits import Limits, TrainingClock
+from unmix_plugin.engine.training import progress as limits_module
+from unmix_plugin.engine.training.progress import Limits, TrainingClock
 from unmix_plugin.engine.training.trainer import Trainer
 
 limits = st.builds(

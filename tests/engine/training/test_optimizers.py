@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
+from unmix_plugin.engine.configs import OptimizerConfig
 from unmix_plugin.engine.training.optimizers import (
-    OptimizerConfig,
     build_optimizer,
     forget_gradients,
     learning_rate,

@@ -8,9 +8,9 @@ import pytest
 from rich.console import Console
 
 from unmix_plugin.engine.configs import TrainerConfig
-from unmix_plugin.engine.training.interrupts import Interrupted
 from unmix_plugin.engine.training.progress import ProgressConsole, ProgressDisplay, TrainingStatus
 from unmix_plugin.engine.training.trainer import Trainer
+from unmix_plugin.engine.training.training_control import Interrupted
 
 STATUS = TrainingStatus(
     step=120, seconds=30.0, progress=0.25, loss=0.00123, psnr=31.5, rays_per_second=18_200.0

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unmix_plugin.engine.training.seeding import seed_everything, step_generator, step_seed
+from unmix_plugin.engine.machine import seed_everything, step_generator, step_seed
 
 integers = st.integers(0, 2**40)
 

@@ -10,10 +10,10 @@ import torch
 from rich.console import Console
 
 from tests.engine.stopped_runs import call_after_step, newest, quiet_trainer
-from unmix_plugin.engine.runs.checkpoints import checkpoint_steps
 from unmix_plugin.engine.runs.load_run import load_config
-from unmix_plugin.engine.training.interrupts import Interrupted
+from unmix_plugin.engine.runs.run_folder import checkpoint_steps
 from unmix_plugin.engine.training.trainer import Trainer
+from unmix_plugin.engine.training.training_control import Interrupted
 
 
 def in_background(work):

@@ -11,8 +11,8 @@ import torch
 
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.runs.run_folder import RunFolder
+from unmix_plugin.engine.training.progress import MetricsWriter, RunLog
 from unmix_plugin.engine.training.trainer import Trainer
-from unmix_plugin.engine.training.writers import MetricsWriter, RunLog
 from unmix_plugin.errors import RunError
 
 HAS_TENSORBOARD = importlib.util.find_spec("tensorboard") is not None

@@ -5,7 +5,7 @@ import torch
 
 from tests.scenes.scene_factory import ball_alpha, ring_poses
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.scenes.geometry.carving import carve_box
 from unmix_plugin.scenes.geometry.lighting import local_log_brightness
 

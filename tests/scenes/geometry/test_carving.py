@@ -13,7 +13,7 @@ from PIL import Image
 from tests.scenes.geometry.ball_views import BOX, FOCAL, SIDE, ball_matter, make_cameras
 from tests.scenes.scene_factory import ball_alpha, look_at, make_scene, ring_poses
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.scenes import carve, load_scene
 from unmix_plugin.scenes.geometry.bounds import find_bounds
 from unmix_plugin.scenes.geometry.carving import (

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from unmix_plugin.engine.geometry.rotations import rotation_matrix
+from unmix_plugin.engine.geometry.key_poses import rotation_matrix
 from unmix_plugin.scenes import load_scene
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.scenes.geometry.carving import foreground_mask, mask_warning, share_explained

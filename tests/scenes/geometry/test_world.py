@@ -9,8 +9,7 @@ import torch
 
 from tests.scenes.geometry.ball_views import make_cameras
 from tests.scenes.scene_factory import look_at
-from unmix_plugin.engine.geometry.contraction import UnitSpace
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import SceneBox, UnitSpace
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes import SceneOptions, carve, load_scene
 from unmix_plugin.scenes.demo import scene as demo_scene

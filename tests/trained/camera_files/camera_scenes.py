@@ -7,7 +7,7 @@ import torch
 
 from tests.scenes.scene_factory import look_at, ring_poses
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.scenes.scene import Normalisation
 

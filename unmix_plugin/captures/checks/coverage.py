@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from unmix_plugin.captures.checks.seen_view import SeenView, angles_between
-from unmix_plugin.engine.geometry.focus import meeting_point
+from unmix_plugin.engine.geometry.camera_paths import meeting_point
 from unmix_plugin.errors import counted
 
 FEW_VIEWS = 15

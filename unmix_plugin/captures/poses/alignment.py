@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float64
 from unmix_plugin.captures.poses.lens_fit import project_opencv
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 from unmix_plugin.captures.poses.rigid import FLIP
-from unmix_plugin.engine.geometry.focus import focus_point
+from unmix_plugin.engine.geometry.camera_paths import focus_point
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.scenes.placement import Placement
 

@@ -10,7 +10,7 @@ from jaxtyping import Float64
 
 from unmix_plugin.captures.poses.alignment import moved
 from unmix_plugin.captures.poses.pose_set import PoseSet
-from unmix_plugin.engine.geometry.focus import focus_point, meeting_point
+from unmix_plugin.engine.geometry.camera_paths import focus_point, meeting_point
 from unmix_plugin.formats.ply import write_ply
 from unmix_plugin.scenes.placement import Placement
 

@@ -1,7 +1,15 @@
-"""Moving cameras: a circle around the scene, and a smooth path through some of its cameras.
+"""Where cameras look: the point nearest to their optical axes, and whether these meet there.
+
+Notation: `N` cameras; poses are camera to world, OpenGL axes.
+
+Moving cameras: a circle around the scene, and a smooth path through some of its cameras.
 
 Notation: `N` cameras, `F` frames. Axes are OpenGL: the columns of a pose are right, up and back; a camera looks along
 minus back.
+
+Cameras of built-in scenes: square pictures, held upright.
+
+Notation: `N` views.
 """
 
 from __future__ import annotations
@@ -11,8 +19,51 @@ import torch
 from jaxtyping import Float, Float64
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.errors import ConfigError
+
+_LEAST_CONVERGENCE = 1e-3
+"""Least mean squared sine between optical axes and the direction that they spread from least, (1.8 deg)^2, with which
+the nearest point is fixed at all."""
+_LEAST_SPREAD_DEG = 6.0
+"""Root mean square of that angle for cameras turned about a subject; a flight whose camera sways has less."""
+_MOST_MISSED = 0.25
+"""By how much half of the axes may miss the point, over their depth there."""
+
+
+def focus_point(poses: Float64[np.ndarray, "N 3 4"]) -> Float64[np.ndarray, "3"] | None:
+    """The point nearest to all optical axes, least squares; None if they are parallel or most point away from it."""
+    if _convergence(poses) < _LEAST_CONVERGENCE:
+        return None
+    across = _across(poses)
+    point = np.linalg.solve(across.mean(axis=0), (across @ poses[:, :, 3:]).mean(axis=0)[:, 0])
+    depths = ((point - poses[:, :, 3]) * -poses[:, :, 2]).sum(axis=-1)
+    return point if (depths > 0.0).mean() > 0.5 else None
+
+
+def meeting_point(poses: Float64[np.ndarray, "N 3 4"]) -> Float64[np.ndarray, "3"] | None:
+    """That point where the axes meet well enough to say that the subject is there, otherwise None.
+
+    They do not where cameras look down on land from an aircraft, side by side at something flat, or around themselves.
+    """
+    point = focus_point(poses)
+    if point is None or _convergence(poses) < np.sin(np.radians(_LEAST_SPREAD_DEG)) ** 2:
+        return None
+    towards, forward = point - poses[:, :, 3], -poses[:, :, 2]
+    depths = (towards * forward).sum(axis=-1)
+    missed = np.linalg.norm(towards - depths[:, None] * forward, axis=-1)
+    return point if np.median(missed / np.abs(depths).clip(min=1e-12)) <= _MOST_MISSED else None
+
+
+def _across(poses: Float64[np.ndarray, "N 3 4"]) -> Float64[np.ndarray, "N 3 3"]:
+    """Projections of space to what is square to each optical axis."""
+    axes = poses[:, :, 2]
+    return np.eye(3) - axes[:, :, None] * axes[:, None, :]
+
+
+def _convergence(poses: Float64[np.ndarray, "N 3 4"]) -> float:
+    return float(np.linalg.eigvalsh(_across(poses).mean(axis=0))[0])
+
 
 _WIDEST_GAP_DEG = 120.0
 """Directions that no camera looks from, beyond which a circle becomes an arc: behind them there may be walls."""
@@ -209,4 +260,29 @@ def _with_lens(cameras: Cameras, poses: Float[np.ndarray, "F 3 4"]) -> Cameras:
         torch.zeros(count, 4),
         cameras.width,
         cameras.height,
+    )
+
+
+def upright_cameras(
+    positions: Float[np.ndarray, "N 3"], backward: Float[np.ndarray, "N 3"], size: int, angle: float
+) -> Cameras:
+    """Pinhole cameras in a world whose z points upwards.
+
+    Args:
+        positions: In scene units.
+        backward: Unit vectors against the view, none of them vertical.
+        size: Rows and columns of all pictures.
+        angle: Between the left and right edge of a picture, radians, below pi.
+    """
+    views = len(positions)
+    right = np.cross([0.0, 0.0, 1.0], backward)
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    poses = np.stack([right, np.cross(backward, right), backward, positions], axis=2)
+    return Cameras(
+        torch.tensor(poses, dtype=torch.float32),
+        torch.full((views, 2), float(size / 2 / np.tan(angle / 2))),
+        torch.full((views, 2), size / 2),
+        torch.zeros(views, 4),
+        size,
+        size,
     )

@@ -1,4 +1,10 @@
-"""Poses of line cameras: a function of the row, interpolated between key poses.
+"""Rotation vectors and rotation matrices.
+
+Notation: `w` is a rotation vector: its direction is the axis, its length the angle in radians.
+
+Source: Rodrigues' formula; see Sola et al. 2018, A micro Lie theory for state estimation in robotics, example 4.
+
+Poses of line cameras: a function of the row, interpolated between key poses.
 
 A line camera takes one row of its image after the other while it moves, so each row has a pose of its own. Between key
 poses the rotation turns about one axis at an even rate (slerp) and the position moves along a straight line; beyond the
@@ -6,6 +12,10 @@ first and the last key pose, by half a row at most, both go on.
 
 Notation: `N` cameras, `M` key poses of all cameras, `R` rays; `y` is a height in the image in pixels, so row r is taken
 at y = r + 0.5. A frame camera has one key pose, which holds for all rows.
+
+Which row of a line camera sees a point: the one whose line passes through it.
+
+Notation: `P` points, `y` height in the image in pixels.
 """
 
 from __future__ import annotations
@@ -18,7 +28,37 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.rotations import rotation_matrix, rotation_vector
+_SMALL = 1e-6
+"""Squared angle below which series replace the closed forms."""
+
+
+def rotation_matrix(w: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
+    """exp([w]x); differentiable everywhere, also at 0."""
+    squared = (w * w).sum(dim=-1)[..., None, None]
+    is_small = squared < _SMALL
+    safe = torch.where(is_small, torch.ones_like(squared), squared)
+    angle = safe.sqrt()
+    first = torch.where(is_small, 1 - squared / 6, angle.sin() / angle)
+    second = torch.where(is_small, 0.5 - squared / 24, (1 - angle.cos()) / safe)
+    cross = _cross_matrix(w)
+    return torch.eye(3, dtype=w.dtype, device=w.device) + first * cross + second * (cross @ cross)
+
+
+def rotation_vector(matrix: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 3"]:
+    """The inverse of `rotation_matrix` for angles below pi."""
+    skew = 0.5 * (matrix - matrix.transpose(-1, -2))
+    axis = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1)
+    sine = axis.norm(dim=-1, keepdim=True)
+    cosine = 0.5 * (matrix.diagonal(dim1=-2, dim2=-1).sum(dim=-1, keepdim=True) - 1)
+    angle = torch.atan2(sine, cosine)
+    return axis * torch.where(sine * sine < _SMALL, 1 + angle * angle / 6, angle / sine.clamp(min=1e-12))
+
+
+def _cross_matrix(w: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
+    """[w]x, with which a product is the cross product by w."""
+    x, y, z = w.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
 
 
 @dataclass(frozen=True)
@@ -131,3 +171,60 @@ class KeyPoses:
         if not (found._places.diff() > 0).all():
             raise ValueError("the heights of key poses must increase")
         return found
+
+
+_MOST_STRIPES = 400
+"""Stripes of the image that are looked through for a point; within one, points move evenly in the camera's axes."""
+
+_CHUNK = 1 << 14
+"""Points looked up at once."""
+
+
+def project_by_row(
+    points: Float[Tensor, "P 3"], keys: KeyPoses, num_rows: int
+) -> tuple[Float[Tensor, " P"], Float[Tensor, "P 3"]]:
+    """The height at which each point is first seen, and where it lies in the camera's axes then.
+
+    Args:
+        keys: Of one line camera.
+        num_rows: Rows of its image.
+    Returns:
+        y in [0, num_rows], and positions in the camera's axes; a point that no row sees has z = 1, behind the camera.
+    """
+    num_stripes = min(num_rows, _MOST_STRIPES)
+    heights = torch.linspace(0, num_rows, num_stripes + 1, device=points.device)
+    poses = keys.at(torch.zeros_like(heights, dtype=torch.int64), heights)
+    stripes, found = _first_stripes(points, poses)
+    seen = found.nonzero()[:, 0]
+    start, end = (_local(points[seen], poses[stripes[seen] + side]) for side in (0, 1))
+    change = end[:, 1] - start[:, 1]
+    share = torch.where(change == 0, 0.5, -start[:, 1] / torch.where(change == 0, 1.0, change)).clamp(0, 1)
+    y, local = torch.zeros_like(points[:, 0]), torch.ones_like(points)
+    y[seen] = (stripes[seen] + share) * (num_rows / num_stripes)
+    local[seen] = start + share[:, None] * (end - start)
+    return y, local
+
+
+def _first_stripes(
+    points: Float[Tensor, "P 3"], poses: Float[Tensor, "n 3 4"]
+) -> tuple[Int[Tensor, " P"], Bool[Tensor, " P"]]:
+    """The first stripe between neighbouring poses that passes over each point, and whether there is one."""
+    stripes = torch.zeros(len(points), dtype=torch.int64, device=points.device)
+    # One product gives each point's coordinate in each pose; a chunk of points keeps it small. Poses lie along the
+    # first axis, so that comparing neighbours takes whole rows of memory.
+    up, back = (
+        (poses[:, :, axis], (poses[:, :, 3] * poses[:, :, axis]).sum(dim=1, keepdim=True)) for axis in (1, 2)
+    )
+    count = len(poses) - 1
+    left = torch.arange(count, 0, -1, dtype=torch.int16, device=points.device)[:, None]
+    for first in range(0, len(points), _CHUNK):
+        chosen = points[first : first + _CHUNK].T.contiguous()
+        is_above, is_before = up[0] @ chosen > up[1], back[0] @ chosen < back[1]
+        passes = (is_above[1:] ^ is_above[:-1]) & is_before[1:] & is_before[:-1]
+        stripes[first : first + _CHUNK] = count - (passes * left).amax(dim=0).long()
+    return stripes.clamp(max=count - 1), stripes < count
+
+
+def _local(points: Float[Tensor, "P 3"], poses: Float[Tensor, "P 3 4"]) -> Float[Tensor, "P 3"]:
+    """Points in the axes of their poses."""
+    return torch.einsum("pi,pij->pj", points - poses[:, :, 3], poses[:, :, :3])

@@ -12,11 +12,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from types import FrameType
 
-from unmix_plugin.engine.instantiate import require_in_range
-from unmix_plugin.engine.processes.joining import are_started
+from unmix_plugin.engine.configs import MOST_PROCESSES, require_in_range
 from unmix_plugin.errors import RunError
 
-MOST_PROCESSES = 1024
 _GRACE_SECONDS = 10.0
 """For the processes that are left to say what is wrong and to save, once one has ended."""
 
@@ -34,6 +32,11 @@ def start_together(module: str, argv: Sequence[str], count: int) -> None:
     require_in_range("num-devices", count, 1, MOST_PROCESSES)
     if count > 1 and not are_started():
         sys.exit(run_processes(module, argv, count))
+
+
+def are_started() -> bool:
+    """Whether this process was started as one of several."""
+    return int(os.environ.get("WORLD_SIZE", "1")) > 1 and "RANK" in os.environ
 
 
 def run_processes(module: str, argv: Sequence[str], count: int) -> int:

@@ -4,16 +4,20 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from unmix_plugin.engine.configs import TrainerConfig
-from unmix_plugin.engine.devices import resolve_device
+from unmix_plugin.engine.machine import resolve_device
 from unmix_plugin.engine.model import Model
 from unmix_plugin.engine.pipeline import Pipeline
 from unmix_plugin.engine.registry import find_method
-from unmix_plugin.engine.runs.checkpoints import Checkpoint, checkpoint_steps, newest_complete_checkpoint
+from unmix_plugin.engine.runs.atomic_files import read_run_json, write_run_json
+from unmix_plugin.engine.runs.checkpoints import (
+    Checkpoint,
+    TrainingRecord,
+    newest_complete_checkpoint,
+    restore_model,
+)
 from unmix_plugin.engine.runs.config_json import config_from_json, config_to_json
-from unmix_plugin.engine.runs.run_files import read_run_json, write_run_json
-from unmix_plugin.engine.runs.run_folder import RunFolder, open_run_folder
+from unmix_plugin.engine.runs.run_folder import RunFolder, checkpoint_steps, open_run_folder
 from unmix_plugin.engine.runs.scene_record import SceneRecord, check_same_scene, read_scene_record
-from unmix_plugin.engine.training.training_state import TrainingRecord, restore_model
 from unmix_plugin.errors import ConfigError, RunError, UnmixError
 
 
@@ -56,7 +60,7 @@ def load_model(path: Path, device: str = "auto") -> LoadedModel:
     """
     run, place = open_run_folder(path), resolve_device(device)
     config = load_config(path)
-    scene = read_scene_record(run, config.pipeline.datamanager._target)
+    scene = read_scene_record(run, config.pipeline.datamanager.target)
     checkpoint = require_checkpoint(run)
     model = _model_of(config, scene, run)
     restore_model(checkpoint.tensors, model, averaged=True)
@@ -74,7 +78,7 @@ def load_pipeline(path: Path, device: str = "auto", data: Path | None = None) ->
     """
     run, place = open_run_folder(path), resolve_device(device)
     config = load_config(path)
-    scene = read_scene_record(run, config.pipeline.datamanager._target)
+    scene = read_scene_record(run, config.pipeline.datamanager.target)
     checkpoint = require_checkpoint(run)
     config = config if data is None else replace(config, data=data)
     pipeline: Pipeline = config.pipeline.setup(data=require_data(config), device=place, seed=config.seed)

@@ -1,12 +1,15 @@
-"""The folder of one run: what lies where in it, making one, finding one."""
+"""The folder of one run: what lies where in it, making one, finding one.
 
+One training at a time writes to a run.
+"""
+
+import errno
 import os
 import re
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 
-from unmix_plugin.engine.runs.checkpoints import checkpoint_steps
 from unmix_plugin.errors import RunError
 
 
@@ -126,6 +129,12 @@ def newest_run(output_dir: Path) -> RunFolder:
     return open_run_folder(max(found)[1])
 
 
+def checkpoint_steps(folder: Path) -> list[int]:
+    """Steps of the checkpoints in `folder`, newest first, complete or not."""
+    stems = (path.stem.removeprefix("step-") for path in folder.glob("step-*.json"))
+    return sorted((int(stem) for stem in stems if stem.isdigit()), reverse=True)
+
+
 def _refuse_links_out(root: Path) -> None:
     """Whoever made the folder must not choose which other files get written."""
     for folder, folders, files in os.walk(root):
@@ -141,3 +150,50 @@ def _refuse_links_out(root: Path) -> None:
 def _file_name(name: str) -> str:
     """`name` with whatever a folder name had better not have replaced by `_`."""
     return re.sub(r"[^\w.+-]", "_", name).strip(".")
+
+
+try:
+    import fcntl
+except ImportError:  # Windows: there the lock guards nothing
+    fcntl = None  # type: ignore[assignment]
+
+
+class RunLock:
+    """Held from its making to `release`, or to the end of the process, however it ends."""
+
+    def __init__(self, path: Path) -> None:
+        """Take the lock; the same process may take it again.
+
+        Raises:
+            RunError: another process has it, or the file can't be made.
+        """
+        self._descriptor: int | None = None
+        flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
+        try:
+            self._descriptor = os.open(path, flags, 0o666)
+            if fcntl is not None:
+                fcntl.lockf(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if self._descriptor is None or error.errno in (
+                errno.EAGAIN,
+                errno.EACCES,
+            ):  # others: no locks here
+                raise RunError(self._refusal(path, error)) from error
+        os.ftruncate(self._descriptor, 0)
+        os.write(self._descriptor, str(os.getpid()).encode())
+
+    def release(self) -> None:
+        """Let others train the run."""
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None
+
+    __del__ = release
+
+    def _refusal(self, path: Path, error: OSError) -> str:
+        if self._descriptor is None:
+            return f"can't write {path}: {error.strerror or error}"
+        holder = os.read(self._descriptor, 20).decode(errors="replace")
+        return (
+            f"another training writes to {path.parent} (process {holder}); stop it first, or wait for its end"
+        )

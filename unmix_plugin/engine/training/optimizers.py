@@ -2,44 +2,23 @@
 
 A schedule is a pure function of the training progress in [0, 1], so it stretches over whichever limit, steps or
 seconds, a run has.
+
+Keeping non-finite numbers out of the parameters.
+
+A moving average of the parameters, which renders better than the last step's.
 """
 
-import math
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
-from unmix_plugin.errors import ConfigError, require
+from unmix_plugin.engine.configs import OptimizerConfig
+from unmix_plugin.errors import ConfigError, RunError
 
 _BETAS = (0.9, 0.99)
 _EPS = 1e-15  # far below any gradient, so that the size of the loss does not matter
-
-
-@dataclass(frozen=True)
-class OptimizerConfig:
-    """Adam for one group of parameters, and its learning-rate schedule."""
-
-    lr: float = 1e-2
-    """Step size at the start of training."""
-    final_factor: float = 0.1
-    """Step size at the end of training as a part of `lr`; between, it falls by equal factors. 1 keeps it constant."""
-    weight_decay: float = 0.0
-    """Times the parameters, added to their gradient: draws what the data leaves open to 0."""
-
-    def __post_init__(self) -> None:
-        """Refuse impossible settings.
-
-        Raises:
-            ConfigError: a number out of its range.
-        """
-        rules = {
-            "lr above 0 and finite": 0 < self.lr < math.inf,
-            "final-factor in (0, 1]": 0 < self.final_factor <= 1,
-            "weight-decay of at least 0 and finite": 0 <= self.weight_decay < math.inf,
-        }
-        require("an optimizer", self, rules)
 
 
 def learning_rate(config: OptimizerConfig, progress: float) -> float:
@@ -104,3 +83,114 @@ def _all_fusable(param_groups: Mapping[str, list[nn.Parameter]]) -> bool:
     """Whether torch has a fused Adam for these parameters: real floating point on the CPU or a CUDA GPU."""
     params = [param for group in param_groups.values() for param in group]
     return all(param.is_floating_point() and param.device.type in ("cpu", "cuda") for param in params)
+
+
+_MAX_IN_A_ROW = 20
+"""Training fails after so many steps in a row with a non-finite loss or gradient."""
+
+
+class GradientGuard:
+    """Looks at loss and gradients before each update and refuses non-finite ones."""
+
+    def __init__(self, optimizer: torch.optim.Optimizer) -> None:
+        self.optimizer = optimizer
+        self.skipped = 0
+        """Steps refused so far."""
+        self.in_a_row = 0
+        """Steps refused since the last good one."""
+
+    @torch.no_grad()
+    def check(self, loss: Tensor) -> tuple[bool, float]:
+        """Whether the optimiser may step, and the loss as a number.
+
+        Raises:
+            RunError: too many steps in a row were refused.
+        """
+        gradients = {
+            group["name"]: [param.grad for param in group["params"] if param.grad is not None]
+            for group in self.optimizer.param_groups
+        }
+        norms = {name: _norm(values) for name, values in gradients.items() if values}
+        # One transfer for all of them: each would wait for the GPU.
+        numbers = torch.stack([loss.detach().float(), *norms.values()])
+        finite, value = torch.stack([torch.isfinite(numbers).all().float(), numbers[0]]).tolist()
+        if finite:
+            self.in_a_row = 0
+        else:
+            self._refuse(value, norms)
+        return bool(finite), value
+
+    def _refuse(self, loss: float, norms: Mapping[str, Tensor]) -> None:
+        self.skipped += 1
+        self.in_a_row += 1
+        if self.in_a_row >= _MAX_IN_A_ROW:
+            bad = [name for name, norm in norms.items() if not torch.isfinite(norm)]
+            raise RunError(
+                f"{self.in_a_row} training steps in a row had a non-finite loss or gradient (loss {loss:g}; "
+                f"gradients of {', '.join(bad) or 'no group'}); the last checkpoint is good. Lower the learning rates, "
+                "or look for values far outside [0, 1] in the scene"
+            )
+
+
+def _norm(gradients: list[Tensor]) -> Tensor:
+    return torch.stack([torch.linalg.vector_norm(gradient) for gradient in gradients]).norm().float()
+
+
+AVERAGE_INTERVAL = 8
+"""Steps of a training between updates, each of which costs about as much as a step of the optimiser."""
+
+
+class ParameterAverage:
+    """Exponential moving average of a module's trained parameters.
+
+    Its decay rises as (1 + n) / (10 + n) with the number n of updates until it reaches the one asked for: until then it
+    spans about the last ninth of the training so far, however long that is. Each step of the first interval is an
+    update, so that a training of few steps isn't shown as it began.
+    """
+
+    def __init__(self, module: nn.Module, decay: float, interval: int = 1) -> None:
+        """Start from the current values.
+
+        Args:
+            module: Whose parameters to follow.
+            decay: Of a step, in [0, 1).
+            interval: Steps between updates after the first interval; each then counts for so many steps.
+        """
+        self.interval = interval
+        self.decay = decay**interval
+        self.updates = 0
+        self.params = {name: param for name, param in module.named_parameters() if param.requires_grad}
+        self.values = {name: param.detach().clone() for name, param in self.params.items()}
+
+    @torch.no_grad()
+    def update(self, step: int) -> None:
+        """Take in the parameters after `step` steps, if that is a multiple of the interval or none has passed yet."""
+        if step > self.interval and step % self.interval != 0:
+            return
+        self.updates += 1
+        decay = min(self.decay, (1 + self.updates) / (10 + self.updates))
+        for name, value in self.values.items():
+            value.lerp_(self.params[name], 1.0 - decay)
+
+    @contextmanager
+    def swapped_in(self) -> Iterator[None]:
+        """Context in which the module has the averaged values."""
+        self._swap()
+        try:
+            yield
+        finally:
+            self._swap()
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The averaged values by parameter name."""
+        return self.values
+
+    def load_state_dict(self, values: Mapping[str, Tensor], updates: int) -> None:
+        """Restore `state_dict` and the number of updates."""
+        for name, value in self.values.items():
+            value.copy_(values[name])
+        self.updates = updates
+
+    def _swap(self) -> None:
+        for name, param in self.params.items():
+            param.data, self.values[name] = self.values[name], param.data

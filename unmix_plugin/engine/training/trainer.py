@@ -10,28 +10,38 @@ from rich.console import Console
 from torch import Tensor
 
 from unmix_plugin.engine.configs import TrainerConfig
+from unmix_plugin.engine.machine import keep_freed_memory
 from unmix_plugin.engine.processes.processes import ALONE, Processes
-from unmix_plugin.engine.runs.checkpoints import checkpoint_steps, save_checkpoint
-from unmix_plugin.engine.runs.config_json import config_to_json
-from unmix_plugin.engine.runs.load_run import require_checkpoint, require_data, write_config
-from unmix_plugin.engine.runs.run_files import write_run_json
-from unmix_plugin.engine.runs.run_folder import RunFolder, create_run_folder, open_run_folder
-from unmix_plugin.engine.runs.run_lock import RunLock
-from unmix_plugin.engine.runs.scene_record import check_same_scene, read_scene_record, scene_record_to_json
-from unmix_plugin.engine.training.averages import AVERAGE_INTERVAL, ParameterAverage
-from unmix_plugin.engine.training.interrupts import Interrupted, StopSignals
-from unmix_plugin.engine.training.limits import Limits, TrainingClock
-from unmix_plugin.engine.training.memory import keep_freed_memory
-from unmix_plugin.engine.training.progress import ProgressConsole, ProgressDisplay, TrainingStatus
-from unmix_plugin.engine.training.training_control import TrainingControl
-from unmix_plugin.engine.training.training_state import (
+from unmix_plugin.engine.runs.atomic_files import write_run_json
+from unmix_plugin.engine.runs.checkpoints import (
     AVERAGE,
     TrainingRecord,
     collect_tensors,
     part,
+    save_checkpoint,
 )
+from unmix_plugin.engine.runs.config_json import config_to_json
+from unmix_plugin.engine.runs.load_run import require_checkpoint, require_data, write_config
+from unmix_plugin.engine.runs.run_folder import (
+    RunFolder,
+    RunLock,
+    checkpoint_steps,
+    create_run_folder,
+    open_run_folder,
+)
+from unmix_plugin.engine.runs.scene_record import check_same_scene, read_scene_record, scene_record_to_json
+from unmix_plugin.engine.training.optimizers import AVERAGE_INTERVAL, ParameterAverage
+from unmix_plugin.engine.training.progress import (
+    Limits,
+    MetricsWriter,
+    ProgressConsole,
+    ProgressDisplay,
+    RunLog,
+    TrainingClock,
+    TrainingStatus,
+)
+from unmix_plugin.engine.training.training_control import Interrupted, StopSignals, TrainingControl
 from unmix_plugin.engine.training.training_steps import StepResult, prepare_steps
-from unmix_plugin.engine.training.writers import MetricsWriter, RunLog
 from unmix_plugin.errors import RunError
 
 

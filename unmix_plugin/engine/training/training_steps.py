@@ -10,26 +10,22 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from unmix_plugin.engine.configs import TrainerConfig
-from unmix_plugin.engine.devices import resolve_device
+from unmix_plugin.engine.configs import OptimizerConfig, TrainerConfig
+from unmix_plugin.engine.machine import resolve_device, seed_everything
 from unmix_plugin.engine.pipeline import Pipeline
-from unmix_plugin.engine.processes.joining import joined, require_equal_settings
-from unmix_plugin.engine.processes.processes import ALONE, Follower, Processes
-from unmix_plugin.engine.runs.checkpoints import Checkpoint
+from unmix_plugin.engine.processes.processes import ALONE, Follower, Processes, joined, require_equal_settings
+from unmix_plugin.engine.runs.checkpoints import Checkpoint, TrainingRecord, restore_training
 from unmix_plugin.engine.runs.config_json import config_to_json
 from unmix_plugin.engine.runs.load_run import require_checkpoint, require_data
 from unmix_plugin.engine.runs.run_folder import open_run_folder
 from unmix_plugin.engine.training.callbacks import TrainingCallbackLocation, run_callbacks
-from unmix_plugin.engine.training.guards import GradientGuard
-from unmix_plugin.engine.training.interrupts import StopSignals
 from unmix_plugin.engine.training.optimizers import (
-    OptimizerConfig,
+    GradientGuard,
     build_optimizer,
     forget_gradients,
     set_learning_rates,
 )
-from unmix_plugin.engine.training.seeding import seed_everything
-from unmix_plugin.engine.training.training_state import TrainingRecord, restore_training
+from unmix_plugin.engine.training.training_control import StopSignals
 from unmix_plugin.errors import ConfigError, RunError, UnmixError
 
 

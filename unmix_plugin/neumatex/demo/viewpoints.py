@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from unmix_plugin.engine.geometry.camera_paths import upright_cameras
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.upright_cameras import upright_cameras
 
 _DISTANCE = 4.2
 _ELEVATIONS_DEG = (-40.0, 70.0)

@@ -14,9 +14,8 @@ from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.key_poses import KeyPoses
-from unmix_plugin.engine.geometry.rays import RayBundle
-from unmix_plugin.engine.geometry.rotations import rotation_matrix
+from unmix_plugin.engine.geometry.key_poses import KeyPoses, rotation_matrix
+from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.poses.knots import Knots, on_spline, spline_weights
 
 Show = Callable[[RayBundle], Float[Tensor, "R D"]]

@@ -33,8 +33,8 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float32, UInt8
 
+from unmix_plugin.engine.geometry.camera_paths import upright_cameras
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.upright_cameras import upright_cameras
 from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.scenes.demo.shading import (
     LAMP,

@@ -21,10 +21,9 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
+from unmix_plugin.engine.geometry.camera_paths import focus_point
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.focus import focus_point
-from unmix_plugin.engine.geometry.rays import RayBundle
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.geometry.carving import MIN_EXPLAINED, carve_box, foreground_rays, share_through
 from unmix_plugin.scenes.geometry.matched_points import MatchedPoints

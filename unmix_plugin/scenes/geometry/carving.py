@@ -42,11 +42,8 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int32, Int64
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.camera_distortion import distort, undistort
-from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.contraction import UnitSpace
-from unmix_plugin.engine.geometry.rays import RayBundle
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.cameras import Cameras, distort, undistort
+from unmix_plugin.engine.geometry.space import RayBundle, SceneBox, UnitSpace
 from unmix_plugin.scenes.scene import Scene
 
 MAX_RAYS = 20_000

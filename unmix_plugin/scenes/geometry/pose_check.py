@@ -26,7 +26,7 @@ from jaxtyping import Float, Float32, Float64, Int
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.scenes.scene import Scene
 
 MOST_BANDS = 32

@@ -30,8 +30,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.contraction import UnitSpace
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import SceneBox, UnitSpace
 from unmix_plugin.scenes.geometry.pose_check import (
     LONGEST_SIDE_PX,
     NUM_AGREEING,

@@ -16,8 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.rays import RayBundle
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.scenes.geometry.pose_check import (
     LONGEST_SIDE_PX,
     NUM_AGREEING,

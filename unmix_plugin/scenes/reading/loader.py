@@ -16,10 +16,10 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Float64
 
+from unmix_plugin.engine.geometry.camera_paths import meeting_point
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.focus import meeting_point
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.errors import SceneError, SpectrumError
 from unmix_plugin.scenes.geometry.bounds import find_bounds
 from unmix_plugin.scenes.geometry.matched_points import MatchedPoints, find_matched_points

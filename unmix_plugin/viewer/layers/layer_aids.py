@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.scene_box import SceneBox
+from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.subspace import PcaColours
 from unmix_plugin.trained.material_view import MaterialView

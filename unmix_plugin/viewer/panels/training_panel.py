@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from unmix_plugin.engine.training.device_share import SHARE_BOUNDS
 from unmix_plugin.engine.training.progress import TrainingStatus
+from unmix_plugin.engine.training.training_control import SHARE_BOUNDS
 from unmix_plugin.viewer import html
 from unmix_plugin.viewer.charts import Chart, Line
 from unmix_plugin.viewer.inputs import number

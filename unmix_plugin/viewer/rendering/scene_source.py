@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 
 from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.engine.runs.run_folder import RunFolder
-from unmix_plugin.engine.training.device_share import DeviceShare
 from unmix_plugin.engine.training.trainer import Trainer
-from unmix_plugin.engine.training.training_control import TrainingControl
+from unmix_plugin.engine.training.training_control import DeviceShare, TrainingControl
 from unmix_plugin.trained.open_run import LoadedRun, require_materials
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.snapshot import snapshot
