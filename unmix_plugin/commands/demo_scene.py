@@ -10,19 +10,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from unmix_plugin.captures.demo.capture import (
-    POSES,
-    RAW_BANDS,
-    RAW_LAMP,
-    RAW_SIZE,
-    RAW_VIEWS,
-    make_demo_capture,
-)
 from unmix_plugin.commands.entry import run_command
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.scenes.demo.scene import DEFAULT_BANDS, DEFAULT_SIZE, DEFAULT_VIEWS, PLACES, make_demo_scene
-from unmix_plugin.scenes.demo.shading import LAMP
-from unmix_plugin.spectral.colour.conversion import parse_light
 
 
 @dataclass(frozen=True)
@@ -62,6 +51,16 @@ def write_demo_scene(arguments: list[str]) -> None:
 
 
 def _write_scene(options: DemoSceneOptions) -> None:
+    from unmix_plugin.scenes.demo.scene import (
+        DEFAULT_BANDS,
+        DEFAULT_SIZE,
+        DEFAULT_VIEWS,
+        PLACES,
+        make_demo_scene,
+    )
+    from unmix_plugin.scenes.demo.shading import LAMP
+    from unmix_plugin.spectral.colour.conversion import parse_light
+
     folder = options.directory
     size, bands, views = _numbers(options, (DEFAULT_SIZE, DEFAULT_BANDS, DEFAULT_VIEWS))
     light = parse_light(options.illuminant or LAMP)
@@ -90,6 +89,16 @@ def _write_scene(options: DemoSceneOptions) -> None:
 
 
 def _write_capture(options: DemoSceneOptions) -> None:
+    from unmix_plugin.captures.demo.capture import (
+        POSES,
+        RAW_BANDS,
+        RAW_LAMP,
+        RAW_SIZE,
+        RAW_VIEWS,
+        make_demo_capture,
+    )
+    from unmix_plugin.spectral.colour.conversion import parse_light
+
     folder = options.directory
     size, bands, views = _numbers(options, (RAW_SIZE, RAW_BANDS, RAW_VIEWS))
     light = parse_light(options.illuminant or RAW_LAMP)

@@ -30,10 +30,6 @@ def train(argv: list[str]) -> None:
         ConfigError: no or an unknown method, or impossible settings.
         SystemExit: help was asked for (0), arguments that do not parse (2), or a stop on request (130).
     """
-    from unmix_plugin.engine.processes.launching import start_together
-    from unmix_plugin.engine.training.progress import ProgressConsole
-    from unmix_plugin.engine.training.training_steps import follow_training, joined_training
-
     methods, broken = discover_methods()
     for plugin in broken:
         print(f"warning: {plugin}", file=sys.stderr)
@@ -41,6 +37,11 @@ def train(argv: list[str]) -> None:
         print(overview(methods))
         return
     config, viewing = parse_all(argv)
+
+    from unmix_plugin.engine.processes.launching import start_together
+    from unmix_plugin.engine.training.progress import ProgressConsole
+    from unmix_plugin.engine.training.training_steps import follow_training, joined_training
+
     start_together("unmix_plugin.commands.train", argv, config.machine.num_devices)
     with joined_training(config) as processes:
         if not processes.is_first:

@@ -1,9 +1,10 @@
-"""How far training has come, and when it ends: by steps, by seconds of training, or by whichever is first.
+"""How far training has come: when it ends, how that is shown, and what is written down of it.
 
-Showing how training goes: a live bar on a terminal, a plain line every few seconds elsewhere.
-
-Writing down how training went: metrics as JSON lines (and TensorBoard, where installed), events as a log.
+It ends by steps, by seconds of training, or by whichever is first. A terminal has a live bar, other outputs a plain
+line every few seconds; metrics become JSON lines (and TensorBoard files, where it is installed), events a log.
 """
+
+from __future__ import annotations
 
 import importlib.util
 import json
@@ -16,15 +17,17 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
-from torch import Tensor
 
 from unmix_plugin.engine.runs.atomic_files import write_file
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.errors import RunError
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @dataclass(frozen=True)
