@@ -1,7 +1,7 @@
 """From an object's folder to a validated `ObjectScene`.
 
 The folder has transforms.json and pictures as any scene has, a mesh, an environment map, and perhaps `relit/<light>/`
-with the same under lights that training never sees. docs/background/neumatex.md says what its keys mean.
+with the same under lights that training never sees. docs/guides/neumatex.md says what its keys mean.
 """
 
 from __future__ import annotations
