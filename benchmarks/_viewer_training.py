@@ -13,8 +13,8 @@ import _common
 
 from unmix_plugin.engine.runs.load_run import read_scene_record
 from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
-from unmix_plugin.viewer.options import TrainingViewerOptions
-from unmix_plugin.viewer.rendering.scene_source import source_of_training
+from unmix_plugin.viewer.access import TrainingViewerOptions
+from unmix_plugin.viewer.rendering.scene import source_of_training
 from unmix_plugin.viewer.server import Viewer
 
 WAYS = ("no viewer", "no page", "one page at rest", "one page always moving")

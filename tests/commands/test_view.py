@@ -13,7 +13,7 @@ from tests.commands.watching import START_S, address, looking, started, visited
 from tests.formats.video_reading import read_video
 from unmix_plugin.commands.view import ViewOptions, prepared, view
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
-from unmix_plugin.viewer.options import ViewerOptions
+from unmix_plugin.viewer.access import ViewerOptions
 
 
 @pytest.mark.parametrize("spoil", SPOILT)

@@ -4,7 +4,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from unmix_plugin.figures.line_chart import ChartLine, LineChart, draw_chart
+from unmix_plugin.figures.plotting import ChartLine, LineChart, draw_chart
 
 X = np.linspace(400.0, 700.0, 4)
 COLOUR = "#123456"

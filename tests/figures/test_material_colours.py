@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unmix_plugin.figures.material_colours import distinct_colours, own_colours
+from unmix_plugin.figures.plotting import distinct_colours, own_colours
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import srgb_to_linear
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from unmix_plugin.figures.picture_canvas import Canvas, CanvasLayout
+from unmix_plugin.figures.pictures import Canvas, CanvasLayout
 
 NAMES = ["endmember_0", "endmember_1", "endmember_10"]
 

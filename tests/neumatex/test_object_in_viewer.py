@@ -13,8 +13,8 @@ from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.formats.exr import write_exr
 from unmix_plugin.trained.model_scene import ModelView
 from unmix_plugin.trained.relighting import LightChoice, relit
-from unmix_plugin.viewer.rendering.scene_source import SceneSource
-from unmix_plugin.viewer.services import Services
+from unmix_plugin.viewer.rendering.scene import SceneSource
+from unmix_plugin.viewer.session import Services
 
 
 @pytest.fixture

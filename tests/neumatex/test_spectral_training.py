@@ -26,9 +26,8 @@ from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 from unmix_plugin.trained.open_run import load_run
 from unmix_plugin.trained.relighting import LightChoice
-from unmix_plugin.viewer.layers.layer_settings import LayerSettings
 from unmix_plugin.viewer.layers.layers import layers_of
-from unmix_plugin.viewer.layers.painting import SwatchLegend
+from unmix_plugin.viewer.layers.painting import LayerSettings, SwatchLegend
 
 SPECTRAL = [*SMALL, "--pipeline.model.material=spectral", "--pipeline.model.num-endmembers=2"]
 

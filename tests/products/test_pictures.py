@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
-from unmix_plugin.figures.picture_grid import (
+from unmix_plugin.figures.pictures import (
     NEUTRAL,
     ColourScale,
     TitledPicture,

@@ -11,7 +11,7 @@ from tests.method_factory import make_model
 from tests.viewer.pages import serving
 from tests.viewer.view_factory import source_of_model
 from unmix_plugin.model import UnmixModel
-from unmix_plugin.viewer.rendering.scene_source import SceneSource
+from unmix_plugin.viewer.rendering.scene import SceneSource
 from unmix_plugin.viewer.server import Viewer
 
 

@@ -8,7 +8,7 @@ from PIL import Image
 
 from benchmarks._viewer_page import Page
 from tests.viewer.view_factory import no_scene
-from unmix_plugin.viewer.options import ViewerOptions
+from unmix_plugin.viewer.access import ViewerOptions
 from unmix_plugin.viewer.server import Viewer
 
 

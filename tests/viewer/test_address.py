@@ -7,8 +7,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.viewer.address import free_port, is_local, notices, tunnel_command, url_of
-from unmix_plugin.viewer.options import TrainingViewerOptions, ViewerOptions
+from unmix_plugin.viewer.access import (
+    TrainingViewerOptions,
+    ViewerOptions,
+    free_port,
+    is_local,
+    start_notices,
+    tunnel_command,
+    url_of,
+)
 
 
 @pytest.fixture
@@ -31,7 +38,7 @@ def test_a_taken_port_is_passed_over(taken):
 
 
 def test_when_no_port_near_is_free_that_is_said(taken, monkeypatch):
-    monkeypatch.setattr("unmix_plugin.viewer.address._PORTS_TRIED", 1)
+    monkeypatch.setattr("unmix_plugin.viewer.access._PORTS_TRIED", 1)
     with pytest.raises(ConfigError, match=f"no free port from {taken} to {taken} at"):
         free_port("127.0.0.1", taken)
 
@@ -66,21 +73,21 @@ def test_the_address_printed_can_be_opened():
 
 
 def test_a_local_viewer_says_its_address_and_nothing_else():
-    assert notices(ViewerOptions(), 7007, {}) == ["viewer: http://127.0.0.1:7007"]
-    assert notices(ViewerOptions(port=0), 5555, {}) == ["viewer: http://127.0.0.1:5555"]
+    assert start_notices(ViewerOptions(), 7007, {}) == ["viewer: http://127.0.0.1:7007"]
+    assert start_notices(ViewerOptions(port=0), 5555, {}) == ["viewer: http://127.0.0.1:5555"]
 
 
 def test_a_viewer_that_others_reach_warns_and_asks_for_a_token():
-    lines = notices(ViewerOptions(host="0.0.0.0"), 7007, {})
+    lines = start_notices(ViewerOptions(host="0.0.0.0"), 7007, {})
     assert lines[1].startswith("warning: everyone who reaches ")
     assert "give --viewer.token" in lines[1]
-    assert "with the token" in notices(ViewerOptions(host="0.0.0.0", token="sesame"), 7007, {})[1]
-    assert "sesame" not in "".join(notices(ViewerOptions(host="0.0.0.0", token="sesame"), 7007, {}))
+    assert "with the token" in start_notices(ViewerOptions(host="0.0.0.0", token="sesame"), 7007, {})[1]
+    assert "sesame" not in "".join(start_notices(ViewerOptions(host="0.0.0.0", token="sesame"), 7007, {}))
 
 
 def test_over_ssh_the_tunnel_to_the_real_port_is_said():
     remote = {"SSH_CONNECTION": "10.0.0.2 50022 10.0.0.9 22", "USER": "ada"}
-    lines = notices(ViewerOptions(), 7009, remote)
+    lines = start_notices(ViewerOptions(), 7009, remote)
     assert lines[1] == "port 7007 is taken, hence 7009"
     assert "ssh -N -L 7009:127.0.0.1:7009 ada@10.0.0.9" in lines[2]
     other = {"SSH_CONNECTION": "10.0.0.2 50022 10.0.0.9 2222"}

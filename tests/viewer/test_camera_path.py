@@ -8,8 +8,7 @@ import torch
 
 from tests.viewer.view_factory import some_pose
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.viewer.camera_path import path_poses, path_views
-from unmix_plugin.viewer.view_cameras import rotation_matrix
+from unmix_plugin.viewer.view_cameras import path_poses, path_views, rotation_matrix
 
 
 def test_a_path_goes_through_its_key_frames_in_their_order():

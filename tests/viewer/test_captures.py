@@ -7,16 +7,16 @@ import pytest
 
 from tests.viewer.view_factory import make_frame, make_services, some_pose
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.viewer import captures
-from unmix_plugin.viewer.captures import (
+from unmix_plugin.viewer.layers.painting import LayerSettings
+from unmix_plugin.viewer.rendering import captures
+from unmix_plugin.viewer.rendering.captures import (
     PictureCanvas,
     PictureRequest,
     SpectraCanvas,
     StripCapture,
     check_size,
 )
-from unmix_plugin.viewer.layers.layer_settings import LayerSettings
-from unmix_plugin.viewer.rendering.edits import Edit
+from unmix_plugin.viewer.rendering.scene import Edit
 from unmix_plugin.viewer.view_cameras import sized_camera
 
 

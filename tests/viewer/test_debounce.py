@@ -1,6 +1,6 @@
 """Text is taken when it is typed, not letter by letter."""
 
-from unmix_plugin.viewer.debounce import WAIT_S, Debounced
+from unmix_plugin.viewer.page import WAIT_S, Debounced
 
 
 def test_work_is_done_once_after_the_last_event():

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unmix_plugin.viewer.gate import MOST_WAITING, Gate, is_own_page
+from unmix_plugin.viewer.access import MOST_WAITING, Gate, is_own_page
 
 
 def test_without_a_token_everyone_is_admitted():

@@ -7,8 +7,8 @@ import msgspec
 import pytest
 
 from tests.viewer.pages import has_control, opened, page_of, serving, show_layer
-from unmix_plugin.viewer.gate import MOST_CLIENTS
-from unmix_plugin.viewer.token_prompt import TokenPrompt
+from unmix_plugin.viewer.access import MOST_CLIENTS
+from unmix_plugin.viewer.server import TokenPrompt
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,8 @@ from html.parser import HTMLParser
 
 import pytest
 
-from unmix_plugin.viewer import html
-from unmix_plugin.viewer.layers.painting import ColourMapLegend, SwatchLegend, TextLegend
+from unmix_plugin.viewer import page as html
+from unmix_plugin.viewer.layers.painting import ColourMapLegend, SwatchLegend, TextLegend, legend_html
 
 EVIL = "<script>alert(1)</script><img src=x onerror='alert(2)'> & \"quotes\""
 
@@ -43,9 +43,9 @@ def parsed(content):
         html.paragraph(EVIL, is_warning=True),
         html.bars([(EVIL, 0.5, (1.0, 0.0, 0.0))]),
         html.table([(EVIL, EVIL)]),
-        html.legend(TextLegend(EVIL)),
-        html.legend(SwatchLegend(((EVIL, (0.1, 0.2, 0.3)),))),
-        html.legend(ColourMapLegend("viridis", 0.0, 1.0, EVIL)),
+        legend_html(TextLegend(EVIL)),
+        legend_html(SwatchLegend(((EVIL, (0.1, 0.2, 0.3)),))),
+        legend_html(ColourMapLegend("viridis", 0.0, 1.0, EVIL)),
         html.swatches([(EVIL, (0.0, 0.0, 0.0))]),
     ],
 )
@@ -56,7 +56,7 @@ def test_words_of_users_are_shown_and_never_run(content):
 
 
 def test_a_colour_bar_says_its_values_and_goes_from_end_to_end():
-    content = html.legend(ColourMapLegend("gray", -1.0, 3.0, "radiance"))
+    content = legend_html(ColourMapLegend("gray", -1.0, 3.0, "radiance"))
     found = parsed(content)
     assert [value in found.text for value in ("-1", "1", "3", "radiance")] == [True] * 4
     assert "#000000" in content

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.viewer import inputs
-from unmix_plugin.viewer.inputs import choice, new_file, number, text
+from unmix_plugin.viewer import page as inputs
+from unmix_plugin.viewer.page import choice, new_file, number, text
 
 anything = st.one_of(
     st.none(), st.booleans(), st.integers(), st.floats(), st.text(), st.lists(st.integers()), st.binary()

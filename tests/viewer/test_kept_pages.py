@@ -3,9 +3,9 @@
 import numpy as np
 
 from tests.viewer.pages import decoded, opened, page_of, show_layer
-from unmix_plugin.viewer.kept_pages import KEPT_S, KeptPages, PageState
-from unmix_plugin.viewer.layers.layer_settings import LayerSettings
-from unmix_plugin.viewer.recipe_editor import RecipeHistory
+from unmix_plugin.viewer.layers.painting import LayerSettings
+from unmix_plugin.viewer.recipes import RecipeHistory
+from unmix_plugin.viewer.session import KEPT_S, KeptPages, PageState
 
 
 def state(rows):

@@ -14,7 +14,7 @@ from unmix_plugin.engine.training.training_control import DeviceShare
 from unmix_plugin.trained.model_scene import ModelScene
 from unmix_plugin.trained.run_views import recorded_views
 from unmix_plugin.trained.world_frame import world_frame
-from unmix_plugin.viewer.rendering.scene_source import SceneSource
+from unmix_plugin.viewer.rendering.scene import SceneSource
 
 OUTPUTS = (
     Output("rgb", "srgb", "colour", "sRGB on black, 0 to 1"),

@@ -12,7 +12,7 @@ from unmix_plugin.editing import Light, Recipe, Retint
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_names
-from unmix_plugin.viewer.rendering.edits import Edit
+from unmix_plugin.viewer.rendering.scene import Edit
 
 
 def test_materials_are_edited_undone_saved_and_loaded(viewer):

@@ -10,8 +10,8 @@ from tests.viewer.pages import decoded, opened, serving, show_layer
 from tests.viewer.view_factory import source_of_model
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.maps.indices import available_indices
-from unmix_plugin.viewer.layers.layer_settings import BACKGROUNDS
-from unmix_plugin.viewer.rendering.edits import Edit
+from unmix_plugin.viewer.layers.painting import BACKGROUNDS
+from unmix_plugin.viewer.rendering.scene import Edit
 
 
 def test_a_page_gets_a_picture_of_its_shape_that_shows_something(viewer):

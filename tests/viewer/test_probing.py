@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.viewer.probing import abundances_csv, probe_through, spectra_csv
+from unmix_plugin.viewer.panels.probe import abundances_csv, probe_through, spectra_csv
 from unmix_plugin.viewer.view_cameras import camera_of, pose_of
 
 

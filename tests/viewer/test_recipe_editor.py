@@ -17,7 +17,7 @@ from unmix_plugin.editing import (
     recipe_from_yaml,
     recipe_to_yaml,
 )
-from unmix_plugin.viewer.recipe_editor import (
+from unmix_plugin.viewer.recipes import (
     RecipeHistory,
     change_of,
     numbered,

@@ -3,7 +3,7 @@
 import numpy as np
 
 from unmix_plugin.engine.training.progress import TrainingStatus
-from unmix_plugin.viewer.training_curve import TrainingCurve
+from unmix_plugin.viewer.session import TrainingCurve
 
 
 def status(step, psnr: float | None = 20.0):

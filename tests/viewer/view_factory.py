@@ -22,15 +22,11 @@ from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.trained.snapshot import unmix_scene
 from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.viewer.layers.layer import layer_named
-from unmix_plugin.viewer.layers.layer_aids import LayerAids
-from unmix_plugin.viewer.layers.layer_settings import LayerSettings
-from unmix_plugin.viewer.layers.layers import LAYERS
-from unmix_plugin.viewer.layers.painting import Legend, Picture
-from unmix_plugin.viewer.rendering.reference import render_reference
-from unmix_plugin.viewer.rendering.scene_source import SceneSource
-from unmix_plugin.viewer.rendering.view import Shown, View
-from unmix_plugin.viewer.services import Services
+from unmix_plugin.viewer.layers.layers import LAYERS, LayerAids, layer_named, render_reference
+from unmix_plugin.viewer.layers.painting import LayerSettings, Legend, Picture
+from unmix_plugin.viewer.rendering.pictures import Shown, View
+from unmix_plugin.viewer.rendering.scene import SceneSource
+from unmix_plugin.viewer.session import Services
 from unmix_plugin.viewer.view_cameras import ViewPose, pose_of
 
 WIDTH, HEIGHT, FOCAL = 24, 16, 20.0

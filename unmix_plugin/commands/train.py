@@ -13,7 +13,7 @@ from unmix_plugin.commands.train_arguments import PROGRAM, overview, parse_all
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.registry import discover_methods
 from unmix_plugin.errors import ConfigError, counted
-from unmix_plugin.viewer.options import TrainingViewerOptions
+from unmix_plugin.viewer.access import TrainingViewerOptions
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -120,7 +120,7 @@ def _shown(trainer: Trainer, viewing: TrainingViewerOptions, console: Console) -
         return
     from unmix_plugin.commands.reporting import say
     from unmix_plugin.engine.runs.load_run import read_scene_record
-    from unmix_plugin.viewer.rendering.scene_source import source_of_training
+    from unmix_plugin.viewer.rendering.scene import source_of_training
     from unmix_plugin.viewer.server import Viewer
 
     try:

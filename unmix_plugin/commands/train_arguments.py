@@ -13,7 +13,7 @@ import tyro
 from unmix_plugin.engine.configs import Common, TrainerConfig
 from unmix_plugin.engine.registry import MethodSpecification, discover_methods, find_method
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.viewer.options import TrainingViewerOptions
+from unmix_plugin.viewer.access import TrainingViewerOptions
 
 PROGRAM = "unmix-train"
 _USAGE = f"""usage: {PROGRAM} METHOD --data DIR [options]

@@ -10,11 +10,11 @@ import tyro
 
 from unmix_plugin.commands.entry import run_command
 from unmix_plugin.engine.configs import DeviceName
-from unmix_plugin.viewer.options import ViewerOptions
+from unmix_plugin.viewer.access import ViewerOptions
 
 if TYPE_CHECKING:
     from unmix_plugin.scenes.scene import Scene
-    from unmix_plugin.viewer.rendering.scene_source import SceneSource
+    from unmix_plugin.viewer.rendering.scene import SceneSource
     from unmix_plugin.viewer.server import Viewer
 
 
@@ -72,7 +72,7 @@ def prepared(options: ViewOptions) -> Viewer:
     from unmix_plugin.editing.apply import assumption_of_light
     from unmix_plugin.editing.edited_run import requested_recipe
     from unmix_plugin.trained.open_run import load_run
-    from unmix_plugin.viewer.rendering.scene_source import source_of_run
+    from unmix_plugin.viewer.rendering.scene import source_of_run
     from unmix_plugin.viewer.server import Viewer
 
     console = CommandConsole()

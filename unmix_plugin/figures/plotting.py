@@ -1,12 +1,33 @@
-"""What all matplotlib figures share: resolution, swatches, plain axes, and colours of right and wrong."""
+"""What all matplotlib figures share: resolution, swatches, plain axes, and colours of right and wrong.
+
+Line charts as SVG: sharp at any size.
+
+A colour for each material: its own where that can be told from the others, otherwise the nearest that can.
+
+Notation: `K` materials, `N` colours; `lab` is CIE 1976 L*a*b* of sRGB colours under D65, in which equal distances look
+about equally different.
+"""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.colour.conversion import (
+    XYZ_TO_LINEAR_SRGB,
+    linear_to_srgb,
+    rgb_matrix,
+    srgb_to_linear,
+)
 
 FIGURE_DPI = 130
 RIGHT, WRONG = (0.80, 0.84, 0.80), (0.80, 0.15, 0.15)
@@ -74,3 +95,135 @@ def plain_axes(axes: Any) -> None:
     axes.grid(color="0.9")
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
+
+
+_FONT_PX = 12
+_INK, _SOFT = "#1c2024", "#5d6670"
+
+
+@dataclass(frozen=True)
+class ChartLine:
+    """One line; where a value is not finite it has a gap."""
+
+    x: np.ndarray
+    y: np.ndarray
+    label: str
+    colour: str
+    """A CSS colour, `#rrggbb`."""
+    width: float = 2.0
+    """In px."""
+    dash: str = "solid"
+    """solid, dashed or dotted, as matplotlib and CSS both call it."""
+
+
+@dataclass(frozen=True)
+class LineChart:
+    """Lines over a common axis."""
+
+    lines: Sequence[ChartLine]
+    x_label: str
+    y_label: str
+    is_log: bool = False
+    """Whether y is logarithmic; values that are not positive are then left out."""
+    from_zero: bool = False
+    """Whether y has to show 0."""
+    size: tuple[float, float] = (640.0, 300.0)
+    """Width and height in px."""
+
+
+def draw_chart(chart: LineChart) -> bytes:
+    """The chart as an SVG file, without a legend; text is drawn as shapes, so that no font is needed."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context({"font.size": _FONT_PX, "svg.hashsalt": "chart", "axes.linewidth": 0.8}):
+        # An SVG has 72 units an inch, so that a unit is a px.
+        figure = Figure(figsize=(chart.size[0] / 72, chart.size[1] / 72), layout="constrained")
+        axes = figure.add_subplot()
+        for line in chart.lines:
+            axes.plot(line.x, line.y, color=line.colour, linewidth=line.width, linestyle=line.dash)
+        if chart.is_log and any((np.asarray(line.y) > 0).any() for line in chart.lines):
+            axes.set_yscale("log", nonpositive="mask")
+        elif chart.from_zero:
+            low, high = axes.get_ylim()
+            axes.set_ylim(min(low, 0.0) if _least(chart) < 0 else 0.0, max(high, 0.0))
+        axes.margins(x=0)
+        axes.set_xlabel(chart.x_label, color=_INK)
+        axes.set_ylabel(chart.y_label, color=_INK)
+        axes.tick_params(which="both", colors=_SOFT)
+        plain_axes(axes)
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+    return buffer.getvalue()
+
+
+def _least(chart: LineChart) -> float:
+    values = np.concatenate([np.asarray(line.y, dtype=np.float64) for line in chart.lines])
+    return float(values[np.isfinite(values)].min(initial=0.0))
+
+
+_LIGHTNESS_BOUNDS = (30.0, 85.0)
+"""L* of colours that stand out from a light page and from black text."""
+
+_DISTANCE = 32.0
+"""Distance in L*a*b* of the colours of any two materials, as long as there is room for it."""
+
+_LEVELS = 21
+"""Steps of each sRGB channel among which colours are looked for."""
+
+
+def own_colours(spectra: Float[Tensor, "K B"], bands: Bands) -> Float64[np.ndarray, "K 3"]:
+    """The sRGB colour of each spectrum, [0, 1]: what a surface of it looks like, or its false colour."""
+    linear = spectra.detach().cpu().double().clamp(min=0) @ rgb_matrix(bands, torch.float64)
+    return linear_to_srgb(linear.clamp(0, 1)).numpy()
+
+
+def distinct_colours(own_srgb: Float[np.ndarray, "K 3"]) -> Float64[np.ndarray, "K 3"]:
+    """sRGB colours near the given ones, any two well apart, all visible on a light page; the first have first choice.
+
+    >>> distinct_colours(np.array([[0.8, 0.2, 0.2], [0.2, 0.3, 0.8]])).round(2)
+    array([[0.8, 0.2, 0.2],
+           [0.2, 0.3, 0.8]])
+    """
+    wanted = _lab(own_srgb)
+    distance = _DISTANCE
+    while True:
+        chosen = _choose_apart(wanted, distance)
+        if chosen is not None:
+            return chosen
+        distance *= 0.9
+
+
+def _choose_apart(wanted: Float64[np.ndarray, "K 3"], distance: float) -> Float64[np.ndarray, "K 3"] | None:
+    """For each wanted colour in turn the nearest that is `distance` from those before; None if one has no place."""
+    srgb, lab = _visible_colours()
+    is_free = np.ones(len(lab), dtype=bool)
+    chosen: list[int] = []
+    for colour in wanted:
+        if not is_free.any():
+            return None
+        to_wanted = np.where(is_free, np.linalg.norm(lab - colour, axis=1), np.inf)
+        chosen.append(int(to_wanted.argmin()))
+        is_free &= np.linalg.norm(lab - lab[chosen[-1]], axis=1) >= distance
+    return srgb[chosen]
+
+
+@lru_cache(maxsize=1)
+def _visible_colours() -> tuple[Float64[np.ndarray, "N 3"], Float64[np.ndarray, "N 3"]]:
+    """Colours to choose from, as sRGB and as L*a*b*."""
+    levels = np.linspace(0, 1, _LEVELS)
+    srgb = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), axis=-1).reshape(-1, 3)
+    lab = _lab(srgb)
+    low, high = _LIGHTNESS_BOUNDS
+    visible = (lab[:, 0] >= low) & (lab[:, 0] <= high)
+    return srgb[visible], lab[visible]
+
+
+def _lab(srgb: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+    """CIE 1976 L*a*b* of sRGB colours."""
+    linear = srgb_to_linear(torch.from_numpy(np.asarray(srgb, dtype=np.float64))).numpy()
+    to_xyz = np.linalg.inv(XYZ_TO_LINEAR_SRGB)
+    ratio = (linear @ to_xyz.T) / to_xyz.sum(axis=1)
+    root = np.where(ratio > (6 / 29) ** 3, np.cbrt(ratio), ratio / (3 * (6 / 29) ** 2) + 4 / 29)
+    x, y, z = root.T
+    return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=-1)

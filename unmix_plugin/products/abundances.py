@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from unmix_plugin.figures.picture_grid import (
+from unmix_plugin.figures.pictures import (
     ColourScale,
     TitledPicture,
     draw_panels,

@@ -14,8 +14,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from unmix_plugin.figures.material_colours import distinct_colours, own_colours
-from unmix_plugin.figures.picture_grid import (
+from unmix_plugin.figures.pictures import (
     NEUTRAL,
     ColourScale,
     TitledPicture,
@@ -24,7 +23,7 @@ from unmix_plugin.figures.picture_grid import (
     over_neutral,
     paint,
 )
-from unmix_plugin.figures.plotting import RIGHT, WRONG, Colour
+from unmix_plugin.figures.plotting import RIGHT, WRONG, Colour, distinct_colours, own_colours
 from unmix_plugin.products.abundances import SHARE_SCALE, share_panels
 from unmix_plugin.products.segmentation import paint_ids
 from unmix_plugin.spectral.bands import Bands

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.figures.picture_grid import over_neutral
+from unmix_plugin.figures.pictures import over_neutral
 from unmix_plugin.formats.files import write_file
 from unmix_plugin.formats.png import rgba_png_bytes
 from unmix_plugin.products.product import Job, Product

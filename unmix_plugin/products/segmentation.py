@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Float64, UInt8
 from torch import Tensor
 
-from unmix_plugin.figures.picture_grid import NEUTRAL, Picture, TitledPicture, draw_panels
+from unmix_plugin.figures.pictures import NEUTRAL, Picture, TitledPicture, draw_panels
 from unmix_plugin.figures.plotting import Colour
 from unmix_plugin.formats.files import array_bytes, write_file
 from unmix_plugin.formats.png import indexed_png_bytes

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from unmix_plugin.figures.material_colours import distinct_colours, own_colours
+from unmix_plugin.figures.plotting import distinct_colours, own_colours
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.spectral.materials import Materials
 

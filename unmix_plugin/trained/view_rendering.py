@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.figures.picture_grid import Picture, premultiplied_over_neutral
+from unmix_plugin.figures.pictures import Picture, premultiplied_over_neutral
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
 

@@ -1,4 +1,7 @@
-"""The viewer's life cycle: listen, admit clients, keep their sessions, shut down cleanly."""
+"""What a page shows before it has given the token.
+
+The viewer's life cycle: listen, admit clients, keep their sessions, shut down cleanly.
+"""
 
 from __future__ import annotations
 
@@ -7,20 +10,22 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from unmix_plugin.editing import Recipe
-from unmix_plugin.viewer import html
-from unmix_plugin.viewer.address import free_port, notices
-from unmix_plugin.viewer.failures import failures_said
-from unmix_plugin.viewer.gate import MOST_CLIENTS, Gate, is_own_page
-from unmix_plugin.viewer.kept_pages import KeptPages, browser_of
-from unmix_plugin.viewer.options import ViewerOptions
+from unmix_plugin.viewer import page as html
+from unmix_plugin.viewer.access import (
+    MOST_CLIENTS,
+    Gate,
+    ViewerOptions,
+    free_port,
+    is_own_page,
+    start_notices,
+)
+from unmix_plugin.viewer.page import failures_said, text
 from unmix_plugin.viewer.panels import PANELS
-from unmix_plugin.viewer.rendering.scene_source import SceneSource
-from unmix_plugin.viewer.services import SceneReader, Services
-from unmix_plugin.viewer.session import Session
-from unmix_plugin.viewer.token_prompt import TokenPrompts
+from unmix_plugin.viewer.rendering.scene import SceneSource
+from unmix_plugin.viewer.session import KeptPages, SceneReader, Services, Session, browser_of
 from unmix_plugin.viewer.view_cameras import point_ahead, pose_of, up_direction
 from unmix_plugin.viewer.web_server import (
     LABEL,
@@ -34,6 +39,77 @@ from unmix_plugin.viewer.web_server import (
 
 if TYPE_CHECKING:
     import viser
+
+
+class TokenPrompt:
+    """Asks one page for the token."""
+
+    def __init__(self, client: viser.ClientHandle, gate: Gate) -> None:
+        self.client = client
+        gui = client.gui
+        self._note = gui.add_html(html.paragraph("This viewer asks for the token that it was started with."))
+        self._word = gui.add_text("token", "")
+        self._button = gui.add_button("enter")
+
+        def enter(_: Any) -> None:
+            self._note.content = html.paragraph("checking")
+            gate.guess(client.client_id, text(self._word.value))
+
+        self._button.on_click(enter)
+
+    def refuse(self) -> None:
+        """Say that the guess was wrong."""
+        self._note.content = html.paragraph("That is not the token.", is_warning=True)
+
+    def remove(self) -> None:
+        """Make room for the panels."""
+        for handle in (self._note, self._word, self._button):
+            handle.remove()
+
+
+class _TokenPrompts:
+    """Pages that have yet to give the token."""
+
+    def __init__(self, gate: Gate, admit: Callable[[viser.ClientHandle], None]) -> None:
+        """
+        Args:
+            gate: Checks what they give.
+            admit: Serves a page that gave the token.
+        """
+        self._gate, self._admit = gate, admit
+        self._prompts: dict[int, TokenPrompt] = {}
+        self._lock = threading.Lock()
+
+    def ask(self, client: viser.ClientHandle, address: str) -> bool:
+        """Ask a page; False if too many from its address are asked already."""
+        if not self._gate.enter(client.client_id, address):
+            return False
+        with client.atomic():  # nobody can answer before the answer is listened for
+            prompt = TokenPrompt(client, self._gate)
+            with self._lock:
+                self._prompts[client.client_id] = prompt
+        return True
+
+    def leave(self, client: viser.ClientHandle) -> None:
+        """Forget a page."""
+        self._gate.leave(client.client_id)
+        with self._lock:
+            self._prompts.pop(client.client_id, None)
+
+    def tick(self) -> None:
+        """Check a guess from each address; called at a steady pace."""
+        for page, is_right in self._gate.verdicts().items():
+            with self._lock:
+                prompt = self._prompts.get(page)
+            if prompt is None:
+                continue
+            if not is_right:
+                prompt.refuse()
+                continue
+            self.leave(prompt.client)
+            prompt.remove()
+            self._admit(prompt.client)
+
 
 _TICK_S = 0.5
 _UNWATCHED_S = 5
@@ -64,7 +140,7 @@ class Viewer:
         self._options = options
         self._say = say
         self._gate = Gate(options.token)
-        self._prompts = TokenPrompts(self._gate, self._open)
+        self._prompts = _TokenPrompts(self._gate, self._open)
         self._sites_warned_of: set[str] = set()
         self._kept_pages = KeptPages()
         self._services = Services(source, read_scene, recipe, options.environments)
@@ -92,7 +168,7 @@ class Viewer:
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(self._disconnected)
         self._ticker.start()
-        for line in notices(self._options, self.port):
+        for line in start_notices(self._options, self.port):
             self._say(line)
 
     def stop(self) -> None:

@@ -1,24 +1,53 @@
-"""One client: its view, panels and notices. Nothing that a client does affects another one or the server."""
+"""What pages leave behind, so that a page that is loaded again goes on where it was.
+
+How loss and PSNR went, in a bounded number of points.
+
+What all clients of a viewer share: the scene, the render loop, what was measured, the folder for files.
+
+One client: its view, panels and notices. Nothing that a client does affects another one or the server.
+"""
 
 from __future__ import annotations
 
+import secrets
 import threading
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from unmix_plugin.trained.relighting import LightChoice
-from unmix_plugin.viewer import html
-from unmix_plugin.viewer.failures import failures_said
-from unmix_plugin.viewer.inputs import number
-from unmix_plugin.viewer.kept_pages import PageState
-from unmix_plugin.viewer.layers.layer_settings import LayerSettings, first_settings
-from unmix_plugin.viewer.layers.painting import ColourMapLegend
-from unmix_plugin.viewer.notices import Notices
-from unmix_plugin.viewer.recipe_editor import RecipeHistory
-from unmix_plugin.viewer.rendering.edits import Edit
-from unmix_plugin.viewer.rendering.view import DEFAULT_HEIGHT, HEIGHT_BOUNDS, Shown, View
-from unmix_plugin.viewer.services import Services
+import numpy as np
+from jaxtyping import Float64
+
+from unmix_plugin.editing import Light, Recipe
+from unmix_plugin.editing.light import relighting_factors
+from unmix_plugin.engine.training.progress import TrainingStatus
+from unmix_plugin.errors import SpectrumError
+from unmix_plugin.scenes.scene import Scene
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.colour.conversion import illuminant_names
+from unmix_plugin.trained.protocol import RenderableScene
+from unmix_plugin.trained.relighting import LightChoice, RelightableScene, relit
+from unmix_plugin.trained.run_views import RunView, recorded_views
+from unmix_plugin.trained.trained_scene import TrainedScene
+from unmix_plugin.viewer import page as html
+from unmix_plugin.viewer.layers.layers import layers_of
+from unmix_plugin.viewer.layers.painting import ColourMapLegend, LayerSettings, first_settings, legend_html
+from unmix_plugin.viewer.page import Notices, failures_said, number
+from unmix_plugin.viewer.recipes import RecipeHistory, numbered
+from unmix_plugin.viewer.rendering.captures import VideoQueue
+from unmix_plugin.viewer.rendering.pictures import (
+    DEFAULT_HEIGHT,
+    HEIGHT_BOUNDS,
+    PictureMaker,
+    Shown,
+    View,
+    num_channels,
+)
+from unmix_plugin.viewer.rendering.render_loop import RenderLoop
+from unmix_plugin.viewer.rendering.scene import Edit, MeasuredViews, SceneAids, SceneSource, usable_views
 from unmix_plugin.viewer.view_cameras import ViewPose, camera_of, point_ahead, pose_from, pose_of
 
 if TYPE_CHECKING:
@@ -26,6 +55,221 @@ if TYPE_CHECKING:
 
     from unmix_plugin.engine.geometry.cameras import Cameras
     from unmix_plugin.spectral.materials import Materials
+
+
+KEPT_S = 600.0
+"""How long what a page left is kept."""
+
+_MOST_KEPT = 64
+_KEY = "unmix-nerf"
+_ANSWER_S = 2.0
+
+
+@dataclass(frozen=True)
+class PageState:
+    """What a page shows, and the edits that it may go back to."""
+
+    pose: ViewPose | None
+    settings: LayerSettings
+    history: RecipeHistory
+    largest_height: int
+    subpixels: int
+    light: LightChoice = LightChoice()
+
+
+class KeptPages:
+    """States of pages that were closed recently, by the browser that they were in."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._left: list[tuple[float, str, PageState]] = []
+        self._lock = threading.Lock()
+
+    def leave(self, browser: str, state: PageState) -> None:
+        """Keep the state of a page that was closed."""
+        with self._lock:
+            self._left = [*self._left, (self._clock(), browser, state)][-_MOST_KEPT:]
+
+    def take(self, browser: str) -> PageState | None:
+        """The state of the browser's page that was closed last and has not come back; None if there is none."""
+        with self._lock:
+            self._left = [kept for kept in self._left if self._clock() - kept[0] < KEPT_S]
+            for index in range(len(self._left) - 1, -1, -1):
+                if self._left[index][1] == browser:
+                    return self._left.pop(index)[2]
+        return None
+
+
+def browser_of(client: viser.ClientHandle) -> str:
+    """The name that a page's browser keeps for this viewer, a new one if it has none or does not say."""
+    try:
+        known = client.local_storage.get_item(_KEY, _ANSWER_S)
+    except (RuntimeError, TimeoutError):  # storage is blocked, or the page has gone
+        known = None
+    if isinstance(known, str) and 0 < len(known) < 100:
+        return known
+    name = secrets.token_hex(16)
+    client.local_storage.set_item(_KEY, name)
+    return name
+
+
+_MOST_POINTS = 400
+
+
+class TrainingCurve:
+    """Points of a training, thinned evenly as they become many."""
+
+    def __init__(self) -> None:
+        self._points: list[TrainingStatus] = []
+        self._stride = 1
+        self._seen = 0
+        self._lock = threading.Lock()
+
+    def add(self, status: TrainingStatus | None) -> None:
+        """Take in a status, if it is one later than the last."""
+        with self._lock:
+            if status is None or (self._points and status.step <= self._points[-1].step):
+                return
+            if self._seen % self._stride == 0:
+                self._points.append(status)
+            self._seen += 1
+            if len(self._points) > _MOST_POINTS:
+                self._points = self._points[::2]
+                self._stride *= 2
+
+    def line(self, name: str) -> tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"]]:
+        """Steps, and `loss` or `psnr` of the points; none where one has no such value."""
+        with self._lock:
+            points = list(self._points)
+        found = [getattr(point, name) for point in points]
+        if None in found:
+            return np.zeros(0), np.zeros(0)
+        return np.array([float(point.step) for point in points]), np.array(found, dtype=np.float64)
+
+
+SceneReader = Callable[[], Scene]
+"""Reads the scene that a run was trained on.
+
+Raises:
+    UnmixError: it is not at hand, or another one.
+"""
+
+
+class Services:
+    """Shared by the sessions of all clients."""
+
+    def __init__(
+        self,
+        source: SceneSource,
+        read_scene: SceneReader,
+        recipe: Recipe | None = None,
+        environments: Sequence[Path] = (),
+    ) -> None:
+        """Computes nothing yet; the scene is read beside everything else once `start` is called.
+
+        Args:
+            source: The model.
+            read_scene: Reads the scene.
+            recipe: What every client sees the scene with at first.
+            environments: Files of lights to offer beside those of the scene.
+        Raises:
+            ConfigError: the recipe does not fit the run, or its method has no environments.
+            SceneError: an environment map is missing, damaged or unusable.
+        """
+        self.source = source
+        self.views = recorded_views(source.record)
+        self.num_train = len(source.record.train_cameras)
+        self.scene: Scene | None = None
+        """The scene, once it is read."""
+        self.videos = VideoQueue()
+        self.curve = TrainingCurve()
+        self._read_scene = read_scene
+        self._reader = threading.Thread(target=self._read, name="unmix-viewer-scene", daemon=True)
+        with source.borrowed() as scene:
+            self.layers = layers_of(scene)
+            self.has_materials = isinstance(scene, TrainedScene)
+            self.lights = _lights(scene, environments)
+            channels = (
+                num_channels(scene.materials) if isinstance(scene, TrainedScene) else 4 * len(scene.outputs)
+            )
+        self.aids = SceneAids(source, self.has_materials)
+        self.maker = PictureMaker(source, self.aids, channels, self.layers)
+        self.loop = RenderLoop(self.maker)
+        self.first_recipe = Recipe()
+        """Every client's first recipe; endmembers are given by their numbers."""
+        if recipe is not None:
+            self.first_recipe = numbered(recipe, self.maker.edited(Edit()).materials.names)
+            self.maker.edited(Edit(self.first_recipe))
+
+    @property
+    def folder(self) -> Path:
+        """Where files go that clients ask for: in the run folder, and nowhere else."""
+        return self.source.run.exports / "viewer"
+
+    @property
+    def recipes_folder(self) -> Path:
+        """Where recipes of this run are kept."""
+        return self.source.run.path / "recipes"
+
+    @cached_property
+    def usable_lights(self) -> tuple[str, ...]:
+        """Names of the lights that the scene can be shown in."""
+        scene = self.maker.edited(Edit())
+        return tuple(name for name in illuminant_names() if _is_usable(name, scene.bands, scene.light_power))
+
+    def start(self) -> None:
+        """Begin to render, and to read the scene."""
+        self.loop.start()
+        self._reader.start()
+
+    def tick(self) -> None:
+        """Note how training goes; called twice a second."""
+        if self.source.control is not None:
+            self.curve.add(self.source.control.status)
+
+    def stop(self) -> None:
+        """End rendering; waits for the scene if it is still being read."""
+        self.videos.stop()
+        self.loop.stop()
+        if self._reader.is_alive():
+            # Not left behind: a thread in native code when the interpreter ends takes the process down with it.
+            self._reader.join()
+
+    def view_named(self, name: str) -> RunView | None:
+        """A view of the scene by its name."""
+        return next((view for view in self.views if view.name == name), None)
+
+    def _read(self) -> None:
+        """Read the scene; without it the viewer only lacks what was measured."""
+        if self.has_materials:
+            _ = self.usable_lights  # takes a second, which the first page need not wait for
+        with failures_said("the scene could not be read", self._note_missing):
+            scene = self._read_scene()
+            self.scene = scene
+            if self.has_materials and usable_views(scene):
+                self.aids.set_measured(MeasuredViews(scene, self.source))
+            elif self.has_materials:
+                self.aids.set_measured(None, "no training view has all bands")
+
+    def _note_missing(self, reason: str) -> None:
+        self.aids.set_measured(None, f"the scene is not at hand: {reason}")
+
+
+def _is_usable(light: str, bands: Bands, recorded: Float64[np.ndarray, " B"] | None) -> bool:
+    try:
+        relighting_factors(bands, recorded, Light(light))
+    except SpectrumError:
+        return False
+    return True
+
+
+def _lights(scene: RenderableScene, environments: Sequence[Path]) -> tuple[str, ...]:
+    """Names of a scene's lights, and the paths of those that a user gives."""
+    paths = tuple(str(path.resolve()) for path in environments)
+    for path in paths:
+        relit(scene, LightChoice(path), "of this run")
+    return (*scene.lights, *paths) if isinstance(scene, RelightableScene) else ()
+
 
 _MOVING_QUALITY, _RESTING_QUALITY = 80, 90
 """JPEG quality of pictures that are soon replaced, and of those that stay."""
@@ -235,7 +479,7 @@ class Session:
             depth=shown.depth,
         )
         if self._legend is not None:
-            text = html.legend(shown.legend)
+            text = legend_html(shown.legend)
             if text != self._legend_shown:
                 self._legend_shown = self._legend.content = text
             self.value_range_shown = (

@@ -2,6 +2,10 @@
 
 Notation: a browser's pose has OpenCV axes (+x right, +y down, +z forward) as a quaternion w, x, y, z and a position in
 model space, and the vertical field of view in radians; ours has OpenGL axes and focal lengths in pixels.
+
+A path through key frames in the order in which they were set: smooth, with even time between them.
+
+Notation: `F` frames of the path.
 """
 
 from __future__ import annotations
@@ -19,9 +23,11 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.trained.run_views import RunView
 
 if TYPE_CHECKING:
     import viser
+
 
 FOV_BOUNDS = (math.radians(1.0), math.radians(170.0))
 """Least and greatest vertical field of view."""
@@ -170,3 +176,41 @@ def quaternion(rotation: Float[np.ndarray, "3 3"]) -> tuple[float, float, float,
 
     x, y, z, w = Rotation.from_matrix(rotation).as_quat().tolist()
     return (w, x, y, z)
+
+
+MOST_KEY_FRAMES = 100
+SECONDS_BOUNDS = (0.5, 120.0)
+FPS_BOUNDS = (1, 60)
+
+
+def path_poses(key_frames: Sequence[ViewPose], num_frames: int) -> list[ViewPose]:
+    """Poses along the path: through every key frame, positions and fields of view by splines, turns by slerp.
+
+    Args:
+        key_frames: At least two.
+        num_frames: F, at least two: the first and the last are at the ends.
+    Raises:
+        ConfigError: fewer than two key frames.
+    """
+    if len(key_frames) < 2:
+        raise ConfigError("a path needs at least two key frames; look from elsewhere and add another one")
+    from scipy.interpolate import CubicSpline
+    from scipy.spatial.transform import Rotation, Slerp
+
+    keys = np.arange(len(key_frames), dtype=np.float64)
+    times = np.linspace(0.0, keys[-1], num_frames)
+    values = np.array([[*pose.position, pose.fov] for pose in key_frames])
+    smooth = CubicSpline(keys, values, bc_type="natural")(times)
+    turns = Slerp(keys, Rotation.from_matrix(np.stack([rotation_matrix(pose.wxyz) for pose in key_frames])))
+    aspect = key_frames[0].aspect
+    return [
+        checked_pose(quaternion(rotation), row[:3], float(row[3]), aspect)
+        for row, rotation in zip(smooth, turns(times).as_matrix(), strict=True)
+    ]
+
+
+def path_views(poses: Sequence[ViewPose], width: int, height: int) -> list[RunView]:
+    """The path as views of a size, for a camera file."""
+    return [
+        RunView(f"path_{index:04d}", sized_camera(pose, width, height)) for index, pose in enumerate(poses)
+    ]

@@ -12,7 +12,7 @@ from PIL import Image
 from tests.formats.video_reading import read_video
 from tests.products.render.render_factory import SCENE, read_envi, read_exr, render, truth, views
 from unmix_plugin.errors import RunError
-from unmix_plugin.figures.picture_canvas import CanvasLayout
+from unmix_plugin.figures.pictures import CanvasLayout
 from unmix_plugin.products.render.files import still_paths
 from unmix_plugin.products.render.job import RenderJob, output_paths
 from unmix_plugin.products.render.survey import Survey

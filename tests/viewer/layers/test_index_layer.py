@@ -9,9 +9,8 @@ from torch.testing import assert_close
 
 from tests.viewer.view_factory import make_aids, make_frame, make_source, paint_layer
 from unmix_plugin.errors import ConfigError, SpectrumError
-from unmix_plugin.viewer.layers import index_layer
-from unmix_plugin.viewer.layers.layer_settings import LayerSettings
-from unmix_plugin.viewer.layers.painting import ColourMapLegend, over_background, paint_values
+from unmix_plugin.viewer.layers import layers as index_layer
+from unmix_plugin.viewer.layers.painting import ColourMapLegend, LayerSettings, over_background, paint_values
 
 FORMULA = "(r650-r450)/(r650+r450)"
 

@@ -8,14 +8,14 @@ from hypothesis import strategies as st
 
 from tests.viewer.view_factory import make_aids
 from unmix_plugin.spectral.maps.indices import MAX_LENGTH
-from unmix_plugin.viewer.layers.layer_settings import (
+from unmix_plugin.viewer.layers.painting import (
     BACKGROUNDS,
     COLOUR_MAPS,
     EXPOSURE_BOUNDS,
     GAMMA_BOUNDS,
+    VIEW_TRANSFORMS,
     LayerSettings,
 )
-from unmix_plugin.viewer.layers.view_transforms import VIEW_TRANSFORMS
 
 names = st.sampled_from([entry.name for entry in fields(LayerSettings)])
 anything = st.recursive(

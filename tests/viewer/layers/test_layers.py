@@ -13,11 +13,11 @@ from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.colour.conversion import band_composite_matrix, linear_to_srgb
 from unmix_plugin.spectral.materials import Coefficients
 from unmix_plugin.trained.run_materials import endmember_colours
-from unmix_plugin.viewer.layers.layer_settings import LayerSettings
 from unmix_plugin.viewer.layers.layers import LAYERS
 from unmix_plugin.viewer.layers.painting import (
     BACKGROUNDS,
     ColourMapLegend,
+    LayerSettings,
     SwatchLegend,
     TextLegend,
     colour_table,

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb
-from unmix_plugin.viewer.layers.view_transforms import VIEW_TRANSFORMS, to_display
+from unmix_plugin.viewer.layers.painting import VIEW_TRANSFORMS, to_display
 
 greys = torch.logspace(-3, 2, 200)[:, None].expand(-1, 3)
 

@@ -4,7 +4,7 @@ import pytest
 
 from tests.viewer.rendering.loop_driver import LARGEST, make_loop
 from tests.viewer.view_factory import Screen
-from unmix_plugin.viewer.rendering.frames import FrameRender
+from unmix_plugin.viewer.rendering.pictures import FrameRender
 
 
 @pytest.fixture

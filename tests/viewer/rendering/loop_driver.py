@@ -2,11 +2,9 @@
 
 from contextlib import contextmanager
 
-from unmix_plugin.viewer.rendering.frames import num_channels
-from unmix_plugin.viewer.rendering.pacing import Speedometer
-from unmix_plugin.viewer.rendering.picture_maker import PictureMaker
+from unmix_plugin.viewer.rendering.pictures import PictureMaker, Speedometer, num_channels
 from unmix_plugin.viewer.rendering.render_loop import RenderLoop
-from unmix_plugin.viewer.rendering.scene_aids import SceneAids
+from unmix_plugin.viewer.rendering.scene import SceneAids
 
 LARGEST = 64
 

@@ -11,8 +11,8 @@ from tests.viewer.view_factory import ring
 from unmix_plugin.editing import Gloss, Light, Recipe, Remove, Rename, Retint, Scale, Swap, sample_seen
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.viewer.rendering import edits
-from unmix_plugin.viewer.rendering.edits import Edit
+from unmix_plugin.viewer.rendering import scene as edits
+from unmix_plugin.viewer.rendering.scene import Edit
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from torch.testing import assert_close
 from tests.viewer.view_factory import make_frame, make_source
 from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.viewer.rendering.frames import FrameRender, num_channels
+from unmix_plugin.viewer.rendering.pictures import FrameRender, num_channels
 from unmix_plugin.viewer.view_cameras import camera_of, pose_of
 
 

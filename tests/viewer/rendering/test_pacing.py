@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unmix_plugin.viewer.rendering.pacing import (
+from unmix_plugin.viewer.rendering.pictures import (
     BLOCK_S,
     FEWEST_PIXELS,
     LONGEST_MOVING_S,

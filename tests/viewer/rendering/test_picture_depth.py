@@ -4,7 +4,7 @@ import numpy as np
 from torch.testing import assert_close
 
 from tests.viewer.view_factory import make_frame
-from unmix_plugin.viewer.rendering.picture_depth import FAR, picture_depth
+from unmix_plugin.viewer.rendering.pictures import FAR, picture_depth
 from unmix_plugin.viewer.view_cameras import camera_of, pose_of
 
 

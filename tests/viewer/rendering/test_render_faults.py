@@ -6,10 +6,9 @@ from tests.viewer.rendering.loop_driver import finest, finish
 from tests.viewer.view_factory import Screen, some_pose
 from unmix_plugin.editing import Recipe, Scale
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.viewer.layers.layer_settings import LayerSettings
-from unmix_plugin.viewer.rendering.edits import Edit
-from unmix_plugin.viewer.rendering.frames import FrameRender
-from unmix_plugin.viewer.rendering.view import Capture
+from unmix_plugin.viewer.layers.painting import LayerSettings
+from unmix_plugin.viewer.rendering.pictures import Capture, FrameRender
+from unmix_plugin.viewer.rendering.scene import Edit
 from unmix_plugin.viewer.view_cameras import camera_of
 
 

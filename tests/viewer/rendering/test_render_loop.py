@@ -12,12 +12,9 @@ import torch
 from tests.viewer.rendering.loop_driver import LARGEST, finest, finish, make_loop
 from tests.viewer.view_factory import Screen, some_pose
 from unmix_plugin.editing import Light, Recipe, Remove, Scale
-from unmix_plugin.viewer.layers.layer_settings import LayerSettings
-from unmix_plugin.viewer.rendering.edits import Edit
-from unmix_plugin.viewer.rendering.frames import FrameRender, num_channels
-from unmix_plugin.viewer.rendering.picture_maker import PictureMaker
-from unmix_plugin.viewer.rendering.scene_aids import SceneAids
-from unmix_plugin.viewer.rendering.view import Capture
+from unmix_plugin.viewer.layers.painting import LayerSettings
+from unmix_plugin.viewer.rendering.pictures import Capture, FrameRender, PictureMaker, num_channels
+from unmix_plugin.viewer.rendering.scene import Edit, SceneAids
 from unmix_plugin.viewer.view_cameras import camera_of
 
 
@@ -205,7 +202,7 @@ def test_more_rays_a_pixel_are_cast_for_the_finest_picture_only(loop, screen, mo
 
 
 def test_a_picture_never_takes_more_memory_than_is_set_aside(source, monkeypatch):
-    monkeypatch.setattr("unmix_plugin.viewer.rendering.picture_maker.LARGEST_FRAME_BYTES", 40_000)
+    monkeypatch.setattr("unmix_plugin.viewer.rendering.pictures.LARGEST_FRAME_BYTES", 40_000)
     loop, screen = make_loop(source), Screen()
     screen.view.largest_height = 2048
     loop.add(screen.view)

@@ -12,7 +12,7 @@ from unmix_plugin.trained.material_view import MaterialView
 
 
 def test_while_training_runs_pictures_follow_it(tmp_path, monkeypatch):
-    monkeypatch.setattr("unmix_plugin.viewer.rendering.picture_maker.REFRESH_S", 0.05)
+    monkeypatch.setattr("unmix_plugin.viewer.rendering.pictures.REFRESH_S", 0.05)
     control, model = TrainingControl(), make_model()
     source = source_of_model(model, tmp_path, control)
     with running_loop(source) as loop, control.running():

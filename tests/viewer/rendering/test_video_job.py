@@ -10,10 +10,10 @@ import tyro
 from unmix_plugin.commands.render import RenderOptions
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.trained.relighting import LightChoice
-from unmix_plugin.viewer.layers.layer_settings import LayerSettings
 from unmix_plugin.viewer.layers.layers import LAYERS
-from unmix_plugin.viewer.rendering import video_job
-from unmix_plugin.viewer.rendering.video_job import VideoJob, VideoQueue, output_of, render_argv
+from unmix_plugin.viewer.layers.painting import LayerSettings
+from unmix_plugin.viewer.rendering import captures as video_job
+from unmix_plugin.viewer.rendering.captures import VideoJob, VideoQueue, output_of, render_argv
 
 
 @pytest.mark.parametrize("layer", [name for name in LAYERS if name != "error"])

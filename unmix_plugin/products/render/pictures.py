@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, Float64, UInt8
 
 from unmix_plugin.engine.outputs import Output
-from unmix_plugin.figures.picture_grid import (
+from unmix_plugin.figures.pictures import (
     NEUTRAL,
     ColourScale,
     over_neutral,

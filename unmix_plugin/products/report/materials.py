@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float64
 
-from unmix_plugin.figures.line_chart import ChartLine, LineChart
-from unmix_plugin.figures.plotting import css_colour
+from unmix_plugin.figures.plotting import ChartLine, LineChart, css_colour
 from unmix_plugin.spectral.library.material_library import MaterialLibrary
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.metrics import match_endmembers

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from unmix_plugin.figures.line_chart import LineChart, draw_chart
-from unmix_plugin.figures.plotting import css_colour
+from unmix_plugin.figures.plotting import LineChart, css_colour, draw_chart
 
 _LARGEST_SIDE_PX = 640
 """Larger pictures are shrunk, as a page would show them."""

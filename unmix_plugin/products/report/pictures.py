@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unmix_plugin.figures.line_chart import ChartLine, LineChart
-from unmix_plugin.figures.picture_grid import NEUTRAL, ColourScale, paint
-from unmix_plugin.figures.plotting import RIGHT, WRONG, Colour
+from unmix_plugin.figures.pictures import NEUTRAL, ColourScale, paint
+from unmix_plugin.figures.plotting import RIGHT, WRONG, ChartLine, Colour, LineChart
 from unmix_plugin.products.evaluation_pictures import MaterialLook, material_look
 from unmix_plugin.products.report.views import ReportViews, ShownView, evenly
 from unmix_plugin.products.segmentation import paint_ids

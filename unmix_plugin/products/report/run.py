@@ -15,7 +15,7 @@ import numpy as np
 
 from unmix_plugin import __version__
 from unmix_plugin.engine.runs.config_json import config_to_json
-from unmix_plugin.figures.line_chart import ChartLine, LineChart
+from unmix_plugin.figures.plotting import ChartLine, LineChart
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.evaluation import DEFINITIONS
 from unmix_plugin.trained.open_run import LoadedRun

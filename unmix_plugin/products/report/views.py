@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from unmix_plugin.figures.picture_grid import ColourScale, over_neutral, paint
+from unmix_plugin.figures.pictures import ColourScale, over_neutral, paint
 from unmix_plugin.products.abundances import SHARE_SCALE
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.evaluation import Evaluation, ViewTruth

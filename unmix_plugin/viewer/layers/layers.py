@@ -1,4 +1,21 @@
-"""What can be shown: pure functions from a rendered view to a picture and its legend.
+"""Some rays through the whole scene that stay the same while the camera moves: colour scales and principal axes are
+taken from them, so that colours mean the same from everywhere.
+
+Notation: `N` reference rays that end on something, `B` bands.
+
+What layers need to know of the run beside the view itself.
+
+One thing that can be shown of a rendered view.
+
+Layers that follow from the outputs that a scene names: each is painted by its kind.
+
+Notation: `H x W` pixels; pictures are sRGB in [0, 1].
+
+The layer of a spectral index: what is seen as one number a pixel, of its reflectance.
+
+Notation: pictures are (H, W, 3) sRGB in [0, 1]; `N` reference rays.
+
+What can be shown: pure functions from a rendered view to a picture and its legend.
 
 Titles, kinds and ranges are those of the registry of outputs; here is how materials are painted.
 
@@ -8,37 +25,323 @@ black.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.space import SceneBox
+from unmix_plugin.engine.outputs import Output, OutputKind
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.conversion import band_composite_matrix, describe_colour, rgb_matrix
+from unmix_plugin.spectral.colour.conversion import (
+    band_composite_matrix,
+    describe_colour,
+    rgb_matrix,
+    srgb_to_linear,
+)
+from unmix_plugin.spectral.maps.indices import SpectralIndex, parse_index
+from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials
 from unmix_plugin.spectral.segmentation import NOTHING_ID
+from unmix_plugin.spectral.subspace import PcaColours
 from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.trained.outputs.families import FAMILIES
 from unmix_plugin.trained.outputs.registry import OUTPUTS
-from unmix_plugin.trained.protocol import RenderableScene
+from unmix_plugin.trained.protocol import RenderableScene, RenderedView
+from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.viewer.layers.index_layer import paint_index
-from unmix_plugin.viewer.layers.layer import Layer, Painter
-from unmix_plugin.viewer.layers.layer_aids import LayerAids
-from unmix_plugin.viewer.layers.layer_settings import LayerSettings
-from unmix_plugin.viewer.layers.output_layers import PAINTED_KINDS, layer_of
 from unmix_plugin.viewer.layers.painting import (
     ColourMapLegend,
+    LayerSettings,
     Legend,
     Picture,
     SwatchLegend,
     TextLegend,
+    colour_table,
     over_background,
     paint_values,
     tone_mapped,
 )
 
+_NUM_CAMERAS = 6
+_NUM_RAYS = 6000
 
-def _paint_colour(diffuse: bool, specular: bool) -> Painter:
+
+@dataclass(frozen=True)
+class _Reference:
+    """Coefficients of the reference rays."""
+
+    coefficients: Coefficients
+    """(N, ...)."""
+    points: Float[Tensor, "N 3"]
+    """Where the rays end, model space."""
+
+    def spectra(self, materials: Materials) -> Float[Tensor, "N B"]:
+        """What the rays show with the given materials, as if each ended fully on what it ended on."""
+        return materials.spectra(self.coefficients) / self.coefficients.accumulation[:, None]
+
+    def range_of(self, values: Float[Tensor, "N"]) -> tuple[float, float]:
+        """From 0, or the 1st percentile of values that may be negative, to the 99th percentile."""
+        return _percentile_range(values, low_at_most=0.0)
+
+
+def _percentile_range(values: Float[Tensor, "N"], low_at_most: float = math.inf) -> tuple[float, float]:
+    """From the 1st percentile, or `low_at_most` if that is less, to the 99th; never empty."""
+    if len(values) == 0:
+        return (0.0, 1.0)
+    low, high = torch.quantile(values.float(), values.new_tensor([0.01, 0.99]).float()).tolist()
+    low = min(low, low_at_most)
+    return (low, high if high > low + 1e-6 else low + 1.0)
+
+
+@torch.no_grad()
+def render_reference(scene: TrainedScene, cameras: Cameras) -> _Reference:
+    """Reference rays through some of the cameras, spread over all."""
+    step = max(1, len(cameras) // _NUM_CAMERAS)
+    chosen = list(range(0, len(cameras), step))[:_NUM_CAMERAS]
+    cameras = cameras.one_size()
+    aspect = cameras.width / cameras.height
+    height = max(1, min(cameras.height, int((_NUM_RAYS / len(chosen) / aspect) ** 0.5)))
+    parts, points = [], []
+    for index in chosen:
+        camera = cameras[index].resized(max(1, round(aspect * height)), height)
+        seen = scene.look(camera, subpixels=1).coefficients.flatten()
+        rays = camera.to(scene.device).image_rays(0)
+        ends = rays.origins + seen.ray_distance[:, None] * rays.directions
+        is_seen = seen.is_occupied
+        parts.append(seen.map(lambda packed, chosen=is_seen: packed[chosen]))
+        points.append(ends[is_seen])
+    return _Reference(Coefficients.concatenate(parts), torch.cat(points))
+
+
+_MOST_REMEMBERED = 32
+_ValueT = TypeVar("_ValueT")
+
+_ErrorOf = Callable[[MaterialView], tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"], str]]
+"""A view's error against the nearest training view, where it is known, and that view's name."""
+
+
+@dataclass(frozen=True)
+class LayerAids:
+    """What layers need to know of the run."""
+
+    reference: _Reference
+    scene_box: SceneBox
+    error_of: _ErrorOf | None = None
+    why_no_error: str = "the scene is not at hand"
+    _kept: dict[tuple[str, bytes], Any] = field(default_factory=dict, repr=False, compare=False)
+
+    def colours_of(self, materials: Materials) -> Float[Tensor, "K 3"]:
+        """sRGB colours that stand for the materials, as in all pictures of a run."""
+        return self._remembered(
+            "colours",
+            materials,
+            lambda: torch.as_tensor(endmember_colours(materials)).to(materials.endmembers),
+        )
+
+    def pca_of(self, materials: Materials) -> PcaColours:
+        """Principal components of what the reference rays show with the materials."""
+        return self._remembered("pca", materials, lambda: PcaColours.fit(self.reference.spectra(materials)))
+
+    def depth_range(self, frame: MaterialView) -> tuple[float, float]:
+        """Distances between which the scene box lies, world units."""
+        aabb, scale = self.scene_box.aabb.cpu(), frame.scene.frame.scale
+        middle, radius = aabb.mean(dim=0), float((aabb[1] - aabb[0]).norm()) / 2
+        distance = float((frame.camera.camera_to_world[0, :, 3].cpu() - middle).norm())
+        return (max(0.0, distance - radius) / scale, (distance + radius) / scale)
+
+    def _remembered(self, what: str, materials: Materials, make: Callable[[], _ValueT]) -> _ValueT:
+        """What `make` gives, kept for the materials that clients look at."""
+        spectra = torch.cat([materials.endmembers, materials.specular_spectra])
+        key = (what, spectra.cpu().numpy().tobytes())
+        found = self._kept.get(key)  # looked up once: another thread may clear what is kept at any moment
+        if found is None:
+            if len(self._kept) >= _MOST_REMEMBERED:
+                self._kept.clear()
+            found = self._kept[key] = make()
+        return found
+
+
+_Painter = Callable[[Any, LayerSettings, Any], tuple[Picture, Legend]]
+"""From a rendered view, of the kind of scene that has the layer, and what layers need of the run."""
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A name, what users read, and the function that paints it."""
+
+    name: str
+    """As in outputs of renders, where there is such an output."""
+    title: str
+    """What users read."""
+    paint: _Painter
+    controls: frozenset[str]
+    """Which of `wavelength`, `false-colour`, `endmember`, `index`, `tone`, `scale` apply."""
+    is_labels: bool = False
+    """Whether each colour stands for something of its own, so that pictures must not be compressed with loss."""
+
+
+def layer_named(name: str, layers: Mapping[str, Layer]) -> Layer:
+    """A layer by its name.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    if name not in layers:
+        raise ConfigError(f"there is no layer named {name[:40]!r}; known: {', '.join(layers)}")
+    return layers[name]
+
+
+_Paint = Callable[[Tensor, RenderedView, LayerSettings, Output], tuple[Picture, Legend]]
+
+
+def _layer_of(output: Output) -> Layer:
+    """The layer of an output of a kind that can be painted."""
+    paint, controls = _PAINTERS[output.kind]
+
+    def paint_output(
+        frame: RenderedView, settings: LayerSettings, _: LayerAids | None
+    ) -> tuple[Picture, Legend]:
+        return paint(frame[output.name], frame, settings, output)
+
+    return Layer(output.name, output.title, paint_output, controls, output.kind == "labels")
+
+
+def _paint_srgb(
+    values: Tensor, frame: RenderedView, settings: LayerSettings, output: Output
+) -> tuple[Picture, Legend]:
+    return _paint_linear(srgb_to_linear(values.clamp(0, 1)), frame, settings, output)
+
+
+def _paint_linear(
+    values: Tensor, frame: RenderedView, settings: LayerSettings, output: Output
+) -> tuple[Picture, Legend]:
+    return tone_mapped(values, frame.coverage, settings), TextLegend(output.what)
+
+
+def _paint_picture(
+    values: Tensor, frame: RenderedView, settings: LayerSettings, output: Output
+) -> tuple[Picture, Legend]:
+    return over_background(values.clamp(0, 1), frame.opacity, settings), TextLegend(output.what)
+
+
+def _paint_vectors(
+    values: Tensor, frame: RenderedView, settings: LayerSettings, output: Output
+) -> tuple[Picture, Legend]:
+    legend = TextLegend(f"{output.what}; red, green, blue: x, y, z from -1 to 1")
+    return over_background(((values + 1) / 2).clamp(0, 1), frame.opacity, settings), legend
+
+
+def _paint_map(
+    values: Tensor, frame: RenderedView, settings: LayerSettings, output: Output
+) -> tuple[Picture, Legend]:
+    is_known = values.isfinite()
+    seen = values[is_known & (frame.opacity > OCCUPIED_ACCUMULATION)]
+    scale = settings.value_range or output.value_range or _percentile_range(seen)
+    picture = paint_values(values, scale, settings.colour_map)
+    legend = ColourMapLegend(settings.colour_map, *scale, output.what)
+    # Opacity itself is shown everywhere, also where there is little of it.
+    opacity = is_known.to(picture) if output.name == "accumulation" else frame.opacity * is_known
+    return over_background(picture, opacity, settings), legend
+
+
+def _paint_labels(
+    values: Tensor, frame: RenderedView, settings: LayerSettings, output: Output
+) -> tuple[Picture, Legend]:
+    palette = _palette().to(frame.opacity)
+    is_something = (values != NOTHING_ID).to(palette)
+    return over_background(palette[values.long()], is_something, settings), TextLegend(output.what)
+
+
+def _paint_shares(
+    values: Tensor, frame: RenderedView, settings: LayerSettings, output: Output
+) -> tuple[Picture, Legend]:
+    """The colours that labels have, mixed by the shares."""
+    palette = _palette()[: values.shape[-1]].to(values)
+    shares = values / values.sum(dim=-1, keepdim=True).clamp(min=1e-6)
+    names = (f"{output.title} {number}" for number in range(len(palette)))
+    legend = SwatchLegend(tuple(zip(names, map(tuple, palette.tolist()), strict=True)))
+    return over_background(shares @ palette, frame.opacity, settings), legend
+
+
+def _palette() -> Tensor:
+    """A colour for each id, (256, 3); those of neighbours are far apart."""
+    return colour_table("turbo")[torch.arange(256) * 389 % 1024]
+
+
+_PAINTERS: dict[OutputKind, tuple[_Paint, frozenset[str]]] = {
+    "srgb": (_paint_srgb, frozenset({"tone"})),
+    "linear": (_paint_linear, frozenset({"tone"})),
+    "picture": (_paint_picture, frozenset()),
+    "grey": (_paint_map, frozenset({"scale"})),
+    "map": (_paint_map, frozenset({"scale"})),
+    "labels": (_paint_labels, frozenset()),
+    "shares": (_paint_shares, frozenset()),
+    "vectors": (_paint_vectors, frozenset()),
+}
+
+_PAINTED_KINDS = frozenset(_PAINTERS)
+"""Kinds of outputs that can be painted without knowing more of them."""
+
+
+_CHUNK = 1 << 16
+"""Pixels whose spectra are held at once."""
+
+_LONGEST_LABEL = 120
+
+
+def _paint_index(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
+    """The index that is chosen, over the background where it is undefined or hardly anything is seen.
+
+    Raises:
+        ConfigError: none is chosen, an unknown one, or a formula that can't be read.
+        SpectrumError: the bands do not cover what it needs.
+    """
+    materials = frame.materials
+    index = _chosen_index(settings, materials.bands)
+    values = _index_values(index, frame)
+    scale = (
+        settings.value_range
+        or index.usual_range
+        or _seen_range(index, aids.reference.coefficients, materials)
+    )
+    what = index.what if len(index.what) <= _LONGEST_LABEL else f"{index.what[:_LONGEST_LABEL]}..."
+    label = what if materials.light is not None else f"{what}; of radiance: light unknown"
+    picture = paint_values(values, scale, settings.colour_map)
+    opacity = frame.coefficients.accumulation * values.isfinite()
+    return over_background(picture, opacity, settings), ColourMapLegend(settings.colour_map, *scale, label)
+
+
+def _chosen_index(settings: LayerSettings, bands: Bands) -> SpectralIndex:
+    if not settings.index:
+        edges = bands.edges_nm
+        raise ConfigError(
+            f"no spectral index is chosen: type a formula of the wavelengths from {edges[0]:g} to {edges[-1]:g} nm "
+            f"that the bands cover, such as r{float(bands.centers_nm[-1]):g}/r{float(bands.centers_nm[0]):g}"
+        )
+    return parse_index(settings.index, bands)
+
+
+def _index_values(index: SpectralIndex, view: MaterialView) -> Float[Tensor, "H W"]:
+    """The index of every pixel, chunk by chunk: the spectra of a whole picture may not fit into memory."""
+    rows = view.coefficients.flatten()
+    chunks = [rows.map(lambda _, part=part: part) for part in rows.packed.split(_CHUNK)]
+    values = torch.cat([index(view.materials.reflectance(chunk)) for chunk in chunks])
+    return values.unflatten(0, view.opacity.shape)
+
+
+def _seen_range(index: SpectralIndex, reference: Coefficients, materials: Materials) -> tuple[float, float]:
+    """From the 1st to the 99th percentile of the index of the reference rays."""
+    values = index(materials.reflectance(reference))
+    return _percentile_range(values[values.isfinite()])
+
+
+def _paint_colour(diffuse: bool, specular: bool) -> _Painter:
     def paint(frame: MaterialView, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
         bands = frame.materials.bands
         light = frame.materials.through(
@@ -155,7 +458,7 @@ def covered(bands: Bands, wavelength_nm: float) -> float:
     return min(max(low, wavelength_nm), high)
 
 
-def _own(name: str, paint: Painter, *controls: str) -> Layer:
+def _own(name: str, paint: _Painter, *controls: str) -> Layer:
     """A layer with a painter of its own; the rest is that of the output, or the family of outputs, of its name."""
     output = OUTPUTS[name] if name in OUTPUTS else FAMILIES[name]
     return Layer(name, output.title, paint, frozenset(controls), output.kind == "labels")
@@ -167,16 +470,16 @@ LAYERS: dict[str, Layer] = {
         _own("rgb", _paint_colour(True, True), "tone"),
         _own("false-colour", _paint_false_colour, "tone", "false-colour"),
         _own("band", _paint_band, "scale", "wavelength"),
-        _own("index", paint_index, "scale", "index"),
+        _own("index", _paint_index, "scale", "index"),
         Layer("abundance", "abundance of one endmember", _paint_abundance, frozenset({"scale", "endmember"})),
         _own("abundances", _paint_abundances),
         _own("segmentation", _paint_segmentation),
-        layer_of(OUTPUTS["confidence"]),
+        _layer_of(OUTPUTS["confidence"]),
         _own("diffuse", _paint_colour(True, False), "tone"),
         _own("specular", _paint_colour(False, True), "tone"),
         _own("pca", _paint_pca),
         _own("depth", _paint_depth, "scale"),
-        layer_of(OUTPUTS["accumulation"]),
+        _layer_of(OUTPUTS["accumulation"]),
         Layer("error", "error against a training view", _paint_error, frozenset({"scale"})),
     )
 }
@@ -186,6 +489,6 @@ LAYERS: dict[str, Layer] = {
 def layers_of(scene: RenderableScene) -> dict[str, Layer]:
     """All that can be shown of a scene, by name: what its materials allow, and its outputs that can be painted."""
     if not isinstance(scene, TrainedScene):
-        return {output.name: layer_of(output) for output in scene.outputs if output.kind in PAINTED_KINDS}
+        return {output.name: _layer_of(output) for output in scene.outputs if output.kind in _PAINTED_KINDS}
     others = (output for output in scene.outputs if output.kind in ("map", "vectors"))
-    return {**LAYERS, **{output.name: layer_of(output) for output in others if output.name not in LAYERS}}
+    return {**LAYERS, **{output.name: _layer_of(output) for output in others if output.name not in LAYERS}}

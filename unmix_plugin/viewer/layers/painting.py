@@ -1,22 +1,142 @@
-"""Values and light as pictures over a background, and what legends say.
+"""How values and light become pictures, as a user has chosen to see them, and what the colours mean.
 
-Notation: pictures are (H, W, 3) sRGB in [0, 1].
+Notation: pictures are (H, W, 3) sRGB in [0, 1]; `light` is linear RGB in sRGB primaries, 0 and up, 1 = the
+sensor's full
+scale before exposure.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TypeAlias
+from html import escape
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from unmix_plugin.spectral.colour.conversion import linear_to_srgb, srgb_to_linear
-from unmix_plugin.viewer.layers.layer_settings import BACKGROUNDS, COLOUR_MAPS, LayerSettings
-from unmix_plugin.viewer.layers.view_transforms import to_display
+from unmix_plugin.figures.plotting import css_colour
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.colour.conversion import agx, linear_to_srgb, srgb_to_linear
+from unmix_plugin.spectral.maps.indices import available_indices
+from unmix_plugin.viewer import page as html
+from unmix_plugin.viewer.page import choice, number, text
+
+BACKGROUNDS = {"grey": 0.92, "white": 1.0, "black": 0.0}
+"""sRGB value of what shows nothing; grey is that of the figures."""
+
+COLOUR_MAPS = ("viridis", "magma", "inferno", "cividis", "turbo", "coolwarm", "gray")
+"""As matplotlib names them."""
+
+EXPOSURE_BOUNDS, GAMMA_BOUNDS = (-8.0, 8.0), (0.2, 5.0)
+_WAVELENGTH_BOUNDS = (1.0, 1e5)
+_VALUE_BOUNDS = (-1e6, 1e6)
+_LONGEST_INDEX = 1000
+"""Letters that are kept: more than a formula may have, so that none becomes another one by being cut."""
+
+
+@dataclass(frozen=True)
+class LayerSettings:
+    """What is shown and how; every value lies within bounds."""
+
+    layer: str = "rgb"
+    wavelength_nm: float = 550.0
+    """Shown by the layer `band`."""
+    false_colour_nm: tuple[float, float, float] = (650.0, 550.0, 450.0)
+    """Shown as red, green, blue by the layer `false-colour`."""
+    endmember: int = 0
+    """Shown by the layer `abundance`."""
+    index: str = ""
+    """Shown by the layer `index`: a name or a formula, as the output `index:` takes it; empty where none is chosen."""
+    colour_map: str = "viridis"
+    value_range: tuple[float, float] | None = None
+    """Values at the ends of the colour map; None for the layer's own."""
+    exposure_ev: float = 0.0
+    """Stops."""
+    gamma: float = 1.0
+    view_transform: _ViewTransform = "srgb"
+    background: str = "grey"
+    """Where nothing is seen; one of `BACKGROUNDS`."""
+
+    def changed(self, name: str, value: Any) -> LayerSettings:
+        """With one setting as a browser sent it, brought within its bounds; what makes no sense changes nothing."""
+        return replace(self, **{name: _CHECKS[name](value, getattr(self, name))})
+
+
+def first_settings(bands: Bands) -> LayerSettings:
+    """What a page shows at first; false colour from the middles of the long, middle and short third of the bands."""
+    centers_nm, count = bands.centers_nm.tolist(), len(bands)
+    starts = (centers_nm[5 * count // 6], centers_nm[count // 2], centers_nm[count // 6])
+    return LayerSettings(false_colour_nm=starts, index=next(iter(available_indices(bands)), ""))
+
+
+def _checked_range(value: Any, before: tuple[float, float] | None) -> tuple[float, float] | None:
+    if value is None:
+        return None
+    try:
+        low, high = (number(part, *_VALUE_BOUNDS, fallback=math.nan) for part in value)
+    except (TypeError, ValueError):
+        return before
+    return (low, high) if low < high else before
+
+
+def _checked_wavelengths(value: Any, before: tuple[float, float, float]) -> tuple[float, float, float]:
+    try:
+        red, green, blue = value
+    except (TypeError, ValueError):
+        return before
+    checked = [
+        number(one, *_WAVELENGTH_BOUNDS, fallback=old)
+        for one, old in zip((red, green, blue), before, strict=True)
+    ]
+    return (checked[0], checked[1], checked[2])
+
+
+_CHECKS: dict[str, Callable[[Any, Any], Any]] = {
+    "layer": lambda value, before: value if isinstance(value, str) and len(value) < 100 else before,
+    "wavelength_nm": lambda value, before: number(value, *_WAVELENGTH_BOUNDS, fallback=before),
+    "false_colour_nm": _checked_wavelengths,
+    "endmember": lambda value, before: int(number(value, 0, 254, fallback=before)),
+    "index": lambda value, before: (
+        " ".join(text(value).split())[:_LONGEST_INDEX] if isinstance(value, str) else before
+    ),
+    "colour_map": lambda value, before: choice(value, COLOUR_MAPS, before),
+    "value_range": _checked_range,
+    "exposure_ev": lambda value, before: number(value, *EXPOSURE_BOUNDS, fallback=before),
+    "gamma": lambda value, before: number(value, *GAMMA_BOUNDS, fallback=before),
+    "view_transform": lambda value, before: choice(value, VIEW_TRANSFORMS, before),
+    "background": lambda value, before: choice(value, BACKGROUNDS, before),
+}
+
+
+_ViewTransform = Literal["srgb", "agx"]
+VIEW_TRANSFORMS: dict[_ViewTransform, str] = {
+    "srgb": "sRGB (exact up to white)",
+    "agx": "AgX (keeps highlights)",
+}
+"""Names and what users read."""
+
+
+def to_display(
+    light: Float[Tensor, "*pixels 3"], exposure_ev: float, gamma: float, transform: _ViewTransform
+) -> Float[Tensor, "*pixels 3"]:
+    """Light as a display shows it.
+
+    Args:
+        light: Linear RGB.
+        exposure_ev: Stops: each doubles the light.
+        gamma: Applied last; above 1 lifts what is dark.
+        transform: `srgb` clips at white; `agx` compresses 16.5 stops, as film does.
+    """
+    exposed = light * 2.0**exposure_ev
+    shown = agx(exposed) if transform == "agx" else linear_to_srgb(exposed.clamp(0, 1))
+    shown = shown.clamp(0, 1)
+    return shown if math.isclose(gamma, 1.0) else shown.pow(1 / gamma)
+
 
 Picture: TypeAlias = Float[Tensor, "H W 3"]
 
@@ -88,3 +208,25 @@ def tone_mapped(
 def as_bytes(picture: Picture) -> UInt8[np.ndarray, "H W 3"]:
     """A picture as 8-bit values on the CPU."""
     return (picture * 255 + 0.5).clamp(0, 255).to(torch.uint8).cpu().numpy()
+
+
+def legend_html(shown: Legend) -> str:
+    """What the colours of a picture mean."""
+    if isinstance(shown, ColourMapLegend):
+        return _colour_bar(shown)
+    if isinstance(shown, SwatchLegend):
+        return html.swatches(shown.entries)
+    return html.paragraph(shown.text)
+
+
+def _colour_bar(shown: ColourMapLegend) -> str:
+    table_rows = colour_table(shown.colour_map)
+    chosen = np.linspace(0, len(table_rows) - 1, 17).round().astype(int)
+    stops = ",".join(css_colour(table_rows[index].tolist()) for index in chosen)
+    return (
+        f'<div style="{html.BLOCK_STYLE}"><div>{escape(shown.label)}</div>'
+        f'<div style="height:0.9em;background:linear-gradient(to right,{stops})"></div>'
+        '<div style="display:flex;justify-content:space-between">'
+        f"<span>{shown.low:.4g}</span><span>{(shown.low + shown.high) / 2:.4g}</span>"
+        f"<span>{shown.high:.4g}</span></div></div>"
+    )

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from unmix_plugin.viewer.panels.capture_panel import CapturePanel
-from unmix_plugin.viewer.panels.layer_panel import LayerPanel
-from unmix_plugin.viewer.panels.light_panel import LightPanel
-from unmix_plugin.viewer.panels.materials_panel import MaterialsPanel
-from unmix_plugin.viewer.panels.probe_panel import ProbePanel
-from unmix_plugin.viewer.panels.scene_panel import ScenePanel
-from unmix_plugin.viewer.panels.training_panel import TrainingPanel, is_training
-from unmix_plugin.viewer.panels.values_panel import ValuesPanel
-from unmix_plugin.viewer.services import Services
-from unmix_plugin.viewer.session import Panel
+from unmix_plugin.viewer.panels.capture import CapturePanel
+from unmix_plugin.viewer.panels.materials import MaterialsPanel
+from unmix_plugin.viewer.panels.probe import ProbePanel, ValuesPanel
+from unmix_plugin.viewer.panels.training import TrainingPanel, is_training
+from unmix_plugin.viewer.panels.view import LayerPanel, LightPanel, ScenePanel
+from unmix_plugin.viewer.session import Panel, Services
 
 
 def has_materials(services: Services) -> bool:

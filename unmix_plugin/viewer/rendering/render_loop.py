@@ -11,11 +11,10 @@ import time
 from collections.abc import Callable
 
 from unmix_plugin.trained.protocol import RenderedView
-from unmix_plugin.viewer.failures import failures_said
-from unmix_plugin.viewer.layers.layer_settings import LayerSettings
-from unmix_plugin.viewer.rendering.edits import Edit
-from unmix_plugin.viewer.rendering.picture_maker import RESTING_COST, PictureMaker, wants_more
-from unmix_plugin.viewer.rendering.view import Capture, View
+from unmix_plugin.viewer.layers.painting import LayerSettings
+from unmix_plugin.viewer.page import failures_said
+from unmix_plugin.viewer.rendering.pictures import RESTING_COST, Capture, PictureMaker, View, wants_more
+from unmix_plugin.viewer.rendering.scene import Edit
 from unmix_plugin.viewer.view_cameras import ViewPose
 
 _POLL_S = 0.05

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from unmix_plugin.engine.training.progress import TrainingStatus
 from unmix_plugin.engine.training.training_control import SHARE_BOUNDS
-from unmix_plugin.viewer import html
-from unmix_plugin.viewer.charts import Chart, Line
-from unmix_plugin.viewer.inputs import number
-from unmix_plugin.viewer.services import Services
-from unmix_plugin.viewer.session import Session
+from unmix_plugin.viewer import page as html
+from unmix_plugin.viewer.page import Chart, Line, number
+from unmix_plugin.viewer.session import Services, Session
 
 _LOSS_COLOUR, _PSNR_COLOUR = (0.85, 0.3, 0.1), (0.1, 0.4, 0.8)
 _TICKS_A_CHART = 4

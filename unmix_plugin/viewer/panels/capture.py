@@ -14,25 +14,29 @@ from unmix_plugin.errors import ConfigError
 from unmix_plugin.formats.files import write_file
 from unmix_plugin.trained.camera_files.camera_files import camera_file_bytes
 from unmix_plugin.trained.world_frame import world_frame
-from unmix_plugin.viewer.camera_path import (
-    FPS_BOUNDS,
-    MOST_KEY_FRAMES,
-    SECONDS_BOUNDS,
-    path_poses,
-    path_views,
-)
-from unmix_plugin.viewer.captures import (
+from unmix_plugin.viewer.page import new_file, number
+from unmix_plugin.viewer.rendering.captures import (
     SIDE_BOUNDS,
     PictureCanvas,
     PictureRequest,
     SpectraCanvas,
     StripCapture,
+    VideoJob,
     check_size,
+    output_of,
+    render_argv,
 )
-from unmix_plugin.viewer.inputs import new_file, number
-from unmix_plugin.viewer.rendering.video_job import VideoJob, output_of, render_argv
 from unmix_plugin.viewer.session import Session
-from unmix_plugin.viewer.view_cameras import ViewPose, camera_of, sized_camera
+from unmix_plugin.viewer.view_cameras import (
+    FPS_BOUNDS,
+    MOST_KEY_FRAMES,
+    SECONDS_BOUNDS,
+    ViewPose,
+    camera_of,
+    path_poses,
+    path_views,
+    sized_camera,
+)
 
 _PREVIEW_FPS = 12
 _LARGEST_DOWNLOAD = 1 << 26

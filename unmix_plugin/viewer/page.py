@@ -1,0 +1,306 @@
+"""One page in a browser: what comes from it, checked; what it is told and shown."""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+import threading
+import time
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+from unmix_plugin.errors import ConfigError, UnmixError
+from unmix_plugin.figures.plotting import css_colour
+from unmix_plugin.spectral.bands import Bands
+
+if TYPE_CHECKING:
+    import viser
+
+
+LONGEST_TEXT = 100_000
+"""Letters of a text that are looked at."""
+
+_LONGEST_NAME = 64
+_ChoiceT = TypeVar("_ChoiceT")
+
+
+def number(value: Any, low: float | int, high: float | int, fallback: float | int) -> float:
+    """A number within [low, high]; `fallback` for what is not a number or not finite.
+
+    >>> number(7, 0, 5, fallback=1), number("x", 0, 5, fallback=1), number(float("nan"), 0, 5, fallback=1)
+    (5.0, 1.0, 1.0)
+    """
+    try:
+        found = float(value)
+    except (TypeError, ValueError, OverflowError):
+        return float(fallback)
+    return min(max(found, float(low)), float(high)) if math.isfinite(found) else float(fallback)
+
+
+def choice(value: Any, known: Collection[_ChoiceT], fallback: _ChoiceT) -> _ChoiceT:
+    """The value if it is one of `known`, otherwise `fallback`."""
+    return next((one for one in known if type(one) is type(value) and one == value), fallback)
+
+
+def index_in(menu: Any) -> int:
+    """Which of a menu's options is chosen.
+
+    Raises:
+        ConfigError: none of them.
+    """
+    options = tuple(menu.options)
+    if menu.value not in options:
+        raise ConfigError(f"there is no {menu.label} {str(menu.value)[:40]!r}")
+    return options.index(menu.value)
+
+
+def text(value: Any) -> str:
+    """What was typed, cut to `LONGEST_TEXT`; empty for what is not text."""
+    return value[:LONGEST_TEXT] if isinstance(value, str) else ""
+
+
+def new_file(folder: Path, name: Any, suffix: str, fallback: str) -> Path:
+    """A path directly in `folder` that no file has, named as asked as far as that is safe.
+
+    Args:
+        folder: Where; it need not exist.
+        name: What was typed. Anything but letters, digits, `_`, `-` and inner dots becomes `_`.
+        suffix: Ending, with its dot.
+        fallback: Used where nothing is left of the name.
+    Raises:
+        ConfigError: there are too many files of that name.
+    """
+    cleaned = re.sub(r"[^A-Za-z0-9_.-]", "_", text(name)[:_LONGEST_NAME].strip()).strip("._")
+    stem = cleaned.removesuffix(suffix).strip("._") or fallback
+    for count in range(1, 10_000):
+        path = folder / f"{stem if count == 1 else f'{stem}-{count}'}{suffix}"
+        if not path.exists():
+            return path
+    raise ConfigError(f"too many files named {stem} in {folder}; choose another name")
+
+
+_LOG = logging.getLogger("unmix_plugin.viewer")
+
+
+@contextmanager
+def failures_said(what: str, say: Callable[[str], None]) -> Iterator[None]:
+    """Context that lets no error out.
+
+    Args:
+        what: What internal errors are reported as; they are logged with their traceback.
+        say: Shows a message to the user. Its own errors are logged.
+    """
+    try:
+        yield
+    except UnmixError as error:
+        _say(what, say, str(error))
+    except Exception as error:  # noqa: BLE001 - internal errors must not end the thread that serves everyone
+        _LOG.exception(what)
+        _say(what, say, f"{what}: {type(error).__name__}: {error}")
+
+
+def _say(what: str, say: Callable[[str], None], message: str) -> None:
+    try:
+        say(message)
+    except Exception:  # noqa: BLE001 - the page to tell has gone
+        _LOG.warning("%s, and the client could not be told: %s", what, message)
+
+
+WAIT_S = 0.4
+"""How long typing must pause."""
+
+
+class Debounced:
+    """Work that waits until its events have stopped coming."""
+
+    def __init__(self, work: Callable[[], None], clock: Callable[[], float] = time.monotonic) -> None:
+        """`work` is done once, after the last event; `clock` tells seconds."""
+        self._work, self._clock = work, clock
+        self._due_s: float | None = None
+        self._lock = threading.Lock()
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether there is something left to do."""
+        return self._due_s is not None
+
+    def note(self) -> None:
+        """An event came."""
+        with self._lock:
+            self._due_s = self._clock() + WAIT_S
+
+    def tick(self) -> None:
+        """Do the work if the last event was long enough ago; called now and then."""
+        with self._lock:
+            is_due = self._due_s is not None and self._clock() >= self._due_s
+        if is_due:
+            self.finish()
+
+    def finish(self) -> None:
+        """Do the work now if there is something left to do."""
+        with self._lock:
+            was_waiting, self._due_s = self._due_s is not None, None
+        if was_waiting:
+            self._work()
+
+
+BLOCK_STYLE = "padding:0.2em 0.8em;font-size:0.85em;line-height:1.35"
+
+
+def paragraph(text: str, is_warning: bool = False) -> str:
+    """A line of text."""
+    colour = ";color:#c92a2a" if is_warning else ""
+    return f'<div style="{BLOCK_STYLE}{colour}">{escape(text)}</div>'
+
+
+def bars(entries: Sequence[tuple[str, float, Sequence[float]]]) -> str:
+    """Names, values in [0, 1] and sRGB colours as horizontal bars."""
+    rows = []
+    for name, value, colour in entries:
+        width = 100 * min(max(value, 0.0), 1.0)
+        rows.append(
+            '<div style="display:flex;align-items:center;gap:0.5em">'
+            f'<span style="flex:0 0 8.5em;overflow:hidden;text-overflow:ellipsis">{escape(name)}</span>'
+            '<span style="flex:1;background:#8883;height:0.8em">'
+            f'<span style="display:block;height:100%;width:{width:.1f}%;background:{css_colour(colour)}"></span></span>'
+            f'<span style="flex:0 0 2.6em;text-align:right">{value:.2f}</span></div>'
+        )
+    return f'<div style="{BLOCK_STYLE}">{"".join(rows)}</div>'
+
+
+def table(rows: Sequence[tuple[str, str]]) -> str:
+    """Names and values side by side."""
+    cells = "".join(
+        f'<tr><td style="padding-right:1em;opacity:0.7">{escape(name)}</td><td>{escape(value)}</td></tr>'
+        for name, value in rows
+    )
+    return f'<div style="{BLOCK_STYLE}"><table>{cells}</table></div>'
+
+
+def swatches(entries: Sequence[tuple[str, Sequence[float]]]) -> str:
+    items = "".join(
+        '<div style="display:flex;align-items:center;gap:0.5em">'
+        f'<span style="width:0.9em;height:0.9em;background:{css_colour(colour)}"></span>{escape(name)}</div>'
+        for name, colour in entries
+    )
+    return f'<div style="{BLOCK_STYLE}">{items}</div>'
+
+
+_ASPECT = 1.5
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of a chart."""
+
+    name: str
+    values: Float[np.ndarray, " N"]
+    colour: Sequence[float]
+    """sRGB, [0, 1]."""
+    is_dashed: bool = False
+    is_thin: bool = False
+
+
+class Chart:
+    """Lines over wavelength or over anything else; hidden while it has none."""
+
+    def __init__(self, gui: viser.GuiApi, title: str, x_label: str = "wavelength (nm)") -> None:
+        self._title, self._x_label = title, x_label
+        self._handle: viser.GuiUplotHandle | None = None
+        self._gui = gui
+        self._place = gui.add_folder(title, visible=False)
+
+    def draw(self, bands: Bands, lines: Sequence[Line]) -> None:
+        """Show spectra."""
+        self.plot(bands.centers_nm, lines)
+
+    def plot(self, x: Float[np.ndarray, " N"], lines: Sequence[Line]) -> None:
+        """Show lines over any axis."""
+        if len(x) == 0 or not lines:
+            self.clear()
+            return
+        data = (
+            np.asarray(x, np.float64),
+            *(np.nan_to_num(np.asarray(line.values, np.float64)) for line in lines),
+        )
+        series: tuple[Any, ...] = ({"label": self._x_label}, *(_series(line) for line in lines))
+        if self._handle is not None and len(self._handle.series) == len(series):
+            self._handle.data, self._handle.series = data, series
+        else:
+            self._remove()
+            scales: Any = {"x": {"time": False, "auto": True}, "y": {"auto": True}}
+            with self._place:
+                self._handle = self._gui.add_uplot(data=data, series=series, scales=scales, aspect=_ASPECT)
+        self._place.visible = True
+
+    def clear(self) -> None:
+        """Show nothing."""
+        self._remove()
+        self._place.visible = False
+
+    def _remove(self) -> None:
+        if self._handle is not None:
+            self._handle.remove()
+            self._handle = None
+
+
+def _series(line: Line) -> dict[str, Any]:
+    dash = {"dash": (6, 4)} if line.is_dashed else {}
+    return {
+        "label": line.name,
+        "stroke": css_colour(line.colour),
+        "width": 1 if line.is_thin else 2.5,
+        **dash,
+    }
+
+
+_SHOWN_S = 8.0
+_LONGEST = 2000
+"""Characters of a notice."""
+
+
+class Notices:
+    """Notices to a client: warnings and notes on edits replace the ones before."""
+
+    def __init__(self, client: viser.ClientHandle) -> None:
+        self._client = client
+        self._warning: viser.NotificationHandle | None = None
+        self._warning_said = (-math.inf, "")
+        self._note: viser.NotificationHandle | None = None
+        self._notes: tuple[str, ...] = ()
+
+    def say(self, title: str, text: str) -> viser.NotificationHandle:
+        """Show a notice."""
+        return self._add(title, text, "teal")
+
+    def warn(self, text: str, title: str) -> None:
+        """Show a warning in place of the one before: a control that is dragged causes many. The same one is shown once
+        in 8 s."""
+        before, self._warning_said = self._warning_said, (time.monotonic(), text)
+        if before[1] == text and self._warning_said[0] - before[0] < _SHOWN_S:
+            return
+        if self._warning is not None:
+            self._warning.remove()
+        self._warning = self._add(title, text, "red")
+
+    def show_notes(self, notes: tuple[str, ...]) -> None:
+        """Show what is new among the notes of the edit in force, in place of those shown before."""
+        new = [note for note in notes if note not in self._notes]
+        self._notes = notes
+        if new:
+            if self._note is not None:
+                self._note.remove()
+            self._note = self.say("edited", "; ".join(new))
+
+    def _add(self, title: str, text: str, colour: Literal["teal", "red"]) -> viser.NotificationHandle:
+        return self._client.add_notification(
+            title, text[:_LONGEST], auto_close_seconds=_SHOWN_S, color=colour
+        )

@@ -1,0 +1,338 @@
+"""What a point is made of: a ray through a click, its spectrum, its abundances, what training views measured there.
+
+Notation: `B` bands, `K` endmembers.
+
+Click a point: its spectrum, what it is made of, and what training views measured there; several are compared.
+
+Click a point of a scene without endmembers: the numbers of its outputs there.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.formats.files import write_file
+from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Materials
+from unmix_plugin.trained.trained_scene import TrainedScene
+from unmix_plugin.viewer import page as html
+from unmix_plugin.viewer.page import Chart, Line, new_file, number
+from unmix_plugin.viewer.panels.materials import likeness_rows
+from unmix_plugin.viewer.rendering.pictures import PictureMaker
+from unmix_plugin.viewer.rendering.scene import Edit, MeasuredViews
+from unmix_plugin.viewer.session import Session
+from unmix_plugin.viewer.view_cameras import camera_of
+
+if TYPE_CHECKING:
+    import viser
+
+
+@dataclass(frozen=True)
+class ProbedPoint:
+    """What one point is made of."""
+
+    number: int
+    """From 1."""
+    point: tuple[float, float, float]
+    """Model space."""
+    materials: Materials
+    """As they are shown."""
+    predicted: Float64[np.ndarray, " B"]
+    """Radiance, as rendered."""
+    abundances: Float64[np.ndarray, " K"]
+    """Shares, sum 1."""
+    contributions: Float64[np.ndarray, "K B"]
+    """Radiance that each endmember adds, as bright as it is there."""
+    measured: Float64[np.ndarray, " B"] | None = None
+    """Radiance in a training view that sees the point."""
+    measured_in: str = ""
+    """Name of that view."""
+
+    @property
+    def position(self) -> Float[Tensor, "3"]:
+        """The point as a tensor."""
+        return torch.tensor(self.point)
+
+    @property
+    def material(self) -> int:
+        """The endmember of the largest share."""
+        return int(self.abundances.argmax())
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return self.materials.names[self.material]
+
+
+def probe_through(
+    scene: TrainedScene, camera: Cameras, column: float, row: float, number: int
+) -> ProbedPoint:
+    """What is seen through a point of a picture.
+
+    Args:
+        scene: With the materials as they are shown.
+        camera: One camera.
+        column, row: In pixels.
+        number: Of the probe.
+    Raises:
+        ConfigError: nothing is there.
+    """
+    last_column, last_row = camera.width - 1, camera.height - 1
+    found = scene.probe(camera, min(max(int(column), 0), last_column), min(max(int(row), 0), last_row))
+    if found.opacity < OCCUPIED_ACCUMULATION or found.position is None:
+        raise ConfigError("nothing is there to probe: less than half of the light ends on something")
+    x, y, z = found.position.tolist()
+    endmembers = scene.materials.endmembers.double().cpu().numpy()
+    return ProbedPoint(
+        number,
+        (x, y, z),
+        scene.materials,
+        found.values["predicted"],
+        found.values["abundances"],
+        found.values["scaled_abundances"][:, None] * endmembers,
+    )
+
+
+def take_probe(
+    maker: PictureMaker,
+    edit: Edit,
+    camera: Cameras,
+    place: tuple[float, float],
+    number: int,
+    measured: MeasuredViews | None = None,
+) -> ProbedPoint:
+    """What is seen through a point of a camera's picture, and what a training view measured there.
+
+    Args:
+        maker: Has the scene.
+        edit: What is changed.
+        camera: One camera.
+        place: Column and row, pixels.
+        number: Of the probe.
+        measured: The training views, if they are at hand.
+    Raises:
+        UnmixError: nothing is there, or the edit does not fit the run.
+    """
+    with maker.edit_turn(edit) as (scene, shown):
+        taken = probe_through(shown, camera, *place, number)
+        found = measured and measured.measurement(taken.position, camera, shown.light_power, scene)
+    if found is None:
+        return taken
+    view = f"{found.view}, before the edits" if edit.recipe.operations else found.view
+    return replace(taken, measured=found.spectrum.double().numpy(), measured_in=view)
+
+
+def spectra_csv(probes: Sequence[ProbedPoint]) -> bytes:
+    """One row a band: wavelength, and for each probe what was predicted and, where known, measured."""
+    header, columns = ["wavelength"], [probes[0].materials.bands.centers_nm]
+    for one in probes:
+        header.append(f"probe_{one.number}_predicted")
+        columns.append(one.predicted)
+        if one.measured is not None:
+            header.append(f"probe_{one.number}_measured")
+            columns.append(one.measured)
+    return _csv(header, [[f"{value:.9g}" for value in row] for row in np.stack(columns, axis=1)])
+
+
+def abundances_csv(probes: Sequence[ProbedPoint]) -> bytes:
+    """One row a probe: number, position in model space, material, the training view measured in, abundances."""
+    header = ["probe", "x", "y", "z", "material", "measured_in", *probes[0].materials.names]
+    rows = [
+        [
+            str(one.number),
+            *(f"{value:.9g}" for value in one.point),
+            one.name,
+            one.measured_in,
+            *(f"{value:.6g}" for value in one.abundances),
+        ]
+        for one in probes
+    ]
+    return _csv(header, rows)
+
+
+def _csv(header: Sequence[str], rows: Sequence[Sequence[str]]) -> bytes:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerows([header, *rows])
+    return text.getvalue().encode()
+
+
+MOST_PROBES = 12
+"""Probes that a client keeps; the first goes when another comes."""
+
+_COLOURS = (
+    (0.9, 0.1, 0.3),
+    (0.1, 0.45, 0.9),
+    (0.1, 0.6, 0.2),
+    (0.85, 0.5, 0.0),
+    (0.5, 0.2, 0.8),
+    (0.0, 0.6, 0.6),
+)
+_SHOWN_SHARE = 0.08
+"""Endmembers of at least this share: what they add to a probe's spectrum is drawn beside it."""
+
+_PROBED_ROWS = 512
+_PROBE_RADIUS = 0.015
+_NONE = "none yet"
+
+
+class ProbePanel:
+    """Keeps the probes of a client."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._probes: list[ProbedPoint] = []
+        self._markers: dict[int, viser.IcosphereHandle] = {}
+        self._taken = 0
+        gui = session.client.gui
+        self._is_on = gui.add_checkbox("probe where I click", True)
+        self._chosen = gui.add_dropdown("probe", _no_probes())
+        self._chosen.on_update(session.guarded(self._show_chosen))
+        self._text = gui.add_html(html.paragraph("Click a point of the picture."))
+        self._bars = gui.add_html("")
+        self._chart = Chart(gui, "spectrum")
+        self._comparison = Chart(gui, "all probes")
+        gui.add_button("save as CSV").on_click(session.guarded(self._save))
+        gui.add_button("forget all").on_click(session.guarded(self._forget))
+        session.client.scene.on_click()(self._clicked)
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        x, y = event.screen_pos
+        self._session.guarded(lambda: self._take(x, y))()
+
+    def _take(self, x: Any, y: Any) -> None:
+        """Probe a point of the canvas, given in parts of its width and height."""
+        if self._is_on.value is not True:
+            return
+        column, row = (number(value, 0.0, 1.0, fallback=0.5) for value in (x, y))
+        session, services = self._session, self._session.services
+        camera = camera_of(session.pose(), _PROBED_ROWS)
+        place = (column * camera.width, row * camera.height)
+        taken = take_probe(
+            services.maker, session.view.edit, camera, place, self._taken + 1, services.aids.measured
+        )
+        self._taken += 1
+        self._probes.append(taken)
+        while len(self._probes) > MOST_PROBES:
+            self._drop(self._probes[0])
+        self._markers[taken.number] = session.client.scene.add_icosphere(
+            f"/probes/{taken.number}", _PROBE_RADIUS, color=_marker(taken), position=taken.point
+        )
+        session.show_objects("probe", True)
+        self._chosen.options = tuple(_label(one) for one in self._probes)
+        self._chosen.value = _label(taken)  # which shows it
+
+    def _show_chosen(self) -> None:
+        chosen = next((one for one in self._probes if _label(one) == self._chosen.value), None)
+        if chosen is not None:
+            self._show(chosen)
+
+    def _show(self, shown: ProbedPoint) -> None:
+        rows = [
+            ("material", shown.name),
+            ("position", ", ".join(f"{value:.3f}" for value in shown.point)),
+            ("measured in", shown.measured_in or "no training view at hand sees the point"),
+            *likeness_rows(shown.predicted, shown.materials),
+        ]
+        self._text.content = html.table(rows)
+        names, bands = shown.materials.names, shown.materials.bands
+        colours = self._session.colours_of(shown.materials)
+        entries = zip(names, shown.abundances.tolist(), colours, strict=True)
+        self._bars.content = html.bars(sorted(entries, key=lambda entry: -entry[1])[:16])
+        lines = [Line("predicted", shown.predicted, _colour(shown))]
+        if shown.measured is not None:
+            lines.append(
+                Line(f"measured, {shown.measured_in}", shown.measured, (0.35, 0.35, 0.35), is_dashed=True)
+            )
+        lines += [
+            Line(names[index], shown.contributions[index], colours[index], is_thin=True)
+            for index in np.flatnonzero(shown.abundances >= _SHOWN_SHARE)
+        ]
+        self._chart.draw(bands, lines)
+        self._comparison.draw(
+            bands, [Line(f"probe {one.number}", one.predicted, _colour(one)) for one in self._probes]
+        )
+
+    def _save(self) -> None:
+        if not self._probes:
+            raise ConfigError("there is no probe to save; click a point of the picture first")
+        folder = self._session.services.folder
+        for name, content in (
+            ("probes", spectra_csv(self._probes)),
+            ("probe-abundances", abundances_csv(self._probes)),
+        ):
+            path = write_file(new_file(folder, name, ".csv", name), content)
+            self._session.client.send_file_download(path.name, content)
+        self._session.say("saved", f"{path.parent}: spectra and abundances of {len(self._probes)} probes")
+
+    def _forget(self) -> None:
+        for one in list(self._probes):
+            self._drop(one)
+        self._session.show_objects("probe", False)
+        self._chosen.options = _no_probes()
+        self._text.content, self._bars.content = html.paragraph("Click a point of the picture."), ""
+        self._chart.clear()
+        self._comparison.clear()
+
+    def _drop(self, one: ProbedPoint) -> None:
+        self._probes.remove(one)
+        self._markers.pop(one.number).remove()
+
+
+def _label(one: ProbedPoint) -> str:
+    return f"{one.number}: {one.name}"
+
+
+def _colour(one: ProbedPoint) -> tuple[float, float, float]:
+    return _COLOURS[(one.number - 1) % len(_COLOURS)]
+
+
+def _marker(one: ProbedPoint) -> tuple[int, int, int]:
+    red, green, blue = (int(255 * value) for value in _colour(one))
+    return red, green, blue
+
+
+def _no_probes() -> tuple[str, ...]:
+    return (_NONE,)
+
+
+_PROBED_ROWS_VALUES_PANEL = 512
+_MOST_NUMBERS = 8
+
+
+class ValuesPanel:
+    """Shows what a scene is at the point that was clicked last."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._text = session.client.gui.add_html(html.paragraph("Click a point of the picture."))
+        session.client.scene.on_click()(self._clicked)
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        x, y = event.screen_pos
+        self._session.guarded(lambda: self._take(x, y))()
+
+    def _take(self, x: float, y: float) -> None:
+        """Probe a point of the canvas, given in parts of its width and height."""
+        camera = camera_of(self._session.pose(), _PROBED_ROWS_VALUES_PANEL)
+        column = min(int(number(x, 0.0, 1.0, fallback=0.5) * camera.width), camera.width - 1)
+        row = min(int(number(y, 0.0, 1.0, fallback=0.5) * camera.height), camera.height - 1)
+        with self._session.services.source.borrowed() as scene:
+            found = scene.probe(camera, column, row)
+        rows = [
+            (name, ", ".join(f"{value:.4g}" for value in values[:_MOST_NUMBERS]))
+            for name, values in found.values.items()
+        ]
+        if found.world_position is not None:
+            rows.append(("position", ", ".join(f"{value:.3f}" for value in found.world_position)))
+        self._text.content = html.table(rows)

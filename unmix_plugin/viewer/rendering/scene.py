@@ -1,0 +1,382 @@
+"""Where the viewer's scene comes from: a finished run, or a training that is under way.
+
+Recipes as the viewer applies them: cheaply, and again as training changes the scene.
+
+What the training views measured: spectra of points that they see, and errors of a rendered view.
+
+Notation: `P` points, `B` bands. A training view sees a point if nothing that the model renders is in front of it.
+
+What layers and edits need of the scene beside the view itself: made again as training goes on.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Float64
+from torch import Tensor
+
+from unmix_plugin.editing import Recipe, changes_geometry, edit_scene, sample_seen
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.runs.load_run import SceneRecord
+from unmix_plugin.engine.runs.run_folder import RunFolder
+from unmix_plugin.engine.training.trainer import Trainer
+from unmix_plugin.engine.training.training_control import DeviceShare, TrainingControl
+from unmix_plugin.scenes.scene import Scene
+from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients
+from unmix_plugin.trained.library_matches import relit as relit_measurement
+from unmix_plugin.trained.material_view import MaterialView
+from unmix_plugin.trained.open_run import LoadedRun, require_materials
+from unmix_plugin.trained.protocol import RenderableScene
+from unmix_plugin.trained.relighting import LightChoice, relit
+from unmix_plugin.trained.snapshot import snapshot
+from unmix_plugin.trained.trained_scene import TrainedScene
+from unmix_plugin.viewer.layers.layers import LayerAids, render_reference
+
+
+@dataclass(frozen=True)
+class SceneSource:
+    """A scene, renewed after each training step in which it is asked for."""
+
+    run: RunFolder
+    """Where what the viewer writes goes."""
+    record: SceneRecord
+    """What the run keeps of its input."""
+    device: DeviceShare
+    """Turns with training, if there is one."""
+    take: Callable[[], RenderableScene]
+    """The scene at this moment; called while training waits."""
+    control: TrainingControl | None = None
+    """The training under way; None for a finished run."""
+    _taken: dict[int, RenderableScene] = field(default_factory=dict, repr=False)
+
+    @contextmanager
+    def borrowed(self, cost: float = 1.0) -> Iterator[RenderableScene]:
+        """Context with the scene and the device to render it.
+
+        Turns do not nest: whoever has the device must not ask for it again.
+
+        Args:
+            cost: As `DeviceShare.guest_turn` has it.
+        """
+        with self.device.guest_turn(cost):
+            scene = self._taken.get(self.version)
+            if scene is None:
+                scene = self.take()
+                self._taken.clear()
+                self._taken[self.version] = scene
+            yield scene
+
+    @contextmanager
+    def borrowed_materials(self) -> Iterator[TrainedScene]:
+        """The same for a scene that must have endmembers.
+
+        Raises:
+            ConfigError: it has none.
+        """
+        with self.borrowed() as scene:
+            yield require_materials(scene, "of this run")
+
+    @property
+    def version(self) -> int:
+        """Rises with each change of the scene: training steps that it has seen."""
+        return self.device.training_turns
+
+    @property
+    def is_changing(self) -> bool:
+        """Whether the next picture of the same view would be another one."""
+        return self.device.is_training
+
+
+def source_of_run(run: LoadedRun) -> SceneSource:
+    """The scene of a finished run."""
+    return SceneSource(run.folder, run.record, DeviceShare(), lambda: run.scene)
+
+
+def source_of_training(trainer: Trainer, record: SceneRecord) -> SceneSource:
+    """The scene of a training, before or while it runs.
+
+    Raises:
+        ConfigError: its method offers no scene.
+    """
+    name, model = trainer.config.method_name, trainer.pipeline.model
+
+    def take() -> RenderableScene:
+        averages = None if trainer.average is None else trainer.average.state_dict()
+        return snapshot(model, name, record, averages)
+
+    source = SceneSource(trainer.run, record, trainer.control.device, take, trainer.control)
+    with source.borrowed():
+        pass  # refuses a method without a scene before the page is served
+    return source
+
+
+_RENEWAL_S = 0.5
+"""Seconds between two edited scenes while training changes the unedited one."""
+
+_See = Callable[[TrainedScene], Coefficients]
+"""What cameras see of a scene, for edits that depend on it."""
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """The edited scene made last."""
+
+    edited: RenderableScene
+    version: int
+    made_at: float
+
+    def serves(self, version: int) -> bool:
+        return self.version == version or time.monotonic() - self.made_at < _RENEWAL_S
+
+
+@dataclass(frozen=True, eq=False)
+class Edit:
+    """A recipe or another light, and the scene that it last gave; compared by identity."""
+
+    recipe: Recipe = Recipe()
+    light: LightChoice = LightChoice()
+    """For scenes whose light can be exchanged; such scenes have no recipes."""
+    _kept: list[_Kept] = field(default_factory=list, repr=False)
+    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
+
+    @property
+    def is_none(self) -> bool:
+        """Whether nothing is changed."""
+        return not self.has_recipe and self.light == LightChoice()
+
+    @property
+    def has_recipe(self) -> bool:
+        """Whether materials, or the light of a scene of mixed materials, are changed."""
+        return bool(self.recipe.operations) or self.recipe.illuminant is not None
+
+    @property
+    def changes_geometry(self) -> bool:
+        """Whether pictures must be rendered for it: shape or gloss change."""
+        return changes_geometry(self.recipe)
+
+    def reuses(self, other: Edit) -> bool:
+        """Whether what was rendered with `other` can be shown with this edit's materials."""
+        if self.light != other.light:
+            return False
+        return self is other or (not self.changes_geometry and not other.changes_geometry)
+
+    def apply(self, scene: RenderableScene, version: int, see: _See) -> RenderableScene:
+        """The edited scene; must be called while the scene is lent.
+
+        Args:
+            scene: The unedited one.
+            version: Rises as training changes it.
+            see: Asked only if the recipe depends on pictures.
+        Raises:
+            ConfigError: the recipe does not fit the run.
+        """
+        if self.is_none:
+            return scene
+        with self._lock:
+            if not self._kept or not self._kept[0].serves(version):
+                self._kept[:] = [_Kept(self._applied(scene, see), version, time.monotonic())]
+            return self._kept[0].edited
+
+    def _applied(self, scene: RenderableScene, see: _See) -> RenderableScene:
+        if self.light != LightChoice():
+            return relit(scene, self.light, "of this run")
+        scene = require_materials(scene, "of this run")
+        return edit_scene(scene, self.recipe, see(scene) if self.recipe.wants_pictures else None)
+
+
+_TOLERANCE = 0.03
+"""Depths of a point and of what a view renders there may differ by so much of the depth."""
+
+_VIEWS_KEPT = 4
+_STEPS_KEPT = 200
+"""Depths rendered so many training steps ago are rendered again."""
+
+_VIEWS_TRIED = 6
+
+
+@dataclass(frozen=True)
+class _Measurement:
+    """What a training view measured of a point."""
+
+    view: str
+    """Name of the view."""
+    spectrum: Float32[Tensor, "B"]
+    """Radiance, [0, 1]."""
+
+
+def usable_views(scene: Scene) -> list[int]:
+    """Training views whose spectra can be put beside those of the model."""
+    return [index for index in scene.train_indices if scene.sensor_of(index).sees_all_bands]
+
+
+class MeasuredViews:
+    """The training views of a scene that is at hand, of a rig those with all bands."""
+
+    def __init__(self, scene: Scene, source: SceneSource) -> None:
+        self._scene = scene
+        self._source = source
+        self._indices = usable_views(scene)
+        self._cameras = scene.cameras[self._indices]
+        self._distances: OrderedDict[int, tuple[int, Tensor]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def error(self, frame: MaterialView) -> tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"], str]:
+        """Mean absolute error of the bands against the nearest training view, where that sees the same point.
+
+        Returns:
+            Errors; where they are known; the name of the view.
+        """
+        index = int(self._by_nearness(frame.camera)[0])
+        height, width = frame.camera.height, frame.camera.width
+        errors = torch.zeros(height * width)
+        is_known = torch.zeros(height * width, dtype=torch.bool)
+        seen = (frame.coefficients.accumulation.flatten() > OCCUPIED_ACCUMULATION).nonzero()[:, 0]
+        if len(seen):
+            points = _end_points(frame)[seen]
+            rows, columns, sees = self._pixels_of(points, index)
+            cube = self._in_light(self._scene.cube(self._indices[index]), frame.scene.light_power)
+            spectra = frame.materials.spectra(
+                frame.coefficients.flatten().map(lambda packed: packed[seen[sees]])
+            ).cpu()
+            measured = cube[rows[sees], columns[sees]]
+            places = seen[sees].cpu()
+            errors[places] = (spectra - measured).abs().mean(dim=-1)
+            is_known[places] = True
+        device = frame.coefficients.accumulation.device
+        name = self._scene.frames[self._indices[index]].name
+        return errors.view(height, width).to(device), is_known.view(height, width).to(device), name
+
+    def measurement(
+        self,
+        point: Float[Tensor, "3"],
+        camera: Cameras,
+        light: Float64[np.ndarray, " B"] | None,
+        scene: TrainedScene,
+    ) -> _Measurement | None:
+        """What the training view nearest to a camera measured of a point; None where no view tried sees it.
+
+        Args:
+            point: Model space.
+            camera: One camera.
+            light: In which the scene is shown, relative power; what was measured is relit to it. None if unknown.
+            scene: The unedited scene, which is lent.
+        """
+        for index in self._by_nearness(camera)[:_VIEWS_TRIED].tolist():
+            rows, columns, sees = self._pixels_of(point[None], index, scene)
+            if bool(sees[0]):
+                cube = self._scene.cube(self._indices[index])
+                spectrum = self._in_light(cube[int(rows[0]), int(columns[0])].copy(), light)
+                return _Measurement(self._scene.frames[self._indices[index]].name, spectrum)
+        return None
+
+    def _in_light(
+        self, measured: Float32[np.ndarray, "*pixels B"], light: Float64[np.ndarray, " B"] | None
+    ) -> Float32[Tensor, "*pixels B"]:
+        """Radiance as it is in the light that the scene is shown in."""
+        recorded = self._source.record.summary.get("illuminant")
+        is_same = light is None or (recorded is not None and np.allclose(light, recorded, rtol=1e-4))
+        found = measured if is_same else relit_measurement(measured, recorded, light).astype(np.float32)
+        return torch.from_numpy(found)
+
+    def _by_nearness(self, camera: Cameras) -> Tensor:
+        """Training views by the angle between their axis and the camera's, and by their distance to it."""
+        middle = self._scene.scene_box.aabb.mean(dim=0)
+        pose, poses = camera.camera_to_world[0].cpu(), self._cameras.camera_to_world
+        reach = (pose[:, 3] - middle).norm().clamp(min=1e-3)
+        offsets = (poses[:, :, 3] - pose[:, 3]).norm(dim=-1) / reach
+        angles = (poses[:, :, 2] * pose[:, 2]).sum(dim=-1).clamp(-1, 1).arccos()
+        return (offsets + angles).argsort()
+
+    def _pixels_of(
+        self, points: Float[Tensor, "P 3"], index: int, lent: TrainedScene | None = None
+    ) -> tuple[Tensor, Tensor, Bool[Tensor, "P"]]:
+        """Row and column of each point in a training view, and whether that view sees it."""
+        camera = self._cameras[index]
+        coords, depths = camera.project(points.cpu(), 0)
+        columns, rows = coords.nan_to_num(-1.0).clamp(-1, 1e6).floor().long().unbind(-1)
+        inside = (depths > 0) & (columns >= 0) & (rows >= 0)
+        inside &= (columns < camera.width) & (rows < camera.height)
+        rows, columns = rows.clamp(0, camera.height - 1), columns.clamp(0, camera.width - 1)
+        places = camera.poses_at(torch.zeros_like(rows), coords[:, 1].nan_to_num(0.0))[:, :, 3]
+        distance = (points.cpu() - places).norm(dim=-1)
+        rendered = self._distance_of(index, lent)[rows, columns]
+        return rows, columns, inside & ((distance - rendered).abs() < _TOLERANCE * distance)
+
+    def _distance_of(self, index: int, lent: TrainedScene | None) -> Float[Tensor, "H W"]:
+        """Distances along the rays of a training view as last rendered, infinite where nothing is."""
+        step = self._source.version
+        with self._lock:
+            kept = self._distances.get(index)
+        if kept is not None and step - kept[0] < _STEPS_KEPT:
+            return kept[1]
+        with self._source.borrowed_materials() if lent is None else nullcontext(lent) as scene:
+            seen = scene.look(self._cameras[index], subpixels=1).coefficients
+        distance = seen.ray_distance.where(seen.is_occupied, torch.inf).cpu()
+        with self._lock:
+            self._distances[index] = (step, distance)
+            while len(self._distances) > _VIEWS_KEPT:
+                self._distances.popitem(last=False)
+        return distance
+
+
+def _end_points(frame: MaterialView) -> Float[Tensor, "P 3"]:
+    """Where the rays of all pixels end."""
+    coefficients = frame.coefficients
+    bundle = frame.camera.to(coefficients.accumulation.device).image_rays(0)
+    distance = coefficients.ray_distance.flatten()
+    return bundle.origins + distance[:, None] * bundle.directions
+
+
+_RENEWAL_STEPS = 200
+"""Training steps after which the rays are rendered again."""
+
+
+class SceneAids:
+    """Rays through the whole scene, what cameras see of it, and what was measured."""
+
+    def __init__(self, source: SceneSource, has_materials: bool) -> None:
+        self.measured: MeasuredViews | None = None
+        """What the training views measured, once the scene is read."""
+        self.why_not_measured = "the scene is still being read"
+        """What is said where `measured` is missing."""
+        self._source, self._has_materials = source, has_materials
+        self._for_layers: tuple[int, LayerAids] | None = None
+        self._seen: tuple[int, Coefficients] | None = None
+
+    def set_measured(self, measured: MeasuredViews | None, why_not: str = "") -> None:
+        """Note what was measured, or why that is unknown."""
+        self.measured, self.why_not_measured = measured, why_not
+        self._for_layers = None
+
+    def for_layers(self) -> LayerAids | None:
+        """What layers need; None without materials. Must not be called while the scene is lent."""
+        if not self._has_materials:
+            return None
+        kept, version = self._for_layers, self._source.version
+        age = 0 if kept is None else version - kept[0]
+        if kept is None or age >= _RENEWAL_STEPS or (age > 0 and not self._source.is_changing):
+            kept = self._for_layers = (version, self._made())
+        return kept[1]
+
+    def see(self, scene: TrainedScene) -> Coefficients:
+        """What the training cameras see of the unedited scene, not long ago; called while it is lent."""
+        version = self._source.version
+        if self._seen is None or version - self._seen[0] >= _RENEWAL_STEPS:
+            self._seen = (version, sample_seen(scene))
+        return self._seen[1]
+
+    def _made(self) -> LayerAids:
+        error_of = None if self.measured is None else self.measured.error
+        why_not = self.why_not_measured
+        record = self._source.record
+        with self._source.borrowed_materials() as scene:
+            reference = render_reference(scene, record.train_cameras)
+        return LayerAids(reference, record.scene_box, error_of, why_not)
