@@ -126,7 +126,7 @@ def _sync(path: Path, flags: int) -> None:
         os.close(descriptor)
 
 
-RUN_FORMAT = 2
+RUN_FORMAT = 3
 """Version of everything in a run folder; raised when an older version of this package could not read it."""
 
 _DEEPEST = 32
