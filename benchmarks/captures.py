@@ -106,7 +106,7 @@ def process(capture: Path, scene: Path, poses: str, mask: str) -> float:
 
 def pose_errors(scene: Path, capture: Path, views: int) -> dict[str, float]:
     """Share of registered views, and how far their poses are from the truth."""
-    from unmix_plugin.captures.poses.alignment import align_poses
+    from tests.captures.poses.alignment import align_poses
     from unmix_plugin.captures.poses.reading import read_poses
 
     estimated, truth = read_poses(scene / "transforms.json"), read_poses(capture / "poses-true.json")
@@ -124,7 +124,7 @@ def pose_errors(scene: Path, capture: Path, views: int) -> dict[str, float]:
 
 def reflectance_errors(scene: Path, size: int, views: int) -> dict[str, float]:
     """Mean absolute difference between the scene's cubes and what was rendered, without noise, on matter."""
-    from unmix_plugin.captures.demo.capture import view_name
+    from unmix_plugin.captures.demo import view_name
     from unmix_plugin.scenes.demo.scene import demo_cameras, reflected
     from unmix_plugin.scenes.demo.shading import reflectances, render_view, speckled_things
 

@@ -6,14 +6,14 @@ from functools import partial
 import numpy as np
 import pytest
 
-from unmix_plugin.captures.demo import capture as demo_capture
-from unmix_plugin.captures.demo.capture import make_demo_capture
-from unmix_plugin.captures.demo.line_camera import (
+from unmix_plugin.captures import demo as demo_capture
+from unmix_plugin.captures.demo import (
     FULL_WELL,
     READ_NOISE,
     WHITE_SHARE,
     BadBands,
     demo_line_camera,
+    make_demo_capture,
 )
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.demo.scene import demo_cameras, label_image, reflected

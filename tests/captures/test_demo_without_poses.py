@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.captures.poses.alignment import align_poses
 from tests.commands.running import run
-from unmix_plugin.captures.demo import capture as demo_capture
-from unmix_plugin.captures.poses.alignment import align_poses
+from unmix_plugin.captures import demo as demo_capture
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.commands.process import process
 from unmix_plugin.scenes.demo.shading import render_view

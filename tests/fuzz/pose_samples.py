@@ -14,8 +14,8 @@ from tests.captures.poses.micmac_files import CALIBRATION, ORIENTATION, RADIAL, 
 from tests.captures.poses.opensfm_reconstruction import BROWN, reconstruction
 from tests.captures.poses.pose_factory import FLIP, ring, transforms
 from unmix_plugin.captures.poses.matching import match_poses
-from unmix_plugin.captures.poses.placement import place_poses
 from unmix_plugin.captures.poses.reading import read_poses
+from unmix_plugin.captures.posing import place_poses
 from unmix_plugin.formats.ply import read_ply_points
 
 _SIMILARITY = (

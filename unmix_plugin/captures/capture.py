@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from unmix_plugin.captures.poses.pose_set import Lens, PoseSet
+from unmix_plugin.captures.poses.lens import Lens
+from unmix_plugin.captures.poses.pose_set import PoseSet
 from unmix_plugin.captures.spectral_file import SpectralFile
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from unmix_plugin.captures.checks.seen_view import SeenView
+from unmix_plugin.captures.checks import SeenView
 from unmix_plugin.figures.pictures import Canvas, CanvasLayout, columns_for
 from unmix_plugin.figures.plotting import FIGURE_DPI, figure_bytes, plain_axes
 

@@ -4,16 +4,28 @@ The border of the views tells how bright the background is and how much it varie
 follows from that. Specks are then removed and small holes are filled.
 
 Notation: `H x W` pixels, `B` bands; values in [0, 1] as they are written.
+
+Where the opacity of views comes from: files, a background that is white or black, or nowhere.
+
+What pictures of a capture say of a view's pixels: how opaque they are, which are to be ignored, what they show.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, UInt8
 
+from unmix_plugin.captures.calibration.raster import Raster
+from unmix_plugin.captures.calibration.sampling import sampled_rows
+from unmix_plugin.captures.calibration.sensor import Sensor
+from unmix_plugin.captures.capture import CaptureView
+from unmix_plugin.captures.options import MaskKind
+from unmix_plugin.captures.poses.pose_set import name_some
 from unmix_plugin.errors import CaptureError
 
 Background = Literal["white", "black"]
@@ -112,3 +124,207 @@ def _without_small(mask: Bool[np.ndarray, "H W"], smallest: int) -> tuple[Bool[n
     is_small = sizes < smallest
     is_small[0] = False
     return mask & ~is_small[parts], int(is_small.sum())
+
+
+BORDER_SHARE = 0.02
+"""Width of the border that a background is judged by, as a share of the view's."""
+MOST_BORDER_PIXELS = 20000
+BRIGHT_PERCENTILE = 99.0
+LOOKED_AT = 12
+"""Views whose border is looked at for a white background that nobody has named."""
+ALMOST_WHITE = 0.9
+"""Brightness of such a background, as a share of full reflectance or, where none is known, of the brightest pixels."""
+WHITE_BORDER = 0.75
+"""Share of the border that such a background covers."""
+
+
+def choose_mask(views: Sequence[CaptureView], asked: MaskKind | None) -> tuple[MaskKind, list[str]]:
+    """What tells matter from background, and what a user should know of it.
+
+    Raises:
+        CaptureError: opacity is asked of files that some views don't have.
+    """
+    if asked not in (None, "files"):
+        return asked, []
+    found = [has_opacity(view, alpha_only=asked is None) for view in views]
+    missing = [view.name for view, has_it in zip(views, found, strict=True) if not has_it]
+    if not missing:
+        return "files", []
+    if asked == "files":
+        raise CaptureError(
+            f"--mask files: view {missing[0]} has no mask; expected a picture with an alpha channel, or a mask that is "
+            "white where matter is, for every view"
+        )
+    if len(missing) == len(views):
+        return "none", []
+    has = "has" if len(missing) == 1 else "have"
+    note = (
+        f"{len(missing)} of {len(views)} views {has} no alpha channel ({name_some(missing)}), so that of the others is "
+        "not used: give all views one, or choose --mask"
+    )
+    return "none", [note]
+
+
+def background_rule(
+    sensor: Sensor,
+    views: Sequence[CaptureView],
+    scale: float,
+    kind: Background,
+    sample: Float32[np.ndarray, "N c"],
+) -> BackgroundRule:
+    """The rule that fits the border of the views.
+
+    Args:
+        scale: Calibrated values are divided by it.
+        sample: Pixels of all views, divided already.
+    Raises:
+        CaptureError: most of the border is not of this kind.
+    """
+    pixels = _border(sensor, views, scale)
+    return find_background(kind, pixels, _brightest(kind, sample, pixels))
+
+
+def white_background_note(
+    sensor: Sensor, views: Sequence[CaptureView], scale: float, sample: Float32[np.ndarray, "N c"]
+) -> list[str]:
+    """A hint at `--mask white` if the border of most views is almost white; arguments as `background_rule` has them."""
+    pixels = _border(sensor, views[:: max(1, -(-len(views) // LOOKED_AT))], scale)
+    least = ALMOST_WHITE * (1.0 if sensor.is_absolute else _brightest("white", sample, pixels))
+    share = float(np.mean(background_brightness("white", pixels) >= least)) if len(pixels) else 0.0
+    if least <= 0 or share < WHITE_BORDER:
+        return []
+    note = (
+        f"{share:.0%} of the border of the views is almost white, and no view has a mask: if this is background, "
+        "--mask white leaves it out"
+    )
+    return [note]
+
+
+def _brightest(
+    kind: Background, sample: Float32[np.ndarray, "N c"], border: Float32[np.ndarray, "M c"]
+) -> float:
+    everywhere = np.concatenate([background_brightness(kind, sample), background_brightness(kind, border)])
+    return float(np.percentile(np.clip(everywhere, 0.0, 1.0), BRIGHT_PERCENTILE)) if len(everywhere) else 0.0
+
+
+def _border(sensor: Sensor, views: Sequence[CaptureView], scale: float) -> Float32[np.ndarray, "M c"]:
+    """Pixels at the border of the views, in [0, 1]; saturated ones are 1, missing ones are left out."""
+    raster = sensor.calibration.raster
+    width = max(1, round(BORDER_SHARE * raster.width))
+    columns = np.r_[0:width, raster.width - width : raster.width]
+    rows = sorted({0, raster.height - 1, *sampled_rows(raster.height)})
+    step = max(1, len(views) * (2 * raster.width + 2 * width * len(rows)) // MOST_BORDER_PIXELS)
+    border = []
+    for view in views:
+        for row in rows:
+            part = sensor.calibration.rows(view.cube, row, row + 1)
+            shown = np.arange(raster.width) if row in (0, raster.height - 1) else columns
+            shown = shown[row % step :: step]
+            values = np.where(part.saturated[0, shown], np.float32(scale), part.values[0, shown])
+            border.append(values[~part.missing[0, shown]])
+    return np.clip(np.concatenate(border) / np.float32(scale), 0.0, 1.0)
+
+
+HALF = 127
+"""Grey above which a mask is white."""
+OPAQUE = 255
+
+
+@dataclass(frozen=True)
+class ViewMasks:
+    """Masks of one view on the scene's raster."""
+
+    valid: Bool[np.ndarray, "H W"]
+    """Pixels that are not to be ignored."""
+    opacity: UInt8[np.ndarray, "H W"] | None
+    """255 where matter covers a pixel; None where no file says so."""
+
+
+def has_opacity(view: CaptureView, alpha_only: bool = False) -> bool:
+    """Whether a file says what is matter: an alpha channel, or a mask that is white there."""
+    has_alpha = view.alpha is not None or _alpha_picture(view) is not None
+    return has_alpha or (view.mask is not None and not alpha_only)
+
+
+def read_view_masks(view: CaptureView, raster: Raster, use_opacity: bool) -> ViewMasks:
+    """The masks of a view.
+
+    Args:
+        view: It may have an alpha channel. Its mask is black where pixels are ignored, or, if opacity is looked for and
+            there is no alpha channel, where background is.
+        raster: Of the scene; a square of pixels is valid where all of it is, and as opaque as its mean.
+        use_opacity: Whether to look for it.
+    Raises:
+        CaptureError: a file can't be read or has another size than the cube.
+    """
+    valid, opacity = np.ones((raster.height, raster.width), bool), None
+    alpha = _alpha(view) if use_opacity else None
+    if alpha is not None:
+        mean = raster.averaged(_cut(alpha, raster).astype(np.float32))
+        opacity = np.rint(mean).astype(np.uint8)
+    if view.mask is not None:
+        mask = _cut(_read(view.mask, "L", view), raster)
+        if use_opacity and opacity is None:
+            opacity = np.where(raster.any_in_square(mask <= HALF), 0, OPAQUE).astype(np.uint8)
+        else:
+            valid = ~raster.any_in_square(mask == 0)
+    return ViewMasks(valid, opacity)
+
+
+def read_labels(view: CaptureView, raster: Raster) -> UInt8[np.ndarray, "H W"] | None:
+    """True materials of a view; None if it has none, or if pixels are averaged.
+
+    Raises:
+        CaptureError: the file can't be read or has another size than the cube.
+    """
+    if view.labels is None or raster.binning > 1:
+        return None
+    return _cut(_read(view.labels, None, view), raster).astype(np.uint8)
+
+
+def _alpha(view: CaptureView) -> UInt8[np.ndarray, "H W"] | None:
+    if view.alpha is not None:
+        if view.alpha.shape[:2] != view.cube.shape[:2]:
+            raise CaptureError(
+                f"{view.alpha.path} has {view.alpha.shape[0]} x {view.alpha.shape[1]} pixels; expected "
+                f"{view.cube.shape[0]} x {view.cube.shape[1]}, as the cube has"
+            )
+        return np.rint(np.clip(view.alpha.read()[..., 0], 0.0, 1.0) * OPAQUE).astype(np.uint8)
+    picture = _alpha_picture(view)
+    return None if picture is None else _read(picture, "RGBA", view)[..., 3]
+
+
+def _alpha_picture(view: CaptureView) -> Path | None:
+    """The picture with an alpha channel: the one beside the cube, or the view itself if it is one."""
+    from PIL import Image
+
+    picture = view.cube.path if view.cube.reader == "picture" else view.picture
+    if picture is None:
+        return None
+    try:
+        with Image.open(picture) as opened:
+            has_alpha = "A" in opened.getbands() or "transparency" in opened.info
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise CaptureError(f"{picture} can't be read as a picture ({error}); mend or remove it") from error
+    return picture if has_alpha else None
+
+
+def _cut(pixels: np.ndarray, raster: Raster) -> np.ndarray:
+    return pixels[raster.file_rows(0, raster.height), raster.columns]
+
+
+def _read(path: Path, mode: str | None, view: CaptureView) -> np.ndarray:
+    """A picture with the pixels of the cube, converted to a mode of Pillow or as it is."""
+    from PIL import Image
+
+    height, width, _ = view.cube.shape
+    try:
+        with Image.open(path) as picture:
+            if picture.size != (width, height):
+                raise CaptureError(
+                    f"{path} has {picture.size[0]} x {picture.size[1]} pixels (width x height); expected "
+                    f"{width} x {height}, as the cube of view {view.name} has"
+                )
+            return np.asarray(picture if mode is None else picture.convert(mode))
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise CaptureError(f"{path} can't be read as a picture ({error}); mend or remove it") from error

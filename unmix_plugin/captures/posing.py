@@ -1,19 +1,41 @@
-"""The cameras of a capture's views, from wherever the user says."""
+"""The cameras of a capture's views, from wherever the user says.
+
+Poses of all lenses of a rig from those of some.
+
+Where two lenses have poses in the same releases, their offset follows from these. Otherwise the rotations that the
+files give are used, and the lenses are taken to be in one place (`RigRelatives`: Euler angles in degrees, R = Rx Ry Rz,
+from the axes of the lens to those of the reference lens, with +x right, +y down, +z forward).
+
+Where a scene is placed: +z up, its middle in the origin, its cameras at most 1 away; recorded to be undone.
+
+Poses of written views, estimated from pictures of their cubes.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
+import numpy as np
+from jaxtyping import Bool, Float64, UInt8
+
+from unmix_plugin.captures.camera_tags import tag_numbers
 from unmix_plugin.captures.capture import Capture, CaptureView
+from unmix_plugin.captures.plan import Plan
+from unmix_plugin.captures.poses.estimation import contrast_picture, estimate_poses, mean_weights
+from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.matching import match_poses
-from unmix_plugin.captures.poses.placement import place_poses
-from unmix_plugin.captures.poses.pose_set import Lens, PosedCamera, PoseSet
+from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 from unmix_plugin.captures.poses.reading import read_poses
-from unmix_plugin.captures.rigs.completing import complete_rigs
-from unmix_plugin.errors import CaptureError
+from unmix_plugin.captures.writing.view_files import FULL_SCALE, ViewRecord
+from unmix_plugin.engine.geometry.camera_paths import focus_point, meeting_point
+from unmix_plugin.errors import CaptureError, counted
+from unmix_plugin.formats.ply import write_ply
+from unmix_plugin.scenes.placement import Placement
+from unmix_plugin.scenes.reading.cubes import map_array
 
 ESTIMATE = "estimate"
 LEAST_VIEWS = 2
@@ -134,3 +156,273 @@ def fit_lens(lens: Lens | None, view: CaptureView) -> Lens:
 def _files_of(view: CaptureView) -> list[Path]:
     picture = [] if view.picture is None else [view.picture]
     return [*view.cube.files, *picture]
+
+
+Pose: TypeAlias = Float64[np.ndarray, "4 4"]
+Offsets: TypeAlias = dict[tuple[str, str], Pose]
+"""From the camera space of the second lens to that of the first, by the names of both, OpenGL axes."""
+OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0])
+
+
+def complete_rigs(
+    views: Sequence[CaptureView], cameras: Mapping[str, PosedCamera]
+) -> tuple[dict[str, PosedCamera], tuple[str, ...]]:
+    """Give views without pose that of another lens of the same release, moved by the rig.
+
+    Args:
+        views: Of any layout; those without `release` are left as they are.
+        cameras: By the name of the view, for some of them.
+    Returns:
+        Cameras of more views, and what was done, one sentence a lens.
+    """
+    releases: dict[str, list[CaptureView]] = defaultdict(list)
+    for view in views:
+        if view.release:
+            releases[view.release].append(view)
+    offsets = _measured_offsets(releases, cameras)
+    measured = set(offsets)
+    completed, how = dict(cameras), Counter[tuple[str, str]]()
+    for members in releases.values():
+        posed = [view for view in members if view.name in cameras]
+        for view in members:
+            if view.name in cameras:
+                continue
+            base, offset = _offset_to(view, posed, offsets)
+            if base is None or offset is None:
+                how[(view.sensor, "unknown" if posed else "unposed")] += 1
+                continue
+            pose = _square(cameras[base.name].camera_to_world) @ offset
+            completed[view.name] = PosedCamera(pose[:3], view.lens)
+            how[(view.sensor, "poses" if (base.sensor, view.sensor) in measured else "files")] += 1
+    return completed, tuple(_say(sensor, kind, count) for (sensor, kind), count in how.items())
+
+
+def _say(sensor: str, kind: str, count: int) -> str:
+    return (
+        f"{counted(count, 'view')} of lens {sensor} "
+        + {
+            "unposed": "left out: no lens of their release has a pose",
+            "unknown": "left out: there is no pose, and nothing says where the lens is on the rig",
+            "poses": "got the pose of another lens of their release, moved as in other releases",
+            "files": "got the pose of another lens of their release, turned as the files say, at the same place",
+        }[kind]
+    )
+
+
+def _offset_to(
+    view: CaptureView, posed: Sequence[CaptureView], offsets: Offsets
+) -> tuple[CaptureView | None, Pose | None]:
+    """A posed view of the release and the offset from it, measured ones first."""
+    for base in posed:
+        if (base.sensor, view.sensor) in offsets:
+            return base, offsets[base.sensor, view.sensor]
+    rotation = rig_rotation(view)
+    for base in posed:
+        other = rig_rotation(base)
+        if rotation is not None and other is not None:
+            offset = np.eye(4)
+            offset[:3, :3] = OPENCV_TO_OPENGL @ other.T @ rotation @ OPENCV_TO_OPENGL
+            return base, offset
+    return None, None
+
+
+def rig_rotation(view: CaptureView) -> Float64[np.ndarray, "3 3"] | None:
+    """From the axes of the lens to those of the reference lens, as the file says; None where it doesn't."""
+    angles = tag_numbers(view.cube.metadata.get("xmp") or {}, "RigRelatives")
+    if angles is None or len(angles) != 3 or not np.isfinite(angles).all():
+        return None
+    (cx, cy, cz), (sx, sy, sz) = np.cos(np.deg2rad(angles)), np.sin(np.deg2rad(angles))
+    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    return about_x @ about_y @ about_z
+
+
+def _measured_offsets(
+    releases: Mapping[str, Sequence[CaptureView]], cameras: Mapping[str, PosedCamera]
+) -> Offsets:
+    """Offsets between lenses with poses in one release: mean rotation, median place."""
+    found: dict[tuple[str, str], list[Pose]] = defaultdict(list)
+    for members in releases.values():
+        poses = {
+            view.sensor: _square(cameras[view.name].camera_to_world)
+            for view in members
+            if view.name in cameras
+        }
+        for first, base in poses.items():
+            for second, other in poses.items():
+                if first != second:
+                    found[first, second].append(np.linalg.inv(base) @ other)
+    return {pair: _mean(np.stack(offsets)) for pair, offsets in found.items()}
+
+
+def _mean(offsets: Float64[np.ndarray, "N 4 4"]) -> Pose:
+    left, _, right = np.linalg.svd(offsets[:, :3, :3].mean(axis=0))
+    mean = np.eye(4)
+    mean[:3, :3] = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    mean[:3, 3] = np.median(offsets[:, :3, 3], axis=0)
+    return mean
+
+
+def _square(pose: Float64[np.ndarray, "3 4"]) -> Pose:
+    return np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
+
+
+POINTS_FILE = "points.ply"
+"""Of a scene folder; its `ply_file_path`."""
+LEAST_TURN_DEG = 10.0
+"""Horizontal axes of cameras that span less than this do not tell the vertical."""
+MOST_SWAY_DEG = 30.0
+"""Between the axes of cameras that look down and their mean, about."""
+
+
+@dataclass(frozen=True)
+class PlacedPoses:
+    """Poses in the world of a scene."""
+
+    poses: PoseSet
+    """In the scene's world; its offset is 0."""
+    placement: Placement
+    """From the source's world to the scene's."""
+    notes: tuple[str, ...]
+    """How up axis, middle and scale were found, one sentence each."""
+
+
+def place_poses(poses: PoseSet, is_flight: bool = False) -> PlacedPoses:
+    """Settle up axis, middle and scale of a scene.
+
+    The up axis is the source's where it has one, otherwise the direction across which the cameras' horizontal axes lie,
+    or the mean of their up vectors. The middle is where the cameras look, or that of the sparse points.
+
+    Args:
+        poses: In the source's world.
+        is_flight: Whether cameras that all look one way look down.
+    """
+    stacked = np.stack([camera.camera_to_world for camera in poses.cameras.values()])
+    up, how_up = _find_up(stacked, poses.up, is_flight)
+    middle, how_middle = _find_middle(stacked, poses.points)
+    reach = float(np.linalg.norm(stacked[:, :, 3] - middle, axis=1).max())
+    scale = 1.0 / reach if reach > 0 else 1.0
+    rotation = _turn_to_z(up)
+    inner = Placement(rotation, -rotation @ middle, scale)
+    cameras = {name: moved(camera, inner) for name, camera in poses.cameras.items()}
+    points = None if poses.points is None else inner.to_scene(poses.points)
+    how_large = [f"1 unit of the scene is {1.0 / scale:.6g} of the source"] if poses.has_world else []
+    notes = (how_up, how_middle, *how_large)
+    placed = replace(poses, cameras=cameras, points=points, offset=np.zeros(3), up=np.array([0.0, 0.0, 1.0]))
+    return PlacedPoses(placed, replace(inner, offset=poses.offset), notes)
+
+
+def write_points(folder: Path, poses: PoseSet) -> str | None:
+    """Write the sparse points beside a scene's transforms.json; the name for `ply_file_path`, None without points.
+
+    Args:
+        poses: In the scene's world.
+    Raises:
+        RunError: the disk is full or refuses.
+    """
+    if poses.points is None or len(poses.points) == 0:
+        return None
+    columns = {axis: poses.points[:, index].astype(np.float32) for index, axis in enumerate("xyz")}
+    if poses.colours is not None:
+        columns |= {name: poses.colours[:, index] for index, name in enumerate(("red", "green", "blue"))}
+    write_ply(
+        folder / POINTS_FILE, columns, comments=["sparse points of structure from motion, scene coordinates"]
+    )
+    return POINTS_FILE
+
+
+def moved(camera: PosedCamera, similarity: Placement) -> PosedCamera:
+    """The camera in the world that the similarity leads to."""
+    pose = camera.camera_to_world
+    position = similarity.to_scene(pose[:, 3])
+    return replace(camera, camera_to_world=np.column_stack([similarity.rotation @ pose[:, :3], position]))
+
+
+def _find_up(
+    poses: Float64[np.ndarray, "N 3 4"], known: Float64[np.ndarray, "3"] | None, is_flight: bool
+) -> tuple[Float64[np.ndarray, "3"], str]:
+    if known is not None:
+        return known, "up is the source's"
+    back = poses[:, :, 2].mean(axis=0)
+    if is_flight and np.linalg.norm(back) > np.cos(np.radians(MOST_SWAY_DEG)):
+        return back / np.linalg.norm(back), "up is against where the cameras look, as they would in a flight"
+    mean = poses[:, :, 1].mean(axis=0)
+    _, singular, vt = np.linalg.svd(poses[:, :, 0], full_matrices=True)
+    is_spread = len(singular) > 1 and singular[1] > np.sin(np.radians(LEAST_TURN_DEG)) * singular[0]
+    vertical = vt[2] * (1.0 if vt[2] @ mean >= 0 else -1.0)
+    if is_spread and vertical @ mean > 0.5 * np.linalg.norm(mean) > 0.05:
+        return vertical, "up is square to the cameras' horizontal axes"
+    if np.linalg.norm(mean) > 0.1:
+        return mean / np.linalg.norm(mean), "up is the mean of the cameras' up vectors"
+    return np.array([0.0, 0.0, 1.0]), "up is not to be told from the cameras: +z of the source is taken"
+
+
+def _find_middle(
+    poses: Float64[np.ndarray, "N 3 4"], points: Float64[np.ndarray, "P 3"] | None
+) -> tuple[Float64[np.ndarray, "3"], str]:
+    met, nearest = meeting_point(poses), focus_point(poses)
+    if met is None and points is not None and len(points) > 0:
+        return np.median(points, axis=0), (
+            "the middle is that of the sparse points, as the cameras look at no one place"
+        )
+    if nearest is not None:
+        return nearest, "the middle is the point nearest to all optical axes"
+    return poses[:, :, 3].mean(axis=0), "the middle is that of the cameras"
+
+
+def _turn_to_z(up: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
+    """The smallest rotation that takes a unit vector to +z."""
+    axis, cosine = np.cross(up, (0.0, 0.0, 1.0)), float(up[2])
+    if cosine < -1.0 + 1e-9:
+        return np.diag([1.0, -1.0, -1.0])
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + cross + cross @ cross / (1.0 + cosine)
+
+
+def estimated_poses(plan: Plan, records: Mapping[str, ViewRecord], scene: Path, work: Path) -> PoseSet:
+    """Structure from motion on all views.
+
+    Args:
+        plan: Of the scene.
+        records: Of its views, which are all written.
+        scene: Folder that they are in.
+        work: Folder for files of the estimation.
+    Returns:
+        Poses by view, with lenses of the whole images as the capture has them.
+    Raises:
+        CaptureError: pycolmap is not installed, or too few views could be registered.
+    """
+    shown = {name: _shown(scene, record) for name, record in records.items()}
+    pictures = {name: _contrast_of(scene, records[name], shown[name]) for name in records}
+    sensors = {view.name: view.sensor for view in plan.views}
+    poses = estimate_poses(pictures, work, sensors, shown if plan.mask != "none" else None)
+    cameras = {}
+    for view in plan.views:
+        camera = poses.cameras.get(view.name)
+        if camera is None or camera.lens is None:
+            continue
+        raster = plan.recipes[view.sensor].calibration.raster
+        whole = raster.lens_of_file(camera.lens, view.cube.shape[0], view.cube.shape[1])
+        cameras[view.name] = replace(camera, lens=whole)
+    return replace(poses, cameras=cameras)
+
+
+def _contrast_of(scene: Path, record: ViewRecord, shown: Bool[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W"]:
+    cube = map_array(scene / record.paths["hyperspectral_file_path"])
+    height, width, bands = cube.shape
+    weights = mean_weights(np.ones(bands, bool)) / FULL_SCALE
+    return contrast_picture(lambda rows: cube[rows], (height, width), weights, shown)
+
+
+def _shown(scene: Path, record: ViewRecord) -> Bool[np.ndarray, "H W"]:
+    """Pixels of matter that were measured."""
+    from PIL import Image
+
+    with Image.open(scene / record.paths["file_path"]) as picture:
+        shown = np.asarray(picture.convert("RGBA"))[..., 3] > 127
+    if "mask_path" in record.paths:
+        with Image.open(scene / record.paths["mask_path"]) as mask:
+            shown = shown & (np.asarray(mask.convert("L")) > 0)
+    return shown

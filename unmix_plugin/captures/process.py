@@ -1,4 +1,7 @@
-"""From a capture to a scene: look at it, decide, write view after view, and name the folder when all is there."""
+"""From a capture to a scene: look at it, decide, write view after view, and name the folder when all is there.
+
+Views of one sensor are alike: same size, same bands, same type of numbers.
+"""
 
 from __future__ import annotations
 
@@ -6,22 +9,21 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from unmix_plugin.captures.alike import refuse_unlike_views
+import numpy as np
+
 from unmix_plugin.captures.calibration.sensor import References
 from unmix_plugin.captures.capture import Capture, CaptureView
-from unmix_plugin.captures.estimating import estimated_poses
 from unmix_plugin.captures.layouts.registry import LAYOUTS, LayoutOptions, find_views
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.plan import Plan, input_files, make_plan
-from unmix_plugin.captures.posing import ESTIMATE, given_poses, pose_views
+from unmix_plugin.captures.posing import ESTIMATE, estimated_poses, given_poses, pose_views
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.readers.read_options import ReadOptions
 from unmix_plugin.captures.spectral_file import SpectralFile
 from unmix_plugin.captures.wavelengths import parse_wavelengths
 from unmix_plugin.captures.writing.scene_files import write_scene_files
-from unmix_plugin.captures.writing.sources import hashes
 from unmix_plugin.captures.writing.view_files import ViewRecord, write_view
-from unmix_plugin.captures.writing.work_folder import WorkFolder, refuse_output
+from unmix_plugin.captures.writing.work_folder import WorkFolder, hashes, refuse_output
 from unmix_plugin.errors import CaptureError, ConfigError, did_you_mean
 
 Say = Callable[[str], None]
@@ -125,3 +127,43 @@ def _write_views(plan: Plan, folder: WorkFolder, follow: Follow) -> dict[str, Vi
             folder.note(record)
         records[view.name] = record
     return records
+
+
+LARGEST_DIFFERENCE_NM = 0.1
+
+
+def refuse_unlike_views(views: Sequence[CaptureView]) -> None:
+    """Refuse views that differ from the first of their sensor.
+
+    Raises:
+        CaptureError: they do.
+    """
+    first: dict[str, SpectralFile] = {}
+    for view in views:
+        _refuse_unlike(view.cube, first.setdefault(view.sensor, view.cube))
+
+
+def _refuse_unlike(cube: SpectralFile, first: SpectralFile) -> None:
+    if cube.shape != first.shape:
+        found, expected = (" x ".join(map(str, file.shape)) for file in (cube, first))
+        raise CaptureError(
+            f"{cube.path} has {found} rows, columns and bands; expected {expected}, as {first.path} has: all views of "
+            "a camera are alike, so crop or remove this one"
+        )
+    wavelengths, expected_nm = cube.bands.wavelengths_nm, first.bands.wavelengths_nm
+    if (wavelengths is None) != (expected_nm is None):
+        raise CaptureError(
+            f"only one of {cube.path} and {first.path} gives wavelengths; give them for all with --wavelengths"
+        )
+    if wavelengths is not None and expected_nm is not None:
+        band = int(np.argmax(np.abs(wavelengths - expected_nm)))
+        if abs(wavelengths[band] - expected_nm[band]) > LARGEST_DIFFERENCE_NM:
+            raise CaptureError(
+                f"{cube.path} has {wavelengths[band]:g} nm at band {band}; expected {expected_nm[band]:g} nm, as "
+                f"{first.path} has: all views of a camera have the same bands"
+            )
+    if cube.dtype != first.dtype:
+        raise CaptureError(
+            f"{cube.path} holds {cube.dtype.name}; expected {first.dtype.name}, as {first.path} holds: convert all "
+            "views alike"
+        )

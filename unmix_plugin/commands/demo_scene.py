@@ -89,7 +89,7 @@ def _write_scene(options: DemoSceneOptions) -> None:
 
 
 def _write_capture(options: DemoSceneOptions) -> None:
-    from unmix_plugin.captures.demo.capture import (
+    from unmix_plugin.captures.demo import (
         POSES,
         RAW_BANDS,
         RAW_LAMP,

@@ -11,7 +11,7 @@ from tests.captures.files_in_memory import file_of
 from unmix_plugin.captures.calibration.calibration import Calibration, WhiteReference, find_missing
 from unmix_plugin.captures.calibration.raster import Raster
 from unmix_plugin.captures.calibration.references import open_reference
-from unmix_plugin.captures.poses.pose_set import Lens
+from unmix_plugin.captures.poses.lens import Lens
 
 HEIGHT, WIDTH, BANDS = 12, 8, 4
 EVERY = np.arange(BANDS)

@@ -9,11 +9,17 @@ import numpy as np
 import pytest
 
 from tests.captures.checks.view_factory import ball_points, record_of, ring_of, view_at
-from unmix_plugin.captures.checks.coverage import overlap, ring
-from unmix_plugin.captures.checks.moving_light import measure
-from unmix_plugin.captures.checks.pictures import blur, exposure, pixels
-from unmix_plugin.captures.checks.report import check_views, report_text
-from unmix_plugin.captures.pictures import detail
+from unmix_plugin.captures.checks import (
+    blur,
+    check_views,
+    exposure,
+    measure,
+    overlap,
+    pixels,
+    report_text,
+    ring,
+)
+from unmix_plugin.captures.writing.view_files import detail
 
 LAMP = np.array([2.0, 1.0, 5.0])
 

@@ -8,8 +8,9 @@ import numpy as np
 from PIL import Image
 
 from tests.scenes.scene_factory import look_at
-from unmix_plugin.captures.checks.seen_view import SeenView
-from unmix_plugin.captures.poses.pose_set import Lens, PosedCamera
+from unmix_plugin.captures.checks import SeenView
+from unmix_plugin.captures.poses.lens import Lens
+from unmix_plugin.captures.poses.pose_set import PosedCamera
 from unmix_plugin.captures.writing.view_files import ViewRecord
 
 SIDE = 120

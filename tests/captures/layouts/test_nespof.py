@@ -14,10 +14,8 @@ from tests.captures.layouts.data_sets import (
     write_nespof,
     write_real,
 )
-from unmix_plugin.captures.layouts.nespof import find_nespof
-from unmix_plugin.captures.layouts.nespof_real import find_nespof_real
+from unmix_plugin.captures.layouts.nespof import find_nespof, find_nespof_real, open_intensity, open_opacity
 from unmix_plugin.captures.layouts.registry import LayoutOptions
-from unmix_plugin.captures.layouts.stokes_exr import open_intensity, open_opacity
 from unmix_plugin.errors import CaptureError
 
 

@@ -17,9 +17,8 @@ from tests.captures.layouts.data_sets import (
     write_picture,
     write_unmix,
 )
-from unmix_plugin.captures.layouts.nerfstudio import find_nerfstudio
 from unmix_plugin.captures.layouts.registry import LAYOUTS, LayoutOptions, find_views
-from unmix_plugin.captures.layouts.unmix_nerf import find_hs_nerf, find_unmix_nerf
+from unmix_plugin.captures.layouts.transforms import find_hs_nerf, find_nerfstudio, find_unmix_nerf
 from unmix_plugin.errors import CaptureError
 
 

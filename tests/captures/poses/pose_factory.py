@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from tests.scenes.scene_factory import ring_poses
-from unmix_plugin.captures.poses.pose_set import Lens, PosedCamera, PoseSet
+from unmix_plugin.captures.poses.lens import Lens
+from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 
 LENS = Lens(640, 480, (500.0, 510.0), (321.0, 239.0), (0.01, -0.02, 0.001, -0.002))
 FLIP = np.diag([1.0, -1.0, -1.0])

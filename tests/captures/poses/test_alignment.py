@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tests.captures.poses.alignment import align_poses, similarity_of
 from tests.captures.poses.pose_factory import LENS, ring_set
-from unmix_plugin.captures.poses.alignment import align_poses, moved, similarity_of
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
+from unmix_plugin.captures.posing import moved
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.scenes.placement import Placement
 

@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.captures.poses.pose_factory import FLIP, LENS, assert_same_poses, ring
-from unmix_plugin.captures.poses.lens_fit import project_opencv
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.errors import CaptureError
 
@@ -70,7 +69,7 @@ def test_lenses_see_what_colmaps_own_projection_sees(tmp_path, model):
     assert lens is not None
     ideal = np.random.default_rng(0).uniform([-0.3, -0.22], [0.3, 0.22], (50, 2))
     wanted = made.cameras[7].img_from_cam(np.column_stack([ideal, np.ones(50)]))
-    mine = project_opencv(ideal, lens.focal_px, lens.center_px, lens.radial, lens.tangential)
+    mine = lens.pixels_of(ideal)
     is_exact = not any("replaced by the nearest" in note for note in found.notes)
     assert is_exact == (
         model not in ("FULL_OPENCV", "OPENCV_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE")

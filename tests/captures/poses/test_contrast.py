@@ -1,6 +1,6 @@
 import numpy as np
 
-from unmix_plugin.captures.poses.contrast import (
+from unmix_plugin.captures.poses.estimation import (
     contrast_picture,
     mean_weights,
     stretch,

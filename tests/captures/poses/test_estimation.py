@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from tests.captures.poses.alignment import align_poses
 from tests.scenes.scene_factory import look_at
 from unmix_plugin.captures.poses import estimation
-from unmix_plugin.captures.poses.alignment import align_poses
 from unmix_plugin.captures.poses.estimation import estimate_poses
-from unmix_plugin.captures.poses.pose_set import Lens, PosedCamera, PoseSet
+from unmix_plugin.captures.poses.lens import Lens
+from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 from unmix_plugin.errors import CaptureError
 
 pytest.importorskip("pycolmap")

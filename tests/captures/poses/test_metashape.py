@@ -4,7 +4,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.captures.poses.metashape_document import document, text_of
 from tests.captures.poses.pose_factory import assert_same_poses, ring
-from unmix_plugin.captures.poses.lens_fit import project_opencv
+from unmix_plugin.captures.poses.lens import project_opencv
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.errors import CaptureError
 

@@ -3,7 +3,6 @@ import pytest
 
 from tests.captures.poses.micmac_files import CALIBRATION, ORIENTATION, RADIAL, text_of
 from tests.captures.poses.pose_factory import FLIP, assert_same_poses, ring
-from unmix_plugin.captures.poses.lens_fit import project_opencv
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.errors import CaptureError
 
@@ -46,7 +45,7 @@ def test_distortion_in_pixels_about_its_own_centre_is_ours_within_half_a_pixel(t
     factor = 1 - 2e-7 * squared - 1e-14 * squared**2
     bent = np.column_stack([x * factor + p1 * (squared + 2 * x**2), y * factor + 2 * p1 * x * y])
     wanted = bent + np.array([322.5, 241.5])
-    mine = project_opencv(ideal, lens.focal_px, lens.center_px, lens.radial, lens.tangential)
+    mine = lens.pixels_of(ideal)
     np.testing.assert_allclose(mine, wanted, atol=0.5)
     assert np.abs(500 * ideal + [321, 239] - wanted).max() > 3
 

@@ -8,9 +8,9 @@ from tests.captures.poses.pose_factory import ring_set, transforms, write_json
 from tests.captures.poses.test_alignment import SIMILARITY, elsewhere, in_a_row
 from tests.scenes.geometry.ground_views import flight_poses
 from tests.scenes.scene_factory import make_scene, ring_poses
-from unmix_plugin.captures.poses.placement import place_poses, write_points
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 from unmix_plugin.captures.poses.reading import read_poses
+from unmix_plugin.captures.posing import place_poses, write_points
 from unmix_plugin.scenes import load_scene
 
 FAR = np.array([500_123.0, 5_400_321.0, 300.0])

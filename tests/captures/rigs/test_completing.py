@@ -4,8 +4,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from unmix_plugin.captures.capture import CaptureView
-from unmix_plugin.captures.poses.pose_set import Lens, PosedCamera
-from unmix_plugin.captures.rigs.completing import complete_rigs
+from unmix_plugin.captures.poses.lens import Lens
+from unmix_plugin.captures.poses.pose_set import PosedCamera
+from unmix_plugin.captures.posing import complete_rigs
 from unmix_plugin.captures.spectral_file import SpectralFile
 
 LENS = Lens(4, 3, (5.0, 5.0), (2.0, 1.5))

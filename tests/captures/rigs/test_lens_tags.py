@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from unmix_plugin.captures.poses.pose_set import Lens
-from unmix_plugin.captures.rigs.lens_tags import lens_of
+from unmix_plugin.captures.layouts.rig import lens_of
+from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.spectral_file import SpectralFile
 from unmix_plugin.errors import CaptureError
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from unmix_plugin.captures.poses.pose_set import Lens
+from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.errors import ConfigError
 
 

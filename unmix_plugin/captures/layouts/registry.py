@@ -1,11 +1,15 @@
-"""The layouts by name. Each is a function from a folder to a `Capture`, imported when it is used."""
+"""The layouts by name, and what several of them use: the files that a list names, and the names of views.
+
+A layout is a function from a folder to a `Capture`, imported when it is used.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import TypeAlias
 
 import numpy as np
@@ -13,7 +17,7 @@ from jaxtyping import Float64
 
 from unmix_plugin.captures.capture import Capture
 from unmix_plugin.captures.readers.read_options import Axes, ReadOptions
-from unmix_plugin.errors import CaptureError
+from unmix_plugin.errors import CaptureError, counted
 
 
 @dataclass(frozen=True)
@@ -41,10 +45,10 @@ FindViews: TypeAlias = Callable[[Path, LayoutOptions], Capture]
 _FUNCTIONS = {
     "cubes": "cubes:find_cubes",
     "nespof": "nespof:find_nespof",
-    "nespof-real": "nespof_real:find_nespof_real",
-    "hs-nerf": "unmix_nerf:find_hs_nerf",
-    "unmix-nerf": "unmix_nerf:find_unmix_nerf",
-    "nerfstudio": "nerfstudio:find_nerfstudio",
+    "nespof-real": "nespof:find_nespof_real",
+    "hs-nerf": "transforms:find_hs_nerf",
+    "unmix-nerf": "transforms:find_unmix_nerf",
+    "nerfstudio": "transforms:find_nerfstudio",
     "rig": "rig:find_rig",
 }
 """Module in this package, and the function in it."""
@@ -64,3 +68,82 @@ def find_views(layout: str, root: Path, options: LayoutOptions) -> Capture:
     module, function = _FUNCTIONS[layout].split(":")
     find: FindViews = getattr(import_module(f"unmix_plugin.captures.layouts.{module}"), function)
     return find(root, options)
+
+
+MOST_NAMED = 3
+
+
+class FoundFiles:
+    """Looks for the files of a capture and tells of all that are missing in one message."""
+
+    def __init__(self, root: Path) -> None:
+        self._root = root.resolve()
+        self._missing: list[str] = []
+
+    def look(self, where: str, *texts: str) -> Path | None:
+        """The first of some paths in the folder that is a file; None if none is.
+
+        Raises:
+            CaptureError: the path leaves the folder.
+        """
+        for text in texts:
+            path = self._root / text
+            try:
+                is_inside = path.resolve().is_relative_to(self._root) and not Path(text).is_absolute()
+                is_file = path.is_file()
+            except (OSError, RuntimeError, ValueError) as error:
+                raise CaptureError(
+                    f"{where}: {text!r} can't be followed ({error}); expected a path in the folder"
+                ) from error
+            if not is_inside:
+                raise CaptureError(
+                    f"{where}: {text!r} leaves the folder {self._root}; copy the file into it and name it from there"
+                )
+            if is_file:
+                return path
+        return None
+
+    def find(self, where: str, text: str, *others: str) -> Path | None:
+        """The same; noted as missing if none is.
+
+        Raises:
+            CaptureError: the path leaves the folder.
+        """
+        path = self.look(where, text, *others)
+        self._missing += [] if path else [text]
+        return path
+
+    def refuse_missing(self, advice: str) -> None:
+        """End here if a file was missing.
+
+        Raises:
+            CaptureError: some were; the message names a few.
+        """
+        if self._missing:
+            shown = ", ".join(self._missing[:MOST_NAMED])
+            more = len(self._missing) - MOST_NAMED
+            raise CaptureError(
+                f"{self._root} lacks {counted(len(self._missing), 'file')} of its views: {shown}"
+                f"{f' and {more} more' if more > 0 else ''}; {advice}"
+            )
+
+
+def view_names(texts: Sequence[str], where: str) -> list[str]:
+    """Names of views from the paths of their files: the stems, or with their folders where stems repeat.
+
+    Raises:
+        CaptureError: two paths give the same name.
+    """
+    paths = [PurePosixPath(text.replace("\\", "/")) for text in texts]
+    stems = [path.name if path.suffix[1:].isdecimal() else path.stem for path in paths]
+    if len(set(stems)) < len(stems):
+        stems = ["_".join([*path.parent.parts, stem]) for path, stem in zip(paths, stems, strict=True)]
+    names = [re.sub(r"[^\w.+-]+", "_", stem).strip("._") or "view" for stem in stems]
+    seen: dict[str, str] = {}
+    for name, text in zip(names, texts, strict=True):
+        other = seen.setdefault(name.casefold(), text)
+        if other is not text:
+            raise CaptureError(
+                f"{where}: {other} and {text} would both be the view '{name}'; rename one of them"
+            )
+    return names

@@ -7,29 +7,33 @@
 Every file is a view, with the lens as its sensor. Files of one release share an identifier in their XMP, otherwise
 their name up to the band. Pictures in colour are left out, as nothing says what their channels measure; so are thermal
 bands.
+
+Which lens and release of the shutter each file of a multispectral camera belongs to.
+
+The lens that a multispectral camera writes into its files (tags of Pix4D's namespace, and DJI's).
+
+Their pixels have 0 at the centre of the first pixel, ours 0.5: principal points are moved by half a pixel.
 """
 
 from __future__ import annotations
 
-from collections import Counter
+import math
+import re
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from unmix_plugin.captures.camera_tags import exif_number, tag_text
+from unmix_plugin.captures.camera_tags import XmpTags, exif_number, tag_numbers, tag_text
 from unmix_plugin.captures.capture import Capture, CaptureView
-from unmix_plugin.captures.layouts.found_files import view_names
-from unmix_plugin.captures.layouts.registry import LayoutOptions
-from unmix_plugin.captures.layouts.rig_files import (
-    BandFile,
-    open_band_file,
-    release_names,
-    sensor_names,
-    splits_of,
-)
-from unmix_plugin.captures.rigs.lens_tags import lens_of
+from unmix_plugin.captures.layouts.registry import LayoutOptions, view_names
+from unmix_plugin.captures.layouts.transforms import Split
+from unmix_plugin.captures.poses.lens import Lens, Points, fit_lens, require_unfolded
+from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import BandTable, SpectralFile
 from unmix_plugin.errors import CaptureError, counted
 
@@ -167,3 +171,216 @@ def _odd(bands: Sequence[BandFile], releases: Sequence[str]) -> list[str]:
         shown = ", ".join(incomplete[:3])
         notes.append(f"{len(incomplete)} of {len(counts)} releases lack a band: {shown}")
     return notes
+
+
+BAND_ENDING = re.compile(
+    r"(?:_MS)?[_-](\d{1,2}|GRE|GREEN|RED|REG|REDEDGE|RE|NIR|BLUE|RGB|G|R|B|D|W)$", re.IGNORECASE
+)
+"""Of a file's stem."""
+DJI_NUMBER = re.compile(r"(DJI_\d+)(\d)$", re.IGNORECASE)
+"""Of a Phantom 4 Multispectral: the last digit is the band, 0 the colour picture."""
+EVAL_INTERVAL = 8
+"""Every so many releases, one is for evaluation."""
+UNIQUE_TAGS = ("MicaSense:CaptureId", "CaptureUUID", "CaptureId")
+
+
+@dataclass(frozen=True)
+class BandFile:
+    """One file before it is a view."""
+
+    file: SpectralFile
+    base: str
+    """Name up to the band, with its folder."""
+    ending: str
+    """What tells the band in the name."""
+
+    @property
+    def tags(self) -> XmpTags:
+        return self.file.metadata.get("xmp") or {}
+
+
+def open_band_file(path: Path, root: Path) -> BandFile:
+    file = open_spectral_file(path)
+    number = DJI_NUMBER.fullmatch(path.stem)
+    found = BAND_ENDING.search(path.stem)
+    base, ending = path.stem, ""
+    if number is not None:
+        base, ending = number[1], number[2]
+    elif found is not None:
+        base, ending = path.stem[: found.start()], found[1]
+    folder = path.parent.relative_to(root)
+    return BandFile(file, str(folder / base) if folder.parts else base, ending.lower())
+
+
+def sensor_names(bands: Sequence[BandFile]) -> list[str]:
+    """Names of the lenses: the band's, with the index in the rig where several share it; or the file's ending."""
+    titles = [tag_text(item.tags, "BandName") or item.ending or "band" for item in bands]
+    slugs = [re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-") or "band" for title in titles]
+    indices = [tag_text(item.tags, "RigCameraIndex") or item.ending for item in bands]
+    owners: dict[str, set[str]] = defaultdict(set)
+    for slug, index in zip(slugs, indices, strict=True):
+        owners[slug].add(index)
+    return [
+        slug if len(owners[slug]) == 1 else f"{slug}-{index or '0'}"
+        for slug, index in zip(slugs, indices, strict=True)
+    ]
+
+
+def release_names(bands: Sequence[BandFile], where: str) -> list[str]:
+    """Names of the releases: the name up to the band of the first file of each, with its folder where names repeat.
+
+    Identifiers count where they join files; cameras that write another one into every file are grouped by name.
+
+    Raises:
+        CaptureError: two releases would have one name.
+    """
+    identifiers = [tag_text(item.tags, *UNIQUE_TAGS) or "" for item in bands]
+    counts = Counter(identifier for identifier in identifiers if identifier)
+    keys = [
+        identifier if counts[identifier] > 1 else f"name {item.base}"
+        for item, identifier in zip(bands, identifiers, strict=True)
+    ]
+    titles = {key: item.base for key, item in reversed(list(zip(keys, bands, strict=True)))}
+    repeated = {title for title, count in Counter(titles.values()).items() if count > 1}
+    texts = [f"{title} {key}" if title in repeated else title for key, title in titles.items()]
+    names = dict(zip(titles, view_names([f"{text}.tif" for text in texts], where), strict=True))
+    return [names[key] for key in keys]
+
+
+def splits_of(releases: Iterable[str]) -> dict[str, Split]:
+    """One of every eight releases is for evaluation, with all its lenses: in their middle, since what the first and
+    the last of a flight show no other does."""
+    names = sorted(set(releases))
+    evaluated = names[min(EVAL_INTERVAL, len(names)) // 2 :: EVAL_INTERVAL]
+    return {release: "eval" if release in evaluated else "train" for release in names}
+
+
+MM_OF_UNIT: dict[float, float] = {2.0: 25.4, 3.0: 10.0, 4.0: 1.0, 5.0: 1e-3}
+"""Millimetres in EXIF's FocalPlaneResolutionUnit: inch, cm, mm, micrometre."""
+TAGS = "lens in the XMP"
+LONGEST_MM = 50.0
+"""Focal length without a unit from which it is in pixels; these cameras have about 5 mm."""
+HALF_PIXEL = 0.5
+LIMIT_PX = 10.0
+"""By how much the lens with k1, k2, p1, p2 may differ from the camera's; poses usually bring a better one."""
+
+
+def lens_of(file: SpectralFile) -> tuple[Lens | None, tuple[str, ...]]:
+    """The lens of a file, and what there is to say of it; no lens where its tags don't tell one.
+
+    Raises:
+        CaptureError: its model differs from every OPENCV lens by too much, or folds the image over.
+    """
+    lens, notes = _stated_lens(file, file.metadata.get("xmp") or {}, file.metadata.get("exif") or {})
+    if lens is None:
+        return None, notes
+    numbers = (*lens.focal_px, *lens.center_px, *lens.distortion)
+    if not np.isfinite(numbers).all() or min(lens.focal_px) <= 0.0:
+        return None, ("no lens in the file's tags: its numbers make no sense",)
+    return lens, notes
+
+
+def _stated_lens(
+    file: SpectralFile, tags: XmpTags, exif: dict[str, Any]
+) -> tuple[Lens | None, tuple[str, ...]]:
+    if tag_numbers(tags, "DewarpData") is not None:
+        return _dji_lens(file, tags)
+    resolution = _resolution(exif)
+    centre_mm = tag_numbers(tags, "Camera:PrincipalPoint")
+    if resolution is None or centre_mm is None or len(centre_mm) != 2:
+        return None, ("no lens in the file's tags: principal point or focal plane resolution is absent",)
+    centre = (centre_mm[0] * resolution[0] + HALF_PIXEL, centre_mm[1] * resolution[1] + HALF_PIXEL)
+    fisheye = tag_numbers(tags, "FisheyePolynomial")
+    if fisheye is not None and (tag_text(tags, "Camera:ModelType") or "fisheye").lower() == "fisheye":
+        return _fisheye_lens(file, tags, fisheye, centre)
+    return _perspective_lens(file, tags, resolution, centre)
+
+
+def _resolution(exif: dict[str, Any]) -> tuple[float, float] | None:
+    """Pixels a millimetre along x and y."""
+    unit = MM_OF_UNIT.get(exif_number(exif, "FocalPlaneResolutionUnit") or 4.0, 1.0)
+    across = (exif_number(exif, "FocalPlaneXResolution") or 0.0) / unit
+    down = (exif_number(exif, "FocalPlaneYResolution") or 0.0) / unit
+    return (across, down or across) if across > 0.0 else None
+
+
+def _perspective_lens(
+    file: SpectralFile, tags: XmpTags, resolution: tuple[float, float], centre: tuple[float, float]
+) -> tuple[Lens | None, tuple[str, ...]]:
+    focal = tag_numbers(tags, "PerspectiveFocalLength")
+    if focal is None or focal[0] <= 0.0:
+        return None, ("no lens in the file's tags: PerspectiveFocalLength is absent",)
+    unit = tag_text(tags, "PerspectiveFocalLengthUnits") or ("mm" if focal[0] < LONGEST_MM else "px")
+    focal_px = (focal[0] * resolution[0], focal[0] * resolution[1]) if unit == "mm" else (focal[0], focal[0])
+    distortion = tag_numbers(tags, "PerspectiveDistortion") or []
+    k1, k2, k3, p1, p2 = distortion if len(distortion) == 5 else [0.0] * 5
+    return _lens(file, focal_px, centre, (k1, k2, k3), (p1, p2)), ()
+
+
+def _dji_lens(file: SpectralFile, tags: XmpTags) -> tuple[Lens | None, tuple[str, ...]]:
+    """`DewarpData`: a date; fx, fy, cx, cy, k1, k2, p1, p2, k3, where cx, cy count from the optical centre."""
+    text = (tag_text(tags, "DewarpData") or "").rpartition(";")[2]
+    numbers = tag_numbers({"DewarpData": text}, "DewarpData") or []
+    middle = [(tag_numbers(tags, f"CalibratedOpticalCenter{axis}") or [math.nan])[0] for axis in "XY"]
+    if len(numbers) != 9 or not np.isfinite(middle).all():
+        return None, ("no lens in the file's tags: DewarpData or CalibratedOpticalCenter is incomplete",)
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = numbers
+    centre = (middle[0] + cx + HALF_PIXEL, middle[1] + cy + HALF_PIXEL)
+    return _lens(file, (fx, fy), centre, (k1, k2, k3), (p1, p2)), ()
+
+
+def _lens(
+    file: SpectralFile,
+    focal_px: tuple[float, float],
+    centre: tuple[float, float],
+    radial: tuple[float, float, float],
+    tangential: tuple[float, float],
+) -> Lens:
+    """A lens of the file's size.
+
+    Raises:
+        CaptureError: its distortion folds the image over.
+    """
+    height, width = file.shape[:2]
+    lens = Lens(width, height, focal_px, centre, (*radial[:2], *tangential), (radial[2], 0.0))
+    if lens.higher_radial[0]:
+        require_unfolded(lens, f"{file.path}, {TAGS}")
+    return lens
+
+
+def _fisheye_lens(
+    file: SpectralFile, tags: XmpTags, polynomial: list[float], centre: tuple[float, float]
+) -> tuple[Lens | None, tuple[str, ...]]:
+    """Pix4D's fisheye: radius p0 + p1 t + p2 t^2 + p3 t^3 with t = 2/pi times the angle, then the matrix C, D; E, F."""
+    numbers = tag_numbers(tags, "FisheyeAffineMatrix")
+    if numbers is None or len(numbers) != 4:
+        return None, ("no lens in the file's tags: FisheyeAffineMatrix is absent",)
+    height, width = file.shape[:2]
+    try:
+        lens, note = _fit_fisheye((width, height), tuple(polynomial), tuple(numbers), centre)
+    except CaptureError as error:
+        raise CaptureError(f"{file.path}, {error}") from error
+    return lens, (note,)
+
+
+@lru_cache
+def _fit_fisheye(
+    size: tuple[int, int],
+    polynomial: tuple[float, ...],
+    matrix: tuple[float, ...],
+    centre: tuple[float, float],
+) -> tuple[Lens, str]:
+    """The lens nearest to a fisheye; all files of a lens have the same."""
+    affine = np.array(matrix).reshape(2, 2)
+
+    def project(ideal: Points) -> Points:
+        radius = np.hypot(*ideal.T)
+        bent = np.polynomial.polynomial.polyval(2.0 / math.pi * np.arctan(radius), polynomial)
+        ratio = np.divide(
+            bent, radius, out=np.full_like(radius, 2.0 / math.pi * polynomial[1]), where=radius > 1e-9
+        )
+        return (ideal * ratio[:, None]) @ affine.T + np.array(centre)
+
+    focal = 2.0 / math.pi * polynomial[1] * np.diag(affine)
+    start = Lens(*size, (float(focal[0]), float(focal[1])), centre)
+    return fit_lens(project, start, "fisheye of Pix4D", TAGS, LIMIT_PX)

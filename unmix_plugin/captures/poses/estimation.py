@@ -1,4 +1,14 @@
-"""Poses estimated from the pictures themselves: structure from motion with COLMAP, one lens a sensor."""
+"""Poses estimated from the pictures themselves: structure from motion with COLMAP, one lens a sensor.
+
+Pictures in which features are found: 8 bits, stretched, with local contrast, made from spectral cubes.
+
+Notation: `H x W` pixels, `B` bands.
+
+Structure from motion with pycolmap, as a process of its own: `python -m ... SETTINGS.json`.
+
+A process, because COLMAP ends the one that it runs in when a check of its own fails, can't be interrupted, and talks to
+standard error.
+"""
 
 from __future__ import annotations
 
@@ -7,18 +17,16 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, Shaped, UInt8
 
 from unmix_plugin.captures.poses.colmap import read_colmap
-from unmix_plugin.captures.poses.contrast import without_rim
-from unmix_plugin.captures.poses.pose_set import PoseSet
-from unmix_plugin.captures.poses.rigid import name_some
-from unmix_plugin.captures.poses.sfm_process import SfmSettings, write_settings
+from unmix_plugin.captures.poses.pose_set import PoseSet, name_some
 from unmix_plugin.errors import CaptureError
 
 Picture = UInt8[np.ndarray, "H W"] | UInt8[np.ndarray, "H W 3"]
@@ -106,7 +114,7 @@ def _run(settings: SfmSettings, folder: Path) -> list[dict]:
     """Start the process that reconstructs, with its output in the log file."""
     result = folder / "result.json"
     result.unlink(missing_ok=True)
-    command = [sys.executable, "-m", "unmix_plugin.captures.poses.sfm_process", str(write_settings(settings))]
+    command = [sys.executable, "-m", "unmix_plugin.captures.poses.estimation", str(write_settings(settings))]
     with (folder / LOG).open("wb") as log:
         status = subprocess.run(
             command, stdout=log, stderr=log, stdin=subprocess.DEVNULL, check=False
@@ -138,3 +146,226 @@ def _best(models: list[dict], files: Mapping[str, str], folder: Path) -> PoseSet
         notes.append(f"views without pose: {name_some(missing)}")
     notes += poses.notes
     return replace(poses, cameras=cameras, source="estimated by COLMAP", has_world=False, notes=tuple(notes))
+
+
+ReadRows = Callable[[slice], Shaped[np.ndarray, "h W B"]]
+"""Some rows of a cube, all bands."""
+
+_PERCENTILES = (1.0, 99.5)
+_GAMMA = 0.5
+"""Values are light; shadows need the room that eyes, and detectors made for photographs, expect."""
+_LOCAL_CONTRAST = 0.02
+_TILES = 8
+"""A side is cut into so many tiles, each with a contrast of its own."""
+_ROWS = 64
+"""Read at once."""
+
+
+def contrast_picture(
+    read_rows: ReadRows,
+    size: tuple[int, int],
+    weights: Float[np.ndarray, " B"],
+    valid: Bool[np.ndarray, "H W"] | None = None,
+) -> UInt8[np.ndarray, "H W"]:
+    """A picture of a cube that is never in memory as a whole.
+
+    Args:
+        read_rows: The cube, calibrated or not.
+        size: H, W.
+        weights: Of bands in the mean; 0 leaves a band out. Use the same for all views, so that they look alike.
+        valid: Pixels that count for the stretch; others become black. Pixels that are not finite never count.
+    """
+    height, width = size
+    mean = np.empty((height, width), np.float32)
+    used = np.flatnonzero(weights)
+    for start in range(0, height, _ROWS):
+        rows = slice(start, min(start + _ROWS, height))
+        mean[rows] = read_rows(rows)[..., used].astype(np.float32) @ weights[used].astype(np.float32)
+    return stretch(mean, valid)
+
+
+def stretch(
+    values: Float32[np.ndarray, "H W"], valid: Bool[np.ndarray, "H W"] | None = None
+) -> UInt8[np.ndarray, "H W"]:
+    """Values between two percentiles as a picture with local contrast; black where they don't count."""
+    from skimage.exposure import equalize_adapthist
+
+    counts = np.isfinite(values) if valid is None else valid & np.isfinite(values)
+    if not counts.any():
+        return np.zeros(values.shape, np.uint8)
+    low, high = np.percentile(values[counts], _PERCENTILES)
+    if high <= low:
+        return np.where(counts, np.uint8(128), np.uint8(0))
+    level = np.clip((np.where(counts, values, low) - low) / (high - low), 0.0, 1.0) ** _GAMMA
+    tile = [max(side // _TILES, 1) for side in values.shape]
+    local = equalize_adapthist(level, kernel_size=tile, clip_limit=_LOCAL_CONTRAST)
+    return np.where(counts, np.round(255.0 * local), 0.0).astype(np.uint8)
+
+
+def mean_weights(good: Bool[np.ndarray, " B"]) -> Float64[np.ndarray, " B"]:
+    """Weights that average the good bands; all of them if none is good."""
+    weights = good.astype(np.float64) if good.any() else np.ones(len(good))
+    return weights / weights.sum()
+
+
+def without_rim(mask: Bool[np.ndarray, "H W"], pixels: int) -> Bool[np.ndarray, "H W"]:
+    """A mask of matter without its rim, whose features belong to the silhouette and not to the surface."""
+    from scipy.ndimage import binary_erosion
+
+    return binary_erosion(mask, iterations=pixels) if pixels > 0 else mask
+
+
+LEAST_MODEL = 3
+"""Images of the smallest model that is kept."""
+ENOUGH = 0.9
+"""Share of registered images with which no other focal length is tried."""
+FOCAL_FACTORS = (1.2, 3.0, 7.0)
+"""First focal lengths to try, over the longer side: wide, tele and far lenses."""
+PEAK_THRESHOLD = 0.003
+"""Of features: half of COLMAP's, as matter in a laboratory has less texture than a street."""
+CAMERA_MODEL = "SIMPLE_RADIAL"
+"""COLMAP's name of a lens with one number of distortion."""
+MOST_FEATURES = 8192
+"""Of a picture."""
+SEED = 0
+GAIN = 0.02
+"""Part of the reprojection error that distortion has to remove to be kept."""
+GREATEST_BEND = 0.1
+"""Of half the diagonal: what distortion may move the corner of a picture by."""
+
+
+@dataclass(frozen=True)
+class SfmSettings:
+    """What to reconstruct."""
+
+    folder: str
+    """Holds `images` and gets `database.db` and `models`."""
+    sensors: tuple[tuple[str, ...], ...]
+    """Names of image files with one lens each."""
+    has_masks: bool
+    """Whether `masks` holds IMAGE.png for images, black where no features are wanted."""
+    sequential: bool
+    """Match neighbours in the order of names instead of all pairs."""
+    threads: int
+
+
+def write_settings(settings: SfmSettings) -> Path:
+    """The file to start the process with."""
+    path = Path(settings.folder) / "settings.json"
+    path.write_text(json.dumps(asdict(settings)), encoding="utf-8")
+    return path
+
+
+def main(path: Path) -> None:
+    """Reconstruct, and write `result.json`: folder, registered images and reprojection error of each model."""
+    import pycolmap
+
+    values = json.loads(path.read_text(encoding="utf-8"))
+    settings = SfmSettings(**{**values, "sensors": tuple(map(tuple, values["sensors"]))})
+    pycolmap.set_random_seed(SEED)
+    folder = Path(settings.folder)
+    database = folder / "database.db"
+    database.unlink(missing_ok=True)
+    _extract(pycolmap, settings, database)
+    _match(pycolmap, settings, database)
+    count = sum(map(len, settings.sensors))
+    found: list[dict[str, Any]] = []
+    for factor in FOCAL_FACTORS:
+        _set_focal(pycolmap, database, factor)
+        found += _map(pycolmap, settings, database, folder / "models" / f"{factor:g}")
+        if max((model["registered"] for model in found), default=0) >= ENOUGH * count:
+            break
+    (folder / "result.json").write_text(json.dumps(found), encoding="utf-8")
+
+
+def _extract(pycolmap: Any, settings: SfmSettings, database: Path) -> None:
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads, options.use_gpu = settings.threads, False
+    options.sift.max_num_features, options.sift.peak_threshold = MOST_FEATURES, PEAK_THRESHOLD
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = CAMERA_MODEL
+    if settings.has_masks:
+        reader.mask_path = Path(settings.folder) / "masks"
+    for names in settings.sensors:
+        pycolmap.extract_features(
+            database,
+            Path(settings.folder) / "images",
+            image_names=list(names),
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            reader_options=reader,
+            extraction_options=options,
+            device=pycolmap.Device.cpu,
+        )
+
+
+def _match(pycolmap: Any, settings: SfmSettings, database: Path) -> None:
+    options = pycolmap.FeatureMatchingOptions()
+    options.num_threads, options.use_gpu = settings.threads, False
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = SEED
+    match = pycolmap.match_sequential if settings.sequential else pycolmap.match_exhaustive
+    match(database, matching_options=options, verification_options=verification, device=pycolmap.Device.cpu)
+
+
+def _set_focal(pycolmap: Any, database: Path, factor: float) -> None:
+    """Start all lenses from a focal length of so many times the longer side, without distortion."""
+    with pycolmap.Database.open(database) as opened:
+        for camera in opened.read_all_cameras():
+            values = np.zeros(len(camera.params))
+            values[list(camera.focal_length_idxs())] = factor * max(camera.width, camera.height)
+            values[list(camera.principal_point_idxs())] = camera.width / 2, camera.height / 2
+            camera.params = values
+            opened.update_camera(camera)
+
+
+def _map(pycolmap: Any, settings: SfmSettings, database: Path, output: Path) -> list[dict[str, Any]]:
+    """Models from one first focal length, without distortion, which a few views of a far lens would let run away."""
+    output.mkdir(parents=True, exist_ok=True)
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads, options.random_seed, options.min_model_size = (
+        settings.threads,
+        SEED,
+        LEAST_MODEL,
+    )
+    options.max_num_models = 5
+    options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = False
+    options.max_focal_length_ratio = options.mapper.max_focal_length_ratio = 50.0
+    options.triangulation.max_focal_length_ratio = 50.0
+    options.mapper.random_seed = options.triangulation.random_seed = SEED
+    options.mapper.init_min_tri_angle, options.mapper.init_min_num_inliers = 8.0, 50
+    options.mapper.abs_pose_min_num_inliers, options.mapper.abs_pose_min_inlier_ratio = 15, 0.15
+    models = pycolmap.incremental_mapping(database, Path(settings.folder) / "images", output, options)
+    found = []
+    for number, model in models.items():
+        place = output / str(number)
+        bent = _with_distortion(pycolmap, model)
+        bent.write(place)
+        error = bent.compute_mean_reprojection_error()
+        found.append({"folder": str(place), "registered": bent.num_reg_images(), "error_px": error})
+    return found
+
+
+def _with_distortion(pycolmap: Any, model: Any) -> Any:
+    """The model with distortion refined too, where that is better and stays small; otherwise as it was."""
+    bent = pycolmap.Reconstruction(model)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_extra_params, options.print_summary = True, False
+    pycolmap.bundle_adjustment(bent, options)
+    is_better = (
+        bent.compute_mean_reprojection_error() < (1.0 - GAIN) * model.compute_mean_reprojection_error()
+    )
+    return bent if is_better and all(map(_is_plausible, bent.cameras.values())) else model
+
+
+def _is_plausible(camera: Any) -> bool:
+    """Whether distortion moves the corners of the picture by a small part of the diagonal."""
+    corners = np.array([[0.0, 0.0], [camera.width, 0.0], [0.0, camera.height], [camera.width, camera.height]])
+    away = corners - (camera.principal_point_x, camera.principal_point_y)
+    ideal = away / (camera.focal_length_x, camera.focal_length_y)
+    bent = camera.img_from_cam(np.column_stack([ideal, np.ones(4)]))
+    limit = GREATEST_BEND * 0.5 * np.hypot(camera.width, camera.height)
+    return bool(np.isfinite(bent).all() and np.linalg.norm(bent - corners, axis=1).max() < limit)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -7,8 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
-from unmix_plugin.captures.poses.rigid import name_some
+from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet, name_some
 from unmix_plugin.errors import CaptureError, counted
 
 BY_ORDER = "#"

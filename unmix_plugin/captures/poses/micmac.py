@@ -12,11 +12,9 @@ from xml.etree import ElementTree
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.captures.poses.lens_fit import Points, fit_lens
-from unmix_plugin.captures.poses.pose_set import Lens, PoseSet
-from unmix_plugin.captures.poses.raw_poses import RawCamera, find_offset, make_pose_set
-from unmix_plugin.captures.poses.rigid import FLIP
-from unmix_plugin.captures.poses.xml_text import load_xml, number_of, numbers_of
+from unmix_plugin.captures.poses.files import load_xml, number_of, numbers_of
+from unmix_plugin.captures.poses.lens import Lens, Points, fit_lens
+from unmix_plugin.captures.poses.pose_set import FLIP, PoseSet, RawCamera, find_offset, make_pose_set
 from unmix_plugin.errors import CaptureError
 
 PREFIX = "Orientation-"

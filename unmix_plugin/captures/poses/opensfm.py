@@ -11,10 +11,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.captures.poses.lens_fit import fit_lens, project_fisheye
-from unmix_plugin.captures.poses.pose_set import Lens, PoseSet
-from unmix_plugin.captures.poses.raw_poses import RawCamera, SparsePoints, make_pose_set
-from unmix_plugin.captures.poses.rigid import FLIP, name_some
+from unmix_plugin.captures.poses.lens import Lens, fit_lens, project_fisheye
+from unmix_plugin.captures.poses.pose_set import (
+    FLIP,
+    PoseSet,
+    RawCamera,
+    SparsePoints,
+    make_pose_set,
+    name_some,
+)
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.scenes.reading.faults import describe, read_number
 

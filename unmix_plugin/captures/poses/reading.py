@@ -1,4 +1,7 @@
-"""Poses of any program that we know, found by content."""
+"""Poses of any program that we know, found by content.
+
+Poses of LLFF: poses_bounds.npy, (N, 17): a 3 x 5 matrix [R | t | h, w, f] (axes down, right, back), near, far.
+"""
 
 from __future__ import annotations
 
@@ -6,19 +9,19 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from unmix_plugin.captures.json_files import load_json
+import numpy as np
+
 from unmix_plugin.captures.poses.colmap import find_models, read_colmap
-from unmix_plugin.captures.poses.lens_fit import require_unfolded
-from unmix_plugin.captures.poses.llff import FILE_NAME as LLFF_FILE
-from unmix_plugin.captures.poses.llff import read_llff
+from unmix_plugin.captures.poses.files import PictureSizes, Size, load_json, load_xml
+from unmix_plugin.captures.poses.lens import Lens, require_unfolded
+from unmix_plugin.captures.poses.matching import BY_ORDER
 from unmix_plugin.captures.poses.metashape import read_metashape
 from unmix_plugin.captures.poses.micmac import find_orientations, read_micmac
 from unmix_plugin.captures.poses.opensfm import is_reconstruction, read_opensfm
-from unmix_plugin.captures.poses.pose_set import PoseSet
-from unmix_plugin.captures.poses.sizes import PictureSizes, Size
+from unmix_plugin.captures.poses.pose_set import PoseSet, RawCamera, make_pose_set
 from unmix_plugin.captures.poses.transforms_json import has_frames, read_transforms
-from unmix_plugin.captures.poses.xml_text import load_xml
 from unmix_plugin.errors import CaptureError
+from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array, read_array_header
 from unmix_plugin.scenes.reading.faults import describe
 
 KNOWN = (
@@ -134,3 +137,55 @@ def _first_bytes(path: Path) -> bytes:
             return file.read(512)
     except OSError as error:
         raise CaptureError(f"{path} can't be read ({error.strerror or error})") from error
+
+
+LLFF_FILE = "poses_bounds.npy"
+PICTURE_FOLDERS = ("images", "exr")
+"""Where the pictures are, in the order of whose names the poses come."""
+
+
+def read_llff(path: Path) -> PoseSet:
+    """Poses in the order of the file, with the names of the pictures beside it where there are as many.
+
+    Raises:
+        CaptureError: it is not an array of the right shape, or a size or focal length makes no sense.
+    """
+    try:
+        shape = read_array_header(path).shape
+        is_table = len(shape) == 2 and shape[0] > 0 and shape[1] in (15, 17)
+        table = np.array(map_array(path), dtype=np.float64) if is_table else None
+    except UnreadableArrayError as error:
+        raise CaptureError(f"{path} {error}") from error
+    except OSError as error:
+        raise CaptureError(f"{path} can't be read ({error.strerror or error})") from error
+    if table is None:
+        raise CaptureError(f"{path} has the shape {shape}; expected (views, 17) numbers, as LLFF writes them")
+    names, note = _names(path.parent, len(table))
+    cameras = []
+    for name, row in zip(names, table[:, :15].reshape(-1, 3, 5), strict=True):
+        down, right, back, position, (height, width, focal) = row.T
+        if not (1 <= width <= 1e6 and 1 <= height <= 1e6 and 0 < focal < 1e9):
+            raise CaptureError(
+                f"{path}: the camera of {name} has height, width, focal length {height:g}, {width:g}, {focal:g}; "
+                "expected pixels above 0"
+            )
+        lens = Lens(
+            round(width), round(height), (float(focal), float(focal)), (float(width) / 2, float(height) / 2)
+        )
+        cameras.append(RawCamera(name, np.column_stack([right, -down, back, position]), lens))
+    return make_pose_set(cameras, f"LLFF's {path.name}", str(path), notes=[note])
+
+
+def _names(folder: Path, count: int) -> tuple[list[str], str]:
+    for place in PICTURE_FOLDERS:
+        if (folder / place).is_dir():
+            found = sorted(
+                entry.name for entry in (folder / place).iterdir() if not entry.name.startswith(".")
+            )
+            if len(found) == count:
+                return [
+                    f"{place}/{name}" for name in found
+                ], f"poses are those of {place}/ in the order of names"
+    return [
+        f"{BY_ORDER}{index:04d}" for index in range(count)
+    ], "poses have no names: they go by the order of views"

@@ -1,11 +1,16 @@
 """The folder beside the output in which a scene is made: views that are done survive a kill, and nothing takes it for a
 scene, as it has no transforms.json and is called unfinished.
+
+The files that a scene is made of: which they are, and their hashes.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import shutil
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +21,8 @@ from unmix_plugin.engine.runs.atomic_files import (
     write_errors_as,
     write_file,
 )
-from unmix_plugin.errors import ConfigError
+from unmix_plugin.errors import CaptureError, ConfigError
+from unmix_plugin.scenes.reading.faults import sha256_of
 
 PLAN_NAME, RECORD_NAME, SCENE_NAME = "plan.json", "process.json", "transforms.json"
 _VIEWS, POSES_NAME = "views", "poses"
@@ -116,3 +122,48 @@ def refuse_output(output: Path, overwrite: bool) -> None:
 
 def _json(value: Any) -> bytes:
     return (json.dumps(value, indent=1, sort_keys=True) + "\n").encode()
+
+
+def stamps(paths: Iterable[Path]) -> list[list[Any]]:
+    """Path, size and time of change of each file: what tells quickly whether it is still the same.
+
+    Raises:
+        CaptureError: a file is gone.
+    """
+    found = []
+    for path in paths:
+        for file in _files_of(path):
+            with _reading(file):
+                facts = file.stat()
+            found.append([os.fspath(file.absolute()), facts.st_size, facts.st_mtime_ns])
+    return found
+
+
+def hashes(paths: Iterable[Path]) -> list[dict[str, Any]]:
+    """Path, size and SHA-256 of each file.
+
+    Raises:
+        CaptureError: a file can't be read.
+    """
+    found = []
+    for path in paths:
+        for file in _files_of(path):
+            with _reading(file):
+                found.append(
+                    {"path": os.fspath(file), "bytes": file.stat().st_size, "sha256": sha256_of(file)}
+                )
+    return found
+
+
+def _files_of(path: Path) -> list[Path]:
+    """The file, or those of a folder that a reader takes as one."""
+    return sorted(child for child in path.iterdir() if child.is_file()) if path.is_dir() else [path]
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Context in which an error of the system becomes one of reading `path`."""
+    try:
+        yield
+    except OSError as error:
+        raise CaptureError(f"{path} can't be read ({error.strerror or error})") from error

@@ -6,14 +6,13 @@ Notation: `N` cameras, `P` points.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from unmix_plugin.captures.poses.lens_fit import project_opencv
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
-from unmix_plugin.captures.poses.rigid import FLIP
+from unmix_plugin.captures.posing import moved
 from unmix_plugin.engine.geometry.camera_paths import focus_point
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.scenes.placement import Placement
@@ -97,24 +96,6 @@ def similarity_of(source: Float64[np.ndarray, "P 3"], target: Float64[np.ndarray
     return Placement(rotation, target_middle / scale - rotation @ source_middle, scale)
 
 
-def project(camera: PosedCamera, points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, "P 2"]:
-    """Pixels of points; NaN for points behind the camera."""
-    assert camera.lens is not None
-    rotation, position = camera.camera_to_world[:, :3] @ FLIP, camera.camera_to_world[:, 3]
-    x, y, z = ((points - position) @ rotation).T
-    depth = np.where(z > 1e-9, z, np.nan)
-    lens = camera.lens
-    ideal = np.column_stack([x / depth, y / depth])
-    return project_opencv(ideal, lens.focal_px, lens.center_px, lens.radial, lens.tangential)
-
-
-def moved(camera: PosedCamera, similarity: Placement) -> PosedCamera:
-    """The camera in the world that the similarity leads to."""
-    pose = camera.camera_to_world
-    position = similarity.to_scene(pose[:, 3])
-    return replace(camera, camera_to_world=np.column_stack([similarity.rotation @ pose[:, :3], position]))
-
-
 def _extent(cameras: Sequence[PosedCamera]) -> float:
     """Mean distance of cameras from their middle; 1 where they are at one place."""
     positions = np.stack([camera.camera_to_world[:, 3] for camera in cameras])
@@ -155,7 +136,7 @@ def _refine(
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
 
-    wanted = np.stack([project(camera, points) for camera in theirs])
+    wanted = np.stack([camera.pixels_of(points) for camera in theirs])
     seen = np.isfinite(wanted) & _inside(wanted, theirs)[..., None]
     pivot = points.mean(axis=0)
 
@@ -168,7 +149,7 @@ def _refine(
         return Placement(turn @ first.rotation, translation, scale)
 
     def errors(step: np.ndarray) -> np.ndarray:
-        found = np.stack([project(moved(camera, changed(step)), points) for camera in mine])
+        found = np.stack([moved(camera, changed(step)).pixels_of(points) for camera in mine])
         return np.nan_to_num((found - wanted)[seen], nan=1e4)
 
     reach = _extent(theirs)
@@ -193,8 +174,8 @@ def _alignment(
     points: Float64[np.ndarray, "P 3"],
 ) -> Alignment:
     aligned = [moved(camera, similarity) for camera in mine]
-    wanted = np.stack([project(camera, points) for camera in theirs])
-    squared = ((np.stack([project(camera, points) for camera in aligned]) - wanted) ** 2).sum(axis=-1)
+    wanted = np.stack([camera.pixels_of(points) for camera in theirs])
+    squared = ((np.stack([camera.pixels_of(points) for camera in aligned]) - wanted) ** 2).sum(axis=-1)
     squared[~_inside(wanted, theirs)] = np.nan
     found, true = (np.stack([camera.camera_to_world for camera in those]) for those in (aligned, theirs))
     cosines = ((found[:, :, :3] * true[:, :, :3]).sum(axis=(1, 2)) - 1.0) / 2.0

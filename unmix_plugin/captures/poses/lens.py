@@ -1,4 +1,4 @@
-"""Lenses of models that we do not have, replaced by the OPENCV lens that is nearest over the image.
+"""The lens of a camera, and the nearest one of its kind to lenses of models that we do not have.
 
 Notation: `P` points; ideal coordinates are x/z, y/z before the camera, +x right, +y down.
 """
@@ -6,18 +6,49 @@ Notation: `P` points; ideal coordinates are x/z, y/z before the camera, +x right
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.captures.poses.pose_set import Lens
 from unmix_plugin.errors import CaptureError
 
 Points = Float64[np.ndarray, "P 2"]
 Project: TypeAlias = Callable[[Points], Points]
 """From ideal coordinates to pixels."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Intrinsics of a camera. Pixels, with the centre of the first pixel at (0.5, 0.5)."""
+
+    width: int
+    height: int
+    focal_px: tuple[float, float]
+    """Along x and y."""
+    center_px: tuple[float, float]
+    """Principal point x, y."""
+    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    """k1, k2, p1, p2 of the OPENCV model; zeros are a pinhole."""
+    higher_radial: tuple[float, float] = (0.0, 0.0)
+    """k3, k4: radial terms of the sixth and eighth power."""
+
+    @property
+    def radial(self) -> tuple[float, float, float, float]:
+        """k1 to k4."""
+        return (*self.distortion[:2], *self.higher_radial)
+
+    @property
+    def tangential(self) -> tuple[float, float]:
+        """p1, p2."""
+        return self.distortion[2:]
+
+    def pixels_of(self, ideal: Points) -> Points:
+        """Where ideal points are seen."""
+        return project_opencv(ideal, self.focal_px, self.center_px, self.radial, self.tangential)
+
 
 LARGEST_ERROR_PX = 0.5
 """Of a fitted lens anywhere in the image; beyond, the images have to be undistorted."""
@@ -114,7 +145,7 @@ def _folds(lens: Lens) -> bool:
     """Remembered, since all files of one camera have the same lens."""
 
     def project(ideal: Points) -> Points:
-        return project_opencv(ideal, lens.focal_px, lens.center_px, lens.radial, lens.tangential)
+        return lens.pixels_of(ideal)
 
     return _invert(project, _pixel_grid(lens.width, lens.height), lens) is None
 

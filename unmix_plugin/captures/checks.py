@@ -1,0 +1,472 @@
+"""A written view as the checks look at it: its camera, its picture, what was measured while it was written.
+
+Notation: `H x W` pixels, `N` views, `P` points.
+
+Where the cameras are: how many there are, from which sides they look, and whether neighbours see the same.
+
+Views that differ from the others: blurred ones, and jumps of exposure.
+
+Whether the light moves with the camera, as on a turntable, measured on sparse points in pairs of near views.
+
+Under fixed lamps a matt point keeps its brightness from view to view. Lamps that move along with the camera make a
+pattern that stands still in the picture, bright in the middle or towards a lamp: points that cross it get brighter on
+one side and darker on the other. So the logarithm of the ratio of brightness has a slope along the direction of
+movement, the same in all pairs. On a ball lit from the camera the slope, per radius and radian of movement, is about 1;
+lamps on both sides make it negative. Strong vignetting that nothing corrects has a slope too.
+
+One page of text: what looks wrong, what was measured, what was done.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64
+
+from unmix_plugin.captures.poses.pose_set import PosedCamera
+from unmix_plugin.captures.writing.view_files import ViewRecord
+from unmix_plugin.engine.geometry.camera_paths import meeting_point
+from unmix_plugin.errors import counted
+
+
+@dataclass(frozen=True)
+class SeenView:
+    """One view of a scene that is written."""
+
+    record: ViewRecord
+    camera: PosedCamera
+    """With the lens of the picture."""
+    picture: Path
+
+    @property
+    def name(self) -> str:
+        """Of the view."""
+        return self.record.name
+
+    @property
+    def position(self) -> Float64[np.ndarray, "3"]:
+        """Of the camera."""
+        return self.camera.camera_to_world[:, 3]
+
+    @property
+    def axis(self) -> Float64[np.ndarray, "3"]:
+        """Unit vector along which the camera looks."""
+        return -self.camera.camera_to_world[:, 2]
+
+    @cached_property
+    def luminance(self) -> Float32[np.ndarray, "H W"]:
+        """Linear luminance of the picture, smoothed over 3 x 3 pixels; NaN where the view shows nothing."""
+        from PIL import Image
+        from scipy import ndimage
+
+        with Image.open(self.picture) as picture:
+            pixels = np.asarray(picture.convert("RGBA"))
+        levels = np.arange(256) / 255.0
+        linear = np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
+        light = linear[pixels[..., :3]] @ np.array([0.2126, 0.7152, 0.0722])
+        smooth = ndimage.uniform_filter(light, 3)
+        return np.where(pixels[..., 3] > 127, smooth, np.nan).astype(np.float32)
+
+    def pixels_of(self, points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, "P 2"]:
+        """Where points are seen, x and y in pixels; NaN outside the picture or behind the camera."""
+        found = self.camera.pixels_of(points)
+        found[~self._inside(found)] = np.nan
+        return found
+
+    def has_before_it(self, points: Float64[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
+        """Points nearer to the camera than the middle of all: those behind it are mostly hidden."""
+        distances = np.linalg.norm(points - self.position, axis=1)
+        return distances < np.linalg.norm(np.median(points, axis=0) - self.position)
+
+    def brightness_at(self, pixels: Float64[np.ndarray, "P 2"]) -> Float64[np.ndarray, " P"]:
+        """Luminance at pixels of `pixels_of`; NaN where it is."""
+        found = np.full(len(pixels), np.nan)
+        inside = np.isfinite(pixels).all(axis=1)
+        columns, rows = np.floor(pixels[inside]).astype(int).T
+        found[inside] = self.luminance[rows, columns]
+        return found
+
+    def _inside(self, pixels: Float64[np.ndarray, "P 2"]) -> Bool[np.ndarray, " P"]:
+        assert self.camera.lens is not None
+        width, height = self.camera.lens.width, self.camera.lens.height
+        x, y = pixels.T
+        return (x >= 0) & (x < width) & (y >= 0) & (y < height)  # false for NaN
+
+
+def log_ratio(
+    first: SeenView, second: SeenView, points: Float64[np.ndarray, "P 3"]
+) -> Float64[np.ndarray, " P"]:
+    """Logarithm of how much brighter points are in the second view than in the first; not finite where unseen."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.log(second.brightness_at(second.pixels_of(points))) - np.log(
+            first.brightness_at(first.pixels_of(points))
+        )
+
+
+def angles_between(views: Sequence[SeenView]) -> Float64[np.ndarray, "N N"]:
+    """Angles between optical axes, degrees."""
+    axes = np.stack([view.axis for view in views])
+    return np.degrees(np.arccos(np.clip(axes @ axes.T, -1.0, 1.0)))
+
+
+FEW_VIEWS = 15
+NARROW_DEG = 12.0
+"""Cameras that are all within this range of elevation see the object from one height only."""
+WIDE_RING_DEG = 180.0
+"""Part of a circle from which a ring counts as one."""
+GAP_DEG = 75.0
+LEAST_OVERLAP = 0.4
+"""Share of a view that another one should see too."""
+FAR_NEIGHBOUR_DEG = 35.0
+_SAMPLES = 8
+
+
+def few_views(views: Sequence[SeenView]) -> list[str]:
+    """Whether there are enough views."""
+    if len(views) >= FEW_VIEWS:
+        return []
+    return [f"only {len(views)} views: expect holes and fog; {FEW_VIEWS} or more all around serve better"]
+
+
+def ring(views: Sequence[SeenView]) -> tuple[list[str], str]:
+    """From which sides the cameras look, and what is missing."""
+    poses = np.stack([view.camera.camera_to_world for view in views])
+    focus = meeting_point(poses)
+    if focus is None:
+        return [], "the cameras look at no one place: sides are not judged"
+    directions = poses[:, :, 3] - focus
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    elevation = np.degrees(np.arcsin(np.clip(directions[:, 2], -1.0, 1.0)))
+    azimuth = np.sort(np.degrees(np.arctan2(directions[:, 1], directions[:, 0])))
+    gap = float(np.diff(azimuth, append=azimuth[0] + 360.0).max())
+    around, height = 360.0 - gap, float(np.ptp(elevation))
+    said = (
+        f"cameras span {around:.0f} degrees around the middle, at elevations of {elevation.min():.0f} to "
+        f"{elevation.max():.0f} degrees"
+    )
+    findings = []
+    if height < NARROW_DEG and around > WIDE_RING_DEG:
+        findings.append(
+            f"a narrow ring: all cameras are within {height:.0f} degrees of elevation, so that what is seen from "
+            "above or below is a guess; add a second ring 25 degrees higher"
+        )
+    if around > WIDE_RING_DEG and gap > GAP_DEG:
+        findings.append(f"no camera looks from {gap:.0f} degrees of the circle around the object")
+    return findings, said
+
+
+def overlap(
+    views: Sequence[SeenView], points: Float64[np.ndarray, "P 3"] | None = None
+) -> tuple[list[str], str]:
+    """Whether each view shows something that another view shows from a similar side.
+
+    A grid of rays of each view is followed to the depth of the middle of the scene: where the cameras look, or that of
+    the sparse points if they look at no one place. What other cameras see of these places is the overlap, if they look
+    from within 35 degrees.
+    """
+    poses = np.stack([view.camera.camera_to_world for view in views])
+    focus = meeting_point(poses)
+    if focus is None and points is not None and len(points):
+        focus = np.median(points, axis=0)
+    if focus is None or len(views) < 2:
+        return [], "overlap is not judged: the cameras look at no one place, and there are no sparse points"
+    between = angles_between(views)
+    shares = np.zeros(len(views))
+    nearest = np.zeros(len(views))
+    for index, view in enumerate(views):
+        points = _points_seen(view, focus)
+        angles = np.where(np.arange(len(views)) == index, np.inf, between[index])
+        nearest[index] = angles.min()
+        near = np.argsort(angles)[: min(6, len(views) - 1)]
+        near = near[angles[near] <= FAR_NEIGHBOUR_DEG]
+        seen = [np.isfinite(views[other].pixels_of(points)).all(axis=1).mean() for other in near]
+        shares[index] = max(seen, default=0.0)
+    alone = [index for index in range(len(views)) if shares[index] < LEAST_OVERLAP]
+    findings = []
+    if alone:
+        worst = min(alone, key=lambda index: shares[index])
+        names = ", ".join(views[index].name for index in alone[:5]) + (" and more" if len(alone) > 5 else "")
+        findings.append(
+            f"{counted(len(alone), 'view')} with hardly any overlap with another one ({names}): of "
+            f"{views[worst].name} at most {shares[worst]:.0%} is seen by a neighbour, the nearest looks from "
+            f"{nearest[worst]:.0f} degrees away; take views in smaller steps"
+        )
+    return findings, (
+        f"views share {np.median(shares):.0%} with a neighbour (median; least {shares.min():.0%}); the nearest one "
+        f"looks from {np.median(nearest):.0f} degrees away (median; most {nearest.max():.0f})"
+    )
+
+
+def _points_seen(view: SeenView, focus: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "P 3"]:
+    """Points on a grid of the view's rays, at the depth of the middle; lenses are taken without distortion."""
+    lens = view.camera.lens
+    assert lens is not None
+    x, y = np.meshgrid(
+        (np.arange(_SAMPLES) + 0.5) / _SAMPLES * lens.width,
+        (np.arange(_SAMPLES) + 0.5) / _SAMPLES * lens.height,
+    )
+    across = (x.ravel() - lens.center_px[0]) / lens.focal_px[0]
+    down = (y.ravel() - lens.center_px[1]) / lens.focal_px[1]
+    rays = np.column_stack([across, -down, -np.ones_like(across)]) @ view.camera.camera_to_world[:, :3].T
+    depth = max(float((focus - view.position) @ view.axis), 1e-9)
+    return view.position + depth * rays
+
+
+BLURRED = 0.6
+"""Detail of a view against the median of all, below which it is blurred."""
+LEAST_VIEWS = 4
+JUMP = 0.15
+"""Logarithm of a gain against the others that counts as a jump."""
+JUMP_DEVIATIONS = 4.0
+LEAST_POINTS = 50
+NEIGHBOURS = 6
+"""Views that one is compared with: the nearest."""
+SATURATED_SHARE = 0.01
+MISSING_SHARE = 0.05
+
+
+def blur(views: Sequence[SeenView]) -> tuple[list[str], str]:
+    """Views with less fine detail than the others."""
+    details = np.array([view.record.detail for view in views])
+    middle = float(np.median(details))
+    if len(views) < LEAST_VIEWS or middle <= 0:
+        return [], "blur is not judged"
+    blurred = [
+        f"{view.name} ({detail / middle:.0%} of the usual detail)"
+        for view, detail in zip(views, details, strict=True)
+        if detail < BLURRED * middle
+    ]
+    findings = (
+        [f"{counted(len(blurred), 'view')} less sharp than the others: {_some(blurred)}"] if blurred else []
+    )
+    return (
+        findings,
+        f"finest structures have {middle:.2f} times the contrast of those twice as large (median of views)",
+    )
+
+
+def exposure(views: Sequence[SeenView], points: Float64[np.ndarray, "P 3"] | None) -> tuple[list[str], str]:
+    """Views whose sparse points are brighter or darker than the same points in the views nearest to them."""
+    if points is None or len(points) < LEAST_POINTS or len(views) < LEAST_VIEWS:
+        return (
+            [],
+            "exposure is not compared: it takes sparse points, which come with estimated poses and COLMAP",
+        )
+    gains = _gains(views, points)
+    if np.isnan(gains).any():
+        return [], "exposure is not compared: too few sparse points are seen in every view"
+    usual = 1.4826 * float(np.median(np.abs(gains - np.median(gains))))
+    limit = max(JUMP, JUMP_DEVIATIONS * usual)
+    jumps = [
+        f"{view.name} ({np.exp(gain):.2f} times as bright)"
+        for view, gain in zip(views, gains, strict=True)
+        if abs(gain) > limit
+    ]
+    findings = (
+        [f"exposure jumps in {counted(len(jumps), 'view')}, judged by sparse points: {_some(jumps)}"]
+        if jumps
+        else []
+    )
+    return (
+        findings,
+        f"sparse points vary by {np.expm1(usual):.0%} in brightness from view to view (robust deviation)",
+    )
+
+
+def _gains(views: Sequence[SeenView], points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, " N"]:
+    """Logarithm of how much brighter a view is than the views around it; NaN where too few points tell."""
+    angles = angles_between(views) + 360.0 * np.eye(len(views))
+    before = [view.has_before_it(points) for view in views]
+    gains = np.full(len(views), np.nan)
+    for index, view in enumerate(views):
+        ratios = []
+        for other in np.argsort(angles[index])[:NEIGHBOURS]:
+            shared = points[before[index] & before[other]]
+            found = log_ratio(views[other], view, shared)
+            found = found[np.isfinite(found)]
+            if len(found) >= LEAST_POINTS // 2:
+                ratios.append(float(np.median(found)))
+        if len(ratios) >= 2:
+            gains[index] = np.median(ratios)
+    return gains
+
+
+def pixels(views: Sequence[SeenView]) -> list[str]:
+    """Views with many saturated or missing pixels."""
+    findings = []
+    for what, share, limit in (
+        ("saturated", "saturated_pixels", SATURATED_SHARE),
+        ("missing", "missing_pixels", MISSING_SHARE),
+    ):
+        shares = {view.name: getattr(view.record, share) / view.record.num_pixels for view in views}
+        many = [f"{name} ({part:.0%})" for name, part in shares.items() if part > limit]
+        if many:
+            findings.append(
+                f"{counted(len(many), 'view')} with more than {limit:.0%} {what} pixels: {_some(many)}"
+            )
+    empty = [view.name for view in views if view.record.matter_share == 0.0]
+    if empty:
+        findings.append(f"{counted(len(empty), 'view')} without any matter, by the mask: {_some(empty)}")
+    return findings
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+
+
+ANGLES_DEG = (4.0, 25.0)
+"""Between the views of a pair."""
+LEAST_POINTS_OF_SLOPE, LEAST_PAIRS = 60, 6
+MOST_PAIRS = 200
+MOST_CHANGE = 0.7
+"""Logarithm of a ratio beyond which a pixel shows another surface."""
+LEAST_SLOPE = 0.15
+"""Slopes below, up or down, count as none."""
+CERTAINTY = 4.0
+"""Standard errors of the slope that are beyond doubt."""
+
+
+@dataclass(frozen=True)
+class MovingLight:
+    """What was measured."""
+
+    slope: float
+    """0 under fixed lamps."""
+    error: float
+    """Standard error of the slope."""
+    pairs: int
+
+    @property
+    def moves(self) -> bool:
+        """Whether the light moves with the camera, beyond doubt."""
+        return abs(self.slope) > max(LEAST_SLOPE, CERTAINTY * self.error)
+
+
+def measure(views: Sequence[SeenView], points: Float64[np.ndarray, "P 3"] | None) -> MovingLight | None:
+    """The slope over all pairs of near views; None where there are too few points or pairs."""
+    if points is None or len(points) < LEAST_POINTS_OF_SLOPE:
+        return None
+    slopes = []
+    for first, second in _pairs(views):
+        slope = _slope(views[first], views[second], points)
+        if slope is not None:
+            slopes.append(slope)
+    if len(slopes) < LEAST_PAIRS:
+        return None
+    values = np.array(slopes)
+    middle = float(np.median(values))
+    deviation = 1.4826 * float(np.median(np.abs(values - middle)))
+    return MovingLight(middle, 1.2533 * deviation / float(np.sqrt(len(values))), len(values))
+
+
+def moving_light(
+    views: Sequence[SeenView], points: Float64[np.ndarray, "P 3"] | None
+) -> tuple[list[str], str]:
+    """What to tell of it."""
+    found = measure(views, points)
+    if found is None:
+        return (
+            [],
+            "whether light moves with the camera is not measured: it takes sparse points and near views",
+        )
+    said = (
+        f"the brightness of sparse points has a slope of {found.slope:.2f} +- {found.error:.2f} along the movement of "
+        f"the camera ({found.pairs} pairs of views; 0 is fixed light)"
+    )
+    if not found.moves:
+        return [], said
+    finding = (
+        f"light moves with the camera, as when an object is turned before fixed lamps: {said}. Shading of a point then "
+        "changes from view to view"
+    )
+    return [finding], said
+
+
+def _pairs(views: Sequence[SeenView]) -> list[tuple[int, int]]:
+    angles = angles_between(views)
+    low, high = ANGLES_DEG
+    first, second = np.nonzero((angles >= low) & (angles <= high))
+    pairs = list(zip(first.tolist(), second.tolist(), strict=True))
+    return pairs[:: max(1, len(pairs) // MOST_PAIRS)]
+
+
+def _slope(first: SeenView, second: SeenView, points: Float64[np.ndarray, "P 3"]) -> float | None:
+    """Slope of log brightness along the direction in which the camera moves, per radius and radian."""
+    points = points[first.has_before_it(points) & second.has_before_it(points)]
+    before, ratio = first.pixels_of(points), log_ratio(first, second, points)
+    rotation = first.camera.camera_to_world[:, :3]
+    turned = (second.position - first.position) @ rotation
+    direction = np.array([turned[0], -turned[1]])
+    length = float(np.linalg.norm(direction))
+    good = np.isfinite(ratio) & (np.abs(ratio) < MOST_CHANGE)
+    if good.sum() < LEAST_POINTS_OF_SLOPE or length == 0.0:
+        return None
+    along = before[good] @ (direction / length)
+    middle = np.median(along)
+    radius = float(np.percentile(np.abs(along - middle), 95))
+    if radius == 0.0:
+        return None
+    angle = float(np.arccos(np.clip(first.axis @ second.axis, -1.0, 1.0)))
+    slope = np.polyfit((along - middle) / radius, ratio[good], 1)[0]
+    return float(slope / angle)
+
+
+_WIDTH = 110
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What the checks say, one sentence each."""
+
+    findings: tuple[str, ...]
+    """What looks wrong."""
+    measured: tuple[str, ...]
+    """What was looked at, with its numbers."""
+
+
+def check_views(views: Sequence[SeenView], points: np.ndarray | None) -> Checked:
+    """All checks.
+
+    Args:
+        views: Of one sensor, in order.
+        points: Sparse points (P, 3), if there are any.
+    """
+    findings, measured = [*few_views(views), *pixels(views)], []
+    for found, said in (
+        ring(views),
+        overlap(views, points),
+        blur(views),
+        exposure(views, points),
+        moving_light(views, points),
+    ):
+        findings += found
+        measured.append(said)
+    return Checked(tuple(findings), tuple(measured))
+
+
+def report_text(title: str, checked: Checked, done: Sequence[str]) -> str:
+    """The page.
+
+    Args:
+        title: First line.
+        checked: Of the checks.
+        done: What was done, one sentence each.
+    """
+    wrong = checked.findings or ("nothing that these checks can see",)
+    parts = [title, ""]
+    for heading, lines in (
+        ("What looks wrong", wrong),
+        ("What was measured", checked.measured),
+        ("What was done", done),
+    ):
+        parts += [heading, *(_bullet(line) for line in lines), ""]
+    return "\n".join(parts)
+
+
+def _bullet(line: str) -> str:
+    return textwrap.fill(line, _WIDTH, initial_indent="- ", subsequent_indent="  ", break_long_words=False)

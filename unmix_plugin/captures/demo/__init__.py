@@ -1,1 +1,0 @@
-"""The built-in scene as an instrument would have written it."""
