@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool
 from torch import Tensor
 
 from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
@@ -123,18 +123,6 @@ class HyperspectralDataManager(DataManager):
         }
         return self.eval_cameras[index], batch
 
-    def measured_in(self, index: int, columns: Int[Tensor, " W"]) -> dict[str, Tensor]:
-        """`spectra` (H, W, B), `valid` (H, W), `alpha` (H, W) where it is known, and of a rig `sensor`."""
-        view, chosen = self.scene.train_indices[index], columns.numpy()
-        alpha = self.scene.alpha(view)
-        found = {
-            "spectra": self.scene.cube(view, (slice(None), chosen)),
-            "valid": self.scene.valid_mask(view)[:, chosen],
-            **({} if alpha is None else {"alpha": alpha[:, chosen]}),
-            **({"sensor": np.array(self.scene.frames[view].sensor)} if self.scene.is_rig else {}),
-        }
-        return {name: torch.tensor(array, device=self.device) for name, array in found.items()}
-
     def get_train_rays_per_batch(self) -> int:
         """Rays of the next training batch."""
         return self._pixels_for(self._num_rays) * self._subpixels**2
@@ -201,14 +189,15 @@ class HyperspectralDataManager(DataManager):
         matrices = [torch.from_numpy(sensors[sensor].matrix).float() for sensor in shares]
         return {**found, "sensor": np.array(chosen), "typical": typical_spectrum(means, matrices).numpy()}
 
-    def judge_again(self, cameras: Cameras) -> Mapping[str, np.ndarray]:
-        """`reachable`, where alpha tells of it and the cameras are right enough to carve by."""
+    def carved_by(self, cameras: Cameras) -> Bool[Tensor, "X Y Z"] | None:
+        """`reachable` by other cameras of the training views; None where alpha doesn't tell of it, or they are too far
+        off to carve by."""
         if not self.scene.has_alpha or self.scene.is_unbounded:
-            return {}
+            return None
         foreground = self._evidence.foreground()
         hull = carve(self.scene, self._grid_resolution, foreground, cameras)
         is_right = share_explained(self.scene, hull, foreground, cameras) >= _FAIRLY_EXPLAINED
-        return {"reachable": hull} if is_right else {}
+        return torch.from_numpy(hull) if is_right else None
 
     def summary(self) -> dict[str, Any]:
         """The scene's own record: files, splits, normalisation, truth, hashes."""

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import torch
@@ -129,44 +128,13 @@ class UnmixModel(Model):
         reachable = self._pose_training.begin(initial_data, self.scene_box, self.metadata["pixel_size"])
         self.grid = make_grid(self.config, reachable, self.is_unbounded).to(self.device)
 
-    def begins_anew(self, step: int, progress: float) -> bool:
-        """Whether line cameras that were off are nearly right now."""
-        return self._pose_training.begins_anew(step, progress)
-
-    def begin_anew(
-        self, progress: float, initial_data: Mapping[str, np.ndarray], generator: torch.Generator
-    ) -> None:
-        """Keep poses and gains of views alone: a field keeps some of what it learnt from poses that were off."""
-        for own, first in zip(self.field.parameters(), self._untrained_field().parameters(), strict=True):
-            own.copy_(first)
-        self._pose_training.begin_anew(progress)
-        self.initialise(initial_data, generator)
-
-    def group_progress(self, progress: float) -> dict[str, float]:
-        """All groups but that of the poses, once the scene is learnt anew."""
-        if not self._pose_training.has_begun_anew:
-            return {}
-        own = self._pose_training.scene_progress(progress)
-        return {name: own for name in self.get_param_groups() if name != "poses"}
-
-    def settled_cameras(self, cameras: Cameras) -> Cameras | None:
-        """The corrected cameras once the levels of the grid have joined."""
-        return self._pose_training.settled(cameras)
-
-    def take_in(self, data: Mapping[str, np.ndarray]) -> None:
-        """Keep empty what the masks carve away as seen by the corrected cameras."""
-        self._pose_training.settle()
-        if "reachable" in data:
-            self.grid.empty_beyond(torch.from_numpy(data["reachable"]).to(self.device))
-
     @torch.no_grad()
-    def look_again(self, step: int, progress: float, data: DataManager) -> None:
-        """Register line cameras to the scene, where poses are refined and it is time."""
-        if self._pose_training.is_to_register(step, progress):
-            composite = partial(self.renderer.composite, self.field)
-            self._pose_training.register(
-                data, self.scene_box, composite, self.materials, self.comparison, self.processes
-            )
+    def between_steps(self, step: int, progress: float, data: DataManager) -> Collection[str]:
+        """Keep empty what the masks carve away as seen by the corrected cameras, once poses hardly change any more."""
+        reachable = self._pose_training.carved(data)
+        if reachable is not None:
+            self.grid.empty_beyond(reachable.to(self.device))
+        return ()
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """The hash table, the networks and the spectra."""
@@ -338,7 +306,7 @@ class UnmixModel(Model):
         )
 
     def _begin_step(self, step: int, progress: float) -> None:
-        self._progress = self._pose_training.scene_progress(progress)
+        self._progress = progress
         self._pose_training.begin_step(step, progress, self.field)
         if is_due(step):
             update_grid(

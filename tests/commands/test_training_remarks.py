@@ -30,14 +30,6 @@ def test_a_training_that_did_not_settle_is_told_from_one_that_did(quarters, said
     assert said is None or said in found[0]
 
 
-def test_a_scene_that_is_learnt_anew_is_judged_from_there_on():
-    before = [{**line, "lr/grid": 0.1 - 1e-4 * line["step"]} for line in course(0.1, 0.02, 0.01, 0.01)]
-    after = [{**line, "step": 1000 + line["step"]} for line in course(1.0, 0.4, 0.2, 0.1)]
-    after = [{**line, "lr/grid": 0.2 - 1e-4 * line["step"]} for line in after]
-    assert "still fell by 50%" in remarks(before + after)[0]
-    assert "hardly fell" in remarks([{**line, "lr/grid": 0.01} for line in before + after])[0]
-
-
 def test_few_lines_and_losses_that_are_not_finite_say_nothing():
     assert remarks(course(1.0, 0.9, 0.85, 0.8)[-5:]) == []
     assert remarks([{**line, "loss": None} for line in course(1.0, 0.9, 0.85, 0.8)]) == []

@@ -56,6 +56,33 @@ def test_a_finished_run_renders_from_its_folder_alone(short_config: TrainerConfi
     assert len(loaded.scene.train_cameras) == 10
 
 
+def test_groups_that_a_model_resets_between_steps_are_forgotten(short_config, monkeypatch):
+    trainer = Trainer(replace(short_config, average_decay=0.9), console=Console(file=io.StringIO()))
+    asked = []
+
+    def between_steps(step, _progress, data):
+        assert data is trainer.pipeline.datamanager
+        assert not torch.is_grad_enabled()
+        asked.append(step)
+        return ["fields"] if step == 3 else []
+
+    monkeypatch.setattr(trainer.pipeline.model, "between_steps", between_steps)
+    steps = trainer.train().steps
+    assert asked == list(range(steps))
+    param = trainer.optimizer.param_groups[0]["params"][0]
+    assert float(trainer.optimizer.state[param]["step"]) == steps - 3
+    assert trainer.average is not None
+    assert trainer.average.updates == 5  # one a step up to the eighth, of which three are forgotten
+
+
+def test_a_model_is_warmed_up_once(short_config, monkeypatch):
+    trainer, warmed = Trainer(short_config, console=Console(file=io.StringIO())), []
+    monkeypatch.setattr(trainer.pipeline.model, "warm_up", lambda: warmed.append(trainer.step))
+    trainer.warm_up()
+    trainer.train()
+    assert warmed == [0]
+
+
 def test_training_json_says_how_long_and_how_much_was_trained(short_config: TrainerConfig):
     trainer = Trainer(short_config, console=Console(file=io.StringIO()))
     record = trainer.train()

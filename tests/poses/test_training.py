@@ -84,7 +84,7 @@ def test_space_is_carved_once_by_the_corrected_cameras(folder):
     datamanager: Any = trainer.pipeline.datamanager
     [(step, cameras)] = asked
     assert step == 6
-    hull = torch.from_numpy(datamanager.judge_again(cameras)["reachable"])
+    hull = datamanager.carved_by(cameras)
     assert 0 < hull.float().mean() < 1
     assert torch.equal(model.grid.reachable, hull)
     assert not torch.equal(hull, torch.from_numpy(datamanager.initial_data()["reachable"]))
@@ -98,8 +98,8 @@ def test_nothing_is_carved_by_cameras_that_contradict_each_other(folder):
     turned = right.camera_to_world.clone()
     turns = 0.3 * torch.randn(len(right), 3, generator=torch.Generator().manual_seed(0))
     turned[:, :, :3] = rotation_matrix(turns) @ turned[:, :, :3]
-    assert set(datamanager.judge_again(right)) == {"reachable"}
-    assert datamanager.judge_again(replace(right, camera_to_world=turned)) == {}
+    assert datamanager.carved_by(right) is not None
+    assert datamanager.carved_by(replace(right, camera_to_world=turned)) is None
 
 
 def test_a_resumed_refinement_is_the_one_that_was_never_stopped(folder):

@@ -64,7 +64,7 @@ def _prepared(config: TrainerConfig, console: Console, processes: Processes) -> 
     if trainer.pipeline.reasons:
         say(console, trainer.pipeline.reasons)
     with announce_kernel_compilation(console):
-        trainer.pipeline.model.warm_up()
+        trainer.warm_up()
     data = trainer.pipeline.datamanager
     say(
         console,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -40,8 +39,7 @@ def remarks(lines: Sequence[Mapping[str, Any]]) -> list[str]:
     known = [line for line in lines if line.get("loss") is not None]
     if len(known) < _FEWEST_LINES:
         return []
-    judged = _since_anew(known)
-    first, third, last = (_typical_loss(judged, quarter) for quarter in (1, 3, 4))
+    first, third, last = (_typical_loss(known, quarter) for quarter in (1, 3, 4))
     if None in (first, third, last) or not first or not third or last is None:
         return []
     found = []
@@ -70,15 +68,6 @@ def remarks(lines: Sequence[Mapping[str, Any]]) -> list[str]:
             "(--max-num-iterations, --max-seconds) will show more"
         )
     return found
-
-
-def _since_anew(lines: Sequence[Mapping[str, Any]]) -> Sequence[Mapping[str, Any]]:
-    """Lines since the scene was learnt anew; all if it never was. Rates of learning only fall meanwhile."""
-    start = 0
-    for number, (before, line) in enumerate(pairwise(lines), start=1):
-        if any(line[name] > before.get(name, line[name]) for name in line if name.startswith("lr/")):
-            start = number
-    return lines[start:]
 
 
 def _typical_loss(lines: Sequence[Mapping[str, Any]], quarter: int) -> float | None:

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Int
 from torch import Tensor
 
 from unmix_plugin.engine.configs import DataManagerConfig
@@ -85,16 +84,6 @@ class DataManager(ABC):
     def initial_data(self) -> Mapping[str, np.ndarray]:
         """Arrays from which a new model takes its first parameter values; read once when a run starts, never when
         one is loaded, since by then the values are in the checkpoint."""
-        return {}
-
-    def judge_again(self, cameras: Cameras) -> Mapping[str, np.ndarray]:
-        """What of `initial_data` depends on where the training views were taken, by other cameras than the given ones;
-        empty where nothing does."""
-        return {}
-
-    def measured_in(self, index: int, columns: Int[Tensor, " W"]) -> dict[str, Tensor]:
-        """What was measured in some columns of the image of training view `index`, named as in `eval_image`; empty
-        where no model asks for it."""
         return {}
 
     def summary(self) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import torch
@@ -20,6 +20,9 @@ from unmix_plugin.errors import ConfigError
 
 if TYPE_CHECKING:
     from unmix_plugin.engine.data_manager import DataManager
+
+TrainOutputs: TypeAlias = tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Tensor]]
+"""Outputs, losses and metrics of one batch."""
 
 
 class Model(nn.Module, ABC):
@@ -60,36 +63,18 @@ class Model(nn.Module, ABC):
         """Fill parameters and buffers from the data manager's `initial_data`; called once when a run starts, after
         the move to the device, and never when one is loaded. `generator` is on the CPU."""
 
-    def settled_cameras(self, cameras: Cameras) -> Cameras | None:
-        """The training views' cameras as this model has corrected them, once they hardly change any more and until
-        `take_in` was called; else None. Asked before each training step.
+    def between_steps(self, step: int, progress: float, data: DataManager) -> Collection[str]:
+        """Learn what single batches don't tell, say from whole views or from cameras that were corrected. Called
+        without gradients before each training step, after the callbacks.
 
         Args:
-            cameras: As the data manager has them.
+            step, progress: As a `TrainingCallback` takes them.
+            data: What is trained on.
+        Returns:
+            Names of parameter groups that were reset: the optimiser and the average of the parameters forget what they
+            were. Usually none.
         """
-        return None
-
-    def take_in(self, data: Mapping[str, np.ndarray]) -> None:
-        """Learn what the data manager's `judge_again` finds with `settled_cameras`."""
-
-    def look_again(self, step: int, progress: float, data: DataManager) -> None:
-        """Compare the scene with whole training views where something is learnt from them that single pixels don't
-        tell. Called before each training step, after the model's own callbacks."""
-
-    def begins_anew(self, step: int, progress: float) -> bool:
-        """Whether to learn the scene anew from this training step on, since what is known of its cameras is better now.
-        Asked before each step, before anything else."""
-        return False
-
-    def begin_anew(
-        self, progress: float, initial_data: Mapping[str, np.ndarray], generator: torch.Generator
-    ) -> None:
-        """Fill parameters and buffers as at the start of the run, but for what is to be kept; `progress` is the part of
-        the training that is over, the other arguments are those of `initialise`. torch's global generator is seeded."""
-
-    def group_progress(self, progress: float) -> dict[str, float]:
-        """How far those parameter groups are on their way, [0, 1], that are not where the training is."""
-        return {}
+        return ()
 
     @abstractmethod
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
@@ -115,6 +100,18 @@ class Model(nn.Module, ABC):
     def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """Scalars worth following in training; `psnr` (dB) is shown in the progress display."""
         return {}
+
+    def get_train_loss_dict(self, ray_bundle: RayBundle, batch: dict[str, Tensor]) -> TrainOutputs:
+        """Outputs, losses and metrics of a training batch; a model that shares work between them writes this anew.
+
+        The outputs go to `num_samples` and `next_num_rays` alone.
+        """
+        outputs = self(ray_bundle)
+        metrics = self.get_metrics_dict(outputs, batch)
+        losses = self.get_loss_dict(outputs, batch, metrics)
+        with torch.no_grad():
+            self.observe(outputs, batch)
+        return outputs, losses, metrics
 
     @abstractmethod
     def get_image_metrics_and_images(

@@ -1,11 +1,10 @@
 """A data manager and a model, joined: what one training or evaluation step computes."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -13,17 +12,13 @@ from torch import Tensor, nn
 from unmix_plugin.engine.configs import PipelineConfig
 from unmix_plugin.engine.data_manager import DataManager
 from unmix_plugin.engine.machine import step_generator, step_seed
-from unmix_plugin.engine.model import Model
-from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
+from unmix_plugin.engine.model import Model, TrainOutputs
+from unmix_plugin.engine.training.callbacks import TrainingCallback
 
 MODEL_STREAM = 1
 """Stream of randomness of the model's own draws in a step; data managers draw from stream 0."""
 _PROCESS_STREAM = 2
 """From which the other processes of a training take their seeds."""
-
-
-TrainOutputs: TypeAlias = tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Tensor]]
-"""Outputs, losses and metrics of one batch."""
 
 
 class Pipeline(nn.Module):
@@ -70,13 +65,7 @@ class Pipeline(nn.Module):
 
     def get_train_loss_dict(self, step: int) -> TrainOutputs:
         """Outputs, losses and metrics of training step `step`."""
-        ray_bundle, batch = self.datamanager.next_train(step)
-        outputs = self.model(ray_bundle)
-        metrics = self.model.get_metrics_dict(outputs, batch)
-        losses = self.model.get_loss_dict(outputs, batch, metrics)
-        with torch.no_grad():
-            self.model.observe(outputs, batch)
-        return outputs, losses, metrics
+        return self.model.get_train_loss_dict(*self.datamanager.next_train(step))
 
     @torch.no_grad()
     def evaluate_images(self) -> Iterator[tuple[str, dict[str, float], dict[str, Tensor]]]:
@@ -100,30 +89,13 @@ class Pipeline(nn.Module):
         return self.model.get_param_groups()
 
     def get_training_callbacks(self) -> list[TrainingCallback]:
-        """The data manager's callbacks, then the model's, then what one tells the other of corrected cameras
-        and whole views."""
-        own = TrainingCallback(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, self._look_again)
-        return [*self.datamanager.get_training_callbacks(), *self.model.get_training_callbacks(), own]
+        """The data manager's callbacks, then the model's."""
+        return [*self.datamanager.get_training_callbacks(), *self.model.get_training_callbacks()]
 
     @torch.no_grad()
-    def begin_anew(self, step: int, progress: float) -> list[str]:
-        """Let the model learn the scene anew where it is time; names of the parameter groups that were set back."""
-        if not self.model.begins_anew(step, progress):
-            return []
-        generator = torch.Generator().manual_seed(self.seed)
-        self.model.begin_anew(progress, self.datamanager.initial_data(), generator)
-        self._judge_again()
-        return list(self.model.group_progress(progress))
-
-    @torch.no_grad()
-    def _look_again(self, step: int, progress: float) -> None:
-        self._judge_again()
-        self.model.look_again(step, progress, self.datamanager)
-
-    def _judge_again(self) -> None:
-        cameras = self.model.settled_cameras(self.datamanager.train_cameras)
-        if cameras is not None:
-            self.model.take_in(self.datamanager.judge_again(cameras))
+    def between_steps(self, step: int, progress: float) -> Collection[str]:
+        """What the model learns of the data between two steps; names of the parameter groups that it reset."""
+        return self.model.between_steps(step, progress, self.datamanager)
 
 
 def average_metrics(found: Sequence[Mapping[str, float]]) -> dict[str, float]:

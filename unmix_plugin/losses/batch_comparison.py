@@ -14,7 +14,6 @@ from torch import Tensor
 from unmix_plugin.light.view_gains import ViewGains
 from unmix_plugin.losses.abundance_guide import AbundanceGuide
 from unmix_plugin.losses.training_losses import LossConfig, compare_pixels, pixel_mean, spectral_losses
-from unmix_plugin.poses.line_cameras import Swept
 from unmix_plugin.presets import AlphaPreset, choose
 from unmix_plugin.sensors.band_balance import BandBalance
 from unmix_plugin.sensors.batches import SensorPart, mean_over_parts, split_parts
@@ -105,16 +104,6 @@ class BatchComparison:
             if self.seen_by.tells_materials(part.sensor, self.num_endmembers):
                 abundances = pixel_mean(part.outputs["abundances"], len(part.batch["spectra"]))
                 self.guide.observe(abundances, *self._guided(part))
-
-    def through(self, view: Swept) -> Float[Tensor, "B C"]:
-        """From a spectrum on the scene's bands to the channels of a line camera that are compared, as `parts` makes
-        what its sensor sees."""
-        axes, gains = view.axes, self.view_gains
-        if gains is not None:
-            terms = self.seen_by.project(gains.terms, view.sensor)
-            index = torch.tensor([view.index], device=terms.device)
-            axes = axes * gains(index, terms / terms[:1]).T
-        return axes if view.sensor is None else self.seen_by.matrix(view.sensor).T @ axes
 
     def _part_losses(
         self, part: SensorPart, wanted: set[str], generator: torch.Generator | None

@@ -1,9 +1,7 @@
 """Poses corrected while training: small tangent steps of rotation and position.
 
 A correction is a function of the view and of the row: one step for a frame camera, and for a line camera a sum of
-waves, computed at the knots of a cubic spline a few rows apart. Given poses stay what they are; rays are moved. Line
-cameras that were registered to the scene (line_cameras.py) have the corrections that were found then, in place of
-steps.
+waves, computed at the knots of a cubic spline a few rows apart. Given poses stay what they are; rays are moved.
 
 What moves all views alike (a similarity of the world about the scene's middle) can't be seen in pictures, so it is
 taken out of the corrections. A view that goes farther than `LARGEST_STEP` has lost its way: it gets its given pose
@@ -22,13 +20,12 @@ from dataclasses import replace
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Float64, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses, rotation_matrix
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
-from unmix_plugin.engine.processes.processes import Processes
 from unmix_plugin.operators.gradients import scale_gradient
 from unmix_plugin.poses.knots import Knots, on_spline, row_waves, similarities, spline_weights
 from unmix_plugin.poses.lens import LensRefinement
@@ -66,10 +63,6 @@ class PoseRefinement(nn.Module):
     gauge: Tensor
     is_free: Tensor
     settled: Tensor
-    anew_at: Tensor
-    found: Tensor
-    """Corrections at the knots of line cameras that were registered to the scene, which hold in place of steps."""
-    is_found: Tensor
     counts: Tensor
     first: Tensor
     rows: Tensor
@@ -91,14 +84,9 @@ class PoseRefinement(nn.Module):
         self.register_buffer("gauge", torch.zeros(6 * total, 7))
         self.register_buffer("is_free", torch.ones(len(rows), dtype=torch.bool))
         self.register_buffer("settled", torch.zeros((), dtype=torch.bool))
-        self.register_buffer("anew_at", torch.ones((), dtype=torch.float64))
-        self.register_buffer("found", torch.zeros(total, 6))
-        self.register_buffer("is_found", torch.zeros(len(rows), dtype=torch.bool))
         self.is_settled = False
         """Whether the scene was judged by the corrected cameras; the buffer keeps it, but reading that from a GPU in
         each step would take time."""
-        self.began_anew_at = 1.0
-        """Part of the training after which the scene was begun anew, 1 before; the same."""
         self.register_load_state_dict_post_hook(_after_loading)
         self.register_buffer("counts", counts, persistent=False)
         self.register_buffer("first", counts.cumsum(0) - counts, persistent=False)
@@ -127,49 +115,10 @@ class PoseRefinement(nn.Module):
         self.settled.fill_(True)
         self.is_settled = True
 
-    def begin_anew(self, progress: float) -> None:
-        """Note that the scene is learnt anew from that part of the training on, and is to be judged once more."""
-        self.anew_at.fill_(progress)
-        self.settled.fill_(False)
-        self.began_anew_at, self.is_settled = progress, False
-
     @property
     def corrections(self) -> Float[Tensor, "M 6"]:
         """By how much the cameras are turned and moved at the knots."""
-        return torch.where(self._is_found_at_knots, self.found, self._free_steps() * self.scale[:, None])
-
-    @torch.no_grad()
-    def steps_of(self, view: int, distance: float) -> Float64[Tensor, "n 6"]:
-        """The corrections of a line camera as `register` takes them: shifts are a share of `distance`."""
-        knots = self._knots_of(view)
-        steps = self.corrections[knots].double()
-        steps[:, 3:] *= self.reach[knots, None] / distance
-        return steps.cpu()
-
-    @torch.no_grad()
-    def take_registered(self, view: int, steps: Float64[Tensor, "n 6"], distance: float) -> None:
-        """Let a line camera have these corrections from now on, unless they go too far; as `steps_of` has them."""
-        knots, found = self._knots_of(view), steps.to(self.found)
-        sizes = found.view(-1, 2, 3).norm(dim=-1).amax(dim=1)
-        if float((sizes / self.bound[knots]).mean()) > 1:
-            return
-        found[:, 3:] *= distance / self.reach[knots, None]
-        self.found[knots] = found
-        self.is_found[view] = self.is_free[view] = True
-
-    @torch.no_grad()
-    def agree(self, processes: Processes) -> None:
-        """Let all processes have the first one's registered poses."""
-        processes.of_first(self.found)
-        for flags in (self.is_found, self.is_free):
-            flags.copy_(processes.of_first(flags.float()) > 0)
-
-    @property
-    def _is_found_at_knots(self) -> Bool[Tensor, "M 1"]:
-        return self.is_found.repeat_interleave(self.counts)[:, None]
-
-    def _knots_of(self, view: int) -> slice:
-        return slice(int(self.first[view]), int(self.first[view] + self.counts[view]))
+        return self._free_steps() * self.scale[:, None]
 
     def _free_steps(self) -> Float[Tensor, "M 6"]:
         """Steps without what moves all views alike; 0 for views that were undone."""
@@ -196,7 +145,7 @@ class PoseRefinement(nn.Module):
 
     def penalty(self, config: PoseConfig) -> Float[Tensor, ""]:
         """What large and rough corrections cost."""
-        steps = self._free_steps() * ~self._is_found_at_knots
+        steps = self._free_steps()
         bends = [steps[self.get_buffer(f"places_{count}")].diff(n=2, dim=1).flatten() for count in self.lines]
         bent = torch.cat([steps.new_zeros(0), *bends])
         large = steps.square().mean() + self.lens.penalty()
@@ -315,4 +264,4 @@ class PoseRefinement(nn.Module):
 
 
 def _after_loading(poses: PoseRefinement, _: object) -> None:
-    poses.is_settled, poses.began_anew_at = bool(poses.settled), float(poses.anew_at)
+    poses.is_settled = bool(poses.settled)

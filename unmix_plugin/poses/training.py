@@ -1,32 +1,40 @@
 """What a training does with poses that are corrected, step by step; nothing where they are taken as they are.
 
 The levels of the field's grid join in the coarse part of the training, a little after whose start poses begin to move;
-at its end space is carved by the corrected cameras, and line cameras are registered later. Then these learn the
-scene anew: it keeps some of what it learnt from poses that were off. Frames, whose poses settle sooner, gain nothing by
-that.
+at its end space is carved by the corrected cameras.
 
 Notation: `X x Y x Z` cells of the occupancy grid.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from unmix_plugin.engine.data_manager import DataManager
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.engine.processes.processes import Processes
 from unmix_plugin.field import CoefficientField, UnmixField
 from unmix_plugin.losses.batch_comparison import BatchComparison
-from unmix_plugin.poses.line_cameras import LineCameras
 from unmix_plugin.poses.refinement import PoseRefinement
 from unmix_plugin.poses.settings import PoseConfig
-from unmix_plugin.spectral.materials import Coefficients, Materials
+from unmix_plugin.spectral.materials import Materials
+
+
+@runtime_checkable
+class CarvesAgain(Protocol):
+    """Data with masks by which space can be carved."""
+
+    train_cameras: Cameras
+
+    def carved_by(self, cameras: Cameras) -> Bool[Tensor, "X Y Z"] | None:
+        """Cells that may hold something, if the training views stand there; None where that is not known."""
+        ...
 
 
 class PoseTraining:
@@ -35,7 +43,6 @@ class PoseTraining:
     def __init__(self, config: PoseConfig, poses: PoseRefinement | None) -> None:
         """`poses` is None where they are taken as they are."""
         self._config, self._poses = config, poses
-        self._lines = LineCameras(() if poses is None else poses.knots.rows)
         self._fineness = 0.0
 
     def begin(
@@ -49,29 +56,6 @@ class PoseTraining:
         self._poses.begin(torch.from_numpy(initial_data["knots"]), box, pixel_size)
         return torch.ones_like(reachable)
 
-    def begins_anew(self, step: int, progress: float) -> bool:
-        """Whether the scene is to be learnt anew: line cameras were registered to it, and it was not done before."""
-        if self._poses is None or not self._lines.views or self.has_begun_anew:
-            return False
-        return self._config.begins_anew(step, progress) and bool(self._poses.is_found.any())
-
-    def begin_anew(self, progress: float) -> None:
-        """Note that the scene is learnt anew from that part of the training on."""
-        assert self._poses is not None
-        self._poses.begin_anew(progress)
-
-    @property
-    def has_begun_anew(self) -> bool:
-        """Whether the scene was begun anew."""
-        return self._poses is not None and self._poses.began_anew_at < 1
-
-    def scene_progress(self, progress: float) -> float:
-        """How far the scene is on its way, [0, 1], at that part of the training."""
-        if self._poses is None or not self.has_begun_anew:
-            return progress
-        start = self._poses.began_anew_at
-        return max((progress - start) / (1 - start), 0.0)
-
     def begin_step(self, step: int, progress: float, field: CoefficientField) -> None:
         """Let as many levels of the field's grid join as it is time for."""
         self._fineness = self._config.fineness(step, progress)
@@ -84,34 +68,17 @@ class PoseTraining:
         if self._poses is not None:
             self._poses.undo_runaways(is_final=self._is_fine)
 
-    def settled(self, cameras: Cameras) -> Cameras | None:
-        """The corrected cameras, once, when the levels of the grid have joined."""
-        if self._poses is None or self._poses.is_settled or not self._is_fine:
+    def carved(self, data: object) -> Bool[Tensor, "X Y Z"] | None:
+        """Once, when the levels of the grid have joined: what can't be carved away by the corrected cameras."""
+        if (
+            self._poses is None
+            or self._poses.is_settled
+            or not self._is_fine
+            or not isinstance(data, CarvesAgain)
+        ):
             return None
-        return self._poses.refined(cameras)
-
-    def settle(self) -> None:
-        """Note that the scene was judged by the corrected cameras."""
-        assert self._poses is not None
         self._poses.settle()
-
-    def is_to_register(self, step: int, progress: float) -> bool:
-        """Whether there are line cameras, and it is time to register them to the scene."""
-        return bool(self._lines.views) and self._config.registers(step, progress)
-
-    def register(
-        self,
-        data: DataManager,
-        box: SceneBox,
-        composite: Callable[[RayBundle], Coefficients],
-        materials: Materials,
-        comparison: BatchComparison,
-        processes: Processes,
-    ) -> None:
-        """Register line cameras to the scene."""
-        assert self._poses is not None
-        self._lines.register(self._poses, data, box, composite, materials, comparison.through)
-        self._poses.agree(processes)
+        return data.carved_by(self._poses.refined(data.train_cameras))
 
     def corrected(self, rays: RayBundle) -> RayBundle:
         """Training rays as their corrected cameras send them."""

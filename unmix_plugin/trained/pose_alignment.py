@@ -28,8 +28,8 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import rotation_matrix
 from unmix_plugin.engine.geometry.space import RayBundle
-from unmix_plugin.poses.line_cameras import main_axes
 from unmix_plugin.poses.refinement import LARGEST_STEP
+from unmix_plugin.poses.row_fitting import main_axes
 from unmix_plugin.trained.material_view import MaterialView
 
 if TYPE_CHECKING:

@@ -59,13 +59,6 @@ def test_each_group_has_its_own_settings_and_rate():
     assert (found["a"]["weight_decay"], found["b"]["weight_decay"]) == (0.5, 0.0)
 
 
-def test_a_group_may_be_at_another_place_of_its_way():
-    params = {name: [nn.Parameter(torch.ones(2))] for name in "ab"}
-    configs = {name: OptimizerConfig(lr=1.0, final_factor=0.25) for name in "ab"}
-    optimizer = build_optimizer(params, configs)
-    assert set_learning_rates(optimizer, configs, 1.0, {"b": 0.5}) == {"a": 0.25, "b": pytest.approx(0.5)}
-
-
 def test_a_group_whose_gradients_are_forgotten_steps_as_at_first():
     params = {name: [nn.Parameter(torch.zeros(1))] for name in "ab"}
     configs = {name: OptimizerConfig(lr=0.1) for name in "ab"}

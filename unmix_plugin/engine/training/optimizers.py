@@ -60,12 +60,10 @@ def set_learning_rates(
     optimizer: torch.optim.Optimizer,
     configs: Mapping[str, OptimizerConfig],
     progress: float,
-    group_progress: Mapping[str, float] | None = None,
 ) -> dict[str, float]:
-    """Set every group's step size for `progress`, or for its own in `group_progress`; returns them by group name."""
-    own = group_progress or {}
+    """Set every group's step size for `progress`; returns them by group name."""
     names = [group["name"] for group in optimizer.param_groups]
-    rates = {name: learning_rate(configs[name], own.get(name, progress)) for name in names}
+    rates = {name: learning_rate(configs[name], progress) for name in names}
     for group in optimizer.param_groups:
         group["lr"] = rates[group["name"]]
     return rates

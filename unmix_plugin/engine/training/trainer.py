@@ -88,6 +88,7 @@ class Trainer:
         self.total_rays = 0
         self.average = self._new_average()
         self._saved_step: int | None = None
+        self._is_warm = False
         with processes.together():
             self.run = self._new_run() if resumed is None else resumed
             self.log = RunLog(self.run)
@@ -126,7 +127,7 @@ class Trainer:
         """
         try:
             with self.control.device.training_turn():
-                self.pipeline.model.warm_up()
+                self.warm_up()
             self.steps.begin(self.step)
             with StopSignals() as stop, ProgressDisplay(self.console) as display, self.control.running():
                 self._loop(stop, display)
@@ -146,6 +147,12 @@ class Trainer:
         finally:
             self.writer.close()
             self._lock.release()
+
+    def warm_up(self) -> None:
+        """Let the model compile and allocate what its first step needs, if that has not been done."""
+        if not self._is_warm:
+            self.pipeline.model.warm_up()
+            self._is_warm = True
 
     def save(self) -> None:
         """Save a checkpoint of the present step.
@@ -193,10 +200,6 @@ class Trainer:
         """A step, and whatever is shown, written or measured after it."""
         result = self._train_step()
         loss, metrics = result.loss, result.values
-        if result.is_anew:
-            said = f"step {self.step - 1}: the scene is learnt anew, as its cameras are known better now"
-            self.log.write(said)
-            display.message(said)
         if self.control.is_status_due or self.progress >= 1.0:
             self.control.show(self._status(loss, metrics))
         if display.is_due or self.progress >= 1.0:
@@ -218,7 +221,7 @@ class Trainer:
             result = self.steps.take(step, progress)
             self.step += 1
             self.total_rays += result.num_rays
-            if result.is_anew:
+            if result.has_reset:
                 self.average = self._new_average()
             if self.average is not None:
                 self.average.update(self.step)  # after the callbacks, which keep parameters in their bounds

@@ -41,8 +41,8 @@ class StepResult:
     """Of all processes."""
     is_refused: bool
     """Whether loss or gradients were not finite, so that nothing was updated."""
-    is_anew: bool = False
-    """Whether the scene is learnt anew from this step on."""
+    has_reset: bool = False
+    """Whether parameters were reset before it."""
 
 
 class TrainingSteps:
@@ -65,7 +65,6 @@ class TrainingSteps:
         self.guard = GradientGuard(self.optimizer)
         self.callbacks = pipeline.get_training_callbacks()
         self.learning_rates: dict[str, float] = {}
-        self._first_num_rays = pipeline.datamanager.get_train_rays_per_batch()
 
     @property
     def num_rays(self) -> int:
@@ -123,11 +122,11 @@ class TrainingSteps:
         pipeline, datamanager = self.pipeline, self.pipeline.datamanager
         pipeline.train()  # a guest may have left it in evaluation mode
         pipeline.seed_step(step)
-        is_anew = self._begin_anew(step, progress)
         run_callbacks(self.callbacks, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, step, progress)
+        reset = pipeline.between_steps(step, progress)
+        forget_gradients(self.optimizer, reset)
         num_rays = datamanager.get_train_rays_per_batch()
-        rates = pipeline.model.group_progress(progress)
-        self.learning_rates = set_learning_rates(self.optimizer, self.configs, progress, rates)
+        self.learning_rates = set_learning_rates(self.optimizer, self.configs, progress)
         outputs, losses, metrics = pipeline.get_train_loss_dict(step)
         total = torch.stack(list(losses.values())).sum()
         self.optimizer.zero_grad(set_to_none=True)
@@ -143,16 +142,7 @@ class TrainingSteps:
         counts = {"num_rays": num_rays, "num_samples": pipeline.model.num_samples(outputs)}
         values = {name: value.detach() for name, value in {**losses, **metrics}.items()}
         values.update({name: torch.tensor(float(count)) for name, count in counts.items()})
-        return StepResult(loss, values, num_rays * self.processes.count, not is_finite, is_anew)
-
-    def _begin_anew(self, step: int, progress: float) -> bool:
-        """Let the model learn the scene anew where it is time, the same in all processes."""
-        names = self.pipeline.begin_anew(step, progress)
-        if names:
-            self.processes.equalise(self.pipeline.model.state_dict().values())
-            forget_gradients(self.optimizer, names)
-            self.share_rays(self._first_num_rays)
-        return bool(names)
+        return StepResult(loss, values, num_rays * self.processes.count, not is_finite, bool(reset))
 
     def _averaged(self, total: Tensor, wanted: int | None) -> tuple[Tensor, int | None]:
         """Gradients, loss and the rays wanted for the next step, as means over the processes."""

@@ -1,0 +1,125 @@
+"""Rows of a line camera move until the scene looks like what they measured."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.testing import assert_close
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.key_poses import KeyPoses, rotation_matrix
+from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
+from unmix_plugin.poses.row_fitting import fit_rows, main_axes, solve_banded
+
+ROWS, WIDTH, FOCAL_PX, HEIGHT, SWEEP = 64, 48, 60.0, 2.0, 2.0
+BOX = SceneBox(torch.tensor([[-1.0, -1.0, -0.1], [1.0, 1.0, 0.1]]))
+PIXEL = 1 / FOCAL_PX
+
+
+def camera(wobble_px: float = 0.0) -> Cameras:
+    """A sweep down the y axis, which turns about the camera's x and y axes in waves of that size."""
+    heights = torch.arange(ROWS) + 0.5
+    place = heights / ROWS
+    turns = wobble_px * PIXEL * torch.stack([(7 * place).sin(), (9 * place).cos(), 0 * place], dim=1)
+    places = torch.stack([0 * place, SWEEP * (0.5 - place), HEIGHT + 0 * place], dim=1)
+    poses = torch.cat([rotation_matrix(turns), places[:, :, None]], dim=2)
+    lens = (torch.full((1, 2), FOCAL_PX), torch.tensor([[WIDTH / 2, ROWS / 2]]), torch.zeros(1, 4))
+    keys = KeyPoses(poses, heights, (ROWS,))
+    return Cameras(poses[ROWS // 2, None], *lens, WIDTH, ROWS, key_poses=keys)
+
+
+def seen(rays: RayBundle) -> Float[Tensor, "R 3"]:
+    """Two smooth textures and the opacity of a disc at z = 0."""
+    along = -rays.origins[:, 2] / rays.directions[:, 2]
+    x, y = (rays.origins + along[:, None] * rays.directions)[:, :2].T
+    opacity = ((0.8 - torch.stack([x, y]).norm(dim=0)) * 40).sigmoid()
+    first = 0.5 + 0.25 * torch.sin(9 * x) * torch.cos(7 * y) + 0.15 * torch.sin(5 * x + 4 * y)
+    second = 0.5 + 0.3 * torch.cos(8 * y - 3 * x)
+    return torch.stack([first * opacity, second * opacity, opacity], dim=1)
+
+
+def look(rays: RayBundle, axes: Float[Tensor, "2 C"]) -> Float[Tensor, "R D"]:
+    found = seen(rays)
+    return torch.cat([found[:, :2] @ axes, found[:, 2:]], dim=1)
+
+
+def fitted(truth: Cameras, valid: Tensor | None = None, spoilt: slice = slice(0, 0)) -> Cameras:
+    """From the sweep without wobble, by the picture of `truth`, in which some rows are white."""
+    picture = seen(truth.image_rays(0)).view(ROWS, WIDTH, 3)
+    picture[spoilt] = 1.0
+    valid = torch.ones(ROWS, WIDTH, dtype=torch.bool) if valid is None else valid
+    return fit_rows(camera(), picture[..., :2], valid, picture[..., 2], BOX, look)
+
+
+def off_by(found: Cameras, truth: Cameras) -> float:
+    """Largest distance on the disc, pixels."""
+    places = [
+        rays.origins - rays.origins[:, 2:] / rays.directions[:, 2:] * rays.directions
+        for rays in (found.image_rays(0), truth.image_rays(0))
+    ]
+    on_disc = places[1].norm(dim=1) < 0.7
+    return float((places[0] - places[1])[on_disc].norm(dim=1).max()) / HEIGHT / PIXEL
+
+
+@pytest.mark.parametrize("size_px", [1.0, 6.0])
+def test_a_wobble_is_found(size_px: float) -> None:
+    truth = camera(size_px)
+    assert off_by(camera(), truth) > 0.9 * size_px
+    assert off_by(fitted(truth), truth) < 0.1
+
+
+def test_rows_that_fit_stay_where_they_are() -> None:
+    assert off_by(fitted(camera()), camera()) < 0.02
+
+
+def test_pixels_that_are_not_valid_do_not_pull() -> None:
+    valid = torch.ones(ROWS, WIDTH, dtype=torch.bool)
+    valid[20:30] = False
+    assert off_by(fitted(camera(), valid, slice(20, 30)), camera()) < 0.02
+
+
+def test_where_nothing_is_valid_nothing_moves() -> None:
+    found = fitted(camera(1.0), torch.zeros(ROWS, WIDTH, dtype=torch.bool))
+    assert_close(found.image_rays(0).directions, camera().image_rays(0).directions, atol=1e-6, rtol=0)
+
+
+def test_a_line_camera_with_key_poses_of_its_own_starts_from_them() -> None:
+    truth = camera(1.0)
+    assert truth.key_poses is not None
+    sparse = replace(truth, key_poses=truth.key_poses)
+    picture = seen(truth.image_rays(0)).view(ROWS, WIDTH, 3)
+    valid = torch.ones(ROWS, WIDTH, dtype=torch.bool)
+    found = fit_rows(sparse, picture[..., :2], valid, picture[..., 2], BOX, look)
+    assert off_by(found, truth) < 0.02
+
+
+def test_the_channels_that_are_compared_hold_all_that_two_materials_show() -> None:
+    generator = torch.Generator().manual_seed(0)
+    mixed = torch.rand(200, 2, generator=generator) @ torch.rand(2, 5, generator=generator)
+    axes = main_axes(mixed)
+    assert_close(mixed @ axes @ axes.T, mixed, atol=1e-5, rtol=0)
+    assert main_axes(mixed[:0]).shape == (5, 3)
+
+
+@pytest.mark.parametrize("num_knots", [4, 5, 9])
+def test_the_banded_solution_is_the_dense_one(num_knots: int) -> None:
+    generator = np.random.default_rng(0)
+    blocks = np.zeros((4, num_knots, 6, 6))
+    dense = np.zeros((num_knots, 6, num_knots, 6))
+    for knot in range(num_knots - 3):
+        rows = generator.normal(size=(30, 24))
+        normal = (rows.T @ rows).reshape(4, 6, 4, 6)
+        dense[knot : knot + 4, :, knot : knot + 4] += normal
+        for low in range(4):
+            for high in range(low, 4):
+                blocks[high - low, knot + low] += normal[high, :, low]
+    blocks[0] += np.eye(6)
+    dense += np.einsum("ab,ij->aibj", np.eye(num_knots), np.eye(6))
+    pull = generator.normal(size=(num_knots, 6))
+    matrix = dense.reshape(6 * num_knots, -1)
+    matrix[np.diag_indices_from(matrix)] *= 1.01
+    expected = np.linalg.solve(matrix, pull.ravel()).reshape(pull.shape)
+    np.testing.assert_allclose(solve_banded(blocks, pull, 0.01), expected, rtol=1e-8, atol=1e-12)

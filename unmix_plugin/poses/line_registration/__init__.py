@@ -1,1 +1,0 @@
-"""Poses of line cameras, fitted row by row to what a scene shows."""
