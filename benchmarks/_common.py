@@ -11,6 +11,7 @@ import json
 import os
 import platform
 import subprocess
+import sys
 import sysconfig
 import tempfile
 import time
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from unmix_plugin.engine.training.trainer import Trainer
 
 REPOSITORY = Path(__file__).resolve().parent.parent
+sys.path.append(str(REPOSITORY))  # tools/ is in no wheel
 RESULTS = Path(__file__).resolve().parent / "results"
 
 Verdict: TypeAlias = Literal["aim reached", "pass", "MISS", "not measured", "reported"]

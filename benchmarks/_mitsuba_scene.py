@@ -12,8 +12,8 @@ import torch
 import trimesh
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.neumatex.geometry.mesh import Mesh
-from unmix_plugin.neumatex.lighting.environment import Environment
+from unmix_plugin.neumatex.tracing.environment import Environment
+from unmix_plugin.neumatex.tracing.mesh import Mesh
 
 _ENVIRONMENT_ROWS = 512
 

@@ -17,11 +17,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from unmix_plugin.engine.pipeline import average_metrics
-from unmix_plugin.neumatex.demo.layered_surface import LayeredSurface
-from unmix_plugin.neumatex.materials.neural import NeuralFamily
-from unmix_plugin.neumatex.model import NeumatexModel
-from unmix_plugin.neumatex.prior_anchor import PriorAnchor
-from unmix_plugin.neumatex.triplane import LOG_VARIANCE_RANGE
+from unmix_plugin.neumatex.demo.surfaces import LayeredSurface
+from unmix_plugin.neumatex.fit.model import NeumatexModel
+from unmix_plugin.neumatex.fit.start import PriorAnchor
+from unmix_plugin.neumatex.tracing.neural import NeuralFamily
+from unmix_plugin.neumatex.tracing.surface import LOG_VARIANCE_RANGE
 
 
 class OracleAnchor(nn.Module):

@@ -10,7 +10,7 @@ import math
 import torch
 from torch import Tensor
 
-from unmix_plugin.neumatex.materials.microfacet import (
+from unmix_plugin.neumatex.tracing.microfacet import (
     distribution,
     half_vectors,
     reflection_density,

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from unmix_plugin.neumatex.lighting.built_in import built_in_environment
-from unmix_plugin.neumatex.lighting.environment import Environment
-from unmix_plugin.neumatex.materials.family import MaterialFamily
-from unmix_plugin.neumatex.materials.shading_frame import frames, to_local, to_world
+from unmix_plugin.neumatex.tracing.built_in_lights import built_in_environment
+from unmix_plugin.neumatex.tracing.environment import Environment
+from unmix_plugin.neumatex.tracing.families import MaterialFamily
+from unmix_plugin.neumatex.tracing.microfacet import frames, to_local, to_world
 from unmix_plugin.spectral.colour.conversion import agx
 
 ENVIRONMENTS = ("studio", "window-room", "overcast", "sunset")

@@ -146,7 +146,7 @@ class _Fit:
 
 def written_object(root: Path, seed: int, size: int, views: int, lights: int) -> Path:
     """An object's folder, made if it is not there."""
-    from unmix_plugin.neumatex.demo.demo_object import demo_object
+    from unmix_plugin.neumatex.demo.objects import demo_object
 
     folder = root / f"object-{seed}"
     if not folder.exists():

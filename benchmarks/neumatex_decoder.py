@@ -23,12 +23,10 @@ import tyro
 from _spheres import Sphere, environments, picture, psnr, sphere, under_environment, under_point_lights
 from PIL import Image
 
-from unmix_plugin.neumatex.lighting.environment import Environment
-from unmix_plugin.neumatex.materials.family import MaterialFamily
-from unmix_plugin.neumatex.materials.layered import LayeredFamily
-from unmix_plugin.neumatex.materials.layered_prior import draw_materials
-from unmix_plugin.neumatex.materials.neural import NeuralFamily
-from unmix_plugin.neumatex.materials.pbr import PbrFamily
+from tools.train_decoder import draw_materials
+from unmix_plugin.neumatex.tracing.environment import Environment
+from unmix_plugin.neumatex.tracing.families import LayeredFamily, MaterialFamily, PbrFamily
+from unmix_plugin.neumatex.tracing.neural import NeuralFamily
 
 Candidates: TypeAlias = dict[str, tuple[MaterialFamily, torch.Tensor]]
 LAYERED, NEURAL, PBR = LayeredFamily(), NeuralFamily(), PbrFamily()

@@ -20,10 +20,17 @@ import torch
 import tyro
 from torch import Tensor
 
-from unmix_plugin.neumatex.prior.plane_fit import Estimates, fit_planes
-from unmix_plugin.neumatex.prior.small_network import MaterialName, Observations, SmallPrior
-from unmix_plugin.neumatex.prior.small_weights import SHIPPED, read_record, read_small_prior
-from unmix_plugin.neumatex.triplane import point_features
+from unmix_plugin.neumatex.prior.small import (
+    SHIPPED,
+    Estimates,
+    MaterialName,
+    Observations,
+    SmallPrior,
+    fit_planes,
+    read_record,
+    read_small_prior,
+)
+from unmix_plugin.neumatex.tracing.surface import plane_features
 
 NAMES: dict[MaterialName, list[str]] = {
     "neural": [*(f"base colour {c}" for c in "RGB"), *(f"latent {m} {c}" for m in "AB" for c in "RGB")],
@@ -82,8 +89,8 @@ def main(options: Options) -> None:
 
 def measure(options: Options) -> dict[str, Any]:
     """Figures of both materials."""
-    from unmix_plugin.neumatex.prior.train_small import truth_of
-    from unmix_plugin.neumatex.prior.training_data import training_object
+    from tools.prior_objects import training_object
+    from tools.train_prior import truth_of
 
     count = 2 if options.quick else options.objects
     prior = read_small_prior("neural", options.weights)
@@ -113,7 +120,7 @@ def answers_of(
     readers = prior.readers_of(material)
     estimates = Estimates(observations.positions, *prior.estimate(prior(observations), material))
     planes = fit_planes(readers, estimates)
-    features = [point_features(*pair) for pair in zip(planes, observations.positions, strict=True)]
+    features = [plane_features(*pair) for pair in zip(planes, observations.positions, strict=True)]
     read = torch.cat(features)
     return readers.material(read), (0.5 * readers.log_variance(read)).exp()
 

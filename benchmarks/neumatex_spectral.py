@@ -117,7 +117,7 @@ def main(options: Options) -> None:
 
 def written_object(folder: Path, seed: int, size: int, views: int, bands: int) -> Path:
     """An object's folder, made if it is not there."""
-    from unmix_plugin.neumatex.demo.spectral_object import demo_spectral_object
+    from unmix_plugin.neumatex.demo.objects import demo_spectral_object
 
     if not folder.exists():
         print(f"object {seed}: rendering its pictures ...", flush=True)
@@ -161,9 +161,9 @@ def seconds_of_training(run: Path) -> float:
 @torch.no_grad()
 def materials(run: Path, folder: Path) -> dict[str, float]:
     """Angle of the endmembers as reflectances, and what of the albedo's error follows the light."""
-    from unmix_plugin.neumatex.materials.spectral import SpectralFamily
-    from unmix_plugin.neumatex.scene.load_object import load_object
-    from unmix_plugin.neumatex.trained_object import TrainedObject
+    from unmix_plugin.neumatex.fit.object_scene import load_object
+    from unmix_plugin.neumatex.fit.trained_object import TrainedObject
+    from unmix_plugin.neumatex.tracing.families import SpectralFamily
     from unmix_plugin.spectral.metrics import endmember_angle
     from unmix_plugin.trained.open_run import load_run, require_materials
 
@@ -196,7 +196,7 @@ def seen_pixels(
     truth: Any, scene: Any, endmembers: torch.Tensor, lamp: torch.Tensor, index: int
 ) -> tuple[torch.Tensor, ...]:
     """Of pixels that count: direct light, the true albedo, the one found, that with shading, the true abundances."""
-    from unmix_plugin.neumatex.scene.pixel_list import OPAQUE
+    from unmix_plugin.neumatex.fit.data_manager import OPAQUE
 
     light, alpha = direct_light(truth, index)
     name = truth.pictures.names[index]
@@ -217,9 +217,9 @@ def seen_pixels(
 
 def direct_light(truth: Any, index: int) -> tuple[torch.Tensor, torch.Tensor]:
     """What a white matt surface would send to a view in direct light, mean over the bands; and alpha."""
-    from unmix_plugin.neumatex.geometry.ray_mesh import RayMesh
-    from unmix_plugin.neumatex.materials.spectral import SpectralFamily
-    from unmix_plugin.neumatex.tracing.render_view import render_view
+    from unmix_plugin.neumatex.tracing.families import SpectralFamily
+    from unmix_plugin.neumatex.tracing.path_tracer import render_view
+    from unmix_plugin.neumatex.tracing.rays import RayMesh
 
     class White:
         family = SpectralFamily(torch.ones(1, truth.environment.num_colours))

@@ -26,12 +26,12 @@ import torch
 import tyro
 from _reference_materials import ConductorBlend, UniformSurface
 
+from unmix_plugin.neumatex.demo.objects import viewpoints
 from unmix_plugin.neumatex.demo.shapes import demo_mesh
-from unmix_plugin.neumatex.demo.viewpoints import viewpoints
-from unmix_plugin.neumatex.geometry.mesh import Mesh
-from unmix_plugin.neumatex.geometry.ray_mesh import RayMesh
-from unmix_plugin.neumatex.lighting.built_in import built_in_environment
-from unmix_plugin.neumatex.tracing.render_view import render_view
+from unmix_plugin.neumatex.tracing.built_in_lights import built_in_environment
+from unmix_plugin.neumatex.tracing.mesh import Mesh
+from unmix_plugin.neumatex.tracing.path_tracer import render_view
+from unmix_plugin.neumatex.tracing.rays import RayMesh
 
 ASKED = _common.Limit(1.0, is_upper=True, unit=" %")
 OBJECTS = {

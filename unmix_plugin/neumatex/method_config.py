@@ -5,20 +5,20 @@ from pathlib import Path
 from typing import Any
 
 from unmix_plugin.engine import MethodSpecification, OptimizerConfig, PipelineConfig, TrainerConfig
-from unmix_plugin.neumatex.datamanager import ObjectDataManagerConfig
-from unmix_plugin.neumatex.model_settings import NeumatexModelConfig
+from unmix_plugin.neumatex.fit.data_manager import ObjectDataManagerConfig
+from unmix_plugin.neumatex.fit.settings import NeumatexModelConfig
 
 
 def _scene(*arguments: Any) -> Any:
     """See `object_snapshot.trained_object`; imported when a run is opened."""
-    from unmix_plugin.neumatex.object_snapshot import trained_object
+    from unmix_plugin.neumatex.fit.trained_object import trained_object
 
     return trained_object(*arguments)
 
 
 def _products() -> Sequence[Any]:
     """What `unmix-export` makes of objects; imported when the command is called."""
-    from unmix_plugin.neumatex.material_export.material import MaterialProduct
+    from unmix_plugin.neumatex.export.product import MaterialProduct
 
     return (MaterialProduct(),)
 

@@ -1,10 +1,161 @@
-"""What views show of points: fits that must find what colours were made of."""
+"""Which views a prior takes.
 
+Lobes of a known light against their integrals.
+
+Points on a mesh, who sees them and what light reaches them: cases whose answers are known.
+
+What views show of points: fits that must find what colours were made of.
+"""
+
+import math
+
+import pytest
 import torch
+import trimesh
 from torch.testing import assert_close
 
-from unmix_plugin.neumatex.prior.light_lobes import NUM_LOBES
-from unmix_plugin.neumatex.prior.observations import compressed, lobe_fits
+from tests.neumatex.surfaces import ring_cameras
+from unmix_plugin.neumatex.prior.observations import (
+    NUM_LOBES,
+    PosedViews,
+    compressed,
+    known_light,
+    light_lobes,
+    lobe_fits,
+    sample_surface,
+    well_spread,
+)
+from unmix_plugin.neumatex.tracing.environment import Environment, directions_of_pixels
+from unmix_plugin.neumatex.tracing.mesh import Mesh, mesh_of
+from unmix_plugin.neumatex.tracing.rays import RayMesh
+
+
+def test_of_a_ring_the_views_taken_are_evenly_spread():
+    angles = torch.arange(12) * (2 * torch.pi / 12)
+    positions = torch.stack([angles.cos(), angles.sin(), torch.zeros(12)], dim=-1) * 3
+    assert well_spread(positions, 4) == [0, 3, 6, 9]
+
+
+def test_no_view_is_taken_twice_even_if_cameras_coincide():
+    assert well_spread(torch.ones(5, 3), 4) == sorted(set(well_spread(torch.ones(5, 3), 4)))
+    assert well_spread(torch.eye(3), 12) == [0, 1, 2]
+
+
+def test_every_camera_needs_its_picture_and_alpha():
+    with pytest.raises(ValueError, match="1 pictures and 2 alphas for 2 cameras"):
+        PosedViews(ring_cameras(2, 8), [torch.zeros(8, 8, 3)], [torch.zeros(8, 8)] * 2)
+
+
+def test_chosen_views_keep_picture_alpha_and_camera_together():
+    pictures = [torch.full((8, 8, 3), float(index)) for index in range(3)]
+    alphas = [torch.full((8, 8), float(index)) for index in range(3)]
+    views = PosedViews(ring_cameras(3, 8), pictures, alphas)[[2, 0]]
+    assert [float(picture[0, 0, 0]) for picture in views.pictures] == [2.0, 0.0]
+    assert [float(alpha[0, 0]) for alpha in views.alphas] == [2.0, 0.0]
+    assert torch.equal(views.cameras.camera_to_world, ring_cameras(3, 8).camera_to_world[[2, 0]])
+
+
+UP = torch.tensor([[0.0, 0.0, 1.0]])
+
+
+def test_an_even_light_is_the_same_in_every_lobe():
+    lobes = light_lobes(Environment(torch.full((64, 128, 3), 2.0), exposure_stops=1.0))
+    directions = torch.nn.functional.normalize(
+        torch.randn(50, 3, generator=torch.Generator().manual_seed(0)), dim=-1
+    )
+    assert_close(lobes.diffuse.radiance(directions), torch.full((50, 3), 4.0))
+    assert_close(lobes.about(directions), torch.full((50, NUM_LOBES, 3), 4.0))
+
+
+def test_the_irradiance_of_a_bright_half_follows_the_cosine():
+    image = (directions_of_pixels(64, 128)[..., 2:] > 0).float().expand(64, 128, 3)
+    lobes = light_lobes(Environment(image))
+    tilts = torch.tensor([0.0, 60.0, 90.0, 180.0]).deg2rad()
+    normals = torch.stack([tilts.sin(), torch.zeros(4), tilts.cos()], dim=-1)
+    # The irradiance under a hemisphere of radiance 1 is pi (1 + cos tilt) / 2.
+    assert_close(lobes.diffuse.radiance(normals)[:, 0], (1 + tilts.cos()) / 2, atol=0.01, rtol=0)
+
+
+@pytest.mark.parametrize("turn", [0.0, 70.0])
+def test_a_spot_is_widened_more_by_blunter_lobes_and_turns_with_the_light(turn):
+    environment = Environment(torch.zeros(64, 128, 3), rotation_deg=turn)
+    angle = math.radians(turn)
+    spot = torch.tensor([math.cos(angle), math.sin(angle), 0.0])
+    away = Environment(environment.image, turn).image.clone()
+    away[31:33, 63:65] = 100.0  # the picture's centre is +x before the turn
+    found = light_lobes(Environment(away, turn)).about(torch.stack([spot, -spot]))
+    at_spot, opposite = found[0, :, 0], found[1, :, 0]
+    assert (at_spot[:-1] > 2 * at_spot[1:]).all()
+    assert (opposite[:-1] < 1e-6).all()
+
+
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+def mesh_from(shape: trimesh.Trimesh) -> Mesh:
+    return mesh_of(torch.tensor(shape.vertices).float(), torch.tensor(shape.faces).int())
+
+
+def sphere() -> RayMesh:
+    return RayMesh(mesh_from(trimesh.creation.icosphere(subdivisions=4)))
+
+
+def even_light() -> Environment:
+    return Environment(torch.full((32, 64, 3), 3.0))
+
+
+def test_points_of_a_sphere_lie_on_it_evenly():
+    points = sample_surface(sphere().mesh, 4000, generator())
+    assert_close(points.positions.norm(dim=-1), torch.ones(4000), atol=3e-3, rtol=0)
+    assert_close(points.normals, points.positions, atol=0.01, rtol=0)
+    assert points.positions.mean(dim=0).abs().max() < 0.04
+    # Bands of a sphere of the same height have the same area.
+    assert_close(points.positions[:, 2].histc(5, -1, 1), torch.full((5,), 800.0), atol=100, rtol=0)
+
+
+def test_a_camera_sees_the_half_of_a_sphere_that_faces_it():
+    ray_mesh = sphere()
+    points = sample_surface(ray_mesh.mesh, 500, generator())
+    eyes = torch.tensor([[50.0, 0.0, 0.0], [0.0, 0.0, -50.0]])
+    known = known_light(points, eyes, ray_mesh, even_light(), generator())
+    along = torch.stack([points.positions[:, 0], -points.positions[:, 2]], dim=-1)
+    assert known.visible[along > 0.15].all()
+    assert not known.visible[along < 0.05].any()
+    assert_close(known.cosines, along.clamp(0, 1), atol=0.03, rtol=0)
+
+
+def test_nothing_shadows_a_sphere_and_light_is_in_units_of_its_mean():
+    ray_mesh = sphere()
+    points = sample_surface(ray_mesh.mesh, 200, generator())
+    known = known_light(points, torch.tensor([[9.0, 0.0, 0.0]]), ray_mesh, even_light(), generator())
+    assert_close(known.irradiance, torch.ones(200, 3), atol=1e-4, rtol=0)
+    assert known.unshadowed.min() > 0.97
+    seen = known.visible[:, 0]
+    assert_close(known.mirrored[seen], torch.ones_like(known.mirrored[seen]), atol=1e-4, rtol=0)
+    assert (known.mirror_open[seen] == 1).all()
+
+
+def test_a_wall_hides_points_behind_it_and_halves_the_light_at_its_foot():
+    floor = trimesh.creation.box((2.0, 2.0, 0.02))
+    wall = trimesh.creation.box((0.02, 2.0, 40.0))
+    wall.apply_translation((-0.2, 0.0, 20.0))
+    both = trimesh.util.concatenate([floor, wall])
+    assert isinstance(both, trimesh.Trimesh)
+    ray_mesh = RayMesh(mesh_from(both))
+    points = sample_surface(mesh_from(floor), 3000, generator())
+    at_foot = (points.normals[:, 2] > 0.5) & (points.positions[:, 0].abs() < 0.19)
+    at_foot &= (points.positions[:, 0] > -0.18) & (points.positions[:, 1].abs() < 0.3)
+    points = points.select(at_foot)
+    eyes = torch.tensor([[-9.0, 0.0, 5.0], [9.0, 0.0, 5.0]])
+    known = known_light(points, eyes, ray_mesh, even_light(), generator())
+    assert len(points.positions) > 20
+    assert not known.visible[:, 0].any()
+    assert known.visible[:, 1].all()
+    # A wall in front of half the sky takes nearly half of the irradiance.
+    assert abs(float(known.unshadowed.mean()) - 0.55) < 0.06
+    # Seen from the right, the mirrored direction runs into the wall.
+    assert (known.mirror_open[:, 1] == 0).all()
 
 
 def made_of(lobe: int):

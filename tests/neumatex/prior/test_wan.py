@@ -9,8 +9,7 @@ from safetensors.torch import load_file, save_file
 from torch.testing import assert_close
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.neumatex.prior.wan import WAN_1_3B, WanPrior, diffusers_models
-from unmix_plugin.neumatex.prior.wan_weights import read_wan_prior
+from unmix_plugin.neumatex.prior.wan import WAN_1_3B, WanPrior, diffusers_models, read_wan_prior
 
 TINY = {
     **WAN_1_3B,

@@ -1,4 +1,17 @@
-"""Numbers that a network can learn from: what views show of points, beside the light that was there.
+"""Posed pictures of an object, as a prior wants them.
+
+Notation: `V` views of `H` x `W` pixels. Cameras are in model space, where the mesh lies in [-1, 1]^3.
+
+What a known light sends into lobes: cosine-weighted for the diffuse part, narrower ones about a mirrored direction.
+
+Notation: `N` directions, `K` lobes, `C` colours, `H x W` pixels of a latitude-longitude picture,
+`P` of a coarse one.
+
+Points on a mesh, and what is known of them before any picture is read: who sees them, and what light reaches them.
+
+Notation: `N` points in model space, `V` views, `K` lobes of light. All light is divided by the environment's mean.
+
+Numbers that a network can learn from: what views show of points, beside the light that was there.
 
 Notation: leading axes are objects and `N` points; `V` views, `K` lobes of light, `F` features. Colours and light are
 divided by the environment's mean radiance, so that exposure does not matter.
@@ -6,12 +19,215 @@ divided by the environment's mean radiance, so that exposure does not matter.
 
 from __future__ import annotations
 
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import functional
 
-from unmix_plugin.neumatex.prior.light_lobes import NUM_LOBES
-from unmix_plugin.neumatex.triplane import encode
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.neumatex.tracing.environment import Environment, directions_of_pixels
+from unmix_plugin.neumatex.tracing.mesh import Mesh
+from unmix_plugin.neumatex.tracing.rays import RayMesh, SurfacePoints
+from unmix_plugin.neumatex.tracing.surface import encode
+
+
+@dataclass(frozen=True)
+class PosedViews:
+    """Pictures with their cameras; sizes may differ."""
+
+    cameras: Cameras
+    """V of them, in model space."""
+    pictures: Sequence[Float[Tensor, "H W 3"]]
+    """Linear radiance in the unit of the environment, not multiplied by alpha; a tone curve is undone before."""
+    alphas: Sequence[Float[Tensor, "H W"]]
+    """1 where the object is, 0 beside it; observations below 0.9 are not used."""
+
+    def __post_init__(self) -> None:
+        counts = (len(self.cameras), len(self.pictures), len(self.alphas))
+        if len(set(counts)) > 1 or counts[0] == 0:
+            raise ValueError(
+                "PosedViews needs as many pictures and alphas as cameras, at least one; got "
+                f"{counts[1]} pictures and {counts[2]} alphas for {counts[0]} cameras"
+            )
+
+    def __getitem__(self, indices: list[int]) -> PosedViews:
+        """Some of the views, in the order asked for."""
+        chosen = [self.pictures[index] for index in indices], [self.alphas[index] for index in indices]
+        return PosedViews(self.cameras[indices], *chosen)
+
+
+def well_spread(positions: Float[Tensor, "V 3"], count: int) -> list[int]:
+    """Which cameras to take: the first, then always the one that is farthest in direction from all taken.
+
+    Args:
+        positions: Of the cameras, model space; directions are from the origin.
+        count: How many at most.
+    Returns:
+        Distinct indices, in increasing order.
+    """
+    directions = torch.nn.functional.normalize(positions, dim=-1)
+    chosen = [0]
+    nearest = directions @ directions[0]
+    while len(chosen) < min(count, len(positions)):
+        nearest[chosen] = torch.inf
+        chosen.append(int(nearest.argmin()))
+        nearest = torch.maximum(nearest, directions @ directions[chosen[-1]])
+    return sorted(chosen)
+
+
+SHARPNESSES = (128.0, 20.0, 4.0)
+"""Of the blurred lobes exp(k cos): about what GGX of roughness 0.25, 0.4 and 0.6 reflects."""
+NUM_LOBES = 1 + len(SHARPNESSES)
+"""K: the nearly unblurred light and the blurred lobes."""
+_MIRROR_ROWS = 64
+_BLURRED_ROWS = 32
+
+
+@dataclass(frozen=True)
+class LightLobes:
+    """A light that was blurred once, so that lobes of it are look-ups."""
+
+    diffuse: Environment
+    """Irradiance over pi of a surface by the direction of its normal; nothing is in the way."""
+    mirrored: tuple[Environment, ...]
+    """Mean radiance of each lobe by its direction, sharpest first."""
+
+    def about(self, directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N K C"]:
+        """Mean radiance of each lobe about directions."""
+        return torch.stack([lobe.radiance(directions) for lobe in self.mirrored], dim=1)
+
+
+def light_lobes(environment: Environment) -> LightLobes:
+    """Blur an environment's picture into lobes."""
+    coarse = _shrunk(environment, _BLURRED_ROWS)
+
+    def blurred(kernel: Tensor) -> Environment:
+        image = kernel.to(coarse) @ coarse.flatten(0, 1)
+        return Environment(image.reshape(coarse.shape), environment.rotation_deg)
+
+    diffuse, *lobes = [blurred(kernel) for kernel in _kernels()]
+    mirror = Environment(_shrunk(environment, _MIRROR_ROWS), environment.rotation_deg)
+    return LightLobes(diffuse, (mirror, *lobes))
+
+
+@functools.cache
+def _kernels() -> list[Float[Tensor, "P P"]]:
+    """Weights of every pixel's light in the lobe about every pixel, the diffuse lobe first; they belong to no light."""
+    directions = directions_of_pixels(_BLURRED_ROWS, 2 * _BLURRED_ROWS).reshape(-1, 3)
+    cosines = directions @ directions.T
+    edges = torch.arange(_BLURRED_ROWS + 1, dtype=torch.float64) * math.pi / _BLURRED_ROWS
+    areas = (edges[:-1].cos() - edges[1:].cos()).repeat_interleave(2 * _BLURRED_ROWS).to(cosines)
+    shapes = [cosines.clamp(min=0), *(torch.exp(sharpness * (cosines - 1)) for sharpness in SHARPNESSES)]
+    return [functional.normalize(shape * areas, p=1, dim=1) for shape in shapes]
+
+
+def _shrunk(environment: Environment, rows: int) -> Float[Tensor, "H W C"]:
+    """Means of an environment's radiance over larger pixels."""
+    picture = (environment.image.float() * 2.0**environment.exposure_stops).permute(2, 0, 1)
+    return functional.adaptive_avg_pool2d(picture, (rows, 2 * rows)).permute(1, 2, 0)
+
+
+_LEAST_COSINE = 0.08
+"""Views that graze a point more than this say little of it."""
+_OFF_SURFACE = 2e-5
+"""Distance from the surface at which rays start, model units."""
+_SHADOW_RAYS = 32
+
+
+@dataclass(frozen=True)
+class KnownLight:
+    """Views and light at points of a surface."""
+
+    visible: Bool[Tensor, "N V"]
+    """Whether a view's camera sees a point."""
+    cosines: Float[Tensor, "N V"]
+    """Between the normal and the direction to the camera."""
+    mirrored: Float[Tensor, "N V K 3"]
+    """Light in lobes about the mirrored direction of each view, as if nothing were in the way."""
+    mirror_open: Float[Tensor, "N V"]
+    """1 where the mirrored direction leaves the object, 0 where it meets it again."""
+    irradiance: Float[Tensor, "N 3"]
+    """Over pi, as if nothing were in the way."""
+    unshadowed: Float[Tensor, "N 3"]
+    """Share of the irradiance that the object itself does not block."""
+
+
+def sample_surface(mesh: Mesh, count: int, generator: torch.Generator) -> SurfacePoints:
+    """Points of a mesh, uniform by area, a little above the surface."""
+    corners = mesh.corners()
+    edges = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    crossed = torch.linalg.cross(*edges)
+    faces = torch.multinomial(crossed.norm(dim=-1), count, replacement=True, generator=generator)
+    u, v = torch.rand(2, count, 1, generator=generator).unbind()
+    u, v = torch.where(u + v > 1, 1 - u, u), torch.where(u + v > 1, 1 - v, v)
+    weights = torch.stack([1 - u - v, u, v], dim=1)
+    geometric = functional.normalize(crossed[faces], dim=-1)
+    positions = (weights * corners[faces]).sum(dim=1)
+    normals = (weights * mesh.normals[mesh.faces[faces].long()]).sum(dim=1)
+    normals = functional.normalize(normals, dim=-1)
+    # A file's normals may disagree with the winding of its triangles; the normals say which side is outside.
+    geometric = torch.where((geometric * normals).sum(dim=-1, keepdim=True) < 0, -geometric, geometric)
+    return SurfacePoints(positions + _OFF_SURFACE * geometric, normals, geometric)
+
+
+def known_light(
+    points: SurfacePoints,
+    eyes: Float[Tensor, "V 3"],
+    ray_mesh: RayMesh,
+    environment: Environment,
+    generator: torch.Generator,
+) -> KnownLight:
+    """What is known of points before pictures are read.
+
+    Args:
+        eyes: Positions of the cameras, model space, outside the mesh.
+        generator: Draws the directions of shadow rays.
+    """
+    lobes = light_lobes(environment)
+    mean = environment.mean_radiance().mean().clamp(min=1e-12)
+    to_eye = functional.normalize(eyes - points.positions[:, None], dim=-1)
+    cosines = (to_eye * points.normals[:, None]).sum(dim=-1)
+    above = (to_eye * points.geometric_normals[:, None]).sum(dim=-1)
+    facing = (cosines > _LEAST_COSINE) & (above > _LEAST_COSINE)
+    mirrored = functional.normalize(2 * cosines[..., None] * points.normals[:, None] - to_eye, dim=-1)
+    shape = facing.shape
+    return KnownLight(
+        visible=facing & _open(points, to_eye, facing, ray_mesh),
+        cosines=cosines.clamp(0, 1),
+        mirrored=lobes.about(mirrored.reshape(-1, 3)).unflatten(0, shape) / mean,
+        mirror_open=_open(points, mirrored, facing, ray_mesh).float(),
+        irradiance=lobes.diffuse.radiance(points.normals) / mean,
+        unshadowed=_unshadowed(points, ray_mesh, environment, generator),
+    )
+
+
+def _open(points: SurfacePoints, directions: Tensor, wanted: Tensor, ray_mesh: RayMesh) -> Tensor:
+    """Whether rays leave the object; False where they are not wanted."""
+    found = torch.zeros_like(wanted)
+    rows = wanted.nonzero()[:, 0]
+    found[wanted] = ~ray_mesh.blocked(points.positions[rows], directions[wanted])
+    return found
+
+
+def _unshadowed(
+    points: SurfacePoints, ray_mesh: RayMesh, environment: Environment, generator: torch.Generator
+) -> Float[Tensor, "N 3"]:
+    """Ratio of two estimates from the same directions: with and without the object in the way."""
+    repeated = points.select(torch.arange(len(points.positions)).repeat_interleave(_SHADOW_RAYS))
+    directions, density = environment.sample(torch.rand(len(repeated.positions), 2, generator=generator))
+    cosines = (directions * repeated.normals).sum(dim=-1).clamp(min=0)
+    light = environment.radiance(directions) * (cosines / density.clamp(min=1e-12))[:, None]
+    is_open = _open(repeated, directions[:, None], (cosines > 0)[:, None], ray_mesh)
+    total, reaching = (
+        values.unflatten(0, (-1, _SHADOW_RAYS)).sum(dim=1) for values in (light, light * is_open)
+    )
+    return torch.where(total > 0, reaching / total.clamp(min=1e-12), 1.0)
+
 
 NUM_VIEW_FEATURES = 3 + 3 * NUM_LOBES + 3 + 3 + 3
 NUM_POINT_FEATURES = 3 + 3 + 1 + 3 + 18 + 7 * NUM_LOBES

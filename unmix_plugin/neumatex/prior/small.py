@@ -1,4 +1,16 @@
-"""The prior that is shipped: trained on procedural objects, small enough to run on a processor in a second or two.
+"""The small prior: from what views show of surface points to the material at each of them.
+
+Notation: `B` objects, `N` points, `V` views, `P` parameters of a material, `W` numbers of an embedding.
+
+The small prior's weights: one safetensors file and a JSON record of how it was made.
+
+Latents mean something only beside the decoder that they were made for, so the record has that decoder's SHA-256.
+
+From materials at points to planes: the planes that the readers read back best.
+
+Notation: `B` objects, `N` points, `P` parameters, `C` channels and `R` texels of a plane.
+
+The prior that is shipped: trained on procedural objects, small enough to run on a processor in a second or two.
 
 It has the interface of the published one (views in; planes, and networks that read them, out), but knows the mesh and
 the light, which the published one has to guess from the pictures. It works on the CPU.
@@ -6,20 +18,290 @@ the light, which the published one has to guess from the pictures. It works on t
 
 from __future__ import annotations
 
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import safetensors.torch
 import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
+from jaxtyping import Bool, Float, Int
+from safetensors import SafetensorError
+from torch import Tensor, nn
 from torch.nn import functional
 
-from unmix_plugin.errors import SceneError
-from unmix_plugin.neumatex.geometry.ray_mesh import RayMesh
-from unmix_plugin.neumatex.lighting.environment import Environment
-from unmix_plugin.neumatex.prior.plane_fit import Estimates, fit_planes
-from unmix_plugin.neumatex.prior.small_network import MaterialName, Observations, SmallPrior
-from unmix_plugin.neumatex.prior.small_weights import read_small_prior
-from unmix_plugin.neumatex.prior.surface_samples import known_light, sample_surface
-from unmix_plugin.neumatex.prior.views import PosedViews, well_spread
-from unmix_plugin.neumatex.triplane import Triplane
+from unmix_plugin.engine.runs.atomic_files import write_file
+from unmix_plugin.errors import RunError, SceneError
+from unmix_plugin.neumatex.prior.observations import (
+    NUM_POINT_FEATURES,
+    NUM_VIEW_FEATURES,
+    PosedViews,
+    known_light,
+    point_features,
+    sample_surface,
+    view_features,
+    well_spread,
+)
+from unmix_plugin.neumatex.tracing import neural
+from unmix_plugin.neumatex.tracing.environment import Environment
+from unmix_plugin.neumatex.tracing.rays import RayMesh
+from unmix_plugin.neumatex.tracing.surface import (
+    NUM_CHANNELS,
+    Readers,
+    Triplane,
+    bounded_log_variance,
+    plane_features,
+)
+
+MaterialName = Literal["neural", "pbr"]
+"""What an object's planes can be read as in a fit."""
+TaskName = Literal["neural", "pbr", "layers"]
+"""What the embeddings are trained to tell; the layers are there for the training alone."""
+NUM_PARAMETERS: dict[TaskName, int] = {"neural": 9, "pbr": 5, "layers": 14}
+_VIEW_WIDTH, _POINT_WIDTH, _NUM_HEADS = 64, 128, 4
+_NUM_EXCHANGES = 3
+MOST_ASKED = 640
+"""Points of an object that the others learn from: the first ones, which are as random as all."""
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What is known of points and what views show of them; light is divided by the environment's mean."""
+
+    positions: Float[Tensor, "B N 3"]
+    colours: Float[Tensor, "B N V 3"]
+    visible: Bool[Tensor, "B N V"]
+    cosines: Float[Tensor, "B N V"]
+    mirrored: Float[Tensor, "B N V K 3"]
+    mirror_open: Float[Tensor, "B N V"]
+    irradiance: Float[Tensor, "B N 3"]
+    unshadowed: Float[Tensor, "B N 3"]
+
+    def selected(self, points: Int[Tensor, " n"], views: Int[Tensor, " v"]) -> Observations:
+        """Some of the points and some of the views, in the order asked for."""
+
+        def both(values: Tensor) -> Tensor:
+            return values[:, points][:, :, views]
+
+        return Observations(
+            positions=self.positions[:, points],
+            colours=both(self.colours),
+            visible=both(self.visible),
+            cosines=both(self.cosines),
+            mirrored=both(self.mirrored),
+            mirror_open=both(self.mirror_open),
+            irradiance=self.irradiance[:, points],
+            unshadowed=self.unshadowed[:, points],
+        )
+
+
+class SmallPrior(nn.Module):
+    """Encoder of observations, what it says of each point, and the readers of planes that are fitted to that."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.view_encoder = _perceptron(NUM_VIEW_FEATURES, _VIEW_WIDTH, _VIEW_WIDTH)
+        self.point_encoder = _perceptron(3 * _VIEW_WIDTH + NUM_POINT_FEATURES, _POINT_WIDTH, _POINT_WIDTH)
+        self.exchanges = nn.ModuleList([PointExchange(_POINT_WIDTH) for _ in range(_NUM_EXCHANGES)])
+        self.last_norm = nn.LayerNorm(_POINT_WIDTH)
+        self.heads = nn.ModuleDict(
+            {name: nn.Linear(_POINT_WIDTH, 2 * p) for name, p in NUM_PARAMETERS.items()}
+        )
+        self.neural_readers = Readers(NUM_PARAMETERS["neural"])
+        self.pbr_readers = Readers(NUM_PARAMETERS["pbr"])
+
+    def readers_of(self, material: MaterialName) -> Readers:
+        """The networks that read a material from planes."""
+        return self.neural_readers if material == "neural" else self.pbr_readers
+
+    def forward(self, observations: Observations) -> Float[Tensor, "B N W"]:
+        """Embeddings of points: what their views show, and what other points of the object are like."""
+        seen = observations.visible.any(dim=-1)
+        points = self._points(observations)
+        for exchange in self.exchanges:
+            points = exchange(points, seen)
+        return self.last_norm(points)
+
+    def estimate(
+        self, embeddings: Float[Tensor, "B N W"], task: TaskName
+    ) -> tuple[Float[Tensor, "B N P"], Float[Tensor, "B N P"]]:
+        """Parameters in (0, 1) and their log-variances."""
+        raw, raw_variance = self.heads[task](embeddings).chunk(2, dim=-1)
+        return torch.sigmoid(raw), bounded_log_variance(raw_variance)
+
+    def _points(self, o: Observations) -> Float[Tensor, "B N W"]:
+        """Embeddings of points from all their views; the order of the views does not matter."""
+        reaching = o.irradiance * o.unshadowed
+        views = view_features(o.colours, o.cosines, o.mirrored, o.mirror_open, reaching)
+        encoded = self.view_encoder(views)
+        mask = o.visible[..., None].float()
+        total = mask.sum(dim=-2).clamp(min=1)
+        mean = (encoded * mask).sum(dim=-2) / total
+        spread = ((encoded - mean[..., None, :]).square() * mask).sum(dim=-2) / total
+        largest = torch.where(o.visible[..., None], encoded, -1e4).amax(dim=-2)
+        largest = torch.where(o.visible.any(dim=-1, keepdim=True), largest, 0.0)
+        known = point_features(
+            o.positions, o.colours, o.visible, o.mirrored, o.mirror_open, o.irradiance, o.unshadowed
+        )
+        return self.point_encoder(torch.cat([mean, (spread + 1e-6).sqrt(), largest, known], dim=-1))
+
+
+class PointExchange(nn.Module):
+    """Attention of points to others of the same object, then a perceptron for each.
+
+    One point is seen under one light from a few sides; others of the same material show it under more.
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.first_norm, self.second_norm = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.queries, self.keys_and_values = nn.Linear(width, width), nn.Linear(width, 2 * width)
+        self.joined = nn.Linear(width, width)
+        self.perceptron = nn.Sequential(nn.Linear(width, 3 * width), nn.SiLU(), nn.Linear(3 * width, width))
+
+    def forward(self, points: Float[Tensor, "B N W"], seen: Bool[Tensor, "B N"]) -> Float[Tensor, "B N W"]:
+        """Points after one exchange; those that no view sees ask, but are not asked."""
+        normed = self.first_norm(points)
+        asked, known = normed[:, :MOST_ASKED], seen[:, :MOST_ASKED]
+        known = known | ~known.any(dim=-1, keepdim=True)
+        keys, values = self.keys_and_values(asked).chunk(2, dim=-1)
+        heads = [_in_heads(part) for part in (self.queries(normed), keys, values)]
+        found = functional.scaled_dot_product_attention(*heads, attn_mask=known[:, None, None])
+        points = points + self.joined(found.transpose(1, 2).flatten(2))
+        return points + self.perceptron(self.second_norm(points))
+
+
+def _in_heads(values: Float[Tensor, "B N W"]) -> Float[Tensor, "B H N w"]:
+    return values.unflatten(-1, (_NUM_HEADS, -1)).transpose(1, 2)
+
+
+def _perceptron(*sizes: int) -> nn.Sequential:
+    inputs, hidden, outputs = sizes
+    return nn.Sequential(nn.Linear(inputs, hidden), nn.SiLU(), nn.Linear(hidden, outputs), nn.SiLU())
+
+
+SHIPPED = Path(__file__).parent.parent / "weights"
+_WEIGHTS, _RECORD = "small.safetensors", "small.json"
+
+
+def write_small_prior(folder: Path, prior: SmallPrior, record: dict[str, Any]) -> None:
+    """Put a prior and its record into a folder.
+
+    Args:
+        record: How it was made, JSON; `decoder_sha256` is the decoder of its latents.
+    """
+    data = safetensors.torch.save({name: part.contiguous() for name, part in prior.state_dict().items()})
+    record = {**record, "sha256": hashlib.sha256(data).hexdigest()}
+    write_file(folder / _WEIGHTS, data)
+    write_file(folder / _RECORD, (json.dumps(record, indent=1) + "\n").encode())
+
+
+def read_small_prior(
+    material: MaterialName, folder: Path = SHIPPED, decoder_sha256: str | None = None
+) -> SmallPrior:
+    """The prior in a folder, ready to predict.
+
+    Args:
+        material: What it is to predict; only the neural one depends on the decoder.
+        decoder_sha256: Of the decoder in use; the shipped one's by default.
+    Raises:
+        RunError: a file is missing or damaged, or the latents belong to another decoder.
+    """
+    record = read_record(folder)
+    if material == "neural":
+        expected = shipped_decoder_sha256() if decoder_sha256 is None else decoder_sha256
+        _require_decoder(folder, record, expected)
+    path = folder / _WEIGHTS
+    try:
+        data = path.read_bytes()
+        if hashlib.sha256(data).hexdigest() != record.get("sha256"):
+            raise RunError(f"{path} is not the file that {_RECORD} describes; install the package again")
+        prior = SmallPrior()
+        prior.load_state_dict(safetensors.torch.load(data))
+    except (OSError, SafetensorError, RuntimeError) as error:
+        raise RunError(f"{path} can't be read as weights of the prior: {error}") from error
+    return prior.eval().requires_grad_(requires_grad=False)
+
+
+def read_record(folder: Path = SHIPPED) -> dict[str, Any]:
+    """How a prior was made.
+
+    Raises:
+        RunError: the record is missing or no JSON.
+    """
+    path = folder / _RECORD
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise RunError(f"{path} can't be read: {error}") from error
+
+
+def shipped_decoder_sha256() -> str:
+    """Of the weights of the neural material that come with the package.
+
+    Raises:
+        RunError: they are missing.
+    """
+    try:
+        return hashlib.sha256(neural.SHIPPED.read_bytes()).hexdigest()
+    except OSError as error:
+        raise RunError(f"{neural.SHIPPED} can't be read: {error}; install the package again") from error
+
+
+def _require_decoder(folder: Path, record: dict[str, Any], expected: str) -> None:
+    found = record.get("decoder_sha256")
+    if found != expected:
+        raise RunError(
+            f"the prior in {folder} was trained for the material decoder {str(found)[:12]}, but the decoder in use is "
+            f"{expected[:12]}: its latents would mean something else; train it again (python -m "
+            "tools.train_prior) or use --pipeline.model.material pbr"
+        )
+
+
+RESOLUTION = 32
+"""R of fitted planes: cells that hold several points each, whose errors average out."""
+_RATE = 0.05
+_SHRINKAGE = 1e-4
+"""Pulls texels that hardly a point reads to 0."""
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """What is said of points of objects."""
+
+    positions: Float[Tensor, "B N 3"]
+    parameters: Float[Tensor, "B N P"]
+    log_variance: Float[Tensor, "B N P"]
+
+
+def fit_loss(readers: Readers, planes: Float[Tensor, "B 3 C R R"], estimates: Estimates) -> Float[Tensor, ""]:
+    """How far the planes are from what is said of points: errors count by how sure it is, and log-variances too."""
+    features = torch.stack([plane_features(*pair) for pair in zip(planes, estimates.positions, strict=True)])
+    features, said = features.flatten(0, 1), estimates.log_variance.flatten(0, 1)
+    error = readers.material(features) - estimates.parameters.flatten(0, 1)
+    # Parameters that are known to 0.02 or better count the same: beyond that a few points would decide all.
+    certain = torch.exp(-0.5 * said.clamp(min=-8.0))
+    unsure = readers.log_variance(features) - said
+    return (
+        (error.square() * certain).mean()
+        + 0.02 * unsure.square().mean()
+        + _SHRINKAGE * planes.square().mean()
+    )
+
+
+def fit_planes(readers: Readers, estimates: Estimates, steps: int = 120) -> Float[Tensor, "B 3 C R R"]:
+    """Planes of objects, fitted from 0; the readers stay as they are."""
+    with torch.enable_grad():
+        count = len(estimates.positions)
+        planes = torch.zeros(count, 3, NUM_CHANNELS, RESOLUTION, RESOLUTION, requires_grad=True)
+        optimiser = torch.optim.Adam([planes], lr=_RATE, eps=1e-12)
+        for _ in range(steps):
+            (gradient,) = torch.autograd.grad(count * fit_loss(readers, planes, estimates), planes)
+            planes.grad = gradient
+            optimiser.step()
+    return planes.detach()
+
 
 MOST_VIEWS = 12
 """Views that are looked at; of more, those whose directions are farthest apart."""

@@ -1,1 +1,1 @@
-"""Light that surfaces reflect: a differentiable path tracer."""
+"""How light meets a mesh: geometry, light from far away, reflectances, and paths between them."""

@@ -1,4 +1,8 @@
-"""Radiance that a mesh reflects under an environment, with gradients to its materials.
+"""An object as rays meet it: mesh, light and materials together.
+
+Notation: `R` rays, of which `N` meet the mesh; `C` colours.
+
+Radiance that a mesh reflects under an environment, with gradients to its materials.
 
 At each vertex of a path two directions are drawn: one by the environment's density, one by the material's. Both give
 direct light, weighed by the power heuristic; the material's, where it meets the mesh again, carries the path on.
@@ -10,21 +14,132 @@ Notation: `N` points, `M` vertices of paths that are alive, `C` colours, `P` par
 
 Source: Veach 1997, Robust Monte Carlo Methods for Light Transport Simulation, chapter 9; Zeltner et al. 2021, Monte
 Carlo Estimators for Differential Light Transport, for the name detached sampling.
+
+Random numbers of paths: uniform for each path, evenly spread over the paths of a point.
+
+A Sobol sequence over the samples is shifted by random numbers of each point (modulo 1), so that each path's numbers
+are uniform and independent between points, dimensions and calls, but fill the unit cube evenly.
+
+Source: Cranley and Patterson 1976, Randomization of Number Theoretic Methods for Multiple Integration.
+
+Whole pictures by the path tracer.
+
+Notation: `H x W` pixels, `C` colours, `K` rays that meet the mesh.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
-from unmix_plugin.neumatex.geometry.ray_mesh import Hits, RayMesh, SurfacePoints
-from unmix_plugin.neumatex.lighting.environment import Environment
-from unmix_plugin.neumatex.materials.shading_frame import frames, to_local, to_world
-from unmix_plugin.neumatex.surface import Surface, decoded_once
-from unmix_plugin.neumatex.tracing.sample_points import SamplePoints
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.neumatex.tracing.environment import Environment
+from unmix_plugin.neumatex.tracing.mesh import Mesh
+from unmix_plugin.neumatex.tracing.microfacet import frames, to_local, to_world
+from unmix_plugin.neumatex.tracing.rays import (
+    Hits,
+    PixelHits,
+    RayMesh,
+    SurfacePoints,
+    pixel_hits,
+    subpixel_offsets,
+)
+from unmix_plugin.neumatex.tracing.surface import Surface, decoded_once
+
+
+@dataclass(frozen=True)
+class SeenPoints:
+    """Where rays meet the mesh."""
+
+    found: Bool[Tensor, " R"]
+    points: SurfacePoints
+    """N of them, in the order of the rays that found one."""
+    to_eye: Float[Tensor, "N 3"]
+    """Unit vectors back along the rays."""
+    distances: Float[Tensor, " N"]
+    """Along the rays, model units."""
+
+    @staticmethod
+    def cat(parts: Sequence[SeenPoints]) -> SeenPoints:
+        """One after the other."""
+        points = [part.points for part in parts]
+        return SeenPoints(
+            torch.cat([part.found for part in parts]),
+            SurfacePoints(
+                torch.cat([point.positions for point in points]),
+                torch.cat([point.normals for point in points]),
+                torch.cat([point.geometric_normals for point in points]),
+            ),
+            torch.cat([part.to_eye for part in parts]),
+            torch.cat([part.distances for part in parts]),
+        )
+
+    def scatter(self, values: Float[Tensor, "N *rest"]) -> Float[Tensor, "R *rest"]:
+        """Values of points as those of rays; 0 where a ray meets nothing."""
+        whole = values.new_zeros((len(self.found), *values.shape[1:]))
+        return whole.index_put((self.found.nonzero(as_tuple=True)[0],), values)
+
+
+@dataclass(frozen=True)
+class TracedObject:
+    """Mesh, light and materials."""
+
+    ray_mesh: RayMesh
+    environment: Environment
+    surface: Surface
+
+    def under(self, environment: Environment) -> TracedObject:
+        """The same object under another light."""
+        return replace(self, environment=environment)
+
+    def seen(self, origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"]) -> SeenPoints:
+        """What rays of unit directions meet first."""
+        with torch.no_grad():
+            hits = self.ray_mesh.closest(origins, directions)
+            rows = hits.found.nonzero(as_tuple=True)[0]
+            along = directions[rows]
+            met = hits.select(rows)
+            return SeenPoints(hits.found, self.ray_mesh.points(met, along), -along, met.distances)
+
+    def light(
+        self, seen: SeenPoints, samples: int, bounces: int, generator: torch.Generator
+    ) -> Float[Tensor, "N C"]:
+        """Light that the points send to the eye, an estimate from so many paths; differentiable by the materials."""
+        return reflected_radiance(
+            self.surface,
+            self.ray_mesh,
+            self.environment,
+            seen.points,
+            seen.to_eye,
+            samples=samples,
+            bounces=bounces,
+            generator=generator,
+        )
+
+
+class TracedObjectCache:
+    """Keeps the tree over a mesh's triangles while the mesh stays the same tensors; copies start empty."""
+
+    def __init__(self) -> None:
+        self._vertices: Tensor | None = None
+        self._version = -1
+        self._found: TracedObject | None = None
+
+    def __deepcopy__(self, memo: dict) -> TracedObjectCache:
+        return TracedObjectCache()
+
+    def get(self, mesh: Mesh, environment: Environment, surface: Surface) -> TracedObject:
+        """The object, with what was kept where the vertices have not changed since."""
+        vertices = mesh.vertices
+        if self._found is None or self._vertices is not vertices or self._version != vertices._version:
+            self._vertices, self._version = vertices, vertices._version
+            self._found = TracedObject(RayMesh(mesh, vertices.device), environment, surface)
+        return self._found
 
 
 @dataclass(frozen=True)
@@ -205,3 +320,127 @@ def _power_heuristic(chosen: Float[Tensor, " M"], other: Float[Tensor, " M"]) ->
     # By the ratio, since squares of the densities of sharp lobes overflow.
     ratio = other / chosen
     return torch.where(torch.isfinite(ratio), 1 / (1 + ratio * ratio), 0.0)
+
+
+NUMBERS_A_VERTEX = 5
+"""Two for the environment, three for the material."""
+
+
+@dataclass(frozen=True)
+class SamplePoints:
+    """Numbers in [0, 1) of N points, S samples each."""
+
+    sequence: Float64[Tensor, "S D"]
+    """Common to the points."""
+    shifts: Float64[Tensor, "N D"]
+    """Of each point."""
+
+    @staticmethod
+    def draw(
+        num_points: int,
+        samples: int,
+        vertices: int,
+        generator: torch.Generator | None,
+        device: torch.device,
+    ) -> SamplePoints:
+        """Numbers for paths of so many vertices.
+
+        Raises:
+            ValueError: there is no sample.
+        """
+        if samples < 1:
+            raise ValueError(f"samples must be at least 1; got {samples}")
+        dimensions = NUMBERS_A_VERTEX * vertices
+        sequence = torch.quasirandom.SobolEngine(dimensions).draw(samples, dtype=torch.float64)
+        shifts = torch.rand(num_points, dimensions, generator=generator, dtype=torch.float64, device=device)
+        return SamplePoints(sequence.to(device), shifts)
+
+    def of(self, paths: Int[Tensor, " M"], vertex: int) -> Float[Tensor, "M 5"]:
+        """Numbers of a vertex of paths; path p is sample p % S of point p // S."""
+        samples = len(self.sequence)
+        part = slice(NUMBERS_A_VERTEX * vertex, NUMBERS_A_VERTEX * (vertex + 1))
+        moved = self.sequence[:, part][paths % samples] + self.shifts[:, part][paths // samples]
+        # Rounding to float32 later must not reach 1.
+        return (moved - moved.floor()).clamp(max=1 - 2.0**-24)
+
+
+_PATHS_AT_ONCE = 1 << 18
+"""Paths of one call, which bounds the memory."""
+
+
+def render_view(
+    surface: Surface,
+    ray_mesh: RayMesh,
+    environment: Environment,
+    cameras: Cameras,
+    index: int = 0,
+    *,
+    samples: int = 64,
+    bounces: int = 1,
+    subpixels: int = 2,
+    background: Literal["black", "environment"] = "black",
+    generator: torch.Generator | None = None,
+) -> tuple[Float[Tensor, "H W C"], Float[Tensor, "H W"]]:
+    """The picture of one camera, and the part of each pixel that the mesh covers.
+
+    Args:
+        cameras: In the mesh's space.
+        index: Which of them.
+        samples: Paths a pixel, spread over its rays; at least one a ray.
+        subpixels: A pixel has subpixels x subpixels rays.
+        background: What is seen where the mesh is not. With black, the colours are multiplied by alpha.
+    Returns:
+        Linear radiance and alpha; without gradient.
+    """
+    hits = pixel_hits(ray_mesh, cameras, index, subpixels)
+    radiance = rays_radiance(
+        surface, ray_mesh, environment, hits, samples=samples, bounces=bounces, generator=generator
+    )
+    image, alpha = hits.image(radiance), hits.alpha()
+    if background == "environment":
+        image = image + _background(ray_mesh, environment, cameras, index, subpixels)
+    return image, alpha
+
+
+@torch.no_grad()
+def rays_radiance(
+    surface: Surface,
+    ray_mesh: RayMesh,
+    environment: Environment,
+    hits: PixelHits,
+    *,
+    samples: int,
+    bounces: int = 1,
+    generator: torch.Generator | None = None,
+) -> Float[Tensor, "K C"]:
+    """Radiance along each ray of an image, chunk after chunk; samples are those of a pixel. Without gradient."""
+    samples_a_ray = max(1, -(-samples // hits.rays_a_pixel))
+    rows = torch.arange(len(hits), device=ray_mesh.device).split(max(1, _PATHS_AT_ONCE // samples_a_ray))
+    parts = [
+        reflected_radiance(
+            surface,
+            ray_mesh,
+            environment,
+            hits.points.select(part),
+            hits.to_eye[part],
+            samples=samples_a_ray,
+            bounces=bounces,
+            generator=generator,
+        )
+        for part in rows
+    ]
+    colours = environment.num_colours
+    return torch.cat(parts) if parts else torch.zeros(0, colours, device=ray_mesh.device)
+
+
+def _background(
+    ray_mesh: RayMesh, environment: Environment, cameras: Cameras, index: int, subpixels: int
+) -> Float[Tensor, "H W C"]:
+    """Radiance of the environment where rays miss the mesh, as a mean over each pixel's rays."""
+    width, height = cameras.size(index)
+    total = torch.zeros(height * width, environment.num_colours, device=ray_mesh.device)
+    for offset in subpixel_offsets(subpixels):
+        rays = cameras.to(ray_mesh.device).image_rays(index, offset)
+        missed = ~ray_mesh.blocked(rays.origins, rays.directions)
+        total[missed] += environment.radiance(rays.directions[missed])
+    return (total / subpixels**2).reshape(height, width, -1)

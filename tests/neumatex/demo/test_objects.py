@@ -1,0 +1,279 @@
+"""Procedural meshes: closed, in model space, with normals that point out.
+
+Surfaces of built-in objects: parameters in range, varied, functions of position alone.
+
+The folder of a built-in object: what is in it, and that its parts agree.
+
+The built-in spectral object: that its files explain its pictures, and that unmix-nerf can read it too.
+"""
+
+import json
+
+import numpy as np
+import OpenEXR
+import pytest
+import torch
+import trimesh
+from torch.testing import assert_close
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.neumatex.demo import objects as module
+from unmix_plugin.neumatex.demo.objects import (
+    demo_object,
+    demo_object_path,
+    demo_spectral_object,
+    demo_spectral_object_path,
+    viewpoints,
+)
+from unmix_plugin.neumatex.demo.shapes import SHAPES, Noise, demo_mesh
+from unmix_plugin.neumatex.demo.surfaces import LayeredSurface, SpectralSurface
+from unmix_plugin.neumatex.fit.object_scene import load_object
+from unmix_plugin.neumatex.tracing.families import LayeredFamily
+from unmix_plugin.neumatex.tracing.light_files import read_environment
+from unmix_plugin.neumatex.tracing.mesh import read_mesh
+from unmix_plugin.neumatex.tracing.path_tracer import render_view
+from unmix_plugin.neumatex.tracing.rays import RayMesh
+from unmix_plugin.scenes.reading.loader import load_scene
+
+
+@pytest.mark.parametrize("seed", range(len(SHAPES)))
+def test_shapes_are_closed_and_face_outwards(seed):
+    mesh = demo_mesh(seed, resolution=32)
+    solid = trimesh.Trimesh(mesh.vertices.numpy(), mesh.faces.numpy(), process=False)
+    assert solid.is_watertight
+    assert solid.volume > 0.1
+    a, b, c = mesh.corners().unbind(dim=1)
+    geometric = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
+    agreement = (geometric * mesh.normals[mesh.faces[:, 0].long()]).sum(dim=-1)
+    assert (agreement > 0.5).float().mean() > 0.95
+    assert_close(mesh.vertices.abs().max(), torch.tensor(1.0))
+    assert_close(mesh.vertices.max(dim=0).values, -mesh.vertices.min(dim=0).values, atol=1e-5, rtol=0)
+
+
+def test_a_seed_repeats_and_another_differs():
+    first, again, other = (demo_mesh(seed, resolution=24) for seed in (0, 0, len(SHAPES)))
+    assert torch.equal(first.vertices, again.vertices)
+    assert first.vertices.shape != other.vertices.shape
+
+
+def test_noise_has_unit_variance():
+    import numpy as np
+
+    noise = Noise.draw(np.random.default_rng(0), 5.0)
+    values = noise.at(20 * torch.rand(50_000, 3, generator=torch.Generator().manual_seed(0)))
+    assert_close(values.mean(), torch.tensor(0.0), atol=0.05, rtol=0)
+    assert_close(values.std(), torch.tensor(1.0), atol=0.05, rtol=0)
+
+
+def _positions():
+    return 2 * torch.rand(5000, 3, generator=torch.Generator().manual_seed(0)) - 1
+
+
+def test_parameters_are_in_range_and_vary():
+    seen = set()
+    for seed in range(12):
+        surface = LayeredSurface(seed)
+        parameters = surface.parameters(_positions())
+        assert parameters.shape == (5000, surface.family.num_parameters)
+        assert bool(((parameters >= 0) & (parameters <= 1)).all())
+        assert bool((parameters[:, :3].std(dim=0) > 0.01).all())
+        seen |= set(surface.kinds)
+    assert len(seen) == 7
+
+
+def test_every_layer_is_used_by_some_object():
+    largest = torch.stack([LayeredSurface(seed).parameters(_positions()).amax(dim=0) for seed in range(12)])
+    named = dict(zip(LayeredFamily.PARAMETERS, largest.amax(dim=0).tolist(), strict=True))
+    assert all(value > 0.3 for value in named.values()), named
+
+
+def test_a_seed_repeats_and_another_differs_layered_surface():
+    first, again, other = (LayeredSurface(seed).parameters(_positions()) for seed in (3, 3, 4))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+SIZE = 20
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("demo") / "object"
+    said = []
+    demo_object(folder, seed=3, size=SIZE, views=9, lights=1, say=said.append)
+    assert len(said) == 2
+    return folder
+
+
+def _read(path):
+    channels = OpenEXR.File(str(path), separate_channels=True).channels()
+    return torch.from_numpy(np.stack([channels[name].pixels for name in "RGBA"], axis=-1))
+
+
+def _cameras(content):
+    poses = torch.tensor([frame["transform_matrix"] for frame in content["frames"]])[:, :3]
+    lens = [
+        torch.tensor([[content[f"{what}_{axis}"] for axis in axes]] * len(poses))
+        for what, axes in [("fl", "xy")]
+    ]
+    centres = torch.tensor([[content["cx"], content["cy"]]] * len(poses))
+    return Cameras(poses, lens[0], centres, torch.zeros(len(poses), 4), content["w"], content["h"])
+
+
+def test_pictures_can_be_rendered_again_from_the_files(folder):
+    """Mesh, light, poses and materials together explain a picture, under both lights."""
+    relit = next((folder / "relit").iterdir())
+    rays = RayMesh(read_mesh(folder / "mesh.glb"))
+    for part in (folder, relit):
+        content = json.loads((part / "transforms.json").read_text())
+        picture = _read(part / content["frames"][0]["file_path"])
+        again, alpha = render_view(
+            LayeredSurface(3),
+            rays,
+            read_environment(part / "environment.exr"),
+            _cameras(content),
+            0,
+            samples=160,
+            bounces=2,
+            generator=torch.Generator().manual_seed(1),
+        )
+        assert_close(picture[..., 3], alpha, atol=0.26, rtol=0)
+        assert (picture[..., 3] - alpha).abs().mean() < 2e-3
+        inner = alpha == 1
+        # Single pixels are noisy in both; their means over a few hundred are not.
+        assert_close(picture[inner][:, :3].mean(dim=0), again[inner].mean(dim=0), rtol=0.03, atol=0)
+        difference = (picture[..., :3] - again)[inner].abs().mean()
+        assert difference < 0.12 * again[inner].mean()
+
+
+def test_objects_are_well_exposed_and_whole(folder):
+    content = json.loads((folder / "transforms.json").read_text())
+    pictures = torch.stack([_read(folder / frame["file_path"]) for frame in content["frames"]])
+    assert pictures.shape == (9, SIZE, SIZE, 4)
+    covered = pictures[pictures[..., 3] == 1][:, :3]
+    assert 0.15 < covered.mean() < 0.6
+    border = torch.cat([pictures[:, 0], pictures[:, -1], pictures[:, :, 0], pictures[:, :, -1]], dim=1)
+    assert border.abs().max() == 0
+
+
+def test_base_colours_are_those_of_evaluation_views(folder):
+    truth = sorted(path.name for path in (folder / "truth" / "base_colour").iterdir())
+    assert truth == ["000.exr", "008.exr"]
+    colours = _read(folder / "truth" / "base_colour" / "008.exr")
+    assert torch.equal(colours[..., 3], _read(folder / "images" / "008.exr")[..., 3])
+    assert colours[..., :3].max() <= 1.0001
+    assert colours[colours[..., 3] > 0][:, :3].std() > 0.01
+
+
+def test_a_folder_in_use_and_wrong_numbers_are_refused(folder):
+    with pytest.raises(ConfigError, match="not empty"):
+        demo_object(folder)
+    with pytest.raises(ConfigError, match="--size of a demo object must be 16 to 1024; found 3"):
+        demo_object(folder / "other", size=3)
+
+
+def test_the_default_object_is_written_once(tmp_path, monkeypatch):
+    for name, number in (("DEFAULT_SIZE", 16), ("DEFAULT_VIEWS", 2), ("DEFAULT_LIGHTS", 0)):
+        monkeypatch.setattr(module, name, number)
+    path = demo_object_path(tmp_path)
+    written = (path / "images" / "001.exr").stat().st_mtime_ns
+    assert demo_object_path(tmp_path) == path
+    assert (path / "images" / "001.exr").stat().st_mtime_ns == written
+    (path / "images" / "000.exr").unlink()
+    assert (demo_object_path(tmp_path) / "images" / "000.exr").is_file()
+
+
+def test_cameras_look_at_the_object_from_all_sides():
+    cameras = viewpoints(24, 64, 1.2)
+    places = cameras.camera_to_world[:, :, 3]
+    assert_close(places.norm(dim=-1), torch.full((24,), 4.2))
+    assert places.mean(dim=0)[:2].norm() < 0.6
+    assert places[:, 2].min() < -2
+    assert places[:, 2].max() > 3
+    for index in range(24):
+        pixels, depths = cameras.project(torch.zeros(1, 3), index)
+        assert_close(pixels, torch.full((1, 2), 32.0), atol=1e-3, rtol=0)
+        assert depths > 0
+    assert not torch.allclose(viewpoints(3, 64, 1.2, first=50).camera_to_world, cameras[:3].camera_to_world)
+
+
+@pytest.fixture(scope="module")
+def spectral_folder(tmp_path_factory):
+    spectral_folder = tmp_path_factory.mktemp("demo") / "object"
+    said = []
+    demo_spectral_object(spectral_folder, seed=3, size=20, views=9, bands=6, lights=1, say=said.append)
+    assert len(said) == 2
+    return spectral_folder
+
+
+def test_pictures_can_be_rendered_again_from_the_files_under_both_lights(spectral_folder):
+    scene = load_object(spectral_folder)
+    mesh = demo_mesh(3)
+    assert scene.bands is not None
+    assert scene.lamp is not None
+    surface = SpectralSurface(3, scene.bands.centers_nm, mesh.vertices)
+    held_out = scene.lights[0]
+    assert not np.allclose(
+        scene.lamp, held_out.environment.image[0, 0] / held_out.environment.image[0, 0].max()
+    )
+    for pictures, light in ((scene.pictures, scene.environment), (held_out.pictures, held_out.environment)):
+        generator = torch.Generator().manual_seed(5)
+        radiance, alpha = render_view(
+            surface, RayMesh(mesh), light, pictures.cameras, 0, samples=160, bounces=2, generator=generator
+        )
+        picture = pictures.read(0)
+        assert picture.alpha is not None
+        found, seen = torch.from_numpy(picture.numbers), alpha > 0.99
+        assert_close(torch.from_numpy(picture.alpha), alpha, atol=1 / 255, rtol=0)
+        error = (found[seen] - radiance[seen]).abs().mean() / radiance[seen].mean()
+        assert float(error) < 0.06
+
+
+def test_truth_fits_the_surface_and_every_material_covers_a_part(spectral_folder):
+    scene = load_object(spectral_folder)
+    truth = scene.true_materials
+    assert truth is not None
+    assert scene.bands is not None
+    shares = truth.abundances(0)
+    assert shares is not None
+    alpha = scene.pictures.read(0).alpha
+    assert alpha is not None
+    np.testing.assert_allclose(shares.sum(axis=-1)[alpha > 0.5], 1, atol=2e-3)
+    assert truth.abundances(1) is None
+    vertices = demo_mesh(3).vertices
+    surface = SpectralSurface(3, scene.bands.centers_nm, vertices)
+    means = surface.parameters(vertices)[:, :4].mean(dim=0)
+    assert_close(means, torch.full((4,), 0.25), atol=0.02, rtol=0)
+    assert_close(surface.family.endmembers.double(), torch.from_numpy(truth.endmembers), atol=1e-6, rtol=0)
+
+
+def test_it_is_a_spectral_scene_like_any_other(spectral_folder):
+    scene = load_scene(spectral_folder)
+    truth = load_object(spectral_folder).true_materials
+    assert truth is not None
+    assert scene.material_names == truth.names
+    assert len(scene.eval_indices) == 2
+    assert scene.has_alpha
+    assert scene.has_abundances
+    content = json.loads((spectral_folder / "transforms.json").read_text())
+    assert len(content["frames"]) == 9
+
+
+def test_impossible_numbers_are_refused(tmp_path):
+    with pytest.raises(ConfigError, match="--bands of a demo object must be 4 to 512; found 3"):
+        demo_spectral_object(tmp_path / "object", bands=3)
+    with pytest.raises(ConfigError, match="no environment 'clear-sy'"):
+        demo_spectral_object(tmp_path / "object", size=16, views=2, light="clear-sy")
+
+
+def test_the_default_object_is_written_once_spectral_object(tmp_path, monkeypatch):
+    for name, number in {"SIZE": 16, "VIEWS": 2, "BANDS": 4, "SPECTRAL_LIGHTS": 0}.items():
+        monkeypatch.setattr(module, f"DEFAULT_{name}", number)
+    said = []
+    spectral_folder = demo_spectral_object_path(tmp_path, said.append)
+    assert demo_spectral_object_path(tmp_path, said.append) == spectral_folder
+    assert len(said) == 1
+    bands = load_object(spectral_folder).bands
+    assert bands is not None
+    assert len(bands) == 4

@@ -1,0 +1,229 @@
+"""What is in the files of a material, read with other people's readers.
+
+Laws of atlases and of what their texels show.
+"""
+
+import json
+
+import numpy as np
+import OpenEXR
+import pytest
+import torch
+from PIL import Image
+
+from tests.neumatex.surfaces import LAYERED, PBR, ball, knot
+from tests.products.mesh_reading import loaded_mesh
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.neumatex.export.atlas import Atlas, texels_of, unwrap
+from unmix_plugin.neumatex.export.pbr_fit import fit_pbr
+from unmix_plugin.neumatex.export.product import material_paths, require_texture_size, write_material
+from unmix_plugin.neumatex.tracing.families import LayeredFamily
+from unmix_plugin.scenes.scene import Normalisation
+from unmix_plugin.spectral.colour.conversion import srgb_to_linear
+
+TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+FRAME = Normalisation(TURN, np.array([2.0, 0.0, -1.0]), 0.5)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("material")
+    paths, error = write_material(folder, knot(), PBR, FRAME, 256)
+    assert error == 0
+    assert sorted(paths) == sorted(material_paths(folder, PBR.family))
+    assert sorted(paths) == sorted(path for path in folder.rglob("*") if path.is_file())
+    return folder
+
+
+def sampled(texture, uv):
+    """Colours of a texture at glTF coordinates, from the nearest texel."""
+    height, width = texture.shape[:2]
+    columns, rows = (uv[:, 0] * width).astype(int), (uv[:, 1] * height).astype(int)
+    return texture[rows.clip(0, height - 1), columns.clip(0, width - 1)]
+
+
+def channels_of(path):
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        return {name: channel.pixels for name, channel in file.channels().items()}
+
+
+def exr(path):
+    channels = channels_of(path)
+    return np.stack([channels[name] for name in "RGB"], axis=-1)
+
+
+def test_the_gltf_shows_the_material_where_the_surface_has_it(written):
+    loaded = loaded_mesh(written / "material.glb")
+    model = FRAME.to_model(np.asarray(loaded.vertices, dtype=np.float64))
+    truth = PBR.parameters(torch.from_numpy(model).float()).numpy()
+    uv = np.asarray(loaded.visual.uv) * [1, -1] + [0, 1]  # trimesh has v upwards
+    pbr = loaded.visual.material
+    base = np.asarray(pbr.baseColorTexture.convert("RGB"), dtype=np.float32) / 255
+    linear = srgb_to_linear(torch.from_numpy(sampled(base, uv))).numpy()
+    assert np.abs(linear - truth[:, :3]).mean() < 0.012
+    packed = np.asarray(pbr.metallicRoughnessTexture, dtype=np.float32) / 255
+    assert np.abs(sampled(packed, uv)[:, 1:3] - truth[:, 3:5]).mean() < 0.012
+    assert (pbr.metallicFactor, pbr.roughnessFactor) == (1, 1)
+
+
+def test_the_gltf_is_the_mesh_in_the_world(written):
+    loaded, mesh = loaded_mesh(written / "material.glb"), knot()
+    assert len(loaded.faces) == len(mesh.faces)
+    world = FRAME.to_world(mesh.vertices.double().numpy())
+    np.testing.assert_allclose(
+        np.asarray(loaded.vertices)[loaded.faces], world[mesh.faces.numpy()], atol=1e-5
+    )
+    normals = np.asarray(loaded.vertex_normals)
+    outward = np.cross(*(np.diff(np.asarray(loaded.vertices)[loaded.faces], axis=1).swapaxes(0, 1)))
+    assert ((normals[loaded.faces].mean(axis=1) * outward).sum(axis=1) > 0).all()
+
+
+def test_pictures_are_srgb_numbers_linear_and_both_are_the_same_colours(written):
+    numbers = exr(written / "base_colour.exr")
+    picture = np.asarray(Image.open(written / "base_colour.png"), dtype=np.float32) / 255
+    assert numbers.shape == picture.shape == (256, 256, 3)
+    decoded = srgb_to_linear(torch.from_numpy(picture)).numpy()
+    np.testing.assert_allclose(decoded, numbers, atol=0.006)
+    packed = np.asarray(Image.open(written / "gltf_metallic_roughness.png"), dtype=np.float32) / 255
+    np.testing.assert_allclose(packed, exr(written / "gltf_metallic_roughness.exr"), atol=0.5 / 255 + 1e-6)
+
+
+def test_all_parameters_are_kept_in_full_precision(written):
+    channels = channels_of(written / "parameters.exr")
+    names = json.loads((written / "material.json").read_text())["parameters"]
+    assert [name[3:] for name in sorted(channels)] == names
+    roughness = exr(written / "gltf_metallic_roughness.exr")[..., 1]
+    np.testing.assert_array_equal(channels["03 roughness"], roughness)
+
+
+def test_the_report_says_what_is_in_each_texture(written):
+    report = json.loads((written / "material.json").read_text())
+    assert report["texture_size"] == 256
+    assert 0.4 < report["texels_in_charts"] / 256**2 < 0.9
+    for name, texture in report["textures"].items():
+        assert (written / f"{name}.png").is_file()
+        assert len(texture["channels"]) == 3
+
+
+def fit_error(parameters, pbr, seed=3):
+    """Mean relative error of reflected light of materials, from independent directions."""
+    from unmix_plugin.neumatex.tracing.families import PbrFamily
+
+    g = torch.Generator().manual_seed(seed)
+    wi, wo = (torch.nn.functional.normalize(torch.randn(len(pbr), 3, generator=g), dim=-1) for _ in range(2))
+    wi, wo = wi * wi[:, 2:].sign(), wo * wo[:, 2:].sign()
+    truth = LayeredFamily().evaluate(parameters, wi, wo) * wi[:, 2:]
+    found = PbrFamily().evaluate(pbr, wi, wo) * wi[:, 2:]
+    return float((truth.log1p() - found.log1p()).abs().mean() / truth.log1p().mean())
+
+
+def test_layered_materials_get_a_gltf_material_much_like_them_and_the_same_one_each_time():
+    parameters = LAYERED.parameters(ball().vertices)
+    fit = fit_pbr(LayeredFamily(), parameters, torch.Generator().manual_seed(0))
+    again = fit_pbr(LayeredFamily(), parameters, torch.Generator().manual_seed(0))
+    torch.testing.assert_close(fit.parameters, again.parameters, rtol=0, atol=0)
+    assert fit.parameters.min() >= 0
+    assert fit.parameters.max() <= 1
+    plain = torch.cat([parameters[:, :3], parameters[:, [4, 3]]], dim=1)  # layers left out
+    assert 0.01 < fit.mean_error < 0.2
+    assert fit_error(parameters, fit.parameters) < 0.7 * fit_error(parameters, plain)
+
+
+def test_a_layered_material_that_is_a_gltf_one_is_found_again():
+    g = torch.Generator().manual_seed(1)
+    parameters = torch.zeros(400, 14)
+    parameters[:, :3] = 0.2 + 0.6 * torch.rand(400, 3, generator=g)
+    parameters[:, 3] = (torch.rand(400, generator=g) > 0.5).float()
+    parameters[:, 4] = 0.3 + 0.5 * torch.rand(400, generator=g)
+    parameters[:, 5] = 0.5
+    fit = fit_pbr(LayeredFamily(), parameters, g).parameters
+    assert float((fit[:, 4] - parameters[:, 3]).abs().mean()) < 0.1
+    assert float((fit[:, 3] - parameters[:, 4]).abs().mean()) < 0.06
+    assert float((fit[:, :3] - parameters[:, :3]).abs().mean()) < 0.06
+
+
+@pytest.mark.parametrize("size", [0, 15, 8193])
+def test_impossible_sizes_are_refused(size):
+    with pytest.raises(ConfigError, match=f"--texture-size is {size}; choose 16 to 8192"):
+        require_texture_size(size)
+
+
+def flat_atlas(uv, faces):
+    return Atlas(np.arange(len(uv)), np.array(faces), np.array(uv, dtype=np.float32))
+
+
+def areas_of(atlas):
+    a, b, c = atlas.uv[atlas.faces].astype(np.float64).swapaxes(0, 1)
+    return np.abs(np.linalg.det(np.stack([b - a, c - a], axis=1))) / 2
+
+
+def test_charts_keep_every_triangle_and_lie_in_the_unit_square():
+    mesh = ball()
+    atlas = unwrap(mesh, 256)
+    assert len(atlas.faces) == len(mesh.faces)
+    np.testing.assert_array_equal(atlas.vertices[atlas.faces], mesh.faces.numpy())
+    assert atlas.uv.min() >= 0
+    assert atlas.uv.max() <= 1
+    areas = areas_of(atlas)
+    assert 0.3 < areas.sum() < 1
+    assert (areas > 0).all()
+
+
+def test_no_texel_lies_in_two_charts():
+    atlas = unwrap(ball(), 256)
+    texels = texels_of(atlas, 256)
+    assert len(np.unique(texels.places)) == len(texels.places)
+    assert len(texels.places) == pytest.approx(areas_of(atlas).sum() * 256**2, rel=0.02)
+
+
+def test_texels_show_the_points_of_the_surface_that_their_centres_map_to():
+    mesh, size = ball(3), 128
+    atlas = unwrap(mesh, size)
+    texels = texels_of(atlas, size)
+    centres = np.stack([texels.places % size + 0.5, texels.places // size + 0.5], axis=1) / size
+    np.testing.assert_allclose(texels.of_corners(atlas.uv, atlas.faces), centres, atol=1e-6)
+    positions = texels.of_corners(mesh.vertices.numpy(), atlas.vertices[atlas.faces])
+    radii = np.linalg.norm(positions, axis=1)
+    assert radii.min() > 0.985
+    assert radii.max() < 1 + 1e-6
+
+
+def test_two_triangles_that_fill_the_square_have_all_texels_once():
+    atlas = flat_atlas([[0, 0], [1, 0], [1, 1], [0, 1]], [[0, 1, 2], [0, 2, 3]])
+    texels = texels_of(atlas, 32)
+    np.testing.assert_array_equal(texels.places, np.arange(32 * 32))
+    assert set(texels.triangles.tolist()) == {0, 1}
+    np.testing.assert_allclose(texels.weights.sum(axis=1), 1, atol=1e-12)
+
+
+def test_triangles_without_area_in_the_texture_have_no_texels():
+    atlas = flat_atlas([[0.1, 0.1], [0.6, 0.6], [0.35, 0.35]], [[0, 1, 2]])
+    assert len(texels_of(atlas, 64).places) == 0
+
+
+def test_a_texture_has_the_values_of_its_texels_and_beyond_them_those_of_the_nearest():
+    atlas = flat_atlas([[0, 0], [0.5, 0], [0.5, 1], [0, 1]], [[0, 1, 2], [0, 2, 3]])
+    texels = texels_of(atlas, 8)
+    rows = (texels.places // 8)[:, None].astype(np.float32)
+    picture = texels.texture(rows)
+    np.testing.assert_array_equal(picture[..., 0], np.repeat(np.arange(8.0)[:, None], 8, axis=1))
+
+
+def test_triangles_are_found_whatever_chunks_they_are_looked_at_in(monkeypatch):
+    atlas = unwrap(ball(), 64)
+    whole = texels_of(atlas, 64)
+    monkeypatch.setattr("unmix_plugin.neumatex.export.atlas._CHUNK", 37)
+    parts = texels_of(atlas, 64)
+    np.testing.assert_array_equal(parts.places, whole.places)
+    np.testing.assert_array_equal(parts.triangles, whole.triangles)
+
+
+def test_without_xatlas_one_message_names_it(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    with pytest.raises(ConfigError, match="pip install xatlas"):
+        unwrap(ball(1), 64)
+
+
+def test_a_texture_too_small_for_the_charts_is_refused():
+    with pytest.raises(ConfigError, match="--texture-size"):
+        unwrap(ball(5), 16)

@@ -1,0 +1,388 @@
+"""Reading an object's folder: where things lie afterwards, and one message for each thing that is wrong.
+
+Reading an object with spectral pictures, and one message for each thing that is wrong with its light.
+"""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from numpy.testing import assert_allclose
+from PIL import Image
+
+from tests.neumatex.factory import (
+    CENTRE,
+    ENDMEMBERS,
+    LAMP,
+    RADIUS,
+    SIZE,
+    WAVELENGTHS,
+    write_cubes,
+    write_light,
+    write_object,
+    write_picture,
+    write_spectral_object,
+    write_table,
+)
+from unmix_plugin.errors import SceneError, UnmixError
+from unmix_plugin.formats.exr import write_exr
+from unmix_plugin.neumatex.fit.data_manager import PixelList
+from unmix_plugin.neumatex.fit.object_scene import load_object
+from unmix_plugin.neumatex.tracing.rays import RayMesh
+from unmix_plugin.scenes.placement import Placement
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_object(tmp_path_factory.mktemp("object") / "ball")
+
+
+@pytest.fixture
+def folder(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "ball"))
+
+
+def _change(folder: Path, **keys) -> None:
+    path = folder / "transforms.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **keys}))
+
+
+def test_the_mesh_fills_model_space_and_cameras_see_it_where_alpha_is(made):
+    scene = load_object(made)
+    vertices = scene.mesh.vertices
+    assert float(vertices.abs().max()) == pytest.approx(1, abs=1e-5)
+    np.testing.assert_allclose(scene.frame.to_world(np.zeros(3)), CENTRE, atol=1e-6)
+    assert scene.frame.scale == pytest.approx(1 / RADIUS, rel=1e-5)
+    assert scene.split.evaluation == (0,)
+    assert len(scene.split.train) == 5
+    rays = scene.pictures.cameras.image_rays(2)
+    seen = RayMesh(scene.mesh).closest(rays.origins, rays.directions).found.reshape(24, 24).numpy()
+    alpha = scene.pictures.read(2).alpha
+    assert alpha is not None
+    assert (seen == (alpha > 0.5)).mean() > 0.96
+
+
+def test_light_truth_tone_and_held_out_lights_are_read(made):
+    scene = load_object(made)
+    assert scene.pictures.tone == "linear"
+    assert [light.name for light in scene.lights] == ["dim"]
+    assert len(scene.lights[0].pictures) == 2
+    assert float(scene.lights[0].environment.image.max()) == 0.5
+    truth = scene.base_colour(0)
+    assert truth is not None
+    np.testing.assert_allclose(truth[12, 12], (0.5, 0.3, 0.1), rtol=1e-6)
+    assert scene.base_colour(1) is None
+
+
+def test_poses_that_nerfstudio_turned_and_scaled_find_the_mesh_in_the_world(made, folder):
+    expected = load_object(made).pictures.cameras
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    placement = Placement(turn, np.array([1.0, 2.0, 3.0]), 0.25, np.array([5.0, 0.0, 0.0]))
+    content = json.loads((folder / "transforms.json").read_text())
+    for frame in content["frames"]:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, 3] = placement.to_scene(pose[:3, 3])
+        pose[:3, :3] = turn @ pose[:3, :3]
+        frame["transform_matrix"] = pose.tolist()
+    (folder / "transforms.json").write_text(json.dumps({**content, **placement.to_json()}))
+    found = load_object(folder).pictures.cameras
+    np.testing.assert_allclose(found.camera_to_world, expected.camera_to_world, atol=1e-5)
+
+
+def test_a_mesh_with_y_upwards_is_turned_and_that_is_said(made, folder):
+    expected, mesh = load_object(made), trimesh.load(folder / "mesh.ply")
+    assert isinstance(mesh, trimesh.Trimesh)
+    x, y, z = np.asarray(mesh.vertices).T
+    mesh.vertices = np.stack([x, z, -y], axis=1)
+    mesh.export(folder / "mesh.ply")
+    found = load_object(folder)
+    np.testing.assert_allclose(found.mesh.vertices, expected.mesh.vertices, atol=1e-5)
+    np.testing.assert_allclose(found.mesh.normals, expected.mesh.normals, atol=1e-3)
+    assert found.notes[len(expected.notes) :] == (
+        "mesh.ply has y as its upward axis, the poses have z: the mesh was turned",
+    )
+
+
+def test_display_pictures_get_a_learnt_response_unless_the_folder_says_otherwise(tmp_path):
+    folder = write_object(tmp_path / "ball", suffix=".png")
+    assert load_object(folder).pictures.tone == "camera"
+    _change(folder, tone_mapping="agx")
+    assert load_object(folder).pictures.tone == "agx"
+
+
+def test_light_can_be_turned_and_exposed(folder):
+    _change(folder, environment_rotation_deg=90, environment_exposure_stops=1)
+    light = load_object(folder).environment
+    assert (light.rotation_deg, light.exposure_stops) == (90, 1)
+
+
+def _move_mesh(folder: Path) -> None:
+    mesh = trimesh.load_mesh(folder / "mesh.ply", process=False)
+    mesh.apply_translation([0.0, 0.0, 2.0])
+    mesh.export(folder / "mesh.ply")
+
+
+def _scale_mesh(folder: Path, factor: float) -> None:
+    mesh = trimesh.load_mesh(folder / "mesh.ply", process=False)
+    mesh.apply_translation(-CENTRE)
+    mesh.apply_scale(factor)
+    mesh.apply_translation(CENTRE)
+    mesh.export(folder / "mesh.ply")
+
+
+def _blank_alpha(folder: Path) -> None:
+    for path in (folder / "images").iterdir():
+        write_exr(path, dict.fromkeys("RGBA", np.zeros((SIZE, SIZE), np.float32)), {})
+
+
+def _flatten_mesh(folder: Path) -> None:
+    mesh = trimesh.load_mesh(folder / "mesh.ply", process=False)
+    mesh.apply_scale(0.0)
+    mesh.export(folder / "mesh.ply")
+
+
+def _bad_light(folder: Path) -> None:
+    image = np.full((8, 16), np.nan, np.float32)
+    write_exr(folder / "environment.exr", {"R": image, "G": image, "B": image}, {})
+
+
+def _second_mesh(folder: Path) -> None:
+    shutil.move(folder / "mesh.ply", folder / "a.ply")
+    shutil.copy(folder / "a.ply", folder / "b.ply")
+
+
+def _no_pose(folder: Path) -> None:
+    content = json.loads((folder / "transforms.json").read_text())
+    del content["frames"][3]["transform_matrix"]
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
+def test_a_mesh_of_another_size_is_said_to_fit_badly(made, folder):
+    assert not any("outlines" in note for note in load_object(made).notes)
+    _scale_mesh(folder, 1.25)
+    notes = load_object(folder).notes
+    assert any("mesh.ply and alpha show different outlines: their overlap is 6" in note for note in notes)
+
+
+@pytest.mark.parametrize(("sky", "stops"), [(1e4, "-13"), (1e-3, "10")])
+def test_pictures_and_light_of_different_units_are_told(made, folder, sky, stops):
+    assert not any("units" in note for note in load_object(made).notes)
+    write_light(folder, sky=sky)
+    notes = [note for note in load_object(folder).notes if "different units" in note]
+    assert len(notes) == 1
+    assert f"'environment_exposure_stops' {stops} higher" in notes[0]
+
+
+def test_integer_arrays_of_file_path_are_divided_by_the_value_scale(folder):
+    path = folder / "transforms.json"
+    content = json.loads(path.read_text())
+    for index, frame in enumerate(content["frames"]):
+        frame["file_path"] = f"images/{index}.npy"
+        np.save(folder / frame["file_path"], np.full((SIZE, SIZE, 3), 2000, np.uint16))
+    path.write_text(json.dumps({**content, "value_scale": 4000}))
+    assert load_object(folder).pictures.read(0).numbers.max() == 0.5
+
+
+def test_an_object_that_is_mostly_in_the_shade_is_not_doubted(folder):
+    for path in (folder / "images").iterdir():
+        write_picture(path, (0.5, 0.3, 0.1), lit_rows=SIZE // 2 - 4)
+    assert not any("units" in note for note in load_object(folder).notes)
+
+
+FAULTS = {
+    "mesh elsewhere": (
+        _move_mesh,
+        r"is not where .* in 6 of 6 views .* is \(0.3, -0.2, 3.5\), the cameras look at \(0.3, -0.2, 1.5\), 2 away",
+    ),
+    "mesh in another unit": (
+        lambda folder: _scale_mesh(folder, 0.001),
+        "0.001 long; its middle is .*, 0 away from there, and stand 3 from what they look at",
+    ),
+    "alpha of nothing": (lambda folder: _blank_alpha(folder), "no pixel shows the object; write alpha"),
+    "mesh without area": (_flatten_mesh, "has an area"),
+    "no mesh": (lambda folder: (folder / "mesh.ply").unlink(), r"has no mesh; put mesh.glb or .* there"),
+    "several meshes": (_second_mesh, r"has several: a.ply, b.ply; name one with 'mesh_path'"),
+    "no light": (
+        lambda folder: (folder / "environment.exr").unlink(),
+        "has no environment; put environment.exr",
+    ),
+    "broken light": (_bad_light, "environment.exr.*not finite"),
+    "no pose": (_no_pose, r"frames\[3\]: 'transform_matrix' is absent"),
+    "no picture": (lambda folder: (folder / "images/004.exr").unlink(), "'images/004.exr' is missing"),
+    "unknown tone": (lambda folder: _change(folder, tone_mapping="filmic"), "'tone_mapping' is \"filmic\""),
+    "wrong turn": (
+        lambda folder: _change(folder, environment_rotation_deg="north"),
+        "environment_rotation_deg",
+    ),
+    "negative picture": (
+        lambda folder: write_picture(folder / "images/001.exr", (-1.0, 0.0, 0.0)),
+        "001.exr: negative values, NaN or infinity in .* pixels?;",
+    ),
+    "mixed pictures": (
+        lambda folder: _change(folder, frames=_with_png(folder)),
+        "mix pictures of light",
+    ),
+    "wrong held-out light": (
+        lambda folder: write_light(folder / "relit" / "dim", sky=0.0),
+        "relit/dim/environment.exr",
+    ),
+}
+
+
+def _with_png(folder: Path) -> list:
+    write_picture(folder / "images" / "png.png", (0.1, 0.1, 0.1))
+    frames = json.loads((folder / "transforms.json").read_text())["frames"]
+    return [*frames[:-1], {**frames[-1], "file_path": "images/png.png"}]
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_is_told_in_one_message(folder, fault):
+    spoil, expected = FAULTS[fault]
+    spoil(folder)
+    with pytest.raises(SceneError) as error:
+        load_object(folder)
+    text = str(error.value)
+    assert len(text.splitlines()) == 1
+    import re
+
+    assert re.search(expected, text), text
+
+
+def test_paths_out_of_the_folder_are_refused_without_a_setting_that_is_not_there(folder):
+    shutil.move(folder / "mesh.ply", folder.parent / "mesh.ply")
+    _change(folder, mesh_path="../mesh.ply")
+    with pytest.raises(SceneError, match=r"leaves the scene folder; copy the file into it$"):
+        load_object(folder)
+
+
+@pytest.fixture(scope="module")
+def made_spectral(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_spectral_object(tmp_path_factory.mktemp("object") / "ball")
+
+
+@pytest.fixture
+def spectral_folder(made_spectral: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made_spectral, tmp_path / "ball"))
+
+
+def change(spectral_folder: Path, **keys) -> None:
+    path = spectral_folder / "transforms.json"
+    content = {**json.loads(path.read_text()), **keys}
+    path.write_text(json.dumps({key: value for key, value in content.items() if value is not None}))
+
+
+def test_light_has_the_lamps_spectrum_here_and_where_it_is_held_out(made_spectral):
+    scene = load_object(made_spectral)
+    assert scene.bands is not None
+    assert scene.bands.centers_nm.tolist() == WAVELENGTHS
+    assert scene.lamp is not None
+    assert_allclose(scene.lamp, LAMP)
+    assert_allclose(scene.environment.image[0, 0], LAMP, rtol=1e-6)
+    assert_allclose(scene.lights[0].environment.image[0, 0], 0.5 * LAMP, rtol=1e-6)
+
+
+def test_a_held_out_light_may_have_its_own_lamp_and_an_option_replaces_the_objects(spectral_folder):
+    write_table(spectral_folder / "relit" / "dim" / "lamp.csv", ("power",), LAMP[None, ::-1])
+    change(spectral_folder / "relit" / "dim", illuminant_path="lamp.csv")
+    assert_allclose(
+        load_object(spectral_folder).lights[0].environment.image[0, 0], 0.5 * LAMP[::-1], rtol=1e-6
+    )
+    lamp = load_object(spectral_folder, "E").lamp
+    assert lamp is not None
+    assert_allclose(lamp, np.ones(5))
+
+
+def test_true_materials_are_read(made_spectral):
+    truth = load_object(made_spectral).true_materials
+    assert truth is not None
+    assert truth.names == ("blue", "red")
+    assert_allclose(truth.endmembers, ENDMEMBERS)
+    shares = truth.abundances(0)
+    assert shares is not None
+    assert shares[3, 12].tolist() == [1, 0]
+
+
+def _store_integers(spectral_folder: Path) -> None:
+    for path in (spectral_folder / "cubes").glob("*.npy"):
+        np.save(path, np.rint(np.load(path) * 10000).astype(np.uint16))
+
+
+def test_cubes_of_integers_are_divided_by_the_value_scale(made_spectral, spectral_folder):
+    _store_integers(spectral_folder)
+    change(spectral_folder, value_scale=10000.0)
+    expected, found = (
+        load_object(path).pictures.read(1).numbers for path in (made_spectral, spectral_folder)
+    )
+    assert_allclose(found, expected, atol=1e-4)
+
+
+def test_pixels_that_a_mask_leaves_out_are_not_trained_on(made_spectral, spectral_folder):
+    scene = load_object(made_spectral)
+    view = scene.split.train[0]
+    width, height = scene.pictures.cameras.size(view)
+    black = np.full((height, width), 255, np.uint8)
+    black[:, : width // 2] = 0
+    Image.fromarray(black).save(spectral_folder / "mask.png")
+    frames = json.loads((spectral_folder / "transforms.json").read_text())["frames"]
+    frames[view]["mask_path"] = "mask.png"
+    change(spectral_folder, frames=frames)
+    pixels, all_pixels = (
+        PixelList.of(object_, 10**6, 0) for object_ in (load_object(spectral_folder), scene)
+    )
+    masked = (all_pixels.views == 0) & (all_pixels.corners[:, 0] < width // 2)
+    assert masked.any()
+    assert len(pixels.views) == int((~masked).sum())
+
+
+def _fewer_bands(spectral_folder: Path) -> None:
+    for path in (spectral_folder / "relit" / "dim" / "cubes").glob("*.npy"):
+        np.save(path, np.load(path)[..., :4])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "expected"),
+    [
+        (
+            lambda spectral_folder: change(spectral_folder, illuminant_path=None),
+            "light's spectrum is not known",
+        ),
+        (lambda spectral_folder: change(spectral_folder, illuminant_path="none.csv"), "none.csv"),
+        (
+            lambda spectral_folder: change(spectral_folder, wavelengths=None),
+            "no 'wavelengths' for pictures of 5 bands",
+        ),
+        (
+            lambda spectral_folder: change(spectral_folder, wavelengths=[450, 550]),
+            "2 'wavelengths' for pictures of 5 bands",
+        ),
+        (
+            lambda spectral_folder: change(spectral_folder, wavelengths=[450, 500, 550, 600, 900]),
+            "do not reach",
+        ),
+        (lambda spectral_folder: change(spectral_folder, tone_mapping="srgb"), "expected linear light"),
+        (
+            lambda spectral_folder: _store_integers(spectral_folder),
+            "holds uint16; expected floats, or 'value_scale'",
+        ),
+        (lambda spectral_folder: change(spectral_folder, materials=["blue"]), "endmembers_path"),
+        (_fewer_bands, "pictures of 4 bands, wavelengths of 5 bands"),
+        (
+            lambda spectral_folder: write_cubes(
+                spectral_folder / "relit" / "dim", 2, 1.0, wavelengths=[1, 2]
+            ),
+            "wavelengths",
+        ),
+    ],
+)
+def test_light_that_is_not_known_in_every_band_is_refused(spectral_folder, spoil, expected):
+    spoil(spectral_folder)
+    with pytest.raises(UnmixError, match=expected):
+        load_object(spectral_folder)
+
+
+def test_a_lamp_is_not_for_pictures_in_colours(tmp_path):
+    with pytest.raises(UnmixError, match="pictures have 3 colours; leave it out"):
+        load_object(write_object(tmp_path / "ball"), "D65")

@@ -1,0 +1,134 @@
+"""The distance from a prior's material, and the views that a prior gets.
+
+Endmembers and abundances of a run of unmix-nerf at points of a mesh that lies in another space.
+
+A fit starts from a plain material.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from tests.neumatex.factory import write_object
+from tests.products.ball_model import RADIUS, ball_scene
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.neumatex.fit import data_manager
+from unmix_plugin.neumatex.fit.data_manager import view_arrays
+from unmix_plugin.neumatex.fit.object_scene import load_object
+from unmix_plugin.neumatex.fit.start import (
+    PriorAnchor,
+    RunMaterials,
+    TriplaneSurface,
+    material_family,
+    start_plain,
+    views_of,
+)
+from unmix_plugin.neumatex.tracing.surface import Triplane
+from unmix_plugin.spectral.bands import Bands
+
+
+def test_the_distance_counts_each_parameter_by_its_expected_error():
+    generator = torch.Generator().manual_seed(1)
+    said, anchor = Triplane(5, 8, generator=generator), PriorAnchor(Triplane(5, 8, generator=generator))
+    anchor.adopt(said)
+    positions = 2 * torch.rand(7, 3, generator=generator) - 1
+    parameters = torch.rand(7, 5, generator=generator, requires_grad=True)
+    expected = torch.zeros(())
+    for row in range(7):
+        at = positions[row : row + 1]
+        errors = (parameters[row] - said.parameters_at(at)[0]) ** 2
+        expected = expected + (errors / said.log_variance(at)[0].exp()).sum() / 7
+    found = anchor.distance(parameters, positions)
+    torch.testing.assert_close(found, expected)
+    found.backward()
+    assert all(parameter.grad is None for parameter in anchor.parameters())
+    assert float(anchor.distance(said.parameters_at(positions).detach(), positions)) < 1e-9
+
+
+def test_views_for_a_prior_are_the_training_views_thinned_out(tmp_path, monkeypatch):
+    scene = load_object(write_object(tmp_path / "ball"))
+    monkeypatch.setattr(data_manager, "LONGEST_EDGE_PX", 12)
+    views = views_of(view_arrays(scene))
+    assert len(views.pictures) == len(scene.split.train) == 5
+    assert views.pictures[0].shape == (12, 12, 3)
+    whole, thin = scene.pictures.cameras[list(scene.split.train)], views.cameras
+    points = scene.mesh.vertices[:20]
+    full_px, small_px = whole.project(points, 3)[0], thin.project(points, 3)[0]
+    torch.testing.assert_close((full_px - 0.5) / 2 + 0.5, small_px, atol=1e-4, rtol=0)
+    middle = views.pictures[2][6, 6]
+    torch.testing.assert_close(middle, torch.tensor([0.5, 0.3, 0.1]))
+
+
+RUN = RunMaterials(Path("run"), ball_scene())
+COUNT = len(RUN.scene.materials.endmembers)
+TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+SCALE, SHIFT = 0.5, np.array([0.3, -0.1, 0.2])
+
+
+def _corners(scale=SCALE):
+    """Of a model space in which the run's space is turned, scaled and shifted."""
+    of_mesh = np.concatenate([np.zeros((1, 3)), np.eye(3)])
+    return RUN.scene.frame.to_world((of_mesh * scale) @ TURN + SHIFT)
+
+
+def _points(count=200):
+    """Points and normals of the run's ball, in that model space."""
+    outwards = torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
+    outwards = torch.nn.functional.normalize(outwards, dim=1)
+    of_run = RADIUS * outwards.double().numpy()
+    positions = torch.from_numpy((of_run - SHIFT) @ TURN.T / SCALE).float()
+    return positions, torch.from_numpy(outwards.double().numpy() @ TURN.T).float(), outwards
+
+
+def test_abundances_are_those_of_the_runs_surface_at_the_same_place_in_the_world():
+    positions, normals, outwards = _points()
+    shares = RUN.abundances(positions, normals, _corners())
+    clear = outwards[:, 2].abs() > 0.1
+    assert_close(shares[clear, 0], (outwards[clear, 2] > 0).float(), atol=0.02, rtol=0)
+    assert_close(shares.sum(dim=1), torch.ones(len(shares)))
+
+
+def test_a_run_of_another_place_is_refused():
+    positions, normals, _ = _points()
+    with pytest.raises(ConfigError, match="of the mesh's surface only"):
+        RUN.abundances(positions, normals, _corners(scale=3.0))
+
+
+def test_endmembers_become_reflectances_by_the_light():
+    materials = RUN.scene.materials
+    lamp = np.linspace(0.5, 1.0, len(materials.bands))
+    found = RUN.reflectances(materials.bands, lamp, COUNT)
+    light = torch.from_numpy(lamp).float() if materials.light is None else materials.light
+    assert_close(found * light, materials.endmembers.detach())
+
+
+@pytest.mark.parametrize(
+    ("bands", "count", "expected"),
+    [
+        (Bands.of([400, 500]), COUNT, "they must be the same"),
+        (RUN.scene.materials.bands, COUNT + 1, "num-endmembers is"),
+    ],
+)
+def test_a_run_of_other_bands_or_another_number_is_refused(bands, count, expected):
+    with pytest.raises(ConfigError, match=expected):
+        RUN.reflectances(bands, np.ones(len(bands)), count)
+
+
+@pytest.mark.parametrize("name", ["neural", "pbr"])
+def test_a_new_triplane_is_grey_and_reflects_as_what_is_no_metal(name):
+    family = material_family(name)
+    generator = torch.Generator().manual_seed(2)
+    triplane = Triplane(family.num_parameters, 16, generator=generator)
+    start_plain(triplane, family)
+    positions = 2 * torch.rand(200, 3, generator=generator) - 1
+    parameters = TriplaneSurface(family, triplane).parameters(positions).detach()
+    assert family.base_colour(parameters).sub(0.5).abs().mean() < 0.1
+    up = torch.tensor([[0.0, 0.0, 1.0]]).expand(200, 3)
+    side = torch.nn.functional.normalize(torch.tensor([[0.7, 0.0, 1.0]]), dim=-1).expand(200, 3)
+    reflectance = family.evaluate(parameters, side, up)
+    dark = torch.cat([torch.full((200, 3), 0.02), parameters[:, 3:]], dim=-1)
+    # Nearly all of it is the base colour's: a metal's highlight would not go with it.
+    assert family.evaluate(dark, side, up).mean() < 0.35 * reflectance.mean()

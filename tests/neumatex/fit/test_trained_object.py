@@ -1,0 +1,118 @@
+"""Laws of the scene of a mesh with materials: what it shows, under which light, and that nothing changes it."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.neumatex.surfaces import CAMERAS, FRAME, PBR, TURN, make_object, uneven_light
+from unmix_plugin.errors import ConfigError, SceneError
+from unmix_plugin.formats.exr import write_exr
+from unmix_plugin.neumatex.fit.trained_object import OWN_LIGHT
+from unmix_plugin.trained.protocol import RenderableScene
+from unmix_plugin.trained.relighting import EstimatedScene, LightChoice, RelightableScene
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_object()
+
+
+CAMERA = CAMERAS[0].resized(24, 18)
+
+
+def test_it_offers_what_commands_and_viewer_ask_of_scenes(scene):
+    assert isinstance(scene, RenderableScene)
+    assert isinstance(scene, RelightableScene)
+    assert isinstance(scene, EstimatedScene)
+    view = scene.look(CAMERA)
+    for output in scene.outputs:
+        channels = () if output.kind == "map" else (3,)
+        assert view[output.name].shape == (18, 24, *channels), output.name
+        assert view[output.name].isfinite().all()
+    with pytest.raises(ConfigError, match=r"no output named 'rouhness' \(did you mean roughness\?\)"):
+        scene.render(CAMERA, ["rouhness"])
+
+
+def test_what_is_shown_of_the_material_is_that_of_the_surface_that_is_seen(scene):
+    middle = scene.probe(CAMERA, 12, 9)
+    position = torch.as_tensor(middle.position).float()
+    assert float(position.norm()) == pytest.approx(0.6, abs=0.02)
+    truth = PBR.parameters(position[None])[0].numpy()
+    np.testing.assert_allclose(middle.values["base_colour"], truth[:3], atol=1e-5)
+    np.testing.assert_allclose(middle.values["roughness"][0], truth[3], atol=1e-5)
+    np.testing.assert_allclose(middle.values["uncertainty"][0], np.exp(-2), atol=1e-6)
+    camera = CAMERAS[0].camera_to_world[0, :, 3].numpy()
+    assert middle.values["depth"][0] == pytest.approx(
+        np.linalg.norm(FRAME.to_world(camera[None].astype(float)) - middle.world_position), rel=0.02
+    )
+    np.testing.assert_allclose(FRAME.to_model(middle.world_position[None])[0], middle.position, atol=1e-9)
+    normal = middle.values["normals"] @ TURN.T  # back in model space
+    np.testing.assert_allclose(normal, middle.position / 0.6, atol=0.05)
+
+
+def test_where_nothing_is_all_is_black(scene):
+    view = scene.look(CAMERA)
+    empty = view.opacity == 0
+    assert empty.any()
+    for output in scene.outputs:
+        assert (view[output.name][empty] == 0).all(), output.name
+
+
+def test_colour_is_the_tone_curve_of_linear_light_at_full_opacity(scene):
+    view = scene.look(CAMERA)
+    solid = view.opacity == 1
+    torch.testing.assert_close(view["rgb"][solid], scene.curve(view["linear_rgb"][solid]))
+
+
+def test_light_adds_up_and_materials_do_not_change_with_it(scene):
+    """Twice the light is twice the radiance; two stops of exposure are four times."""
+    brighter = scene.with_light(LightChoice(exposure_stops=2.0))
+    before, after = scene.look(CAMERA), brighter.look(CAMERA)
+    torch.testing.assert_close(after["linear_rgb"], 4 * before["linear_rgb"])
+    for name in ("base_colour", "roughness", "normals", "depth"):
+        torch.testing.assert_close(after[name], before[name])
+    torch.testing.assert_close(scene.look(CAMERA)["rgb"], before["rgb"])
+
+
+def test_light_that_is_turned_once_round_is_the_same_and_half_round_another(scene):
+    before = scene.look(CAMERA)["linear_rgb"]
+    round_once = scene.with_light(LightChoice(rotation_deg=360.0)).look(CAMERA)["linear_rgb"]
+    torch.testing.assert_close(round_once, before, atol=2e-3, rtol=0.05)
+    half = scene.with_light(LightChoice(rotation_deg=180.0)).look(CAMERA)["linear_rgb"]
+    assert float((half - before).abs().mean()) > 0.2 * float(before.mean())
+
+
+def test_another_light_can_be_exchanged_for_the_first_again(scene):
+    other = scene.with_light(LightChoice("studio"))
+    assert other.lights == scene.lights
+    back = other.with_light(LightChoice(OWN_LIGHT))
+    torch.testing.assert_close(back.look(CAMERA)["linear_rgb"], scene.look(CAMERA)["linear_rgb"])
+
+
+def test_a_map_of_the_same_light_in_a_file_gives_the_same_picture(scene, tmp_path):
+    image = uneven_light().image.numpy()
+    path = write_exr(tmp_path / "light.exr", {name: image[..., i] for i, name in enumerate("RGB")}, {})
+    read = scene.with_light(LightChoice(str(path)))
+    torch.testing.assert_close(read.look(CAMERA)["linear_rgb"], scene.look(CAMERA)["linear_rgb"])
+    with pytest.raises(SceneError, match="no such environment map"):
+        scene.with_light(LightChoice(str(tmp_path / "other.exr")))
+    with pytest.raises(ConfigError, match=r"no environment 'studoi' \(did you mean studio\?\)"):
+        scene.with_light(LightChoice("studoi"))
+
+
+def test_estimates_are_independent_and_their_mean_comes_near_the_finished_view(scene):
+    finished = make_object(bounces=1).look(CAMERA, 1)["linear_rgb"]
+    mean = first = scene.estimate(CAMERA, 1, 0)
+    for number in range(1, 12):
+        mean = mean.averaged(scene.estimate(CAMERA, 1, number))
+    assert mean.num_estimates == 12
+    assert mean.num_wanted == scene.num_estimates == 4
+    truth = scene.estimate(CAMERA, 1, 99)
+    for number in range(100, 140):
+        truth = truth.averaged(scene.estimate(CAMERA, 1, number))
+
+    def error(view):
+        return float((view - truth["linear_rgb"]).square().mean().sqrt())
+
+    assert error(mean["linear_rgb"]) < 0.6 * error(first["linear_rgb"])
+    assert error(finished) < error(first["linear_rgb"])

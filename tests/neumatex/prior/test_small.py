@@ -1,0 +1,391 @@
+"""Planes that are fitted to what is said of points.
+
+The small prior: data, training steps, prediction from pictures, and its weights on disk.
+
+The loss against its closed form and its limits.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from tests.neumatex.surfaces import ring_cameras
+from tools.prior_objects import (
+    TrainingObjects,
+    random_environment,
+    random_mesh,
+    read_objects,
+    training_object,
+    write_objects,
+)
+from tools.train_prior import (
+    PriorTraining,
+    ReaderTraining,
+    Truth,
+    beta_nll,
+    draw_batch,
+    nll_weight,
+    train,
+    train_readers,
+    training_loss,
+    true_layers,
+    true_pbr,
+)
+from unmix_plugin.errors import RunError, SceneError
+from unmix_plugin.neumatex.prior.observations import PosedViews
+from unmix_plugin.neumatex.prior.small import (
+    NUM_PARAMETERS,
+    RESOLUTION,
+    SHIPPED,
+    Estimates,
+    SmallPrior,
+    filled_triplane,
+    fit_loss,
+    fit_planes,
+    predict,
+    read_colours,
+    read_small_prior,
+    write_small_prior,
+)
+from unmix_plugin.neumatex.tracing.environment import Environment
+from unmix_plugin.neumatex.tracing.rays import RayMesh
+from unmix_plugin.neumatex.tracing.surface import Readers, plane_features
+
+
+def estimates(log_variance: float = -6.0) -> Estimates:
+    """A material that changes smoothly over a sphere."""
+    g = torch.Generator().manual_seed(0)
+    positions = torch.nn.functional.normalize(torch.randn(1, 300, 3, generator=g), dim=-1)
+    parameters = (0.5 + 0.3 * torch.sin(2 * positions)).repeat(1, 1, 2)[..., :5]
+    return Estimates(positions, parameters, torch.full((1, 300, 5), log_variance))
+
+
+def readers() -> Readers:
+    return Readers(5, generator=torch.Generator().manual_seed(1))
+
+
+def test_a_fit_moves_the_planes_to_what_is_said_and_leaves_the_readers():
+    said, networks = estimates(), readers()
+    before = [parameter.clone() for parameter in networks.parameters()]
+    planes = fit_planes(networks, said, steps=120)
+    assert planes.shape == (1, 3, 12, RESOLUTION, RESOLUTION)
+    assert not planes.requires_grad
+    features = plane_features(planes[0], said.positions[0])
+    with torch.no_grad():
+        assert (networks.material(features) - said.parameters[0]).square().mean().sqrt() < 0.05
+        assert (
+            networks.log_variance(features) + 6.0
+        ).abs().mean() < 1.2  # from 1.5 and more; these readers were never trained
+    for parameter, old in zip(networks.parameters(), before, strict=True):
+        assert torch.equal(parameter, old)
+
+
+def test_points_that_are_sure_count_more():
+    said, networks = estimates(), readers()
+    planes = torch.zeros(1, 3, 12, RESOLUTION, RESOLUTION)
+    moved = said.parameters.clone()
+    moved[:, 0] = 0.0
+    unsure = said.log_variance.clone()
+    unsure[:, 0] = 0.0
+    sure_loss, unsure_loss = (
+        fit_loss(networks, planes, Estimates(said.positions, moved, variance))
+        - fit_loss(networks, planes, Estimates(said.positions, said.parameters, variance))
+        for variance in (said.log_variance, unsure)
+    )
+    assert_close(unsure_loss, sure_loss * torch.exp(torch.tensor(-3.0)), rtol=1e-3, atol=1e-7)
+
+
+def test_objects_are_fitted_apart():
+    said, networks = estimates(), readers()
+    both = Estimates(*(torch.cat([part, part.flip(1) * 0.9]) for part in vars(said).values()))
+    alone = fit_planes(networks, said, steps=10)
+    together = fit_planes(networks, both, steps=10)
+    assert_close(together[:1], alone, atol=2e-3, rtol=0)
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def make_prior() -> SmallPrior:
+    torch.manual_seed(0)
+    return SmallPrior()
+
+
+@pytest.fixture(scope="module")
+def paths(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("objects")
+    found = [folder / "first.safetensors", folder / "second.safetensors"]
+    for seed, path in enumerate(found):
+        write_objects(
+            path, [training_object(2 * seed + k, num_points=64, num_views=4, samples=4) for k in (0, 1)]
+        )
+    return found
+
+
+@pytest.fixture(scope="module")
+def objects(paths) -> TrainingObjects:
+    return read_objects(paths)
+
+
+def test_objects_come_back_from_their_files_in_half_precision(objects):
+    assert len(objects) == 4
+    expected = training_object(2, num_points=64, num_views=4, samples=4)
+    found = objects.select([2])
+    assert_close(found.materials, expected.materials, atol=1e-3, rtol=0)
+    assert torch.equal(found.observations.visible, expected.observations.visible)
+    assert_close(found.observations.colours, expected.observations.colours, atol=1e-3, rtol=1e-3)
+
+
+def test_a_seed_gives_one_object():
+    first, second = (training_object(5, num_points=32, num_views=3, samples=2) for _ in range(2))
+    assert torch.equal(first.materials, second.materials)
+    assert torch.equal(first.observations.colours, second.observations.colours)
+
+
+def test_meshes_fill_model_space():
+    for seed in range(12):
+        vertices = random_mesh(generator(seed)).vertices
+        low, high = vertices.min(dim=0).values, vertices.max(dim=0).values
+        assert_close(low, -high, atol=1e-4, rtol=0)
+        assert_close(high.max(), torch.tensor(1.0), atol=1e-4, rtol=0)
+
+
+def test_a_batch_is_turned_but_keeps_what_belongs_to_a_point(objects):
+    truth: Truth = {"pbr": true_pbr(objects.materials.float())}
+    settings = PriorTraining(batch=6, points=40, views=3)
+    observations, targets = draw_batch(objects, truth, settings, generator())
+    assert observations.colours.shape == (6, 40, 3, 3)
+    assert targets["pbr"].shape == (6, 40, 5)
+    known = objects.select(list(range(4)))
+    turned, original = (
+        values.abs().sort(dim=-1).values for values in (observations.positions, known.observations.positions)
+    )
+    # Turning permutes and mirrors axes, so that sorted absolute coordinates say which point it was.
+    for points, target in zip(turned, targets["pbr"], strict=True):
+        distances = torch.cdist(points, original.flatten(0, 1), compute_mode="donot_use_mm_for_euclid_dist")
+        assert distances.min(dim=1).values.max() == 0
+        assert torch.equal(truth["pbr"].flatten(0, 1)[distances.argmin(dim=1)], target)
+
+
+def test_training_on_one_batch_lowers_its_loss(objects):
+    prior = make_prior()
+    truth: Truth = {
+        "pbr": true_pbr(objects.materials.float()),
+        "layers": true_layers(objects.materials.float()),
+    }
+    batch = draw_batch(objects, truth, PriorTraining(batch=4, points=64, views=4), generator())
+    optimiser = torch.optim.Adam(prior.parameters(), lr=3e-3)
+    losses = []
+    for _ in range(40):
+        loss = training_loss(prior, *batch, weight=1.0)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        losses.append(loss.item())
+    assert losses[-1] < losses[0] - 0.1
+
+
+def test_training_ends_by_the_clock_and_changes_weights_that_are_asked_for(objects):
+    prior = make_prior()
+    before = {name: value.clone() for name, value in prior.state_dict().items()}
+    truth: Truth = {"pbr": true_pbr(objects.materials.float())}
+    settings = PriorTraining(seconds=1e-6, batch=2, points=32, views=2)
+    assert train(prior, objects, truth, settings, lambda *_: None) == 1
+    changed = {name for name, value in prior.state_dict().items() if not torch.equal(value, before[name])}
+    assert any(name.startswith("heads.pbr") for name in changed)
+    assert any(name.startswith("view_encoder") for name in changed)
+    assert not any(name.startswith("heads.neural") or "readers" in name for name in changed)
+
+
+def test_readers_are_trained_without_the_encoder(objects):
+    prior = make_prior()
+    before = {name: value.clone() for name, value in prior.state_dict().items()}
+    truth: Truth = {"pbr": true_pbr(objects.materials.float())}
+    settings = ReaderTraining(seconds=1e-6, group=2, steps=2)
+    assert train_readers(prior, objects, truth, "pbr", settings, lambda *_: None) == 1
+    changed = {name for name, value in prior.state_dict().items() if not torch.equal(value, before[name])}
+    assert changed
+    assert all(name.startswith("pbr_readers.") for name in changed)
+
+
+def test_the_likelihood_is_off_first_then_ramps_to_its_weight():
+    settings = PriorTraining(nll_weight=2.0, nll_from=0.2, nll_full_from=0.4)
+    assert [nll_weight(settings, done) for done in (0.0, 0.2, 0.9)] == [0.0, 0.0, 2.0]
+    assert nll_weight(settings, 0.3) == pytest.approx(1.0)
+
+
+def test_layers_that_are_absent_have_no_description():
+    materials = torch.full((1, 14), 0.5)
+    materials[:, [6, 8, 11]] = 0
+    layers = true_layers(materials)
+    assert (layers[:, [6, 7, 8, 9, 10, 11, 12]] == 0).all()
+    assert (layers[:, [0, 1, 2, 3, 4, 5, 13]] == 0.5).all()
+    assert_close(true_pbr(torch.arange(14.0)), torch.tensor([0.0, 1.0, 2.0, 4.0, 3.0]))
+
+
+@pytest.mark.parametrize("axis", [1, 2])
+def test_the_order_of_points_and_of_views_changes_nothing(objects, axis):
+    prior, observations = make_prior(), objects.select([0, 1]).observations
+    orders = [torch.arange(count) for count in observations.visible.shape[1:]]
+    orders[axis - 1] = torch.randperm(len(orders[axis - 1]), generator=generator())
+    with torch.no_grad():
+        expected, found = prior(observations), prior(observations.selected(*orders))
+    assert_close(found, expected[:, orders[0]], atol=1e-5, rtol=1e-4)
+
+
+def test_a_view_that_sees_nothing_changes_nothing(objects):
+    prior, observations = make_prior(), objects.select([0]).observations
+    hidden = observations.visible.clone()
+    hidden[:, :, 1] = False
+    spoiled = observations.colours.clone()
+    spoiled[:, :, 1] = 5.0
+    with torch.no_grad():
+        expected = prior(replace(observations, visible=hidden))
+        assert_close(prior(replace(observations, visible=hidden, colours=spoiled)), expected)
+
+
+def test_a_point_learns_from_those_that_are_seen_alone(objects):
+    prior, observations = make_prior(), objects.select([0]).observations
+    hidden = observations.visible.clone()
+    hidden[:, 1:3] = False
+    hidden[:, 0] = True
+    brighter = observations.colours.clone()
+    brighter[:, 2] *= 3
+    of_hidden, of_seen = (
+        replace(observations, visible=visible, colours=brighter) for visible in (hidden, hidden | True)
+    )
+    with torch.no_grad():
+        base = prior(replace(observations, visible=hidden))[:, 0]
+        assert_close(prior(of_hidden)[:, 0], base)
+        seen = prior(replace(observations, visible=hidden | True))[:, 0]
+        assert (prior(of_seen)[:, 0] - seen).abs().max() > 1e-4
+
+
+def test_objects_of_which_nothing_is_seen_get_numbers_too(objects):
+    prior, observations = make_prior(), objects.select([0]).observations
+    with torch.no_grad():
+        found = prior(replace(observations, visible=torch.zeros_like(observations.visible)))
+    assert torch.isfinite(found).all()
+
+
+class Scene(NamedTuple):
+    views: PosedViews
+    ray_mesh: RayMesh
+    light: Environment
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Views of a sphere-like object in which pixels are coloured by where they are in the picture."""
+    ray_mesh = RayMesh(random_mesh(generator(3)))
+    ramp = (torch.arange(32) + 0.5) / 32
+    picture = torch.stack(
+        [ramp.expand(32, 32), ramp[:, None].expand(32, 32), torch.full((32, 32), 0.5)], dim=-1
+    )
+    views = PosedViews(ring_cameras(5, 32), [picture] * 5, [torch.ones(32, 32)] * 5)
+    return Scene(views, ray_mesh, random_environment(generator(4)))
+
+
+def test_colours_are_read_where_a_point_is_seen(scene):
+    views = scene.views
+    positions = 0.3 * torch.randn(40, 3, generator=generator())
+    colours, shown = read_colours(views, positions)
+    for index in range(5):
+        pixels, _ = views.cameras.project(positions, index)
+        inside = ((pixels > 1) & (pixels < 31)).all(dim=-1)
+        assert shown[inside, index].all()
+        assert_close(colours[inside, index, :2], pixels[inside] / 32, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("material", ["neural", "pbr"])
+def test_a_prediction_is_a_triplane_of_the_resolution_asked_for(scene, material):
+    prior = make_prior()
+    triplane = predict(
+        scene.views, scene.ray_mesh, scene.light, material, resolution=63, generator=generator(), prior=prior
+    )
+    assert triplane.planes.shape == (3, 12, 63, 63)
+    assert triplane.planes.requires_grad
+    positions = 2 * torch.rand(50, 3, generator=generator()) - 1
+    parameters = triplane.parameters_at(positions)
+    assert parameters.shape == (50, NUM_PARAMETERS[material])
+    assert_close(triplane.log_variance(positions).shape, parameters.shape)
+    assert torch.isfinite(parameters).all()
+
+
+def test_planes_in_a_resolution_that_subdivides_theirs_are_the_same_material():
+    planes = torch.randn(3, 12, 32, 32, generator=generator())
+    positions = 2 * torch.rand(50, 3, generator=generator()) - 1
+    own, finer = (filled_triplane(make_prior(), planes, "pbr", resolution) for resolution in (32, 63))
+    assert_close(finer.parameters_at(positions), own.parameters_at(positions), atol=1e-4, rtol=0)
+
+
+def test_views_beside_the_object_are_refused(scene):
+    empty = PosedViews(scene.views.cameras, scene.views.pictures, [torch.zeros(32, 32)] * 5)
+    with pytest.raises(SceneError, match="none of 5 views shows the mesh"):
+        predict(empty, scene.ray_mesh, scene.light, "pbr", generator=generator(), prior=make_prior())
+
+
+def test_weights_come_back_and_latents_are_bound_to_their_decoder(tmp_path):
+    prior = make_prior()
+    write_small_prior(tmp_path, prior, {"decoder_sha256": "a" * 64})
+    found = read_small_prior("neural", tmp_path, decoder_sha256="a" * 64)
+    for name, value in prior.state_dict().items():
+        assert torch.equal(found.state_dict()[name], value)
+    with pytest.raises(RunError, match=r"trained for the material decoder aaaaaaaaaaaa, but .* is bbbb"):
+        read_small_prior("neural", tmp_path, decoder_sha256="b" * 64)
+    read_small_prior("pbr", tmp_path, decoder_sha256="b" * 64)
+
+
+def test_damaged_weights_are_named(tmp_path):
+    write_small_prior(tmp_path, make_prior(), {})
+    path = tmp_path / "small.safetensors"
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(RunError, match=r"is not the file that small\.json describes"):
+        read_small_prior("pbr", tmp_path)
+    with pytest.raises(RunError, match=r"small\.json can't be read"):
+        read_small_prior("pbr", tmp_path / "elsewhere")
+
+
+def test_the_shipped_prior_belongs_to_the_shipped_decoder_and_is_small():
+    read_small_prior("neural")
+    assert (SHIPPED / "small.safetensors").stat().st_size < 10e6
+
+
+def numbers(seed: int) -> torch.Tensor:
+    return torch.randn(20, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def test_with_beta_0_it_is_the_likelihood_of_a_gaussian():
+    predicted, log_variance, target = numbers(0), numbers(1), numbers(2)
+    gaussian = torch.distributions.Normal(predicted, (0.5 * log_variance).exp())
+    constant = 0.5 * torch.log(torch.tensor(2 * torch.pi, dtype=torch.float64))
+    assert_close(
+        beta_nll(predicted, log_variance, target, beta=0.0), -(gaussian.log_prob(target) + constant).mean()
+    )
+
+
+def test_with_beta_a_half_each_likelihood_counts_its_standard_deviation_and_that_has_no_gradient():
+    predicted, log_variance, target = numbers(0).requires_grad_(), numbers(1).requires_grad_(), numbers(2)
+    deviation = (0.5 * log_variance).exp().detach()
+    expected = (deviation * 0.5 * ((predicted - target) ** 2 / log_variance.exp() + log_variance)).mean()
+    actual = beta_nll(predicted, log_variance, target)
+    assert_close(actual, expected)
+    found = torch.autograd.grad(actual, [predicted, log_variance])
+    assert_close(found, torch.autograd.grad(expected, [predicted, log_variance]))
+
+
+def test_with_beta_1_the_mean_is_pulled_as_by_the_squared_error():
+    predicted, log_variance, target = numbers(0).requires_grad_(), numbers(1), numbers(2)
+    found = torch.autograd.grad(beta_nll(predicted, log_variance, target, beta=1.0), predicted)
+    assert_close(found, torch.autograd.grad(0.5 * (predicted - target).square().mean(), predicted))
+
+
+def test_the_best_variance_is_the_squared_error():
+    predicted, target = numbers(0), numbers(2)
+    log_variance = (predicted - target).square().log().requires_grad_()
+    gradient = torch.autograd.grad(beta_nll(predicted, log_variance, target), log_variance)[0]
+    assert_close(gradient, torch.zeros_like(gradient))

@@ -1,0 +1,315 @@
+"""Frames are orthonormal and right-handed, and turn directions there and back.
+
+Laws that hold for the reflectances of every family: reciprocity, exact densities, unbiased sampling, finiteness.
+
+Layered materials keep the light they get, and each layer does what it is there for.
+
+Families accept no points at all, as when no path of a batch goes on.
+
+Spectral materials: what a constant mixture reflects in even light, band by band, and where gradients go.
+"""
+
+import math
+
+import pytest
+import torch
+import trimesh
+from torch.testing import assert_close
+
+from tests.neumatex.surfaces import Uniform, eye_directions, numbers, spherical_grid, unit, wide_parameters
+from unmix_plugin.neumatex.tracing.environment import Environment
+from unmix_plugin.neumatex.tracing.families import LayeredFamily, MaterialFamily, PbrFamily, SpectralFamily
+from unmix_plugin.neumatex.tracing.layers import ggx_albedo
+from unmix_plugin.neumatex.tracing.mesh import mesh_of
+from unmix_plugin.neumatex.tracing.microfacet import frames, to_local, to_world
+from unmix_plugin.neumatex.tracing.neural import NeuralFamily
+from unmix_plugin.neumatex.tracing.path_tracer import reflected_radiance
+from unmix_plugin.neumatex.tracing.rays import RayMesh
+
+NORMALS = torch.nn.functional.normalize(
+    torch.cat([numbers(200, 3) - 0.5, torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])]),
+    dim=-1,
+)
+DIRECTIONS = torch.nn.functional.normalize(numbers(len(NORMALS), 3, seed=9) - 0.5, dim=-1)
+
+
+def test_frames_are_rotations():
+    found = frames(NORMALS)
+    assert_close(found @ found.mT, torch.eye(3).expand_as(found), atol=1e-5, rtol=0)
+    assert_close(torch.linalg.det(found), torch.ones(len(found)), atol=1e-5, rtol=0)
+
+
+def test_the_normal_is_the_z_axis():
+    assert_close(to_local(frames(NORMALS), NORMALS)[:, 2], torch.ones(len(NORMALS)))
+    assert_close(to_world(frames(NORMALS), torch.tensor([[0.0, 0.0, 1.0]]).expand_as(NORMALS)), NORMALS)
+
+
+def test_to_world_undoes_to_local():
+    turned = to_world(frames(NORMALS), to_local(frames(NORMALS), DIRECTIONS))
+    assert_close(turned, DIRECTIONS, atol=1e-5, rtol=0)
+
+
+SPECTRAL = SpectralFamily(torch.tensor([[0.9, 0.5, 0.1, 0.3, 0.0], [0.0, 0.2, 1.0, 0.6, 0.1]]) / 2)
+FAMILIES = [PbrFamily(), LayeredFamily(), NeuralFamily(), SPECTRAL]
+each_family = pytest.mark.parametrize("family", FAMILIES, ids=lambda family: type(family).__name__)
+
+
+@each_family
+def test_light_and_eye_can_change_places(family: MaterialFamily):
+    parameters = wide_parameters(500, family.num_parameters)
+    wi, wo = eye_directions(500, seed=3), eye_directions(500, seed=4)
+    assert_close(
+        family.evaluate(parameters, wi, wo), family.evaluate(parameters, wo, wi), rtol=1e-3, atol=1e-6
+    )
+
+
+@each_family
+def test_nothing_is_reflected_below_the_surface(family: MaterialFamily):
+    parameters = wide_parameters(50, family.num_parameters)
+    above, below = eye_directions(50, seed=3), eye_directions(50, seed=4) * torch.tensor([1.0, 1.0, -1.0])
+    assert family.evaluate(parameters, below, above).abs().max() == 0
+    assert family.evaluate(parameters, above, below).abs().max() == 0
+    values = family.evaluate(parameters, above, above)
+    assert values.min() >= 0
+    assert (values.amax(-1) > 0).float().mean() > 0.9
+
+
+@each_family
+def test_the_density_integrates_to_one(family: MaterialFamily):
+    # Lobes that the grid resolves: roughness of every kind at least 0.4.
+    parameters = 0.4 + 0.6 * wide_parameters(5, family.num_parameters)
+    wi, solid_angles = spherical_grid(500, 500)
+    for row, wo in zip(parameters, eye_directions(5, lowest=0.2), strict=True):
+        density = family.density(row.expand(len(wi), -1), wi, wo.expand_as(wi))
+        assert float((density * solid_angles).sum()) == pytest.approx(1.0, abs=0.003)
+
+
+@each_family
+def test_samples_are_drawn_from_the_density(family: MaterialFamily):
+    # The mean of 1 / density over samples that fall into a region is the region's solid angle.
+    for row, wo in zip(wide_parameters(5, family.num_parameters), eye_directions(5, lowest=0.2), strict=True):
+        rows, eyes = row.expand(100_000, -1), wo.expand(100_000, 3)
+        wi = family.sample(rows, eyes, numbers(100_000, 3))
+        assert_close(wi.norm(dim=-1), torch.ones(len(wi)), atol=1e-4, rtol=0)
+        inverse = 1.0 / family.density(rows, wi, eyes)
+        regions = {2 * math.pi * 0.7: wi[:, 2] > 0.3, math.pi * 0.9: (wi[:, 2] > 0.1) & (wi[:, 0] > 0)}
+        for solid_angle, region in regions.items():
+            assert float((inverse * region).mean()) == pytest.approx(solid_angle, rel=0.04)
+
+
+@each_family
+def test_sampling_estimates_the_same_reflected_light_as_a_uniform_sphere(family: MaterialFamily):
+    parameters = 0.3 + 0.7 * wide_parameters(4, family.num_parameters)
+    grid, solid_angles = spherical_grid(400, 400)
+    for row, wo in zip(parameters, eye_directions(4), strict=True):
+        light = 1.0 + grid[:, :1] + grid[:, 2:]
+        values = family.evaluate(row.expand(len(grid), -1), grid, wo.expand_as(grid)) * light
+        expected = (values * (grid[:, 2].clamp_min(0) * solid_angles)[:, None]).sum(0)
+        rows, eyes = row.expand(60_000, -1), wo.expand(60_000, 3)
+        wi = family.sample(rows, eyes, numbers(60_000, 3))
+        values = family.evaluate(rows, wi, eyes) * (1.0 + wi[:, :1] + wi[:, 2:])
+        found = values * (wi[:, 2].clamp_min(0) / family.density(rows, wi, eyes))[:, None]
+        assert_close(found.mean(0), expected, rtol=0.015, atol=1e-3)
+
+
+@each_family
+def test_importance_sampling_keeps_weights_small(family: MaterialFamily):
+    parameters = wide_parameters(100_000, family.num_parameters)
+    wo = eye_directions(100_000, lowest=0.01)
+    wi = family.sample(parameters, wo, numbers(100_000, 3))
+    cosine = wi[:, 2].clamp_min(0.0)
+    weights = family.evaluate(parameters, wi, wo) * (cosine / family.density(parameters, wi, wo))[:, None]
+    assert weights.isfinite().all()
+    assert float(weights.max()) < 40
+
+
+@each_family
+@pytest.mark.parametrize("lowest", [0.0, 1e-6, 1e-3])
+def test_values_and_gradients_are_finite_up_to_the_horizon(family: MaterialFamily, lowest: float):
+    parameters = wide_parameters(2000, family.num_parameters).requires_grad_()
+    z = torch.full((2000,), lowest)
+    wi = torch.stack([torch.sqrt(1 - z * z), torch.zeros(2000), z], -1)
+    for wo in (wi, wi * torch.tensor([-1.0, 1.0, 1.0]), eye_directions(2000)):
+        values = family.evaluate(parameters, wi, wo)
+        (gradient,) = torch.autograd.grad(values.sum(), parameters)
+        assert values.isfinite().all()
+        assert gradient.isfinite().all()
+        assert family.density(parameters, wi, wo).isfinite().all()
+
+
+@each_family
+def test_gradients_are_those_of_finite_differences(family: MaterialFamily):
+    parameters = (0.25 + 0.5 * numbers(20, family.num_parameters)).requires_grad_()
+    wi, wo = eye_directions(20, seed=5), eye_directions(20, seed=6)
+    (gradient,) = torch.autograd.grad(family.evaluate(parameters, wi, wo).sum(), parameters)
+    step = 2e-3
+    with torch.no_grad():
+        for column in range(family.num_parameters):
+            shift = step * torch.eye(family.num_parameters)[column]
+            rise = family.evaluate(parameters + shift, wi, wo) - family.evaluate(parameters - shift, wi, wo)
+            assert_close(gradient[:, column], rise.sum(-1) / (2 * step), rtol=0.05, atol=0.02)
+
+
+@pytest.mark.parametrize("family", FAMILIES[:2], ids=lambda family: type(family).__name__)
+def test_the_base_colour_is_the_first_three_parameters(family: MaterialFamily):
+    parameters = wide_parameters(5, family.num_parameters)
+    assert torch.equal(family.base_colour(parameters), parameters[:, :3])
+
+
+def test_the_base_colour_of_a_neural_metal_is_what_it_reflects():
+    # Copper, half and wholly metal, and a red dielectric; the diffuse colour of the metal is of no consequence.
+    layered = torch.zeros(3, LayeredFamily.num_parameters)
+    layered[:, :6] = torch.tensor(
+        [[0.95, 0.64, 0.37, 1.0, 0.3, 0.5], [0.95, 0.64, 0.37, 0.7, 0.3, 0.5], [0.8, 0.1, 0.1, 0.0, 0.3, 0.5]]
+    )
+    family = NeuralFamily()
+    parameters = family.from_layered(layered)
+    parameters[0, :3] = 0.2
+    assert_close(family.base_colour(parameters), layered[:, :3], atol=0.06, rtol=0)
+    decoded = family.decoded_family.base_colour(family.decoded(parameters))
+    assert_close(decoded, family.base_colour(parameters))
+
+
+FAMILY = LayeredFamily()
+INDEX = {name: i for i, name in enumerate(LayeredFamily.PARAMETERS)}
+
+
+def albedo(parameters: torch.Tensor, wo: torch.Tensor) -> torch.Tensor:
+    """Share of light that one material reflects from one direction, by importance sampling."""
+    uniforms = torch.quasirandom.SobolEngine(3, scramble=True, seed=0).draw(1 << 15)
+    rows, eyes = parameters.expand(len(uniforms), -1), wo.expand(len(uniforms), 3)
+    wi = FAMILY.sample(rows, eyes, uniforms)
+    weights = wi[:, 2].clamp_min(0) / FAMILY.density(rows, wi, eyes)
+    return (FAMILY.evaluate(rows, wi, eyes) * weights[:, None]).mean(0)
+
+
+def material(**named: float) -> torch.Tensor:
+    """All 0 but a grey base, roughness 0.5, specular level 0.5 and what is named."""
+    parameters = torch.zeros(FAMILY.num_parameters)
+    parameters[:3] = 0.5
+    for name, value in ({"roughness": 0.5, "specular_level": 0.5} | named).items():
+        parameters[INDEX[name.replace("_", " ")]] = value
+    return parameters
+
+
+def test_a_white_furnace_is_never_brightened():
+    white = wide_parameters(60, FAMILY.num_parameters)
+    white[:, :3] = 1.0
+    found = torch.stack([albedo(row, wo) for row, wo in zip(white, eye_directions(60), strict=True)])
+    assert float(found.max()) < 1.005
+
+
+@pytest.mark.parametrize("roughness", [0.2, 0.6, 1.0])
+def test_a_white_dielectric_gives_back_all_light(roughness: float):
+    white = material(roughness=roughness)
+    white[:3] = 1.0
+    for wo in eye_directions(4, lowest=0.1):
+        assert albedo(white, wo).tolist() == pytest.approx([1.0] * 3, abs=0.01)
+
+
+def test_without_layers_or_gloss_only_the_base_is_left():
+    parameters = material(specular_level=0.0, roughness=1.0)
+    wi = wo = torch.tensor([[0.0, 0.0, 1.0]])
+    assert FAMILY.evaluate(parameters[None], wi, wo)[0].tolist() == pytest.approx(
+        [0.5 / math.pi] * 3, rel=0.03
+    )
+
+
+def test_metal_reflects_in_its_colour_and_passes_nothing():
+    parameters = material(metallicity=1.0)
+    parameters[:3] = torch.tensor([0.9, 0.6, 0.2])
+    wo = torch.tensor([[0.0, 0.0, 1.0]])
+    passed, specular = FAMILY.stack(parameters[None]).reflectance(wo.T, wo.T)
+    assert float(passed) == 0.0
+    assert (specular[:, 0] / specular[0, 0]).tolist() == pytest.approx([1.0, 2 / 3, 2 / 9], rel=1e-4)
+
+
+@pytest.mark.parametrize("layer", ["dust", "sheen_weight", "coat_weight"])
+def test_a_layer_dims_the_base_below_it(layer: str):
+    wi, wo = eye_directions(50, seed=7).T, eye_directions(50, seed=8).T
+    bare, _ = FAMILY.stack(material().expand(50, -1)).reflectance(wi, wo)
+    covered, _ = FAMILY.stack(material(**{layer: 1.0}).expand(50, -1)).reflectance(wi, wo)
+    assert (covered < 0.99 * bare).all()
+
+
+def test_haze_moves_light_from_the_highlight_to_its_surroundings():
+    wo = torch.tensor([[0.0, 0.0, 1.0]])
+    aside = torch.tensor([[math.sin(0.3), 0.0, math.cos(0.3)]])
+    sharp, hazy = (material(roughness=0.2, haze_weight=weight)[None] for weight in (0.0, 1.0))
+    assert FAMILY.evaluate(hazy, wo, wo)[0, 0] < 0.5 * FAMILY.evaluate(sharp, wo, wo)[0, 0]
+    assert FAMILY.evaluate(hazy, aside, wo)[0, 0] > FAMILY.evaluate(sharp, aside, wo)[0, 0]
+
+
+def test_albedo_of_the_tables_is_that_of_the_lobes():
+    """A black metal-free base under one layer: what the stack reflects is what its tables say."""
+    grid, solid_angles = spherical_grid(800, 800)
+    parameters = material(specular_level=1.0, roughness=0.6)
+    parameters[:3] = 0.0
+    for wo in eye_directions(4, lowest=0.1):
+        eyes = wo.expand_as(grid).T
+        stack = FAMILY.stack(parameters.expand(len(grid), -1))
+        _, specular = stack.reflectance(grid.T, eyes)
+        reflected = float((specular[0] * grid[:, 2].clamp_min(0) * solid_angles).sum())
+        surface = FAMILY.stack(parameters[None]).passing(wo[2:]).surface
+        assert 1.0 - float(surface) == pytest.approx(reflected, abs=0.003)
+
+
+@pytest.mark.parametrize("kind", [LayeredFamily, NeuralFamily, PbrFamily])
+def test_no_points_have_no_reflectances(kind):
+    family = kind()
+    parameters, directions = torch.zeros(0, family.num_parameters), torch.zeros(0, 3)
+    assert family.evaluate(parameters, directions, directions).shape == (0, 3)
+    assert family.sample(parameters, directions, directions).shape == (0, 3)
+    assert family.density(parameters, directions, directions).shape == (0,)
+
+
+LIGHT = torch.tensor([0.2, 1.0, 0.6, 0.9, 0.4])
+ENDMEMBERS = torch.tensor([[0.9, 0.5, 0.1, 0.3, 0.0], [0.0, 0.2, 1.0, 0.6, 0.1], [0.3, 0.3, 0.3, 0.3, 0.3]])
+
+
+def _ball_in_even_light(family, values, samples=256):
+    """Radiance (N B) of a ball of one material, and cosines to the eye."""
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    rays = RayMesh(mesh_of(torch.tensor(ball.vertices), torch.tensor(ball.faces)))
+    targets = torch.rand(100, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    origins = torch.tensor((0.0, -4.0, 0.0)).expand(100, 3)
+    directions = unit(targets - origins)
+    points = rays.points(rays.closest(origins, directions), directions)
+    radiance = reflected_radiance(
+        Uniform(family, values),
+        rays,
+        Environment(LIGHT.expand(8, 16, 5).contiguous()),
+        points,
+        -directions,
+        samples=samples,
+        generator=torch.Generator().manual_seed(1),
+    )
+    return radiance, -(directions * points.normals).sum(dim=-1)
+
+
+@pytest.mark.parametrize(("roughness", "level"), [(0.3, 0.2), (0.6, 0.7), (1.0, 0.0)])
+def test_a_constant_mixture_in_even_light_is_its_closed_form_in_every_band(roughness, level):
+    shares = torch.tensor([0.5, 0.2, 0.3])
+    values = [*shares.tolist(), roughness, level]
+    radiance, cosine = _ball_in_even_light(SpectralFamily(ENDMEMBERS), values)
+    a, b = ggx_albedo(torch.full((1, len(cosine)), roughness), cosine)
+    gloss = (level**2 * a + b)[0, :, None]
+    expected = LIGHT * (gloss + (1 - gloss) * (shares @ ENDMEMBERS))
+    assert_close(radiance, expected, rtol=0.02, atol=0.004)
+    assert_close(radiance.mean(dim=0), expected.mean(dim=0), rtol=0.003, atol=0)
+
+
+def test_a_white_furnace_sends_back_the_light_of_each_band():
+    radiance, _ = _ball_in_even_light(SpectralFamily(torch.ones(1, 5)), [1.0, 0.5, 0.3])
+    assert_close(radiance.mean(dim=0), LIGHT, rtol=0.003, atol=0)
+
+
+def test_light_tells_endmembers_by_their_share():
+    endmembers = ENDMEMBERS.clone().requires_grad_()
+    radiance, cosine = _ball_in_even_light(SpectralFamily(endmembers), [0.5, 0.0, 0.5, 0.5, 0.2], samples=64)
+    (gradient,) = torch.autograd.grad(radiance.mean(dim=0).sum(), endmembers)
+    a, b = ggx_albedo(torch.full((1, len(cosine)), 0.5), cosine)
+    passed = float((1 - (0.04 * a + b)).mean())
+    assert_close(gradient[0], 0.5 * passed * LIGHT, rtol=0.01, atol=0)
+    assert_close(gradient[0], gradient[2])
+    assert gradient[1].abs().max() == 0

@@ -1,0 +1,302 @@
+"""Environments: directions, densities and draws agree with each other.
+
+Environment maps from files, and what is refused.
+
+Lamps and environments of many bands.
+"""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from unmix_plugin.errors import ConfigError, SceneError, SpectrumError
+from unmix_plugin.formats.exr import write_exr
+from unmix_plugin.formats.spectral_exr import write_spectral_exr
+from unmix_plugin.neumatex.tracing.built_in_lights import NAMES, built_in_environment
+from unmix_plugin.neumatex.tracing.environment import Environment, PictureInversion, directions_of_pixels
+from unmix_plugin.neumatex.tracing.light_files import (
+    mean_spectrum,
+    of_lamp,
+    read_environment,
+    read_environment_of_bands,
+    read_lamp,
+)
+from unmix_plugin.spectral.bands import Bands
+
+
+def _uniforms(count, seed=0):
+    return torch.rand(count, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def _directions(count, seed=0):
+    normals = torch.randn(count, 3, generator=torch.Generator().manual_seed(seed))
+    return torch.nn.functional.normalize(normals, dim=-1)
+
+
+def _spotty(height=16):
+    g = torch.Generator().manual_seed(5)
+    return Environment(torch.rand(height, 2 * height, 3, generator=g) ** 6)
+
+
+@pytest.mark.parametrize(
+    "weights", [[[1.0]], [[0, 3.0], [0, 0]], [[1, 1, 1, 1.0]] * 2, [[0.1, 7, 0], [0.2, 2, 2]]]
+)
+def test_pixels_are_drawn_by_their_weights_and_evenly_within(weights):
+    given = torch.tensor(weights)
+    axis = (torch.arange(600, dtype=torch.float64) + 0.5) / 600
+    grid = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), dim=-1).reshape(-1, 2)
+    row, column, down, across = PictureInversion.of(given).draw(grid)
+    drawn = torch.zeros_like(given, dtype=torch.float64).index_put_(
+        (row, column), torch.ones_like(down), True
+    )
+    assert_close(drawn / len(grid), given.double() / given.double().sum(), atol=3e-3, rtol=0)
+    assert bool((drawn[given == 0] == 0).all())
+    for place in (down, across):
+        heaviest = place[(row * given.shape[1] + column) == given.argmax()]
+        assert_close(heaviest.mean(), torch.tensor(0.5, dtype=torch.float64), atol=0.01, rtol=0)
+        assert_close(heaviest.std(), torch.tensor(12**-0.5, dtype=torch.float64), atol=0.01, rtol=0)
+
+
+def test_directions_follow_the_stated_convention():
+    image = torch.zeros(4, 8, 3)
+    image[2, 1] = torch.tensor([1.0, 2.0, 3.0])
+    u, v = (1 + 0.5) / 8, (2 + 0.5) / 4
+    azimuth, polar = 2 * math.pi * (0.5 - u), math.pi * v
+    flat = math.sin(polar)
+    direction = torch.tensor([[flat * math.cos(azimuth), flat * math.sin(azimuth), math.cos(polar)]])
+    assert_close(Environment(image).radiance(direction), image[2, 1][None])
+    assert_close(Environment(image, exposure_stops=1.0).radiance(direction), 2 * image[2, 1][None])
+    turn = math.radians(30)
+    turned = torch.tensor(
+        [[flat * math.cos(azimuth + turn), flat * math.sin(azimuth + turn), math.cos(polar)]]
+    )
+    assert_close(Environment(image, rotation_deg=30.0).radiance(turned), image[2, 1][None])
+
+
+def test_radiance_at_pixel_centres_is_the_picture():
+    environment = _spotty()
+    directions = directions_of_pixels(16, 32).reshape(-1, 3)
+    assert_close(environment.radiance(directions), environment.image.reshape(-1, 3), atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("rotation", [0.0, 77.0])
+def test_density_integrates_to_one(rotation):
+    environment = Environment(_spotty().image, rotation)
+    mean = environment.density(_directions(400_000)).double().mean()
+    assert_close(4 * math.pi * mean, torch.tensor(1.0, dtype=torch.float64), atol=0.02, rtol=0)
+
+
+@pytest.mark.parametrize("rotation", [0.0, -120.0])
+def test_draws_have_the_stated_density(rotation):
+    environment = Environment(_spotty().image, rotation)
+    directions, density = environment.sample(_uniforms(200_000))
+    assert_close(directions.norm(dim=-1), torch.ones(200_000))
+    same = torch.isclose(environment.density(directions), density, rtol=1e-4)
+    assert same.float().mean() > 0.9999  # some fall on an edge of pixels
+    smooth = directions[:, 0].exp() * (1 + directions[:, 2])
+    estimate = (smooth / density).double().mean()
+    uniform = _directions(400_000)
+    expected = 4 * math.pi * (uniform[:, 0].exp() * (1 + uniform[:, 2])).double().mean()
+    # The density of dark pixels is small, so single draws weigh much.
+    assert_close(estimate, expected, rtol=0.03, atol=0)
+
+
+def test_draws_of_a_bright_pixel_stay_near_it():
+    image = torch.zeros(8, 16, 3)
+    image[3, 5] = 1.0
+    directions, density = Environment(image).sample(_uniforms(1000))
+    centre = directions_of_pixels(8, 16)[3, 5]
+    assert bool((directions @ centre > math.cos(math.radians(55))).all())
+    assert bool((density > 0).all())
+
+
+def test_a_black_environment_is_drawn_from_uniformly():
+    directions, density = Environment(torch.zeros(4, 8, 3)).sample(_uniforms(4000))
+    assert_close(density, torch.full((4000,), 1 / (4 * math.pi)))
+    assert_close(directions.mean(dim=0), torch.zeros(3), atol=0.04, rtol=0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_built_in_environments_are_seeded_and_well_exposed(name):
+    first, again, other = (built_in_environment(name, seed, height=32) for seed in (1, 1, 2))
+    assert torch.equal(first.image, again.image)
+    assert not torch.equal(first.image, other.image)
+    assert bool((first.image >= 0).all())
+    assert_close(first.mean_radiance().mean(), torch.tensor(0.8), atol=1e-4, rtol=0)
+
+
+def test_an_unknown_environment_is_refused():
+    with pytest.raises(ConfigError, match="did you mean studio"):
+        built_in_environment("studios")
+
+
+def _picture(height=4, width=8):
+    return np.random.default_rng(0).uniform(0.01, 20, (height, width, 3)).astype(np.float32)
+
+
+def _exr(path, image):
+    return write_exr(path, {name: image[..., i] for i, name in enumerate("RGB")}, {})
+
+
+def _rgbe(image):
+    mantissas, exponents = np.frexp(image.max(axis=-1))
+    bytes_ = np.empty((*image.shape[:2], 4), np.uint8)
+    bytes_[..., :3] = image * (mantissas / image.max(axis=-1) * 256)[..., None]
+    bytes_[..., 3] = exponents + 128
+    return bytes_
+
+
+def _header(image, rest=b"FORMAT=32-bit_rle_rgbe\n", order=b"-Y %d +X %d\n"):
+    return b"#?RADIANCE\n" + rest + b"\n" + order % image.shape[:2]
+
+
+def _run_length_row(row):
+    coded = bytes([2, 2, len(row) >> 8, len(row) & 255])
+    for channel in row.T:
+        if (channel == channel[0]).all():
+            coded += bytes([128 + len(channel), channel[0]])
+        else:
+            coded += bytes([len(channel)]) + channel.tobytes()
+    return coded
+
+
+def test_exr_is_read_with_rotation_and_exposure(tmp_path):
+    image = _picture()
+    environment = read_environment(_exr(tmp_path / "light.exr", image), 20.0, 1.0)
+    assert_close(environment.image, torch.from_numpy(image))
+    assert (environment.rotation_deg, environment.exposure_stops) == (20.0, 1.0)
+
+
+def test_hdr_is_read_flat_and_run_length_coded(tmp_path):
+    image = _picture(8, 16)
+    image[2] = 1.5
+    rgbe = _rgbe(image)
+    (tmp_path / "flat.hdr").write_bytes(_header(image) + rgbe.tobytes())
+    (tmp_path / "runs.hdr").write_bytes(_header(image) + b"".join(_run_length_row(row) for row in rgbe))
+    flat, runs = (read_environment(tmp_path / name).image for name in ("flat.hdr", "runs.hdr"))
+    assert torch.equal(flat, runs)
+    brightest = torch.from_numpy(image).max(dim=-1, keepdim=True).values
+    assert bool(((flat - torch.from_numpy(image)).abs() <= brightest / 128).all())
+
+
+def test_hdr_repeats_pixels_in_the_old_code(tmp_path):
+    image = np.full((2, 4, 3), 2.0, np.float32)
+    pixel = _rgbe(image)[0, 0].tobytes()
+    (tmp_path / "old.hdr").write_bytes(_header(image) + 2 * (pixel + bytes([1, 1, 1, 3])))
+    assert_close(read_environment(tmp_path / "old.hdr").image, torch.full((2, 4, 3), 2.0))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda image: image.__setitem__((1, 2, 0), np.nan),
+            "not finite in 1 pixel, first in row 1, column 2",
+        ),
+        (lambda image: image.__setitem__((0, 3, 1), -0.5), "negative value in 1 pixel,"),
+        (lambda image: image.fill(0.0), "black everywhere"),
+    ],
+)
+def test_impossible_values_are_refused(tmp_path, change, message):
+    image = _picture()
+    change(image)
+    with pytest.raises(SceneError, match=message):
+        read_environment(_exr(tmp_path / "light.exr", image))
+
+
+def test_wrong_aspect_channels_and_files_are_refused(tmp_path):
+    with pytest.raises(SceneError, match="is 6 x 4 pixels"):
+        read_environment(_exr(tmp_path / "square.exr", _picture(4, 6)))
+    with pytest.raises(SceneError, match="needs R, G and B"):
+        read_environment(write_exr(tmp_path / "depth.exr", {"Z": _picture()[..., 0]}, {}))
+    with pytest.raises(SceneError, match="no such environment map"):
+        read_environment(tmp_path / "missing.exr")
+    (tmp_path / "light.png").write_bytes(b"")
+    with pytest.raises(SceneError, match="convert it to one of"):
+        read_environment(tmp_path / "light.png")
+    for name in ("text.exr", "text.hdr"):
+        (tmp_path / name).write_text("no picture")
+        with pytest.raises(SceneError, match=r"OpenEXR|Radiance"):
+            read_environment(tmp_path / name)
+
+
+def test_cut_and_turned_hdr_is_refused(tmp_path):
+    image = _picture(8, 16)
+    (tmp_path / "cut.hdr").write_bytes(_header(image) + _rgbe(image).tobytes()[:-9])
+    with pytest.raises(SceneError, match="breaks in row 7 of 8"):
+        read_environment(tmp_path / "cut.hdr")
+    (tmp_path / "up.hdr").write_bytes(_header(image, order=b"+Y %d +X %d\n") + _rgbe(image).tobytes())
+    with pytest.raises(SceneError, match="in the order"):
+        read_environment(tmp_path / "up.hdr")
+
+
+BANDS = Bands.of([450, 550, 650, 750])
+
+
+def _csv(path, text):
+    path.write_text(text)
+    return str(path)
+
+
+def test_a_lamp_is_a_table_or_a_name_with_its_greatest_band_1(tmp_path):
+    lamp = _csv(tmp_path / "lamp.csv", "wavelength,power\n400,0\n500,2\n700,6\n800,6\n")
+    np.testing.assert_allclose(read_lamp(lamp, BANDS), np.array([1, 3, 5, 6]) / 6)
+    assert read_lamp("d65", BANDS).max() == 1
+    envi = tmp_path / "lamp.hdr"
+    envi.write_text(
+        "ENVI\nsamples = 4\nlines = 1\nbands = 1\nheader offset = 0\nfile type = ENVI Spectral Library\n"
+        "data type = 4\ninterleave = bsq\nbyte order = 0\nwavelength units = Nanometers\n"
+        "spectra names = {lamp}\nwavelength = {450, 550, 650, 750}\n"
+    )
+    np.array([1, 2, 4, 3], dtype="<f4").tofile(tmp_path / "lamp.sli")
+    np.testing.assert_allclose(read_lamp(str(envi), BANDS), [0.25, 0.5, 1, 0.75])
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("wavelength,power\n500,1\n800,1\n", "do not reach"),
+        ("wavelength,a,b\n400,1,1\n800,1,1\n", "one spectrum; found 2"),
+        ("wavelength,power\n400,0\n460,0\n800,1\n", "no power at 450 nm"),
+    ],
+)
+def test_lamps_that_tell_nothing_of_some_band_are_refused(tmp_path, text, expected):
+    with pytest.raises(SpectrumError, match=expected):
+        read_lamp(_csv(tmp_path / "lamp.csv", text), BANDS)
+
+
+def test_colours_of_an_environment_get_the_lamps_spectrum_by_their_luminance():
+    lamp = torch.tensor([0.1, 0.5, 1.0, 0.2])
+    image = torch.rand(4, 8, 3, generator=torch.Generator().manual_seed(0))
+    light = of_lamp(Environment(image, 30.0, 1.0), lamp)
+    luminance = 0.2126 * image[..., 0] + 0.7152 * image[..., 1] + 0.0722 * image[..., 2]
+    assert_close(light.image, luminance[..., None] * lamp)
+    assert (light.rotation_deg, light.exposure_stops) == (30.0, 1.0)
+    assert_close(mean_spectrum(light), lamp)
+
+
+def test_a_spectral_environment_is_brought_to_the_bands(tmp_path):
+    source = Bands.of([400, 600, 800])
+    image = np.ones((4, 8, 1), np.float32) * np.array([1, 2, 6], np.float32)
+    path = write_spectral_exr(tmp_path / "light.exr", image, source, None)
+    light = read_environment_of_bands(path, BANDS, None, 10.0)
+    assert_close(light.image[0, 0], torch.tensor([1.25, 1.75, 3.0, 5.0]))
+    assert light.rotation_deg == 10.0
+
+
+def test_environments_whose_light_is_not_known_in_every_band_are_refused(tmp_path):
+    grey = np.ones((4, 8), np.float32)
+    colours = write_exr(tmp_path / "rgb.exr", dict.fromkeys("RGB", grey), {})
+    with pytest.raises(SceneError, match=r"light's spectrum is not known; give the lamp's"):
+        read_environment_of_bands(colours, BANDS, None)
+    short = write_spectral_exr(
+        tmp_path / "short.exr", np.ones((4, 8, 2), np.float32), Bands.of([500, 700]), None
+    )
+    with pytest.raises(SceneError, match=r"do not match: .* 50 nm below and 50 nm above"):
+        read_environment_of_bands(short, BANDS, None)
+    nameless = write_exr(tmp_path / "two.exr", dict.fromkeys("PQ", grey), {})
+    with pytest.raises(SceneError, match="needs R, G and B"):
+        read_environment_of_bands(nameless, BANDS, np.ones(4))

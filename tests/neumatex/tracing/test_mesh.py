@@ -1,0 +1,183 @@
+"""Meshes from files: what is kept, turned, noted and refused.
+
+Rays against meshes: kernels beside the brute-force twin, and points that rays can start from.
+"""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from torch.testing import assert_close
+
+from unmix_plugin.errors import SceneError
+from unmix_plugin.neumatex.tracing import mesh as reading
+from unmix_plugin.neumatex.tracing.mesh import mesh_of, read_mesh
+from unmix_plugin.neumatex.tracing.rays import RayMesh, closest_twin
+
+
+@pytest.mark.parametrize("suffix", ["glb", "obj", "ply"])
+def test_formats_agree(tmp_path, suffix):
+    torus = trimesh.creation.torus(1.0, 0.3, major_sections=12, minor_sections=8)
+    path = tmp_path / f"mesh.{suffix}"
+    torus.export(path)
+    notes = []
+    mesh = read_mesh(path, notes)
+    assert notes == []
+    corners = torch.as_tensor(np.array(torus.triangles), dtype=torch.float32)
+    assert_close(mesh.corners(), corners, atol=1e-6, rtol=0)
+
+
+def test_scene_graph_is_applied_and_parts_are_joined(tmp_path):
+    scene = trimesh.Scene()
+    box = trimesh.creation.box()
+    scene.add_geometry(box, transform=trimesh.transformations.translation_matrix((3, 0, 0)))
+    scene.add_geometry(box, transform=trimesh.transformations.scale_matrix(2.0))
+    scene.export(tmp_path / "mesh.glb")
+    mesh = read_mesh(tmp_path / "mesh.glb")
+    assert len(mesh.faces) == 24
+    assert_close(mesh.vertices.max(dim=0).values, torch.tensor([3.5, 1.0, 1.0]))
+    assert_close(mesh.vertices.min(dim=0).values, torch.tensor([-1.0, -1.0, -1.0]))
+
+
+def test_normals_of_the_file_are_kept(tmp_path):
+    sphere = trimesh.creation.icosphere(subdivisions=1)
+    tilted = np.add(sphere.vertices, (0.3, 0, 0))
+    normals = tilted / np.linalg.norm(tilted, axis=1, keepdims=True)
+    trimesh.Trimesh(sphere.vertices, sphere.faces, vertex_normals=normals, process=False).export(
+        tmp_path / "m.glb", include_normals=True
+    )
+    mesh = read_mesh(tmp_path / "m.glb")
+    assert_close(mesh.normals, torch.tensor(normals, dtype=torch.float32), atol=1e-5, rtol=0)
+
+
+def test_inward_triangles_are_turned_and_said(tmp_path):
+    sphere = trimesh.creation.icosphere(subdivisions=2)
+    sphere.invert()
+    sphere.export(tmp_path / "mesh.ply", vertex_normal=False)
+    notes = []
+    mesh = read_mesh(tmp_path / "mesh.ply", notes)
+    assert len(notes) == 1
+    assert "turned outwards" in notes[0]
+    assert_close(mesh.normals, mesh.vertices, atol=0.05, rtol=0)
+    a, b, c = mesh.corners().unbind(1)
+    assert bool(((torch.linalg.cross(b - a, c - a) * a).sum(-1) > 0).all())
+
+
+def test_an_open_mesh_is_noted(tmp_path):
+    box = trimesh.creation.box()
+    trimesh.Trimesh(box.vertices, box.faces[1:]).export(tmp_path / "mesh.ply")
+    notes = []
+    read_mesh(tmp_path / "mesh.ply", notes)
+    assert len(notes) == 1
+    assert "open" in notes[0]
+
+
+def _ply(path, vertices, faces):
+    trimesh.Trimesh(vertices, faces, process=False).export(path)
+    return path
+
+
+def test_bad_meshes_are_refused(tmp_path, monkeypatch):
+    line = [[0, 0, 0], [1, 1, 1], [2, 2, 2]]
+    with pytest.raises(SceneError, match="none of its 1 triangles has an area"):
+        read_mesh(_ply(tmp_path / "line.ply", line, [[0, 1, 2]]))
+    with pytest.raises(SceneError, match="position of vertex 1 is not finite"):
+        read_mesh(_ply(tmp_path / "nan.ply", [[0, 0, 0], [np.nan, 0, 0], [0, 1, 0]], [[0, 1, 2]]))
+    (tmp_path / "text.ply").write_text("no mesh")
+    with pytest.raises(SceneError, match=r"can't be read as a mesh|no triangles"):
+        read_mesh(tmp_path / "text.ply")
+    with pytest.raises(SceneError, match="there is no such mesh file"):
+        read_mesh(tmp_path / "missing.glb")
+    (tmp_path / "mesh.stl").write_text("solid")
+    with pytest.raises(SceneError, match="convert it to one of"):
+        read_mesh(tmp_path / "mesh.stl")
+    trimesh.PointCloud(np.eye(3)).export(tmp_path / "points.ply")
+    with pytest.raises(SceneError, match="no triangles"):
+        read_mesh(tmp_path / "points.ply")
+    monkeypatch.setattr(reading, "MAX_TRIANGLES", 11)
+    trimesh.creation.box().export(tmp_path / "box.ply")
+    with pytest.raises(SceneError, match="has 12 triangles, at most 11"):
+        read_mesh(tmp_path / "box.ply")
+
+
+def test_model_space_is_centred_with_half_edge_one():
+    vertices = torch.tensor([[1.0, 2, 3], [5, 2, 3], [1, 4, 3], [1, 2, 4]])
+    mesh = mesh_of(vertices, torch.tensor([[0, 1, 2], [0, 1, 3]]))
+    moved = mesh.transformed(*mesh.to_model_space())
+    assert_close(moved.vertices.min(dim=0).values, torch.tensor([-1.0, -0.5, -0.25]))
+    assert_close(moved.vertices.max(dim=0).values, torch.tensor([1.0, 0.5, 0.25]))
+
+
+DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+
+
+def _torus():
+    torus = trimesh.creation.torus(0.7, 0.3, major_sections=24, minor_sections=12)
+    return mesh_of(torch.tensor(torus.vertices), torch.tensor(torus.faces))
+
+
+def _sphere(subdivisions=3):
+    sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
+    return mesh_of(torch.tensor(sphere.vertices), torch.tensor(sphere.faces))
+
+
+def _rays(count, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    origins = 1.5 * torch.randn(count, 3, generator=g)
+    return origins, _unit(torch.randn(count, 3, generator=g) - origins)
+
+
+def _unit(vectors):
+    return torch.nn.functional.normalize(vectors, dim=-1)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("count", [0, 1, 2000])
+def test_closest_hits_are_those_of_the_twin(device, count):
+    mesh, (origins, directions) = _torus(), _rays(count)
+    expected = closest_twin(mesh, origins, directions)
+    hits = RayMesh(mesh, device).closest(origins.to(device), directions.to(device))
+    assert torch.equal(hits.found.cpu(), expected.found)
+    assert torch.equal(hits.triangles.cpu(), expected.triangles)
+    assert_close(hits.distances.cpu(), expected.distances, atol=2e-6, rtol=1e-6)
+    assert_close(hits.barycentric.cpu(), expected.barycentric, atol=2e-5, rtol=0)
+    assert count < 2000 or 0.2 < hits.found.float().mean() < 0.8
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_ray_is_blocked_where_it_has_a_hit(device):
+    rays, (origins, directions) = RayMesh(_torus(), device), _rays(2000, seed=1)
+    origins, directions = origins.to(device), directions.to(device)
+    assert torch.equal(rays.blocked(origins, directions), rays.closest(origins, directions).found)
+
+
+def test_points_lie_on_the_surface_and_face_the_viewer():
+    mesh, rays = _sphere(), None
+    rays = RayMesh(mesh)
+    origins, directions = _rays(500, seed=2)
+    hits = rays.closest(origins, directions)
+    origins, directions = origins[hits.found], directions[hits.found]
+    hits = rays.closest(origins, directions)
+    points = rays.points(hits, directions)
+    assert_close(points.positions, origins + hits.distances[:, None] * directions, atol=2e-5, rtol=0)
+    assert bool(((points.normals * directions).sum(-1) < 0).all())
+    assert bool(((points.geometric_normals * directions).sum(-1) <= 0).all())
+    outside = origins.norm(dim=-1) > 1
+    assert_close(points.normals[outside], _unit(points.positions[outside]), atol=0.05, rtol=0)
+    inside = origins.norm(dim=-1) < 0.9
+    assert bool(inside.any())
+    assert_close(points.normals[inside], -_unit(points.positions[inside]), atol=0.02, rtol=0)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
+def test_rays_leave_a_convex_surface_without_meeting_it(scale):
+    mesh = _sphere().transformed(scale, torch.zeros(3))
+    rays, (origins, directions) = RayMesh(mesh), _rays(4000, seed=3)
+    origins = scale * 2 * _unit(origins)
+    hits = rays.closest(origins, directions)
+    origins, directions = origins[hits.found], directions[hits.found]
+    points = rays.points(rays.closest(origins, directions), directions)
+    # Nearly along the surface, where rounding would hurt first.
+    tangent = _unit(torch.linalg.cross(points.geometric_normals, directions))
+    assert not bool(rays.blocked(points.positions, _unit(tangent + 0.01 * points.geometric_normals)).any())
+    assert bool(rays.blocked(points.positions, -points.geometric_normals).all())

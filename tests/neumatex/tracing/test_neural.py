@@ -1,0 +1,139 @@
+"""The decoder stands for layered materials it has not seen, keeps light, and is trained the same way twice.
+
+The shipped weights are those of their record, frozen and small; other files are refused with a reason.
+"""
+
+import hashlib
+import json
+import math
+from pathlib import Path
+
+import pytest
+import safetensors.torch
+import torch
+from torch.testing import assert_close
+
+from tests.neumatex.surfaces import eye_directions, numbers
+from tools.train_decoder import DecoderTraining, draw_materials, response_error, train
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.neumatex.tracing.families import LayeredFamily
+from unmix_plugin.neumatex.tracing.neural import (
+    SHIPPED,
+    Decoder,
+    Encoder,
+    NeuralFamily,
+    read_weights,
+    write_weights,
+)
+
+FAMILY = NeuralFamily()
+
+
+def test_encoded_materials_look_like_the_layered_ones():
+    generator = torch.Generator().manual_seed(77)
+    layered = draw_materials(2000, generator)
+    neural = FAMILY.from_layered(layered)
+    truth, found = LayeredFamily().stack(layered), FAMILY.stack(neural)
+    error = response_error(truth, found, layered[:, :3].T, 16, generator)
+    assert -10 * math.log10(float(error.mean())) > 36
+    assert -10 * float(torch.log10(error).mean()) > 39
+
+
+def test_encoding_keeps_base_colours_and_gives_latents_in_range():
+    layered = draw_materials(200, torch.Generator().manual_seed(78))
+    neural = FAMILY.from_layered(layered)
+    assert torch.equal(neural[:, :3], layered[:, :3])
+    assert neural.min() >= 0
+    assert neural.max() <= 1
+
+
+def test_decoded_parameters_reflect_and_are_drawn_alike():
+    rows, wi, wo = numbers(200, 9), eye_directions(200, seed=5), eye_directions(200, seed=6)
+    uniforms = torch.rand(200, 3, generator=torch.Generator().manual_seed(7))
+    decoded, family = FAMILY.decoded(rows), FAMILY.decoded_family
+    assert_close(family.evaluate(decoded, wi, wo), FAMILY.evaluate(rows, wi, wo))
+    assert_close(family.density(decoded, wi, wo), FAMILY.density(rows, wi, wo))
+    assert_close(family.sample(decoded, wo, uniforms), FAMILY.sample(rows, wo, uniforms))
+    assert torch.equal(family.base_colour(decoded), FAMILY.base_colour(rows))
+
+
+def test_latents_of_any_value_never_brighten_a_white_furnace():
+    uniforms = torch.quasirandom.SobolEngine(3, scramble=True, seed=0).draw(1 << 14)
+    white = numbers(40, 9)
+    white[:, :3] = 1.0
+    for row, wo in zip(white, eye_directions(40), strict=True):
+        rows, eyes = row.expand(len(uniforms), -1), wo.expand(len(uniforms), 3)
+        wi = FAMILY.sample(rows, eyes, uniforms)
+        weights = wi[:, 2].clamp_min(0) / FAMILY.density(rows, wi, eyes)
+        assert float((FAMILY.evaluate(rows, wi, eyes) * weights[:, None]).mean(0).max()) < 1.005
+
+
+def test_the_specular_part_does_not_know_the_base_colour():
+    rows = numbers(100, 9)
+    black, white = rows.clone(), rows.clone()
+    black[:, :3], white[:, :3] = 0.0, 1.0
+    wi, wo = eye_directions(100, seed=3), eye_directions(100, seed=4)
+    passed, specular = FAMILY.stack(rows).reflectance(wi.T, wo.T)
+    assert_close(FAMILY.evaluate(black, wi, wo), specular.T)
+    assert_close(
+        FAMILY.evaluate(white, wi, wo) - specular.T,
+        (passed / math.pi)[:, None].expand(-1, 3),
+        rtol=1e-3,
+        atol=1e-4,
+    )
+
+
+def test_training_is_the_same_twice():
+    settings = DecoderTraining(steps=10, materials=32, lights=2, seed=3)
+    runs = []
+    for _ in range(2):
+        figures: list[float] = []
+        decoder, _ = train(settings, lambda _, psnr, figures=figures: figures.append(psnr))
+        runs.append((figures, decoder.last.weight.tolist()))
+    assert runs[0] == runs[1]
+
+
+def test_training_gets_better():
+    figures: list[float] = []
+    train(DecoderTraining(steps=300, materials=32, lights=2), lambda _, psnr: figures.append(psnr))
+    assert figures[1] > figures[0] + 0.4
+
+
+def test_the_record_belongs_to_the_shipped_file():
+    record, data = json.loads(SHIPPED.with_suffix(".json").read_text()), SHIPPED.read_bytes()
+    assert record["sha256"] == hashlib.sha256(data).hexdigest()
+    assert record["bytes"] == len(data) < 1_000_000
+    DecoderTraining(**record["training"])  # every setting is still one
+
+
+def test_shipped_weights_are_frozen():
+    decoder, encoder = read_weights()
+    assert not any(parameter.requires_grad for parameter in [*decoder.parameters(), *encoder.parameters()])
+
+
+def test_what_is_written_is_read_back(tmp_path: Path):
+    decoder, encoder = Decoder(), Encoder()
+    write_weights(tmp_path / "w.safetensors", decoder, encoder, {})
+    found, _ = read_weights(tmp_path / "w.safetensors")
+    latents = torch.rand(5, 6)
+    assert_close(found(latents).metal_colour, decoder(latents).metal_colour)
+
+
+def test_weights_of_another_shape_are_refused(tmp_path: Path):
+    write_weights(tmp_path / "w.safetensors", Decoder(width=7), Encoder(), {})
+    with pytest.raises(
+        ConfigError, match=r"weights of another shape .*decoder\.hidden\.0\.bias is \(7,\), expected"
+    ):
+        read_weights(tmp_path / "w.safetensors")
+
+
+def test_missing_tensors_are_named(tmp_path: Path):
+    (tmp_path / "w.safetensors").write_bytes(safetensors.torch.save({"other": torch.zeros(2)}))
+    with pytest.raises(ConfigError, match=r"decoder\.hidden\.0\.bias is missing"):
+        read_weights(tmp_path / "w.safetensors")
+
+
+def test_a_file_of_another_kind_is_refused(tmp_path: Path):
+    (tmp_path / "w.safetensors").write_text("no weights")
+    with pytest.raises(ConfigError, match="can't read the material decoder's weights"):
+        read_weights(tmp_path / "w.safetensors")

@@ -1,0 +1,86 @@
+"""Planes and networks on a surface: laws of look-ups, shapes, and what an optimiser may move."""
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from unmix_plugin.neumatex.tracing.surface import (
+    LOG_VARIANCE_RANGE,
+    PLANE_AXES,
+    Triplane,
+    encode,
+    look_up,
+    look_up_twin,
+)
+
+
+def points(count: int, seed: int = 0, reach: float = 1.0) -> torch.Tensor:
+    g = torch.Generator().manual_seed(seed)
+    return (2 * torch.rand(count, 3, generator=g, dtype=torch.float64) - 1) * reach
+
+
+@pytest.mark.parametrize("reach", [1.0, 1.3])
+def test_look_ups_and_their_gradients_agree_with_the_twin(reach):
+    planes = torch.randn(3, 5, 9, 9, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    planes.requires_grad_()
+    positions = points(200, reach=reach)
+    actual, expected = look_up(planes, positions), look_up_twin(planes, positions)
+    assert_close(actual, expected)
+    cotangent = torch.randn(expected.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    found, wanted = (torch.autograd.grad(value, planes, cotangent)[0] for value in (actual, expected))
+    assert_close(found, wanted)
+
+
+def test_a_plane_that_is_linear_in_its_axes_is_read_back_exactly():
+    grid = torch.linspace(-1, 1, 17, dtype=torch.float64)
+    column, row = grid.expand(17, 17), grid[:, None].expand(17, 17)
+    planes = torch.stack([column, row]).expand(3, 2, 17, 17)
+    positions = points(100)
+    assert_close(look_up(planes, positions), torch.cat([positions[:, list(axes)] for axes in PLANE_AXES], 1))
+
+
+def test_a_point_moves_only_the_four_texels_around_it_in_each_plane():
+    triplane = Triplane(9, resolution=8, generator=torch.Generator().manual_seed(0))
+    triplane.parameters_at(torch.tensor([[0.1, -0.3, 0.62]])).sum().backward()
+    assert triplane.planes.grad is not None
+    touched = triplane.planes.grad.abs().sum(dim=1) > 0
+    assert touched.flatten(1).sum(dim=1).tolist() == [4, 4, 4]
+    # x = 0.1 lies between columns 3 and 4 of plane XY, y = -0.3 between its rows 2 and 3.
+    assert touched[0, 2:4, 3:5].all()
+
+
+def test_parameters_are_in_the_unit_interval_and_log_variances_in_theirs():
+    triplane = Triplane(5, resolution=4, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        triplane.planes.mul_(1e3)
+    positions = points(300).float()
+    parameters, log_variance = triplane.parameters_at(positions), triplane.log_variance(positions)
+    assert parameters.shape == log_variance.shape == (300, 5)
+    assert triplane.num_parameters == 5
+    assert 0 <= parameters.min() < 0.1
+    assert 0.9 < parameters.max() <= 1
+    assert LOG_VARIANCE_RANGE[0] <= log_variance.min()
+    assert log_variance.max() <= LOG_VARIANCE_RANGE[1]
+
+
+def test_the_encoding_has_its_three_periods():
+    position = torch.tensor([[0.25, 0.0, -0.5]], dtype=torch.float64)
+    half_turn = torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)
+    here, there = encode(position).reshape(6, 3), encode(position + half_turn).reshape(6, 3)
+    assert_close(there[0, 0], -here[0, 0])  # sin of pi x
+    assert_close(there[1:3], here[1:3])  # 2 pi x and 4 pi x have come round
+    assert encode(position).shape == (1, 18)
+
+
+def test_the_two_groups_hold_every_parameter_once():
+    triplane = Triplane(9, resolution=4)
+    groups = triplane.parameter_groups()
+    assert [id(p) for p in groups["planes"]] == [id(triplane.planes)]
+    grouped = sorted(id(p) for group in groups.values() for p in group)
+    assert grouped == sorted(id(p) for p in triplane.parameters())
+
+
+def test_one_generator_draws_one_triplane():
+    first, second = (Triplane(9, 8, generator=torch.Generator().manual_seed(3)) for _ in range(2))
+    positions = points(20).float()
+    assert_close(first.parameters_at(positions), second.parameters_at(positions), rtol=0, atol=0)

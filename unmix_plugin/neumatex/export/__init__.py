@@ -1,0 +1,1 @@
+"""Materials for other programs: textures, a textured mesh, the decoder as a shader."""

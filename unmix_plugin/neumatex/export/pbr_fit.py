@@ -1,0 +1,144 @@
+"""The metallic-roughness material that reflects most like another one, for every texel.
+
+A small network from the parameters of a material to the five of glTF is trained on the materials of this surface, by
+comparing reflected light in drawn pairs of directions; applied to all texels it is smooth where the materials are.
+
+Notation: `T` materials, `P` their parameters, `D` pairs of directions for each.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from unmix_plugin.neumatex.tracing.families import MaterialFamily, PbrFamily
+
+_STEPS, _MATERIALS, _DIRECTIONS, _WIDTH = 300, 256, 16, 48
+_CHUNK = 1 << 16
+_JUDGED = 512
+"""Materials whose error is measured."""
+
+
+@dataclass(frozen=True)
+class PbrFit:
+    """Parameters of `PbrFamily`, and how well they stand for what they replace."""
+
+    parameters: Float[Tensor, "T 5"]
+    mean_error: float
+    """Mean absolute difference of reflected light x, cosine included, between all directions, as a part of its mean;
+    light is compressed to x / (1 + x), as by an eye. 0 where nothing was to be fitted."""
+
+
+def fit_pbr(family: MaterialFamily, parameters: Float[Tensor, "T P"], generator: torch.Generator) -> PbrFit:
+    """Base colour, roughness and metallicity of materials; those of `PbrFamily` stay as they are.
+
+    Args:
+        family: Of the materials, in three colours.
+        parameters: [0, 1].
+        generator: For the drawn materials and directions, on the CPU.
+    """
+    if isinstance(family, PbrFamily):
+        return PbrFit(parameters.clone(), 0.0)
+    network = _Regression(family).to(parameters.device)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(int(torch.randint(1 << 31, (1,), generator=generator)))
+        network.reset()
+    with torch.enable_grad():
+        _train(network, family, parameters, generator)
+    with torch.no_grad():
+        fitted = torch.cat([network(part) for part in parameters.split(_CHUNK)])
+        return PbrFit(fitted, _mean_error(family, parameters, fitted, generator))
+
+
+class _Regression(nn.Module):
+    """From parameters of a family to those of `PbrFamily`; begins at the family's own base colour."""
+
+    def __init__(self, family: MaterialFamily) -> None:
+        super().__init__()
+        self._family = family
+        self.layers = nn.Sequential(
+            nn.Linear(family.num_parameters, _WIDTH),
+            nn.ReLU(),
+            nn.Linear(_WIDTH, _WIDTH),
+            nn.ReLU(),
+            nn.Linear(_WIDTH, 5),
+        )
+
+    def reset(self) -> None:
+        """Draw first values; a half rough dielectric of the family's base colour."""
+        for layer in self.layers:
+            if isinstance(layer, nn.Linear):
+                layer.reset_parameters()
+        last = self.layers[-1]
+        assert isinstance(last, nn.Linear)
+        with torch.no_grad():
+            last.weight.mul_(0.1)
+            last.bias.copy_(last.bias.new_tensor([0.0, 0.0, 0.0, 0.0, -2.0]))
+
+    def forward(self, parameters: Float[Tensor, "T P"]) -> Float[Tensor, "T 5"]:
+        base = torch.logit(self._family.base_colour(parameters).detach(), eps=1e-3)
+        shifts = self.layers(2 * parameters - 1)
+        return torch.cat([base + shifts[:, :3], shifts[:, 3:]], dim=1).sigmoid()
+
+
+def _train(
+    network: _Regression,
+    family: MaterialFamily,
+    parameters: Float[Tensor, "T P"],
+    generator: torch.Generator,
+) -> None:
+    optimiser = torch.optim.Adam(network.parameters(), lr=1e-2)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, _STEPS)
+    pbr = PbrFamily()
+    for _ in range(_STEPS):
+        chosen = torch.randint(len(parameters), (_MATERIALS,), generator=generator).to(parameters.device)
+        materials = parameters[chosen]
+        repeated = materials.repeat_interleave(_DIRECTIONS, dim=0)
+        wi, wo = _directions(family, repeated, generator)
+        with torch.no_grad():
+            target = _reflected(family, repeated, wi, wo)
+        found = _reflected(pbr, network(materials).repeat_interleave(_DIRECTIONS, dim=0), wi, wo)
+        # Highlights are thousands of times brighter than the rest; an eye, or a tone curve, compresses them.
+        loss = (found.log1p() - target.log1p()).abs().mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+
+
+def _reflected(family: MaterialFamily, parameters: Tensor, wi: Tensor, wo: Tensor) -> Tensor:
+    """Light that goes to the eye from a direction whose radiance would make a white diffuse surface shine with 1."""
+    return torch.pi * family.evaluate(parameters, wi, wo).clamp(min=0) * wi[:, 2:].clamp(min=0)
+
+
+def _directions(
+    family: MaterialFamily, parameters: Float[Tensor, "N P"], generator: torch.Generator
+) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]]:
+    """To the light and to the eye: the eye anywhere, every other light where the material reflects much."""
+    uniforms = torch.rand(len(parameters), 7, generator=generator).to(parameters)
+    wo = _cosine_lobe(uniforms[:, :2])
+    spread, towards_lobe = _cosine_lobe(uniforms[:, 2:4]), family.sample(parameters, wo, uniforms[:, 4:])
+    is_lobe = (torch.arange(len(parameters), device=parameters.device) % 2 == 0)[:, None]
+    return torch.where(is_lobe, towards_lobe, spread), wo
+
+
+def _cosine_lobe(uniforms: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
+    """Directions of the upper hemisphere, drawn as the cosine to its axis is distributed."""
+    radius, angle = uniforms[:, 0].sqrt(), 2 * torch.pi * uniforms[:, 1]
+    height = (1 - uniforms[:, 0]).sqrt()
+    return torch.stack([radius * angle.cos(), radius * angle.sin(), height], dim=-1)
+
+
+def _mean_error(
+    family: MaterialFamily, parameters: Tensor, fitted: Tensor, generator: torch.Generator
+) -> float:
+    chosen = torch.randint(len(parameters), (_JUDGED,), generator=generator).to(parameters.device)
+    repeated, pbr = (values[chosen].repeat_interleave(_DIRECTIONS, dim=0) for values in (parameters, fitted))
+    uniforms = torch.rand(len(repeated), 4, generator=generator).to(repeated)
+    wi, wo = _cosine_lobe(uniforms[:, :2]), _cosine_lobe(uniforms[:, 2:])
+    light = _reflected(family, repeated, wi, wo), _reflected(PbrFamily(), pbr, wi, wo)
+    target, found = (one / (1 + one) for one in light)
+    return float((found - target).abs().mean() / target.mean().clamp(min=1e-9))

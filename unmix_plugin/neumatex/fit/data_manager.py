@@ -1,0 +1,367 @@
+"""Pixels of training views that show the mesh and nothing else, to be drawn evenly.
+
+Notation: `M` pixels, `R` of them drawn, `C` colours or bands.
+
+Training batches of an object's pixels, and its evaluation images under its own light and others.
+
+Notation: `R` pixels of a batch, `C` colours or bands, `H x W` pixels of a view.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from unmix_plugin.engine import (
+    Cameras,
+    DataManager,
+    DataManagerConfig,
+    RayBundle,
+    SceneBox,
+    Target,
+    TrainingCallback,
+    step_generator,
+)
+from unmix_plugin.engine.configs import Common
+from unmix_plugin.errors import SceneError, require
+from unmix_plugin.neumatex.fit.object_scene import ObjectScene, load_object
+from unmix_plugin.neumatex.fit.pictures import PosedPictures, opacity
+from unmix_plugin.neumatex.fit.settings import ObjectRecord
+from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS
+from unmix_plugin.neumatex.prior.observations import well_spread
+from unmix_plugin.neumatex.tracing.environment import Environment
+from unmix_plugin.neumatex.tracing.rays import RayMesh
+from unmix_plugin.scenes.scene import Normalisation
+from unmix_plugin.spectral.colour.conversion import srgb_to_linear
+
+OPAQUE = 0.99
+"""Alpha from which a pixel shows the object alone."""
+_CORNERS = ((0.02, 0.02), (0.98, 0.02), (0.02, 0.98), (0.98, 0.98), (0.5, 0.5))
+"""Where in a pixel the mesh has to be seen, so that every place in it sees it."""
+
+
+@dataclass(frozen=True)
+class DrawnPixels:
+    """Pixels of a batch."""
+
+    views: Int[Tensor, " R"]
+    """Which training view."""
+    places: Float[Tensor, "R 2"]
+    """A random place in each pixel, x and y in pixels of the view."""
+    numbers: Float[Tensor, "R C"]
+    """As the picture holds them."""
+
+
+@dataclass(frozen=True)
+class PixelList:
+    """Pixels by view and place."""
+
+    views: Int[Tensor, " M"]
+    corners: Int[Tensor, "M 2"]
+    """Column and row."""
+    numbers: Float[Tensor, "M C"]
+
+    @staticmethod
+    def of(scene: ObjectScene, most: int, seed: int) -> PixelList:
+        """Read the training views; of more pixels than `most`, so many are drawn.
+
+        Raises:
+            SceneError: no view shows the mesh.
+        """
+        ray_mesh, parts = RayMesh(scene.mesh), []
+        generator = torch.Generator().manual_seed(seed)
+        share = most // len(scene.split.train) + 1
+        for row, view in enumerate(scene.split.train):
+            picture = scene.pictures.read(view)
+            shown = torch.from_numpy(opacity(picture) >= OPAQUE) & sees_mesh(ray_mesh, scene, view)
+            rows, columns = shown.nonzero(as_tuple=True)
+            if len(rows) > share:
+                kept = torch.randperm(len(rows), generator=generator)[:share]
+                rows, columns = rows[kept], columns[kept]
+            numbers = torch.from_numpy(picture.numbers)[rows, columns]
+            parts.append((torch.full_like(rows, row), torch.stack([columns, rows], dim=-1), numbers))
+        found = PixelList(*(torch.cat(values) for values in zip(*parts, strict=True)))
+        if not len(found.views):
+            raise SceneError(f"{scene.root}: no training view shows the mesh and opaque alpha in one pixel")
+        return found
+
+    def draw(self, count: int, generator: torch.Generator) -> DrawnPixels:
+        """Random pixels, each as likely as any other."""
+        chosen = torch.randint(len(self.views), (count,), generator=generator)
+        places = self.corners[chosen] + torch.rand(count, 2, generator=generator)
+        return DrawnPixels(self.views[chosen], places, self.numbers[chosen])
+
+
+def sees_mesh(ray_mesh: RayMesh, scene: ObjectScene, view: int) -> Bool[Tensor, "H W"]:
+    """Pixels of a view that the mesh covers."""
+    camera = scene.pictures.cameras[view].to(ray_mesh.device)
+    seen = torch.ones(camera.height * camera.width, dtype=torch.bool)
+    for place in _CORNERS:
+        rays = camera.image_rays(0, place)
+        seen &= ray_mesh.closest(rays.origins, rays.directions).found.cpu()
+    return seen.reshape(camera.height, camera.width)
+
+
+DEMO_OBJECT = Path("demo-object")
+"""`--data demo-object` stands for the built-in object."""
+DEMO_SPECTRAL_OBJECT = Path("demo-spectral-object")
+"""And this for the one with spectral pictures."""
+_THINNEST = 1e-3
+"""Least half edge of the scene box: a mesh may be flat."""
+
+
+@dataclass(frozen=True)
+class ObjectDataManagerConfig(DataManagerConfig):
+    """How an object's pictures are sampled."""
+
+    _target: Target = field(default_factory=lambda: ObjectDataManager)
+    train_num_rays_per_batch: int = 4096
+    """Pixels of a training step, drawn from all training views where they show the mesh."""
+    max_pixels: int = 8_000_000
+    """Training pixels kept in memory; of more, these are drawn evenly."""
+    lamp: Annotated[str | None, Common] = None
+    """For pictures of many bands: spectrum of the light, a .csv (wavelength,power), an ENVI spectral library or a name
+    (D65, A, ...); None takes 'illuminant_path' of transforms.json."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible settings.
+
+        Raises:
+            ConfigError: a number out of its range.
+        """
+        super().__post_init__()
+        require("the data manager", self, {"max-pixels of at least 1": self.max_pixels >= 1})
+
+
+class ObjectDataManager(DataManager):
+    """Serves pixels that show the object and nothing else.
+
+    A training batch has `numbers` (R, C) as pictures hold them; rays pass through random places of their pixels. An
+    image batch has `numbers` (H, W, C), `alpha` (H, W), `tone` (which of `TONE_MAPPINGS`), `lights` (how many are
+    held out) and, where it is known, `base_colour` (H, W, 3), or of spectral pictures `true_abundances` (H, W, M) and
+    `true_endmembers` (M, B). Images under a held-out light follow the evaluation
+    views and have `environment` (h, w, C) and `environment_placement` (degrees, stops) too.
+    """
+
+    def __init__(
+        self, config: ObjectDataManagerConfig, *, data: Path, device: torch.device, seed: int = 0
+    ) -> None:
+        """
+        Raises:
+            SceneError: the object is missing or malformed.
+        """
+        super().__init__(config, data=data, device=device, seed=seed)
+        self.options = config
+        self.object = load_object(_object_folder(data), config.lamp)
+        pictures, split = self.object.pictures, self.object.split
+        self.train_cameras = pictures.cameras[list(split.train)]
+        self.eval_cameras = pictures.cameras[list(split.evaluation)]
+        reach = self.object.mesh.vertices.abs().amax(dim=0).clamp(min=_THINNEST)
+        self.scene_box = SceneBox(torch.stack([-reach, reach]))
+        self._num_rays = config.train_num_rays_per_batch
+
+    def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
+        """Random object pixels of the training views; the draw depends on (seed, step) only."""
+        drawn = self._pixels.draw(self._num_rays, step_generator(self.seed, step))
+        rays = self.train_cameras.generate_rays(drawn.views, drawn.places)
+        return rays.to(self.device), {"numbers": drawn.numbers.to(self.device)}
+
+    @property
+    def num_eval_images(self) -> int:
+        """Evaluation views, and every picture under a held-out light."""
+        return len(self.eval_cameras) + sum(len(light.pictures) for light in self.object.lights)
+
+    def eval_image(self, index: int) -> tuple[Cameras, dict[str, Tensor]]:
+        """Camera and whole image; those under held-out lights come after the evaluation views."""
+        place = self._find_image(index)
+        if isinstance(place, int):
+            camera, batch = self._image(self.object.pictures, place)
+            return camera, {**batch, **self._truth(place)}
+        light, view = place
+        held_out = self.object.lights[light]
+        camera, batch = self._image(held_out.pictures, view)
+        return camera, {**batch, **_environment_entries(held_out.environment.to(self.device))}
+
+    def eval_name(self, index: int) -> str:
+        """The picture's name, after its light's where that is held out."""
+        place = self._find_image(index)
+        if isinstance(place, int):
+            return self.object.pictures.names[place]
+        held_out = self.object.lights[place[0]]
+        return f"{held_out.name}-{held_out.pictures.names[place[1]]}"
+
+    def get_train_rays_per_batch(self) -> int:
+        """Pixels of the next training batch."""
+        return self._num_rays
+
+    def set_train_rays_per_batch(self, num_rays: int) -> None:
+        """Let the next training batches have `num_rays` pixels."""
+        self._num_rays = num_rays
+
+    def get_training_callbacks(self) -> list[TrainingCallback]:
+        """None; asked for before the training clock starts, hence the place to read the training pixels."""
+        _ = self._pixels
+        return []
+
+    def metadata(self) -> dict[str, Any]:
+        """Shapes of mesh and environment, and what the pictures' numbers are."""
+        return ObjectRecord.of(self.object).to_json()
+
+    def initial_data(self) -> Mapping[str, np.ndarray]:
+        """Mesh and environment, which become buffers of the model, so that a run renders without its data; and some
+        training views for a prior, as `prior_anchor.views_of` puts them together, or of spectral pictures some pixels
+        to start from."""
+        mesh, light = self.object.mesh, self.object.environment
+        arrays = {"vertices": mesh.vertices, "faces": mesh.faces, "normals": mesh.normals, "uv": mesh.uv}
+        arrays["light_map"] = light.image
+        buffers = {name: array.numpy() for name, array in arrays.items() if array is not None}
+        if self.object.bands is not None:
+            return {**buffers, **pixel_arrays(self.object, self.train_cameras, self._pixels, self.seed)}
+        return {**buffers, **view_arrays(self.object)}
+
+    def summary(self) -> dict[str, Any]:
+        """Files, splits, normalisation, hashes."""
+        return self.object.summary()
+
+    @classmethod
+    def check_record(cls, metadata: Mapping[str, Any], summary: Mapping[str, Any]) -> None:
+        """Refuse what no object has."""
+        ObjectRecord.from_json(metadata)
+        Normalisation.from_json(summary["normalisation"])
+
+    def identity(self, summary: Mapping[str, Any]) -> dict[str, Any]:
+        """Views and the content of all files."""
+        return {key: summary.get(key) for key in ("frames", "train_indices", "eval_indices", "input_hashes")}
+
+    def warnings(self) -> list[str]:
+        """What the reader noted of the mesh."""
+        return list(self.object.notes)
+
+    @cached_property
+    def _pixels(self) -> PixelList:
+        """Read when training begins: evaluation needs none of it."""
+        return PixelList.of(self.object, self.options.max_pixels, self.seed)
+
+    def _find_image(self, index: int) -> int | tuple[int, int]:
+        """A view of the object's own pictures, or a light and a view of its pictures."""
+        if index < len(self.eval_cameras):
+            return self.object.split.evaluation[index]
+        index -= len(self.eval_cameras)
+        for light, held_out in enumerate(self.object.lights):
+            if index < len(held_out.pictures):
+                return light, index
+            index -= len(held_out.pictures)
+        raise IndexError(f"{self.num_eval_images} evaluation images; asked for one beyond")
+
+    def _image(self, pictures: PosedPictures, view: int) -> tuple[Cameras, dict[str, Tensor]]:
+        picture = pictures.read(view)
+        return pictures.cameras[view], {
+            "numbers": self._tensor(picture.numbers),
+            "alpha": self._tensor(opacity(picture)),
+            "tone": torch.tensor(TONE_MAPPINGS.index(pictures.tone)),
+            "lights": torch.tensor(len(self.object.lights)),
+        }
+
+    def _truth(self, view: int) -> dict[str, Tensor]:
+        """What is known of a view's materials."""
+        if self.object.bands is None:
+            colours = self.object.base_colour(view)
+            return {} if colours is None else {"base_colour": self._tensor(colours)}
+        materials = self.object.true_materials
+        abundances = None if materials is None else materials.abundances(view)
+        if materials is None or abundances is None:
+            return {}
+        endmembers = self._tensor(materials.endmembers.astype(np.float32))
+        return {"true_abundances": self._tensor(abundances), "true_endmembers": endmembers}
+
+    def _tensor(self, array: np.ndarray) -> Tensor:
+        return torch.from_numpy(array).to(self.device)
+
+
+def _environment_entries(environment: Environment) -> dict[str, Tensor]:
+    placement = torch.tensor([environment.rotation_deg, environment.exposure_stops])
+    return {"environment": environment.image, "environment_placement": placement}
+
+
+def batch_environment(batch: Mapping[str, Tensor]) -> Environment | None:
+    """The held-out light of an image batch; None where it has the object's own."""
+    if "environment" not in batch:
+        return None
+    rotation_deg, exposure_stops = batch["environment_placement"].tolist()
+    return Environment(batch["environment"], rotation_deg, exposure_stops)
+
+
+def _tell(line: str) -> None:
+    """A line about the progress, beside the command's own output."""
+    sys.stderr.write(f"{line}\n")
+
+
+def _object_folder(data: Path) -> Path:
+    if data == DEMO_SPECTRAL_OBJECT:
+        from unmix_plugin.neumatex.demo.objects import demo_spectral_object_path
+
+        return demo_spectral_object_path()
+    if data == DEMO_OBJECT:
+        from unmix_plugin.neumatex.demo.objects import demo_object_path
+
+        return demo_object_path(say=_tell)
+    return data
+
+
+MOST_VIEWS = 12
+
+
+LONGEST_EDGE_PX = 512
+"""Of the views that a prior sees; larger ones are thinned out."""
+
+
+def view_arrays(scene: ObjectScene) -> dict[str, np.ndarray]:
+    """Training views that a prior may look at, as arrays by name; `views_of` puts them together again."""
+    train = list(scene.split.train)
+    cameras = scene.pictures.cameras[train]
+    arrays: dict[str, np.ndarray] = {}
+    chosen = well_spread(cameras.camera_to_world[:, :, 3], MOST_VIEWS)
+    for number, row in enumerate(chosen):
+        picture = scene.pictures.read(train[row])
+        height, width = picture.numbers.shape[:2]
+        step = max(1, -(-max(height, width) // LONGEST_EDGE_PX))
+        # Pixel c of a thinned-out view is pixel c step of the whole one; centres are at + 0.5.
+        lens = torch.cat([cameras.focal_px[row] / step, (cameras.center_px[row] - 0.5) / step + 0.5])
+        light = torch.from_numpy(picture.numbers[::step, ::step].copy())
+        if scene.pictures.tone != "linear":
+            light = srgb_to_linear(light)  # about; an unknown response is only known after the fit
+        arrays[f"view_{number}_light"] = light.numpy()
+        arrays[f"view_{number}_alpha"] = opacity(picture)[::step, ::step].copy()
+        arrays[f"view_{number}_pose"] = cameras.camera_to_world[row].numpy()
+        arrays[f"view_{number}_lens"] = torch.cat([lens, cameras.distortion[row]]).numpy()
+    return arrays
+
+
+NUM_PIXELS = 20_000
+
+
+_STREAM = 7
+
+
+def pixel_arrays(scene: ObjectScene, cameras: Cameras, pixels: PixelList, seed: int) -> dict[str, np.ndarray]:
+    """Rays and spectra of some pixels of the training views, the lamp, and where the world is, as arrays by name."""
+    assert scene.lamp is not None
+    drawn = pixels.draw(NUM_PIXELS, step_generator(seed, 0, stream=_STREAM))
+    rays = cameras.generate_rays(drawn.views, drawn.places)
+    corners = np.concatenate([np.zeros((1, 3)), np.eye(3)])
+    return {
+        "pixels": drawn.numbers.numpy(),
+        "pixel_origins": rays.origins.numpy(),
+        "pixel_directions": rays.directions.numpy(),
+        "lamp": scene.lamp,
+        "world_corners": scene.frame.to_world(corners),
+    }

@@ -1,0 +1,315 @@
+"""Endmembers of a spectral material as they are fitted: their shapes slowly, their brightness fast.
+
+How bright a material is known light tells soon. The shape of a spectrum is less certain: where it may move as fast, it
+drifts towards mixtures. So each endmember has a gain with a rate of its own, which is folded into it after every step.
+
+Notation: `K` endmembers, `B` bands.
+
+The model neumatex: materials on a known mesh under known light, fitted to pictures through a path tracer.
+
+Notation: `R` rays, one a pixel; `N` of them meet the mesh; `C` colours; `P` parameters of a material; `H x W` pixels.
+
+The loss is the squared error of tone-mapped light. Rendered light is a random estimate, whose square would add its
+variance to the error: each of the two factors has an estimate of its own, from independent samples. That is unbiased
+where the tone curve is linear over the spread of the estimates, and nearly so where it bends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from unmix_plugin.engine import Cameras, Model, Output, RayBundle, TrainingCallback, TrainingCallbackLocation
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.neumatex.fit.data_manager import batch_environment
+from unmix_plugin.neumatex.fit.evaluation import (
+    evaluate_object_image,
+    evaluate_spectral_image,
+    evaluation_outputs,
+)
+from unmix_plugin.neumatex.fit.settings import NeumatexModelConfig, ObjectRecord
+from unmix_plugin.neumatex.fit.start import (
+    PriorAnchor,
+    TriplaneSurface,
+    frozen_parts,
+    material_family,
+    start_plain,
+    start_spectral,
+    views_of,
+)
+from unmix_plugin.neumatex.fit.tone import LampRatio, SpectralDisplay, ToneMapping, psnr_db, tone_curve
+from unmix_plugin.neumatex.tracing.environment import Environment
+from unmix_plugin.neumatex.tracing.mesh import Mesh
+from unmix_plugin.neumatex.tracing.path_tracer import SeenPoints, TracedObject, TracedObjectCache
+from unmix_plugin.neumatex.tracing.surface import Triplane
+
+
+def empty_endmembers(config: NeumatexModelConfig, record: ObjectRecord) -> nn.Parameter | None:
+    """Endmembers (K, B) of a spectral material, not yet filled; None for materials in colours.
+
+    Raises:
+        ConfigError: the material does not fit the pictures.
+    """
+    count, bands = config.num_endmembers, record.num_colours
+    if record.is_spectral != (config.material == "spectral"):
+        fitting = "spectral" if record.is_spectral else "neural or pbr"
+        raise ConfigError(
+            f"the material {config.material} does not fit pictures of {bands} "
+            f"{'bands' if record.is_spectral else 'colours'}; choose {fitting}"
+        )
+    if not record.is_spectral:
+        return None
+    if not isinstance(count, int):
+        raise ConfigError("num-endmembers is not settled: call resolve_auto first")
+    if count > bands:
+        raise ConfigError(f"num-endmembers is {count} but the pictures have {bands} bands; choose fewer")
+    return nn.Parameter(torch.zeros(count, bands))
+
+
+@torch.no_grad()
+def settle(endmembers: Float[Tensor, "K B"], gains: Float[Tensor, " K"]) -> None:
+    """Make endmembers as bright as their gains say, as far as reflectances can be, and the gains 1; in place."""
+    bright = endmembers.clamp(0, 1) * gains.clamp(min=0)[:, None]
+    endmembers.copy_(bright / bright.amax(dim=1, keepdim=True).clamp(min=1))
+    gains.fill_(1)
+
+
+_START_SEED = 0
+"""Of networks and planes before training; the run's own seed draws everything else."""
+
+
+class NeumatexModel(Model):
+    """Triplane, family of materials, tone curve; mesh and environment as buffers."""
+
+    config: NeumatexModelConfig
+    outputs = (
+        Output("rgb", "srgb", "colour", "sRGB on black, 0 to 1"),
+        Output("base_colour", "linear", "base colour", "linear, 0 to 1, on black"),
+        Output("accumulation", "map", "opacity", "1 where the mesh is", (0.0, 1.0), "gray"),
+    )
+
+    def populate_modules(self) -> None:
+        """Modules and buffers in the shapes that config and object ask for."""
+        record = ObjectRecord.from_json(self.metadata)
+        self.record = record
+        self.endmembers: nn.Parameter | None = empty_endmembers(self.config, record)
+        self.gains = None if self.endmembers is None else nn.Parameter(torch.ones(len(self.endmembers)))
+        self.family = material_family(self.config.material, self.endmembers, self.gains)
+        # A run keeps the decoder that it was fitted with.
+        self.family_parts = nn.ModuleDict(frozen_parts(self.family))
+        generator = torch.Generator().manual_seed(_START_SEED)
+        parameters, resolution = self.family.num_parameters, self.config.plane_resolution
+        shares = 0 if self.endmembers is None else len(self.endmembers)
+        self.triplane = Triplane(parameters, resolution, generator=generator, num_shares=shares)
+        self.light_curve = self._light_curve()
+        self.anchor = None
+        if self.config.prior != "none" and not record.is_spectral:
+            self.anchor = PriorAnchor(Triplane(parameters, resolution, generator=generator))
+        if not self.config.fit_networks:
+            for network in self.triplane.parameter_groups()["networks"]:
+                network.requires_grad_(False)
+        is_light = record.tone_mapping == "linear"
+        self.curve: nn.Module = self.light_curve if is_light else tone_curve(record.tone_mapping)
+        if record.bands is not None:
+            self.curve = SpectralDisplay(record.bands)
+        for name, buffer in _empty_buffers(record).items():
+            self.register_buffer(name, buffer)
+        self._traced = TracedObjectCache()
+
+    def initialise(self, initial_data: Mapping[str, np.ndarray], generator: torch.Generator) -> None:
+        """Take mesh and environment over, and begin with the prior's material, or a plain one."""
+        for name in _empty_buffers(self.record):
+            self.get_buffer(name).copy_(torch.from_numpy(initial_data[name]))
+        if self.endmembers is not None:
+            start_spectral(self, initial_data, generator)
+        elif self.anchor is None:
+            start_plain(self.triplane, self.family)
+        else:
+            from unmix_plugin.neumatex.prior.small import predict
+
+            assert self.config.material != "spectral"  # which has no prior
+
+            found = predict(
+                views_of(initial_data),
+                self.traced.ray_mesh,
+                self.environment,
+                self.config.material,
+                resolution=self.config.plane_resolution,
+                generator=generator,
+            )
+            self.triplane.load_state_dict(found.state_dict())
+            self.anchor.adopt(found)
+
+    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Planes, networks unless they stay as they are, and the camera's response where there is one."""
+        groups = self.triplane.parameter_groups()
+        if not self.config.fit_networks:
+            groups["networks"] = []
+        spectra = [] if self.endmembers is None else [self.endmembers]
+        gains = [] if self.gains is None else [self.gains]
+        response = list(self.curve.parameters())
+        return {**groups, "response": response, "endmembers": spectra, "gains": gains}
+
+    def get_training_callbacks(self) -> list[TrainingCallback]:
+        """Make the endmembers as bright as their gains say, and keep them what reflectances can be."""
+        if self.endmembers is None:
+            return []
+        return [TrainingCallback(TrainingCallbackLocation.AFTER_TRAIN_ITERATION, self._settle_endmembers)]
+
+    @property
+    def mesh(self) -> Mesh:
+        """In model space."""
+        uv = self.get_buffer("uv") if self.record.has_uv else None
+        return Mesh(self.get_buffer("vertices"), self.get_buffer("faces"), self.get_buffer("normals"), uv)
+
+    @property
+    def environment(self) -> Environment:
+        """The light of the pictures."""
+        record = self.record
+        return Environment(self.get_buffer("light_map"), record.rotation_deg, record.exposure_stops)
+
+    @property
+    def surface(self) -> TriplaneSurface:
+        """The materials as they are now."""
+        return TriplaneSurface(self.family, self.triplane)
+
+    @property
+    def traced(self) -> TracedObject:
+        """Mesh, light and materials, ready for rays."""
+        return self._traced.get(self.mesh, self.environment, self.surface)
+
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
+        """What is seen along the rays; in training two independent estimates of the light, `halves` (2, R, C)."""
+        traced = self.traced
+        seen = traced.seen(ray_bundle.origins, ray_bundle.directions)
+        if self.training:
+            samples = self.config.samples // 2
+            twice = SeenPoints.cat([seen, seen])
+            light = traced.light(twice, samples, self.config.bounces, self._random())
+            halves = torch.stack([seen.scatter(part) for part in light.unflatten(0, (2, -1)).unbind()])
+            return {"halves": halves, "found": seen.found, "positions": seen.points.positions}
+        light = traced.light(seen, self.config.render_samples, self.config.bounces, self._random())
+        base = self.family.base_colour(self.surface.parameters(seen.points.positions))
+        if isinstance(self.curve, SpectralDisplay):
+            base = self.curve.rgb(base)
+        found = seen.found[:, None]
+        return {
+            "rgb": torch.where(found, self.curve(seen.scatter(light)), 0.0),
+            "base_colour": seen.scatter(base),
+            "accumulation": seen.found.float(),
+        }
+
+    def get_loss_dict(
+        self,
+        outputs: dict[str, Tensor],
+        batch: dict[str, Tensor],
+        metrics_dict: dict[str, Tensor] | None = None,
+    ) -> dict[str, Tensor]:
+        """`picture`: the squared error of tone-mapped light, from two independent estimates, of spectral pictures with
+        weights; `prior`: the distance from the prior's material."""
+        residuals = self._residuals(outputs, batch)
+        if isinstance(self.light_curve, LampRatio):
+            residuals = residuals * self.light_curve.weights(batch["numbers"])
+        losses = {"picture": _squared_error(residuals, outputs["found"])}
+        if self.anchor is not None and self.config.regularisation > 0:
+            positions = outputs["positions"]
+            distance = self.anchor.distance(self.surface.parameters(positions), positions)
+            losses["prior"] = self.config.regularisation * distance
+        return losses
+
+    def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """PSNR of the batch, the noise of its few samples left out."""
+        with torch.no_grad():
+            error = _squared_error(self._residuals(outputs, batch), outputs["found"])
+        return {"psnr": psnr_db(error)}
+
+    @torch.no_grad()
+    def get_evaluation_outputs(self, camera: Cameras, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Light and base colour of the pixels that count, under the light that the batch may hold."""
+        light = batch_environment(batch)
+        traced = self.traced if light is None else self.traced.under(light)
+        return evaluation_outputs(self, traced, camera.to(self.device), batch)
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Figures and pictures of one view: see `image_evaluation` and `spectral_evaluation`."""
+        evaluate = evaluate_spectral_image if self.record.is_spectral else evaluate_object_image
+        return evaluate(self, outputs, batch)
+
+    def warm_up(self) -> None:
+        """Compile the kernels, forward and backward, on a few rays that meet the mesh."""
+        towards = -nn.functional.normalize(self.mesh.vertices[:4] + 1e-3, dim=-1)
+        bundle = RayBundle(
+            -3 * towards, towards, torch.zeros(len(towards), dtype=torch.int64, device=self.device)
+        )
+        was_training, generator = self.training, self.generator
+        self.train()
+        self.generator = torch.Generator(self.device).manual_seed(0)
+        halves = self.get_outputs(bundle)["halves"]
+        torch.autograd.grad(halves.sum(), [self.triplane.planes], allow_unused=True)
+        self.generator = generator
+        self.train(was_training)
+
+    def compared(
+        self,
+        light: Float[Tensor, "*n C"],
+        numbers: Float[Tensor, "*m C"],
+        tone: ToneMapping,
+        light_curve: nn.Module,
+    ) -> tuple[Tensor, Tensor]:
+        """Predicted light and a picture's numbers as they are compared.
+
+        Args:
+            tone: What the numbers are of light.
+            light_curve: What light and numbers go through where the numbers are light.
+        """
+        if tone == "linear":
+            return light_curve(light), light_curve(numbers)
+        curve = self.curve if tone == self.record.tone_mapping else tone_curve(tone)
+        return curve(light), numbers.clamp(0, 1)
+
+    def _residuals(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> Float[Tensor, "2 R C"]:
+        tone = self.record.tone_mapping
+        shown, wanted = self.compared(outputs["halves"], batch["numbers"], tone, self.light_curve)
+        return shown - wanted
+
+    def _light_curve(self) -> nn.Module:
+        name = self.config.light_curve
+        if self.record.is_spectral:
+            if name == "agx":
+                raise ConfigError("light-curve is agx, which is for 3 colours; choose auto, srgb or linear")
+            return LampRatio(self.record.lamp) if name == "auto" else tone_curve(name)
+        return tone_curve("agx" if name == "auto" else name)
+
+    @torch.no_grad()
+    def _settle_endmembers(self, step: int, progress: float) -> None:
+        assert self.endmembers is not None
+        assert self.gains is not None
+        settle(self.endmembers, self.gains)
+
+    def _random(self) -> torch.Generator:
+        """The step's source of random numbers; outside training always the same."""
+        if self.generator is not None and self.training:
+            return self.generator
+        return torch.Generator(self.device).manual_seed(0)
+
+
+def _squared_error(residuals: Float[Tensor, "2 R C"], found: Tensor) -> Float[Tensor, ""]:
+    """Mean over the pixels that meet the mesh; may be below 0 by chance where the error is small."""
+    products = residuals[0] * residuals[1] * found[:, None]
+    return products.sum() / (found.sum().clamp(min=1) * residuals.shape[-1])
+
+
+def _empty_buffers(record: ObjectRecord) -> dict[str, Tensor]:
+    buffers = {
+        "vertices": torch.zeros(record.num_vertices, 3),
+        "faces": torch.zeros(record.num_faces, 3, dtype=torch.int32),
+        "normals": torch.zeros(record.num_vertices, 3),
+        "light_map": torch.zeros(*record.environment_size, record.num_light_colours),
+    }
+    return {**buffers, "uv": torch.zeros(record.num_vertices, 2)} if record.has_uv else buffers

@@ -1,0 +1,430 @@
+"""What is known of the light of pictures of many bands: their wavelengths, and the lamp's spectrum.
+
+Notation: `B` bands.
+
+True endmembers and abundances of an object's spectral pictures, where a folder has them.
+
+Notation: `H x W` pixels, `B` bands, `M` true materials.
+
+A validated object: its mesh, the light around it, and posed pictures of it.
+
+World space is that of the mesh's file, and of the poses before nerfstudio's `applied_transform`; z is up. Model space
+has the mesh's bounding box in the middle of [-1, 1]^3, axes as in the world.
+
+From an object's folder to a validated `ObjectScene`.
+
+The folder has transforms.json and pictures as any scene has, a mesh, an environment map, and perhaps `relit/<light>/`
+with the same under lights that training never sees. docs/background/neumatex.md says what its keys mean.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64
+
+from unmix_plugin.errors import SceneError
+from unmix_plugin.neumatex.fit.checks import light_doubt, mesh_fit
+from unmix_plugin.neumatex.fit.pictures import PosedPictures, has_alpha, read_picture, read_posed_pictures
+from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS, ToneMapping
+from unmix_plugin.neumatex.tracing.environment import Environment
+from unmix_plugin.neumatex.tracing.light_files import ENVIRONMENT_SUFFIXES as ENVIRONMENT_SUFFIXES
+from unmix_plugin.neumatex.tracing.light_files import (
+    mean_spectrum,
+    read_environment,
+    read_environment_of_bands,
+    read_lamp,
+)
+from unmix_plugin.neumatex.tracing.mesh import MESH_SUFFIXES as MESH_SUFFIXES
+from unmix_plugin.neumatex.tracing.mesh import Mesh, read_mesh
+from unmix_plugin.neumatex.tracing.rays import RayMesh
+from unmix_plugin.scenes.placement import Placement
+from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array
+from unmix_plugin.scenes.reading.faults import (
+    Faults,
+    describe,
+    read_json_file,
+    read_number,
+    resolve_path,
+    sha256_of,
+)
+from unmix_plugin.scenes.reading.loader import read_endmembers
+from unmix_plugin.scenes.reading.splits import Split, split_frames
+from unmix_plugin.scenes.reading.transforms_json import FILE_NAME, SceneEntry, read_transforms
+from unmix_plugin.scenes.scene import Normalisation
+from unmix_plugin.spectral.bands import Bands
+
+_NUM_COLOURS = 3
+
+
+@dataclass(frozen=True)
+class SpectralLight:
+    """Bands and lamp of spectral pictures."""
+
+    bands: Bands
+    lamp: Float64[np.ndarray, " B"] | None
+    """Relative power, greatest 1; None where it is not given."""
+
+    def lamp_of(self, environment: Environment) -> Float64[np.ndarray, " B"]:
+        """The lamp; the environment's mean spectrum where none is given."""
+        return mean_spectrum(environment).double().numpy() if self.lamp is None else self.lamp
+
+    def of_held_out(self, folder: Path, entry: SceneEntry, pictures: PosedPictures) -> SpectralLight:
+        """The same bands, lit by the held-out light's own lamp where it has one.
+
+        Raises:
+            SceneError: its pictures have other bands.
+        """
+        own = entry.wavelengths_nm
+        if pictures.num_colours != len(self.bands) or (own is not None and Bands(own) != self.bands):
+            raise SceneError(
+                f"{folder}: pictures of {pictures.num_colours} bands"
+                + ("" if own is None else f", wavelengths of {Bands(own)}")
+                + f"; the object has {self.bands}: give the same"
+            )
+        lamp = _own_lamp(folder, entry, self.bands)
+        return self if lamp is None else replace(self, lamp=lamp)
+
+
+def spectral_light(
+    root: Path, entry: SceneEntry, pictures: PosedPictures, lamp: str | None
+) -> SpectralLight | None:
+    """Bands and lamp of an object's pictures; None for pictures in colours.
+
+    Args:
+        root: The object's folder.
+        entry: Its transforms.json.
+        pictures: Its pictures.
+        lamp: What to take instead of the folder's lamp; see `read_lamp`.
+    Raises:
+        SceneError: pictures of more than three colours without wavelengths, or with another number of them; display
+            pictures; a lamp for pictures in colours.
+        SpectrumError: the lamp can't be read, or is not known at all bands.
+    """
+    found, count = entry.wavelengths_nm, pictures.num_colours
+    if count == _NUM_COLOURS and (found is None or len(found) != count):
+        if lamp is not None:
+            raise SceneError(f"{root}: a lamp is given, but its pictures have {count} colours; leave it out")
+        return None
+    if found is None or len(found) != count:
+        given = "no 'wavelengths'" if found is None else f"{len(found)} 'wavelengths'"
+        raise SceneError(
+            f"{root / FILE_NAME}: {given} for pictures of {count} bands; list the centre of each band in nm"
+        )
+    if pictures.tone != "linear":
+        raise SceneError(
+            f"{root / FILE_NAME}: pictures of {count} bands with 'tone_mapping' {pictures.tone}; expected linear light"
+        )
+    bands = Bands(found)
+    return SpectralLight(bands, _own_lamp(root, entry, bands) if lamp is None else read_lamp(lamp, bands))
+
+
+def _own_lamp(root: Path, entry: SceneEntry, bands: Bands) -> Float64[np.ndarray, " B"] | None:
+    """What 'illuminant_path' names; None where there is none."""
+    if entry.illuminant_path is None:
+        return None
+    faults = Faults(root)
+    path = resolve_path(root, entry.illuminant_path, None, "'illuminant_path'", faults)
+    faults.raise_if_any()
+    return None if path is None else read_lamp(str(path), bands)
+
+
+@dataclass(frozen=True)
+class TrueMaterials:
+    """What an object is really made of."""
+
+    names: tuple[str, ...]
+    endmembers: Float64[np.ndarray, "M B"]
+    """Reflectances."""
+    abundance_files: tuple[Path | None, ...]
+    """One a view."""
+
+    def abundances(self, view: int) -> Float32[np.ndarray, "H W M"] | None:
+        """True abundances of a view's pixels; None where they are unknown.
+
+        Raises:
+            SceneError: the file can't be read, or has another number of materials.
+        """
+        path = self.abundance_files[view]
+        if path is None:
+            return None
+        try:
+            found = np.array(map_array(path), dtype=np.float32)
+        except UnreadableArrayError as error:
+            raise SceneError(f"{path} {error}") from error
+        if found.ndim != 3 or found.shape[2] != len(self.names):
+            raise SceneError(
+                f"{path}: has shape {found.shape}; expected rows x columns x {len(self.names)} materials"
+            )
+        return found
+
+
+def read_true_materials(
+    root: Path, entry: SceneEntry, spectral: SpectralLight | None
+) -> TrueMaterials | None:
+    """What 'endmembers_path' and each frame's 'abundance_file_path' name; None without spectra or endmembers.
+
+    Raises:
+        SceneError: a file is missing, or does not fit the bands.
+    """
+    if spectral is None or entry.endmembers_path is None:
+        return None
+    faults = Faults(root)
+    path = resolve_path(root, entry.endmembers_path, None, "'endmembers_path'", faults)
+    table = None
+    if path is not None:
+        centers = spectral.bands.centers_nm
+        table = read_endmembers(path, centers, entry.materials, "'endmembers_path'", faults)
+    files = tuple(
+        resolve_path(root, frame.paths["abundance_file_path"], None, frame.where, faults)
+        if "abundance_file_path" in frame.paths
+        else None
+        for frame in entry.frames
+    )
+    faults.raise_if_any()
+    assert table is not None
+    return TrueMaterials(table.names, table.spectra, files)
+
+
+@dataclass(frozen=True)
+class HeldOutLight:
+    """The object under a light that training never sees."""
+
+    name: str
+    environment: Environment
+    pictures: PosedPictures
+    """All for evaluation."""
+
+
+@dataclass(frozen=True)
+class ObjectScene:
+    """Everything known about an object; made by `load_object` only, which guarantees what is said here."""
+
+    root: Path
+    """Its folder."""
+    mesh: Mesh
+    """Model space."""
+    environment: Environment
+    """The light of the pictures, world directions."""
+    frame: Normalisation
+    """From world to model space."""
+    pictures: PosedPictures
+    """All views."""
+    split: Split
+    """Views to train on and views to evaluate, at least one each."""
+    lights: tuple[HeldOutLight, ...]
+    bands: Bands | None
+    """Of spectral pictures; None for RGB."""
+    lamp: Float64[np.ndarray, " B"] | None
+    """Relative power of the light of spectral pictures, greatest band 1."""
+    truth: Path | None
+    """Folder of true base colours; None where there is none."""
+    true_materials: TrueMaterials | None
+    """Of spectral pictures, where they are known."""
+    input_hashes: dict[str, str]
+    """SHA-256 of mesh, environment and pictures."""
+    notes: tuple[str, ...]
+    """What is unusual but usable."""
+
+    def base_colour(self, index: int) -> Float32[np.ndarray, "H W 3"] | None:
+        """True base colour of a view, linear; None where it is unknown.
+
+        Raises:
+            SceneError: its file is malformed.
+        """
+        name = f"{self.pictures.files[index].name}.exr"
+        if self.truth is None or not (self.truth / name).is_file():
+            return None
+        found: Float[np.ndarray, "H W 3"] = read_picture(self.truth / name).numbers
+        return found
+
+    def summary(self) -> dict[str, Any]:
+        """What a run has to record of the object, as JSON-able values."""
+        return {
+            "root": str(self.root),
+            "frames": self.pictures.names,
+            "train_indices": list(self.split.train),
+            "eval_indices": list(self.split.evaluation),
+            "normalisation": self.frame.to_json(),
+            "tone_mapping": self.pictures.tone,
+            "lights": {light.name: light.pictures.names for light in self.lights},
+            "input_hashes": dict(self.input_hashes),
+        }
+
+
+EVAL_INTERVAL = 8
+"""Every so many frames one is for evaluation, where transforms.json does not say which."""
+MOST_STOPS = 20.0
+
+
+def load_object(root: Path, lamp: str | None = None) -> ObjectScene:
+    """Read and check an object's folder.
+
+    Args:
+        root: The folder.
+        lamp: For pictures of many bands: what lit them, as `read_lamp` takes it, instead of what the folder says.
+    Raises:
+        SceneError: the folder is not a sound object; the message says what is wrong with it.
+    """
+    root = root.resolve()
+    faults, notes = Faults(root), list[str]()
+    entry = read_transforms(root, faults, needs_cubes=False)
+    split = split_frames(entry, "auto", EVAL_INTERVAL, faults)
+    light = _read_light(root, faults)
+    mesh_path = _find_file(root, "mesh_path", "mesh", MESH_SUFFIXES, faults)
+    faults.raise_if_any()
+    assert light is not None
+    assert mesh_path is not None
+    frame, mesh, pictures = _placed(
+        read_mesh(mesh_path, notes), mesh_path.name, root, entry, light, notes, faults
+    )
+    spectral = spectral_light(root, entry, pictures, lamp)
+    environment = light.environment(spectral)
+    doubt = light_doubt(pictures, environment)
+    notes += [] if doubt is None else [doubt]
+    files = {mesh_path.name: mesh_path, light.environment_path.name: light.environment_path}
+    truth = root / "truth" / "base_colour"
+    return ObjectScene(
+        root=root,
+        mesh=mesh,
+        environment=environment,
+        frame=frame,
+        pictures=pictures,
+        split=split,
+        lights=tuple(_read_held_out(path, frame, spectral) for path in _held_out_folders(root)),
+        bands=None if spectral is None else spectral.bands,
+        lamp=None if spectral is None else spectral.lamp_of(environment),
+        truth=truth if truth.is_dir() else None,
+        true_materials=read_true_materials(root, entry, spectral),
+        input_hashes={**{name: sha256_of(path) for name, path in files.items()}, **pictures.hashes},
+        notes=tuple(notes),
+    )
+
+
+@dataclass(frozen=True)
+class _Light:
+    """What a transforms.json says of light and tone."""
+
+    environment_path: Path
+    rotation_deg: float
+    exposure_stops: float
+    tone: ToneMapping | None
+
+    def environment(self, spectral: SpectralLight | None) -> Environment:
+        """In the bands of spectral pictures, otherwise in colours."""
+        placement = (self.rotation_deg, self.exposure_stops)
+        if spectral is None:
+            return read_environment(self.environment_path, *placement)
+        return read_environment_of_bands(self.environment_path, spectral.bands, spectral.lamp, *placement)
+
+
+def _read_light(root: Path, faults: Faults) -> _Light | None:
+    """The keys of light and tone; None with noted faults where they are wrong."""
+    noted, content = faults.noted, _content(root)
+    path = _find_file(root, "environment_path", "environment", ENVIRONMENT_SUFFIXES, faults)
+    numbers = dict[str, float]()
+    for key, most in (("environment_rotation_deg", 1e6), ("environment_exposure_stops", MOST_STOPS)):
+        number = read_number(content.get(key, 0.0))
+        if number is None or abs(number) > most:
+            faults.add(
+                FILE_NAME,
+                f"'{key}' is {describe(content[key])}; expected a number from {-most:g} to {most:g}",
+            )
+        numbers[key] = number or 0.0
+    tone = content.get("tone_mapping")
+    if tone is not None and tone not in TONE_MAPPINGS:
+        known = ", ".join(TONE_MAPPINGS)
+        faults.add(FILE_NAME, f"'tone_mapping' is {describe(tone)}; expected one of {known}")
+    if path is None or faults.noted > noted:
+        return None
+    rotation_deg, exposure_stops = numbers.values()
+    return _Light(path, rotation_deg, exposure_stops, cast("ToneMapping | None", tone))
+
+
+def _find_file(root: Path, key: str, what: str, suffixes: tuple[str, ...], faults: Faults) -> Path | None:
+    """The file that a key names, or the only one of its kind; None and a noted fault if there is none."""
+    named = _content(root).get(key)
+    if named is not None:
+        if not isinstance(named, str) or not named:
+            faults.add(FILE_NAME, f"'{key}' is {describe(named)}; expected a path")
+            return None
+        return resolve_path(root, named, None, f"'{key}'", faults)
+    found = sorted(path for path in root.iterdir() if path.suffix.lower() in suffixes and path.is_file())
+    usual = [path for path in found if path.stem == what]
+    chosen = usual if len(found) > 1 and usual else found
+    if len(chosen) == 1:
+        return chosen[0]
+    listed = ", ".join(path.name for path in chosen)
+    names = " or ".join(f"{what}{suffix}" for suffix in suffixes)
+    advice = f"name one with '{key}' in {FILE_NAME}" if chosen else f"put {names} there"
+    faults.add(str(root), f"has {f'several: {listed}' if chosen else f'no {what}'}; {advice}")
+    return None
+
+
+def _content(root: Path) -> dict[str, Any]:
+    """What transforms.json holds, which `read_transforms` has checked to be an object."""
+    return read_json_file(root / FILE_NAME)
+
+
+def _placed(
+    given: Mesh, name: str, root: Path, entry: SceneEntry, light: _Light, notes: list[str], faults: Faults
+) -> tuple[Normalisation, Mesh, PosedPictures]:
+    """The mesh and the pictures in model space; a mesh that fits only with its y axis upwards is turned.
+
+    Raises:
+        SceneError: it fits neither way; the message says how far off it is as it was given.
+    """
+    found: list[str] = []
+    for placed in (given, given.with_y_upwards()):
+        frame, mesh = _model_space(placed)
+        pictures = read_posed_pictures(root, entry, _from_poses(frame, entry.placement), light.tone, faults)
+        alphas = [_alpha(pictures, index) for index in range(len(pictures))]
+        fit = mesh_fit(RayMesh(mesh), pictures.cameras, alphas, frame, name)
+        if fit.misplaced is None:
+            doubt = fit.doubt(name)
+            notes += [] if doubt is None else [doubt]
+            notes += (
+                [f"{name} has y as its upward axis, the poses have z: the mesh was turned"] if found else []
+            )
+            return frame, mesh, pictures
+        found.append(fit.misplaced)
+    raise SceneError(found[0])
+
+
+def _model_space(mesh: Mesh) -> tuple[Normalisation, Mesh]:
+    scale, offset = mesh.to_model_space()
+    middle = -offset.double().numpy()
+    return Normalisation(np.eye(3), np.zeros(3), scale, middle), mesh.transformed(scale, offset)
+
+
+def _from_poses(frame: Normalisation, placement: Placement) -> Normalisation:
+    """From the space of transforms.json to model space, given that from the world."""
+    back = placement.rotation.T
+    shift = placement.scale * (placement.offset - frame.offset - back @ placement.translation)
+    return Normalisation(back, shift, frame.scale / placement.scale)
+
+
+def _alpha(pictures: PosedPictures, index: int) -> np.ndarray | None:
+    picture = pictures.read(index)
+    return picture.alpha if has_alpha(picture) else None
+
+
+def _held_out_folders(root: Path) -> list[Path]:
+    relit = root / "relit"
+    return sorted(path for path in relit.iterdir() if path.is_dir()) if relit.is_dir() else []
+
+
+def _read_held_out(folder: Path, frame: Normalisation, spectral: SpectralLight | None) -> HeldOutLight:
+    faults = Faults(folder)
+    entry: SceneEntry = read_transforms(folder, faults, needs_cubes=False)
+    light = _read_light(folder, faults)
+    faults.raise_if_any()
+    if light is None:
+        raise SceneError(f"{folder} has no environment map")
+    pictures = read_posed_pictures(folder, entry, _from_poses(frame, entry.placement), light.tone, faults)
+    if spectral is not None:
+        spectral = spectral.of_held_out(folder, entry, pictures)
+    return HeldOutLight(folder.name, light.environment(spectral), pictures)

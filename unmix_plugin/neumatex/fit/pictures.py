@@ -1,0 +1,271 @@
+"""One picture of an object: 8-bit pictures, OpenEXR with linear light, .npy cubes.
+
+Notation: `H x W` pixels, `C` colours or bands.
+
+Pictures of an object with their cameras: what a transforms.json lists.
+
+Notation: `N` pictures of `H x W` pixels, `C` colours or bands.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.errors import CaptureError, SceneError, counted
+from unmix_plugin.neumatex.fit.tone import ToneMapping
+from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array, read_array_header
+from unmix_plugin.scenes.reading.faults import Faults, resolve_path, sha256_of
+from unmix_plugin.scenes.reading.images import FORMATS, UnreadableImageError, read_colour, read_mask
+from unmix_plugin.scenes.reading.loader import make_cameras
+from unmix_plugin.scenes.reading.transforms_json import FrameEntry, SceneEntry
+from unmix_plugin.scenes.scene import Normalisation
+
+LIGHT_SUFFIXES = (".exr", ".npy")
+"""Files whose numbers are linear light; others hold 8 bits a channel."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Numbers of a picture, colours not multiplied by alpha."""
+
+    numbers: Float32[np.ndarray, "H W C"]
+    """Linear light, or display values in [0, 1]."""
+    alpha: Float32[np.ndarray, "H W"] | None
+    """Opacity in [0, 1]; None where the file has none."""
+    valid: Bool[np.ndarray, "H W"] | None = None
+    """Pixels that count; None where no mask says."""
+
+
+def read_picture(path: Path, value_scale: float | None = None) -> Picture:
+    """Read and check one picture.
+
+    Args:
+        path: Its file.
+        value_scale: Stored number of a .npy cube that stands for 1; None for floats of light as they are.
+    Raises:
+        SceneError: it can't be read, has less than 3 colours, or values that are negative or not finite.
+    """
+    readers = {".exr": _read_exr, ".npy": partial(_read_npy, value_scale=value_scale)}
+    try:
+        picture = readers.get(path.suffix.lower(), _read_display)(path)
+    except (UnreadableArrayError, UnreadableImageError) as error:
+        raise SceneError(f"{path} {error}") from error
+    except CaptureError as error:
+        raise SceneError(str(error)) from error
+    except OSError as error:
+        raise SceneError(f"{path} can't be read ({error.strerror or error})") from error
+    shown = picture.numbers if picture.alpha is None else picture.numbers[picture.alpha > 0]
+    if not (np.isfinite(shown).all() and (shown >= 0).all()):
+        bad = int((~np.isfinite(shown) | (shown < 0)).any(axis=-1).sum())
+        raise SceneError(
+            f"{path}: negative values, NaN or infinity in {counted(bad, 'pixel')}; expected light, 0 and up: "
+            "repair the picture"
+        )
+    return picture
+
+
+def _read_display(path: Path) -> Picture:
+    from PIL import Image
+
+    try:
+        with Image.open(path, formats=FORMATS) as image:
+            size = (image.height, image.width)
+    except Exception as error:
+        raise UnreadableImageError(
+            f"cannot be read as a PNG, JPEG or TIFF picture ({type(error).__name__})"
+        ) from error
+    pixels = read_colour(path, size).astype(np.float32) / np.float32(255)
+    return Picture(pixels[..., :3], pixels[..., 3] if pixels.shape[2] == 4 else None)
+
+
+def _read_exr(path: Path) -> Picture:
+    from unmix_plugin.captures.readers.exr import open_exr
+    from unmix_plugin.captures.readers.read_options import ReadOptions
+
+    everything = (slice(None), slice(None))
+    file = open_exr(path, ReadOptions())
+    numbers = np.array(file.read_part(*everything), dtype=np.float32, order="C")
+    if numbers.shape[2] < 3:
+        raise SceneError(f"{path}: has {numbers.shape[2]} channels of colour; expected R, G and B")
+    if "A" not in file.metadata.get("other_channels", []):
+        return Picture(numbers, None)
+    alpha = open_exr(path, ReadOptions(dataset="A")).read_part(*everything)
+    return Picture(numbers, np.asarray(alpha, dtype=np.float32)[..., 0].clip(0, 1))
+
+
+def _read_npy(path: Path, value_scale: float | None) -> Picture:
+    header = read_array_header(path)
+    if len(header.shape) != 3 or header.shape[2] < 3:
+        raise SceneError(
+            f"{path}: holds numbers of shape {header.shape}; expected rows x columns x 3 or more colours"
+        )
+    if value_scale is None and header.dtype.kind != "f":
+        raise SceneError(
+            f"{path}: holds {header.dtype}; expected floats, or 'value_scale' in transforms.json: the number that "
+            "stands for 1"
+        )
+    numbers = np.array(map_array(path), dtype=np.float32, order="C")
+    return Picture(numbers if value_scale is None else numbers / np.float32(value_scale), None)
+
+
+@dataclass(frozen=True)
+class PictureFiles:
+    """The files of one picture."""
+
+    name: str
+    """Short name, unique among its neighbours, fit for file names."""
+    colours: Path
+    """What holds its colours."""
+    opacity: Path | None = None
+    """What holds its alpha, where that is another file."""
+    mask: Path | None = None
+    """Black where pixels do not count."""
+    value_scale: float | None = None
+    """Stored number of a .npy array that stands for 1."""
+
+
+@dataclass(frozen=True)
+class PosedPictures:
+    """Pictures and their cameras, read when asked for."""
+
+    files: tuple[PictureFiles, ...]
+    cameras: Cameras
+    """Model space, one a picture."""
+    tone: ToneMapping
+    """What the numbers are of light."""
+    num_colours: int
+    """C."""
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    @property
+    def names(self) -> list[str]:
+        """Of the pictures."""
+        return [files.name for files in self.files]
+
+    def read(self, index: int) -> Picture:
+        """One picture, checked; premultiplied cubes whose alpha is apart are divided by it.
+
+        Raises:
+            SceneError: it can't be read, or its size has changed.
+        """
+        files = self.files[index]
+        picture = read_files(files)
+        width, height = self.cameras.size(index)
+        if picture.numbers.shape[:2] != (height, width):
+            raise SceneError(f"{files.colours} has changed since it was first read; start again")
+        return picture
+
+    @cached_property
+    def hashes(self) -> dict[str, str]:
+        """SHA-256 of each file, by its picture's name."""
+        return {files.name: sha256_of(files.colours) for files in self.files}
+
+
+def read_files(files: PictureFiles) -> Picture:
+    """A picture from its one or two files.
+
+    Raises:
+        SceneError: one can't be read, or their sizes differ.
+    """
+    picture = read_picture(files.colours, files.value_scale)
+    if files.mask is not None:
+        try:
+            height, width = picture.numbers.shape[:2]
+            picture = replace(picture, valid=read_mask(files.mask, (height, width)))
+        except UnreadableImageError as error:
+            raise SceneError(f"{files.mask} {error}") from error
+    if files.opacity is None:
+        return picture
+    alpha = read_picture(files.opacity).alpha
+    if alpha is None:
+        return picture
+    if alpha.shape != picture.numbers.shape[:2]:
+        raise SceneError(
+            f"{files.opacity}: has {alpha.shape[1]} x {alpha.shape[0]} pixels, its cube {files.colours.name} has "
+            f"{picture.numbers.shape[1]} x {picture.numbers.shape[0]}; give both one size"
+        )
+    numbers = picture.numbers / np.maximum(alpha, np.float32(1e-3))[..., None]
+    return Picture(numbers, alpha, picture.valid)
+
+
+def read_posed_pictures(
+    root: Path, entry: SceneEntry, frame: Normalisation, tone: ToneMapping | None, faults: Faults
+) -> PosedPictures:
+    """Find and check the pictures of a transforms.json.
+
+    Args:
+        root: Its folder.
+        entry: Its content, without faults.
+        frame: From the space of its poses to model space.
+        tone: What it says of the pictures; None for light in files that hold light, an unknown response in others.
+        faults: Where faults are noted.
+    Raises:
+        SceneError: pictures are missing or malformed; all their faults in one message.
+    """
+    located = [_locate(root, frame, entry.value_scale, faults) for frame in entry.frames]
+    faults.raise_if_any()
+    names = _names([str(files.colours.relative_to(root)) for files in located if files is not None])
+    named = [
+        replace(files, name=name) for name, files in zip(names, located, strict=True) if files is not None
+    ]
+    sizes, colours = _check(root, named, faults)
+    kinds = {files.colours.suffix.lower() in LIGHT_SUFFIXES for files in named}
+    if len(kinds) > 1 or len(colours) > 1:
+        faults.add(
+            "frames", f"mix pictures of light (.exr, .npy) and others, or of {colours} colours; give one kind"
+        )
+    faults.raise_if_any()
+    usual: ToneMapping = "linear" if kinds == {True} else "camera"
+    return PosedPictures(tuple(named), make_cameras(entry, sizes, frame), tone or usual, colours.pop())
+
+
+def _locate(root: Path, frame: FrameEntry, value_scale: float | None, faults: Faults) -> PictureFiles | None:
+    """The files of a frame; None with noted faults where one is missing."""
+    keys = [key for key in ("hyperspectral_file_path", "file_path", "mask_path") if key in frame.paths]
+    found = {key: resolve_path(root, frame.paths[key], None, frame.where, faults) for key in keys}
+    mask = found.pop("mask_path", None)
+    pictures = [path for path in found.values() if path is not None]
+    if len(pictures) < len(found) or not pictures or (mask is None and "mask_path" in keys):
+        return None
+    return PictureFiles("", *pictures, mask=mask, value_scale=value_scale)
+
+
+def _check(root: Path, named: list[PictureFiles], faults: Faults) -> tuple[list[tuple[int, int]], set[int]]:
+    """Sizes of all pictures, and the numbers of colours that they have."""
+    sizes, colours = [], set()
+    for files in named:
+        try:
+            shape = read_files(files).numbers.shape
+        except SceneError as error:
+            faults.add(str(root), str(error).replace(f"{root}/", ""))
+            continue
+        sizes.append((shape[0], shape[1]))
+        colours.add(shape[2])
+    return sizes, colours
+
+
+def _names(paths: list[str]) -> list[str]:
+    """The shortest names that differ: stems, with folders before them, or with numbers."""
+    plain = [PurePosixPath(path).with_suffix("") for path in paths]
+    candidates = ([path.name for path in plain], ["_".join(path.parts) for path in plain])
+    numbered = [f"{path.name}_{index}" for index, path in enumerate(plain)]
+    return next((names for names in candidates if len(set(names)) == len(names)), numbered)
+
+
+def has_alpha(picture: Picture) -> bool:
+    """Whether some pixel is not opaque."""
+    return picture.alpha is not None and bool((picture.alpha < 1).any())
+
+
+def opacity(picture: Picture) -> Float32[np.ndarray, "H W"]:
+    """Alpha; 1 where the picture has none, 0 where a mask says that pixels do not count."""
+    alpha = np.ones(picture.numbers.shape[:2], np.float32) if picture.alpha is None else picture.alpha
+    return alpha if picture.valid is None else alpha * picture.valid

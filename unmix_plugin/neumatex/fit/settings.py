@@ -1,0 +1,194 @@
+"""What gives a model of an object its shape: `metadata` of its data manager, checked when a run is opened.
+
+Settings of the model neumatex, and how those that follow from the object are found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+import torch
+
+from unmix_plugin.engine import Model, ModelConfig, Target
+from unmix_plugin.engine.configs import Common, short
+from unmix_plugin.engine.runs.config_json import config_from_json
+from unmix_plugin.errors import require
+from unmix_plugin.neumatex.fit.tone import LightCurve, ToneMapping
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.unmixing.endmembers import EndmemberMethod
+
+if TYPE_CHECKING:
+    from unmix_plugin.neumatex.fit.object_scene import ObjectScene
+
+
+@dataclass(frozen=True)
+class ObjectRecord:
+    """Sizes of an object's buffers, and what does not fit in them."""
+
+    num_vertices: int = 3
+    num_faces: int = 1
+    has_uv: bool = False
+    environment_size: tuple[int, int] = (1, 2)
+    """Rows and columns."""
+    num_light_colours: int = 3
+    rotation_deg: float = 0.0
+    """Of the environment about +z."""
+    exposure_stops: float = 0.0
+    """Of the environment."""
+    num_colours: int = 3
+    """Of the pictures."""
+    tone_mapping: ToneMapping = "linear"
+    """What the pictures' numbers are of light."""
+    wavelengths_nm: tuple[float, ...] = ()
+    """Of spectral pictures; empty for RGB."""
+    lamp: tuple[float, ...] = ()
+    """Relative power of the light of spectral pictures, greatest band 1; empty for RGB."""
+
+    @property
+    def is_spectral(self) -> bool:
+        """Whether the pictures have bands, not colours."""
+        return bool(self.lamp)
+
+    @property
+    def bands(self) -> Bands | None:
+        """Of spectral pictures."""
+        return Bands.of(self.wavelengths_nm) if self.is_spectral else None
+
+    @staticmethod
+    def of(scene: ObjectScene) -> ObjectRecord:
+        """The record of an object."""
+        mesh, light = scene.mesh, scene.environment
+        height, width, light_colours = light.image.shape
+        return ObjectRecord(
+            num_vertices=len(mesh.vertices),
+            num_faces=len(mesh.faces),
+            has_uv=mesh.uv is not None,
+            environment_size=(height, width),
+            num_light_colours=light_colours,
+            rotation_deg=light.rotation_deg,
+            exposure_stops=light.exposure_stops,
+            num_colours=scene.pictures.num_colours,
+            tone_mapping=scene.pictures.tone,
+            wavelengths_nm=() if scene.bands is None else tuple(scene.bands.centers_nm.tolist()),
+            lamp=() if scene.lamp is None else tuple(scene.lamp.tolist()),
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON-able values."""
+        values = asdict(self)
+        lists = {name: list(value) for name, value in values.items() if isinstance(value, tuple)}
+        return {**values, **lists}
+
+    @staticmethod
+    def from_json(values: Mapping[str, Any]) -> ObjectRecord:
+        """What `to_json` wrote.
+
+        Raises:
+            ConfigError, ValueError: a value is of the wrong type or out of its range.
+        """
+        record = config_from_json(dict(values), ObjectRecord(), "the object")
+        counts = (record.num_vertices, record.num_faces, *record.environment_size, record.num_colours)
+        if min(counts) < 1 or record.num_light_colours < 1:
+            raise ValueError(f"an object needs sizes of at least 1; found {counts}")
+        if record.is_spectral and {len(record.lamp), len(record.wavelengths_nm)} != {record.num_colours}:
+            raise ValueError(
+                f"an object of {record.num_colours} bands needs as many wavelengths and powers of its lamp; found "
+                f"{len(record.wavelengths_nm)} and {len(record.lamp)}"
+            )
+        return record
+
+
+Auto = Literal["auto"]
+PriorName = Literal["small", "none"]
+MaterialName = Literal["neural", "pbr", "spectral"]
+"""Families that can be trained."""
+
+
+def _model() -> type[Model]:
+    from unmix_plugin.neumatex.fit.model import NeumatexModel
+
+    return NeumatexModel
+
+
+@dataclass(frozen=True)
+class NeumatexModelConfig(ModelConfig):
+    """What is fitted, and how it is rendered meanwhile."""
+
+    _target: Target = field(default_factory=_model)
+    eval_num_rays_per_chunk: int = 4096
+    """Pixels rendered at once for a whole image; fewer take less memory."""
+    material: Annotated[MaterialName, Common] = "neural"
+    """Family of materials: neural (base colour and latents of a shared decoder), pbr (base colour, roughness,
+    metallicity), or for pictures of many bands spectral (a mixture of endmember reflectances under a grey gloss)."""
+    num_endmembers: Annotated[int | Auto | None, Common, short("endmembers")] = None
+    """Of spectral materials: K, how many reflectances are mixed; auto proposes it from the training pixels. None is the
+    number of --pipeline.model.from-run, otherwise 6, or the number of bands if that is smaller."""
+    endmember_init: EndmemberMethod = "pairs"
+    """Of spectral materials: first guess of the endmembers, from the pixels divided by the light that reaches them."""
+    from_run: Annotated[Path | None, Common] = None
+    """Of spectral materials: run of unmix-nerf whose endmembers and abundances the fit starts from."""
+    samples: Annotated[int, Common] = 16
+    """Paths a pixel in training, in two independent halves; more is slower and less noisy. Few leave a bias, since tone
+    curves bend: at equal time, 16 in half as many pixels did better than 8, and 4 in twice as many worse."""
+    bounces: Annotated[int, Common] = 1
+    """How often light may be reflected between parts of the object before it reaches the point that is seen."""
+    render_samples: Annotated[int, Common] = 64
+    """Paths a pixel in renders and in the viewer."""
+    eval_samples: Annotated[int, Common] = 256
+    """Paths a pixel in evaluation, where noise would count as an error of the material: with 64 a good fit measures
+    1.4 dB worse than it is, with 256 0.2 dB."""
+    prior: Annotated[PriorName, Common] = "small"
+    """Where the fit starts and what it is held to: small is the prior of the package; none starts from a plain grey
+    material. Spectral materials have no prior: they start from the pictures or from a run."""
+    fit_networks: bool = True
+    """Fit the networks that read the planes, too. Published with a prior: the planes alone."""
+    regularisation: float = 1e-5
+    """Weight of the distance from the prior, over its expected squared error. Less than the squared error of a fitted
+    pixel: what the prior has wrong it has wrong in whole regions, so that many of its points count as few."""
+    plane_resolution: int = 128
+    """Texels along an edge of each of the three planes."""
+    light_curve: LightCurve | Auto = "auto"
+    """Tone curve through which pictures of linear light are compared in training; others are compared as they are. Auto
+    is agx for colours; for bands light over the lamp's power, its logarithm above 1, so that dim bands count too."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible settings.
+
+        Raises:
+            ConfigError: a number out of its range.
+        """
+        super().__post_init__()
+        rules = {
+            "samples of 2 to 1024": 2 <= self.samples <= 1024,
+            "bounces of 0 to 8": 0 <= self.bounces <= 8,
+            "render-samples of 1 to 65536": 1 <= self.render_samples <= 65536,
+            "eval-samples of 1 to 65536": 1 <= self.eval_samples <= 65536,
+            "regularisation of at least 0": 0 <= self.regularisation < float("inf"),
+            "plane-resolution of 2 to 2048": 2 <= self.plane_resolution <= 2048,
+        }
+        count = self.num_endmembers
+        rules["num-endmembers of 1 to 64 or auto"] = count in (None, "auto") or 1 <= int(count) <= 64
+        rules["from-run with the material spectral only"] = (
+            self.from_run is None or self.material == "spectral"
+        )
+        require("the model", self, rules)
+
+    def resolve_auto(
+        self, initial_data: Callable[[], Mapping[str, np.ndarray]], generator: torch.Generator
+    ) -> tuple[NeumatexModelConfig, str]:
+        """With a number of endmembers, where the material is spectral.
+
+        Raises:
+            SpectrumError: no pixel is neither dark nor saturated.
+            ConfigError, RunError: the run to start from is unusable.
+        """
+        if self.material != "spectral" or isinstance(self.num_endmembers, int):
+            return self, ""
+        from unmix_plugin.neumatex.fit.start import resolved_num_endmembers
+
+        count, reason = resolved_num_endmembers(self, initial_data(), generator)
+        return replace(self, num_endmembers=count), reason

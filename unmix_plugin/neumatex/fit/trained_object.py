@@ -1,0 +1,364 @@
+"""What can be shown of an object: outputs by name, from surface points and the light that they reflect.
+
+Notation: `H x W` pixels, `K` rays that meet the mesh, `P` parameters, `C` colours.
+
+The scene of a run of neumatex: a mesh with its materials, rendered under any light.
+
+Notation: `H x W` pixels, `K` rays that meet the mesh, `P` parameters, `C` colours.
+
+From a model of neumatex, trained or in training, to the object that it holds at this moment.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.space import SceneBox
+from unmix_plugin.engine.outputs import Output, named_output
+from unmix_plugin.engine.runs.scene_record import SceneRecord
+from unmix_plugin.errors import ConfigError, did_you_mean
+from unmix_plugin.neumatex.fit.tone import SpectralDisplay
+from unmix_plugin.neumatex.tracing.built_in_lights import NAMES, built_in_environment
+from unmix_plugin.neumatex.tracing.environment import Environment
+from unmix_plugin.neumatex.tracing.families import MaterialFamily, PbrFamily, SpectralFamily
+from unmix_plugin.neumatex.tracing.light_files import (
+    ENVIRONMENT_SUFFIXES,
+    of_lamp,
+    read_environment,
+    read_environment_of_bands,
+)
+from unmix_plugin.neumatex.tracing.mesh import Mesh
+from unmix_plugin.neumatex.tracing.path_tracer import rays_radiance
+from unmix_plugin.neumatex.tracing.rays import PixelHits, RayMesh, pixel_hits
+from unmix_plugin.neumatex.tracing.surface import Surface
+from unmix_plugin.scenes.scene import Normalisation
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.segmentation import material_ids
+from unmix_plugin.trained.model_scene import ModelView, frozen_parameters
+from unmix_plugin.trained.probe import one_pixel
+from unmix_plugin.trained.protocol import Probe
+from unmix_plugin.trained.relighting import LightChoice
+from unmix_plugin.trained.run_views import RunView, recorded_views
+from unmix_plugin.trained.world_frame import world_frame
+
+if TYPE_CHECKING:
+    from unmix_plugin.neumatex.fit.model import NeumatexModel
+
+
+_CHUNK = 1 << 17
+_DARKEST = 0.02
+"""Base colour below which shading is not divided by it."""
+
+_COMMON = (
+    Output("rgb", "srgb", "colour", "sRGB on black, 0 to 1, with the tones of the pictures"),
+    Output("linear_rgb", "linear", "colour (linear)", "linear radiance on black"),
+    Output("base_colour", "linear", "base colour", "linear, 0 to 1, on black"),
+)
+_PBR = (
+    Output("roughness", "map", "roughness", "roughness, 0 to 1", (0.0, 1.0)),
+    Output("metallicity", "map", "metallicity", "metallicity, 0 to 1", (0.0, 1.0)),
+)
+_LATENTS = (
+    Output("latents_a", "picture", "latents A", "the decoder's latents 1 to 3 as red, green, blue"),
+    Output("latents_b", "picture", "latents B", "the decoder's latents 4 to 6 as red, green, blue"),
+)
+_SPECTRAL = (
+    Output("spectral", "channels", "radiance", "radiance in every band, on black"),
+    Output("reflectance", "channels", "reflectance", "diffuse reflectance in every band, 0 to 1, on black"),
+    Output("abundances", "shares", "abundances", "share of each endmember, summing to opacity", (0.0, 1.0)),
+    Output("segmentation", "labels", "segmentation", "endmember of the largest share; 255 where nothing is"),
+    Output("roughness", "map", "roughness", "roughness of the gloss, 0 to 1", (0.0, 1.0)),
+    Output(
+        "specular_level", "map", "specular level", "root of what the gloss reflects straight on", (0.0, 1.0)
+    ),
+)
+_UNCERTAINTY = Output(
+    "uncertainty", "map", "uncertainty", "expected error of the material's parameters, mean", None, "magma"
+)
+_GEOMETRY = (
+    Output("shading", "linear", "shading", "light divided by base colour, on black"),
+    Output("normals", "vectors", "normals", "unit vectors in world axes, 0 where nothing is"),
+    Output("depth", "map", "depth", "distance along the viewing axis in world units, 0 where nothing is"),
+    Output("accumulation", "map", "opacity", "part of the pixel that the mesh covers", (0.0, 1.0)),
+)
+
+
+def has_latents(family: MaterialFamily) -> bool:
+    """Whether parameters 3 to 8 are latents of a decoder."""
+    return getattr(family, "decoder", None) is not None
+
+
+def object_outputs(family: MaterialFamily, has_variance: bool) -> tuple[Output, ...]:
+    """The outputs of objects with materials of a family, in the order in which they are offered."""
+    own: tuple[Output, ...] = ()
+    if isinstance(family, SpectralFamily):
+        own = _SPECTRAL
+    elif has_latents(family) or isinstance(family, PbrFamily):
+        own = _LATENTS if has_latents(family) else _PBR
+    return (*_COMMON, *own, *((_UNCERTAINTY,) if has_variance else ()), *_GEOMETRY)
+
+
+def view_outputs(
+    scene: TrainedObject, camera: Cameras, hits: PixelHits, light: Float[Tensor, "K C"]
+) -> dict[str, Tensor]:
+    """All outputs of a view, (H, W, ...); colours are on black, everything else is a mean over what is seen in a
+    pixel."""
+    alpha = hits.alpha()
+    positions = hits.points.positions
+    parameters = _in_chunks(scene.surface.parameters, positions, scene.surface.family.num_parameters)
+    base = scene.surface.family.base_colour(parameters)
+    seen = alpha[..., None].clamp(min=1e-6)
+
+    def mean(values: Tensor) -> Tensor:
+        """Of what is seen."""
+        return hits.image(values) / seen
+
+    linear = hits.image(light)
+    in_colours = scene.curve.rgb if isinstance(scene.curve, SpectralDisplay) else _as_it_is
+    rgb = torch.where(alpha[..., None] > 0, scene.curve(linear / seen), 0.0) * alpha[..., None]
+    found = {
+        "rgb": rgb,
+        "linear_rgb": in_colours(linear),
+        "base_colour": in_colours(hits.image(base)),
+        "shading": hits.image(in_colours(light) / in_colours(base).clamp(min=_DARKEST)),
+        "normals": _world_normals(scene, mean(hits.points.normals)) * (alpha > 0)[..., None],
+        "depth": mean(_depths(scene, camera, positions)[:, None])[..., 0],
+        "accumulation": alpha,
+    }
+    family = scene.surface.family
+    if isinstance(family, SpectralFamily):
+        shares = hits.image(family.abundances(parameters))
+        found |= {"spectral": linear, "reflectance": hits.image(base), "abundances": shares}
+        found["segmentation"] = material_ids(shares, alpha)
+        gloss = mean(parameters[:, family.num_endmembers :])
+        found["roughness"], found["specular_level"] = gloss.unbind(dim=-1)
+    elif has_latents(family):
+        found["latents_a"], found["latents_b"] = mean(parameters[:, 3:6]), mean(parameters[:, 6:9])
+    elif isinstance(family, PbrFamily):
+        found["roughness"], found["metallicity"] = mean(parameters[:, 3:5]).unbind(dim=-1)
+    if scene.log_variance is not None:
+        spread = (_in_chunks(scene.log_variance, positions, family.num_parameters) / 2).exp()
+        found["uncertainty"] = mean(spread.mean(dim=1, keepdim=True))[..., 0]
+    return found
+
+
+def _as_it_is(values: Tensor) -> Tensor:
+    return values
+
+
+def _in_chunks(look_up, positions: Float[Tensor, "K 3"], width: int) -> Tensor:  # noqa: ANN001
+    parts = [look_up(part) for part in positions.split(_CHUNK)] if len(positions) else []
+    return torch.cat(parts) if parts else positions.new_zeros((0, width))
+
+
+def _world_normals(scene: TrainedObject, normals: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+    rotation = torch.from_numpy(scene.frame.rotation).to(normals)
+    return torch.nn.functional.normalize(normals @ rotation, dim=-1)
+
+
+def _depths(scene: TrainedObject, camera: Cameras, positions: Float[Tensor, "K 3"]) -> Float[Tensor, " K"]:
+    """Along the viewing axis, world units."""
+    pose = camera.camera_to_world[0].to(positions)
+    return -((positions - pose[:, 3]) @ pose[:, 2]) / scene.frame.scale
+
+
+OWN_LIGHT = "of the pictures"
+"""Name of the light that the pictures were taken under."""
+
+_GLANCE_SAMPLES = 4
+"""Paths a pixel of one estimate."""
+
+_SUBPIXELS = 2
+"""Rays along a pixel's edge of a finished view."""
+
+
+@dataclass(frozen=True)
+class TrainedObject:
+    """Mesh, materials and light; a value. `with_light` gives another one."""
+
+    ray_mesh: RayMesh
+    surface: Surface
+    environment: Environment
+    frame: Normalisation
+    views: tuple[RunView, ...]
+    scene_box: SceneBox
+    curve: Callable[[Float[Tensor, "*pixels C"]], Float[Tensor, "*pixels 3"]]
+    """From light to the sRGB numbers that are shown."""
+    log_variance: Callable[[Float[Tensor, "N 3"]], Float[Tensor, "N P"]] | None = None
+    """Logarithm of the expected squared error of each parameter at points of the surface; None: unknown."""
+    samples: int = 64
+    """Paths a pixel of a finished view."""
+    bounces: int = 1
+    """Reflections between parts of the object."""
+    notes: tuple[str, ...] = ()
+    own_light: Environment | None = None
+    """The light of the pictures, once another one is in use."""
+    bands: Bands | None = None
+    """Of light and base reflectance; None for colours."""
+    lamp: Float[Tensor, " B"] | None = None
+    """Spectrum that environments in colours get; None for colours."""
+
+    @property
+    def mesh(self) -> Mesh:
+        """In model space."""
+        return self.ray_mesh.mesh
+
+    @property
+    def device(self) -> torch.device:
+        """Where it is rendered."""
+        return self.ray_mesh.device
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """All that can be shown of the materials and of the light that they reflect."""
+        return object_outputs(self.surface.family, self.log_variance is not None)
+
+    def output(self, name: str) -> Output:
+        """An output by its name.
+
+        Raises:
+            ConfigError: there is none.
+        """
+        return named_output(self.outputs, name)
+
+    @property
+    def lights(self) -> tuple[str, ...]:
+        """The light of the pictures, then those that are built in."""
+        return (OWN_LIGHT, *NAMES)
+
+    def with_light(self, choice: LightChoice) -> TrainedObject:
+        """The object under another light.
+
+        Raises:
+            ConfigError: there is no such light.
+            SceneError: the file of an environment map is missing, damaged or unusable.
+        """
+        own = self.own_light or self.environment
+        light = own if choice.name in (None, OWN_LIGHT) else self._named_light(str(choice.name))
+        turned = Environment(
+            light.image.to(self.device),
+            light.rotation_deg + choice.rotation_deg,
+            light.exposure_stops + choice.exposure_stops,
+        )
+        return replace(self, environment=turned, own_light=own)
+
+    def _named_light(self, name: str) -> Environment:
+        if name in self.lights:
+            light = built_in_environment(name)
+            return light if self.lamp is None else of_lamp(light, self.lamp.cpu())
+        if not name.lower().endswith(ENVIRONMENT_SUFFIXES):
+            hint = did_you_mean(name, self.lights, likeness=0.5, form=" ({})")
+            raise ConfigError(
+                f"there is no environment {name!r}{hint}; known are {', '.join(self.lights)}, and the path of an "
+                f"environment map ({', '.join(ENVIRONMENT_SUFFIXES)})"
+            )
+        path = Path(name)
+        if self.bands is None or self.lamp is None:
+            return _environment_file(path, path.stat().st_mtime_ns if path.exists() else 0)
+        return read_environment_of_bands(path, self.bands, self.lamp.cpu().double().numpy())
+
+    def look(self, camera: Cameras, subpixels: int | None = None) -> ModelView:
+        """All outputs of a view; `subpixels` squared rays a pixel."""
+        rays = _SUBPIXELS if subpixels is None else subpixels
+        return self._rendered(camera, rays, self.samples, 0)
+
+    @property
+    def num_estimates(self) -> int:
+        """Estimates that have as many paths together as a finished view."""
+        return max(1, round(self.samples / _GLANCE_SAMPLES))
+
+    def estimate(self, camera: Cameras, subpixels: int, number: int) -> ModelView:
+        """All outputs of a view, with few paths; those of other numbers are independent of it."""
+        view = self._rendered(camera, subpixels, _GLANCE_SAMPLES, number + 1)
+        return replace(view, num_wanted=self.num_estimates)
+
+    def render(self, camera: Cameras, names: Collection[str]) -> dict[str, Tensor]:
+        """Outputs of a view by name, (H, W, ...).
+
+        Raises:
+            ConfigError: an unknown name.
+        """
+        known = [self.output(name).name for name in names]
+        view = self.look(camera)
+        return {name: view[name] for name in known}
+
+    def probe(self, camera: Cameras, column: int, row: int) -> Probe:
+        """All outputs in one pixel, and where its ray meets the mesh.
+
+        Raises:
+            ConfigError: the pixel is outside the image.
+        """
+        one = one_pixel(camera, column, row)
+        view = self.look(one, 1)
+        values = {name: tensor.reshape(-1).double().cpu().numpy() for name, tensor in view.tensors.items()}
+        hits = pixel_hits(self.ray_mesh, one, 0)
+        position = hits.points.positions[0].double().cpu().numpy() if len(hits) else None
+        world = None if position is None else self.frame.to_world(position[None])[0]
+        return Probe(values, float(view.opacity.reshape(-1)[0]), position, world)
+
+    @torch.no_grad()
+    def _rendered(self, camera: Cameras, subpixels: int, samples: int, number: int) -> ModelView:
+        hits = pixel_hits(self.ray_mesh, camera, 0, subpixels)
+        generator = torch.Generator(self.device).manual_seed(_seed(camera, number))
+        light = rays_radiance(
+            self.surface,
+            self.ray_mesh,
+            self.environment,
+            hits,
+            samples=samples,
+            bounces=self.bounces,
+            generator=generator,
+        )
+        return ModelView(camera, view_outputs(self, camera, hits, light))
+
+
+@lru_cache(maxsize=2)
+def _environment_file(path: Path, changed_ns: int) -> Environment:  # noqa: ARG001 - a changed file is another one
+    """An environment map, kept while it stays as it is: a slider that turns it asks for it again and again."""
+    return read_environment(path)
+
+
+def _seed(camera: Cameras, number: int) -> int:
+    """Of the samples of one view: another one for each strip of rows of a picture, always the same for the same one."""
+    return 7919 * number + round(abs(float(camera.center_px[0, 1]))) % 7907
+
+
+def trained_object(
+    model: NeumatexModel, record: SceneRecord, averages: Mapping[str, Tensor] | None = None
+) -> TrainedObject:
+    """The object of a model as it is now; training that goes on does not change it.
+
+    Args:
+        model, averages: As `frozen_parameters` takes them.
+        record: Cameras and frame of its run.
+    Raises:
+        RunError: the record is damaged.
+    """
+    frozen = frozen_parameters(model, averages)
+    triplane = copy.deepcopy(model.triplane, dict(frozen)).eval()  # type: ignore[arg-type]
+    curve = copy.deepcopy(model.curve, dict(frozen)).eval()  # type: ignore[arg-type]
+    family = copy.deepcopy(model.family, dict(frozen))  # type: ignore[arg-type]
+    return TrainedObject(
+        model.traced.ray_mesh,
+        replace(model.surface, family=family, triplane=triplane),
+        model.environment,
+        world_frame(record),
+        recorded_views(record),
+        record.scene_box,
+        curve,
+        None if model.record.is_spectral else triplane.log_variance,
+        model.config.render_samples,
+        model.config.bounces,
+        bands=model.record.bands,
+        lamp=torch.tensor(model.record.lamp) if model.record.is_spectral else None,
+    )

@@ -1,1 +1,0 @@
-"""Triangle meshes: reading them, and rays against them."""

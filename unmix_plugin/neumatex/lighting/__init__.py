@@ -1,1 +1,0 @@
-"""Light from far away: environment maps, read from files or built in."""

@@ -1,1 +1,0 @@
-"""Materials of a surface as files for others: textures, a glTF approximation, and a description of the decoder."""

@@ -1,1 +1,0 @@
-"""Families of materials: reflectances that share a set of parameters."""

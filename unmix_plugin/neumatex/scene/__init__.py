@@ -1,1 +1,0 @@
-"""An object's folder: mesh, environment and posed pictures, read and checked."""

@@ -1,0 +1,363 @@
+"""What a family of materials offers: evaluation and importance sampling of its reflectances.
+
+Notation: `N` surface points, `P` parameters of a material, `C` colours or bands. Directions are unit vectors in the
+local frame of a point, whose z axis is the shading normal; `wi` points to the light, `wo` to the eye.
+
+What families share whose directions to the light are drawn from a cosine lobe and visible GGX normals.
+
+Materials that are a stack of layers over a diffuse base.
+
+Notation as in `family`.
+
+Analytic layered materials: the truth that the neural decoder learns, and procedural objects are made of.
+
+Notation as in `family`.
+
+The metallic-roughness materials of glTF 2.0: five numbers a point.
+
+Notation as in `family`; inside, as in `microfacet`. As published these materials may reflect up to twice the light at
+grazing angles, where the diffuse part does not know how much the surface reflects. That is kept: files of this kind
+mean just this.
+
+Spectral materials: a diffuse base that is a mixture of endmember reflectances, and a grey gloss above it.
+
+Notation as in `family`, with `B` bands for its colours and `K` endmembers. With abundances a, endmembers E and the
+albedo A of the gloss for light from one direction,
+
+    f = (1 - A(wi)) (1 - A(wo)) / (1 - mean A) (a E) / pi + gloss(wi, wo)
+
+The gloss is one GGX lobe, the same in all bands. What it reflects does not reach the base, so a white base under it
+reflects all light, and no material more than it gets.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from unmix_plugin.neumatex.tracing.layers import (
+    LARGEST_COAT_ROUGHNESS,
+    LARGEST_COVER,
+    LARGEST_DIELECTRIC_F0,
+    LARGEST_HAZE,
+    LARGEST_SHEEN,
+    LayerStack,
+    ggx_albedo,
+    mean_ggx_albedo,
+)
+from unmix_plugin.neumatex.tracing.microfacet import (
+    LobeMixture,
+    alpha_of,
+    distribution,
+    dot,
+    half_vectors,
+    schlick,
+    visibility,
+)
+
+
+@runtime_checkable
+class MaterialFamily(Protocol):
+    """Reflectances with a common set of parameters, each parameter in [0, 1]; differentiable by the parameters."""
+
+    @property
+    def num_parameters(self) -> int:
+        """P."""
+        ...
+
+    @property
+    def num_colours(self) -> int:
+        """C."""
+        ...
+
+    def evaluate(
+        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N C"]:
+        """Reflectance, 1/sr, without the cosine; 0 where a direction is below the surface."""
+        ...
+
+    def sample(
+        self, parameters: Float[Tensor, "N P"], wo: Float[Tensor, "N 3"], uniforms: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N 3"]:
+        """Directions to the light, drawn about as the reflectance times the cosine is distributed; no gradient.
+
+        Args:
+            uniforms: Independent numbers in [0, 1).
+        """
+        ...
+
+    def density(
+        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, " N"]:
+        """Probability density of `sample`, 1/sr; no gradient."""
+        ...
+
+    def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
+        """Base colour, linear, [0, 1]: what a metal reflects, and the diffuse albedo of everything else."""
+        ...
+
+
+@runtime_checkable
+class DecodableFamily(MaterialFamily, Protocol):
+    """A family whose parameters are decoded by a network, once for all directions at a point."""
+
+    @property
+    def decoded_family(self) -> MaterialFamily:
+        """The same reflectances by decoded parameters, which need no network."""
+        ...
+
+    def decoded(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N D"]:
+        """Parameters of `decoded_family`; differentiable."""
+        ...
+
+
+class LobeFamily(ABC):
+    """Sampling by a mixture of lobes; notation as in `family`."""
+
+    @torch.no_grad()
+    def sample(
+        self, parameters: Float[Tensor, "N P"], wo: Float[Tensor, "N 3"], uniforms: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N 3"]:
+        """Directions to the light, drawn from a cosine lobe and visible GGX normals."""
+        wo = wo.T.contiguous()
+        return self._mixture(parameters, wo).sample(wo, uniforms.T.contiguous()).T.contiguous()
+
+    @torch.no_grad()
+    def density(
+        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, " N"]:
+        """Probability density of `sample`, 1/sr."""
+        wo = wo.T.contiguous()
+        return self._mixture(parameters, wo).density(wi.T.contiguous(), wo)
+
+    @abstractmethod
+    def _mixture(self, parameters: Float[Tensor, "N P"], wo: Float[Tensor, "3 N"]) -> LobeMixture:
+        """The lobes of each point, seen along a direction."""
+
+
+class StackFamily(ABC):
+    """Parameters of a material; the first three are its diffuse colour, linear, and all of them give its layers."""
+
+    num_colours = 3
+
+    @abstractmethod
+    def stack(self, parameters: Float[Tensor, "N P"]) -> LayerStack:
+        """The layers that the parameters stand for."""
+
+    def evaluate(
+        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N C"]:
+        """Reflectance, 1/sr, without the cosine: what passes the layers times the base over pi, and what they
+        reflect; 0 where a direction is below the surface."""
+        passed, specular = self.stack(parameters).reflectance(wi.T.contiguous(), wo.T.contiguous())
+        return ((passed / math.pi) * self.diffuse_colour(parameters).T + specular).T
+
+    @torch.no_grad()
+    def sample(
+        self, parameters: Float[Tensor, "N P"], wo: Float[Tensor, "N 3"], uniforms: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N 3"]:
+        """Directions to the light, drawn from a cosine lobe and three GGX lobes."""
+        wo = wo.T.contiguous()
+        mixture = self.stack(parameters).mixture(wo, self.diffuse_colour(parameters).T)
+        return mixture.sample(wo, uniforms.T.contiguous()).T.contiguous()
+
+    @torch.no_grad()
+    def density(
+        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, " N"]:
+        """Probability density of `sample`, 1/sr."""
+        wo = wo.T.contiguous()
+        mixture = self.stack(parameters).mixture(wo, self.diffuse_colour(parameters).T)
+        return mixture.density(wi.T.contiguous(), wo)
+
+    def diffuse_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
+        """Linear albedo of what is below the layers; a metal has nothing there, and the colour says nothing."""
+        return parameters[:, :3]
+
+    def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
+        """Linear base colour: what a metal reflects, and the diffuse albedo of everything else."""
+        layers = self.stack(parameters)
+        return torch.lerp(self.diffuse_colour(parameters), layers.metal_colour.T, layers.metallicity[:, None])
+
+
+class LayeredFamily(StackFamily):
+    """Dust over sheen over clear coat over a surface with haze over a base that is diffuse or metal.
+
+    Parameters, each in [0, 1]:
+
+    | index | name | meaning |
+    | --- | --- | --- |
+    | 0 to 2 | base colour | linear RGB; what a metal reflects, and the diffuse albedo of everything else |
+    | 3 | metallicity | 0 dielectric, 1 metal |
+    | 4 | roughness | perceptual; the GGX width is about its square |
+    | 5 | specular level | `f0` of the dielectric, 0 to 0.08; 0.5 is a refractive index of 1.5 |
+    | 6 | coat weight | of a clear coat of index 1.5 |
+    | 7 | coat roughness | perceptual, 0 to 0.6 |
+    | 8 | sheen weight | 0 to 0.6 |
+    | 9 | sheen roughness | 0 hugs the silhouette, 1 is all over |
+    | 10 | sheen tint | from white to the hue of the base colour |
+    | 11 | haze weight | share of the surface's reflection that is spread, 0 to 0.7 |
+    | 12 | haze spread | the haze's roughness is `roughness + (1 - roughness) (0.15 + 0.6 spread)` |
+    | 13 | dust | cover at normal incidence, 0 to 0.7 |
+    """
+
+    PARAMETERS = (
+        "base colour R", "base colour G", "base colour B", "metallicity", "roughness", "specular level", "coat weight",
+        "coat roughness", "sheen weight", "sheen roughness", "sheen tint", "haze weight", "haze spread", "dust",
+    )  # fmt: skip
+    num_parameters = len(PARAMETERS)
+
+    def stack(self, parameters: Float[Tensor, "N P"]) -> LayerStack:
+        """The layers that the parameters stand for."""
+        base, scalars = parameters.T.contiguous().split([3, parameters.shape[1] - 3])
+        metallicity, roughness, level, coat, coat_roughness, *others = scalars.unbind(0)
+        sheen, sheen_roughness, tint, haze, spread, dust = others
+        hue = base / base.amax(0).clamp_min(1e-3)
+        hazy = roughness + (1.0 - roughness) * (0.15 + 0.6 * spread)
+        return LayerStack(
+            dust_cover=LARGEST_COVER * dust,
+            sheen_colour=LARGEST_SHEEN * sheen * (1.0 + tint * (hue - 1.0)),
+            sheen_roughness=sheen_roughness,
+            coat_weight=coat,
+            roughness=torch.stack([LARGEST_COAT_ROUGHNESS * coat_roughness, roughness, hazy]),
+            haze_weight=LARGEST_HAZE * haze,
+            metallicity=metallicity,
+            metal_colour=base,
+            dielectric_f0=LARGEST_DIELECTRIC_F0 * level,
+        )
+
+
+_DIELECTRIC_F0 = 0.04
+
+
+class PbrFamily(LobeFamily):
+    """Parameters: base colour (0 to 2, linear), roughness (3), metallicity (4).
+
+    Source:
+        glTF 2.0 specification, appendix B.
+    """
+
+    PARAMETERS = ("base colour R", "base colour G", "base colour B", "roughness", "metallicity")
+    num_parameters = len(PARAMETERS)
+    num_colours = 3
+
+    def evaluate(
+        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N C"]:
+        """Reflectance, 1/sr, without the cosine; 0 where a direction is below the surface."""
+        base, roughness, metallicity = _columns(parameters)
+        wi, wo = wi.T.contiguous(), wo.T.contiguous()
+        half = half_vectors(wi, wo)
+        f0 = _DIELECTRIC_F0 + metallicity * (base - _DIELECTRIC_F0)
+        fresnel = f0 + (1.0 - f0) * schlick(dot(wo, half))
+        alpha = alpha_of(roughness)
+        lobe = distribution(alpha, half) * visibility(alpha, wi[2], wo[2])
+        diffuse = (1.0 - fresnel) * ((1.0 - metallicity) / math.pi) * base
+        return ((diffuse + fresnel * lobe) * ((wi[2] > 0) & (wo[2] > 0))).T
+
+    def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
+        """Linear base colour; of metals, the colour of what they reflect."""
+        return parameters[:, :3]
+
+    def _mixture(self, parameters: Tensor, wo: Tensor) -> LobeMixture:
+        base, roughness, metallicity = _columns(parameters)
+        f0 = _DIELECTRIC_F0 + metallicity * (base.mean(0) - _DIELECTRIC_F0)
+        specular = f0 + (1.0 - f0) * schlick(wo[2])
+        diffuse = (1.0 - metallicity) * base.mean(0) * (1.0 - f0)
+        return LobeMixture.of_albedos(alpha_of(roughness), diffuse[0], specular)
+
+
+def _columns(parameters: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Base colour (3 N), roughness (1 N) and metallicity (1 N)."""
+    base, roughness, metallicity = parameters.T.contiguous().split([3, 1, 1])
+    return base, roughness, metallicity
+
+
+NUM_GLOSS = 2
+"""Parameters of the gloss."""
+
+
+class SpectralFamily(LobeFamily):
+    """Parameters: abundances (0 to K - 1, at least 0, sum 1), roughness (K), specular level (K + 1).
+
+    The gloss reflects the square of the specular level at normal incidence: 0.2 is a common dielectric's 4 %.
+    """
+
+    def __init__(self, endmembers: Float[Tensor, "K B"], gains: Float[Tensor, " K"] | None = None) -> None:
+        """
+        Args:
+            endmembers: Reflectances, [0, 1]; kept as they are given, so that their gradients arrive there.
+            gains: Factors of the endmembers, whose gradients tell how bright these should be. They are 1 except within
+                a step of training, so that `endmembers` are the whole reflectances.
+        """
+        self.endmembers = endmembers
+        self.gains = endmembers.new_ones(len(endmembers)) if gains is None else gains
+
+    @property
+    def num_endmembers(self) -> int:
+        """K."""
+        return self.endmembers.shape[0]
+
+    @property
+    def num_parameters(self) -> int:
+        """K + 2."""
+        return self.num_endmembers + NUM_GLOSS
+
+    @property
+    def num_colours(self) -> int:
+        """B."""
+        return self.endmembers.shape[1]
+
+    @property
+    def PARAMETERS(self) -> tuple[str, ...]:  # noqa: N802 - as the other families call it
+        """Names of the parameters."""
+        shares = tuple(f"abundance {index}" for index in range(self.num_endmembers))
+        return (*shares, "roughness", "specular level")
+
+    def abundances(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N K"]:
+        """Share of each endmember."""
+        return parameters[:, : self.num_endmembers]
+
+    def evaluate(
+        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N C"]:
+        """Reflectance, 1/sr, without the cosine; 0 where a direction is below the surface."""
+        roughness, f0 = self._gloss(parameters)
+        wi, wo = wi.T.contiguous(), wo.T.contiguous()
+        half = half_vectors(wi, wo)
+        alpha = alpha_of(roughness)
+        fresnel = f0 + (1.0 - f0) * schlick(dot(wo, half))
+        gloss = fresnel * distribution(alpha, half) * visibility(alpha, wi[2], wo[2])
+        a, b = mean_ggx_albedo(roughness)
+        passed = _passing(roughness, f0, wi[2]) * _passing(roughness, f0, wo[2]) / (1.0 - (f0 * a + b))
+        above = (wi[2] > 0) & (wo[2] > 0)
+        base = self.base_colour(parameters)
+        return (passed * above / math.pi).T * base + (gloss * above).T
+
+    def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
+        """Diffuse reflectance of each band, [0, 1]."""
+        return self.abundances(parameters) @ (self.gains[:, None] * self.endmembers)
+
+    def _gloss(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
+        """Roughness (1 N), and what the gloss reflects at normal incidence (1 N)."""
+        roughness, level = parameters[:, self.num_endmembers :].T.contiguous().split([1, 1])
+        return roughness, level * level
+
+    def _mixture(self, parameters: Tensor, wo: Tensor) -> LobeMixture:
+        roughness, f0 = self._gloss(parameters)
+        passed = _passing(roughness, f0, wo[2])
+        diffuse = passed[0] * self.base_colour(parameters).mean(dim=1)
+        return LobeMixture.of_albedos(alpha_of(roughness), diffuse, 1.0 - passed)
+
+
+def _passing(
+    roughness: Float[Tensor, "1 N"], f0: Float[Tensor, "1 N"], cosine: Float[Tensor, " N"]
+) -> Float[Tensor, "1 N"]:
+    """Share of light from a direction that the gloss does not reflect."""
+    a, b = ggx_albedo(roughness, cosine.clamp_min(0.0))
+    return 1.0 - (f0 * a + b)

@@ -1,0 +1,314 @@
+"""A thin coat of dust: grey-brown, thicker to see along it than through it.
+
+What a direction passes through falls with its cosine mu as `(1 - cover)^(1 / mu)`; the rest is scattered such that a
+white dust would lose no light.
+
+Sheen of cloth: the distribution called Charlie.
+
+Notation as in `microfacet`.
+
+Directional albedos of the lobes, integrated once and looked up afterwards.
+
+A table's rows are perceptual roughness from 0 to 1, its columns the square root of the cosine from 0 to 1: albedos
+change fastest near the horizon.
+
+Layers over a diffuse or metallic base: dust, sheen, clear coat, a glossy surface with haze.
+
+Notation as in `microfacet`. From the top, each layer reflects its share and lets `1 - albedo` of each direction through
+to what is below, on the way in and on the way out. So the stack is reciprocal and never reflects more than it gets.
+All of it is `passed * base / pi + specular`, where only `passed` is the part that meets the diffuse base colour.
+"""
+
+import math
+from dataclasses import dataclass, fields
+from functools import lru_cache
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from unmix_plugin.neumatex.tracing.microfacet import (
+    SMALLEST_COSINE,
+    LobeMixture,
+    alpha_of,
+    distribution,
+    dot,
+    half_vectors,
+    sample_reflections,
+    schlick,
+    visibility,
+)
+
+LARGEST_COVER = 0.7
+DUST_COLOUR = (0.52, 0.46, 0.38)
+"""Linear RGB."""
+
+
+def dust_passed(cover: Float[Tensor, " N"], cosine: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
+    """Share of light along a direction that passes the dust.
+
+    >>> dust_passed(torch.tensor([0.5]), torch.tensor([0.5]))
+    tensor([0.2500])
+    """
+    return torch.exp(torch.log1p(-cover) / cosine.clamp_min(SMALLEST_COSINE))
+
+
+def mean_held(cover: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
+    """Share of cosine-weighted light of the whole hemisphere that the dust holds back.
+
+    With tau = -log(1 - cover) it is 1 - 2 E3(tau); the exponential integral is summed at Gauss-Legendre nodes.
+    """
+    log_passed = torch.log1p(-cover)
+    nodes = zip(_NODES, _WEIGHTS, strict=True)
+    passed = [2.0 * weight * mu * torch.exp(log_passed * (1.0 / mu)) for mu, weight in nodes]
+    return 1.0 - torch.stack(passed).sum(0)
+
+
+# Six nodes of Gauss and Legendre on [0, 1].
+_NODES = (0.03376524, 0.16939531, 0.38069041, 0.61930959, 0.83060469, 0.96623476)
+_WEIGHTS = (0.08566225, 0.18038079, 0.23395697, 0.23395697, 0.18038079, 0.08566225)
+
+
+_SMALLEST_WIDTH = 0.22
+"""Narrower ones would reflect more than all light near the horizon."""
+
+
+def sheen_reflection(
+    roughness: Float[Tensor, " N"],
+    half: Float[Tensor, "3 N"],
+    n_i: Float[Tensor, " N"],
+    n_o: Float[Tensor, " N"],
+) -> Float[Tensor, " N"]:
+    """White sheen, 1/sr, at a half vector; both directions above the surface.
+
+    Source:
+        Estevez and Kulla 2017, Production friendly microfacet sheen BRDF; visibility of Ashikhmin and Premoze.
+    """
+    exponent = 1.0 / (_SMALLEST_WIDTH + (1.0 - _SMALLEST_WIDTH) * roughness)
+    log_sine2 = torch.log((half[0] * half[0] + half[1] * half[1]).clamp_min(1e-12))
+    density = (2.0 + exponent) / (2.0 * math.pi) * torch.exp(exponent * (0.5 * log_sine2))
+    n_i, n_o = n_i.clamp_min(SMALLEST_COSINE), n_o.clamp_min(SMALLEST_COSINE)
+    return density / (4.0 * (n_i + n_o - n_i * n_o))
+
+
+_ROWS, _COLUMNS, _STRATA = 32, 48, 32
+
+
+def ggx_albedo(
+    roughness: Float[Tensor, "K N"], cosine: Float[Tensor, " N"]
+) -> tuple[Float[Tensor, "K N"], Float[Tensor, "K N"]]:
+    """`(a, b)`: a GGX lobe of Schlick's Fresnel term reflects `f0 a + b` of what comes from this cosine."""
+    a, b = _look_up(_ggx_cells(roughness.device), roughness, cosine).unbind(0)
+    return a, b
+
+
+def sheen_albedo(roughness: Float[Tensor, " N"], cosine: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
+    """Directional albedo of white sheen, [0, 1]."""
+    return _look_up(_sheen_cells(roughness.device), roughness[None], cosine)[0, 0]
+
+
+def mean_ggx_albedo(roughness: Float[Tensor, "K N"]) -> tuple[Float[Tensor, "K N"], Float[Tensor, "K N"]]:
+    """`(a, b)` of `ggx_albedo`, averaged over the hemisphere with the cosine as weight."""
+    means = _ggx_means(roughness.device)
+    row = (roughness.detach() * (_ROWS - 1)).floor().clamp(0, _ROWS - 2)
+    index = row.long().reshape(-1)
+    low, rise = (each.index_select(1, index).reshape(2, *roughness.shape) for each in means)
+    a, b = (low + (roughness * (_ROWS - 1) - row) * rise).unbind(0)
+    return a, b
+
+
+@lru_cache(maxsize=1)
+def ggx_table() -> Float[Tensor, "R M 2"]:
+    """Quasi Monte Carlo over visible normals, on a grid of strata."""
+    roughness, cosine = _nodes(_COLUMNS, alpha_of(torch.linspace(0.0, 1.0, _ROWS)))
+    table = torch.empty(_ROWS * _COLUMNS, 2)
+    steps = (torch.arange(_STRATA) + 0.5) / _STRATA
+    uniforms = torch.cartesian_prod(steps, steps).T
+    for node in range(_ROWS * _COLUMNS):
+        wo = _direction(cosine[node])[:, None].expand(3, uniforms.shape[1])
+        alpha = roughness[node].expand(uniforms.shape[1])
+        wi = sample_reflections(alpha, wo, uniforms)
+        a2, n_i, n_o = alpha[0] ** 2, wi[2].clamp_min(0.0), wo[2]
+        root_i, root_o = (torch.sqrt(a2 + (1.0 - a2) * n * n) for n in (n_i, n_o))
+        # Reflectance times cosine over density: masking of both directions over masking of the eye's alone.
+        passed = n_i * (n_o + root_o) / (n_o * root_i + n_i * root_o).clamp_min(1e-9)
+        edge = schlick(dot(half_vectors(wi, wo), wo))
+        table[node] = torch.stack([((1.0 - edge) * passed).mean(), (edge * passed).mean()])
+    return table.reshape(_ROWS, _COLUMNS, 2)
+
+
+@lru_cache(maxsize=1)
+def sheen_table() -> Float[Tensor, "R M 1"]:
+    """A product rule over the hemisphere."""
+    roughness, cosine = _nodes(_COLUMNS, torch.linspace(0.0, 1.0, _ROWS))
+    steps = (torch.arange(2 * _STRATA) + 0.5) / (2 * _STRATA)
+    u, v = torch.cartesian_prod(steps, steps).unbind(-1)
+    # Squared steps crowd at the horizon; du of the cosine is 2 u.
+    wi_z, weight = u * u, 2.0 * u
+    sine = torch.sqrt(1.0 - wi_z * wi_z)
+    wi = torch.stack([sine * torch.cos(math.pi * v), sine * torch.sin(math.pi * v), wi_z])
+    table = torch.empty(_ROWS * _COLUMNS, 1)
+    for node in range(_ROWS * _COLUMNS):
+        wo = _direction(cosine[node])[:, None].expand_as(wi)
+        value = sheen_reflection(roughness[node].expand_as(wi_z), half_vectors(wi, wo), wi_z, wo[2])
+        table[node] = (value * wi_z * weight).mean() * 2.0 * math.pi
+    return table.reshape(_ROWS, _COLUMNS, 1)
+
+
+def _nodes(columns: int, rows: Tensor) -> tuple[Tensor, Tensor]:
+    cosine = torch.linspace(0.0, 1.0, columns).square().clamp_min(SMALLEST_COSINE)
+    return rows.repeat_interleave(columns), cosine.repeat(len(rows))
+
+
+def _direction(cosine: Tensor) -> Tensor:
+    return torch.stack([torch.sqrt(1.0 - cosine * cosine), torch.zeros_like(cosine), cosine])
+
+
+def _mean(table: Tensor) -> Tensor:
+    """Average over directions, row by row: the integral of 2 mu E(mu), with mu the square of the column."""
+    s = torch.linspace(0.0, 1.0, table.shape[1])
+    return torch.trapezoid(4.0 * s[:, None] ** 3 * table, s, dim=1)
+
+
+@lru_cache(maxsize=4)
+def _ggx_cells(device: torch.device) -> Tensor:
+    return _cells(ggx_table()).to(device)
+
+
+@lru_cache(maxsize=4)
+def _ggx_means(device: torch.device) -> tuple[Tensor, Tensor]:
+    """Means of each row, (2, rows), and their rise to the next row."""
+    means = _mean(ggx_table()).T.contiguous().to(device)
+    return means, means.diff(dim=1)
+
+
+@lru_cache(maxsize=4)
+def _sheen_cells(device: torch.device) -> Tensor:
+    return _cells(sheen_table()).to(device)
+
+
+def _cells(table: Tensor) -> Tensor:
+    """Four coefficients of each bilinear cell for each channel, (4 channels, cells)."""
+    corner, right = table[:-1, :-1], table[:-1, 1:] - table[:-1, :-1]
+    below, twist = table[1:, :-1] - table[:-1, :-1], table[1:, 1:] - table[1:, :-1] - right
+    cells = torch.stack([corner, right, below, twist])
+    return cells.permute(0, 3, 1, 2).reshape(4 * table.shape[2], -1).contiguous()
+
+
+def _look_up(cells: Tensor, roughness: Tensor, cosine: Tensor) -> Tensor:
+    """Bilinear, (channels K N); the gradient goes to the roughness."""
+    row = (roughness.detach() * (_ROWS - 1)).floor().clamp(0, _ROWS - 2)
+    at = torch.sqrt(cosine.clamp(0.0, 1.0)) * (_COLUMNS - 1)
+    column = at.floor().clamp(0, _COLUMNS - 2)
+    index = (row * (_COLUMNS - 1) + column).long().reshape(-1)
+    corner, right, below, twist = cells.index_select(1, index).reshape(
+        4, cells.shape[0] // 4, *roughness.shape
+    )
+    x = at - column
+    return (corner + x * right) + (roughness * (_ROWS - 1) - row) * (below + x * twist)
+
+
+_COAT_F0 = 0.04
+LARGEST_DIELECTRIC_F0 = 0.08
+LARGEST_COAT_ROUGHNESS = 0.6
+LARGEST_SHEEN = 0.6
+LARGEST_HAZE = 0.7
+
+
+@dataclass(frozen=True)
+class LayerStack:
+    """Materials at N points; every number in [0, 1]."""
+
+    dust_cover: Float[Tensor, " N"]
+    """How much of light at normal incidence meets dust."""
+    sheen_colour: Float[Tensor, "3 N"]
+    sheen_roughness: Float[Tensor, " N"]
+    coat_weight: Float[Tensor, " N"]
+    roughness: Float[Tensor, "3 N"]
+    """Perceptual: of the coat, of the surface, of its haze."""
+    haze_weight: Float[Tensor, " N"]
+    """How much of the surface's reflection is spread into the haze."""
+    metallicity: Float[Tensor, " N"]
+    metal_colour: Float[Tensor, "3 N"]
+    dielectric_f0: Float[Tensor, " N"]
+
+    def repeat(self, times: int) -> "LayerStack":
+        """Each material `times` times in a row."""
+        return LayerStack(
+            **{each.name: getattr(self, each.name).repeat_interleave(times, -1) for each in fields(self)}
+        )
+
+    def reflectance(
+        self, wi: Float[Tensor, "3 N"], wo: Float[Tensor, "3 N"]
+    ) -> tuple[Float[Tensor, " N"], Float[Tensor, "3 N"]]:
+        """`(passed, specular)`: what passes down to the base and up again, and what the layers reflect, 1/sr.
+
+        Both are 0 where a direction is below the surface.
+        """
+        light, eye = self.passing(wi[2]), self.passing(wo[2])
+        dust = light.dust * eye.dust
+        sheen = dust * light.sheen * eye.sheen
+        coat = sheen * light.coat * eye.coat
+        half = half_vectors(wi, wo)
+        edge = schlick(dot(wo, half))
+        alpha = alpha_of(self.roughness)
+        lobes = distribution(alpha, half) * visibility(alpha, wi[2], wo[2])
+        coat_lobe, sharp, hazy = lobes.unbind(0)
+        of_coat = self.coat_weight * (_COAT_F0 + (1.0 - _COAT_F0) * edge) * coat_lobe
+        surface = coat * self._mixed(sharp, hazy)
+        of_sheen = dust * sheen_reflection(self.sheen_roughness, half, wi[2], wo[2])
+        # f0 + (1 - f0) edge, of three colours, with what has none apart.
+        specular = self.f0 * (surface * (1.0 - edge)) + (surface * edge + sheen * of_coat)
+        specular = specular + of_sheen * self.sheen_colour + self._dust(light.dust, eye.dust)
+        above = (wi[2] > 0) & (wo[2] > 0)
+        passed = coat * (1.0 - self.metallicity) * light.surface * eye.surface / self._surface_mean()
+        return passed * above, specular * above
+
+    def mixture(self, wo: Float[Tensor, "3 N"], base: Float[Tensor, "C N"]) -> LobeMixture:
+        """A density about like the reflectance times the cosine; without gradient."""
+        with torch.no_grad():
+            eye = self.passing(wo[2])
+            f0 = self.f0.mean(0)
+            edge = schlick(wo[2]) * (1.0 - self.roughness[1])
+            surface = eye.dust * eye.sheen * eye.coat * (f0 + (1.0 - f0) * edge)
+            coat = eye.dust * eye.sheen * (1.0 - eye.coat)
+            specular = torch.stack([coat, surface * (1.0 - self.haze_weight), surface * self.haze_weight])
+            below = eye.dust * eye.sheen * eye.coat * eye.surface * (1.0 - self.metallicity) * base.mean(0)
+            diffuse = below + 0.5 * (1.0 - eye.dust) + eye.dust * (1.0 - eye.sheen)
+            return LobeMixture.of_albedos(alpha_of(self.roughness), diffuse, specular)
+
+    @property
+    def f0(self) -> Float[Tensor, "3 N"]:
+        """What the surface reflects at normal incidence."""
+        return self.dielectric_f0 + self.metallicity * (self.metal_colour - self.dielectric_f0)
+
+    def _dust(self, passed_light: Tensor, passed_eye: Tensor) -> Tensor:
+        held = (1.0 - passed_light) * (1.0 - passed_eye) / mean_held(self.dust_cover).clamp_min(1e-6)
+        return held * (torch.tensor(DUST_COLOUR, device=held.device)[:, None] / math.pi)
+
+    def passing(self, cosine: Float[Tensor, " N"]) -> "Passing":
+        """What each layer lets through from one direction to what is below."""
+        cosine = cosine.clamp_min(0.0)
+        (coat_a, *surface_a), (coat_b, *surface_b) = (x.unbind(0) for x in ggx_albedo(self.roughness, cosine))
+        coat = 1.0 - self.coat_weight * (_COAT_F0 * coat_a + coat_b)
+        surface = 1.0 - (self.dielectric_f0 * self._mixed(*surface_a) + self._mixed(*surface_b))
+        sheen = 1.0 - self.sheen_colour.amax(0) * sheen_albedo(self.sheen_roughness, cosine)
+        return Passing(dust_passed(self.dust_cover, cosine), sheen, coat, surface)
+
+    def _surface_mean(self) -> Tensor:
+        """Mean of `surface` over directions, which makes a white base under it lose no light."""
+        (_, *a), (_, *b) = (x.unbind(0) for x in mean_ggx_albedo(self.roughness))
+        return 1.0 - (self.dielectric_f0 * self._mixed(*a) + self._mixed(*b))
+
+    def _mixed(self, sharp: Tensor, hazy: Tensor) -> Tensor:
+        return sharp + self.haze_weight * (hazy - sharp)
+
+
+@dataclass(frozen=True)
+class Passing:
+    """Shares of light along one direction that pass each layer, (N)."""
+
+    dust: Tensor
+    sheen: Tensor
+    coat: Tensor
+    surface: Tensor

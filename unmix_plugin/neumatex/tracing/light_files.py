@@ -1,0 +1,288 @@
+"""Environment maps from OpenEXR and Radiance files, checked.
+
+Notation: `H x W` pixels.
+
+Reading Radiance's RGBE pictures (.hdr).
+
+Source: Ward 1991, Real Pixels, Graphics Gems II; the run-length code of the Radiance file format's documentation.
+
+Notation: `H x W` pixels.
+
+Light for pictures of many bands: a lamp's spectrum, and environments that have a spectrum in every direction.
+
+An environment in colours says how bright each direction is, not what its spectrum is. With a lamp, every direction has
+the lamp's spectrum times the luminance of its colour: radiance of band b is `Y(direction) lamp_b`, where the lamp's
+greatest band is 1. An environment whose channels are wavelengths needs no lamp; it is brought to the bands by linear
+interpolation.
+
+Notation: `B` bands, `H x W` pixels.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Float64
+from torch import Tensor
+
+from unmix_plugin.errors import SceneError, SpectrumError, counted
+from unmix_plugin.neumatex.tracing.environment import Environment
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.colour.conversion import illuminant_power, parse_light
+from unmix_plugin.spectral.library.material_library import read_library_table
+from unmix_plugin.spectral.library.spectra_csv import resample_spectra
+
+ENVIRONMENT_SUFFIXES = (".exr", ".hdr")
+"""Formats that are read."""
+
+
+def read_environment(path: Path, rotation_deg: float = 0.0, exposure_stops: float = 0.0) -> Environment:
+    """The light of a latitude-longitude picture.
+
+    Args:
+        path: A .exr file with channels R, G, B (or Y), or a .hdr file; twice as wide as high.
+        rotation_deg: Turns the light about +z, counter-clockwise seen from above.
+        exposure_stops: Radiance is the picture's times 2 to this power.
+    Raises:
+        SceneError: the file is missing, damaged or of another kind, or has NaN, infinite or negative values, no light
+            at all, or another aspect.
+    """
+    if not path.is_file():
+        raise SceneError(f"{path}: there is no such environment map")
+    readers = {".exr": _read_exr, ".hdr": read_hdr}
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise SceneError(
+            f"{path}: is not an environment map; convert it to one of {', '.join(ENVIRONMENT_SUFFIXES)}"
+        )
+    image = reader(path)
+    check_environment(path, image)
+    return Environment(torch.from_numpy(np.ascontiguousarray(image)), rotation_deg, exposure_stops)
+
+
+def _read_exr(path: Path) -> np.ndarray:
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: channel.pixels for name, channel in file.channels().items()}
+    except Exception as error:
+        raise SceneError(f"{path}: can't be read as OpenEXR; copy or export it again") from error
+    names = next((names for names in (("R", "G", "B"), ("Y", "Y", "Y")) if set(names) <= set(channels)), None)
+    if names is None:
+        raise SceneError(f"{path}: has channels {', '.join(channels)}; an environment map needs R, G and B")
+    return np.stack([channels[name].astype(np.float32) for name in names], axis=-1)
+
+
+def check_environment(path: Path, image: np.ndarray) -> None:
+    height, width = image.shape[:2]
+    if width != 2 * height:
+        raise SceneError(
+            f"{path}: is {width} x {height} pixels; a latitude-longitude map is twice as wide as high, so crop or "
+            "convert it"
+        )
+    for fault, where in {
+        "a value that is not finite": ~np.isfinite(image).all(axis=-1),
+        "a negative value": (image < 0).any(axis=-1),
+    }.items():
+        if where.any():
+            row, column = (int(index[0]) for index in np.nonzero(where))
+            values = image[row, column].tolist()
+            raise SceneError(
+                f"{path}: has {fault} in {counted(int(where.sum()), 'pixel')}, first in row {row}, column {column}: "
+                f"{values}; repair the picture"
+            )
+    if not (image > 0).any():
+        raise SceneError(
+            f"{path}: is black everywhere, so nothing would be lit; choose another environment map"
+        )
+
+
+_NEW_RUNS = (8, 0x7FFF)
+"""Widths, in pixels, that may have the newer run-length code."""
+
+
+def read_hdr(path: Path) -> Float32[np.ndarray, "H W 3"]:
+    """Linear radiance of a picture whose rows run from the top, each from the left.
+
+    Raises:
+        SceneError: the file is damaged, holds XYZ instead of RGB, or stores its pixels in another order.
+    """
+    data = path.read_bytes()
+    height, width, start = _header(path, data)
+    rgbe = np.empty((height, width, 4), dtype=np.uint8)
+    row = 0
+    try:
+        for row in range(height):
+            start = _read_row(data, start, rgbe[row])
+    except (IndexError, ValueError) as error:
+        raise SceneError(f"{path}: ends or breaks in row {row} of {height}; copy the file again") from error
+    exponents = rgbe[..., 3:].astype(np.int32)
+    scale = np.where(exponents > 0, np.ldexp(np.float32(1.0), exponents - 136), np.float32(0.0))
+    return (rgbe[..., :3] * scale).astype(np.float32)
+
+
+def _header(path: Path, data: bytes) -> tuple[int, int, int]:
+    """Rows, columns and where the pixels start."""
+    match = re.search(rb"\n\n(\S+) (\d+) (\S+) (\d+)\n", data[:65536])
+    if not data.startswith((b"#?RADIANCE", b"#?RGBE")) or match is None:
+        raise SceneError(f"{path}: is no Radiance picture (its header is missing); convert it to .exr")
+    if b"FORMAT=32-bit_rle_xyze" in data[: match.start()]:
+        raise SceneError(f"{path}: holds XYZ colours; convert it to RGB")
+    if (match[1], match[3]) != (b"-Y", b"+X"):
+        raise SceneError(
+            f"{path}: has its rows in the order {match[0].decode().strip()!r}, not -Y +X; convert it"
+        )
+    return int(match[2]), int(match[4]), match.end()
+
+
+def _read_row(data: bytes, start: int, row: np.ndarray) -> int:
+    """Fill a row's (W, 4) bytes; where the next row starts."""
+    width = len(row)
+    coded = _NEW_RUNS[0] <= width <= _NEW_RUNS[1] and data[start : start + 2] == b"\x02\x02"
+    if not coded:
+        return _read_old_row(data, start, row)
+    if data[start + 2] << 8 | data[start + 3] != width:
+        raise ValueError("length of the row")
+    start += 4
+    for channel in range(4):
+        column = 0
+        while column < width:
+            count = data[start]
+            if count > 128:
+                count -= 128
+                values, used = data[start + 1], 2
+            else:
+                values, used = np.frombuffer(data, np.uint8, count, start + 1), count + 1
+            if count == 0 or column + count > width:
+                raise ValueError("run")
+            row[column : column + count, channel] = values
+            column, start = column + count, start + used
+    return start
+
+
+def _read_old_row(data: bytes, start: int, row: np.ndarray) -> int:
+    """A row of plain pixels, in which (1, 1, 1, n) repeats the pixel before it."""
+    column, shift = 0, 0
+    while column < len(row):
+        pixel = np.frombuffer(data, np.uint8, 4, start)
+        start += 4
+        if tuple(pixel[:3]) == (1, 1, 1):
+            count = int(pixel[3]) << shift
+            if column == 0 or column + count > len(row):
+                raise ValueError("run")
+            row[column : column + count] = row[column - 1]
+            column, shift = column + count, shift + 8
+        else:
+            row[column] = pixel
+            column, shift = column + 1, 0
+    return start
+
+
+_LUMINANCE = (0.2126, 0.7152, 0.0722)
+"""Of the sRGB primaries."""
+_FILES = (".csv", ".hdr", ".sli")
+
+
+def read_lamp(lamp: str, bands: Bands) -> Float64[np.ndarray, " B"]:
+    """A lamp's relative power in each band, greatest 1.
+
+    Args:
+        lamp: Path of a table with one spectrum, a .csv (`wavelength,power`) or an ENVI spectral library; or the name
+            of a known light (D65, A, FL2, ...).
+        bands: Of the pictures.
+    Raises:
+        SpectrumError: the file is missing, malformed or holds several spectra; a light that is not known; one that is
+            not known at all bands, or zero in one of them.
+    """
+    path = Path(lamp)
+    if path.suffix.lower() not in _FILES:
+        return _lit_everywhere(illuminant_power(parse_light(lamp), bands), lamp, bands)
+    table = read_library_table(path)
+    if len(table.names) != 1:
+        raise SpectrumError(f"{path}: a lamp has one spectrum; found {len(table.names)}: {table.names}")
+    try:
+        power = resample_spectra(table.spectra[0], table.bands, bands)
+    except SpectrumError as error:
+        raise SpectrumError(f"{path}: {error}") from error
+    return _lit_everywhere(power, lamp, bands)
+
+
+def read_environment_of_bands(
+    path: Path,
+    bands: Bands,
+    lamp: Float64[np.ndarray, " B"] | None,
+    rotation_deg: float = 0.0,
+    exposure_stops: float = 0.0,
+) -> Environment:
+    """The light of a latitude-longitude picture in colours or of wavelengths; see `read_environment`.
+
+    Raises:
+        SceneError: as `read_environment`; wavelengths that do not reach all bands; colours without a lamp.
+    """
+    spectral = _read_wavelengths(path, bands) if path.suffix.lower() == ".exr" and path.is_file() else None
+    if spectral is not None:
+        check_environment(path, spectral)
+        return Environment(torch.from_numpy(spectral), rotation_deg, exposure_stops)
+    colours = read_environment(path, rotation_deg, exposure_stops)
+    if lamp is None:
+        raise SceneError(
+            f"{path}: is in colours, and the pictures have {len(bands)} bands, so the light's spectrum is not known; "
+            "give the lamp's with 'illuminant_path' in transforms.json or --pipeline.datamanager.lamp (a .csv with "
+            "wavelength,power, an ENVI spectral library, or a name such as D65), or an OpenEXR environment whose "
+            "channels are wavelengths"
+        )
+    return of_lamp(colours, torch.from_numpy(lamp))
+
+
+def of_lamp(environment: Environment, lamp: Float[Tensor, "B"]) -> Environment:
+    """An environment in three colours as one whose every direction has a lamp's spectrum, as bright as its colour."""
+    image = environment.image
+    luminance = image @ image.new_tensor(_LUMINANCE)
+    spectra = luminance[..., None] * lamp.to(image)
+    return Environment(spectra, environment.rotation_deg, environment.exposure_stops)
+
+
+def mean_spectrum(environment: Environment) -> Float[Tensor, "B"]:
+    """Spectrum of all light of an environment together, greatest value 1."""
+    height = environment.image.shape[0]
+    rows = torch.arange(height, dtype=torch.float64) + 0.5
+    weights = (torch.pi * rows / height).sin().to(environment.image)
+    total = (environment.image * weights[:, None, None]).sum(dim=(0, 1))
+    return total / total.amax()
+
+
+def _lit_everywhere(power: Float64[np.ndarray, " B"], lamp: str, bands: Bands) -> Float64[np.ndarray, " B"]:
+    if not (power > 0).all():
+        dark = bands.centers_nm[int(np.argmin(power))]
+        raise SpectrumError(
+            f"lamp {lamp} has no power at {dark:g} nm, where nothing could be told of reflectance; leave such bands "
+            "out of the pictures"
+        )
+    return power / power.max()
+
+
+def _read_wavelengths(path: Path, bands: Bands) -> np.ndarray | None:
+    """Channels that are wavelengths, at the bands; None where there are none."""
+    from unmix_plugin.captures.readers.exr import open_exr
+    from unmix_plugin.captures.readers.read_options import ReadOptions
+    from unmix_plugin.errors import CaptureError
+
+    try:
+        file = open_exr(path, ReadOptions())
+        if file.bands.wavelengths_nm is None:
+            return None
+        values = np.asarray(file.read_part(slice(None), slice(None)), dtype=np.float64)
+    except CaptureError as error:
+        raise SceneError(str(error)) from error
+    order = np.argsort(file.bands.wavelengths_nm)
+    try:
+        found = resample_spectra(values[..., order], Bands(file.bands.wavelengths_nm[order]), bands)
+    except SpectrumError as error:
+        raise SceneError(
+            f"{path}: its wavelengths and those of the pictures do not match: {error}"
+        ) from error
+    return np.ascontiguousarray(found, dtype=np.float32)

@@ -1,0 +1,239 @@
+"""A triangle mesh with shading normals.
+
+Notation: `V` vertices, `F` triangles. Triangles are counter-clockwise seen from outside.
+
+Meshes from glTF, OBJ and PLY files, checked.
+
+Coordinates are taken as they are, as those of the cameras' world: a file whose axes were exchanged on export (many
+programs write glTF with +y up) has to be exported without that.
+
+Notation: `V` vertices, `F` triangles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from unmix_plugin.errors import SceneError
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles of one object; `mesh_of` makes one from vertices and faces."""
+
+    vertices: Float[Tensor, "V 3"]
+    """Positions; in world units as read, in [-1, 1] in model space."""
+    faces: Int[Tensor, "F 3"]
+    """Vertices of each triangle, int32."""
+    normals: Float[Tensor, "V 3"]
+    """Unit shading normals, outward."""
+    uv: Float[Tensor, "V 2"] | None = None
+    """Texture coordinates of the file, v upwards; None if it has none."""
+
+    def transformed(self, scale: float, offset: Float[Tensor, "3"]) -> Mesh:
+        """The mesh with vertices `scale * (vertices + offset)`, scale > 0."""
+        return replace(self, vertices=scale * (self.vertices + offset.to(self.vertices)))
+
+    def with_y_upwards(self) -> Mesh:
+        """The mesh turned by 90 degrees about x, so that its y axis points along z, as the world's upward axis does."""
+        vertices, normals = (
+            torch.stack([v[:, 0], -v[:, 2], v[:, 1]], dim=1) for v in (self.vertices, self.normals)
+        )
+        return replace(self, vertices=vertices.contiguous(), normals=normals.contiguous())
+
+    def to(self, device: torch.device | str) -> Mesh:
+        """The same mesh on another device."""
+        uv = None if self.uv is None else self.uv.to(device)
+        return Mesh(self.vertices.to(device), self.faces.to(device), self.normals.to(device), uv)
+
+    def corners(self) -> Float[Tensor, "F 3 3"]:
+        """Positions of each triangle's vertices."""
+        return self.vertices[self.faces.long()]
+
+    def to_model_space(self) -> tuple[float, Float[Tensor, "3"]]:
+        """Scale and offset for `transformed` that centre the bounding box and give its longest half edge length 1."""
+        low, high = self.vertices.min(dim=0).values, self.vertices.max(dim=0).values
+        return 2.0 / float((high - low).max()), -(low + high) / 2
+
+
+def mesh_of(
+    vertices: Float[Tensor, "V 3"],
+    faces: Int[Tensor, "F 3"],
+    normals: Float[Tensor, "V 3"] | None = None,
+    uv: Float[Tensor, "V 2"] | None = None,
+) -> Mesh:
+    """A mesh of float32 vertices, with area-weighted normals where none are given."""
+    vertices, faces = vertices.float().contiguous(), faces.int().contiguous()
+    if normals is None:
+        normals = area_weighted_normals(vertices, faces)
+    return Mesh(vertices, faces, torch.nn.functional.normalize(normals.float(), dim=-1), uv)
+
+
+def area_weighted_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "V 3"]:
+    """Unit normals of vertices: means over their triangles, weighted by area; +z where they cancel."""
+    a, b, c = vertices.double()[faces.long()].unbind(dim=1)
+    doubled_areas = torch.linalg.cross(b - a, c - a)
+    sums = torch.zeros_like(vertices, dtype=torch.float64)
+    sums.index_add_(0, faces.reshape(-1).long(), doubled_areas.repeat_interleave(3, dim=0))
+    lengths = sums.norm(dim=-1, keepdim=True)
+    upwards = sums.new_tensor((0.0, 0.0, 1.0))
+    return torch.where(lengths > 1e-30, sums / lengths.clamp(min=1e-30), upwards).float()
+
+
+MAX_TRIANGLES = 5_000_000
+"""More are refused: the tree over them and the memory of a training would not fit common machines."""
+
+MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
+"""Formats that are read."""
+
+_SMALLEST_FACE = 1e-14
+"""Part of the squared bounding box diagonal; triangles of less area are dropped, since they have no normal."""
+
+
+def read_mesh(path: Path, notes: list[str] | None = None) -> Mesh:
+    """The triangles of a file in world coordinates, all objects of its scene graph in one mesh.
+
+    A closed mesh whose triangles face inwards is turned outwards.
+
+    Args:
+        path: A .glb, .gltf, .obj or .ply file.
+        notes: Gets a sentence for each thing that is unusual but usable: an open mesh, a mesh that was turned.
+    Raises:
+        SceneError: the file is missing, damaged or of another kind, or has no triangle with an area, positions that
+            are not finite, or too many triangles.
+    """
+    vertices, faces, normals, uv = _joined([_placed(*part) for part in _parts(path)])
+    _check(path, vertices, faces)
+    faces = _with_area(path, vertices, faces)
+    notes = [] if notes is None else notes
+    if _is_closed(vertices, faces):
+        faces, normals = _outwards(path, vertices, faces, normals, notes)
+    else:
+        notes.append(
+            f"{path.name}: the mesh is open; light may pass through its holes, and its inside is black"
+        )
+    return mesh_of(
+        torch.as_tensor(vertices),
+        torch.as_tensor(faces),
+        None if normals is None else torch.as_tensor(normals),
+        None if uv is None else torch.as_tensor(uv.astype(np.float32)),
+    )
+
+
+def _parts(path: Path) -> list[tuple[Any, np.ndarray]]:
+    """The meshes of a file's scene graph, each with its 4 x 4 transform to the world."""
+    import trimesh
+
+    if not path.is_file():
+        raise SceneError(f"{path}: there is no such mesh file")
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise SceneError(
+            f"{path}: is not a mesh format that is read here; convert it to one of {', '.join(MESH_SUFFIXES)}"
+        )
+    try:
+        scene = trimesh.load_scene(path, process=False, maintain_order=True)
+        placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
+    except Exception as error:
+        raise SceneError(f"{path}: can't be read as a mesh ({error}); export it again") from error
+    parts = [(scene.geometry[name], np.asarray(transform)) for transform, name in placed]
+    parts = [part for part in parts if isinstance(part[0], trimesh.Trimesh) and len(part[0].faces)]
+    if not parts:
+        raise SceneError(f"{path}: has no triangles; export the object as a triangle mesh")
+    return parts
+
+
+def _placed(loaded: Any, transform: np.ndarray) -> tuple[np.ndarray | None, ...]:
+    """Positions, triangles, and normals and texture coordinates if the file has them, in the world."""
+    linear = transform[:3, :3]
+    vertices = np.asarray(loaded.vertices, dtype=np.float64) @ linear.T + transform[:3, 3]
+    faces = np.asarray(loaded.faces, dtype=np.int64).reshape(-1, 3)
+    normals = _file_normals(loaded)
+    if normals is not None:
+        normals = normals @ np.linalg.pinv(linear)
+    uv = getattr(loaded.visual, "uv", None)
+    uv = None if uv is None or len(uv) != len(vertices) else np.asarray(uv)
+    return vertices, faces[:, ::-1] if np.linalg.det(linear) < 0 else faces, normals, uv
+
+
+def _joined(
+    parts: list[tuple[Any, ...]],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]:
+    """One mesh; normals and texture coordinates only if all parts have them."""
+    firsts = np.cumsum([0, *(len(part[0]) for part in parts[:-1])])
+    faces = np.concatenate([part[1] + first for part, first in zip(parts, firsts, strict=True)])
+    vertices, normals, uv = (
+        None
+        if any(part[index] is None for part in parts)
+        else np.concatenate([part[index] for part in parts])
+        for index in (0, 2, 3)
+    )
+    assert vertices is not None
+    return vertices, faces, normals, uv
+
+
+def _check(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    if not len(faces):
+        raise SceneError(f"{path}: has no triangles; export the object as a triangle mesh")
+    if len(faces) > MAX_TRIANGLES:
+        raise SceneError(
+            f"{path}: has {len(faces):,} triangles, at most {MAX_TRIANGLES:,} are read; decimate the mesh"
+        )
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise SceneError(f"{path}: a triangle names vertex {faces.max()} of {len(vertices)}; export it again")
+    finite = np.isfinite(vertices.sum(axis=1))
+    if not finite[faces].all():
+        index = int(np.flatnonzero(~finite)[0])
+        raise SceneError(f"{path}: the position of vertex {index} is not finite: {vertices[index].tolist()}")
+
+
+def _with_area(path: Path, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """The triangles that have an area."""
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    diagonal = np.ptp(vertices[faces.reshape(-1)], axis=0)
+    keep = areas > _SMALLEST_FACE * float(diagonal @ diagonal)
+    if not keep.any():
+        raise SceneError(f"{path}: none of its {len(faces)} triangles has an area; export the mesh again")
+    return faces[keep]
+
+
+def _file_normals(loaded: Any) -> np.ndarray | None:
+    """Normals that the file holds; None where it has none, or no usable ones."""
+    if "vertex_normals" not in loaded._cache.cache:
+        return None
+    normals = np.array(loaded.vertex_normals, dtype=np.float64)
+    usable = np.isfinite(normals).all() and (np.linalg.norm(normals, axis=1) > 1e-6).all()
+    return normals if usable else None
+
+
+def _is_closed(vertices: np.ndarray, faces: np.ndarray) -> bool:
+    """Whether each edge is shared by two triangles that run along it in opposite directions."""
+    # Files split vertices at seams of texture and normals; positions alone say what is joined.
+    _, joined = np.unique(vertices, axis=0, return_inverse=True)
+    corners = joined.reshape(-1)[faces]
+    starts, ends = corners.reshape(-1), np.roll(corners, -1, axis=1).reshape(-1)
+    forward, backward = starts * len(vertices) + ends, ends * len(vertices) + starts
+    return bool(np.array_equal(np.sort(forward), np.sort(backward)))
+
+
+def _outwards(
+    path: Path, vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None, notes: list[str]
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Triangles and normals that point out of a closed mesh."""
+    a, b, c = (vertices[faces[:, corner]] - vertices.mean(axis=0) for corner in range(3))
+    crosses = np.cross(b, c)
+    if np.einsum("ij,ij->", a, crosses) < 0:
+        notes.append(f"{path.name}: the triangles faced inwards; they were turned outwards")
+        faces = faces[:, ::-1].copy()
+    if normals is not None:
+        a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+        agreement = np.einsum("ij,ij->i", np.cross(b - a, c - a), normals[faces].mean(axis=1))
+        normals = -normals if agreement.sum() < 0 else normals
+    return faces, normals

@@ -1,0 +1,229 @@
+"""Rays against a triangle mesh: closest hits, occlusion, and surface points that new rays can start from.
+
+Notation: `N` rays. A ray's direction has unit length, so that distances are in the mesh's unit.
+
+Where the rays of a camera's pixels meet a mesh.
+
+A pixel has n x n rays through the middles of its n x n parts; n = 1 is the ray through the pixel's centre.
+
+Notation: `H x W` pixels, `K` rays that meet the mesh.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.neumatex.tracing.mesh import Mesh
+from unmix_plugin.operators.launching import as_warp, launch, vector_type, warp
+
+_LONGEST = 1e30
+"""Distance of a ray that hits nothing."""
+
+_OFFSET = 4e-6
+"""Distance from a surface at which rays leave it, as part of the mesh's greatest coordinate: float32 positions are
+wrong by a few 1e-7 of it."""
+
+_LEAST_COSINE = 0.02
+"""Shading normals are bent to the viewer where interpolation turned them further away than this."""
+
+
+@dataclass(frozen=True)
+class Hits:
+    """Where rays first meet a mesh."""
+
+    found: Bool[Tensor, " N"]
+    triangles: Int[Tensor, " N"]
+    """Triangle of each hit, int64; -1 where there is none."""
+    barycentric: Float[Tensor, "N 2"]
+    """Weights of the triangle's first and second vertex; the third has what is missing to 1."""
+    distances: Float[Tensor, " N"]
+    """Along the ray; 1e30 where nothing is hit."""
+
+    def select(self, rows: Tensor) -> Hits:
+        """Hits of some of the rays: by a mask or by indices."""
+        return Hits(self.found[rows], self.triangles[rows], self.barycentric[rows], self.distances[rows])
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Points of a surface as a viewer sees them."""
+
+    positions: Float[Tensor, "N 3"]
+    """Off the surface by a tiny distance on the viewer's side, so that new rays don't meet it where they start."""
+    normals: Float[Tensor, "N 3"]
+    """Unit shading normals, turned to the viewer."""
+    geometric_normals: Float[Tensor, "N 3"]
+    """Unit normals of the triangles, turned to the viewer."""
+
+    def select(self, rows: Tensor) -> SurfacePoints:
+        """Some of the points: by a mask or by indices."""
+        return SurfacePoints(self.positions[rows], self.normals[rows], self.geometric_normals[rows])
+
+
+class RayMesh:
+    """A mesh with a tree over its triangles, on one device."""
+
+    def __init__(self, mesh: Mesh, device: torch.device | str = "cpu") -> None:
+        self.mesh = mesh.to(device)
+        self.device = self.mesh.vertices.device
+        wp = warp()
+        self._vertices = self.mesh.vertices.contiguous()
+        self._faces = self.mesh.faces.reshape(-1).contiguous()
+        self._tree: Any = wp.Mesh(wp.from_torch(self._vertices, dtype=wp.vec3f), wp.from_torch(self._faces))
+        self._offset = _OFFSET * float(self._vertices.abs().max())
+
+    def closest(self, origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> Hits:
+        """First hits of rays, from either side of a triangle."""
+        from unmix_plugin.neumatex.tracing._ray_kernels import closest_kernel
+
+        triangles = torch.empty(len(origins), dtype=torch.int64, device=self.device)
+        barycentric = origins.new_empty((len(origins), 2))
+        distances = origins.new_empty(len(origins))
+        vec2 = vector_type(2, torch.float32)
+        written = [as_warp(triangles), as_warp(barycentric, vec2), as_warp(distances)]
+        launch(closest_kernel, len(origins), [*self._rays(origins, directions), *written], self.device)
+        return Hits(triangles >= 0, triangles, barycentric, distances)
+
+    def blocked(self, origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
+        """Whether rays meet the mesh at all."""
+        from unmix_plugin.neumatex.tracing._ray_kernels import blocked_kernel
+
+        blocked = torch.empty(len(origins), dtype=torch.uint8, device=self.device)
+        launch(
+            blocked_kernel, len(origins), [*self._rays(origins, directions), as_warp(blocked)], self.device
+        )
+        return blocked.bool()
+
+    def points(self, hits: Hits, directions: Float[Tensor, "N 3"]) -> SurfacePoints:
+        """Surface points of hits, all of which are found.
+
+        Args:
+            hits: Of `closest`.
+            directions: Of the rays that hit.
+        """
+        faces = self.mesh.faces[hits.triangles].long()
+        u, v = hits.barycentric[:, :1], hits.barycentric[:, 1:]
+        a, b, c = self.mesh.vertices[faces].unbind(dim=1)
+        # Edges from one corner lose less than three weighted corners do.
+        positions = c + u * (a - c) + v * (b - c)
+        geometric = torch.nn.functional.normalize(torch.linalg.cross(a - c, b - c), dim=-1)
+        shading = (torch.stack([u, v, 1 - u - v], dim=1) * self.mesh.normals[faces]).sum(dim=1)
+        shading = torch.nn.functional.normalize(shading, dim=-1)
+        backside = (geometric * directions).sum(dim=-1, keepdim=True) > 0
+        geometric = torch.where(backside, -geometric, geometric)
+        # A triangle's own vertices may be wound against its normals: what faces the viewer decides.
+        shading = torch.where((shading * geometric).sum(dim=-1, keepdim=True) < 0, -shading, shading)
+        return SurfacePoints(positions + self._offset * geometric, _bent_to(-directions, shading), geometric)
+
+    def _rays(self, origins: Tensor, directions: Tensor) -> list[Any]:
+        vec3 = vector_type(3, torch.float32)
+        rays = [as_warp(values.contiguous(), vec3) for values in (origins, directions)]
+        return [self._tree.id, _LONGEST, *rays]
+
+
+def _bent_to(to_eye: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    """Normals whose cosine with the direction to the viewer is at least a little above 0."""
+    cosines = (normals * to_eye).sum(dim=-1, keepdim=True)
+    bent = torch.nn.functional.normalize(normals + (_LEAST_COSINE - cosines) * to_eye, dim=-1)
+    return torch.where(cosines < _LEAST_COSINE, bent, normals)
+
+
+def closest_twin(mesh: Mesh, origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> Hits:
+    """The same as `RayMesh.closest` in plain PyTorch: every ray against every triangle, in double precision.
+
+    Source: Moeller and Trumbore 1997, Fast, Minimum Storage Ray/Triangle Intersection.
+    """
+    a, b, c = mesh.corners().double().unbind(dim=1)
+    o, d = origins.double()[:, None], directions.double()[:, None]
+    across = torch.linalg.cross(d, (c - a)[None])
+    determinants = ((b - a) * across).sum(dim=-1)
+    inverse = torch.where(determinants == 0, torch.inf, 1 / determinants)
+    from_a = o - a
+    second = (from_a * across).sum(dim=-1) * inverse
+    along = torch.linalg.cross(from_a, (b - a).expand_as(from_a))
+    third = (d * along).sum(dim=-1) * inverse
+    distances = ((c - a) * along).sum(dim=-1) * inverse
+    inside = (second >= 0) & (third >= 0) & (second + third <= 1) & (distances > 0) & (distances < _LONGEST)
+    distances, triangles = torch.where(inside, distances, _LONGEST).min(dim=1)
+    found = distances < _LONGEST
+    chosen = triangles[:, None]
+    second, third = (values.gather(1, chosen)[:, 0] for values in (second, third))
+    barycentric = torch.stack([1 - second - third, second], dim=-1)
+    return Hits(
+        found,
+        torch.where(found, triangles, -1),
+        torch.where(found[:, None], barycentric, 0.0).float(),
+        distances.float(),
+    )
+
+
+@dataclass(frozen=True)
+class PixelHits:
+    """Surface points behind the pixels of one image."""
+
+    pixels: Int[Tensor, " K"]
+    """Pixel of each ray, row * W + column, increasing; a pixel has up to n x n rays."""
+    points: SurfacePoints
+    to_eye: Float[Tensor, "K 3"]
+    """Unit vectors to the camera."""
+    width: int
+    height: int
+    rays_a_pixel: int
+    """n x n."""
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def alpha(self) -> Float[Tensor, "H W"]:
+        """Part of each pixel's rays that meet the mesh."""
+        counts = torch.bincount(self.pixels, minlength=self.width * self.height)
+        return (counts.float() / self.rays_a_pixel).reshape(self.height, self.width)
+
+    def image(self, values: Float[Tensor, "K C"]) -> Float[Tensor, "H W C"]:
+        """Means over each pixel of values of its rays, 0 where a ray misses (so multiplied by alpha)."""
+        sums = values.new_zeros(self.width * self.height, values.shape[1]).index_add(0, self.pixels, values)
+        return (sums / self.rays_a_pixel).reshape(self.height, self.width, -1)
+
+    def select(self, rows: Tensor) -> PixelHits:
+        """Some of the rays, by increasing indices or a mask."""
+        return PixelHits(
+            self.pixels[rows],
+            self.points.select(rows),
+            self.to_eye[rows],
+            self.width,
+            self.height,
+            self.rays_a_pixel,
+        )
+
+
+def pixel_hits(ray_mesh: RayMesh, cameras: Cameras, index: int, subpixels: int = 1) -> PixelHits:
+    """The hits of one camera."""
+    width, height = cameras.size(index)
+    pixels, parts, to_eye = [], [], []
+    for offset in subpixel_offsets(subpixels):
+        rays = cameras.to(ray_mesh.device).image_rays(index, offset)
+        hits = ray_mesh.closest(rays.origins, rays.directions)
+        found = hits.found.nonzero()[:, 0]
+        directions = rays.directions[found]
+        parts.append(ray_mesh.points(hits.select(found), directions))
+        pixels.append(found)
+        to_eye.append(-directions)
+    order = torch.cat(pixels).argsort(stable=True)
+    points = SurfacePoints(
+        torch.cat([part.positions for part in parts])[order],
+        torch.cat([part.normals for part in parts])[order],
+        torch.cat([part.geometric_normals for part in parts])[order],
+    )
+    return PixelHits(torch.cat(pixels)[order], points, torch.cat(to_eye)[order], width, height, subpixels**2)
+
+
+def subpixel_offsets(subpixels: int) -> list[tuple[float, float]]:
+    """Middles of the parts of a pixel, x and y in [0, 1]."""
+    middles = [(index + 0.5) / subpixels for index in range(subpixels)]
+    return [(x, y) for y in middles for x in middles]

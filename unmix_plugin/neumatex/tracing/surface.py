@@ -1,0 +1,213 @@
+"""Where the path tracer gets materials from: one family, and its parameters at points of a mesh.
+
+A material on a surface: three planes of features, read by two small networks that all objects share.
+
+Notation: `N` points in model space, where the mesh lies in [-1, 1]^3; `P` parameters of a material; `C` channels and
+`R` texels along an edge of a plane. Plane 0 is XY, plane 1 YZ, plane 2 XZ; the first letter runs along a plane's
+columns, the second along its rows. The first texel lies at -1, the last at +1, and points outside read the border.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import Literal, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from unmix_plugin.neumatex.tracing.families import DecodableFamily, MaterialFamily
+
+
+@runtime_checkable
+class Surface(Protocol):
+    """A mesh's materials."""
+
+    @property
+    def family(self) -> MaterialFamily:
+        """The reflectances that the parameters stand for."""
+        ...
+
+    def parameters(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N P"]:
+        """Parameters of the material at surface points, [0, 1]; differentiable.
+
+        Args:
+            positions: Model space, where the mesh fits in [-1, 1]^3.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class DecodedSurface:
+    """The same materials, their parameters decoded where they are looked up; see `Surface`."""
+
+    encoded: Surface
+    decodable: DecodableFamily
+    """Of `encoded`."""
+
+    @property
+    def family(self) -> MaterialFamily:
+        """Of the decoded parameters."""
+        return self.decodable.decoded_family
+
+    def parameters(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N P"]:
+        """Decoded parameters at surface points."""
+        return self.decodable.decoded(self.encoded.parameters(positions))
+
+
+def decoded_once(surface: Surface) -> Surface:
+    """The same materials so that a network, where the family has one, is evaluated once a point, not once a
+    direction."""
+    family = surface.family
+    return DecodedSurface(surface, family) if isinstance(family, DecodableFamily) else surface
+
+
+PLANE_AXES = ((0, 1), (1, 2), (0, 2))
+"""Axes of the model that run along the columns and the rows of XY, YZ, XZ."""
+NUM_CHANNELS = 12
+"""Channels of a plane, as published."""
+NUM_FREQUENCIES = 3
+"""Bands of the positional encoding, as published."""
+LOG_VARIANCE_RANGE = (-9.0, 0.0)
+"""Least and largest log-variance of a parameter: standard deviations of 0.011 and 1, the parameters being in [0, 1]."""
+_WIDTH = 64
+
+
+class Readers(nn.Module):
+    """Two networks that read features of points: the material's parameters, and how wrong they may be."""
+
+    def __init__(
+        self,
+        num_parameters: int,
+        num_channels: int = NUM_CHANNELS,
+        generator: torch.Generator | None = None,
+        num_shares: int = 0,
+    ) -> None:
+        """Random networks.
+
+        Args:
+            num_parameters: P.
+            generator: Draws the weights.
+            num_shares: How many of the first parameters are shares, which sum to 1.
+        """
+        super().__init__()
+        inputs = 3 * num_channels + 3 + 6 * NUM_FREQUENCIES
+        self.num_parameters = num_parameters
+        self.num_shares = num_shares
+        self.material_network = _network(inputs, num_parameters, generator)
+        self.variance_network = _network(inputs, num_parameters, generator)
+
+    def material(self, features: Float[Tensor, "N F"]) -> Float[Tensor, "N P"]:
+        """Parameters in (0, 1) of points whose `plane_features` are given."""
+        raw = self.material_network(features)
+        if not self.num_shares:
+            return torch.sigmoid(raw)
+        shares, others = raw.tensor_split([self.num_shares], dim=-1)
+        return torch.cat([torch.softmax(shares, dim=-1), torch.sigmoid(others)], dim=-1)
+
+    def log_variance(self, features: Float[Tensor, "N F"]) -> Float[Tensor, "N P"]:
+        """Log-variances within `LOG_VARIANCE_RANGE` of points whose `plane_features` are given."""
+        return bounded_log_variance(self.variance_network(features))
+
+
+class Triplane(nn.Module):
+    """Parameters of a material and their log-variance at points of one object."""
+
+    def __init__(
+        self,
+        num_parameters: int,
+        resolution: int = 128,
+        num_channels: int = NUM_CHANNELS,
+        generator: torch.Generator | None = None,
+        num_shares: int = 0,
+    ) -> None:
+        """A random material, nearly the same everywhere.
+
+        Args:
+            num_parameters: P; 9 for the neural material, 5 for base colour, roughness and metallicity.
+            resolution: R, at least 2.
+            generator: Draws the planes and the networks.
+            num_shares: How many of the first parameters are shares, which sum to 1.
+        """
+        super().__init__()
+        texels = (3, num_channels, resolution, resolution)
+        self.planes = nn.Parameter(0.1 * torch.randn(texels, generator=generator))
+        self.readers = Readers(num_parameters, num_channels, generator, num_shares)
+
+    @property
+    def num_parameters(self) -> int:
+        """P."""
+        return self.readers.num_parameters
+
+    @property
+    def num_shares(self) -> int:
+        """How many of the first parameters sum to 1."""
+        return self.readers.num_shares
+
+    def parameters_at(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N P"]:
+        """Parameters of the material in (0, 1); differentiable by planes and networks."""
+        return self.readers.material(plane_features(self.planes, positions))
+
+    def log_variance(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N P"]:
+        """Logarithm of the expected squared error of each parameter, within `LOG_VARIANCE_RANGE`."""
+        return self.readers.log_variance(plane_features(self.planes, positions))
+
+    def parameter_groups(self) -> dict[Literal["planes", "networks"], list[nn.Parameter]]:
+        """What an optimiser may move: an object's planes, and the networks that are frozen while one is fitted."""
+        return {"planes": [self.planes], "networks": list(self.readers.parameters())}
+
+
+def plane_features(planes: Float[Tensor, "3 C R R"], positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N F"]:
+    """What the networks read: 3 C numbers of the planes, the position, and its sines and cosines."""
+    return torch.cat([look_up(planes, positions), positions, encode(positions)], dim=-1)
+
+
+def look_up(planes: Float[Tensor, "3 C R R"], positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3*C"]:
+    """Bilinear look-ups in the three planes, one after the other."""
+    places = torch.stack([positions[:, list(axes)] for axes in PLANE_AXES])[:, None]
+    found = functional.grid_sample(planes, places, padding_mode="border", align_corners=True)
+    return found[:, :, 0].permute(2, 0, 1).flatten(1)
+
+
+def look_up_twin(planes: Float[Tensor, "3 C R R"], positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3*C"]:
+    """`look_up` in plain steps."""
+    last = planes.shape[-1] - 1
+    texels = (positions.clamp(-1, 1) + 1) / 2 * last
+    low = texels.floor().clamp(0, last - 1).long()
+    share = texels - low
+    parts = []
+    for plane, (column, row) in zip(planes, PLANE_AXES, strict=True):
+        x, y, u, v = low[:, column], low[:, row], share[:, column], share[:, row]
+        upper = plane[:, y, x] * (1 - u) + plane[:, y, x + 1] * u
+        lower = plane[:, y + 1, x] * (1 - u) + plane[:, y + 1, x + 1] * u
+        parts.append((upper * (1 - v) + lower * v).T)
+    return torch.cat(parts, dim=-1)
+
+
+def encode(positions: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n E"]:
+    """Sines and cosines of the position times pi, 2 pi and 4 pi: 18 numbers."""
+    angles = torch.cat([positions * (math.pi * 2.0**band) for band in range(NUM_FREQUENCIES)], dim=-1)
+    return torch.cat([angles.sin(), angles.cos()], dim=-1)
+
+
+def bounded_log_variance(raw: Float[Tensor, "*n P"]) -> Float[Tensor, "*n P"]:
+    """Log-variances within `LOG_VARIANCE_RANGE` from any numbers."""
+    low, high = LOG_VARIANCE_RANGE
+    return low + (high - low) * torch.sigmoid(raw)
+
+
+def _network(inputs: int, outputs: int, generator: torch.Generator | None) -> nn.Sequential:
+    sizes = [inputs, _WIDTH, _WIDTH, _WIDTH, outputs]
+    layers: list[nn.Module] = []
+    for index, (before, after) in enumerate(itertools.pairwise(sizes)):
+        is_last = index == len(sizes) - 2
+        layer = nn.Linear(before, after, device="meta").to_empty(device="cpu")  # no global random numbers
+        bound = (3 if is_last else 6) ** 0.5 / before**0.5
+        with torch.no_grad():
+            layer.weight.uniform_(-bound, bound, generator=generator)
+            layer.bias.zero_()
+        layers += [layer] if is_last else [layer, nn.ReLU()]
+    return nn.Sequential(*layers)
