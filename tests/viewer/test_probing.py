@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.viewer.panels.probe import abundances_csv, probe_through, spectra_csv
 from unmix_plugin.viewer.view_cameras import camera_of, pose_of
 
@@ -39,6 +40,18 @@ def test_a_probe_lies_on_the_ray_through_the_click(camera, taken):
     assert coords[0].tolist() == pytest.approx([camera.width / 2, camera.height / 2], abs=1.0)
 
 
+def test_a_probe_tells_where_it_is_in_the_world_that_exports_are_in(source, camera):
+    frame = Normalisation(
+        np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([0.3, -2.0, 5.0]), 0.25
+    )
+    with source.borrowed() as scene:
+        moved = replace(scene, frame=frame)
+        taken = probe_through(moved, camera, camera.width / 2, camera.height / 2, 1)
+    np.testing.assert_allclose(taken.world, frame.to_world(np.array(taken.point)), rtol=1e-9)
+    row = list(csv.reader(io.StringIO(abundances_csv([taken]).decode())))[1]
+    np.testing.assert_allclose([float(value) for value in row[1:4]], taken.world, rtol=1e-7)
+
+
 def test_where_nothing_is_there_is_nothing_to_probe(source, camera):
     away = camera.camera_to_world.clone()
     away[0, :, 3] *= 50
@@ -66,7 +79,7 @@ def test_the_files_of_probes_hold_every_number(taken):
     assert rows[0][6:] == list(taken.materials.names)
     assert rows[2][5] == "train_003"
     np.testing.assert_allclose([float(value) for value in rows[1][6:]], taken.abundances, atol=1e-5)
-    np.testing.assert_allclose([float(value) for value in rows[1][1:4]], taken.point, rtol=1e-7)
+    np.testing.assert_allclose([float(value) for value in rows[1][1:4]], taken.world, rtol=1e-7)
 
 
 def test_names_with_commas_stay_one_field(taken):

@@ -45,6 +45,8 @@ class ProbedPoint:
     """From 1."""
     point: tuple[float, float, float]
     """Model space."""
+    world: tuple[float, float, float]
+    """The same point in the world that exports are in."""
     materials: Materials
     """As they are shown."""
     predicted: Float64[np.ndarray, " B"]
@@ -89,13 +91,14 @@ def probe_through(
     """
     last_column, last_row = camera.width - 1, camera.height - 1
     found = scene.probe(camera, min(max(int(column), 0), last_column), min(max(int(row), 0), last_row))
-    if found.opacity < OCCUPIED_ACCUMULATION or found.position is None:
+    if found.opacity < OCCUPIED_ACCUMULATION or found.position is None or found.world_position is None:
         raise ConfigError("nothing is there to probe: less than half of the light ends on something")
-    x, y, z = found.position.tolist()
+    (x, y, z), (world_x, world_y, world_z) = found.position.tolist(), found.world_position.tolist()
     endmembers = scene.materials.endmembers.double().cpu().numpy()
     return ProbedPoint(
         number,
         (x, y, z),
+        (world_x, world_y, world_z),
         scene.materials,
         found.values["predicted"],
         found.values["abundances"],
@@ -145,12 +148,12 @@ def spectra_csv(probes: Sequence[ProbedPoint]) -> bytes:
 
 
 def abundances_csv(probes: Sequence[ProbedPoint]) -> bytes:
-    """One row a probe: number, position in model space, material, the training view measured in, abundances."""
+    """One row a probe: number, position in the world, material, the training view measured in, abundances."""
     header = ["probe", "x", "y", "z", "material", "measured_in", *probes[0].materials.names]
     rows = [
         [
             str(one.number),
-            *(f"{value:.9g}" for value in one.point),
+            *(f"{value:.9g}" for value in one.world),
             one.name,
             one.measured_in,
             *(f"{value:.6g}" for value in one.abundances),
@@ -240,7 +243,7 @@ class ProbePanel:
     def _show(self, shown: ProbedPoint) -> None:
         rows = [
             ("material", shown.name),
-            ("position", ", ".join(f"{value:.3f}" for value in shown.point)),
+            ("position", ", ".join(f"{value:.4g}" for value in shown.world)),
             ("measured in", shown.measured_in or "no training view at hand sees the point"),
             *likeness_rows(shown.predicted, shown.materials),
         ]
