@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tests.method_factory import make_scene
-from tests.products.ball_model import RADIUS, SHADE, ball_scene, cameras_around
+from tests.products.ball_model import RADIUS, SHADE, BallField, ball_scene, cameras_around
 from tests.trained.camera_files.camera_scenes import FRAME, around
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.trained.probe import one_pixel
@@ -50,6 +50,28 @@ def test_a_point_is_what_the_field_says_there():
     np.testing.assert_allclose(probe.spectra["predicted"], SHADE * BALL.materials.endmembers[1], atol=1e-6)
     assert probe.opacity > 0.99
     np.testing.assert_array_equal(probe.world_position, world)
+
+
+class LampOnCamera(BallField):
+    """The ball in a light that stands at the camera: as bright as it is lit squarely."""
+
+    def get_outputs(self, positions, directions, features, light=None):
+        found = super().get_outputs(positions, directions, features, light)
+        squareness = -(torch.nn.functional.normalize(positions, dim=-1) * directions).sum(
+            dim=-1, keepdim=True
+        )
+        return {**found, "scaled_abundances": squareness.clamp(min=0) * found["scaled_abundances"]}
+
+
+@pytest.mark.parametrize("away", [(1.0, 0.0, 0.2), (0.3, -0.5, -0.8)])
+def test_a_point_in_a_light_that_moves_with_the_camera_is_lit_squarely(away):
+    scene = replace(BALL, field=LampOnCamera())
+    place = RADIUS * np.array(away) / np.linalg.norm(away)
+    probe = scene.probe_point(*FRAME.to_world(place).tolist())
+    material = 0 if away[2] > 0 else 1
+    np.testing.assert_allclose(
+        probe.spectra["predicted"], SHADE * BALL.materials.endmembers[material], atol=1e-4
+    )
 
 
 def test_empty_space_has_no_opacity():

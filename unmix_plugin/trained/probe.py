@@ -13,6 +13,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.rays import RayBundle
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.trained.protocol import Probe
 
@@ -51,7 +52,8 @@ def probe_pixel(scene: TrainedScene, camera: Cameras, pixel: tuple[int, int]) ->
 
 @torch.no_grad()
 def probe_point(scene: TrainedScene, point: tuple[float, float, float]) -> Probe:
-    """What a point of the world is made of: its spectrum as lit there, without the view-dependent part.
+    """What a point of the world is made of: its spectrum, lit squarely where the light moves with the camera, without
+    the view-dependent part.
 
     Raises:
         ConfigError: the point is outside the scene box.
@@ -68,7 +70,10 @@ def probe_point(scene: TrainedScene, point: tuple[float, float, float]) -> Probe
             f"{_text(greatest)} of the world"
         )
     density, features = scene.field.get_density(inside)
-    outputs = scene.field.get_outputs(inside, torch.zeros_like(inside), features)
+    none = torch.zeros(1, dtype=torch.int64, device=scene.device)
+    here = RayBundle(inside, torch.zeros_like(inside), none)
+    normals = scene.renderer.normals(scene.field, here, inside.new_zeros(1))
+    outputs = scene.field.get_outputs(inside, -normals, features)
     is_there = scene.renderer.is_occupied(inside).to(density)
     predicted = is_there[:, None] * (outputs["scaled_abundances"] @ scene.materials.endmembers)
     return Probe(
