@@ -248,6 +248,10 @@ class UnmixModel(Model):
         }
         return found if outputs is None else {name: found[name] for name in outputs}
 
+    def get_evaluation_outputs(self, camera: Cameras, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """A view as the lens sees it that training corrected, if it did."""
+        return self.get_outputs_for_camera(camera if self.poses is None else self.poses.lens.of(camera))
+
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:

@@ -15,6 +15,7 @@ from unmix_plugin.formats.files import make_folder, write_file
 from unmix_plugin.products.product import Job, Product
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.trained.run_views import RunView
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 _LENS_KEYS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4")
 
@@ -31,8 +32,9 @@ class Poses(Product):
         path = job.folder / "transforms.json"
         job.claim([path])
         make_folder(job.folder)
-        is_refined = getattr(job.loaded.config.pipeline.model, "poses", "fixed") == "refine"
-        content = poses_json(job.loaded.scene.views, job.frame, is_refined)
+        scene = job.loaded.scene
+        is_refined = isinstance(scene, TrainedScene) and "pose" in scene.fitted
+        content = poses_json(scene.views, scene.frame, is_refined)
         write_file(path, (json.dumps(content, indent=1) + "\n").encode())
         return [path]
 

@@ -26,7 +26,8 @@ def unmix_scene(
 
     Args:
         model, averages: As `frozen_parameters` takes them.
-        record: Cameras and frame of its run; training cameras are shown as they were corrected.
+        record: Cameras and frame of its run; they are shown as they were corrected, those of evaluation views with the
+            corrected lens.
     Raises:
         RunError: the record is damaged.
     """
@@ -35,7 +36,11 @@ def unmix_scene(
     specular = frozen.get(id(materials.specular_spectra), materials.specular_spectra)
     if model.poses is not None:
         own = copy.deepcopy(model.poses, frozen)  # type: ignore[arg-type]
-        record = replace(record, train_cameras=own.refined(record.train_cameras))
+        record = replace(
+            record,
+            train_cameras=own.refined(record.train_cameras),
+            eval_cameras=own.lens.of(record.eval_cameras),
+        )
     materials = replace(materials, endmembers=frozen[id(model.endmembers)], specular_spectra=specular)
     opaque = renderer.opaque_clearance
     renderer = replace(
@@ -52,6 +57,10 @@ def unmix_scene(
         recorded_views(record),
         model.metadata["pixel_size"],
         model.metadata["subpixels"],
+        fitted=(
+            *(["pose"] if model.poses is not None else []),
+            *(["gain"] if model.view_gains is not None else []),
+        ),
     )
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Collection
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -50,6 +51,8 @@ class TrainedScene:
     """Rays through a pixel along each of its edges."""
     notes: tuple[str, ...] = ()
     """What a user has to be told of how it was edited."""
+    fitted: tuple[Literal["pose", "gain"], ...] = ()
+    """What training found for each of its views, so that other views are aligned before they are measured."""
 
     @property
     def bands(self) -> Bands:
@@ -116,7 +119,7 @@ class TrainedScene:
         return probe_pixel(self, camera, (column, row))
 
     def probe_point(self, x: float, y: float, z: float) -> Probe:
-        """What a point of the world is made of, as lit there, without the view-dependent part.
+        """What a point of the world is made of, lit squarely, without the view-dependent part.
 
         Raises:
             ConfigError: the point is outside the scene box.
