@@ -1,6 +1,7 @@
-"""docs/guides/plugins.md: the public names that it lists are those there are, and its example trains."""
+"""docs/guides/plugins.md: it lists the public names, and its example trains, is evaluated and rendered."""
 
 import importlib.metadata
+import json
 import re
 import sys
 import types
@@ -10,8 +11,10 @@ import pytest
 
 import unmix_plugin.engine
 from tests.commands.running import run
+from unmix_plugin.commands.eval import evaluate
+from unmix_plugin.commands.render import render
 from unmix_plugin.commands.train import train
-from unmix_plugin.engine import registry
+from unmix_plugin.engine import Output, registry
 from unmix_plugin.engine.runs.load_run import load_model
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 
@@ -33,7 +36,7 @@ def test_no_other_name_is_public():
     assert sorted(modules) == sorted(unmix_plugin.engine.__all__)
 
 
-def test_the_example_of_the_page_imports_public_names_only_and_trains(tmp_path, monkeypatch):
+def test_the_example_of_the_page_imports_public_names_only_trains_and_is_evaluated(tmp_path, monkeypatch):
     (code,) = re.findall(r"^`spectral_grid.py`\n\n```python\n(.*?)^```", PAGE, flags=re.DOTALL | re.MULTILINE)
     ours = set(re.findall(r"from (unmix_plugin\S*) import", code))
     assert ours == {"unmix_plugin.datamanager", "unmix_plugin.engine"}
@@ -46,6 +49,21 @@ def test_the_example_of_the_page_imports_public_names_only_and_trains(tmp_path, 
     argv = ["--data", tmp_path / "scene", "--output-dir", tmp_path / "out", "--pipeline.model.resolution", 8]
     ended = run(train, "spectral-grid", *argv, "--max-num-iterations", 3, "--device", "cpu")
     assert ended.status == 0, ended.err
-    loaded = load_model(Path(ended.last_line.removeprefix("run: ")), "cpu")
+    path = Path(ended.last_line.removeprefix("run: "))
+    loaded = load_model(path, "cpu")
     view = loaded.model.get_outputs_for_camera(loaded.scene.eval_cameras[0])
     assert view["spectral"].shape == (16, 16, 4)
+
+    for outputs in ((), (Output("spectral", "channels", "spectra", "radiance on black"),)):
+        monkeypatch.setattr(module.SpectralGrid, "outputs", outputs, raising=False)
+        ended = run(evaluate, "--run", path, "--device", "cpu")
+        assert ended.status == 0, ended.err
+        metrics = json.loads((path / "eval" / "metrics.json").read_text())
+        assert metrics["psnr"] > 3
+        assert metrics["views"] == 2
+        assert [image["name"] for image in metrics["per_image"]] == ["eval_002", "eval_006"]
+    ended = run(evaluate, "--run", path, "--illuminant", "A", "--device", "cpu")
+    assert "the method spectral-grid makes no scene of mixed materials" in " ".join(ended.err.split())
+    ended = run(render, "--run", path, "--output", tmp_path / "views", "--device", "cpu")
+    assert ended.status == 0, ended.err
+    assert len(list((tmp_path / "views" / "spectral").glob("*.hdr"))) == 2

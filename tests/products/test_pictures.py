@@ -21,7 +21,7 @@ from unmix_plugin.figures.pictures import (
 )
 from unmix_plugin.products.abundances import Abundances, colour_panel, draw_abundances
 from unmix_plugin.products.endmembers import draw_endmembers
-from unmix_plugin.products.evaluation_pictures import (
+from unmix_plugin.products.evaluation import (
     draw_colour,
     draw_matched_abundances,
     draw_matched_segmentation,

@@ -63,8 +63,8 @@ def open_run(path: str | Path, device: str = "auto") -> TrainedScene:
     return load_run(path, device).materials_scene
 
 
-def require_materials(scene: RenderableScene, method_name: str) -> TrainedScene:
-    """A scene that has endmembers.
+def require_materials(scene: RenderableScene | None, method_name: str) -> TrainedScene:
+    """The scene, if it has endmembers; None stands for a method that makes none.
 
     Raises:
         ConfigError: it has none.

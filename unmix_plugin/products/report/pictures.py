@@ -9,7 +9,7 @@ import numpy as np
 
 from unmix_plugin.figures.pictures import NEUTRAL, ColourScale, paint
 from unmix_plugin.figures.plotting import RIGHT, WRONG, ChartLine, Colour, LineChart
-from unmix_plugin.products.evaluation_pictures import MaterialLook, material_look
+from unmix_plugin.products.evaluation import MaterialLook, material_look
 from unmix_plugin.products.report.views import ReportViews, ShownView, evenly
 from unmix_plugin.products.segmentation import paint_ids
 from unmix_plugin.spectral.segmentation import NOTHING_ID

@@ -1,0 +1,299 @@
+"""The evaluation of a run: figures of merit of every view, and prediction beside truth as pictures.
+
+A scene of mixed materials is measured against all that is known of its spectral scene. Models of other methods measure
+their images themselves. Both write metrics.json and a folder for each kind of picture.
+
+True materials keep their colours in all pictures; a predicted endmember has the colour of the material that it is
+matched to, and one of its own where it is matched to none.
+
+Notation: `H x W` pixels, `B` bands, `K` true materials, `P` predicted endmembers.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from unmix_plugin.engine.pipeline import Pipeline, average_metrics
+from unmix_plugin.engine.processes.processes import Processes
+from unmix_plugin.figures.pictures import (
+    NEUTRAL,
+    ColourScale,
+    TitledPicture,
+    draw_panels,
+    in_rows,
+    over_neutral,
+    paint,
+)
+from unmix_plugin.figures.plotting import RIGHT, WRONG, Colour, distinct_colours, own_colours
+from unmix_plugin.formats.files import write_file
+from unmix_plugin.formats.png import rgba_png_bytes
+from unmix_plugin.products.abundances import SHARE_SCALE, share_panels
+from unmix_plugin.products.segmentation import paint_ids
+from unmix_plugin.scenes.scene import Scene
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.colour.conversion import describe_colour, linear_to_srgb
+from unmix_plugin.spectral.segmentation import NOTHING_ID
+from unmix_plugin.trained.evaluation import (
+    DEFINITIONS,
+    Evaluation,
+    ViewTruth,
+    finite_or_none,
+    scene_truth,
+    view_truth,
+)
+from unmix_plugin.trained.pose_alignment import align_pose
+from unmix_plugin.trained.row_alignment import align_rows
+from unmix_plugin.trained.run_views import views_of
+from unmix_plugin.trained.trained_scene import TrainedScene
+from unmix_plugin.trained.view_alignment import align_gain
+from unmix_plugin.trained.view_rendering import (
+    RenderedView,
+    as_numpy,
+    coloured_picture,
+    render_view,
+    subpixels_for,
+)
+
+_ERROR_SCALE = ColourScale("magma", 0.0, 0.2, "error of sRGB")
+_COLUMNS = 7
+
+
+Follow = Callable[[str, Sequence[Any]], Iterator[Any]]
+"""The items given, while it is shown how many are done."""
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """What was found of a run."""
+
+    figures: dict[str, float | None]
+    """Of the scene; None where there is no truth."""
+    per_image: list[dict[str, Any]]
+    """Name and figures of each view or image."""
+    more: dict[str, Any]
+    """What else metrics.json has."""
+    num_pictures: int
+    has_materials: bool = True
+    """Whether the figures are those of `DEFINITIONS`."""
+
+    def write(self, path: Path, times: Mapping[str, float | None]) -> dict[str, float | None]:
+        """Write metrics.json; its figures, those of training among them.
+
+        Raises:
+            RunError: the disk is full or refuses.
+        """
+        known = {**self.figures, **times}
+        figures = (
+            {name: known[name] for name in DEFINITIONS if name in known} if self.has_materials else known
+        )
+        content = {**figures, "per_view" if self.has_materials else "per_image": self.per_image, **self.more}
+        write_file(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
+        return figures
+
+
+def evaluate_images(pipeline: Pipeline, folder: Path, follow: Follow) -> Evaluated:
+    """What a model says of its own images, and its pictures of each: KIND/NAME.png in the folder.
+
+    Raises:
+        RunError: the disk is full or refuses.
+    """
+    images, found, num_pictures = pipeline.evaluate_images(), [], 0
+    for _ in follow("evaluating images", range(pipeline.datamanager.num_eval_images)):
+        name, metrics, pictures = next(images)
+        found.append((name, metrics))
+        num_pictures += len(pictures)
+        for kind, picture in pictures.items():
+            pixels = (picture.clamp(0, 1) * 255 + 0.5).byte().cpu().numpy()
+            write_file(folder / kind / f"{name}.png", rgba_png_bytes(pixels, f"{kind} of {name}"))
+    means = average_metrics([metrics for _, metrics in found])
+    figures = {**finite_or_none(means), "views": len(pipeline.datamanager.eval_cameras)}
+    per_image = [{"name": name, **finite_or_none(metrics)} for name, metrics in found]
+    return Evaluated(figures, per_image, {}, num_pictures, has_materials=False)
+
+
+def evaluate_scene(
+    scene: TrainedScene,
+    measured: Scene,
+    light_factors: Float[np.ndarray, " B"] | None,
+    folder: Path,
+    follow: Follow,
+    processes: Processes,
+) -> Evaluated | None:
+    """Measure a scene of mixed materials on the evaluation views of what was measured, and draw each view.
+
+    Args:
+        scene: What renders; each view is aligned first as far as the scene's `fitted` says.
+        measured: With all truth that is known.
+        light_factors: What measured radiance is multiplied with; None: nothing.
+        folder: Where pictures go: rgb, segmentation and abundances.
+        processes: That share the views.
+    Returns:
+        What was found; None in all processes but the first.
+    Raises:
+        RunError, Follower: the disk is full or refuses, or another process failed.
+    """
+    truth = scene_truth(measured).in_light(light_factors)
+    evaluation = Evaluation(truth, scene.materials.endmembers, scene.materials.names)
+    look = material_look(evaluation)
+    # Of segmentations the ids alone are kept: their colours are known after the last view.
+    ids: dict[int, UInt8[np.ndarray, "H W"]] = {}
+    views = list(zip(measured.eval_indices, views_of(scene.views, "eval"), strict=True))
+    fits_gain = "gain" in scene.fitted and not measured.is_rig
+    with processes.together():
+        for index, own in follow("evaluating views", views[processes.rank :: processes.count]):
+            view, camera = view_truth(measured, index).in_light(light_factors), own.camera
+            if "pose" in scene.fitted:
+                align = align_rows if camera.is_line_camera(0) else align_pose
+                camera = align(scene, camera, view)
+            rays = subpixels_for(measured, index, scene.subpixels, scene.pixel_size)
+            predicted = render_view(scene, camera, rays)
+            if fits_gain:
+                predicted = align_gain(predicted, view, torch.from_numpy(measured.wavelengths_nm))
+            if measured.is_rig:
+                evaluation.sensors[view.name] = measured.sensor_of(index).name
+            psnr_db, name = evaluation.add(view, predicted)["psnr"], f"{view.name}.png"
+            write_file(folder / "rgb" / name, draw_colour(view, predicted, truth.bands, psnr_db))
+            drawn = draw_matched_abundances(view, predicted, evaluation, look)
+            write_file(folder / "abundances" / name, drawn)
+            ids[index] = predicted.segmentation.numpy()
+    if processes.count > 1:
+        parts = processes.gather((evaluation, ids))
+        if not processes.is_first:
+            return None
+        evaluation.merge((other for other, _ in parts[1:]), [measured.frames[i].name for i, _ in views])
+        ids = {index: found for _, part in parts for index, found in part.items()}
+    matching = evaluation.segmentation().matching
+    for index in follow("drawing segmentations", list(ids)):
+        name = measured.frames[index].name
+        drawn = draw_matched_segmentation(name, measured.labels(index), ids[index], look, matching)
+        write_file(folder / "segmentation" / f"{name}.png", drawn)
+    more: dict[str, Any] = {"definitions": DEFINITIONS}
+    per_sensor = {name: finite_or_none(found) for name, found in evaluation.per_sensor().items()}
+    more |= {"per_sensor": per_sensor} if per_sensor else {}
+    aligned = [*(["pose"] if "pose" in scene.fitted else []), *(["gain"] if fits_gain else [])]
+    more |= {"aligned": aligned} if aligned else {}
+    per_view = [{"name": name, **finite_or_none(found)} for name, found in evaluation.per_view.items()]
+    return Evaluated(finite_or_none(evaluation.figures()), per_view, more, 3 * len(ids))
+
+
+@dataclass(frozen=True)
+class MaterialLook:
+    """Names and colours of true materials and predicted endmembers in one evaluation."""
+
+    true_names: tuple[str, ...]
+    true_colours: Float[np.ndarray, "K 3"]
+    pred_names: tuple[str, ...]
+    surplus_colours: Float[np.ndarray, "P 3"]
+    """Colours of predicted endmembers that stand for no true material."""
+
+    @property
+    def true_entries(self) -> list[tuple[str, Colour]]:
+        """Name and colour of each true material."""
+        return list(zip(self.true_names, self.true_colours, strict=True))
+
+    def pred_colours(self, matching: Mapping[int, int]) -> dict[int, np.ndarray]:
+        """Colour of each predicted endmember.
+
+        Args:
+            matching: Predicted -> true.
+        """
+        return {
+            index: self.true_colours[matching[index]] if index in matching else self.surplus_colours[index]
+            for index in range(len(self.pred_names))
+        }
+
+
+def material_look(evaluation: Evaluation) -> MaterialLook:
+    """Names and colours for all figures of an evaluation."""
+    truth, endmembers = evaluation.truth, evaluation.endmembers
+    grey = torch.full((truth.num_materials, len(truth.bands)), 0.2, dtype=torch.float64)
+    spectra = grey if truth.endmembers is None else truth.endmembers.double()
+    colours = distinct_colours(own_colours(torch.cat([spectra, endmembers]), truth.bands))
+    return MaterialLook(
+        truth.names or tuple(f"material {index}" for index in range(len(spectra))),
+        colours[: len(spectra)],
+        evaluation.names,
+        colours[len(spectra) :],
+    )
+
+
+def draw_colour(view: ViewTruth, predicted: RenderedView, bands: Bands, psnr_db: float) -> bytes:
+    """True colour, predicted colour, and their difference; in false colours for sensors without all bands."""
+    weights, spectra = view.colour_weights(bands), view.seen(predicted.spectra)
+    error = np.abs(_srgb_on_black(spectra, weights) - _srgb_on_black(view.spectra, weights)).mean(axis=-1)
+    seen = np.maximum(as_numpy(view.opacity), as_numpy(predicted.coverage))
+    panels = [
+        TitledPicture(coloured_picture(view.spectra, view.opacity, weights), "true"),
+        TitledPicture(coloured_picture(spectra, predicted.coverage, weights), "predicted"),
+        TitledPicture(over_neutral(paint(error, _ERROR_SCALE), (seen > 0.01).astype(np.float64)), "error"),
+    ]
+    colours = describe_colour(bands).split(":")[0] if view.sensor is None else f"seen by {view.sensor.name}"
+    heading = f"{view.name}: {colours}, spectral PSNR {psnr_db:.1f} dB"
+    return draw_panels([panels], heading, _ERROR_SCALE)
+
+
+def draw_matched_segmentation(
+    name: str,
+    labels: UInt8[np.ndarray, "H W"] | None,
+    ids: UInt8[np.ndarray, "H W"],
+    look: MaterialLook,
+    matching: Mapping[int, int],
+) -> bytes:
+    """True labels, predicted materials in the colours of those they are matched to, and where they differ."""
+    colours = look.pred_colours(matching)
+    as_true = np.full(256, NOTHING_ID, dtype=np.uint8)
+    as_true[list(matching)] = list(matching.values())
+    panels = [TitledPicture(paint_ids(ids, colours), "predicted")]
+    seen = set(np.unique(as_true[ids]).tolist())
+    extra: list[tuple[str, Colour]] = []
+    if labels is not None:
+        agreement = np.where((as_true[ids] != labels)[..., None], WRONG, RIGHT)
+        agreement[labels == NOTHING_ID] = NEUTRAL
+        true = TitledPicture(paint_ids(labels, dict(enumerate(look.true_colours))), "true")
+        panels = [true, *panels, TitledPicture(agreement, "disagreement")]
+        seen |= set(np.unique(labels).tolist())
+        extra = [("right", RIGHT), ("wrong", WRONG), ("unlabelled", (NEUTRAL,) * 3)]
+    true_entries = [entry for index, entry in enumerate(look.true_entries) if index in seen]
+    surplus = [
+        (name, colours[index])
+        for index, name in enumerate(look.pred_names)
+        if index not in matching and (ids == index).any()
+    ]
+    return draw_panels([panels], f"{name}: segmentation", legend=true_entries + surplus + extra)
+
+
+def draw_matched_abundances(
+    view: ViewTruth, predicted: RenderedView, evaluation: Evaluation, look: MaterialLook
+) -> bytes:
+    """Each true material's abundance above that of the endmember matched to it; surplus endmembers at the end."""
+    swatches = own_colours(evaluation.endmembers, evaluation.truth.bands)
+    pred_panels = share_panels(predicted.shares, predicted.accumulation, look.pred_names, swatches)
+    heading, matching = f"{view.name}: abundances", evaluation.matching
+    if view.abundances is None or matching is None:
+        return draw_panels(in_rows(pred_panels), heading, SHARE_SCALE)
+    has_truth = view.abundances.sum(dim=-1) > 0
+    true_panels = share_panels(view.abundances, view.opacity * has_truth, look.true_names, look.true_colours)
+    blank = TitledPicture(np.full_like(true_panels[0].image, NEUTRAL), "none matched")
+    partners = dict(zip(matching.true_ids, matching.pred_ids, strict=True))
+    partner_panels = [
+        pred_panels[partners[index]] if index in partners else blank for index in range(len(true_panels))
+    ]
+    columns = min(len(true_panels), _COLUMNS)
+    pairs = zip(in_rows(true_panels, columns), in_rows(partner_panels, columns), strict=True)
+    surplus = [panel for index, panel in enumerate(pred_panels) if index not in matching.pred_ids]
+    rows = [row for pair in pairs for row in pair] + in_rows(surplus, columns)
+    return draw_panels(rows, f"{heading}, true above predicted (matched by spectral angle)", SHARE_SCALE)
+
+
+def _srgb_on_black(spectra: Float[Tensor, "H W b"], weights: Float[Tensor, "b 3"]) -> np.ndarray:
+    linear = spectra.double().clamp(0, 1) @ weights
+    return linear_to_srgb(linear.clamp(0, 1)).numpy()
