@@ -85,7 +85,7 @@ class Evaluated:
     has_materials: bool = True
     """Whether the figures are those of `DEFINITIONS`."""
 
-    def write(self, path: Path, times: Mapping[str, float | None]) -> dict[str, float | None]:
+    def write(self, path: Path, times: Mapping[str, float | None]) -> dict[str, Any]:
         """Write metrics.json; its figures, those of training among them.
 
         Raises:
