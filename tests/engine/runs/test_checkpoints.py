@@ -36,7 +36,7 @@ class Faults:
         self.at = at
         self.error = error
         self.dead = dead
-        monkeypatch.setattr(atomic_files, "CHUNK_BYTES", 200)
+        monkeypatch.setattr(atomic_files, "_CHUNK_BYTES", 200)
         for name in CALLS:
             monkeypatch.setattr(os, name, self.wrap(name, getattr(os, name)))
 

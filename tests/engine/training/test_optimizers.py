@@ -1,21 +1,36 @@
-"""Learning-rate schedules as functions of progress, and the optimiser they drive."""
+"""Learning-rate schedules as functions of progress, and the optimiser they drive.
 
+Non-finite numbers never reach the parameters.
+
+The moving average of the parameters.
+"""
+
+import io
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rich.console import Console
 from torch import nn
 
-from unmix_plugin.engine.configs import OptimizerConfig
+from unmix_plugin.engine.configs import OptimizerConfig, TrainerConfig
+from unmix_plugin.engine.runs.checkpoints import newest_complete_checkpoint
+from unmix_plugin.engine.runs.load_run import load_model
+from unmix_plugin.engine.training import optimizers as guards
+from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.engine.training.optimizers import (
+    GradientGuard,
+    ParameterAverage,
     build_optimizer,
     forget_gradients,
     learning_rate,
     set_learning_rates,
 )
-from unmix_plugin.errors import ConfigError
+from unmix_plugin.engine.training.trainer import Trainer
+from unmix_plugin.errors import ConfigError, RunError
 
 configs = st.builds(
     OptimizerConfig,
@@ -102,3 +117,184 @@ def test_weight_decay_draws_what_has_no_gradient_to_zero_and_hardly_moves_the_re
 def test_a_group_without_settings_is_refused_by_name():
     with pytest.raises(ConfigError, match="group heads; configs: fields"):
         build_optimizer({"heads": [nn.Parameter(torch.ones(1))]}, {"fields": OptimizerConfig()})
+
+
+def make_guard():
+    params = [nn.Parameter(torch.zeros(2)), nn.Parameter(torch.zeros(3)), nn.Parameter(torch.zeros(1))]
+    configs = {"a": OptimizerConfig(), "b": OptimizerConfig()}
+    optimizer = build_optimizer({"a": params[:2], "b": params[2:]}, configs)
+    for param in params:
+        param.grad = torch.ones_like(param)
+    return GradientGuard(optimizer), params
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_a_bad_loss_or_any_one_bad_gradient_entry_is_refused(bad: float):
+    guard, params = make_guard()
+    assert guard.check(torch.tensor(0.5)) == (True, 0.5)
+    assert guard.check(torch.tensor(bad))[0] is False
+    for param in params:
+        assert param.grad is not None
+        param.grad[-1] = bad
+        assert guard.check(torch.tensor(0.5)) == (False, 0.5)
+        param.grad[-1] = 1.0
+    assert guard.skipped == 4
+
+
+def test_parameters_without_gradient_do_not_matter():
+    guard, params = make_guard()
+    params[0].grad = params[2].grad = None
+    assert guard.check(torch.tensor(1.0))[0] is True
+
+
+def test_only_refusals_in_a_row_end_training(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(guards, "MAX_IN_A_ROW", 2)
+    guard, _ = make_guard()
+    for loss in (math.nan, 1.0, math.nan, 1.0):
+        guard.check(torch.tensor(loss))
+    assert guard.skipped == 2
+    guard.check(torch.tensor(math.nan))
+    with pytest.raises(RunError, match="2 training steps in a row had a non-finite loss"):
+        guard.check(torch.tensor(math.nan))
+
+
+def poisoned_trainer(config: TrainerConfig, steps: set[int]) -> Trainer:
+    """Its loss is NaN in `steps`."""
+    trainer = Trainer(config, console=Console(file=io.StringIO()))
+    original = trainer.pipeline.get_train_loss_dict
+
+    def poisoned(step: int):
+        outputs, losses, metrics = original(step)
+        return outputs, {"rgb_loss": losses["rgb_loss"] * (math.nan if step in steps else 1.0)}, metrics
+
+    trainer.pipeline.get_train_loss_dict = poisoned  # type: ignore[method-assign]
+    return trainer
+
+
+def test_a_poisoned_step_changes_no_parameter_and_is_counted_and_logged(short_config: TrainerConfig):
+    trainer = poisoned_trainer(short_config, {5})
+    seen: list[torch.Tensor] = []
+    grid = next(trainer.pipeline.model.parameters())
+    where = TrainingCallbackLocation.AFTER_TRAIN_ITERATION
+    trainer.callbacks.append(TrainingCallback(where, lambda *_: seen.append(grid.detach().clone())))
+    record = trainer.train()
+    assert record.skipped_steps == 1
+    assert torch.equal(seen[5], seen[4])
+    assert not torch.equal(seen[6], seen[5])
+    assert "step 5 skipped: non-finite loss (nan)" in trainer.log.path.read_text()
+    assert '"loss": null' in trainer.run.metrics_path.read_text()
+
+
+def test_training_that_stays_poisoned_ends_with_the_last_checkpoint_whole(
+    short_config: TrainerConfig, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(guards, "MAX_IN_A_ROW", 3)
+    trainer = poisoned_trainer(short_config, set(range(6, 100)))
+    with pytest.raises(RunError, match="3 training steps in a row"):
+        trainer.train()
+    checkpoint = newest_complete_checkpoint(trainer.run.checkpoints)
+    assert checkpoint is not None
+    assert checkpoint.step == 8
+    assert all(tensor.isfinite().all() for tensor in checkpoint.tensors.values())
+
+
+def test_the_average_of_a_constant_is_the_constant():
+    module = nn.Linear(3, 2)
+    expected = module.weight.detach().clone()
+    average = ParameterAverage(module, decay=0.9)
+    for step in range(1, 30):
+        average.update(step)
+    torch.testing.assert_close(average.values["weight"], expected, rtol=0, atol=1e-7)
+
+
+def test_after_many_steps_the_average_is_exponential():
+    module = nn.Linear(1, 1, bias=False)
+    average = ParameterAverage(module, decay=0.5)
+    expected = 0.0
+    for step in range(1, 60):
+        with torch.no_grad():
+            module.weight.fill_(float(step % 7))
+        average.update(step)
+        expected = 0.5 * expected + 0.5 * (step % 7)
+    torch.testing.assert_close(average.values["weight"].item(), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_an_interval_of_two_updates_at_every_second_step_with_the_decay_squared():
+    module = nn.Linear(1, 1, bias=False)
+    average = ParameterAverage(module, decay=0.9, interval=2)
+    assert average.decay == 0.9**2
+    average.update(1)
+    average.update(2)
+    before = average.updates
+    for step in range(3, 8):
+        average.update(step)
+    assert average.updates - before == 2
+
+
+def test_the_steps_of_the_first_interval_are_each_taken_in_so_that_a_short_training_shows():
+    module = nn.Linear(1, 1, bias=False)
+    with torch.no_grad():
+        module.weight.fill_(0.0)
+    average = ParameterAverage(module, decay=0.99, interval=8)
+    with torch.no_grad():
+        module.weight.fill_(1.0)
+    for step in range(1, 4):
+        average.update(step)
+    assert average.updates == 3
+    assert average.values["weight"].item() > 0.95
+
+
+@pytest.mark.parametrize("num_steps", [400, 4000])
+@pytest.mark.parametrize("interval", [1, 8])
+def test_before_the_decay_bites_the_average_spans_the_same_part_of_a_training_of_any_length(
+    num_steps, interval
+):
+    module = nn.Linear(1, 1, bias=False)
+    average = ParameterAverage(module, decay=0.99999, interval=interval)
+    for step in range(1, num_steps + 1):
+        with torch.no_grad():
+            module.weight.fill_(step / num_steps)
+        average.update(step)
+    # A mean in which the weight of a step grows with its number to the 8th lags a tenth of the way behind.
+    assert average.values["weight"].item() == pytest.approx(0.9, abs=0.02)
+
+
+def test_swapping_in_shows_the_average_and_gives_the_parameters_back():
+    module = nn.Linear(2, 2)
+    average = ParameterAverage(module, decay=0.9)
+    before = module.weight.detach().clone()
+    with torch.no_grad():
+        module.weight.add_(1.0)
+    with average.swapped_in():
+        assert torch.equal(module.weight, before)
+    assert torch.equal(module.weight, before + 1.0)
+    assert torch.equal(average.values["weight"], before)
+
+
+def test_a_run_with_an_average_is_evaluated_and_loaded_with_it(short_config: TrainerConfig):
+    config = replace(short_config, average_decay=0.8, steps_per_eval_all_images=12)
+    trainer = Trainer(config, console=Console(file=io.StringIO()))
+    trainer.train()
+    assert trainer.average is not None
+    loaded = load_model(trainer.run.path, "cpu")
+    grid = dict(loaded.model.named_parameters())["field.grid"]
+    assert torch.equal(grid, trainer.average.values["field.grid"])
+    assert not torch.equal(grid, dict(trainer.pipeline.model.named_parameters())["field.grid"])
+    line = trainer.run.metrics_path.read_text().splitlines()[-1]
+    with trainer.average.swapped_in():
+        assert f'"psnr": {trainer.pipeline.get_average_eval_image_metrics_and_images()[0]["psnr"]}' in line
+
+
+def test_the_average_takes_parameters_as_callbacks_after_the_step_leave_them(short_config: TrainerConfig):
+    trainer = Trainer(replace(short_config, average_decay=0.0), console=Console(file=io.StringIO()))
+    grid = dict(trainer.pipeline.model.named_parameters())["field.grid"]
+
+    def bound(step: int, progress: float) -> None:  # noqa: ARG001
+        with torch.no_grad():
+            grid.clamp_(-1e-6, 1e-6)
+
+    trainer.callbacks.append(TrainingCallback(TrainingCallbackLocation.AFTER_TRAIN_ITERATION, bound))
+    assert trainer.average is not None
+    trainer.average.interval = 1
+    trainer.train()
+    assert torch.equal(trainer.average.values["field.grid"], grid)

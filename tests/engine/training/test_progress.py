@@ -1,16 +1,133 @@
-"""Progress is a live bar on a terminal and plain lines elsewhere."""
+"""Training ends at whichever limit is reached first, and progress says how near that is.
 
+Progress is a live bar on a terminal and plain lines elsewhere.
+
+Metrics as JSON lines and TensorBoard files, events as a log.
+"""
+
+import contextlib
+import errno
+import importlib.util
 import io
+import json
+import math
 import re
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from rich.console import Console
 
 from unmix_plugin.engine.configs import TrainerConfig
-from unmix_plugin.engine.training.progress import ProgressConsole, ProgressDisplay, TrainingStatus
+from unmix_plugin.engine.runs.load_run import load_config
+from unmix_plugin.engine.runs.run_folder import RunFolder
+from unmix_plugin.engine.training import progress as limits_module
+from unmix_plugin.engine.training.progress import (
+    Limits,
+    MetricsWriter,
+    ProgressConsole,
+    ProgressDisplay,
+    RunLog,
+    TrainingClock,
+    TrainingStatus,
+)
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.engine.training.training_control import Interrupted
+from unmix_plugin.errors import RunError
+
+limits = st.builds(
+    Limits,
+    max_steps=st.none() | st.integers(0, 10_000),
+    max_seconds=st.none() | st.floats(1e-3, 1e4),
+)
+steps, seconds = st.integers(0, 20_000), st.floats(0, 2e4)
+
+
+@given(limits, steps, seconds)
+def test_progress_is_the_nearer_limits_fraction(limit: Limits, step: int, spent: float):
+    progress = limit.progress(step, spent)
+    assert 0.0 <= progress <= 1.0
+    over = [
+        limit.max_steps is not None and step >= limit.max_steps,
+        limit.max_seconds is not None and spent >= limit.max_seconds,
+    ]
+    assert limit.reached(step, spent) == any(over) == (progress == 1.0)
+    if not any(over) and limit.max_steps and limit.max_seconds is None:
+        assert progress == step / limit.max_steps
+
+
+@given(limits, steps, seconds, st.integers(0, 100), st.floats(0, 100))
+def test_progress_never_falls(limit: Limits, step: int, spent: float, more: int, longer: float):
+    assert limit.progress(step + more, spent + longer) >= limit.progress(step, spent)
+
+
+@pytest.fixture
+def fake_time(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """A clock that goes on by `tick` whenever it is read, and by hand."""
+    fake = SimpleNamespace(now=0.0, tick=0.0)
+
+    def read() -> float:
+        fake.now += fake.tick
+        return fake.now
+
+    monkeypatch.setattr(limits_module, "time", SimpleNamespace(perf_counter=read))
+    return fake
+
+
+def test_the_clock_counts_only_while_it_runs(fake_time):
+    clock = TrainingClock(seconds=10.0)
+    fake_time.now = 5.0
+    assert clock.seconds == 10.0
+    with clock.running():
+        fake_time.now += 3.0
+    assert clock.seconds == 13.0
+    with contextlib.suppress(ValueError), clock.running():
+        fake_time.now += 1.0
+        raise ValueError
+    assert clock.seconds == 14.0
+
+
+def test_a_limit_in_seconds_ends_training_in_time_with_the_schedule_run_out(
+    short_config: TrainerConfig, fake_time
+):
+    fake_time.tick = 1 / 64
+    trainer = Trainer(replace(short_config, max_num_iterations=None, max_seconds=0.5, steps_per_save=0))
+    record = trainer.train()
+    assert (record.steps, record.train_seconds) == (32, 0.5)
+    assert record.progress == 1.0
+    assert record.learning_rates["fields"] < 0.2 * 0.2
+    resumed = Trainer(replace(load_config(trainer.run.path), max_seconds=0.75)).train()
+    assert (resumed.steps, resumed.train_seconds) == (48, 0.75)
+
+
+def test_seconds_of_evaluation_saving_and_warming_up_do_not_count(
+    short_config: TrainerConfig, monkeypatch: pytest.MonkeyPatch, fake_time
+):
+    fake_time.tick = 1 / 64
+    trainer = Trainer(
+        replace(short_config, max_num_iterations=3, steps_per_eval_all_images=1, steps_per_save=1)
+    )
+    slow = {"eval": 0, "warm": 0}
+
+    def evaluate():
+        slow["eval"] += 1
+        fake_time.now += 400
+        return {"psnr": 1.0}, {}
+
+    def warm_up() -> None:
+        slow["warm"] += 1
+        fake_time.now += 400
+
+    monkeypatch.setattr(trainer.pipeline, "get_average_eval_image_metrics_and_images", evaluate)
+    monkeypatch.setattr(trainer.pipeline.model, "warm_up", warm_up)
+    record = trainer.train()
+    assert slow == {"eval": 3, "warm": 1}
+    assert record.train_seconds == 3 / 64
+
 
 STATUS = TrainingStatus(
     step=120, seconds=30.0, progress=0.25, loss=0.00123, psnr=31.5, rays_per_second=18_200.0
@@ -89,3 +206,85 @@ def test_even_the_shortest_training_shows_where_it_ended(short_config: TrainerCo
     out = io.StringIO()
     Trainer(short_config, console=Console(file=out)).train()
     assert [line.split("  ")[0] for line in out.getvalue().splitlines()] == ["step 12"]
+
+
+HAS_TENSORBOARD = importlib.util.find_spec("tensorboard") is not None
+
+
+@pytest.fixture
+def without_tensorboard(monkeypatch: pytest.MonkeyPatch):
+    real = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name == "tensorboard" else real(name)
+    )
+
+
+@pytest.mark.usefixtures("without_tensorboard")
+def test_each_write_is_one_json_line_and_what_is_not_finite_is_null(tmp_path: Path):
+    writer = MetricsWriter(RunFolder(tmp_path))
+    writer.write(1, 0.12345, "train", {"loss": 0.5, "psnr": math.inf})
+    writer.write(2, 1.0, "eval_all", {"psnr": 30.0})
+    writer.write_images(2, {"rgb": torch.zeros(2, 2, 3)})
+    writer.close()
+    lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert lines == [
+        {"step": 1, "seconds": 0.123, "split": "train", "loss": 0.5, "psnr": None},
+        {"step": 2, "seconds": 1.0, "split": "eval_all", "psnr": 30.0},
+    ]
+    assert not (tmp_path / "tensorboard").exists()
+
+
+@pytest.mark.skipif(not HAS_TENSORBOARD, reason="tensorboard is not installed")
+def test_tensorboard_gets_the_same_numbers_where_it_is_installed(tmp_path: Path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    writer = MetricsWriter(RunFolder(tmp_path))
+    writer.write(1, 0.1, "train", {"loss": 0.5})
+    writer.write(2, 0.2, "train", {"loss": 0.25})
+    writer.write_images(2, {"rgb": torch.rand(4, 5, 3)})
+    writer.close()
+    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    assert [(event.step, event.value) for event in events.Scalars("train/loss")] == [(1, 0.5), (2, 0.25)]
+    assert (events.Images("eval/rgb")[0].height, events.Images("eval/rgb")[0].width) == (4, 5)
+
+
+@pytest.mark.usefixtures("without_tensorboard")
+def test_resuming_cuts_off_later_lines_and_a_half_written_one(tmp_path: Path):
+    path = tmp_path / "metrics.jsonl"
+    path.write_text('{"step": 1}\n{"step": 2}\n{"step": 3}\n[]\n{"step": 4, "lo')
+    MetricsWriter(RunFolder(tmp_path), resumed_step=2).write(3, 0.0, "train", {})
+    assert [json.loads(line)["step"] for line in path.read_text().splitlines()] == [1, 2, 3]
+
+
+def test_the_log_dates_each_event(tmp_path: Path):
+    log = RunLog(RunFolder(tmp_path))
+    log.write("started")
+    log.write("saved step 5")
+    first, second = (tmp_path / "run.log").read_text().splitlines()
+    assert first.endswith("+00:00 started")
+    assert second.endswith("+00:00 saved step 5")
+    assert first[:4].isdigit()
+
+
+def test_a_full_disk_while_saving_ends_training_with_a_clear_error_and_the_last_checkpoint(
+    short_config: TrainerConfig, monkeypatch: pytest.MonkeyPatch
+):
+    trainer = Trainer(short_config)
+    saved: list[int] = []
+    original = trainer.save
+
+    def save_then_fill_the_disk() -> None:
+        original()
+        saved.append(trainer.step)
+        monkeypatch.setattr("os.write", refuse)
+
+    def refuse(*_: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(trainer, "save", save_then_fill_the_disk)
+    with pytest.raises(RunError, match=r"No space left on device.*go on with --load-run"):
+        trainer.train()
+    assert saved == [4]
+    names = sorted(path.name for path in trainer.run.checkpoints.iterdir())
+    assert names == ["step-000004.json", "step-000004.safetensors"]
+    assert "failed at step 8: RunError" in trainer.log.path.read_text()

@@ -1,0 +1,166 @@
+"""Bundles of rays.
+
+The box of model space.
+
+Laws of the contraction of space.
+"""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.testing import assert_close
+
+from unmix_plugin.engine.geometry.space import RayBundle, SceneBox, UnitSpace, contract, uncontract
+
+
+def make_bundle(count: int) -> RayBundle:
+    generator = torch.Generator().manual_seed(1)
+    directions = torch.randn(count, 3, generator=generator)
+    directions = directions / directions.norm(dim=-1, keepdim=True)
+    return RayBundle(torch.randn(count, 3, generator=generator), directions, torch.arange(count))
+
+
+def test_a_slice_keeps_origin_direction_and_camera_of_each_ray_together():
+    bundle = make_bundle(7)
+    part = bundle[2:5]
+    assert len(part) == 3
+    assert torch.equal(part.origins, bundle.origins[2:5])
+    assert torch.equal(part.directions, bundle.directions[2:5])
+    assert part.camera_indices.tolist() == [2, 3, 4]
+
+
+def test_an_index_tensor_picks_rays_in_its_order_and_a_mask_keeps_theirs():
+    bundle = make_bundle(5)
+    assert bundle[torch.tensor([4, 0, 4])].camera_indices.tolist() == [4, 0, 4]
+    assert bundle[torch.tensor([True, False, False, True, False])].camera_indices.tolist() == [0, 3]
+
+
+def test_an_empty_bundle_has_length_zero():
+    assert len(make_bundle(4)[:0]) == 0
+
+
+def test_moving_to_a_device_keeps_the_values():
+    bundle = make_bundle(3)
+    moved = bundle.to("cpu")
+    assert torch.equal(moved.origins, bundle.origins)
+    assert moved.camera_indices.dtype == torch.int64
+
+
+def test_joined_bundles_are_one_after_the_other():
+    bundle = make_bundle(5)
+    joined = RayBundle.join([bundle[:2], bundle[2:]])
+    assert torch.equal(joined.origins, bundle.origins)
+    assert torch.equal(joined.directions, bundle.directions)
+    assert torch.equal(joined.camera_indices, bundle.camera_indices)
+    assert joined.axes is None
+
+
+BOX = SceneBox(torch.tensor([[-1.0, -2.0, 0.0], [1.0, 3.0, 0.5]]))
+numbers = st.floats(-4.0, 4.0, width=32)
+vectors = st.tuples(numbers, numbers, numbers)
+
+
+def test_corners_normalise_to_zero_and_one():
+    assert torch.equal(BOX.normalise(BOX.aabb), torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]))
+
+
+def test_size_is_the_edge_lengths():
+    assert torch.equal(BOX.size, torch.tensor([2.0, 5.0, 0.5]))
+
+
+@given(vectors)
+def test_contains_agrees_with_normalised_coordinates(point):
+    p = torch.tensor(point)
+    normalised = BOX.normalise(p)
+    clear = ((normalised - 0.5).abs() - 0.5).abs().min() > 1e-5  # rounding decides on the surface itself
+    if clear:
+        assert bool(BOX.contains(p)) == bool(((normalised >= 0) & (normalised <= 1)).all())
+
+
+@given(vectors, vectors.filter(lambda v: max(map(abs, v)) > 0.1))
+def test_the_stretch_inside_is_exactly_what_intersect_says(origin, direction):
+    o, d = torch.tensor([origin]), torch.tensor([direction])
+    d = d / d.norm()
+    t_near, t_far = BOX.intersect(o, d)
+    assert 0.0 <= t_near.item() <= t_far.item()
+    t = torch.linspace(0.0, 20.0, 801)
+    points = o + t[:, None] * d
+    within = (t > t_near + 1e-3) & (t < t_far - 1e-3)
+    beyond = (t < t_near - 1e-3) | (t > t_far + 1e-3)
+    assert grown_box(1e-3).contains(points[within]).all()
+    assert not grown_box(-1e-3).contains(points[beyond]).any()
+
+
+def grown_box(margin: float) -> SceneBox:
+    return SceneBox(BOX.aabb + torch.tensor([[-margin], [margin]]))
+
+
+def test_a_ray_along_an_axis_on_a_face_gives_finite_distances():
+    t_near, t_far = BOX.intersect(torch.tensor([[-1.0, -5.0, 0.0]]), torch.tensor([[0.0, 1.0, 0.0]]))
+    assert torch.isfinite(t_near).all()
+    assert torch.isfinite(t_far).all()
+
+
+def test_a_ray_that_misses_has_a_stretch_of_no_length():
+    t_near, t_far = BOX.intersect(torch.tensor([[5.0, 5.0, 5.0]]), torch.tensor([[0.0, 1.0, 0.0]]))
+    assert t_near.item() == t_far.item()
+
+
+def test_a_ray_that_leaves_the_box_behind_it_misses():
+    t_near, t_far = BOX.intersect(torch.tensor([[0.0, 5.0, 0.25]]), torch.tensor([[0.0, 1.0, 0.0]]))
+    assert t_near.item() == t_far.item()
+
+
+def test_an_inside_out_box_is_refused():
+    with pytest.raises(ValueError, match="smaller corner first"):
+        SceneBox(torch.tensor([[0.0, 0.0, 0.0], [1.0, -1.0, 1.0]]))
+
+
+OBLONG = SceneBox(torch.tensor([[-1.0, 0.0, 2.0], [3.0, 1.0, 5.0]]))
+POINTS = st.lists(st.floats(-100, 100, width=32), min_size=3, max_size=3).map(torch.tensor)
+
+
+@given(POINTS)
+def test_uncontract_inverts_contract(point):
+    found = uncontract(contract(point.double()))
+    assert_close(found, point.double(), rtol=1e-6, atol=1e-9)
+
+
+@given(POINTS, POINTS)
+def test_contraction_brings_points_nearer_and_is_continuous(a, b):
+    """Its greatest stretch is 1, inside the inner cube and across its faces."""
+    moved = (contract(a.double()) - contract(b.double())).abs().amax()
+    assert moved <= 2 * (a.double() - b.double()).abs().amax() + 1e-12
+    near = contract(a.double() * (1 + 1e-9)) - contract(a.double())
+    assert near.abs().amax() < 1e-8
+
+
+@given(POINTS)
+def test_contraction_stays_below_two_and_leaves_the_inner_cube_alone(point):
+    found = contract(point.double())
+    assert found.abs().amax() < 2
+    inner = point.double() / 100
+    assert torch.equal(contract(inner), inner)
+
+
+def test_the_far_end_of_a_direction_lies_on_the_outer_cube():
+    assert_close(contract(torch.tensor([1e6, 0.0, 5e5])), torch.tensor([2.0, 0.0, 1.0]), rtol=0, atol=1e-5)
+
+
+def test_the_unit_cube_of_a_bounded_scene_is_its_box_to_the_last_bit():
+    points = torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
+    space = UnitSpace(OBLONG)
+    assert torch.equal(space.to_unit(points), OBLONG.normalise(points))
+    assert torch.equal(space.from_unit(points), points * OBLONG.size + OBLONG.aabb[0])
+    assert torch.equal(space.contains(points), OBLONG.contains(points))
+
+
+def test_the_unit_cube_of_an_unbounded_scene_holds_all_of_space_and_the_box_in_its_middle():
+    space = UnitSpace(OBLONG, is_unbounded=True)
+    far = 1000 * torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
+    unit = space.to_unit(far)
+    assert ((unit > 0) & (unit < 1)).all()
+    assert space.contains(far).all()
+    assert_close(space.from_unit(space.to_unit(far / 100)), far / 100, rtol=1e-3, atol=1e-3)
+    assert_close(space.to_unit(OBLONG.aabb)[:, 0], torch.tensor([0.25, 0.75]))
