@@ -86,7 +86,7 @@ def test_help_shows_the_common_options_and_help_all_the_others_too():
     assert common.status == everything.status == 0
     for flag in ("--data", "--max-seconds", "--endmembers", "--value-scale", "--help-all"):
         assert flag in common.out
-    for flag in ("--optimizers.grid.lr", "--pipeline.model.field", "--viewer.port", "--steps-per-save"):
+    for flag in ("--checkpoints-kept", "--pipeline.model.field", "--viewer.port", "--steps-per-save"):
         assert flag not in common.out
         assert flag in everything.out
     assert len(common.out.splitlines()) < 80

@@ -198,7 +198,7 @@ class TrainerConfig:
     """Write losses and metrics to metrics.jsonl every so many steps."""
     checkpoints_kept: int = 2
     """How many of the newest checkpoints stay in the run folder."""
-    average_decay: float | None = None
+    average_decay: tyro.conf.Suppress[float | None] = None
     """Decay a step of the moving average of the parameters with which the run is evaluated and rendered; early in
     training it decays faster, to span at most about a ninth of the steps so far. None: no average."""
     load_run: Annotated[Path | None, Common] = None
@@ -207,7 +207,7 @@ class TrainerConfig:
     """Devices and processes."""
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)
     """Data and model."""
-    optimizers: Mapping[str, OptimizerConfig] = field(default_factory=dict)
+    optimizers: tyro.conf.Suppress[Mapping[str, OptimizerConfig]] = field(default_factory=dict)
     """Settings of the optimiser by parameter group."""
 
     def __post_init__(self) -> None:
