@@ -89,9 +89,7 @@ def test_masked_and_invalid_pixels_are_never_drawn(scene_folder, tmp_path):
         cube = np.load(path)
         cube[:, :8] = np.nan
         np.save(path, cube)
-    with pytest.raises(
-        SceneError, match=r"(?s)NaN.*invalid_pixels is --pipeline\.datamanager\.scene\.invalid-pixels"
-    ):
+    with pytest.raises(SceneError, match=r"(?s)NaN.*leave these out with --invalid-pixels mask"):
         make(folder)
     manager = make(folder, scene=SceneOptions(invalid_pixels="mask"))
     bundle, batch = manager.next_train(0)

@@ -6,9 +6,7 @@ its area, so several rays are cast through it, one in each cell of a grid on it;
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
-from dataclasses import fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -24,7 +22,6 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.engine.machine import step_generator
 from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
-from unmix_plugin.errors import SceneError
 from unmix_plugin.light.search import find_lamp
 from unmix_plugin.poses.knots import Knots
 from unmix_plugin.presets import choose, preset_for
@@ -42,7 +39,7 @@ from unmix_plugin.scenes.geometry.pose_check import check_scene_poses, parallax_
 from unmix_plugin.scenes.geometry.surface_evidence import SurfaceEvidence
 from unmix_plugin.scenes.pixel_table import PixelRays, PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
-from unmix_plugin.scenes.scene import Scene, SceneOptions, check_recorded_scene, scene_identity
+from unmix_plugin.scenes.scene import check_recorded_scene, scene_identity
 from unmix_plugin.sensors.batches import join_parts
 from unmix_plugin.spectral.bad_values import BandNoise
 from unmix_plugin.spectral.unmixing.endmembers import typical_spectrum
@@ -78,7 +75,7 @@ class HyperspectralDataManager(DataManager):
         """
         super().__init__(config, data=data, device=device, seed=seed)
         self.options = config
-        self.scene = _load(_scene_folder(data), config.scene)
+        self.scene = load_scene(_scene_folder(data), config.scene)
         self.scene_box = self.scene.scene_box
         self.train_cameras = self.scene.cameras[list(self.scene.train_indices)]
         self.eval_cameras = self.scene.cameras[list(self.scene.eval_indices)]
@@ -299,18 +296,6 @@ class HyperspectralDataManager(DataManager):
         if light == "camera":
             lamp = find_lamp(cameras, self._evidence.log_shading(), reachable, self.scene_box)
         return {"light": np.array(light), "lamp": np.array(() if lamp is None else lamp.numbers())}
-
-
-def _load(folder: Path, options: SceneOptions) -> Scene:
-    """The scene; where an error names an option of it, the option's flag is added."""
-    try:
-        return load_scene(folder, options)
-    except SceneError as error:
-        names = [item.name for item in fields(SceneOptions)]
-        # "camera to world" and a folder called world don't name the option.
-        named = [name for name in names if re.search(rf"(?<!to )(?<![\w/]){name}\b", str(error))]
-        flags = [f"{name} is --pipeline.datamanager.scene.{name.replace('_', '-')}" for name in named]
-        raise SceneError("\n".join([str(error), *flags])) from error
 
 
 def _scene_folder(data: Path) -> Path:

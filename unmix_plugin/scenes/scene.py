@@ -39,12 +39,12 @@ class SceneOptions:
     invalid_pixels: Annotated[InvalidPixels, Common, short("invalid-pixels")] = "refuse"
     """What to do with pixels that hold NaN, infinite or negative values: refuse the scene; leave them out (mask); or
     set negative values to 0, as suits noise around black, and leave the others out (clip)."""
-    allow_outside_paths: bool = False
+    allow_outside_paths: Annotated[bool, short("allow-outside-paths")] = False
     """Follow paths in transforms.json that lead out of the scene folder (`..`, absolute, symbolic links)."""
-    eval_split: Literal["auto", "lists", "filename", "interval"] = "auto"
+    eval_split: Annotated[Literal["auto", "lists", "filename", "interval"], short("eval-split")] = "auto"
     """Evaluation frames by the lists of transforms.json, by folder or file name, or every n-th; auto takes the first
     of these that the scene supports."""
-    eval_interval: int = 8
+    eval_interval: Annotated[int, short("eval-interval")] = 8
     """With an interval split every n-th frame, from the first on, is for evaluation."""
     world: Annotated[Literal["bounded", "unbounded", "auto"], Common, short("world")] = "auto"
     """Whether all that pictures show lies in a box, or goes on behind it as far as the sky. Auto is bounded where

@@ -68,7 +68,7 @@ def test_nan_infinite_and_negative_values_are_counted_by_frame(folder):
         "frames[4] cubes/view_4.npy: the cube has 2 NaN, 1 infinite, 3 negative values in 3 of 320 pixels"
         in fault
     )
-    assert "invalid_pixels 'mask'" in fault
+    assert "--invalid-pixels mask" in fault
 
 
 def test_a_frame_without_any_valid_pixel_is_refused_even_when_masking(folder):
@@ -92,7 +92,7 @@ def test_float_cubes_in_other_units_get_a_scale_proposed_that_then_works(folder,
     folder.edit_cubes(lambda cube: cube.astype(np.float32) * factor)
     fault = fault_of(folder)
     assert "values are far outside [0, 1]" in fault
-    assert f"set value_scale to {scale}" in fault
+    assert f"--value-scale {scale}" in fault
     assert load_scene(folder.root, SceneOptions(value_scale=float(scale))).cube(1).max() <= 1.0
 
 
@@ -104,7 +104,7 @@ def test_noise_around_black_is_one_message_with_two_remedies(folder):
     assert "frames[2] cubes/view_2.npy and 3 more: their cubes have " in fault
     assert "negative values in" in fault
     assert "down to -0.006" in fault
-    assert "invalid_pixels 'mask'; for noise around black use 'clip'" in fault
+    assert "--invalid-pixels mask; for noise around black --invalid-pixels clip" in fault
     scene = load_scene(folder.root, SceneOptions(invalid_pixels="clip"))
     assert scene.valid_mask(3).all()
     assert scene.cube(3).min() == 0.0
@@ -140,17 +140,17 @@ def test_integer_cubes_are_refused_with_the_scale_that_fits(folder, dtype, facto
     folder.edit_cubes(lambda cube: np.round(cube.astype(np.float64) * factor).astype(dtype))
     fault = fault_of(folder)
     assert "the cube holds integers" in fault
-    assert f"set value_scale to {scale}" in fault
+    assert f"--value-scale {scale}" in fault
 
 
 def test_a_value_scale_that_is_much_too_small_is_refused(folder):
     folder.edit_cubes(lambda cube: np.full(cube.shape, 4000, np.uint16))
-    assert "after division by value_scale 255" in fault_of(folder, value_scale=255.0)
+    assert "after division by --value-scale 255" in fault_of(folder, value_scale=255.0)
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, 1e-320, float("nan"), float("inf")])
 def test_a_value_scale_that_is_no_positive_number_is_refused(folder, scale):
-    assert "value_scale: is" in fault_of(folder, value_scale=scale)
+    assert "--value-scale: is" in fault_of(folder, value_scale=scale)
 
 
 class Exploding:

@@ -90,12 +90,12 @@ def test_every_nth_frame_evaluates_and_no_frame_is_lost_or_used_twice(count, int
 
 @pytest.mark.parametrize("interval", [1, 0, -3])
 def test_an_interval_that_leaves_nothing_to_train_on_is_refused(interval):
-    with pytest.raises(SceneError, match="eval_interval: is"):
+    with pytest.raises(SceneError, match="--eval-interval: is"):
         split_of(["a", "b"], method="interval", interval=interval)
 
 
 def test_lists_that_are_asked_for_must_be_there():
-    with pytest.raises(SceneError, match="eval_split 'lists' needs them"):
+    with pytest.raises(SceneError, match="--eval-split lists needs them"):
         split_of(["a", "b"], method="lists")
 
 

@@ -437,9 +437,9 @@ def _note_invalid(named: list[tuple[str, CubeValues]], invalid_pixels: InvalidPi
     least = min(values.least for values in cubes)
     counts = ((nan, "NaN"), (infinite, "infinite"), (negative, "negative"))
     found = ", ".join(f"{count} {kind}" for count, kind in counts if count)
-    remedy = "mend it, or leave these out with invalid_pixels 'mask'"
+    remedy = "mend it, or leave these out with --invalid-pixels mask"
     if negative and all(values.is_noise for values in cubes):
-        remedy += "; for noise around black use 'clip', which sets negative values to 0"
+        remedy += "; for noise around black --invalid-pixels clip, which sets negative values to 0"
     lowest = f", down to {least:.3g}" if negative else ""
     cube = "the cube has" if len(cubes) == 1 else "their cubes have"
     for where, _ in usable:
@@ -453,7 +453,7 @@ def _note_scales(measured: list[tuple[str, CubeValues]], scale: float | None, fa
         greatest = max(values.greatest for _, values in integers)
         proposal = propose_scale(greatest, is_integer=True)
         message = (
-            f"the cube holds integers (up to {greatest:g} in this scene); set value_scale to {proposal:g}"
+            f"the cube holds integers (up to {greatest:g} in this scene); give --value-scale {proposal:g}"
         )
         for where, _ in integers:
             faults.add(where, f"{message}, the number that stands for 1{describe_scale(proposal)}")
@@ -463,8 +463,8 @@ def _note_scales(measured: list[tuple[str, CubeValues]], scale: float | None, fa
         return
     greatest = max(values.greatest for _, values in far)
     proposal = propose_scale(greatest, all(values.is_integer for _, values in far))
-    given = "" if scale is None else f" after division by value_scale {scale:g}"
-    advice = f"set value_scale to {proposal:g}"
+    given = "" if scale is None else f" after division by --value-scale {scale:g}"
+    advice = f"give --value-scale {proposal:g}"
     if scale is None:
         advice += ", or to 1 to clip highlights at 1"
     for where, _ in far:

@@ -143,7 +143,9 @@ def resolve_path(
         return None
     if not inside and not allow_outside:
         or_allow = (
-            "" if allow_outside is None else ", or allow it with allow_outside_paths if you trust this scene"
+            ""
+            if allow_outside is None
+            else ", or allow it with --allow-outside-paths if you trust this scene"
         )
         faults.add(where, f"{text!r} leaves the scene folder; copy the file into it{or_allow}")
         return None

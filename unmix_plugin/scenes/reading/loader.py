@@ -337,7 +337,7 @@ def _check_options(options: SceneOptions, faults: Faults) -> None:
     low, high = SCALE_RANGE
     if scale is not None and not low <= scale <= high:
         faults.add(
-            "value_scale", f"is {scale:g}; expected a positive number, the stored value that stands for 1"
+            "--value-scale", f"is {scale:g}; expected a positive number, the stored value that stands for 1"
         )
         faults.raise_if_any()
 

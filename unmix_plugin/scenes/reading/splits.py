@@ -38,7 +38,7 @@ def split_frames(
     if method == "lists" and not entry.split_lists:
         faults.add(
             FILE_NAME,
-            "has no train_filenames, val_filenames or test_filenames; eval_split 'lists' needs them",
+            "has no train_filenames, val_filenames or test_filenames; --eval-split lists needs them",
         )
         return Split((), ())
     if method == "lists" or (method == "auto" and entry.split_lists):
@@ -52,7 +52,7 @@ def split_frames(
             FILE_NAME, f"no frame is left to train on ({_how(method)}); name some in 'train_filenames'"
         )
     if entry.frames and not split.evaluation:
-        advice = "name some in 'test_filenames' or use eval_split 'interval'"
+        advice = "name some in 'test_filenames' or use --eval-split interval"
         faults.add(FILE_NAME, f"no frame is left to evaluate ({_how(method)}); {advice}")
     return split
 
@@ -118,7 +118,7 @@ def _by_name(entry: SceneEntry, faults: Faults) -> Split:
         name = _name_split(frame.paths)
         if name is None:
             message = "neither its folder nor its name starts with train, eval, val or test"
-            faults.add(frame.where, f"{message}, which eval_split 'filename' needs")
+            faults.add(frame.where, f"{message}, which --eval-split filename needs")
         else:
             members.setdefault(name, []).append(index)
     evaluation = members.get("test") or sorted(members.get("eval", []) + members.get("val", []))
@@ -127,6 +127,8 @@ def _by_name(entry: SceneEntry, faults: Faults) -> Split:
 
 def _by_interval(count: int, interval: int, faults: Faults) -> Split:
     if interval < 2:
-        faults.add("eval_interval", f"is {interval}; expected 2 or more, so that frames are left to train on")
+        faults.add(
+            "--eval-interval", f"is {interval}; expected 2 or more, so that frames are left to train on"
+        )
         return Split((), ())
     return Split(tuple(i for i in range(count) if i % interval != 0), tuple(range(0, count, interval)))
