@@ -162,6 +162,8 @@ class Ended:
     seconds: float
     peak_bytes: int
     """Largest resident size. Linux counts what this process had at the start of the child, so it can be too large."""
+    cpu_seconds: float = 0.0
+    """Processor time of the command and of all that it waited for."""
 
     @property
     def run(self) -> Path:
@@ -213,7 +215,8 @@ def run_command(
         raise SystemExit(f"{Path(words[0]).name} ended with {process.returncode}:\n{tail}")
     # macOS gives bytes, Linux units of 1024.
     unit = 1 if platform.system() == "Darwin" else 1024
-    return Ended(process.returncode, output, seconds, usage.ru_maxrss * unit)
+    cpu_seconds = usage.ru_utime + usage.ru_stime
+    return Ended(process.returncode, output, seconds, usage.ru_maxrss * unit, cpu_seconds)
 
 
 def quiet_trainer(words: Sequence[str]) -> Trainer:
