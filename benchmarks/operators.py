@@ -96,7 +96,7 @@ class TrainingState:
         generator = torch.Generator().manual_seed(0)
         self.device = t_near.device
         jitter = torch.rand(len(t_near), generator=generator).to(self.device)
-        self.marched = (origins, directions, t_near, t_far, jitter, renderer.clearance, renderer.step)
+        self.marched = (origins, directions, t_near, t_far, jitter, renderer.skips, renderer.step)
         self.samples = marching.march(*self.marched)
         rays = self.samples.ray_indices
         self.positions = origins[rays] + self.samples.t[:, None] * directions[rays]

@@ -42,7 +42,7 @@ from unmix_plugin.rendering.model_parts import (
     make_renderer,
     make_view_gains,
 )
-from unmix_plugin.rendering.ray_outputs import met_by_rays, ray_outputs
+from unmix_plugin.rendering.ray_outputs import observed_by_rays, ray_outputs
 from unmix_plugin.rendering.renderer import VolumeRenderer
 from unmix_plugin.sensors.band_balance import BandBalance
 from unmix_plugin.sensors.views import SensorViews
@@ -148,7 +148,7 @@ class UnmixModel(Model):
     @property
     def renderer(self) -> VolumeRenderer:
         """How rays are rendered at present; its grid follows the training."""
-        if self._renderer is None or self._renderer.clearance is not self.grid.clearance:
+        if self._renderer is None or self._renderer.skips is not self.grid.skips:
             box = self.scene_box.to(self.device)
             self._renderer = make_renderer(
                 self.config, self.preset, box, self.grid, self.step, self.is_unbounded
@@ -170,7 +170,7 @@ class UnmixModel(Model):
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
         """`spectral` (R, B) on black (of a rig `coefficients`, from which follows what its sensors see), all that
-        `ray_outputs` gives, and what `met_by_rays` gives where the grid records it."""
+        `ray_outputs` gives, and what `observed_by_rays` gives where the grid records it."""
         generator = self.generator if self.training else None
         if self.training:
             ray_bundle = self._pose_training.corrected(ray_bundle)
@@ -184,8 +184,8 @@ class UnmixModel(Model):
         )
         if self.view_gains is not None:
             seen["cameras"] = ray_bundle.camera_indices
-        if self.training and self.grid.met is not None:
-            seen.update(met_by_rays(rendered, self.renderer.space))
+        if self.training and self.grid.observed is not None:
+            seen.update(observed_by_rays(rendered, self.renderer.space))
         outputs = {**seen, **ray_outputs(rendered, ray_bundle)}
         return self._pose_training.believed(outputs, ray_bundle) if self.training else outputs
 
@@ -217,8 +217,8 @@ class UnmixModel(Model):
         """Note which cells the views see, and how far margins of abundances are from those of measured spectra."""
         visible_weight = choose(self.config.renderer.visible_weight, self.preset.visible_weight)
         record_seen(self.grid, outputs, visible_weight, self.processes)
-        if "met_densities" in outputs:
-            self.grid.record_met(outputs["met_positions"], outputs["met_densities"])
+        if "observed_densities" in outputs:
+            self.grid.record_observed(outputs["observed_positions"], outputs["observed_densities"])
         self.comparison.observe(outputs, batch)
         self._pose_training.observe(outputs, batch, self.comparison, self.materials)
 

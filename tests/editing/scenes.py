@@ -71,6 +71,6 @@ def tensors_of(scene: TrainedScene) -> dict[str, Tensor]:
         "endmembers": materials.endmembers,
         "specular_spectra": materials.specular_spectra,
         "light": materials.light,
-        "clearance": renderer.clearance,
+        "skips": renderer.skips,
         "reachable": renderer.reachable,
     }

@@ -5,12 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.method_factory import CAMERA, make_model
-from unmix_plugin.operators import (
-    _compositing_kernels,
-    _hash_kernels,
-    _marching_kernels,
-    _merging_kernels,
-)
+from unmix_plugin.operators import compositing, hash_encoding, marching, merging
 from unmix_plugin.operators.launching import warp
 
 
@@ -23,7 +18,7 @@ def _specialised() -> None:
     model.renderer.normals(field, bundle, bundle.origins.new_full((len(bundle),), 4.0))
 
 
-@pytest.mark.parametrize("module", [_marching_kernels, _hash_kernels, _compositing_kernels, _merging_kernels])
+@pytest.mark.parametrize("module", [marching, hash_encoding, compositing, merging])
 @pytest.mark.usefixtures("_specialised")
 def test_kernels_compile_to_code_for_a_gpu(module, tmp_path):
     warp().compile_aot_module(module, arch=80, module_dir=tmp_path, use_ptx=True)

@@ -18,7 +18,7 @@ from unmix_plugin.light.shading import Lamplight
 from unmix_plugin.light.shadows import FINEST, ShadowDetail, lamplight, visible_part
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.model_settings import UnmixModelConfig
-from unmix_plugin.operators.grid_cells import clearance_of
+from unmix_plugin.operators.occupancy import skip_distances
 
 TURNTABLE = Lamp("turntable", (0.0, 0.0, 0.1), (0.0, 0.0, 1.0), (-1.0, 2.0, 3.0))
 NUMBERS = TURNTABLE.numbers()
@@ -63,7 +63,7 @@ def test_a_lamp_is_the_same_after_it_was_written_as_numbers():
 def test_what_stands_before_the_lamp_casts_a_shadow_and_what_stands_behind_does_not():
     positions = torch.tensor([[-0.5, 0.0, 0.5], [-0.5, 0.0, -0.5], [0.99, 0.0, 0.5]])
     lamps = positions + torch.tensor([5.0, 0.0, 0.0])
-    found = visible_part(positions, lamps, BOX, clearance_of(wall() != 0))
+    found = visible_part(positions, lamps, BOX, skip_distances(wall() != 0))
     assert found[0] < 0.01
     assert_close(found[1:], torch.ones(2))
 
@@ -72,11 +72,11 @@ def test_shadows_come_nearer_and_get_sharper_until_training_ends():
     plate = torch.zeros(64, 64, 64, dtype=torch.uint8)
     plate[:, :, 32:36] = 1
     below = torch.tensor([[0.0, 0.0, -0.2], [0.0, 0.0, -0.7]])
-    lamps, clearance = below + torch.tensor([0.0, 0.0, 5.0]), clearance_of(plate != 0)
+    lamps, skips = below + torch.tensor([0.0, 0.0, 5.0]), skip_distances(plate != 0)
     first, middle, last = (
-        visible_part(below, lamps, BOX, clearance, ShadowDetail.at(progress)) for progress in (0.0, 0.5, 1.0)
+        visible_part(below, lamps, BOX, skips, ShadowDetail.at(progress)) for progress in (0.0, 0.5, 1.0)
     )
-    assert torch.equal(visible_part(below, lamps, BOX, clearance), last)
+    assert torch.equal(visible_part(below, lamps, BOX, skips), last)
     assert bool((first > middle).all() & (middle > last).all())
     assert float(last.max()) < 0.05
     assert ShadowDetail.at(1.0) == FINEST
@@ -93,7 +93,7 @@ def test_the_slope_of_the_visible_part_follows_what_moving_the_lamp_changes():
             lamp.change.copy_(torch.tensor([0.0, change, 0.0]))
         generator = torch.Generator().manual_seed(0)
         return lamplight(
-            lamp, origins, positions, BOX, clearance_of(wall() != 0), ShadowDetail.at(0.0), generator
+            lamp, origins, positions, BOX, skip_distances(wall() != 0), ShadowDetail.at(0.0), generator
         ).visible.mean()
 
     high, low = (float(mean_visible(change).detach()) for change in (0.05, -0.05))
@@ -107,9 +107,9 @@ def test_the_slope_of_the_visible_part_follows_what_moving_the_lamp_changes():
 def cast_shadows(model: UnmixModel, opaque: torch.Tensor) -> None:
     """Make these cells of the model's grid the opaque ones."""
     assert model.grid.opaque is not None
-    assert model.grid.opaque_clearance is not None
+    assert model.grid.opaque_skips is not None
     model.grid.opaque.copy_(opaque)
-    model.grid.opaque_clearance.copy_(clearance_of(opaque != 0))
+    model.grid.opaque_skips.copy_(skip_distances(opaque != 0))
 
 
 def model_with_lamp() -> UnmixModel:

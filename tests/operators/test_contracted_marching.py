@@ -13,7 +13,7 @@ from unmix_plugin.operators.contracted_marching import (
     march_contracted_twin,
     unit_points,
 )
-from unmix_plugin.operators.grid_cells import clearance_of
+from unmix_plugin.operators.occupancy import skip_distances
 
 
 def make_rays(num_rays: int, seed: int = 0):
@@ -28,10 +28,10 @@ def make_rays(num_rays: int, seed: int = 0):
 @pytest.mark.parametrize("sides", [(8, 8, 8), (3, 5, 7), (1, 1, 1)])
 def test_kernel_and_twin_take_the_same_samples(num_rays, sides, device):
     occupied = torch.rand(sides, generator=torch.Generator().manual_seed(3)) < 0.3
-    clearance = clearance_of(occupied).to(device)
+    skips = skip_distances(occupied).to(device)
     origins, directions, jitter = (values.to(device) for values in make_rays(num_rays))
     found, expected = (
-        function(origins, directions, jitter, clearance, 0.05)
+        function(origins, directions, jitter, skips, 0.05)
         for function in (march_contracted, march_contracted_twin)
     )
     # A sample within rounding of a cell's face may fall to either side.
@@ -48,13 +48,13 @@ def test_kernel_and_twin_take_the_same_samples(num_rays, sides, device):
 @pytest.mark.parametrize("most", [1, 7, 1000])
 def test_the_first_samples_and_what_follows_are_those_of_all(most, device):
     occupied = torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(3)) < 0.3
-    clearance = clearance_of(occupied).to(device)
+    skips = skip_distances(occupied).to(device)
     origins, directions, _ = (values.to(device) for values in make_rays(200))
-    samples = march_contracted(origins, directions, torch.full_like(origins[:, 0], 0.5), clearance, 0.05)
+    samples = march_contracted(origins, directions, torch.full_like(origins[:, 0], 0.5), skips, 0.05)
     starts, counts = samples.packed_info.unbind(-1)
     ends = torch.zeros_like(origins[:, 0])
     for before in (0, most):
-        found = march_contracted_first(origins, directions, ends, clearance, 0.05, most)
+        found = march_contracted_first(origins, directions, ends, skips, 0.05, most)
         assert torch.equal(found.counts, (counts - before).clamp(0, most))
         is_written = torch.arange(most, device=device) < found.counts[:, None]
         rows = (starts[:, None] + before + torch.arange(most, device=device))[is_written]

@@ -8,10 +8,10 @@ import warp as wp
 from torch.testing import assert_close
 
 from unmix_plugin.operators.compositing import accumulate, volume_weights
-from unmix_plugin.operators.grid_cells import clearance_of
 from unmix_plugin.operators.hash_encoding import HashGridLayout, hash_encode
 from unmix_plugin.operators.launching import as_warp, launch, vector_type
 from unmix_plugin.operators.marching import march
+from unmix_plugin.operators.occupancy import skip_distances
 
 
 @wp.kernel(enable_backward=False)
@@ -82,9 +82,9 @@ def everything_from(generator: torch.Generator) -> tuple[torch.Tensor, ...]:
     num_rays = 1500
     origins = torch.rand(num_rays, 3, generator=generator)
     directions = torch.rand(num_rays, 3, generator=generator) - origins
-    clearance = clearance_of(torch.rand(8, 8, 8, generator=generator) < 0.5)
+    skips = skip_distances(torch.rand(8, 8, 8, generator=generator) < 0.5)
     zeros, ones = torch.zeros(num_rays), torch.ones(num_rays)
-    samples = march(origins, directions, zeros, ones, 0.5 * ones, clearance, 0.05)
+    samples = march(origins, directions, zeros, ones, 0.5 * ones, skips, 0.05)
     positions = origins[samples.ray_indices] + samples.t[:, None] * directions[samples.ray_indices]
     table = torch.randn(layout.num_rows, 4, generator=generator).requires_grad_()
     encoded = hash_encode(positions, table, layout)

@@ -4,7 +4,6 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from unmix_plugin.operators.grid_cells import clearance_of
 from unmix_plugin.operators.marching import (
     PackedSamples,
     count_samples,
@@ -12,6 +11,7 @@ from unmix_plugin.operators.marching import (
     march_first,
     march_twin,
 )
+from unmix_plugin.operators.occupancy import skip_distances
 
 
 def make_rays(num_rays: int, seed: int = 0):
@@ -35,7 +35,7 @@ def test_kernel_and_twin_take_the_same_samples(num_rays, sides, device):
     lattice = (t_near + jitter * step)[:, None] + torch.arange(int(longest / step) + 2, device=device) * step
     taken = []
     for function in (march, march_twin):
-        samples = function(o, d, t_near, t_far, jitter, clearance_of(occupied).to(device), step)
+        samples = function(o, d, t_near, t_far, jitter, skip_distances(occupied).to(device), step)
         ray, count = samples.ray_indices, samples.packed_info[:, 1]
         indices = ((samples.t - lattice[ray, 0]) / step).round().long()
         assert_close(samples.t, lattice[ray, indices], rtol=0, atol=2e-6)
@@ -89,9 +89,9 @@ def test_every_lattice_point_in_front_of_the_far_end_is_taken_and_none_at_it(ste
 def test_what_is_passed_over_by_clearance_is_empty(share, step):
     rays = make_rays(2000)
     occupied = torch.rand(40, 30, 50, generator=torch.Generator().manual_seed(1)) < share
-    clearance = clearance_of(occupied)
-    passing, looking = (march(*rays, grid, step) for grid in (clearance, clearance.clamp(max=1)))
-    assert clearance.max() > 2
+    skips = skip_distances(occupied)
+    passing, looking = (march(*rays, grid, step) for grid in (skips, skips.clamp(max=1)))
+    assert skips.max() > 2
     assert len(looking) > 0
     assert torch.equal(passing.packed_info, looking.packed_info)
     assert torch.equal(passing.t, looking.t)
@@ -104,10 +104,8 @@ def test_only_the_occupied_slab_is_sampled_and_its_samples_measure_it():
     n = 64
     origins = torch.tensor([[-1.0, 0.5, 0.5]]).repeat(n, 1)
     directions = torch.tensor([[1.0, 0.0, 0.0]]).repeat(n, 1)
-    clearance = clearance_of(occupied)
-    samples = march(
-        origins, directions, torch.ones(n), 2 * torch.ones(n), torch.arange(n) / n, clearance, 0.03
-    )
+    skips = skip_distances(occupied)
+    samples = march(origins, directions, torch.ones(n), 2 * torch.ones(n), torch.arange(n) / n, skips, 0.03)
     x = samples.t - 1
     assert (x >= 0.25 - 1e-6).all()
     assert (x <= 0.625 + 1e-6).all()
@@ -117,7 +115,7 @@ def test_only_the_occupied_slab_is_sampled_and_its_samples_measure_it():
 
 def test_rays_that_miss_or_meet_nothing_have_no_samples():
     origins, directions, t_near, t_far, jitter = make_rays(6)
-    nothing = clearance_of(torch.zeros(4, 4, 4, dtype=torch.bool))
+    nothing = skip_distances(torch.zeros(4, 4, 4, dtype=torch.bool))
     empty = march(origins, directions, t_near, t_far, jitter, nothing, 0.05)
     missed = march(origins, directions, t_near, t_near, jitter, torch.zeros(4, 4, 4).byte(), 0.05)
     assert len(empty) == len(missed) == 0
@@ -126,11 +124,11 @@ def test_rays_that_miss_or_meet_nothing_have_no_samples():
 
 @pytest.mark.parametrize("most", [1, 3, 200])
 def test_the_first_samples_of_rays_are_those_of_all_and_of_the_twin(most, device):
-    clearance = clearance_of(torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(3)) < 0.3).to(device)
+    skips = skip_distances(torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(3)) < 0.3).to(device)
     o, d, t_near, t_far, _ = (x.to(device) for x in make_rays(300))
-    found = march_first(o, d, t_near, t_far, clearance, 0.013, most)
+    found = march_first(o, d, t_near, t_far, skips, 0.013, most)
     for function, atol in ((march, 0), (march_twin, 2)):
-        samples = function(o, d, t_near, t_far, torch.full_like(t_near, 0.5), clearance, 0.013)
+        samples = function(o, d, t_near, t_far, torch.full_like(t_near, 0.5), skips, 0.013)
         starts, counts = samples.packed_info.unbind(-1)
         # A sample within rounding of a cell's face may fall to either side.
         assert_close(found.counts, counts.clamp(max=most), rtol=0, atol=atol)
@@ -144,12 +142,12 @@ def test_the_first_samples_of_rays_are_those_of_all_and_of_the_twin(most, device
 
 @pytest.mark.parametrize("most", [1, 5])
 def test_marching_on_from_the_ends_gives_what_follows(most, device):
-    clearance = clearance_of(torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(3)) < 0.3).to(device)
+    skips = skip_distances(torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(3)) < 0.3).to(device)
     o, d, t_near, t_far, _ = (x.to(device) for x in make_rays(300))
-    together = march_first(o, d, t_near, t_far, clearance, 0.013, 2 * most)
-    first = march_first(o, d, t_near, t_far, clearance, 0.013, most)
+    together = march_first(o, d, t_near, t_far, skips, 0.013, 2 * most)
+    first = march_first(o, d, t_near, t_far, skips, 0.013, most)
     full = first.counts == most
-    then = march_first(o[full], d[full], first.ends[full], t_far[full], clearance, 0.013, most)
+    then = march_first(o[full], d[full], first.ends[full], t_far[full], skips, 0.013, most)
     # The same lattice but for rounding, by which a sample may fall to either side of a cell's face.
     same = then.counts == together.counts[full] - most
     assert same.double().mean() > 0.98
@@ -177,10 +175,10 @@ def test_a_step_of_no_length_is_refused():
 def test_samples_are_counted_as_they_are_taken(num_rays, device):
     occupied = torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(3)) < 0.3
     o, d, t_near, t_far, _ = (x.to(device) for x in make_rays(num_rays))
-    clearance = clearance_of(occupied).to(device)
+    skips = skip_distances(occupied).to(device)
     half = torch.full((num_rays,), 0.5, device=device)
-    taken = march_twin(o, d, t_near, t_far, half, clearance, 0.013)
-    counts = count_samples(o, d, t_near, t_far, clearance, 0.013)
+    taken = march_twin(o, d, t_near, t_far, half, skips, 0.013)
+    counts = count_samples(o, d, t_near, t_far, skips, 0.013)
     # A sample within rounding of a cell's face may fall to either side.
     assert_close(counts, taken.packed_info[:, 1], rtol=0, atol=2)
     assert int(counts.sum()) == pytest.approx(int(taken.packed_info[:, 1].sum()), rel=1e-3)

@@ -1,9 +1,10 @@
-"""What the occupancy grid keeps and discards."""
+"""The occupancy grid: which cells are occupied, visible and near one another."""
 
+import pytest
 import torch
+from scipy.ndimage import distance_transform_cdt
 
-from unmix_plugin.operators.grid_cells import clearance_of
-from unmix_plugin.operators.occupancy import OccupancyGrid
+from unmix_plugin.operators.occupancy import OccupancyGrid, VisibleCells, skip_distances
 
 
 def ball(points: torch.Tensor) -> torch.Tensor:
@@ -48,7 +49,7 @@ def test_what_is_emptied_later_stays_empty_and_all_else_is_as_it_was():
     grid.empty_beyond(reachable)
     assert torch.equal(grid.occupied[4:], other.occupied[4:])
     assert not grid.occupied[:4].any()
-    assert torch.equal(grid.clearance, clearance_of(grid.occupied != 0))
+    assert torch.equal(grid.skips, skip_distances(grid.occupied != 0))
     updated(grid, ball, times=3, seed=1)
     assert not grid.occupied[:4].any()
     assert grid.occupied[4:].any()
@@ -94,17 +95,17 @@ def test_a_grid_that_was_loaded_goes_on_like_the_one_that_was_saved():
     assert not loaded.occupied[~reachable].any()
 
 
-def met_by_rays(grid: OccupancyGrid, density_fn, num_points: int, generator: torch.Generator) -> None:
+def observed_by_rays(grid: OccupancyGrid, density_fn, num_points: int, generator: torch.Generator) -> None:
     points = torch.rand(num_points, 3, generator=generator)
-    grid.record_met(points, density_fn(points))
+    grid.record_observed(points, density_fn(points))
 
 
 def test_cells_in_which_rays_met_nothing_are_empty_without_being_probed():
     generator = torch.Generator().manual_seed(3)
-    known, unknown = OccupancyGrid(torch.ones(8, 8, 8) > 0, records_met=True), full()
+    known, unknown = OccupancyGrid(torch.ones(8, 8, 8) > 0, records_observed=True), full()
     for _ in range(8):
         for grid in (known, unknown):
-            met_by_rays(grid, ball, 4000, generator)
+            observed_by_rays(grid, ball, 4000, generator)
             updated(grid, ball, num_cells=2)
     reference = updated(full(), ball, times=10)
     assert unknown.occupied.float().mean() > 0.9
@@ -112,10 +113,10 @@ def test_cells_in_which_rays_met_nothing_are_empty_without_being_probed():
 
 
 def test_what_rays_met_counts_once_and_the_largest_in_a_cell():
-    grid = OccupancyGrid(torch.ones(2, 2, 2) > 0, records_met=True)
+    grid = OccupancyGrid(torch.ones(2, 2, 2) > 0, records_observed=True)
     updated(grid, lambda points: torch.zeros(len(points)))
     points = torch.tensor([[0.1, 0.1, 0.1], [0.2, 0.3, 0.1], [0.9, 0.9, 0.9]])
-    grid.record_met(points, torch.tensor([3.0, 8.0, 0.5]))
+    grid.record_observed(points, torch.tensor([3.0, 8.0, 0.5]))
     updated(grid, lambda points: torch.zeros(len(points)), num_cells=0)
     assert float(grid.peak_densities[0, 0, 0]) == 8.0
     assert float(grid.peak_densities[1, 1, 1]) == 0.5
@@ -126,8 +127,120 @@ def test_what_rays_met_counts_once_and_the_largest_in_a_cell():
 def test_cells_of_a_block_stay_while_one_of_them_is_dense():
     """Small cells are soon emptied by chance; blocks of them only where nothing was met in any."""
     for block, expected in ((1, 1), (2, 8), (3, 27)):
-        grid = OccupancyGrid(torch.ones(5, 5, 5) > 0, records_met=True)
+        grid = OccupancyGrid(torch.ones(5, 5, 5) > 0, records_observed=True)
         updated(grid, lambda points: torch.zeros(len(points)))
-        grid.record_met(torch.tensor([[0.5, 0.5, 0.5]]), torch.tensor([8.0]))
+        grid.record_observed(torch.tensor([[0.5, 0.5, 0.5]]), torch.tensor([8.0]))
         updated(grid, lambda points: torch.zeros(len(points)), num_cells=0, block=block)
         assert int(grid.occupied.sum()) == expected
+
+
+SIDE = 8
+ENOUGH_RAYS = 16 * SIDE * SIDE
+
+
+def looked_at(
+    *sights: tuple[tuple[int, int, int], int], seen: bool = True, num_rays=ENOUGH_RAYS
+) -> VisibleCells:
+    """Cells after samples in the middle of these ones, each with the number of its view, and a judgement."""
+    cells = VisibleCells((SIDE, SIDE, SIDE))
+    record(cells, *sights, seen=seen, num_rays=num_rays)
+    cells.update()
+    return cells
+
+
+def record(cells: VisibleCells, *sights, seen: bool = True, num_rays: int = ENOUGH_RAYS) -> None:
+    points = (torch.tensor([cell for cell, _ in sights]) + 0.5) / SIDE
+    views = torch.tensor([view for _, view in sights])
+    cells.record(points, views, torch.full((len(sights),), seen), num_rays)
+
+
+def test_what_two_views_see_stays_with_its_neighbours_and_the_rest_is_closed():
+    cells = looked_at(((2, 3, 4), 0), ((2, 3, 4), 1))
+    expected = torch.zeros(SIDE, SIDE, SIDE, dtype=torch.bool)
+    expected[1:4, 2:5, 3:6] = True
+    assert torch.equal(cells.visible, expected)
+
+
+def test_what_one_view_sees_however_often_is_closed():
+    cells = looked_at(((1, 1, 1), 3), ((1, 1, 1), 5), ((6, 6, 6), 3), ((6, 6, 6), 3))
+    assert cells.visible[1, 1, 1]
+    assert not cells.visible[6, 6, 6]
+
+
+def test_of_a_single_view_all_that_it_sees_stays():
+    cells = looked_at(((1, 1, 1), 0), ((6, 6, 6), 0))
+    assert cells.visible[1, 1, 1]
+    assert cells.visible[6, 6, 6]
+    assert not cells.visible[3, 3, 3]
+
+
+def test_samples_that_send_too_little_light_see_nothing():
+    cells = VisibleCells((SIDE, SIDE, SIDE))
+    record(cells, ((6, 6, 6), 0), ((6, 6, 6), 1), seen=False)
+    record(cells, ((1, 1, 1), 0), ((1, 1, 1), 1))
+    cells.update()
+    assert cells.visible[1, 1, 1]
+    assert not cells.visible[6, 6, 6]
+
+
+def test_density_too_thin_for_any_sample_to_be_seen_stays():
+    cells = looked_at(((6, 6, 6), 0), ((6, 6, 6), 1), seen=False)
+    assert cells.visible.all()
+
+
+def test_nothing_is_left_out_before_enough_rays_were_cast():
+    cells = looked_at(((1, 1, 1), 0), ((1, 1, 1), 1), num_rays=ENOUGH_RAYS - 1)
+    assert cells.visible.all()
+    record(cells, ((6, 6, 6), 0), ((6, 6, 6), 1), num_rays=1)
+    cells.update()
+    assert cells.visible[1, 1, 1]
+    assert cells.visible[6, 6, 6]
+    assert not cells.visible[4, 1, 1]
+
+
+def test_large_pictures_need_more_rays_before_anything_is_left_out():
+    cells = VisibleCells((SIDE, SIDE, SIDE))
+    record(cells, ((1, 1, 1), 0), ((1, 1, 1), 1))
+    cells.update(fewest_rays=ENOUGH_RAYS + 1)
+    assert cells.visible.all()
+    record(cells, ((1, 1, 1), 2), num_rays=1)
+    cells.update(fewest_rays=ENOUGH_RAYS + 1)
+    assert not cells.visible[4, 1, 1]
+
+
+def test_only_what_was_seen_since_the_last_update_counts_and_the_open_cells_follow_a_surface():
+    cells = looked_at(((3, 3, 3), 0), ((3, 3, 3), 1))
+    record(cells, ((4, 3, 3), 0), ((4, 3, 3), 1))
+    cells.update()
+    assert cells.visible[5, 3, 3]
+    assert not cells.visible[2, 3, 3]
+
+
+def test_views_of_large_numbers_are_told_apart():
+    cells = looked_at(((2, 2, 2), 1000), ((2, 2, 2), 1001))
+    assert cells.visible[2, 2, 2]
+    assert not cells.visible[6, 6, 6]
+
+
+def test_points_on_the_faces_of_the_box_belong_to_the_outermost_cells():
+    cells = VisibleCells((SIDE, SIDE, SIDE))
+    corners = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]).repeat(2, 1)
+    cells.record(corners, torch.tensor([0, 0, 1, 1]), torch.ones(4, dtype=torch.bool), ENOUGH_RAYS)
+    cells.update()
+    assert cells.visible[0, 0, 0]
+    assert cells.visible[-1, -1, -1]
+    assert int(cells.visible.sum()) == 16
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (3, 5, 7), (40, 9, 20), (50, 50, 50)])
+def test_clearance_is_the_distance_along_the_farthest_axis_rounded_down(shape):
+    occupied = torch.rand(shape, generator=torch.Generator().manual_seed(0)) < 1e-3
+    occupied[shape[0] // 3, -1, 0] = True
+    distance = torch.from_numpy(distance_transform_cdt(~occupied.numpy(), metric="chessboard"))
+    steps = torch.tensor([0, 1, 2, 3, 5, 9, 17])
+    expected = steps[torch.bucketize(distance, steps, right=True) - 1]
+    assert torch.equal(skip_distances(occupied).long(), expected)
+
+
+def test_an_empty_grid_is_clear_as_far_as_is_counted():
+    assert (skip_distances(torch.zeros(4, 5, 6, dtype=torch.bool)) == 17).all()

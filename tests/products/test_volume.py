@@ -60,9 +60,9 @@ def test_names_and_spectra_come_along(volume):
 
 def test_what_is_never_rendered_is_empty():
     scene = make_scene()
-    clearance = torch.ones(8, 8, 8, dtype=torch.uint8)
-    clearance[:4] = 0
-    scene = replace(scene, renderer=replace(scene.renderer, clearance=clearance))
+    skips = torch.ones(8, 8, 8, dtype=torch.uint8)
+    skips[:4] = 0
+    scene = replace(scene, renderer=replace(scene.renderer, skips=skips))
     grid = GridPoints.over(scene.scene_box.aabb, 8)
     for index in range(grid.shape[0]):
         density, abundances = sample_slice(scene, grid.slice_points(index))

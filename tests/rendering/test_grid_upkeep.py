@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from unmix_plugin.engine.geometry.space import SceneBox
-from unmix_plugin.operators.grid_cells import clearance_of
+from unmix_plugin.operators.occupancy import skip_distances
 from unmix_plugin.rendering.grid_upkeep import occupied_density
 from unmix_plugin.rendering.renderer import VolumeRenderer
 
@@ -16,7 +16,7 @@ SHORT_WAY = 0.15
 """Across a cell of the box below, model units."""
 RENDERER = VolumeRenderer(
     SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 0.5]])),
-    clearance_of(torch.ones(CELLS, CELLS, CELLS) > 0),
+    skip_distances(torch.ones(CELLS, CELLS, CELLS) > 0),
     torch.ones(CELLS, CELLS, CELLS, dtype=torch.bool),
     step=0.2,
     smallest_weight=0.0,

@@ -107,7 +107,7 @@ def test_a_scene_is_not_changed_by_what_becomes_of_its_model():
     with torch.no_grad():
         model.field.get_parameter("table").mul_(-2)
         model.endmembers.mul_(0.5)
-        model.grid.clearance.fill_(1)
+        model.grid.skips.fill_(1)
     assert torch.equal(scene.render(camera, ["spectral"])["spectral"], before)
     dark = replace(scene, materials=replace(scene.materials, endmembers=0 * scene.materials.endmembers))
     assert dark.render(camera, ["diffuse"])["diffuse"].max() == 0

@@ -10,7 +10,7 @@ from torch.testing import assert_close
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.field import UnmixField, UnmixFieldConfig
-from unmix_plugin.operators.grid_cells import clearance_of
+from unmix_plugin.operators.occupancy import skip_distances
 from unmix_plugin.presets import WITH_ALPHA, WITHOUT_ALPHA
 from unmix_plugin.rendering.renderer import VolumeRenderer
 from unmix_plugin.rendering.settings import RendererConfig
@@ -27,7 +27,7 @@ def make(
     cells = torch.ones(8, 8, 8)
     step = pixel / 1.5
     return VolumeRenderer(
-        box, clearance_of(cells > 0), cells > 0, step, smallest_weight, rays_per_chunk=7
+        box, skip_distances(cells > 0), cells > 0, step, smallest_weight, rays_per_chunk=7
     ), field
 
 
@@ -112,7 +112,7 @@ def test_rendering_changes_nothing_and_draws_nothing_from_the_global_generator()
 
 def test_points_are_asked_cell_by_cell_and_outside_the_box_is_nothing():
     renderer, _ = make()
-    renderer.clearance[:4] = 1
+    renderer.skips[:4] = 1
     points = torch.tensor([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0], [1.5, 0.0, 0.0]])
     assert renderer.is_occupied(points).tolist() == [False, True, False]
     assert renderer.is_reachable(points).tolist() == [True, True, False]

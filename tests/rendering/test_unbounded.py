@@ -14,9 +14,8 @@ from unmix_plugin.editing.edited_field import EditedField
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.engine.processes.processes import Processes
 from unmix_plugin.field import UnmixField, UnmixFieldConfig
-from unmix_plugin.operators.gradients import scale_gradient
-from unmix_plugin.operators.grid_cells import clearance_of
-from unmix_plugin.operators.occupancy import OccupancyGrid
+from unmix_plugin.operators.compositing import scale_gradient
+from unmix_plugin.operators.occupancy import OccupancyGrid, skip_distances
 from unmix_plugin.rendering.grid_upkeep import update_grid
 from unmix_plugin.rendering.renderer import VolumeRenderer
 
@@ -30,7 +29,7 @@ def make(density: float = 1e-6) -> tuple[VolumeRenderer, UnmixField]:
     with torch.no_grad():
         field.table.zero_()
     cells = torch.ones(16, 16, 16)
-    return VolumeRenderer(BOX, clearance_of(cells > 0), cells > 0, 0.05, 0.0, is_unbounded=True), field
+    return VolumeRenderer(BOX, skip_distances(cells > 0), cells > 0, 0.05, 0.0, is_unbounded=True), field
 
 
 def rays(num_rays: int) -> RayBundle:
@@ -85,7 +84,7 @@ def test_rays_end_on_what_stands_outside_the_box():
     assert bool(inner)
     occupied = renderer.occupied.clone()
     occupied[4:12, 4:12, 4:12] = False  # nothing in the box
-    shell = VolumeRenderer(BOX, clearance_of(occupied), occupied, 0.05, 0.0, is_unbounded=True)
+    shell = VolumeRenderer(BOX, skip_distances(occupied), occupied, 0.05, 0.0, is_unbounded=True)
     with torch.no_grad():
         found = shell.render(field, rays(30)).coefficients
     assert (found.accumulation > 0.99).all()
@@ -129,14 +128,14 @@ def test_training_tells_the_grid_what_rays_meet_in_a_world_without_end_and_only_
     for model in (boxed, world):
         model.generator = torch.Generator().manual_seed(0)
         model.observe(model.get_outputs(rays), batch)
-    assert boxed.grid.met is None
-    assert world.grid.met is not None
-    is_met = world.grid.met >= 0
+    assert boxed.grid.observed is None
+    assert world.grid.observed is not None
+    is_met = world.grid.observed >= 0
     centre = world.renderer.space.to_unit(torch.zeros(1, 3))
     assert 0.5 < is_met.float().mean() < 1
     assert bool(is_met[tuple((centre[0] * 8).long())])
     density = world.field.get_density(torch.zeros(1, 3))[0]
-    assert_close(world.grid.met[is_met].mean(), density[0], rtol=0.5, atol=0)
+    assert_close(world.grid.observed[is_met].mean(), density[0], rtol=0.5, atol=0)
 
 
 def test_a_world_without_end_begins_with_cells_as_large_as_those_of_a_coarse_grid():

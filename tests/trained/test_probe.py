@@ -78,7 +78,7 @@ def test_empty_space_has_no_opacity():
     world = FRAME.to_world(np.array([0.9, 0.9, 0.9]))
     assert BALL.probe_point(*world.tolist()).opacity < 1e-6
     scene = make_scene()
-    empty = replace(scene.renderer, clearance=torch.ones(8, 8, 8, dtype=torch.uint8))
+    empty = replace(scene.renderer, skips=torch.ones(8, 8, 8, dtype=torch.uint8))
     nothing = replace(scene, renderer=empty, frame=FRAME).probe_point(*world.tolist())
     assert nothing.opacity == 0
     assert nothing.abundances.max() == 0

@@ -49,7 +49,7 @@ def lamplight(
     origins: Float[Tensor, "S 3"],
     positions: Float[Tensor, "S 3"],
     box: SceneBox,
-    clearance: UInt8[Tensor, "X Y Z"],
+    skips: UInt8[Tensor, "X Y Z"],
     detail: ShadowDetail = FINEST,
     generator: torch.Generator | None = None,
 ) -> Lamplight:
@@ -58,7 +58,7 @@ def lamplight(
     Only the visible part is differentiable in the lamp's place: shading would move it to where wrong normals want it.
 
     Args:
-        clearance: 0 in the cells of the box that cast shadows; in others what `clearance_of` says.
+        skips: 0 in the cells of the box that cast shadows; in others what `skip_distances` says.
         detail: How sharp they are.
         generator: Draws two points beside the lamp's middle for each sample; None takes four fixed ones.
     """
@@ -68,13 +68,11 @@ def lamplight(
     towards = normalize(fixed - positions, dim=-1)
     if generator is None:
         corners = spread * positions.new_tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
-        parts = [visible_part(positions, fixed + corner, box, clearance, detail) for corner in corners]
+        parts = [visible_part(positions, fixed + corner, box, skips, detail) for corner in corners]
         return Lamplight(torch.stack(parts).mean(dim=0), towards)
     drawn = torch.randn(positions.shape, generator=generator, device=generator.device)
     offsets = spread * drawn.to(positions)
-    one, other = (
-        visible_part(positions, fixed + shift, box, clearance, detail) for shift in (offsets, -offsets)
-    )
+    one, other = (visible_part(positions, fixed + shift, box, skips, detail) for shift in (offsets, -offsets))
     # Stein's identity: the mean of these slopes is the gradient of the visible part, blurred over the points.
     slopes = ((one - other) / (2 * spread**2))[:, None] * offsets
     return Lamplight((one + other) / 2 + (slopes * (middle - fixed)).sum(dim=-1), towards)
@@ -85,13 +83,13 @@ def visible_part(
     positions: Float[Tensor, "S 3"],
     lamps: Float[Tensor, "S 3"],
     box: SceneBox,
-    clearance: UInt8[Tensor, "X Y Z"],
+    skips: UInt8[Tensor, "X Y Z"],
     detail: ShadowDetail = FINEST,
 ) -> Float[Tensor, "S"]:
     """Part of the light from points outside the box that the box lets through to each position."""
     towards = normalize(lamps - positions, dim=-1)
-    cell = float((box.size / torch.tensor(clearance.shape, device=box.size.device)).max())
+    cell = float((box.size / torch.tensor(skips.shape, device=box.size.device)).max())
     t_far = box.intersect(positions, towards)[1]
     t_near = torch.full_like(t_far, detail.clear_cells * cell)
-    counts = count_samples(box.normalise(positions), towards / box.size, t_near, t_far, clearance, cell)
+    counts = count_samples(box.normalise(positions), towards / box.size, t_near, t_far, skips, cell)
     return torch.exp(-(counts / detail.dark_cells).square())

@@ -5,13 +5,15 @@ before sample i is T_i = exp(-sum_{j<i} tau_j), its weight w_i = T_i (1 - exp(-t
 transmittance sum to 1.
 
 Source: Max 1995, Optical Models for Direct Volume Rendering, in the discrete form of Mildenhall et al. 2020, eq. 3.
+
+Of the kernels a work item is a ray, so no two items share an address. Rows and stretches of arrays are taken out before
+they are looped over: an index that counts up from 0 needs no code for negative ones.
 """
 
-from __future__ import annotations
-
-from typing import Any
+from typing import Any, no_type_check
 
 import torch
+import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -63,43 +65,163 @@ def _launch(kernel: Any, packed_info: Int[Tensor, "R 2"], *arrays: Tensor) -> No
 class _VolumeWeights(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, optical_depths: Tensor, packed_info: Tensor) -> Tensor:
-        from unmix_plugin.operators._compositing_kernels import weights_kernel
-
         weights, transmittances = torch.empty_like(optical_depths), torch.empty_like(optical_depths)
-        _launch(weights_kernel, packed_info, optical_depths, packed_info, weights, transmittances)
+        _launch(_weights_kernel, packed_info, optical_depths, packed_info, weights, transmittances)
         ctx.save_for_backward(weights, transmittances, packed_info)
         return weights
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        from unmix_plugin.operators._compositing_kernels import weights_gradient_kernel
-
         weights, transmittances, packed_info = ctx.saved_tensors
         incoming, depth_gradients = gradients[0].contiguous(), torch.empty_like(weights)
         arrays = (weights, transmittances, packed_info, incoming, depth_gradients)
-        _launch(weights_gradient_kernel, packed_info, *arrays)
+        _launch(_weights_gradient_kernel, packed_info, *arrays)
         return depth_gradients, None
 
 
 class _Accumulate(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, weights: Tensor, values: Tensor, packed_info: Tensor) -> Tensor:
-        from unmix_plugin.operators._compositing_kernels import accumulate_kernel
-
         totals = values.new_empty(len(packed_info), values.shape[1])
-        _launch(accumulate_kernel, packed_info, weights, values, packed_info, totals)
+        _launch(_accumulate_kernel, packed_info, weights, values, packed_info, totals)
         ctx.save_for_backward(weights, values, packed_info)
         return totals
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        from unmix_plugin.operators._compositing_kernels import accumulate_gradient_kernel
-
         weights, values, packed_info = ctx.saved_tensors
         incoming = gradients[0].contiguous()
         weight_gradients, value_gradients = torch.empty_like(weights), torch.empty_like(values)
         arrays = (weights, values, packed_info, incoming, weight_gradients, value_gradients)
-        _launch(accumulate_gradient_kernel, packed_info, *arrays)
+        _launch(_accumulate_gradient_kernel, packed_info, *arrays)
         return weight_gradients, value_gradients, None
+
+
+_OPAQUE = wp.constant(1e-20)
+"""Transmittance that counts as 0: no sum has the digits for it, and on numbers too small for a normal exponent, which
+would follow behind every surface, a CPU takes a hundred times as long."""
+
+
+@wp.kernel(enable_backward=False)
+@no_type_check
+def _weights_kernel(
+    first: int,
+    end: int,
+    stride: int,
+    optical_depths: wp.array(dtype=Any),
+    packed_info: wp.array2d(dtype=wp.int64),
+    weights: wp.array(dtype=Any),
+    transmittances: wp.array(dtype=Any),
+):
+    ray = first + wp.tid()
+    while ray < end:
+        sample = int(packed_info[ray, 0])
+        stop = sample + int(packed_info[ray, 1])
+        transmittance = weights.dtype(1.0)
+        while sample < stop:
+            passed = wp.exp(-optical_depths[sample])
+            weights[sample] = transmittance * (weights.dtype(1.0) - passed)
+            transmittance = transmittance * passed
+            if transmittance < weights.dtype(_OPAQUE):
+                transmittance = weights.dtype(0.0)
+            transmittances[sample] = transmittance
+            sample += 1
+        ray += stride
+
+
+@wp.kernel(enable_backward=False)
+@no_type_check
+def _weights_gradient_kernel(
+    first: int,
+    end: int,
+    stride: int,
+    weights: wp.array(dtype=Any),
+    transmittances: wp.array(dtype=Any),
+    packed_info: wp.array2d(dtype=wp.int64),
+    weight_gradients: wp.array(dtype=Any),
+    depth_gradients: wp.array(dtype=Any),
+):
+    # d w_i / d tau_i is what passes sample i; every later weight shrinks by itself: d w_j / d tau_i = -w_j for j > i.
+    ray = first + wp.tid()
+    while ray < end:
+        start = int(packed_info[ray, 0])
+        sample = start + int(packed_info[ray, 1]) - 1
+        behind = weights.dtype(0.0)
+        while sample >= start:
+            gradient = weight_gradients[sample]
+            depth_gradients[sample] = gradient * transmittances[sample] - behind
+            behind = behind + gradient * weights[sample]
+            sample -= 1
+        ray += stride
+
+
+@wp.kernel(enable_backward=False)
+@no_type_check
+def _accumulate_kernel(
+    first: int,
+    end: int,
+    stride: int,
+    weights: wp.array(dtype=Any),
+    values: wp.array2d(dtype=Any),
+    packed_info: wp.array2d(dtype=wp.int64),
+    totals: wp.array2d(dtype=Any),
+):
+    ray = first + wp.tid()
+    while ray < end:
+        start = int(packed_info[ray, 0])
+        count = int(packed_info[ray, 1])
+        ray_weights = weights[start : start + count]
+        ray_values = values[start : start + count]
+        ray_totals = totals[ray]
+        channel = int(0)  # noqa: RUF046, UP018 - Warp takes a bare literal for a constant
+        while channel < values.shape[1]:
+            total = weights.dtype(0.0)
+            i = int(0)  # noqa: RUF046, UP018
+            while i < count:
+                total += ray_weights[i] * ray_values[i, channel]
+                i += 1
+            ray_totals[channel] = total
+            channel += 1
+        ray += stride
+
+
+@wp.kernel(enable_backward=False)
+@no_type_check
+def _accumulate_gradient_kernel(
+    first: int,
+    end: int,
+    stride: int,
+    weights: wp.array(dtype=Any),
+    values: wp.array2d(dtype=Any),
+    packed_info: wp.array2d(dtype=wp.int64),
+    total_gradients: wp.array2d(dtype=Any),
+    weight_gradients: wp.array(dtype=Any),
+    value_gradients: wp.array2d(dtype=Any),
+):
+    ray = first + wp.tid()
+    while ray < end:
+        sample = int(packed_info[ray, 0])
+        stop = sample + int(packed_info[ray, 1])
+        incoming = total_gradients[ray]
+        while sample < stop:
+            weight = weights[sample]
+            sample_values = values[sample]
+            sample_gradients = value_gradients[sample]
+            total = weights.dtype(0.0)
+            channel = int(0)  # noqa: RUF046, UP018
+            while channel < values.shape[1]:
+                gradient = incoming[channel]
+                total += gradient * sample_values[channel]
+                sample_gradients[channel] = weight * gradient
+                channel += 1
+            weight_gradients[sample] = total
+            sample += 1
+        ray += stride
+
+
+def scale_gradient(values: Float[Tensor, "*S"], factors: Float[Tensor, "*#S"]) -> Float[Tensor, "*S"]:
+    """The same values; gradients that reach them are multiplied with `factors`."""
+    constant = values.detach()
+    return constant + factors * (values - constant)

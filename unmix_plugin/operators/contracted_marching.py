@@ -8,15 +8,18 @@ Every sample counts for one `step`, however long its interval: density is per un
 is as opaque anywhere in an untrained field.
 
 Notation: as in marching.py; points are in units of the inner cube's half edge, centred on it.
+
+Of the kernels a work item is a ray. Counting and writing walk the same points with the same arithmetic, so that the
+second pass fills what the first one counted.
 """
 
-from __future__ import annotations
+from typing import no_type_check
 
 import torch
+import warp as wp
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from unmix_plugin.operators.grid_cells import cells_at
 from unmix_plugin.operators.launching import KernelArray, as_warp, launch, vector_type
 from unmix_plugin.operators.marching import (
     FirstSamples,
@@ -25,6 +28,7 @@ from unmix_plugin.operators.marching import (
     count_and_write,
     room_for_samples,
 )
+from unmix_plugin.operators.occupancy import cells_at
 
 FAR_RADIUS = 512.0
 LINEAR_RADIUS = 2.0
@@ -34,7 +38,7 @@ def march_contracted(
     origins: Float[Tensor, "R 3"],
     directions: Float[Tensor, "R 3"],
     jitter: Float[Tensor, "R"],
-    clearance: UInt8[Tensor, "X Y Z"],
+    skips: UInt8[Tensor, "X Y Z"],
     step: float,
 ) -> PackedSamples:
     """Samples of each ray from its origin to r = 512, in occupied cells of contracted space.
@@ -42,22 +46,20 @@ def march_contracted(
     Args:
         origins, directions: Rays in units of the inner cube's half edge.
         jitter: Where in its interval a ray's samples lie, [0, 1).
-        clearance: 0 in occupied cells of the cube from -2 to 2, whatever else it is in others.
+        skips: 0 in occupied cells of the cube from -2 to 2, whatever else it is in others.
         step: Distance of samples in the inner cube, in the ray parameter, > 0.
     Raises:
         ValueError: step isn't positive.
     """
-    from unmix_plugin.operators._contracted_kernels import count_kernel, write_kernel
-
-    rays = _rays(origins, directions, jitter, clearance, step)
-    return PackedSamples(*count_and_write(count_kernel, write_kernel, rays, origins), step)
+    rays = _rays(origins, directions, jitter, skips, step)
+    return PackedSamples(*count_and_write(_count_kernel, _write_kernel, rays, origins), step)
 
 
 def march_contracted_first(
     origins: Float[Tensor, "R 3"],
     directions: Float[Tensor, "R 3"],
     t_start: Float[Tensor, "R"],
-    clearance: UInt8[Tensor, "X Y Z"],
+    skips: UInt8[Tensor, "X Y Z"],
     step: float,
     most: int,
 ) -> FirstSamples:
@@ -66,13 +68,11 @@ def march_contracted_first(
     Args:
         t_start: 0, or the `ends` of the samples before.
     """
-    from unmix_plugin.operators._contracted_kernels import first_kernel
-
-    rays = _rays(origins, directions, torch.full_like(t_start, 0.5), clearance, step)
+    rays = _rays(origins, directions, torch.full_like(t_start, 0.5), skips, step)
     t, counts = room_for_samples(origins, most)
     ends = torch.empty_like(t_start)
     arrays = [as_warp(values) for values in (t_start.contiguous(), counts, ends, t)]
-    launch(first_kernel, len(origins), [*rays, *arrays], origins.device)
+    launch(_first_kernel, len(origins), [*rays, *arrays], origins.device)
     return FirstSamples(t, counts, ends)
 
 
@@ -80,21 +80,21 @@ def _rays(
     origins: Float[Tensor, "R 3"],
     directions: Float[Tensor, "R 3"],
     jitter: Float[Tensor, "R"],
-    clearance: UInt8[Tensor, "X Y Z"],
+    skips: UInt8[Tensor, "X Y Z"],
     step: float,
 ) -> list[KernelArray | float]:
     """The arguments that all kernels share."""
     check_step(step)
     point = vector_type(3, torch.float32)
     lines = [as_warp(values.contiguous(), point) for values in (origins, directions)]
-    return [*lines, as_warp(jitter.contiguous()), step, as_warp(clearance.contiguous())]
+    return [*lines, as_warp(jitter.contiguous()), step, as_warp(skips.contiguous())]
 
 
 def march_contracted_twin(
     origins: Float[Tensor, "R 3"],
     directions: Float[Tensor, "R 3"],
     jitter: Float[Tensor, "R"],
-    clearance: UInt8[Tensor, "X Y Z"],
+    skips: UInt8[Tensor, "X Y Z"],
     step: float,
 ) -> PackedSamples:
     """The same as `march_contracted` in plain PyTorch: walks all rays at once."""
@@ -110,7 +110,7 @@ def march_contracted_twin(
         stride = step * near * (near / LINEAR_RADIUS).clamp(min=1.0)
         at = t + jitter * stride
         unit = unit_points(origins + at[:, None] * directions)
-        hit = is_inside & (clearance[tuple(cells_at(unit, clearance.shape).unbind(-1))] == 0)
+        hit = is_inside & (skips[tuple(cells_at(unit, skips.shape).unbind(-1))] == 0)
         found.append((hit, at))
         t = torch.where(is_inside, t + stride, t)
     nothing = torch.zeros(len(origins), 0, device=origins.device)
@@ -128,3 +128,124 @@ def unit_points(points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"
     """Where points of the world lie in the unit cube that the grid fills."""
     radius = points.abs().amax(dim=-1, keepdim=True).clamp(min=1.0)
     return points * ((2.0 - 1.0 / radius) / radius) / 4.0 + 0.5
+
+
+@wp.func
+@no_type_check
+def _radius_at(point: wp.vec3f):
+    return wp.max(wp.max(wp.abs(point[0]), wp.abs(point[1])), wp.abs(point[2]))
+
+
+@wp.func
+@no_type_check
+def _stride_at(radius: float, step: float):
+    near = wp.max(radius, 1.0)
+    return step * near * wp.max(near / 2.0, 1.0)
+
+
+@wp.func
+@no_type_check
+def _is_occupied(point: wp.vec3f, skips: wp.array3d(dtype=wp.uint8)):
+    """1 in an occupied cell, else 0."""
+    radius = wp.max(_radius_at(point), 1.0)
+    unit = point * ((2.0 - 1.0 / radius) / radius) / 4.0 + wp.vec3f(0.5, 0.5, 0.5)
+    x = wp.clamp(int(unit[0] * float(skips.shape[0])), 0, skips.shape[0] - 1)
+    y = wp.clamp(int(unit[1] * float(skips.shape[1])), 0, skips.shape[1] - 1)
+    z = wp.clamp(int(unit[2] * float(skips.shape[2])), 0, skips.shape[2] - 1)
+    return 1 - wp.min(int(skips[x, y, z]), 1)
+
+
+@wp.kernel(enable_backward=False)
+@no_type_check
+def _count_kernel(
+    first: int,
+    end: int,
+    stride: int,
+    origins: wp.array(dtype=wp.vec3f),
+    directions: wp.array(dtype=wp.vec3f),
+    jitter: wp.array(dtype=float),
+    step: float,
+    skips: wp.array3d(dtype=wp.uint8),
+    counts: wp.array(dtype=wp.int64),
+):
+    index = first + wp.tid()
+    while index < end:
+        count = int(0)  # noqa: RUF046, UP018 - Warp takes a bare literal for a constant
+        t = float(0.0)  # noqa: UP018
+        radius = _radius_at(origins[index])
+        while radius <= 512.0:
+            length = _stride_at(radius, step)
+            count += _is_occupied(origins[index] + (t + jitter[index] * length) * directions[index], skips)
+            t += length
+            radius = _radius_at(origins[index] + t * directions[index])
+        counts[index] = wp.int64(count)
+        index += stride
+
+
+@wp.kernel(enable_backward=False)
+@no_type_check
+def _write_kernel(
+    first: int,
+    end: int,
+    stride: int,
+    origins: wp.array(dtype=wp.vec3f),
+    directions: wp.array(dtype=wp.vec3f),
+    jitter: wp.array(dtype=float),
+    step: float,
+    skips: wp.array3d(dtype=wp.uint8),
+    packed_info: wp.array2d(dtype=wp.int64),
+    ray_indices: wp.array(dtype=wp.int64),
+    t_samples: wp.array(dtype=float),
+):
+    index = first + wp.tid()
+    while index < end:
+        slot = int(packed_info[index, 0])
+        stop = slot + int(packed_info[index, 1])
+        t = float(0.0)  # noqa: UP018
+        radius = _radius_at(origins[index])
+        while slot < stop and radius <= 512.0:
+            length = _stride_at(radius, step)
+            middle = t + jitter[index] * length
+            # An empty point's entry is overwritten by the next point's.
+            ray_indices[slot] = wp.int64(index)
+            t_samples[slot] = middle
+            slot += _is_occupied(origins[index] + middle * directions[index], skips)
+            t += length
+            radius = _radius_at(origins[index] + t * directions[index])
+        index += stride
+
+
+@wp.kernel(enable_backward=False)
+@no_type_check
+def _first_kernel(
+    first: int,
+    end: int,
+    stride: int,
+    origins: wp.array(dtype=wp.vec3f),
+    directions: wp.array(dtype=wp.vec3f),
+    jitter: wp.array(dtype=float),
+    step: float,
+    skips: wp.array3d(dtype=wp.uint8),
+    t_start: wp.array(dtype=float),
+    counts: wp.array(dtype=wp.int64),
+    ends: wp.array(dtype=float),
+    t_samples: wp.array2d(dtype=float),
+):
+    # One pass: there is room for as many samples of each ray as are wanted.
+    index = first + wp.tid()
+    most = t_samples.shape[1]
+    while index < end:
+        row = t_samples[index]
+        slot = int(0)  # noqa: RUF046, UP018
+        t = t_start[index]
+        radius = _radius_at(origins[index] + t * directions[index])
+        while slot < most and radius <= 512.0:
+            length = _stride_at(radius, step)
+            middle = t + jitter[index] * length
+            row[slot] = middle
+            slot += _is_occupied(origins[index] + middle * directions[index], skips)
+            t += length
+            radius = _radius_at(origins[index] + t * directions[index])
+        counts[index] = wp.int64(slot)
+        ends[index] = t
+        index += stride

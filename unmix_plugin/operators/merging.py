@@ -4,13 +4,16 @@ What is looked up once for a group of samples needn't be looked up for each of t
 carry a few hundredths of the light each, and differ little. A sample that carries much stays alone.
 
 Notation: `S` samples, `R` rays, `G` groups, `F` features; weights as in compositing.py.
+
+Of the kernels a work item is a ray. Counting and writing walk the same samples with the same arithmetic, so that the
+second pass fills what the first one counted.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from typing import no_type_check
 
 import torch
+import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -67,8 +70,6 @@ def merge_samples(
         left: Share of its light that each ray has before its samples.
         limits: Which samples are left out and which are merged.
     """
-    from unmix_plugin.operators._merging_kernels import count_kernel, write_kernel
-
     device, num_rays = t.device, len(packed_info)
     behind, weights = left.clone(), torch.empty_like(t)
     counts = torch.empty(num_rays, dtype=torch.int64, device=device)
@@ -76,7 +77,7 @@ def merge_samples(
     numbers = [limits.smallest_weight, limits.most_weight, _GAP * limits.step]
     depths = as_warp(optical_depths.contiguous())
     outputs = [as_warp(values) for values in (behind, weights, counts)]
-    launch(count_kernel, num_rays, [depths, places, info, *numbers, *outputs], device)
+    launch(_count_kernel, num_rays, [depths, places, info, *numbers, *outputs], device)
     ends = counts.cumsum(0)
     group_info = torch.stack([ends - counts, counts], dim=-1)
     total = int(ends[-1]) if num_rays else 0
@@ -91,7 +92,7 @@ def merge_samples(
     found = (merged.packed_info, merged.ray_indices, merged.weights, merged.t, merged.features)
     if total:
         samples = [as_warp(weights), places, as_warp(features.contiguous()), info]
-        launch(write_kernel, num_rays, [*samples, *numbers, *map(as_warp, found)], device)
+        launch(_write_kernel, num_rays, [*samples, *numbers, *map(as_warp, found)], device)
     return merged
 
 
@@ -131,3 +132,109 @@ def merge_samples_twin(
     info = torch.stack([number.cumsum(0) - number, number], dim=-1)
     rays = torch.tensor([ray for ray, _ in groups], dtype=torch.int64)
     return MergedSamples(sums, means @ t, means @ features, rays, info, behind)
+
+
+@wp.func
+@no_type_check
+def _starts_group(weight: float, t: float, total: float, last: float, most: float, gap: float):
+    """1 where a sample doesn't belong to the group that is open, whose weight is `total` and whose end is `last`."""
+    return int(total == 0.0 or total + weight > most or t - last > gap)
+
+
+@wp.kernel(enable_backward=False)
+@no_type_check
+def _count_kernel(
+    first: int,
+    end: int,
+    stride: int,
+    depths: wp.array(dtype=float),
+    t_samples: wp.array(dtype=float),
+    packed_info: wp.array2d(dtype=wp.int64),
+    smallest: float,
+    most: float,
+    gap: float,
+    left: wp.array(dtype=float),
+    weights: wp.array(dtype=float),
+    counts: wp.array(dtype=wp.int64),
+):
+    ray = first + wp.tid()
+    while ray < end:
+        sample = int(packed_info[ray, 0])
+        stop = sample + int(packed_info[ray, 1])
+        transmittance = left[ray]
+        total = float(0.0)  # noqa: UP018 - Warp takes a bare literal for a constant
+        last = float(0.0)  # noqa: UP018
+        count = int(0)  # noqa: RUF046, UP018
+        while sample < stop:
+            passed = transmittance * wp.exp(-depths[sample])
+            weight = transmittance - passed
+            weights[sample] = weight
+            if weight > smallest:
+                transmittance = passed
+                t = t_samples[sample]
+                if _starts_group(weight, t, total, last, most, gap) == 1:
+                    count += 1
+                    total = float(0.0)  # noqa: UP018
+                total += weight
+                last = t
+            sample += 1
+        left[ray] = transmittance
+        counts[ray] = wp.int64(count)
+        ray += stride
+
+
+@wp.kernel(enable_backward=False)
+@no_type_check
+def _write_kernel(
+    first: int,
+    end: int,
+    stride: int,
+    weights: wp.array(dtype=float),
+    t_samples: wp.array(dtype=float),
+    features: wp.array2d(dtype=float),
+    packed_info: wp.array2d(dtype=wp.int64),
+    smallest: float,
+    most: float,
+    gap: float,
+    group_info: wp.array2d(dtype=wp.int64),
+    group_rays: wp.array(dtype=wp.int64),
+    group_weights: wp.array(dtype=float),
+    group_t: wp.array(dtype=float),
+    group_features: wp.array2d(dtype=float),
+):
+    ray = first + wp.tid()
+    width = features.shape[1]
+    while ray < end:
+        sample = int(packed_info[ray, 0])
+        stop = sample + int(packed_info[ray, 1])
+        group = int(group_info[ray, 0]) - 1
+        total = float(0.0)  # noqa: UP018
+        last = float(0.0)  # noqa: UP018
+        while sample < stop:
+            weight = weights[sample]
+            if weight > smallest:
+                t = t_samples[sample]
+                own = features[sample]
+                if _starts_group(weight, t, total, last, most, gap) == 1:
+                    group += 1
+                    total = weight
+                    group_rays[group] = wp.int64(ray)
+                    group_t[group] = t
+                    mean = group_features[group]
+                    channel = int(0)  # noqa: RUF046, UP018
+                    while channel < width:
+                        mean[channel] = own[channel]
+                        channel += 1
+                else:
+                    total += weight
+                    share = weight / total
+                    group_t[group] = group_t[group] + share * (t - group_t[group])
+                    mean = group_features[group]
+                    channel = int(0)  # noqa: RUF046, UP018
+                    while channel < width:
+                        mean[channel] = mean[channel] + share * (own[channel] - mean[channel])
+                        channel += 1
+                group_weights[group] = total
+                last = t
+            sample += 1
+        ray += stride

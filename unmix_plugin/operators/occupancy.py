@@ -1,27 +1,140 @@
 """A grid over the scene box of which cells may be occupied, so that rays skip empty space.
 
-Each cell keeps an exponential moving maximum of the densities probed in it. The grid only says what is empty; what is
-visible is decided from the field's own densities, since a cell's maximum would hide what lies behind its empty part.
+Each cell keeps an exponential moving maximum of the densities probed in it. The grid only says what is empty; what
+light reaches is decided from the field's own densities, since a cell's maximum would hide what lies behind its empty
+part.
 
-Source: Mueller et al. 2022, appendix C.
+Behind every surface lies space that no training ray reaches. What a field says there was never compared with a picture:
+from another side it is a grey floater, and it costs time. What one view alone sees isn't held by the others, and grows
+into shapes that fit a single picture. So rays note where they end, and once enough of them were cast, cells stay
+visible if two views saw them or a neighbour of theirs. A surface that moves by a cell takes the open cells with it.
+
+Source: Mueller et al. 2022, appendix C (occupancy); the visibility masks of Warburg et al. 2023, Nerfbusters, which
+evaluate a field only where training views saw it; here they are kept while training.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
-from unmix_plugin.operators.grid_cells import cells_at, clearance_of
-from unmix_plugin.operators.visibility import VisibleCells
+_MARGIN = 16
+
+
+def cells_at(points: Float[Tensor, "*points 3"], shape: Sequence[int]) -> Int[Tensor, "*points 3"]:
+    """Cell (x, y, z) of each point in the unit cube; of one outside, the nearest along each axis.
+
+    >>> cells_at(torch.tensor([0.0, 0.5, 1.0]), (4, 4, 4))
+    tensor([0, 2, 3])
+    """
+    sides = torch.tensor(tuple(shape), device=points.device)
+    return torch.minimum((points * sides).floor().long().clamp(min=0), sides - 1)
+
+
+def skip_distances(occupied: Bool[Tensor, "X Y Z"]) -> UInt8[Tensor, "X Y Z"]:
+    """How many cells the nearest occupied cell is away at least, along the axis on which it is farthest.
+
+    Returns:
+        0 in occupied cells, else 1, 2, 3, 5, 9 or 17, rounded down.
+
+    >>> skip_distances(torch.arange(8).view(8, 1, 1) == 0).flatten()
+    tensor([0, 1, 2, 3, 3, 5, 5, 5], dtype=torch.uint8)
+    """
+    # Empty margins keep rows apart, so that a shift along any axis is one of memory: views are ten times as slow.
+    side_y, side_z = occupied.shape[1:]
+    padded = torch.nn.functional.pad(occupied.to(torch.uint8), (0, _MARGIN, 0, _MARGIN))
+    near, skips = padded.view(-1), 1 - padded.view(-1)
+    more = near.clone()
+    for reach in (1, 1, 2, 4, 8):
+        for stride in (1, padded.stride(1), padded.stride(0)):
+            shift = min(reach * stride, len(near))
+            more[shift:] |= near[: len(near) - shift]
+            more[: len(near) - shift] |= near[shift:]
+            near.copy_(more)
+        skips.add_(near, alpha=-reach).add_(reach)
+    return skips.view(padded.shape)[:, :side_y, :side_z].contiguous()
+
+
+_RAYS_A_CELL = 16
+"""Rays to cast for each cell of a face of the grid before visibility is decided anew."""
+_NO_VIEW = 255
+"""Views are told apart by their number modulo this, which takes one byte a cell and leaves this number for none."""
+
+
+class VisibleCells(nn.Module):
+    """Cells that two training views have seen, by the rays cast since the last update."""
+
+    visible: Bool[Tensor, "X Y Z"]
+    lowest_view: UInt8[Tensor, "X Y Z"]
+    highest_view: UInt8[Tensor, "X Y Z"]
+    num_rays: Int[Tensor, ""]
+
+    def __init__(self, shape: Sequence[int]) -> None:
+        """Start with every cell of a grid of this shape visible."""
+        super().__init__()
+        self.register_buffer("visible", torch.ones(*shape, dtype=torch.bool))
+        self.register_buffer("lowest_view", torch.full(tuple(shape), _NO_VIEW, dtype=torch.uint8))
+        self.register_buffer("highest_view", torch.zeros(*shape, dtype=torch.uint8))
+        self.register_buffer("num_rays", torch.zeros((), dtype=torch.int64))
+
+    @torch.no_grad()
+    def record(
+        self, points: Float[Tensor, "S 3"], views: Int[Tensor, "S"], seen: Bool[Tensor, "S"], num_rays: int
+    ) -> None:
+        """Note which views see which cells.
+
+        Args:
+            points: Samples in the unit cube.
+            views: Number of the view of each.
+            seen: Samples that send enough of their ray's light to the camera.
+            num_rays: Rays that the samples are of; of all processes, where several train together.
+        """
+        _, side_y, side_z = self.visible.shape
+        x, y, z = cells_at(points, self.visible.shape).unbind(-1)
+        cells = (x * side_y + y) * side_z + z
+        ids = (views % _NO_VIEW).to(torch.uint8)
+        # Unseen samples take part with a number that changes nothing: to choose would be to wait for the device.
+        self.lowest_view.view(-1).scatter_reduce_(0, cells, ids.masked_fill(~seen, _NO_VIEW), "amin")
+        self.highest_view.view(-1).scatter_reduce_(0, cells, ids.masked_fill(~seen, 0), "amax")
+        self.num_rays += num_rays
+
+    @torch.no_grad()
+    def update(self, fewest_rays: int = 0) -> None:
+        """Keep only what two views saw, if `fewest_rays` and enough for each cell were cast, and start over.
+
+        Where two views saw no cell, what one saw is kept; where none saw any, as in thin semi-transparent density, all
+        that was visible.
+        """
+        sides = sorted(self.visible.shape)
+        if int(self.num_rays) < max(_RAYS_A_CELL * sides[1] * sides[2], fewest_rays):
+            return
+        seen_by_two = self.lowest_view < self.highest_view
+        seen = seen_by_two if bool(seen_by_two.any()) else self.lowest_view <= self.highest_view
+        if bool(seen.any()):
+            self.visible.copy_(_with_neighbours(seen))
+        self.lowest_view.fill_(_NO_VIEW)
+        self.highest_view.zero_()
+        self.num_rays.zero_()
+
+
+def _with_neighbours(cells: Bool[Tensor, "X Y Z"]) -> Bool[Tensor, "X Y Z"]:
+    """And the cells that share a face, an edge or a corner with one of them."""
+    for axis in range(3):
+        grown, count = cells.clone(), cells.shape[axis] - 1
+        for here, there in ((1, 0), (0, 1)):
+            grown.narrow(axis, here, count).logical_or_(cells.narrow(axis, there, count))
+        cells = grown
+    return cells
+
 
 _OPAQUE = 3.0
 """Density from which a cell casts shadows, in that from which it counts as occupied."""
 
-DensityFn = Callable[[Float[Tensor, "S 3"]], Float[Tensor, "S"]]
-_NOTHING_MET = -1.0
+_DensityFn = Callable[[Float[Tensor, "S 3"]], Float[Tensor, "S"]]
+_NOT_OBSERVED = -1.0
 
 
 class OccupancyGrid(nn.Module):
@@ -29,24 +142,24 @@ class OccupancyGrid(nn.Module):
 
     peak_densities: Tensor
     occupied: Tensor
-    clearance: Tensor
-    """As `clearance_of` says, of the occupied cells."""
-    met: Tensor | None
-    """Largest density met in each cell since the last update."""
+    skips: Tensor
+    """As `skip_distances` says, of the occupied cells."""
+    observed: Tensor | None
+    """Largest density that rays met in each cell since the last update."""
     reachable: Tensor
     reachable_cells: Tensor
     opaque: Tensor | None
-    opaque_clearance: Tensor | None
-    """As `clearance_of` says, of the cells that cast shadows."""
+    opaque_skips: Tensor | None
+    """As `skip_distances` says, of the cells that cast shadows."""
 
     def __init__(
-        self, reachable: Bool[Tensor, "X Y Z"], casts_shadows: bool = False, records_met: bool = False
+        self, reachable: Bool[Tensor, "X Y Z"], casts_shadows: bool = False, records_observed: bool = False
     ) -> None:
         """Start with every cell occupied that `reachable` allows; the others always stay empty.
 
         Args:
             casts_shadows: Whether to keep the cells that are opaque, none at the start.
-            records_met: Whether densities that rays meet are noted, so that updates need not probe those cells.
+            records_observed: Whether densities that rays meet are noted, so that updates need not probe those cells.
         """
         super().__init__()
         self.visibility = VisibleCells(reachable.shape)
@@ -55,16 +168,18 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("occupied", reachable.to(torch.uint8))
         opaque = torch.zeros(reachable.shape, dtype=torch.uint8) if casts_shadows else None
         self.register_buffer("opaque", opaque)
-        self.register_buffer("opaque_clearance", _clearance(opaque), persistent=False)
-        self.register_buffer("met", torch.full(reachable.shape, _NOTHING_MET) if records_met else None)
-        self.register_buffer("clearance", clearance_of(reachable), persistent=False)
+        self.register_buffer("opaque_skips", _skips(opaque), persistent=False)
+        self.register_buffer(
+            "observed", torch.full(reachable.shape, _NOT_OBSERVED) if records_observed else None
+        )
+        self.register_buffer("skips", skip_distances(reachable), persistent=False)
         self.register_buffer("reachable_cells", _flat_indices(reachable), persistent=False)
         self.register_load_state_dict_post_hook(lambda grid, _: grid._follow())
 
     @torch.no_grad()
     def update(
         self,
-        density_fn: DensityFn,
+        density_fn: _DensityFn,
         threshold: float,
         decay: float,
         num_cells: int | None,
@@ -87,7 +202,7 @@ class OccupancyGrid(nn.Module):
         sides = torch.tensor(self.occupied.shape, device=cells.device)
         offsets = torch.rand(len(cells), 3, generator=generator).to(cells.device)
         densities = density_fn((self._coordinates(cells) + offsets) / sides)
-        self._take_in(cells, densities, decay, block)
+        self._update_peaks(cells, densities, decay, block)
         peaks = self.peak_densities.view(-1)
         reachable_peaks = peaks[self.reachable_cells]
         is_known = torch.isfinite(reachable_peaks)
@@ -96,11 +211,11 @@ class OccupancyGrid(nn.Module):
         self.visibility.update(fewest_rays)
         is_visible = self.visibility.visible.view(-1)[self.reachable_cells]
         self.occupied.view(-1)[self.reachable_cells] = ((reachable_peaks > limit) & is_visible).byte()
-        if self.opaque is not None and self.opaque_clearance is not None:
+        if self.opaque is not None and self.opaque_skips is not None:
             is_opaque = is_known & is_visible & (reachable_peaks > _OPAQUE * limit)
             self.opaque.view(-1)[self.reachable_cells] = is_opaque.byte()
-            self.opaque_clearance.copy_(clearance_of(self.opaque != 0))
-        self.clearance.copy_(clearance_of(self.occupied != 0))
+            self.opaque_skips.copy_(skip_distances(self.opaque != 0))
+        self.skips.copy_(skip_distances(self.occupied != 0))
 
     @torch.no_grad()
     def empty_beyond(self, reachable: Bool[Tensor, "X Y Z"]) -> None:
@@ -112,25 +227,25 @@ class OccupancyGrid(nn.Module):
         self._follow()
 
     @torch.no_grad()
-    def record_met(self, points: Float[Tensor, "S 3"], densities: Float[Tensor, "S"]) -> None:
+    def record_observed(self, points: Float[Tensor, "S 3"], densities: Float[Tensor, "S"]) -> None:
         """Note the densities of points in the unit cube, as far as this grid records what rays meet."""
-        if self.met is not None:
-            _, side_y, side_z = self.met.shape
-            x, y, z = cells_at(points, self.met.shape).unbind(-1)
-            self.met.view(-1).scatter_reduce_(0, (x * side_y + y) * side_z + z, densities, "amax")
+        if self.observed is not None:
+            _, side_y, side_z = self.observed.shape
+            x, y, z = cells_at(points, self.observed.shape).unbind(-1)
+            self.observed.view(-1).scatter_reduce_(0, (x * side_y + y) * side_z + z, densities, "amax")
 
-    def _take_in(
+    def _update_peaks(
         self, cells: Int[Tensor, "N"], densities: Float[Tensor, "N"], decay: float, block: int
     ) -> None:
         """Let what was probed and what rays met change the peaks, each cell's once, and clear what was met."""
         peaks = self.peak_densities
-        found = torch.full_like(peaks, _NOTHING_MET) if self.met is None else self.met.clone()
+        found = torch.full_like(peaks, _NOT_OBSERVED) if self.observed is None else self.observed.clone()
         found.view(-1)[cells] = torch.maximum(found.view(-1)[cells], densities)
         if block > 1:
             found = _block_maxima(found, block)
-        peaks.copy_(torch.where(found > _NOTHING_MET, torch.maximum(_decayed(peaks, decay), found), peaks))
-        if self.met is not None:
-            self.met.fill_(_NOTHING_MET)
+        peaks.copy_(torch.where(found > _NOT_OBSERVED, torch.maximum(_decayed(peaks, decay), found), peaks))
+        if self.observed is not None:
+            self.observed.fill_(_NOT_OBSERVED)
 
     def _choose_cells(self, num_cells: int | None, generator: torch.Generator) -> Int[Tensor, "N"]:
         reachable = self.reachable_cells
@@ -148,8 +263,8 @@ class OccupancyGrid(nn.Module):
         """Find what follows from cells that were loaded or emptied: searching the whole grid takes longer than an
         update."""
         self.reachable_cells = _flat_indices(self.reachable)
-        self.clearance = clearance_of(self.occupied != 0)
-        self.opaque_clearance = _clearance(self.opaque)
+        self.skips = skip_distances(self.occupied != 0)
+        self.opaque_skips = _skips(self.opaque)
 
     def _coordinates(self, cells: Int[Tensor, "N"]) -> Float[Tensor, "N 3"]:
         _, side_y, side_z = self.occupied.shape
@@ -174,5 +289,5 @@ def _flat_indices(reachable: Bool[Tensor, "X Y Z"]) -> Int[Tensor, "N"]:
     return reachable.view(-1).nonzero()[:, 0]
 
 
-def _clearance(cells: UInt8[Tensor, "X Y Z"] | None) -> UInt8[Tensor, "X Y Z"] | None:
-    return None if cells is None else clearance_of(cells != 0)
+def _skips(cells: UInt8[Tensor, "X Y Z"] | None) -> UInt8[Tensor, "X Y Z"] | None:
+    return None if cells is None else skip_distances(cells != 0)

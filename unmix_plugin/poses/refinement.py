@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses, rotation_matrix
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
-from unmix_plugin.operators.gradients import scale_gradient
+from unmix_plugin.operators.compositing import scale_gradient
 from unmix_plugin.poses.knots import Knots, on_spline, row_waves, similarities, spline_weights
 from unmix_plugin.poses.lens import LensRefinement
 from unmix_plugin.poses.settings import PoseConfig

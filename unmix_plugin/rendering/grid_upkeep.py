@@ -99,8 +99,8 @@ def share_sights(grid: OccupancyGrid, processes: Processes) -> None:
     processes.smallest(visibility.lowest_view)
     processes.largest(visibility.highest_view)
     processes.largest(visibility.num_rays)
-    if grid.met is not None:
-        processes.largest(grid.met)
+    if grid.observed is not None:
+        processes.largest(grid.observed)
 
 
 def record_seen(

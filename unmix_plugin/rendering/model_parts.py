@@ -65,8 +65,8 @@ def make_grid(
 
     Where nothing was carved, cells are too many to wait until each was probed: what rays meet in them counts as well.
     """
-    records_met = is_unbounded or config.poses == "refine"
-    return OccupancyGrid(reachable, config.moving_lamp is not None, records_met)
+    records_observed = is_unbounded or config.poses == "refine"
+    return OccupancyGrid(reachable, config.moving_lamp is not None, records_observed)
 
 
 def make_renderer(
@@ -85,14 +85,14 @@ def make_renderer(
     """
     return VolumeRenderer(
         scene_box,
-        grid.clearance,
+        grid.skips,
         grid.reachable,
         step,
         choose(config.renderer.smallest_weight, preset.smallest_weight),
         is_unbounded,
         config.losses.background == "last",
         config.eval_num_rays_per_chunk,
-        grid.opaque_clearance,
+        grid.opaque_skips,
     )
 
 

@@ -24,10 +24,10 @@ def ray_outputs(rendered: RenderedRays, ray_bundle: RayBundle) -> dict[str, Tens
     }
 
 
-def met_by_rays(rendered: RenderedRays, space: UnitSpace) -> dict[str, Tensor]:
-    """Of all N samples looked at, without gradients, `met_positions` in the unit cube and `met_densities`."""
+def observed_by_rays(rendered: RenderedRays, space: UnitSpace) -> dict[str, Tensor]:
+    """Of all N samples looked at, without gradients, `observed_positions` in the unit cube and `observed_densities`."""
     positions = torch.cat(list(rendered.looked_at.all_positions)).detach()
     return {
-        "met_positions": space.to_unit(positions),
-        "met_densities": torch.cat(list(rendered.looked_at.all_densities)),
+        "observed_positions": space.to_unit(positions),
+        "observed_densities": torch.cat(list(rendered.looked_at.all_densities)),
     }

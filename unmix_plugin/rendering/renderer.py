@@ -18,11 +18,10 @@ from unmix_plugin.engine.geometry.space import RayBundle, SceneBox, UnitSpace
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.light.shading import Lamplight
 from unmix_plugin.light.shadows import FINEST, ShadowDetail, lamplight
-from unmix_plugin.operators.compositing import accumulate, volume_weights
+from unmix_plugin.operators.compositing import accumulate, scale_gradient, volume_weights
 from unmix_plugin.operators.contracted_marching import march_contracted, march_contracted_first
-from unmix_plugin.operators.gradients import scale_gradient
-from unmix_plugin.operators.grid_cells import cells_at
 from unmix_plugin.operators.marching import FirstSamples, PackedSamples, march, march_first
+from unmix_plugin.operators.occupancy import cells_at
 from unmix_plugin.rendering.front_to_back import FrontToBack, composite_front_to_back
 from unmix_plugin.rendering.lit_samples import LitSamples, points_of, samples_carrying_weight
 from unmix_plugin.spectral.materials import Coefficients
@@ -59,8 +58,8 @@ class VolumeRenderer:
 
     box: SceneBox
     """What is rendered, model space."""
-    clearance: UInt8[Tensor, "X Y Z"]
-    """0 in the cells of the box that rays are sampled in; others are empty, and have what `clearance_of` says."""
+    skips: UInt8[Tensor, "X Y Z"]
+    """0 in the cells of the box that rays are sampled in; others are empty, and have what `skip_distances` says."""
     reachable: Bool[Tensor, "X Y Z"]
     """Cells that were not carved away before training."""
     step: float
@@ -73,9 +72,9 @@ class VolumeRenderer:
     """Whether the last sample of a ray takes all the light that is left."""
     rays_per_chunk: int = 32_768
     """Rays under way at once for a whole image; fewer take less memory."""
-    opaque_clearance: UInt8[Tensor, "X Y Z"] | None = None
-    """0 in the cells that cast shadows in the light of a lamp that moves with the camera, in others what `clearance_of`
-    says; None without such a lamp."""
+    opaque_skips: UInt8[Tensor, "X Y Z"] | None = None
+    """0 in the cells that cast shadows in the light of a lamp that moves with the camera, in others what
+    `skip_distances` says; None without such a lamp."""
     shadow_detail: ShadowDetail = FINEST
     """How sharp those shadows are."""
 
@@ -158,7 +157,7 @@ class VolumeRenderer:
             camera: One camera.
             subpixels: Rays through a pixel along each of its edges, averaged: all outputs but ratios are linear.
         """
-        camera = camera.to(self.clearance.device)
+        camera = camera.to(self.skips.device)
         centres = [(i + 0.5) / subpixels for i in range(subpixels)]
         total: Coefficients | None = None
         for offset in [(x, y) for y in centres for x in centres]:
@@ -185,7 +184,7 @@ class VolumeRenderer:
     @property
     def occupied(self) -> Bool[Tensor, "X Y Z"]:
         """Cells of the box that rays are sampled in."""
-        return self.clearance == 0
+        return self.skips == 0
 
     def is_occupied(self, positions: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
         """Points in the box, in cells that rays are sampled in."""
@@ -219,10 +218,10 @@ class VolumeRenderer:
         positions: Float[Tensor, "S 3"],
         generator: torch.Generator | None = None,
     ) -> Lamplight | None:
-        if field.moving_lamp is None or self.opaque_clearance is None:
+        if field.moving_lamp is None or self.opaque_skips is None:
             return None
-        lamp, clearance = field.moving_lamp, self.opaque_clearance
-        return lamplight(lamp, origins, positions, self.box, clearance, self.shadow_detail, generator)
+        lamp, skips = field.moving_lamp, self.opaque_skips
+        return lamplight(lamp, origins, positions, self.box, skips, self.shadow_detail, generator)
 
     def _march(self, ray_bundle: RayBundle, generator: torch.Generator | None) -> PackedSamples:
         """All samples of rays; a generator shifts those of each ray at random."""
@@ -232,9 +231,9 @@ class VolumeRenderer:
             jitter = torch.rand(jitter.shape, generator=generator, device=generator.device).to(jitter)
         starts, along = self._in_grid(origins, directions)
         if self.is_unbounded:
-            return march_contracted(starts, along, jitter, self.clearance, self.step)
+            return march_contracted(starts, along, jitter, self.skips, self.step)
         t_near, t_far = self.box.intersect(origins, directions)
-        return march(starts, along, t_near, t_far, jitter, self.clearance, self.step)
+        return march(starts, along, t_near, t_far, jitter, self.skips, self.step)
 
     def _march_first(
         self,
@@ -246,10 +245,10 @@ class VolumeRenderer:
         """The first samples of rays behind these distances, at most so many of each."""
         starts, along = self._in_grid(origins, directions)
         if self.is_unbounded:
-            return march_contracted_first(starts, along, behind, self.clearance, self.step, most)
+            return march_contracted_first(starts, along, behind, self.skips, self.step, most)
         t_near, t_far = self.box.intersect(origins, directions)
         t_near = torch.maximum(t_near, behind)
-        return march_first(starts, along, t_near, t_far, self.clearance, self.step, most)
+        return march_first(starts, along, t_near, t_far, self.skips, self.step, most)
 
     def _in_grid(
         self, origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"]

@@ -42,12 +42,12 @@ def unmix_scene(
             eval_cameras=own.lens.of(record.eval_cameras),
         )
     materials = replace(materials, endmembers=frozen[id(model.endmembers)], specular_spectra=specular)
-    opaque = renderer.opaque_clearance
+    opaque = renderer.opaque_skips
     renderer = replace(
         renderer,
-        clearance=renderer.clearance.clone(),
+        skips=renderer.skips.clone(),
         reachable=renderer.reachable.clone(),
-        opaque_clearance=None if opaque is None else opaque.clone(),
+        opaque_skips=None if opaque is None else opaque.clone(),
     )
     return TrainedScene(
         copy.deepcopy(model.field, frozen).eval(),  # type: ignore[arg-type]

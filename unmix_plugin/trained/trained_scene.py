@@ -130,13 +130,13 @@ class TrainedScene:
         """The same scene on another device; `self` stays where it is."""
         if torch.device(device) == self.device:
             return self
-        opaque = self.renderer.opaque_clearance
+        opaque = self.renderer.opaque_skips
         renderer = replace(
             self.renderer,
             box=self.renderer.box.to(device),
-            clearance=self.renderer.clearance.to(device),
+            skips=self.renderer.skips.to(device),
             reachable=self.renderer.reachable.to(device),
-            opaque_clearance=None if opaque is None else opaque.to(device),
+            opaque_skips=None if opaque is None else opaque.to(device),
         )
         field = copy.deepcopy(self.field).to(device)
         return replace(self, field=field, renderer=renderer, materials=self.materials.to(device))
