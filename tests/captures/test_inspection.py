@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.captures.readers.envi_factory import header_text, write_envi
-from unmix_plugin.captures.inspection import FACTS, inspect_file
-from unmix_plugin.captures.readers.read_options import ReadOptions
+from unmix_plugin.captures.readers.opening import FACTS, inspect_file
+from unmix_plugin.captures.spectral_file import ReadOptions
 from unmix_plugin.commands.process import process
 from unmix_plugin.commands.process_inspect import inspect_command
 from unmix_plugin.errors import CaptureError, ConfigError

@@ -8,7 +8,7 @@ import spectral.io.envi as envi
 
 from tests.formats.cubes import BANDS, WAVELENGTHS_NM, full_disk, random_cube
 from unmix_plugin.errors import RunError
-from unmix_plugin.formats.envi_cube import envi_cube_rows, write_envi_cube
+from unmix_plugin.formats.envi import envi_cube_rows, write_envi_cube
 from unmix_plugin.spectral.bands import Bands
 
 

@@ -8,7 +8,7 @@ import spectral.io.envi as envi
 
 from tests.formats.cubes import BANDS, WAVELENGTHS_NM, full_disk
 from unmix_plugin.errors import RunError
-from unmix_plugin.formats.envi_library import write_envi_library
+from unmix_plugin.formats.envi import write_envi_library
 
 SPECTRA = np.random.default_rng(1).random((3, len(WAVELENGTHS_NM)))
 NAMES = ("wood", "clay, wet", "leaf")

@@ -6,7 +6,7 @@ import struct
 import numpy as np
 
 from tests.products.mesh_reading import loaded_mesh
-from unmix_plugin.formats.glb import write_glb
+from unmix_plugin.formats.meshes import write_glb
 
 GENERATOR = np.random.default_rng(0)
 COUNT = 7

@@ -5,7 +5,7 @@ import pytest
 
 from tests.formats.cubes import full_disk, random_cube
 from unmix_plugin.errors import RunError
-from unmix_plugin.formats.npy import npy_rows
+from unmix_plugin.formats.files import npy_rows
 
 
 def test_rows_in_blocks_are_the_array_that_numpy_loads(tmp_path):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from tests.products.mesh_reading import loaded_mesh
-from unmix_plugin.formats.obj import obj_paths, write_obj
+from unmix_plugin.formats.meshes import obj_paths, write_obj
 
 GENERATOR = np.random.default_rng(0)
 POSITIONS = GENERATOR.normal(size=(5, 3)).astype(np.float32)

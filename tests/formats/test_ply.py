@@ -7,7 +7,7 @@ from plyfile import PlyData
 from tests.formats.cubes import full_disk
 from tests.products.mesh_reading import loaded_mesh
 from unmix_plugin.errors import RunError
-from unmix_plugin.formats.ply import write_ply
+from unmix_plugin.formats.meshes import write_ply
 
 GENERATOR = np.random.default_rng(0)
 FACES = np.array([[0, 1, 2], [2, 1, 3]])

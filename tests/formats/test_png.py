@@ -4,7 +4,7 @@ import imageio.v3 as iio
 import numpy as np
 from PIL import Image
 
-from unmix_plugin.formats.png import indexed_png_bytes, rgba_png_bytes
+from unmix_plugin.formats.files import indexed_png_bytes, rgba_png_bytes
 
 
 def test_colours_and_opacity_are_read_back_as_they_were(tmp_path):

@@ -8,8 +8,7 @@ import pytest
 
 from tests.formats.cubes import BANDS, WAVELENGTHS_NM, random_cube
 from unmix_plugin.errors import RunError
-from unmix_plugin.formats.exr import write_exr
-from unmix_plugin.formats.spectral_exr import write_spectral_exr
+from unmix_plugin.formats.exr import write_exr, write_spectral_exr
 
 
 def opened(path):

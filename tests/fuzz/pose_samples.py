@@ -16,7 +16,7 @@ from tests.captures.poses.pose_factory import FLIP, ring, transforms
 from unmix_plugin.captures.poses.matching import match_poses
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.posing import place_poses
-from unmix_plugin.formats.ply import read_ply_points
+from unmix_plugin.formats.meshes import read_ply_points
 
 _SIMILARITY = (
     "<transform><rotation>0 -1 0 1 0 0 0 0 1</rotation><translation>-2499366.5 -4256836.25 4029217.75</translation>"

@@ -16,6 +16,7 @@ from tests.fuzz.mutation import mutate_json, mutate_png
 from tests.fuzz.reader import Reader
 from tests.scenes.scene_factory import look_at
 from unmix_plugin.errors import ConfigError, SceneError, SpectrumError
+from unmix_plugin.formats.envi import read_spectra_envi
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, measure_cube, read_array_header
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.images import UnreadableImageError, read_colour, read_labels, read_mask
@@ -24,7 +25,6 @@ from unmix_plugin.scenes.reading.splits import split_frames
 from unmix_plugin.scenes.reading.transforms_json import read_transforms
 from unmix_plugin.scenes.scene import Normalisation, SceneOptions
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
-from unmix_plugin.spectral.library.spectra_envi import read_spectra_envi
 from unmix_plugin.spectral.maps.indices import parse_formula
 from unmix_plugin.trained.camera_files.camera_files import read_camera_file
 

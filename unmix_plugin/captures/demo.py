@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, UInt16
 
-from unmix_plugin.formats.envi_header import HeaderValue, beside, header_bytes, wavelength_entries
+from unmix_plugin.formats.envi import HeaderValue, beside, header_bytes, wavelength_entries
 from unmix_plugin.scenes.demo.scene import (
     SIZE_BOUNDS,
     VIEWS_BOUNDS,

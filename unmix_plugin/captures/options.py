@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from unmix_plugin.captures.layouts.registry import LAYOUTS
-from unmix_plugin.captures.readers.read_options import Axes
+from unmix_plugin.captures.spectral_file import Axes
 
 MaskKind = Literal["files", "white", "black", "none"]
 

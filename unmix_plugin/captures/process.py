@@ -18,8 +18,7 @@ from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.plan import Plan, input_files, make_plan
 from unmix_plugin.captures.posing import ESTIMATE, estimated_poses, given_poses, pose_views
 from unmix_plugin.captures.readers.opening import open_spectral_file
-from unmix_plugin.captures.readers.read_options import ReadOptions
-from unmix_plugin.captures.spectral_file import SpectralFile
+from unmix_plugin.captures.spectral_file import ReadOptions, SpectralFile
 from unmix_plugin.captures.wavelengths import parse_wavelengths
 from unmix_plugin.captures.writing.scene_files import write_scene_files
 from unmix_plugin.captures.writing.view_files import ViewRecord, write_view

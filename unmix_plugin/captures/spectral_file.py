@@ -1,14 +1,32 @@
 """A file of an instrument, opened but not read: what it says of itself, and its numbers by rows and bands.
 
 Notation: `H` rows, `W` columns, `B` bands.
+
+What a user adds to a file that doesn't say enough of itself.
+
+Which axis of a stored array is which.
+
+Axes are letters, the slowest first: `y` rows, `x` columns, `b` bands.
+
+Arrays of files that can only be read as a whole: the last few are kept, for the next rows of the same image.
+
+Packages that not every user needs, imported when a file of their format is opened.
+
+What a library says in its log while a file is opened: material for notes, not for the terminal.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import logging
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from pathlib import Path
-from typing import Any, TypeAlias
+from types import ModuleType
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int, Shaped
@@ -197,3 +215,135 @@ def _stack_metadata(parts: list[SpectralFile]) -> dict[str, Any]:
 
 def _all_named(tables: list[tuple[BandTable, int]]) -> bool:
     return all(table.names is not None for table, _ in tables)
+
+
+Axes: TypeAlias = Literal["yxb", "byx", "ybx", "xyb", "bxy", "xby"]
+"""What the axes of an array are, the slowest first: y rows, x columns, b bands."""
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """Facts that override what a file says."""
+
+    dataset: str | None = None
+    """Variable or data set to take from a file that holds several."""
+    wavelengths_nm: Float64[np.ndarray, " B"] | None = None
+    """Band centres in nm, in the order of the file."""
+    axes: Axes | None = None
+    """Order of the axes in formats that don't fix it: NumPy, MATLAB, HDF5, torch, pages of a TIFF."""
+    size: tuple[int, int] | None = None
+    """Rows and columns of an image that is stored as a list of pixels, column after column as MATLAB writes it."""
+
+
+_WITH_BANDS_AT: tuple[Axes, Axes, Axes] = ("byx", "ybx", "yxb")
+
+
+def choose_axes(
+    shape: tuple[int, ...], given: Axes | None, num_wavelengths: int | None, default: Axes = "yxb"
+) -> tuple[Axes, tuple[str, ...]]:
+    """Axes of a 3-D array, and notes.
+
+    Args:
+        shape: Of the array.
+        given: What the user says, which overrides everything.
+        num_wavelengths: Length that the axis of bands has, if it is known.
+        default: Where no length tells.
+
+    >>> choose_axes((31, 64, 48), None, 31)
+    ('byx', ())
+    """
+    if given is not None:
+        return given, ()
+    fitting = [axis for axis in (2, 0, 1) if shape[axis] == num_wavelengths]
+    if _WITH_BANDS_AT.index(default) in fitting:
+        fitting.insert(0, _WITH_BANDS_AT.index(default))
+    if fitting:
+        several = len(set(fitting)) > 1
+        note = f"{num_wavelengths} wavelengths fit several axes of {shape}; bands are taken to be axis {fitting[0]}"
+        return _WITH_BANDS_AT[fitting[0]], (note,) if several else ()
+    bands = _WITH_BANDS_AT.index(default)
+    shortest = int(np.argmin(shape))
+    if shape[shortest] < shape[bands]:
+        note = f"bands are taken to be axis {bands} of {shape}, though axis {shortest} is the shortest"
+        return default, (f"{note}; if that is wrong, say which axis is which (--axes {_other(default)})",)
+    return default, ()
+
+
+def _other(default: Axes) -> Axes:
+    return "byx" if default == "yxb" else "yxb"
+
+
+def image_shape(shape: tuple[int, ...], axes: Axes) -> tuple[int, int, int]:
+    """Rows, columns and bands of a stored array.
+
+    >>> image_shape((31, 64, 48), "byx")
+    (64, 48, 31)
+    """
+    return shape[axes.index("y")], shape[axes.index("x")], shape[axes.index("b")]
+
+
+def take_part(stored: np.ndarray, axes: Axes, rows: slice, bands: BandIndex) -> np.ndarray:
+    """A copy (h, W, b) of some rows and bands of a stored array."""
+    return np.array(stored.transpose([axes.index(axis) for axis in "yxb"])[rows][:, :, bands], order="C")
+
+
+_Key: TypeAlias = tuple[Hashable, ...]
+_KEPT_BYTES = 2**28
+
+_kept: OrderedDict[_Key, np.ndarray] = OrderedDict()
+_lock = threading.Lock()
+
+
+def loaded(load: Callable[..., np.ndarray], path: Path, *arguments: Hashable) -> np.ndarray:
+    """The array that `load(path, *arguments)` gives; read again only if others came between or the file changed.
+
+    Arrays of 256 MiB together are kept, or one that is larger.
+    """
+    state = path.stat()
+    key: _Key = (load, path.resolve(), arguments, state.st_size, state.st_mtime_ns)
+    with _lock:
+        if key in _kept:
+            _kept.move_to_end(key)
+            return _kept[key]
+    array: Any = load(path, *arguments)
+    array.setflags(write=False)
+    with _lock:
+        _kept[key] = array
+        while len(_kept) > 1 and sum(kept.nbytes for kept in _kept.values()) > _KEPT_BYTES:
+            _kept.popitem(last=False)
+    return array
+
+
+def import_extra(package: str) -> ModuleType:
+    """A package of the extra `captures`.
+
+    Raises:
+        CaptureError: it isn't installed.
+    """
+    try:
+        return import_module(package)
+    except ImportError as error:
+        raise CaptureError(
+            f"this file needs the package {package.partition('.')[0]}, which isn't installed ({error}): "
+            "pip install 'unmix-nerf[captures]'"
+        ) from error
+
+
+@contextmanager
+def logged_by(library: str) -> Iterator[list[str]]:
+    """Context in which warnings and errors of a library's log are collected, and shown nowhere."""
+    messages: list[str] = []
+
+    class _Collector(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            messages.append(" ".join(record.getMessage().split())[:200])
+
+    logger, collector = logging.getLogger(library), _Collector(logging.WARNING)
+    propagated = logger.propagate
+    logger.addHandler(collector)
+    logger.propagate = False
+    try:
+        yield messages
+    finally:
+        logger.removeHandler(collector)
+        logger.propagate = propagated

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from unmix_plugin.captures.readers.read_options import Axes, ReadOptions
+from unmix_plugin.captures.spectral_file import Axes, ReadOptions
 from unmix_plugin.commands.entry import DONE, USER_ERROR
 from unmix_plugin.errors import CaptureError, ConfigError, counted
 
@@ -59,7 +59,7 @@ def inspect_command(arguments: list[str]) -> int:
 
 
 def _report(path: Path, options: ReadOptions) -> dict[str, Any]:
-    from unmix_plugin.captures.inspection import inspect_file
+    from unmix_plugin.captures.readers.opening import inspect_file
 
     try:
         return inspect_file(path, options)

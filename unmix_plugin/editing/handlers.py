@@ -28,13 +28,9 @@ from unmix_plugin.editing.retint import LitReflectance, retinted
 from unmix_plugin.editing.seen import appearance_of
 from unmix_plugin.errors import ConfigError, SpectrumError, UnmixError
 from unmix_plugin.figures.plotting import css_colour
+from unmix_plugin.formats.envi import read_library_table
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, srgb_to_linear
-from unmix_plugin.spectral.library.material_library import (
-    DARK_LIGHT,
-    MaterialLibrary,
-    measured_library,
-    read_library_table,
-)
+from unmix_plugin.spectral.library.material_library import DARK_LIGHT, MaterialLibrary, measured_library
 
 _GREATEST_REFLECTANCE = 2.0
 """Of a table of reflectances; more is a sign of per cent. Fluorescent ones exceed 1."""

@@ -1,15 +1,38 @@
-"""Writing results: formats as bytes, files that are whole or not there, and nothing overwritten by accident."""
+"""Writing results: formats as bytes, files that are whole or not there, and nothing overwritten by accident.
+
+Images on disk as they are in memory: a header and then row after row, of which only a few are held at a time.
+
+NumPy's own format, written row after row.
+
+PNG pictures: colours with opacity, and ids with a palette.
+
+Notation: `H x W` pixels, `N` colours.
+"""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Collection
+import os
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
+from jaxtyping import Float, UInt8
 
-from unmix_plugin.engine.runs.atomic_files import make_folder, write_file
+from unmix_plugin.engine.runs.atomic_files import (
+    make_folder,
+    whole_file,
+    write_all,
+    write_errors_as,
+    write_file,
+)
 from unmix_plugin.errors import ConfigError
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
 
 __all__ = ["array_bytes", "make_folder", "refuse_to_overwrite", "write_file"]
 
@@ -32,4 +55,107 @@ def array_bytes(array: np.ndarray) -> bytes:
     """An array as the bytes of an .npy file."""
     buffer = io.BytesIO()
     np.save(buffer, array, allow_pickle=False)
+    return buffer.getvalue()
+
+
+RowSink: TypeAlias = Callable[[np.ndarray], None]
+"""Takes the next rows of an image, (rows, W, ...), from the top down."""
+
+
+@contextmanager
+def raw_rows(path: Path, header: bytes, shape: tuple[int, ...], dtype: np.dtype) -> Iterator[RowSink]:
+    """Context that gives a sink for the rows of an image; at its end the file is complete and has its name.
+
+    Args:
+        path: File to write.
+        header: Bytes before the pixels.
+        shape: Of the whole image, (H, W, ...).
+        dtype: Of the numbers on disk.
+    Raises:
+        ValueError: the rows given don't add up to `shape`.
+    """
+    given = 0
+
+    def add(rows: np.ndarray) -> None:
+        nonlocal given
+        if rows.shape[1:] != shape[1:]:
+            raise ValueError(f"rows of {path.name} have shape {shape[1:]}; got {rows.shape[1:]}")
+        given += len(rows)
+        with write_errors_as(path):
+            _write(descriptor, np.ascontiguousarray(rows, dtype=dtype))
+
+    with whole_file(path) as temporary:
+        with write_errors_as(path):
+            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
+            descriptor = os.open(temporary, flags, 0o666)
+        try:
+            with write_errors_as(path):
+                _write(descriptor, np.frombuffer(header, dtype=np.uint8))
+            yield add
+        finally:
+            os.close(descriptor)
+        if given != shape[0]:
+            raise ValueError(f"{path.name} has {shape[0]} rows; got {given}")
+
+
+def _write(descriptor: int, values: np.ndarray) -> None:
+    write_all(descriptor, values.reshape(-1).view(np.uint8).data)
+
+
+@contextmanager
+def npy_rows(path: Path, shape: tuple[int, ...], dtype: type[np.generic]) -> Iterator[RowSink]:
+    """Context that gives a sink for the rows of an array of this shape; the file appears at its end.
+
+    Raises:
+        ValueError: the rows given don't add up to `shape`.
+    """
+    kind = np.dtype(dtype).newbyteorder("<")
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": np.lib.format.dtype_to_descr(kind), "fortran_order": False, "shape": shape}
+    )
+    with raw_rows(path, header.getvalue(), shape, kind) as add:
+        yield add
+
+
+def rgba_png_bytes(rgba: UInt8[np.ndarray, "H W C"], description: str = "") -> bytes:
+    """sRGB colours, three or four channels; the fourth is opacity, by which colours are not multiplied.
+
+    `description` says what is shown; it is written into the file as its `Description`.
+    """
+    from PIL import Image
+
+    return _encoded(Image.fromarray(rgba), description)
+
+
+def indexed_png_bytes(
+    ids: UInt8[np.ndarray, "H W"],
+    palette: Float[np.ndarray, "N 3"],
+    transparent: int | None = None,
+    description: str = "",
+) -> bytes:
+    """Ids whose colours are in the palette: readers get either, as they ask.
+
+    Args:
+        ids: Indices.
+        palette: sRGB in [0, 1], at most 256.
+        transparent: An id that is not painted.
+        description: As `rgba_png_bytes` takes it.
+    """
+    from PIL import Image
+
+    picture = Image.fromarray(ids, mode=None).copy()
+    picture.putpalette(np.round(np.asarray(palette) * 255).astype(np.uint8).tobytes())
+    return _encoded(picture, description, transparent)
+
+
+def _encoded(picture: Image, description: str, transparent: int | None = None) -> bytes:
+    from PIL.PngImagePlugin import PngInfo
+
+    text = PngInfo()
+    if description:
+        text.add_itxt("Description", description)
+    buffer = io.BytesIO()
+    options = {} if transparent is None else {"transparency": transparent}
+    picture.save(buffer, format="PNG", pnginfo=text, **options)
     return buffer.getvalue()

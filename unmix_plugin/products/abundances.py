@@ -19,7 +19,7 @@ from unmix_plugin.figures.pictures import (
     over_neutral,
     paint,
 )
-from unmix_plugin.formats.envi_cube import envi_cube_paths, write_envi_cube
+from unmix_plugin.formats.envi import envi_cube_paths, write_envi_cube
 from unmix_plugin.formats.exr import layer_names, write_exr
 from unmix_plugin.formats.files import array_bytes, write_file
 from unmix_plugin.products.product import ViewProduct

@@ -8,9 +8,9 @@ from typing import Literal
 
 import numpy as np
 
-from unmix_plugin.formats.envi_cube import write_envi_cube
+from unmix_plugin.formats.envi import write_envi_cube
+from unmix_plugin.formats.exr import write_spectral_exr
 from unmix_plugin.formats.files import array_bytes, write_file
-from unmix_plugin.formats.spectral_exr import write_spectral_exr
 from unmix_plugin.products.abundances import view_paths
 from unmix_plugin.products.product import ViewProduct
 from unmix_plugin.spectral.colour.conversion import rgb_matrix

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from unmix_plugin.figures.plotting import figure_bytes, plain_axes
-from unmix_plugin.formats.envi_library import envi_library_paths, write_envi_library
+from unmix_plugin.formats.envi import envi_library_paths, write_envi_library
 from unmix_plugin.formats.files import make_folder, write_file
 from unmix_plugin.products.product import Job, Product
 from unmix_plugin.spectral.materials import Materials

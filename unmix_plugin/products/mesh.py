@@ -15,9 +15,7 @@ import torch
 from jaxtyping import Float32, Int
 
 from unmix_plugin.errors import ConfigError, RunError
-from unmix_plugin.formats.glb import write_glb
-from unmix_plugin.formats.obj import obj_paths, write_obj
-from unmix_plugin.formats.ply import write_ply
+from unmix_plugin.formats.meshes import obj_paths, write_glb, write_obj, write_ply
 from unmix_plugin.products.product import Job, Product
 
 if TYPE_CHECKING:

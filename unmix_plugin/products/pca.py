@@ -19,8 +19,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.figures.pictures import over_neutral
-from unmix_plugin.formats.files import write_file
-from unmix_plugin.formats.png import rgba_png_bytes
+from unmix_plugin.formats.files import rgba_png_bytes, write_file
 from unmix_plugin.products.product import Job, Product
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Materials
 from unmix_plugin.spectral.subspace import PcaColours

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from unmix_plugin.errors import ConfigError, RunError, counted
-from unmix_plugin.formats.ply import write_ply
+from unmix_plugin.formats.meshes import write_ply
 from unmix_plugin.products.cloud import is_outlier, plane_normals, thinned
 from unmix_plugin.products.product import Job, Product
 

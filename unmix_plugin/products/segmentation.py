@@ -14,8 +14,7 @@ from torch import Tensor
 
 from unmix_plugin.figures.pictures import NEUTRAL, Picture, TitledPicture, draw_panels
 from unmix_plugin.figures.plotting import Colour
-from unmix_plugin.formats.files import array_bytes, write_file
-from unmix_plugin.formats.png import indexed_png_bytes
+from unmix_plugin.formats.files import array_bytes, indexed_png_bytes, write_file
 from unmix_plugin.products.abundances import colour_panel
 from unmix_plugin.products.product import Job, ViewProduct
 from unmix_plugin.spectral.materials import Materials

@@ -85,8 +85,7 @@ class Spectrum(Product):
     def _place(
         self, job: Job, title: str, facts: dict[str, object], probe: Probe, measured: np.ndarray | None
     ) -> ProbedPlace:
-        from unmix_plugin.spectral.library.material_library import library_with
-        from unmix_plugin.trained.library_matches import LIGHT_UNKNOWN, shown_matches
+        from unmix_plugin.trained.library_matches import LIGHT_UNKNOWN, library_with, shown_matches
 
         light = job.scene.light_power
         if light is None:

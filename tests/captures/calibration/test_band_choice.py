@@ -6,8 +6,14 @@ import numpy as np
 import pytest
 
 from tests.captures.files_in_memory import file_of
-from unmix_plugin.captures.calibration.band_choice import BandChoice, drop_found, repeated_wavelengths
-from unmix_plugin.captures.calibration.sampling import Sample, find_saturation, noise_shares
+from unmix_plugin.captures.calibration.bands import (
+    BandChoice,
+    Sample,
+    drop_found,
+    find_saturation,
+    noise_shares,
+    repeated_wavelengths,
+)
 
 WAVELENGTHS_NM = np.linspace(400.0, 900.0, 12)
 GENERATOR = np.random.default_rng(0)

@@ -11,7 +11,7 @@ from PIL import Image
 from tests.captures.poses.pose_factory import LENS, assert_same_poses, ring, transforms, write_json
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.errors import CaptureError
-from unmix_plugin.formats.ply import write_ply
+from unmix_plugin.formats.meshes import write_ply
 
 
 def read(tmp_path, content, **options):

@@ -6,9 +6,9 @@ import pytest
 
 from tests.captures.readers.bands import centres_nm, widths_nm
 from unmix_plugin.captures.readers.opening import open_spectral_file
-from unmix_plugin.captures.readers.read_options import ReadOptions
+from unmix_plugin.captures.spectral_file import ReadOptions
 from unmix_plugin.errors import CaptureError
-from unmix_plugin.formats.spectral_exr import write_spectral_exr
+from unmix_plugin.formats.exr import write_spectral_exr
 from unmix_plugin.spectral.bands import Bands
 
 RNG = np.random.default_rng(0)

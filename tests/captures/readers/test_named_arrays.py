@@ -11,7 +11,7 @@ import torch
 
 from tests.captures.readers.bands import centres_nm, widths_nm
 from unmix_plugin.captures.readers.opening import open_spectral_file
-from unmix_plugin.captures.readers.read_options import ReadOptions
+from unmix_plugin.captures.spectral_file import ReadOptions
 from unmix_plugin.errors import CaptureError
 
 CUBE = np.random.default_rng(0).integers(0, 9000, (8, 9, 5)).astype(np.uint16)

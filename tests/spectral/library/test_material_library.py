@@ -12,16 +12,16 @@ from scipy.spatial import ConvexHull
 from spectral.io.envi import SpectralLibrary
 
 from unmix_plugin.errors import SpectrumError
+from unmix_plugin.formats.envi import read_library_table
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.material_library import (
     LibraryMaterial,
     MaterialLibrary,
     continuum_removed,
-    library_with,
     measured_library,
-    read_library_table,
 )
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
+from unmix_plugin.trained.library_matches import library_with
 
 VISIBLE = Bands.of(np.linspace(400, 700, 31))
 NUM_MEASURED = 183 if "CIE 2024" in SDS_TCS else 182

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from unmix_plugin.captures.capture import Capture
-from unmix_plugin.captures.readers.read_options import Axes, ReadOptions
+from unmix_plugin.captures.spectral_file import Axes, ReadOptions
 from unmix_plugin.errors import CaptureError, counted
 
 

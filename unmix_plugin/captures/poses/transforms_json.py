@@ -17,7 +17,7 @@ from unmix_plugin.captures.poses.files import PictureSizes
 from unmix_plugin.captures.poses.lens import Lens, fit_lens, project_fisheye
 from unmix_plugin.captures.poses.pose_set import PoseSet, RawCamera, SparsePoints, make_pose_set, name_some
 from unmix_plugin.errors import CaptureError, SceneError
-from unmix_plugin.formats.ply import read_ply_points
+from unmix_plugin.formats.meshes import read_ply_points
 from unmix_plugin.scenes.placement import Placement, read_placement
 from unmix_plugin.scenes.reading.faults import Faults, describe, read_number
 

@@ -12,11 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from unmix_plugin.captures.readers.extras import import_extra
-from unmix_plugin.captures.readers.found_arrays import FoundArray
-from unmix_plugin.captures.readers.image_of_arrays import image_of_arrays
-from unmix_plugin.captures.readers.read_options import Axes, ReadOptions
-from unmix_plugin.captures.spectral_file import BandIndex, SpectralFile
+from unmix_plugin.captures.readers.arrays import FoundArray, image_of_arrays
+from unmix_plugin.captures.spectral_file import Axes, BandIndex, ReadOptions, SpectralFile, import_extra
 from unmix_plugin.errors import CaptureError
 
 

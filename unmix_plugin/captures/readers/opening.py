@@ -1,29 +1,113 @@
-"""Any file of an instrument as a `SpectralFile`: the reader is chosen by what the file holds.
+"""What kind of file something is, by its first bytes and then by its name.
+
+Any file of an instrument as a `SpectralFile`: the reader is chosen by what the file holds.
 
 Nothing but headers is read.
+
+What files of instruments and of pose programs hold, as plain values.
 """
 
 from __future__ import annotations
 
+import math
+import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
-from unmix_plugin.captures.readers.band_folder import open_band_folder
-from unmix_plugin.captures.readers.envi import open_envi
+import numpy as np
+
+from unmix_plugin.captures.readers.arrays import open_matlab, open_netcdf3, open_npy, open_npz, open_torch
+from unmix_plugin.captures.readers.envi import header_beside, is_envi_header, open_envi
 from unmix_plugin.captures.readers.exr import open_exr
-from unmix_plugin.captures.readers.file_kinds import file_kind
 from unmix_plugin.captures.readers.hdf5 import open_hdf5
-from unmix_plugin.captures.readers.matlab import open_matlab
-from unmix_plugin.captures.readers.netcdf3 import open_netcdf3
-from unmix_plugin.captures.readers.numpy_files import open_npy, open_npz
-from unmix_plugin.captures.readers.pictures import open_picture
-from unmix_plugin.captures.readers.read_options import ReadOptions
+from unmix_plugin.captures.readers.pictures import open_band_folder, open_picture
 from unmix_plugin.captures.readers.tiff import open_tiff
-from unmix_plugin.captures.readers.torch_files import open_torch
-from unmix_plugin.captures.spectral_file import SpectralFile, unreadable
+from unmix_plugin.captures.spectral_file import ReadOptions, SpectralFile, unreadable
 from unmix_plugin.errors import CaptureError
+
+_BEGINNINGS = {
+    b"II*\0": "tiff",
+    b"MM\0*": "tiff",
+    b"II+\0": "tiff",
+    b"MM\0+": "tiff",
+    b"v/1\x01": "exr",
+    b"\x93NUMPY": "npy",
+    b"MATLAB 5.0": "matlab",
+    b"MATLAB 7.3": "hdf5",
+    b"\x89HDF\r\n\x1a\n": "hdf5",
+    b"CDF": "netcdf",
+    b"\x89PNG\r\n\x1a\n": "picture",
+    b"\xff\xd8\xff": "picture",
+}
+_SUFFIXES = {".hdr": "envi", ".pt": "torch", ".pth": "torch"}
+"""Kinds that their first bytes don't tell, or that are refused with a better reason by their reader."""
+_LFS_POINTER = b"version https://git-lfs"
+_REFUSED = {
+    b"\x1f\x8b": "compressed with gzip; unpack it first",
+    b"BZh": "compressed with bzip2; unpack it first",
+    b"\xfd7zXZ": "compressed with xz; unpack it first",
+    b"Rar!": "a RAR archive; unpack it first",
+    b"7z\xbc\xaf": "a 7z archive; unpack it first",
+    b"<!DOCTYPE": "a web page, perhaps in place of a download; download the file again",
+    b"<html": "a web page, perhaps in place of a download; download the file again",
+    b"#?RADIANCE": "a Radiance picture, which holds no spectral bands",
+}
+_KNOWN = "ENVI, TIFF, OpenEXR, MATLAB, HDF5, NetCDF, .npy, .npz, .pt, PNG, JPEG, or a folder with one picture a band"
+_HDF5_STARTS = (512, 1024, 2048, 4096)
+"""Where the mark of HDF5 may follow bytes of another program."""
+
+
+def file_kind(path: Path) -> str:
+    """Name of the reader for a file or folder.
+
+    Raises:
+        CaptureError: it is missing, empty, or of a kind that no reader reads.
+    """
+    if path.is_dir():
+        return "folder"
+    if not path.is_file():
+        raise CaptureError(f"{path}: no such file")
+    with path.open("rb") as file:
+        begin = file.read(4096 + 8)
+    if not begin:
+        raise CaptureError(f"{path}: the file is empty; copy it again")
+    if begin.startswith(_LFS_POINTER):
+        raise CaptureError(f"{path}: a pointer of Git LFS, not the file itself; fetch it with 'git lfs pull'")
+    kind = _by_content(path, begin)
+    if kind is None:
+        raise CaptureError(
+            f"{path}: of no known kind: begins with {begin[:8]!r}, has no ENVI header beside it; expected {_KNOWN}"
+        )
+    return kind
+
+
+def _by_content(path: Path, begin: bytes) -> str | None:
+    kind = next((kind for magic, kind in _BEGINNINGS.items() if begin.startswith(magic)), None)
+    if kind is not None:
+        return kind
+    if any(begin[start : start + 8] == b"\x89HDF\r\n\x1a\n" for start in _HDF5_STARTS):
+        return "hdf5"
+    if begin.startswith(b"PK\x03\x04") and zipfile.is_zipfile(path):
+        return _kind_of_zip(path)
+    if is_envi_header(path) or (path.suffix.lower() != ".hdr" and header_beside(path) is not None):
+        return "envi"
+    refused = next((why for magic, why in _REFUSED.items() if begin.lstrip().startswith(magic)), None)
+    if refused is not None:
+        raise CaptureError(f"{path}: {refused}")
+    return _SUFFIXES.get(path.suffix.lower())
+
+
+def _kind_of_zip(path: Path) -> str:
+    with zipfile.ZipFile(path) as archive:
+        names = archive.namelist()
+    if any(name.endswith("/data.pkl") for name in names):
+        return "torch"
+    if names and all(name.endswith(".npy") for name in names):
+        return "npz"
+    raise CaptureError(f"{path}: a zip archive ({', '.join(names[:3]) or 'empty'}); unpack it first")
+
 
 Reader: TypeAlias = Callable[[Path, ReadOptions], SpectralFile]
 
@@ -79,3 +163,116 @@ def _with_wavelengths(opened: SpectralFile, options: ReadOptions) -> SpectralFil
 def _size(opened: SpectralFile) -> str:
     height, width, num_bands = opened.shape
     return f"{height} rows x {width} columns x {num_bands} bands"
+
+
+_LARGEST_PROOF = 2**28
+"""Bytes of a row that is read as a proof; of larger ones a single band, or nothing."""
+_LONGEST_TEXT = 500
+_LLFF_COLUMNS = 17
+_POSE_SUFFIXES = (".json", ".xml", ".bin", ".txt")
+FACTS = (
+    *(
+        "reader",
+        "shape",
+        "dtype",
+        "interleave",
+        "wavelengths_nm",
+        "wavelength_evidence",
+        "fwhm_nm",
+        "band_names",
+    ),
+    *("bad_bands", "scale", "no_data", "poses", "notes", "metadata"),
+)
+"""What is reported of every file, None where it has no such thing."""
+
+
+def inspect_file(path: Path, options: ReadOptions | None = None) -> dict[str, Any]:
+    """Facts about a file or folder, as JSON-able values: an image, poses, or both.
+
+    The last row of an image is read, so that a file that is cut short is found out.
+
+    Raises:
+        CaptureError: the file is neither, or is damaged.
+    """
+    try:
+        opened = open_spectral_file(path, options)
+        _prove(opened)
+    except CaptureError as error:
+        poses = _poses_of(path, error)
+        return {"file": str(path), **dict.fromkeys(FACTS), **poses}
+    facts = describe(opened)
+    if path.suffix.lower() == ".npy" and opened.shape[1:] == (_LLFF_COLUMNS, 1):
+        facts |= _poses_of(path, None)
+    return {"file": str(path), **facts}
+
+
+def describe(opened: SpectralFile) -> dict[str, Any]:
+    """What an opened image says of itself; indices of bands count from 0."""
+    bands = opened.bands
+    return {
+        "reader": opened.reader,
+        "shape": list(opened.shape),
+        "dtype": opened.dtype.newbyteorder("=").name,
+        "interleave": opened.interleave,
+        "wavelengths_nm": _listed(bands.wavelengths_nm),
+        "wavelength_evidence": bands.evidence,
+        "fwhm_nm": _listed(bands.fwhm_nm),
+        "band_names": None if bands.names is None else list(bands.names),
+        "bad_bands": None if bands.bad is None else np.flatnonzero(bands.bad).tolist(),
+        "scale": _number(opened.scale),
+        "no_data": _number(opened.no_data),
+        "poses": None,
+        "notes": list(opened.notes),
+        "metadata": _plain(opened.metadata),
+    }
+
+
+def _prove(opened: SpectralFile) -> None:
+    """Read the last row, or one band of it."""
+    height, width, num_bands = opened.shape
+    row_bytes = width * opened.dtype.itemsize
+    if row_bytes <= _LARGEST_PROOF:
+        first = 0 if row_bytes * num_bands <= _LARGEST_PROOF else num_bands - 1
+        opened.read(slice(height - 1, height), slice(first, num_bands))
+
+
+def _poses_of(path: Path, refused: CaptureError | None) -> dict[str, Any]:
+    """Number of cameras and notes of a file of poses.
+
+    Raises:
+        CaptureError: it holds none, and is not an image either: the more fitting of both reasons.
+    """
+    from unmix_plugin.captures.poses.reading import read_poses
+
+    try:
+        found = read_poses(path)
+    except CaptureError as error:
+        if refused is None:
+            return {}
+        raise (error if path.suffix.lower() in _POSE_SUFFIXES else refused) from error
+    return {"poses": len(found.cameras), "notes": list(found.notes), "metadata": {"source": found.source}}
+
+
+def _listed(values: np.ndarray | None) -> list[float] | None:
+    return None if values is None else [round(value, 6) for value in values.tolist()]
+
+
+def _number(value: float | None) -> float | str | None:
+    """JSON has no word for numbers that are not finite."""
+    return value if value is None or math.isfinite(value) else str(value)
+
+
+def _plain(value: Any) -> Any:
+    """JSON-able, with long texts cut."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float):
+        return _number(value)
+    if value is None or isinstance(value, bool | int):
+        return value
+    text = str(value)
+    return text if len(text) <= _LONGEST_TEXT else f"{text[:_LONGEST_TEXT]}..."

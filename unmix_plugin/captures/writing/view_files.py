@@ -29,7 +29,7 @@ from unmix_plugin.captures.masks import (
     read_view_masks,
 )
 from unmix_plugin.engine.runs.atomic_files import whole_file, write_errors_as, write_file
-from unmix_plugin.formats.png import indexed_png_bytes, rgba_png_bytes
+from unmix_plugin.formats.files import indexed_png_bytes, rgba_png_bytes
 from unmix_plugin.spectral.bands import Bands
 
 FULL_SCALE = 65535

@@ -15,12 +15,9 @@ import numpy as np
 
 from unmix_plugin.engine.outputs import Output
 from unmix_plugin.figures.pictures import Canvas, CanvasLayout
-from unmix_plugin.formats.envi_cube import envi_cube_paths, envi_cube_rows
-from unmix_plugin.formats.exr import layer_names, write_exr
-from unmix_plugin.formats.files import write_file
-from unmix_plugin.formats.npy import npy_rows
-from unmix_plugin.formats.png import indexed_png_bytes, rgba_png_bytes
-from unmix_plugin.formats.spectral_exr import write_spectral_exr
+from unmix_plugin.formats.envi import envi_cube_paths, envi_cube_rows
+from unmix_plugin.formats.exr import layer_names, write_exr, write_spectral_exr
+from unmix_plugin.formats.files import indexed_png_bytes, npy_rows, rgba_png_bytes, write_file
 from unmix_plugin.formats.video import FrameSink, video_frames
 from unmix_plugin.products.render.formats import FormattedOutput, file_name
 from unmix_plugin.products.render.pictures import (

@@ -37,7 +37,7 @@ class Report(Product):
         """Render, compare and lay out."""
         from unmix_plugin.products.report.layout import write_report
         from unmix_plugin.products.report.views import evenly
-        from unmix_plugin.spectral.library.material_library import library_with
+        from unmix_plugin.trained.library_matches import library_with
 
         if self.max_views < 1:
             raise ConfigError(f"--max-views is {self.max_views}; choose at least 1")

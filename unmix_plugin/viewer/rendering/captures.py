@@ -23,9 +23,8 @@ from jaxtyping import Float32, UInt8
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.formats.files import write_file
-from unmix_plugin.formats.png import rgba_png_bytes
-from unmix_plugin.formats.spectral_exr import write_spectral_exr
+from unmix_plugin.formats.exr import write_spectral_exr
+from unmix_plugin.formats.files import rgba_png_bytes, write_file
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
 from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.trained.protocol import RenderedView

@@ -1,0 +1,356 @@
+"""PLY: points or meshes with any number of properties a vertex, binary, little-endian.
+
+Notation: `P` vertices, `F` faces.
+
+Wavefront OBJ with a material library beside it; colours of vertices follow their positions.
+
+Notation: `P` vertices, `F` faces, `M` materials.
+
+Binary glTF 2.0 (.glb): one mesh with a colour and any other numbers a vertex.
+
+Source: Khronos Group, glTF 2.0 specification, sections 3.7 (meshes) and 4 (GLB).
+
+Notation: `P` vertices, `F` faces.
+
+Binary glTF 2.0 (.glb) of a mesh with the textures of a metallic-roughness material.
+
+Source: Khronos Group, glTF 2.0 specification, sections 3.7 (meshes), 3.9 (materials) and appendix B.
+
+Notation: `P` vertices, `F` faces.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64, Int, UInt8
+
+from unmix_plugin import __version__
+from unmix_plugin.formats.files import write_file
+
+_TYPES = {"float32": "float", "float64": "double", "uint8": "uchar", "int32": "int"}
+_READ_TYPES = {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
+_READ_TYPES |= {"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2"}
+_READ_TYPES |= {"ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"}
+
+
+def write_ply(
+    path: Path,
+    vertices: Mapping[str, np.ndarray],
+    faces: Int[np.ndarray, "F 3"] | None = None,
+    comments: Sequence[str] = (),
+) -> Path:
+    """Write vertices and, if given, triangles.
+
+    Args:
+        path: File; its folder is made.
+        vertices: Properties by name (x, y, z, nx, ny, nz, red, green, blue have a known meaning), each (P,) of float32,
+            float64, uint8 or int32.
+        faces: Indices of vertices.
+        comments: Lines of the header.
+    Raises:
+        KeyError: a property of another type.
+    """
+    count = len(next(iter(vertices.values())))
+    table = np.empty(
+        count, dtype=[(name, values.dtype.newbyteorder("<")) for name, values in vertices.items()]
+    )
+    for name, values in vertices.items():
+        table[name] = values
+    header = ["ply", "format binary_little_endian 1.0"]
+    header += [f"comment {' '.join(line.split())}" for line in comments]
+    header += [f"element vertex {count}"]
+    header += [f"property {_TYPES[values.dtype.name]} {name}" for name, values in vertices.items()]
+    body = table.tobytes()
+    if faces is not None:
+        header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+        rows = np.empty(len(faces), dtype=[("count", "u1"), ("indices", "<i4", 3)])
+        rows["count"], rows["indices"] = 3, faces
+        body += rows.tobytes()
+    return write_file(path, "\n".join([*header, "end_header", ""]).encode("ascii", "replace") + body)
+
+
+def read_ply_points(
+    path: Path,
+) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"] | None]:
+    """Positions and, if there are any, colours of the vertices of a PLY, binary or text.
+
+    Raises:
+        ValueError: it is not a PLY, is cut short, or its vertices are not numbers x, y, z.
+        OSError: it can't be read.
+    """
+    data = path.read_bytes()
+    end = data.find(b"end_header")
+    if not data.startswith(b"ply") or end < 0:
+        raise ValueError("no PLY header")
+    lines = [line.split() for line in data[:end].decode("ascii", "replace").splitlines()]
+    start = data.find(b"\n", end) + 1
+    order = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
+    kinds = [line[1] for line in lines if line[:1] == ["format"] and len(line) > 1]
+    elements = [index for index, line in enumerate(lines) if line[:1] == ["element"]]
+    if not kinds or kinds[0] not in order or not elements or lines[elements[0]][1:2] != ["vertex"]:
+        raise ValueError("its format is unknown, or vertices are not its first element")
+    count = int(lines[elements[0]][2])
+    stop = elements[1] if len(elements) > 1 else len(lines)
+    named = [line for line in lines[elements[0] + 1 : stop] if line[:1] == ["property"]]
+    if any(len(line) != 3 or line[1] not in _READ_TYPES for line in named):
+        raise ValueError("a vertex has properties that are not plain numbers")
+    names = [line[2] for line in named]
+    if not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
+        raise ValueError("vertices have no x, y, z")
+    dtype = np.dtype([(line[2], (order[kinds[0]] or "<") + _READ_TYPES[line[1]]) for line in named])
+    body = data[start:]
+    if kinds[0] == "ascii":
+        numbers = np.array(body.split()[: count * len(names)], dtype=np.float64).reshape(-1, len(names))
+        table = {name: numbers[:, index] for index, name in enumerate(names)}
+    else:
+        body = body[: max(count, 0) * dtype.itemsize]
+        numbers = np.frombuffer(body[: len(body) // dtype.itemsize * dtype.itemsize], dtype)
+        table = {name: numbers[name] for name in names}
+    if len(numbers) != count:
+        raise ValueError(f"{len(numbers)} vertices; its header promises {count}")
+    positions = np.column_stack([table[axis].astype(np.float64) for axis in "xyz"])
+    if not {"red", "green", "blue"} <= set(names):
+        return positions, None
+    return positions, np.column_stack([table[name].astype(np.uint8) for name in ("red", "green", "blue")])
+
+
+def obj_paths(path_without_suffix: Path) -> list[Path]:
+    """Files that `write_obj` makes."""
+    return [path_without_suffix.with_name(path_without_suffix.name + suffix) for suffix in (".obj", ".mtl")]
+
+
+def write_obj(
+    path_without_suffix: Path,
+    positions: Float[np.ndarray, "P 3"],
+    normals: Float[np.ndarray, "P 3"],
+    srgb: Float[np.ndarray, "P 3"],
+    faces: Int[np.ndarray, "F 3"],
+    materials: Int[np.ndarray, " F"],
+    names: Sequence[str],
+    palette: Float[np.ndarray, "M 3"],
+    comments: Sequence[str] = (),
+) -> list[Path]:
+    """Write a mesh as NAME.obj and NAME.mtl, with nine significant digits, exact for float32.
+
+    Positions that are float64 have 17.
+
+    Args:
+        path_without_suffix: Folder, which is made, and NAME.
+        positions, normals: Of the vertices; unit normals.
+        srgb: Colours of the vertices in [0, 1], which most viewers show; others show the materials.
+        faces, materials: Indices of vertices, and the material of each face.
+        names, palette: Of the materials; in names what is not a letter or digit becomes `_`; sRGB.
+        comments: First lines.
+    """
+    obj_path, library_path = obj_paths(path_without_suffix)
+    plain = [f"material_{index}_{re.sub(r'[^0-9A-Za-z]+', '_', name)}" for index, name in enumerate(names)]
+    text = io.StringIO()
+    text.writelines(f"# {' '.join(line.split())}\n" for line in comments)
+    text.write(f"mtllib {library_path.name}\n")
+    digits = " ".join(3 * ["%.17g" if positions.dtype == np.float64 else "%.9g"])
+    np.savetxt(text, np.hstack([positions, srgb]), fmt=f"v {digits} %.9g %.9g %.9g")
+    np.savetxt(text, normals, fmt="vn %.9g %.9g %.9g")
+    for index in np.unique(materials):
+        text.write(f"usemtl {plain[index]}\n")
+        corners = faces[materials == index] + 1
+        np.savetxt(text, corners.repeat(2, axis=1), fmt="f %d//%d %d//%d %d//%d")
+    library = "".join(
+        f"newmtl {name}\nKd {colour[0]:.6g} {colour[1]:.6g} {colour[2]:.6g}\nillum 1\n\n"
+        for name, colour in zip(plain, palette.tolist(), strict=True)
+    )
+    write_file(library_path, library.encode())
+    return [write_file(obj_path, text.getvalue().encode("utf-8")), library_path]
+
+
+FLOAT, UNSIGNED_INT = 5126, 5125
+VERTEX_BUFFER, INDEX_BUFFER = 34962, 34963
+_JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
+
+
+def write_glb(
+    path: Path,
+    positions: Float32[np.ndarray, "P 3"],
+    normals: Float32[np.ndarray, "P 3"],
+    linear_rgb: Float32[np.ndarray, "P 3"],
+    faces: Int[np.ndarray, "F 3"],
+    numbers: Mapping[str, np.ndarray],
+    extras: Mapping[str, Any],
+) -> Path:
+    """Write a mesh.
+
+    Args:
+        path: File; its folder is made.
+        positions: Of the vertices.
+        normals: Unit vectors.
+        linear_rgb: Colours, linear light in sRGB primaries, [0, 1], as glTF wants them.
+        faces: Indices of vertices.
+        numbers: More of each vertex, (P,) float32, by a name that starts with `_`.
+        extras: What else the file says of the mesh, as JSON has it.
+    """
+    builder = GlbBuilder()
+    attributes = {
+        "POSITION": builder.add(positions, "VEC3", FLOAT, VERTEX_BUFFER, has_bounds=True),
+        "NORMAL": builder.add(normals, "VEC3", FLOAT, VERTEX_BUFFER),
+        "COLOR_0": builder.add(linear_rgb, "VEC3", FLOAT, VERTEX_BUFFER),
+    }
+    for name, values in numbers.items():
+        attributes[name] = builder.add(values, "SCALAR", FLOAT, VERTEX_BUFFER)
+    indices = builder.add(faces.astype("<u4").ravel(), "SCALAR", UNSIGNED_INT, INDEX_BUFFER)
+    material = {"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0}}
+    return builder.write(path, attributes, indices, material, extras)
+
+
+class GlbBuilder:
+    """The binary part and what describes it."""
+
+    def __init__(self) -> None:
+        self.data = bytearray()
+        self.views: list[dict[str, Any]] = []
+        self.accessors: list[dict[str, Any]] = []
+
+    def add(
+        self, values: np.ndarray, kind: str, component: int, target: int, has_bounds: bool = False
+    ) -> int:
+        """Append an array of 4-byte numbers; the index of its accessor."""
+        raw = np.ascontiguousarray(values, dtype="<u4" if component == UNSIGNED_INT else "<f4").tobytes()
+        view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": len(raw), "target": target}
+        accessor = {
+            "bufferView": len(self.views),
+            "componentType": component,
+            "count": len(values),
+            "type": kind,
+        }
+        if has_bounds and len(values):
+            accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
+        self.data += raw
+        self.views.append(view)
+        self.accessors.append(accessor)
+        return len(self.accessors) - 1
+
+    def add_file(self, content: bytes) -> int:
+        """Append a file, such as a picture; the index of its view."""
+        self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": len(content)})
+        self.data += content + b"\0" * (-len(content) % 4)
+        return len(self.views) - 1
+
+    def write(
+        self,
+        path: Path,
+        attributes: Mapping[str, int],
+        indices: int,
+        material: Mapping[str, Any],
+        extras: Mapping[str, Any],
+        **textures: Sequence[Mapping[str, Any]],
+    ) -> Path:
+        """Write a file of one mesh in one material.
+
+        Args:
+            path: File; its folder is made.
+            attributes: Accessor of each attribute of the vertices.
+            indices: Accessor of the faces.
+            material: As glTF has it.
+            extras: What else the file says of the mesh, as JSON has it.
+            textures: What the material points to: `textures`, `samplers`, `images`.
+        Raises:
+            RunError: the disk is full or refuses.
+        """
+        primitive = {"attributes": dict(attributes), "indices": indices, "material": 0}
+        content = {
+            "asset": {"version": "2.0", "generator": f"unmix-nerf {__version__}"},
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"mesh": 0, "name": "surface"}],
+            "meshes": [{"primitives": [primitive], "extras": dict(extras)}],
+            "materials": [material],
+            **textures,
+            "accessors": self.accessors,
+            "bufferViews": self.views,
+            "buffers": [{"byteLength": len(self.data)}],
+        }
+        return write_file(path, _container(json.dumps(content).encode(), bytes(self.data)))
+
+
+def _container(text: bytes, data: bytes) -> bytes:
+    """Header and two chunks, padded to multiples of four bytes."""
+    text += b" " * (-len(text) % 4)
+    data += b"\0" * (-len(data) % 4)
+    chunks = struct.pack("<II", len(text), _JSON_CHUNK) + text
+    chunks += struct.pack("<II", len(data), _BINARY_CHUNK) + data
+    return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
+
+
+_LINEAR, _LINEAR_MIPMAPS, _CLAMP = 9729, 9987, 33071
+
+
+@dataclass(frozen=True)
+class TexturedMesh:
+    """Triangles with texture coordinates, and the pictures that these point into."""
+
+    positions: Float32[np.ndarray, "P 3"]
+    normals: Float32[np.ndarray, "P 3"]
+    """Unit vectors."""
+    uv: Float32[np.ndarray, "P 2"]
+    """u to the right, v downwards."""
+    faces: Int[np.ndarray, "F 3"]
+    base_colour_png: bytes
+    """sRGB."""
+    metallic_roughness_png: bytes
+    """Linear: green is roughness, blue metallicity."""
+
+
+def write_textured_glb(path: Path, mesh: TexturedMesh, extras: Mapping[str, Any]) -> Path:
+    """Write a mesh with its material, pictures included.
+
+    Args:
+        path: File; its folder is made.
+        mesh: What to write.
+        extras: What else the file says of the mesh, as JSON has it.
+    Raises:
+        RunError: the disk is full or refuses.
+    """
+    builder = GlbBuilder()
+    attributes = {
+        "POSITION": builder.add(mesh.positions, "VEC3", FLOAT, VERTEX_BUFFER, has_bounds=True),
+        "NORMAL": builder.add(mesh.normals, "VEC3", FLOAT, VERTEX_BUFFER),
+        "TEXCOORD_0": builder.add(mesh.uv, "VEC2", FLOAT, VERTEX_BUFFER),
+    }
+    indices = builder.add(mesh.faces.astype("<u4").ravel(), "SCALAR", UNSIGNED_INT, INDEX_BUFFER)
+    images = [
+        {"name": name, "mimeType": "image/png", "bufferView": builder.add_file(content)}
+        for name, content in (
+            ("base_colour", mesh.base_colour_png),
+            ("metallic_roughness", mesh.metallic_roughness_png),
+        )
+    ]
+    sampler = {"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAPS, "wrapS": _CLAMP, "wrapT": _CLAMP}
+    return builder.write(
+        path,
+        attributes,
+        indices,
+        _MATERIAL,
+        extras,
+        textures=[{"sampler": 0, "source": 0}, {"sampler": 0, "source": 1}],
+        samplers=[sampler],
+        images=images,
+    )
+
+
+_MATERIAL = {
+    "name": "material",
+    "doubleSided": True,
+    "pbrMetallicRoughness": {
+        "baseColorTexture": {"index": 0},
+        "metallicRoughnessTexture": {"index": 1},
+        "metallicFactor": 1.0,
+        "roughnessFactor": 1.0,
+    },
+}
