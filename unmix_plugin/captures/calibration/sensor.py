@@ -24,11 +24,15 @@ from unmix_plugin.captures.calibration.bands import (
 from unmix_plugin.captures.calibration.calibration import (
     Calibration,
     Raster,
-    WhiteReference,
     exposure_of,
-    is_srgb,
 )
-from unmix_plugin.captures.calibration.references import Reference, open_reference, panel_reference
+from unmix_plugin.captures.calibration.references import (
+    Reference,
+    WhiteReference,
+    is_srgb,
+    open_reference,
+    panel_reference,
+)
 from unmix_plugin.captures.capture import CaptureView
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.radiometry import radiometric_model
