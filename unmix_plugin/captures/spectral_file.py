@@ -1,27 +1,14 @@
 """A file of an instrument, opened but not read: what it says of itself, and its numbers by rows and bands.
 
-Notation: `H` rows, `W` columns, `B` bands.
-
-What a user adds to a file that doesn't say enough of itself.
-
-Which axis of a stored array is which.
-
-Axes are letters, the slowest first: `y` rows, `x` columns, `b` bands.
-
-Arrays of files that can only be read as a whole: the last few are kept, for the next rows of the same image.
-
-Packages that not every user needs, imported when a file of their format is opened.
-
-What a library says in its log while a file is opened: material for notes, not for the terminal.
+Notation: `H` rows, `W` columns, `B` bands. Axes of stored arrays are letters, the slowest first: `y` rows, `x` columns,
+`b` bands.
 """
 
 from __future__ import annotations
 
-import logging
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
@@ -33,11 +20,32 @@ from jaxtyping import Bool, Float64, Int, Shaped
 
 from unmix_plugin.errors import CaptureError
 
+Axes: TypeAlias = Literal["yxb", "byx", "ybx", "xyb", "bxy", "xby"]
+"""What the axes of an array are, the slowest first: y rows, x columns, b bands."""
 BandIndex: TypeAlias = slice | Int[np.ndarray, " b"]
 """Some bands: a slice, or their indices in any order."""
-_PARTLY_KNOWN = "only some of the files give wavelengths"
 ReadPart: TypeAlias = Callable[[slice, BandIndex], Shaped[np.ndarray, "h W b"]]
 """Stored numbers of some rows and bands."""
+
+_WITH_BANDS_AT: tuple[Axes, Axes, Axes] = ("byx", "ybx", "yxb")
+_PARTLY_KNOWN = "only some of the files give wavelengths"
+_KEPT_BYTES = 2**28
+_kept: OrderedDict[tuple[Hashable, ...], np.ndarray] = OrderedDict()
+_lock = threading.Lock()
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """What a user adds to a file that doesn't say enough of itself, or against what it says."""
+
+    dataset: str | None = None
+    """Variable or data set to take from a file that holds several."""
+    wavelengths_nm: Float64[np.ndarray, " B"] | None = None
+    """Band centres in nm, in the order of the file."""
+    axes: Axes | None = None
+    """Order of the axes in formats that don't fix it: NumPy, MATLAB, HDF5, torch, pages of a TIFF."""
+    size: tuple[int, int] | None = None
+    """Rows and columns of an image that is stored as a list of pixels, column after column as MATLAB writes it."""
 
 
 @dataclass(frozen=True)
@@ -95,25 +103,25 @@ class SpectralFile:
             IndexError: there is no such band.
         """
         height, width, num_bands = self.shape
-        rows, bands = slice(*rows.indices(height)), _plain_bands(bands, num_bands)
+        rows = slice(*rows.indices(height))
+        if isinstance(bands, slice) and (bands.step is None or bands.step > 0):
+            bands = slice(*bands.indices(num_bands))
+        else:
+            bands = np.arange(num_bands)[bands]
         if rows.step < 1:
             raise IndexError(f"rows are read from the top down; got the step {rows.step}")
         wanted = (len(range(height)[rows]), width, len(np.arange(num_bands)[bands]))
         if 0 in wanted:
             return np.zeros(wanted, self.dtype.newbyteorder("="))
-        values = self._read_checked(rows, bands)
-        if values.shape != wanted:
-            raise CaptureError(f"{self.path}: reading gave an array of {values.shape}; expected {wanted}")
-        return np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("="))
-
-    def _read_checked(self, rows: slice, bands: BandIndex) -> np.ndarray:
-        """What `read_part` gives; whatever it raises becomes an error of the file."""
         try:
-            return self.read_part(rows, bands)
+            values = self.read_part(rows, bands)
         except CaptureError:
             raise
         except Exception as error:
             raise unreadable(self.path, error) from error
+        if values.shape != wanted:
+            raise CaptureError(f"{self.path}: reading gave an array of {values.shape}; expected {wanted}")
+        return np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("="))
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -131,13 +139,6 @@ def unreadable(path: Path, error: Exception) -> CaptureError:
     return CaptureError(
         f"{path}: can't be read ({type(error).__name__}: {reason}); the file may be cut short or damaged, copy it again"
     )
-
-
-def _plain_bands(bands: BandIndex, num_bands: int) -> BandIndex:
-    """The same bands as a slice with a positive step, or as indices from 0 up."""
-    if isinstance(bands, slice) and (bands.step is None or bands.step > 0):
-        return slice(*bands.indices(num_bands))
-    return np.arange(num_bands)[bands]
 
 
 def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
@@ -165,77 +166,50 @@ def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
         wanted = np.arange(len(owner))[bands]
         return np.concatenate([parts[owner[band]].read(rows, within[[band]]) for band in wanted], axis=-1)
 
+    def shared(values: list[float | None]) -> float | None:
+        return values[0] if len({repr(value) for value in values}) == 1 else None
+
+    # Metadata that differ are listed by part.
+    same = {
+        key: value
+        for key, value in first.metadata.items()
+        if all(repr(part.metadata.get(key)) == repr(value) for part in parts)
+    }
+    own = [{key: value for key, value in part.metadata.items() if key not in same} for part in parts]
     return replace(
         first,
         path=path,
         shape=(*first.shape[:2], len(owner)),
         dtype=np.result_type(*(part.dtype for part in parts)),
         read_part=read_part,
-        bands=_stack_tables([(part.bands, part.shape[2]) for part in parts]),
-        scale=_common([part.scale for part in parts]),
-        no_data=_common([part.no_data for part in parts]),
-        metadata=_stack_metadata(parts),
+        bands=_stack_tables(parts),
+        scale=shared([part.scale for part in parts]),
+        no_data=shared([part.no_data for part in parts]),
+        metadata=same | ({"parts": own} if any(own) else {}),
         notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
         sources=tuple(source for part in parts for source in part.files),
     )
 
 
-def _stack_tables(tables: list[tuple[BandTable, int]]) -> BandTable:
+def _stack_tables(parts: list[SpectralFile]) -> BandTable:
     """One table of several; a column that some table lacks is lacking, but bands without a mark are good."""
 
     def join(columns: list[np.ndarray | None]) -> np.ndarray | None:
         known = [column for column in columns if column is not None]
         return np.concatenate(known) if len(known) == len(columns) else None
 
-    marks = [np.zeros(bands, bool) if table.bad is None else table.bad for table, bands in tables]
-    centres = join([table.wavelengths_nm for table, _ in tables])
-    known = [table for table, _ in tables if table.wavelengths_nm is not None]
-    evidence = tables[0][0].evidence if len(known) in (0, len(tables)) else _PARTLY_KNOWN
+    tables = [part.bands for part in parts]
+    marks = [np.zeros(part.shape[2], bool) if part.bands.bad is None else part.bands.bad for part in parts]
+    num_known = sum(table.wavelengths_nm is not None for table in tables)
     return BandTable(
-        centres,
-        evidence,
-        join([table.fwhm_nm for table, _ in tables]),
-        np.concatenate(marks) if any(table.bad is not None for table, _ in tables) else None,
-        tuple(name for table, _ in tables for name in table.names or ()) if _all_named(tables) else None,
+        join([table.wavelengths_nm for table in tables]),
+        tables[0].evidence if num_known in (0, len(tables)) else _PARTLY_KNOWN,
+        join([table.fwhm_nm for table in tables]),
+        np.concatenate(marks) if any(table.bad is not None for table in tables) else None,
+        None
+        if any(table.names is None for table in tables)
+        else tuple(name for table in tables for name in table.names or ()),
     )
-
-
-def _common(values: list[float | None]) -> float | None:
-    """The value that all share; None if they differ."""
-    return values[0] if len({repr(value) for value in values}) == 1 else None
-
-
-def _stack_metadata(parts: list[SpectralFile]) -> dict[str, Any]:
-    """Entries that are the same in all parts; if any differ, `parts` lists what each part has of its own."""
-    first = parts[0].metadata
-    same = [key for key in first if all(repr(part.metadata.get(key)) == repr(first[key]) for part in parts)]
-    own = [{key: value for key, value in part.metadata.items() if key not in same} for part in parts]
-    return {key: first[key] for key in same} | ({"parts": own} if any(own) else {})
-
-
-def _all_named(tables: list[tuple[BandTable, int]]) -> bool:
-    return all(table.names is not None for table, _ in tables)
-
-
-Axes: TypeAlias = Literal["yxb", "byx", "ybx", "xyb", "bxy", "xby"]
-"""What the axes of an array are, the slowest first: y rows, x columns, b bands."""
-
-
-@dataclass(frozen=True)
-class ReadOptions:
-    """Facts that override what a file says."""
-
-    dataset: str | None = None
-    """Variable or data set to take from a file that holds several."""
-    wavelengths_nm: Float64[np.ndarray, " B"] | None = None
-    """Band centres in nm, in the order of the file."""
-    axes: Axes | None = None
-    """Order of the axes in formats that don't fix it: NumPy, MATLAB, HDF5, torch, pages of a TIFF."""
-    size: tuple[int, int] | None = None
-    """Rows and columns of an image that is stored as a list of pixels, column after column as MATLAB writes it."""
-
-
-_WITH_BANDS_AT: tuple[Axes, Axes, Axes] = ("byx", "ybx", "yxb")
 
 
 def choose_axes(
@@ -264,13 +238,10 @@ def choose_axes(
     bands = _WITH_BANDS_AT.index(default)
     shortest = int(np.argmin(shape))
     if shape[shortest] < shape[bands]:
+        other = "byx" if default == "yxb" else "yxb"
         note = f"bands are taken to be axis {bands} of {shape}, though axis {shortest} is the shortest"
-        return default, (f"{note}; if that is wrong, say which axis is which (--axes {_other(default)})",)
+        return default, (f"{note}; if that is wrong, say which axis is which (--axes {other})",)
     return default, ()
-
-
-def _other(default: Axes) -> Axes:
-    return "byx" if default == "yxb" else "yxb"
 
 
 def image_shape(shape: tuple[int, ...], axes: Axes) -> tuple[int, int, int]:
@@ -287,20 +258,13 @@ def take_part(stored: np.ndarray, axes: Axes, rows: slice, bands: BandIndex) -> 
     return np.array(stored.transpose([axes.index(axis) for axis in "yxb"])[rows][:, :, bands], order="C")
 
 
-_Key: TypeAlias = tuple[Hashable, ...]
-_KEPT_BYTES = 2**28
-
-_kept: OrderedDict[_Key, np.ndarray] = OrderedDict()
-_lock = threading.Lock()
-
-
 def loaded(load: Callable[..., np.ndarray], path: Path, *arguments: Hashable) -> np.ndarray:
     """The array that `load(path, *arguments)` gives; read again only if others came between or the file changed.
 
     Arrays of 256 MiB together are kept, or one that is larger.
     """
     state = path.stat()
-    key: _Key = (load, path.resolve(), arguments, state.st_size, state.st_mtime_ns)
+    key = (load, path.resolve(), arguments, state.st_size, state.st_mtime_ns)
     with _lock:
         if key in _kept:
             _kept.move_to_end(key)
@@ -327,23 +291,3 @@ def import_extra(package: str) -> ModuleType:
             f"this file needs the package {package.partition('.')[0]}, which isn't installed ({error}): "
             "pip install 'unmix-nerf[captures]'"
         ) from error
-
-
-@contextmanager
-def logged_by(library: str) -> Iterator[list[str]]:
-    """Context in which warnings and errors of a library's log are collected, and shown nowhere."""
-    messages: list[str] = []
-
-    class _Collector(logging.Handler):
-        def emit(self, record: logging.LogRecord) -> None:
-            messages.append(" ".join(record.getMessage().split())[:200])
-
-    logger, collector = logging.getLogger(library), _Collector(logging.WARNING)
-    propagated = logger.propagate
-    logger.addHandler(collector)
-    logger.propagate = False
-    try:
-        yield messages
-    finally:
-        logger.removeHandler(collector)
-        logger.propagate = propagated
