@@ -173,8 +173,8 @@ def _dji(file: SpectralFile, tags: XmpTags, exif: Mapping[str, Any]) -> Radiomet
     polynomial = tag_numbers(tags, "VignettingData", "VignettingPolynomial") or []
     centre = [0.0, 0.0]
     if polynomial:
-        axes = [tag_numbers(tags, f"drone-dji:CalibratedOpticalCenter{axis}") or [] for axis in "XY"]
-        middle = tag_numbers(tags, "VignettingCenter") or sum(axes, [])
+        x, y = (tag_numbers(tags, f"drone-dji:CalibratedOpticalCenter{axis}") or [] for axis in "XY")
+        middle = tag_numbers(tags, "VignettingCenter") or [*x, *y]
         centre = _required(file, "XMP drone-dji:CalibratedOpticalCenterX, Y", middle or None, 2)
     scale = adjustment[0] / (gain * 1e-6 * microseconds) / _stored_range(exif)
 
