@@ -253,7 +253,7 @@ def image_shape(shape: tuple[int, ...], axes: Axes) -> tuple[int, int, int]:
     return shape[axes.index("y")], shape[axes.index("x")], shape[axes.index("b")]
 
 
-def take_part(stored: np.ndarray, axes: Axes, rows: slice, bands: BandIndex) -> np.ndarray:
+def take_part(stored: np.ndarray, axes: str, rows: slice, bands: BandIndex) -> np.ndarray:
     """A copy (h, W, b) of some rows and bands of a stored array."""
     return np.array(stored.transpose([axes.index(axis) for axis in "yxb"])[rows][:, :, bands], order="C")
 

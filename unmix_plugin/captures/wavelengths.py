@@ -18,15 +18,8 @@ from jaxtyping import Bool, Float64
 
 from unmix_plugin.captures.spectral_file import BandTable
 from unmix_plugin.errors import ConfigError, SpectrumError
-from unmix_plugin.spectral.bands import require_nanometres
+from unmix_plugin.spectral.bands import nm_per_unit, require_nanometres
 
-_NM_PER_UNIT = {
-    **dict.fromkeys(("nm", "nanometer", "nanometers", "nanometre", "nanometres"), 1.0),
-    **dict.fromkeys(("um", "µm", "μm", "micron", "microns"), 1e3),
-    **dict.fromkeys(("micrometer", "micrometers", "micrometre", "micrometres"), 1e3),
-    **dict.fromkeys(("a", "å", "angstrom", "angstroms"), 0.1),
-    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1e9),
-}
 _NUMBER = r"(?<![\d.,])(\d+(?:[.,]\d+)?)"
 _WITH_UNIT = re.compile(
     _NUMBER + r"[ _-]?(nm|nanomet(?:er|re)s?|[uµμ]m|micromet(?:er|re)s?|microns?)(?![a-z])", re.I
@@ -45,15 +38,6 @@ class NamedWavelengths:
     centres_nm: Float64[np.ndarray, " B"]
     evidence: str
     """With which unit, or why they are taken for nm."""
-
-
-def nm_per_unit(unit: str) -> float | None:
-    """How many nm one of the unit is; None for what is not a unit of length that files use.
-
-    >>> nm_per_unit("Micrometers")
-    1000.0
-    """
-    return _NM_PER_UNIT.get(unit.strip().lower())
 
 
 def wavelengths_in_names(names: Sequence[str]) -> NamedWavelengths | None:

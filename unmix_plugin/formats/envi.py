@@ -1,28 +1,10 @@
-"""The text of an ENVI header as entries: `key = value` lines after the word ENVI.
+"""ENVI files: images and libraries of spectra, each a text (NAME.hdr) beside a file of numbers.
 
-Lists are in braces and may span lines; a line that begins with `;` is a comment.
+The text has `key = value` lines after the word ENVI; a line that begins with `;` is a comment. Lists are in braces,
+separated by commas, and may span lines. Neither can be escaped: names that are written have them replaced.
 
-How the numbers of an ENVI image lie on disk.
-
-Notation: `H` lines, `W` samples, `B` bands.
-
-The text beside an ENVI file: `key = value` lines after the word ENVI.
-
-Lists are in braces, separated by commas, and neither can be escaped: names have them replaced.
-
-ENVI images: NAME.hdr, a text, and NAME.img, the numbers, band-interleaved by pixel.
-
-Notation: `H x W` pixels, `C` bands.
-
-ENVI spectral libraries: NAME.hdr, a text, and NAME.sli, one spectrum after the other.
-
-Notation: `K` spectra, `B` bands.
-
-ENVI spectral libraries: a header `x.hdr` of `key = value` lines, and a file of numbers, one spectrum a line.
-
-Of the header these keys count: `samples` (bands), `lines` (spectra), `data type`, `byte order`, `header offset`,
-`wavelength` and `wavelength units`, `spectra names`, `reflectance scale factor` (values are divided by it) and
-`data ignore value`. Spectra are stored one after the other.
+Notation: `H` lines, `W` samples and `C` bands of an image; `K` spectra of `B` bands of a library, which are stored as
+`K` lines of `B` samples.
 """
 
 from __future__ import annotations
@@ -32,73 +14,59 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from math import prod
 from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float, Float32
 
 from unmix_plugin.engine.runs.atomic_files import write_errors_as, write_file
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.formats.files import RowSink, raw_rows
-from unmix_plugin.spectral.bands import Bands, require_nanometres
+from unmix_plugin.spectral.bands import Bands, nm_per_unit, require_nanometres
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, read_spectra_csv
 
-_KEY = re.compile(r"^[ \t]*([^=\n{}]*?)[ \t]*=(?:\s*(?=\{)|[ \t]*)", re.MULTILINE)
-_BRACE = re.compile(r"[{}]")
-
-
-def parse_envi_header(text: str) -> dict[str, str]:
-    r"""Values by key; keys in lower case with single spaces, lists without their braces.
-
-    Raises:
-        ValueError: the text is no ENVI header, or a list in it is never closed.
-
-    >>> parse_envi_header("ENVI\n; by hand\nBands = 2\nwavelength = {\n450,\n; half\n550}")
-    {'bands': '2', 'wavelength': '450,\n550'}
-    """
-    lines = [line for line in text.lstrip("\ufeff").splitlines() if not line.lstrip().startswith(";")]
-    if not lines or lines[0].strip() != "ENVI":
-        raise ValueError("its first line is not 'ENVI'")
-    body, position = "\n".join(lines[1:]), 0
-    header: dict[str, str] = {}
-    while match := _KEY.search(body, position):
-        key, start = " ".join(match[1].lower().split()), match.end()
-        if body[start : start + 1] == "{":
-            position = _closing_brace(body, start, key) + 1
-            header[key] = body[start + 1 : position - 1].strip()
-        else:
-            position = (body + "\n").index("\n", start)
-            header[key] = body[start:position].strip()
-    return header
-
-
-def _closing_brace(body: str, start: int, key: str) -> int:
-    """Where the list ends that the brace at `start` opens."""
-    depth = 0
-    for brace in _BRACE.finditer(body, start):
-        depth += 1 if brace[0] == "{" else -1
-        if depth == 0:
-            return brace.start()
-    first = body.find("}", start)
-    if key == "description" and first >= 0:  # free text, in which a brace need have no partner
-        return first
-    raise ValueError(f"the list of '{key}' is never closed")
-
+HeaderValue: TypeAlias = str | int | Sequence[str] | Sequence[float] | np.ndarray
 
 _TYPES = {1: "u1", 2: "i2", 3: "i4", 4: "f4", 5: "f8", 12: "u2", 13: "u4", 14: "i8", 15: "u8"}
+_FLOAT32 = 4
 _COMPLEX_TYPES = (6, 9)
 _AXES = {"bsq": "byx", "bil": "ybx", "bip": "yxb"}
 _LARGEST = 2**40
+_LARGEST_HEADER = 2**24
+_OTHER_HEADERS = {
+    "#?R": "a Radiance picture",
+    "BYTEORDER": "an ESRI (ArcGIS) band file",
+    "NROWS": "an ESRI (ArcGIS) band file",
+    "NCOLS": "an ESRI (ArcGIS) band file",
+}
+"""What else ends in .hdr, by how it begins."""
+_DATA_SUFFIXES = (
+    "",
+    ".img",
+    ".dat",
+    ".raw",
+    ".bil",
+    ".bip",
+    ".bsq",
+    ".bin",
+    ".cube",
+    ".hyspex",
+    ".sli",
+    ".lib",
+)
+_SMALLEST_SCALE = 1e-30
+_SHOWN_NM = (640.0, 550.0, 460.0)
+"""Red, green and blue that a viewer shows first, as far as there are bands for them."""
+_NOT_SPACE, _BRACE = re.compile(r"\S"), re.compile(r"[{}]")
 
 
 @dataclass(frozen=True)
 class EnviLayout:
-    """Where each number lies."""
+    """Where each number of an image lies on disk."""
 
     shape: tuple[int, int, int]
-    """H, W, B."""
+    """H, W, C."""
     dtype: np.dtype
     interleave: str
     """bsq, bil or bip."""
@@ -109,163 +77,242 @@ class EnviLayout:
     @property
     def num_bytes(self) -> int:
         """Least size of the file."""
-        return self.offset + prod(self.shape) * self.dtype.itemsize
+        return self.offset + math.prod(self.shape) * self.dtype.itemsize
 
     @property
     def axes(self) -> str:
-        """Order of the axes on disk, the slowest first."""
+        """Order of the axes on disk, the slowest first: y lines, x samples, b bands."""
         return _AXES[self.interleave]
 
 
-def read_layout(header: Mapping[str, str]) -> EnviLayout:
-    """The layout that a header states.
+def read_header(path: Path) -> dict[str, str]:
+    """Values by key; keys in lower case with single spaces, lists without their braces.
 
     Raises:
-        ValueError: an entry is missing or impossible.
+        ValueError: it is no ENVI header, or a list in it is never closed.
+        OSError: it can't be read.
     """
-    _refuse_other_files(header)
-    shape = (_count(header, "lines", 1), _count(header, "samples", 1), _count(header, "bands", 1))
-    code, notes = _count(header, "data type", 0), []
-    if code in _COMPLEX_TYPES:
-        raise ValueError(f"'data type' is {code}, complex numbers; expected one of {_known_types()}")
-    if code not in _TYPES:
-        raise ValueError(f"'data type' is {code}; expected one of {_known_types()}")
-    kind = np.dtype(_TYPES[code])
-    if "byte order" not in header and kind.itemsize > 1:
-        notes.append("the header has no byte order; taken as little-endian")
-    order = _count(header, "byte order", 0, default=0)
-    if order > 1:
-        raise ValueError(f"'byte order' is {order}; expected 0 (little-endian) or 1 (big-endian)")
-    offset = _count(header, "header offset", 0, default=0)
-    return EnviLayout(
-        shape, kind.newbyteorder(">" if order else "<"), _interleave(header), offset, tuple(notes)
-    )
+    size = path.stat().st_size
+    if size > _LARGEST_HEADER:
+        raise ValueError(f"no ENVI header: {size} bytes; expected a text of a few kB")
+    data = path.read_bytes().removeprefix(b"\xef\xbb\xbf")
+    try:
+        text = data.decode()
+    except UnicodeDecodeError:
+        text = data.decode("latin-1")
+    try:
+        return _parse_header(text)
+    except ValueError as error:
+        begin = text.lstrip().upper()
+        other = next((kind for word, kind in _OTHER_HEADERS.items() if begin.startswith(word)), None)
+        found = f"it is the header of {other}" if other else str(error)
+        raise ValueError(
+            f"no ENVI header: {found}; expected 'ENVI' and then 'key = value' lines. Convert the file to ENVI or "
+            "write such a header for it"
+        ) from error
 
 
-def _refuse_other_files(header: Mapping[str, str]) -> None:
-    kind = header.get("file type", "").lower()
-    if "library" in kind:
+def _parse_header(text: str) -> dict[str, str]:
+    r"""
+    >>> _parse_header("ENVI\n; by hand\nBands = 2\nwavelength = {\n450,\n; half\n550}")
+    {'bands': '2', 'wavelength': '450,\n550'}
+    """
+    lines = [line for line in text.splitlines() if not line.lstrip().startswith(";")]
+    if not lines or lines[0].strip() != "ENVI":
+        raise ValueError("its first line is not 'ENVI'")
+    body, position = "\n".join(lines[1:]) + "\n", 0
+    header: dict[str, str] = {}
+    while position < len(body):
+        end = body.index("\n", position)
+        name, equals, value = body[position:end].partition("=")
+        position = end + 1
+        if not equals or _BRACE.search(name):
+            continue
+        key = " ".join(name.lower().split())
+        opening = _NOT_SPACE.search(body, end - len(value))
+        if opening is not None and opening[0] == "{":
+            close = _closing_brace(body, opening.start(), key, key in header)
+            value, position = body[opening.end() : close], body.index("\n", close) + 1
+        header[key] = value.strip()
+    return header
+
+
+def _closing_brace(body: str, start: int, key: str, is_repeated: bool) -> int:
+    """Where the list ends that the brace at `start` opens."""
+    first, depth = body.find("}", start), 0
+    # A description is free text, in which a brace need have no partner.
+    if key == "description" and is_repeated and first >= 0:
+        return first
+    for brace in _BRACE.finditer(body, start):
+        depth += 1 if brace[0] == "{" else -1
+        if depth == 0:
+            return brace.start()
+    if key == "description" and first >= 0:
+        return first
+    raise ValueError(f"the list of '{key}' is never closed")
+
+
+def header_items(header: Mapping[str, str], key: str, separator: str = r"[,\s]") -> list[str]:
+    """Elements of a list; commas too many at its ends or in a row count as none."""
+    items = [" ".join(item.split()) for item in re.split(separator, header.get(key, ""))]
+    return [item for item in items if item]
+
+
+def read_layout(header: Mapping[str, str]) -> EnviLayout:
+    """The layout that the header of an image states.
+
+    Raises:
+        ValueError: an entry is missing or impossible, or it is no header of an image.
+    """
+    if "library" in header.get("file type", "").lower():
         raise ValueError("the file is a library of spectra; expected an image")
-    if _count(header, "file compression", 0, default=0):
+    if _count(header, "file compression", default="0"):
         raise ValueError("the file of numbers is compressed ('file compression'); write it uncompressed")
     for key in ("major frame offsets", "minor frame offsets"):
         if any(part.strip() not in ("", "0") for part in header.get(key, "").split(",")):
             raise ValueError(
                 f"'{key}' is {header[key]}; expected 0: write the image without bytes between frames"
             )
-
-
-def _interleave(header: Mapping[str, str]) -> str:
-    stated = header.get("interleave")
-    if stated is None and _count(header, "bands", 1) == 1:
-        return "bsq"  # with one band all three are the same
-    if (stated or "").lower() not in _AXES:
-        found = "missing" if stated is None else f"'{stated}'"
+    height, width, num_bands = (_count(header, key, least=1) for key in ("lines", "samples", "bands"))
+    code, notes = _count(header, "data type"), ()
+    if code not in _TYPES:
+        found = f"{code}, complex numbers" if code in _COMPLEX_TYPES else str(code)
+        known = ", ".join(f"{code} ({np.dtype(name).name})" for code, name in _TYPES.items())
+        raise ValueError(f"'data type' is {found}; expected one of {known}")
+    kind = np.dtype(_TYPES[code])
+    if "byte order" not in header and kind.itemsize > 1:
+        notes = ("the header has no byte order; taken as little-endian",)
+    order = _count(header, "byte order", default="0")
+    if order > 1:
+        raise ValueError(f"'byte order' is {order}; expected 0 (little-endian) or 1 (big-endian)")
+    # With one band all three are the same.
+    interleave = header.get("interleave", "bsq" if num_bands == 1 else "missing").lower()
+    if interleave not in _AXES:
+        found = interleave if "interleave" not in header else f"'{header['interleave']}'"
         raise ValueError(f"'interleave' is {found}; expected bsq, bil or bip: correct the header")
-    return str(stated).lower()
+    offset = _count(header, "header offset", default="0")
+    dtype = kind.newbyteorder(">" if order else "<")
+    return EnviLayout((height, width, num_bands), dtype, interleave, offset, notes)
 
 
-def _count(header: Mapping[str, str], key: str, least: int, default: int | None = None) -> int:
+def _count(header: Mapping[str, str], key: str, default: str = "", least: int = 0) -> int:
     """A whole number; a comment behind it is cut off."""
-    text = header.get(key, "" if default is None else str(default)).partition(";")[0].strip()
+    text = header.get(key, default).partition(";")[0].strip()
     try:
-        number = int(text) if len(text) < 20 else _LARGEST
+        number = float(text)
     except ValueError:
-        found = f"'{text}'" if text else "missing"
-        raise ValueError(f"'{key}' is {found}; expected a whole number") from None
-    if not least <= number < _LARGEST:
-        raise ValueError(f"'{key}' is {text}; expected a whole number of at least {least}")
-    return number
+        number = math.nan
+    if not (least <= number < _LARGEST and number == int(number)):
+        raise ValueError(f"'{key}' is {text or 'missing'}; expected a whole number of at least {least}")
+    return int(number)
 
 
-def _known_types() -> str:
-    return ", ".join(f"{code} ({np.dtype(name).name})" for code, name in _TYPES.items())
-
-
-HeaderValue: TypeAlias = str | int | Sequence[str] | Sequence[float] | np.ndarray
-
-_FLOAT32 = 4
-"""What the format calls this type."""
-
-
-@contextmanager
-def envi_rows(
-    paths: Sequence[Path], shape: tuple[int, ...], entries: Mapping[str, HeaderValue]
-) -> Iterator[RowSink]:
-    """Context that gives a sink for the rows of a file of float32.
-
-    The header is written last, and an old one is removed before its numbers are replaced: whenever both files are
-    there, they belong together.
+def data_beside(header_path: Path, needed_bytes: int, first: str = "") -> Path:
+    """The file of numbers that a header describes; of several the first that is large enough.
 
     Args:
-        paths: Header and numbers.
-        shape: Of all rows.
-        entries: Of the header.
+        header_path: Of the header.
+        needed_bytes: Least size.
+        first: Suffix that is preferred.
+    Raises:
+        ValueError: there is none.
     """
-    header_path, data_path = paths
-    with raw_rows(data_path, b"", shape, np.dtype("<f4")) as add:
-        yield add
-        with write_errors_as(header_path):
-            header_path.unlink(missing_ok=True)
-    write_file(header_path, header_bytes(entries))
+    base = header_path.with_suffix("")
+    suffixes = [either for suffix in (first, *_DATA_SUFFIXES) for either in (suffix, suffix.upper())]
+    candidates = dict.fromkeys(base.with_name(base.name + suffix) for suffix in suffixes)
+    if first == "" and base.suffix:  # x.raw.hdr beside x.RAW
+        candidates |= {base.with_suffix(base.suffix.upper()): None}
+    found = [path for path in candidates if path.is_file() and path != header_path]
+    if not found:
+        usual = f"{base.name}{first}" if first else f"{base.name} or {base.name}.img"
+        raise ValueError(
+            f"no file of numbers beside this header; expected {usual} (.dat, .raw, .bil, .bip, .bsq, ...) in the same "
+            "folder"
+        )
+    return next((path for path in found if path.stat().st_size >= needed_bytes), found[0])
 
 
-def header_bytes(values: Mapping[str, HeaderValue]) -> bytes:
-    """The header with these entries, in their order; numbers with all their digits.
+def read_library_table(path: Path) -> SpectraTable:
+    """Reflectances from a CSV file or an ENVI spectral library (.hdr or .sli), told by the file's suffix.
 
-    >>> print(header_bytes({"lines": 2, "wavelength": [450.0, 550.5], "band names": ["a,b", "c"]}).decode())
-    ENVI
-    lines = 2
-    wavelength = { 450.0, 550.5 }
-    band names = { a-b, c }
+    Raises:
+        SpectrumError: another kind of file, or one that can't be read.
     """
-    lines = ["ENVI", *(f"{key} = {_text(key, value)}" for key, value in values.items()), ""]
-    return "\n".join(lines).encode()
+    suffix = path.suffix.lower()
+    if suffix == ".csv":
+        return read_spectra_csv(path)
+    if suffix in (".hdr", ".sli"):
+        return read_envi_library(path)
+    raise SpectrumError(f"{path}: a library is a .csv, or an ENVI spectral library (.hdr and .sli)")
 
 
-def layout_entries(samples: int, lines: int, bands: int, interleave: str) -> dict[str, HeaderValue]:
-    """How the numbers lie on disk; float32, little-endian, nothing before them."""
-    return {
-        "samples": samples,
-        "lines": lines,
-        "bands": bands,
-        "header offset": 0,
-        "data type": _FLOAT32,
-        "interleave": interleave,
-        "byte order": 0,
-    }
+def read_envi_library(path: Path) -> SpectraTable:
+    """Read and validate an ENVI spectral library.
+
+    Of the header these keys count beside those of the layout: `wavelength` and `wavelength units`, `spectra names`,
+    `reflectance scale factor` (values are divided by it) and `data ignore value`.
+
+    Args:
+        path: Its header, or the file of numbers beside which the header lies.
+    Raises:
+        SpectrumError: a part is missing, is not such a library, has a unit of wavelength that is not known, or holds
+            values that are ignored, not finite or negative.
+    """
+    header_path = path if path.suffix.lower() == ".hdr" else path.with_suffix(".hdr")
+    try:
+        header = read_header(header_path)
+        layout = read_layout({**header, "file type": "", "bands": "1", "interleave": "bsq"})
+        num_spectra, num_bands, _ = layout.shape
+        data_path = data_beside(header_path, layout.num_bytes, ".sli")
+        found, needed = data_path.stat().st_size - layout.offset, layout.num_bytes - layout.offset
+        if found < needed:
+            raise ValueError(
+                f"{data_path.name} has {max(0, found)} bytes; {num_spectra} spectra of {num_bands} values need {needed}"
+            )
+        stored = np.fromfile(data_path, layout.dtype, num_spectra * num_bands, offset=layout.offset)
+        with np.errstate(all="ignore"):  # signalling NaN, and an ignored value that the type can't hold
+            values = stored.reshape(num_spectra, num_bands).astype(np.float64)
+            if "data ignore value" in header:
+                ignored = np.array(_number(header, "data ignore value")).astype(layout.dtype)
+                values[stored.reshape(values.shape) == ignored] = np.nan
+        unit = header.get("wavelength units", "").strip()
+        factor = nm_per_unit(unit or "nm")
+        if factor is None:
+            raise ValueError(f"'wavelength units' is {unit!r}; expected Nanometers or Micrometers")
+        bands = Bands(_wavelengths(header, num_bands) * factor)
+        require_nanometres(bands.centers_nm)
+        names = header_items(header, "spectra names", ",") or [f"spectrum {i}" for i in range(num_spectra)]
+        if len(names) != num_spectra:
+            raise ValueError(f"{len(names)} 'spectra names' for {num_spectra} spectra")
+        scale = _number(header, "reflectance scale factor", "1")
+        if not _SMALLEST_SCALE <= scale <= 1.0 / _SMALLEST_SCALE:
+            raise ValueError(
+                f"'reflectance scale factor' is {scale:g}; expected a number above 0, such as 10000"
+            )
+        return SpectraTable(bands, tuple(names), values / scale)
+    except OSError as error:
+        raise SpectrumError(f"{header_path}: can't read: {error.strerror or error}") from error
+    except (SpectrumError, ValueError) as error:
+        raise SpectrumError(f"{header_path}: {error}") from error
 
 
-def wavelength_entries(bands: Bands) -> dict[str, HeaderValue]:
-    """Band centres and widths in nm; a width is that of the band's interval, an estimate from the spacing."""
-    widths = bands.widths_nm.round(6)
-    return {"wavelength units": "Nanometers", "wavelength": bands.centers_nm, "fwhm": widths}
+def _wavelengths(header: Mapping[str, str], num_bands: int) -> np.ndarray:
+    try:
+        values = np.array([float(number) for number in header_items(header, "wavelength")])
+    except ValueError:
+        values = np.zeros(0)
+    if not len(values):
+        raise ValueError("'wavelength' is missing or no list of numbers")
+    if len(values) != num_bands:
+        raise ValueError(f"'wavelength' has {len(values)} values for {num_bands} bands")
+    return values
 
 
-def beside(path_without_suffix: Path, suffix: str) -> Path:
-    """A file with this suffix; dots in the name before it stay."""
-    return path_without_suffix.with_name(path_without_suffix.name + suffix)
-
-
-def _text(key: str, value: HeaderValue) -> str:
-    if isinstance(value, str):
-        return "{ " + _plain(value) + " }" if key == "description" else _plain(value)
-    if isinstance(value, int):
-        return str(value)
-    return "{ " + ", ".join(map(_element, value)) + " }"
-
-
-def _element(value: str | float) -> str:
-    return _plain(value).replace(",", "-") if isinstance(value, str) else repr(float(value))
-
-
-def _plain(text: str) -> str:
-    """One line without braces."""
-    return re.sub(r"\s+", " ", text.replace("{", "(").replace("}", ")")).strip()
-
-
-_SHOWN_NM = (640.0, 550.0, 460.0)
-"""Red, green and blue that a viewer shows first, as far as there are bands for them."""
+def _number(header: Mapping[str, str], key: str, default: str = "") -> float:
+    try:
+        return float(header.get(key, default))
+    except ValueError:
+        raise ValueError(f"'{key}' is {header.get(key)}; expected a number") from None
 
 
 def envi_cube_paths(path_without_suffix: Path) -> list[Path]:
@@ -280,7 +327,7 @@ def write_envi_cube(
     names: Sequence[str] | None,
     description: str,
 ) -> list[Path]:
-    """Write a cube as NAME.hdr and NAME.img, float32.
+    """Write a cube as NAME.hdr and NAME.img, float32, band-interleaved by pixel.
 
     Args:
         path_without_suffix: Folder, which is made, and NAME.
@@ -309,18 +356,14 @@ def envi_cube_rows(
         if given is not None and len(given) != shape[2]:
             raise ValueError(f"{len(given)} {what} for {shape[2]} bands")
     height, width, num_bands = shape
-    entries: dict[str, HeaderValue] = {
-        "description": description,
-        "file type": "ENVI Standard",
-        **layout_entries(width, height, num_bands, "bip"),
-    }
+    entries = _entries("ENVI Standard", description, width, height, num_bands, "bip")
     if wavelengths is not None:
         entries |= wavelength_entries(wavelengths)
     if names is not None:
         entries["band names"] = list(names)
     if wavelengths is not None and all(map(wavelengths.contains, _SHOWN_NM)):
         entries["default bands"] = [str(wavelengths.nearest(wavelength) + 1) for wavelength in _SHOWN_NM]
-    with envi_rows(envi_cube_paths(path_without_suffix), shape, entries) as add:
+    with _rows(envi_cube_paths(path_without_suffix), shape, entries) as add:
         yield add
 
 
@@ -347,162 +390,80 @@ def write_envi_library(
     """
     if spectra.shape != (len(names), len(bands)):
         raise ValueError(f"{len(names)} names and {len(bands)} wavelengths for spectra of {spectra.shape}")
-    entries = {
-        "description": description,
-        "file type": "ENVI Spectral Library",
-        **layout_entries(len(bands), len(names), 1, "bsq"),
-        **wavelength_entries(bands),
-        "spectra names": list(names),
-    }
+    entries = _entries("ENVI Spectral Library", description, len(bands), len(names), 1, "bsq")
+    entries |= wavelength_entries(bands) | {"spectra names": list(names)}
     paths = envi_library_paths(path_without_suffix)
-    with envi_rows(paths, spectra.shape, entries) as add:
+    with _rows(paths, spectra.shape, entries) as add:
         add(spectra)
     return paths
 
 
-_TYPES_SPECTRA_ENVI = {1: "u1", 2: "i2", 3: "i4", 4: "f4", 5: "f8", 12: "u2", 13: "u4", 14: "i8", 15: "u8"}
-_NM_PER_UNIT = {
-    **dict.fromkeys(("", "nm", "nanometers", "nanometer"), 1.0),
-    **dict.fromkeys(("um", "micrometers", "micrometer", "microns"), 1e3),
-}
-_GREATEST_COUNT = 2**53
-_SMALLEST_SCALE = 1e-30
-_DATA_SUFFIXES = (".sli", ".SLI", "", ".dat", ".img", ".lib", ".raw")
+@contextmanager
+def _rows(
+    paths: Sequence[Path], shape: tuple[int, ...], entries: Mapping[str, HeaderValue]
+) -> Iterator[RowSink]:
+    """Context that gives a sink for the rows of a file of float32.
 
-
-def read_spectra_envi(path: Path) -> SpectraTable:
-    """Read and validate an ENVI spectral library.
-
-    Args:
-        path: Its header, or the file of numbers beside which the header lies.
-    Raises:
-        SpectrumError: a part is missing, is not such a library, has a unit of wavelength that is not known, or holds
-            values that are ignored, not finite or negative.
+    The header is written last, and an old one is removed before its numbers are replaced: whenever both files are
+    there, they belong together.
     """
-    header_path = path if path.suffix.lower() == ".hdr" else path.with_suffix(".hdr")
-    try:
-        header = _read_header(header_path)
-        values = _read_values(header, header_path)
-        centers = _numbers(header, "wavelength", values.shape[1]) * _nm_per_unit(header)
-        names = _names(header, len(values))
-        bands, scale = Bands(centers), _number(header, "reflectance scale factor", 1.0)
-        require_nanometres(bands.centers_nm)
-        if not _SMALLEST_SCALE <= scale <= 1.0 / _SMALLEST_SCALE:
-            raise SpectrumError(
-                f"'reflectance scale factor' is {scale:g}; expected a number above 0, such as 10000"
-            )
-        return SpectraTable(bands, names, values / scale)
-    except SpectrumError as error:
-        raise SpectrumError(f"{header_path}: {error}") from error
-    except OSError as error:
-        raise SpectrumError(f"{header_path}: can't read: {error.strerror or error}") from error
+    header_path, data_path = paths
+    with raw_rows(data_path, b"", shape, np.dtype("<f4")) as add:
+        yield add
+        with write_errors_as(header_path):
+            header_path.unlink(missing_ok=True)
+    write_file(header_path, header_bytes(entries))
 
 
-def _read_header(path: Path) -> dict[str, str]:
-    """Keys in lower case, and their values; lists with their braces cut off."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise SpectrumError(f"no ENVI header: not text in UTF-8 ({error.reason})") from error
-    try:
-        return parse_envi_header(text)
-    except ValueError as error:
-        raise SpectrumError(f"no ENVI header: {error}") from error
+def _entries(
+    kind: str, description: str, samples: int, lines: int, bands: int, interleave: str
+) -> dict[str, HeaderValue]:
+    """What the file is and how its numbers lie: float32, little-endian, nothing before them."""
+    return {
+        "description": description,
+        "file type": kind,
+        "samples": samples,
+        "lines": lines,
+        "bands": bands,
+        "header offset": 0,
+        "data type": _FLOAT32,
+        "interleave": interleave,
+        "byte order": 0,
+    }
 
 
-def _read_values(header: dict[str, str], header_path: Path) -> Float64[np.ndarray, "K B"]:
-    code = _count_spectra_envi(header, "data type")
-    if code not in _TYPES_SPECTRA_ENVI:
-        raise SpectrumError(f"'data type' is {code}; known: {', '.join(map(str, _TYPES_SPECTRA_ENVI))}")
-    shape = _count_spectra_envi(header, "lines", least=1), _count_spectra_envi(header, "samples", least=1)
-    kind = np.dtype(
-        (">" if _count_spectra_envi(header, "byte order", 0) else "<") + _TYPES_SPECTRA_ENVI[code]
-    )
-    offset, data_path = _count_spectra_envi(header, "header offset", 0), _data_path(header_path)
-    found = max(0, data_path.stat().st_size - offset)
-    needed = shape[0] * shape[1] * kind.itemsize
-    if found < needed:
-        raise SpectrumError(
-            f"{data_path.name} has {found} bytes; {shape[0]} spectra of {shape[1]} values need {needed}"
-        )
-    with data_path.open("rb") as file:
-        file.seek(offset)
-        stored = np.frombuffer(file.read(needed), kind).reshape(shape)
-    with np.errstate(all="ignore"):  # signalling NaN, and an ignored value that the type can't hold
-        values = stored.astype(np.float64)
-        if "data ignore value" in header:
-            values[values == np.array(_any_number(header, "data ignore value")).astype(kind)] = np.nan
-    return values
+def wavelength_entries(bands: Bands) -> dict[str, HeaderValue]:
+    """Band centres and widths in nm; a width is that of the band's interval, an estimate from the spacing."""
+    widths = bands.widths_nm.round(6)
+    return {"wavelength units": "Nanometers", "wavelength": bands.centers_nm, "fwhm": widths}
 
 
-def _data_path(header_path: Path) -> Path:
-    for suffix in _DATA_SUFFIXES:
-        found = header_path.with_suffix(suffix)
-        if found.is_file():
-            return found
-    raise SpectrumError(f"no file of numbers beside it; expected {header_path.with_suffix('.sli').name}")
+def beside(path_without_suffix: Path, suffix: str) -> Path:
+    """A file with this suffix; dots in the name before it stay."""
+    return path_without_suffix.with_name(path_without_suffix.name + suffix)
 
 
-def _nm_per_unit(header: dict[str, str]) -> float:
-    unit = header.get("wavelength units", "").strip().lower()
-    if unit not in _NM_PER_UNIT:
-        raise SpectrumError(f"'wavelength units' is {unit!r}; expected Nanometers or Micrometers")
-    return _NM_PER_UNIT[unit]
+def header_bytes(values: Mapping[str, HeaderValue]) -> bytes:
+    """The header with these entries, in their order; numbers with all their digits.
 
-
-def _names(header: dict[str, str], count: int) -> tuple[str, ...]:
-    names = tuple(" ".join(name.split()) for name in header.get("spectra names", "").split(","))
-    if names == ("",):
-        return tuple(f"spectrum {index}" for index in range(count))
-    if len(names) != count:
-        raise SpectrumError(f"{len(names)} 'spectra names' for {count} spectra")
-    return names
-
-
-def _numbers(header: dict[str, str], key: str, count: int) -> Float64[np.ndarray, " B"]:
-    try:
-        values = np.array([float(number) for number in header.get(key, "").split(",")])
-    except ValueError:
-        raise SpectrumError(f"'{key}' is missing or no list of numbers") from None
-    if len(values) != count:
-        raise SpectrumError(f"'{key}' has {len(values)} values for {count} bands")
-    return values
-
-
-def _number(header: dict[str, str], key: str, default: float | int | None = None) -> float:
-    """A finite number."""
-    if key not in header and default is not None:
-        return float(default)
-    number = _any_number(header, key)
-    if not math.isfinite(number):
-        raise SpectrumError(f"'{key}' is {header[key]}; expected a finite number")
-    return number
-
-
-def _any_number(header: dict[str, str], key: str) -> float:
-    try:
-        return float(header[key])
-    except (KeyError, ValueError):
-        raise SpectrumError(f"'{key}' is {header.get(key, 'missing')}; expected a number") from None
-
-
-def _count_spectra_envi(header: dict[str, str], key: str, default: int | None = None, least: int = 0) -> int:
-    """A whole number from `least` up."""
-    number = _number(header, key, default)
-    if number != int(number) or not least <= number <= _GREATEST_COUNT:
-        raise SpectrumError(f"'{key}' is {header[key]}; expected a whole number of at least {least}")
-    return int(number)
-
-
-def read_library_table(path: Path) -> SpectraTable:
-    """Reflectances from a CSV file or an ENVI spectral library (.hdr or .sli), told by the file's suffix.
-
-    Raises:
-        SpectrumError: another kind of file, or one that can't be read.
+    >>> print(header_bytes({"lines": 2, "wavelength": [450.0, 550.5], "band names": ["a,b", "c"]}).decode())
+    ENVI
+    lines = 2
+    wavelength = { 450.0, 550.5 }
+    band names = { a-b, c }
     """
-    suffix = path.suffix.lower()
-    if suffix == ".csv":
-        return read_spectra_csv(path)
-    if suffix in (".hdr", ".sli"):
-        return read_spectra_envi(path)
-    raise SpectrumError(f"{path}: a library is a .csv, or an ENVI spectral library (.hdr and .sli)")
+
+    def plain(text: str) -> str:
+        return re.sub(r"\s+", " ", text.replace("{", "(").replace("}", ")")).strip()
+
+    def element(value: str | float) -> str:
+        return plain(value).replace(",", "-") if isinstance(value, str) else repr(float(value))
+
+    lines = ["ENVI"]
+    for key, value in values.items():
+        if isinstance(value, str):
+            text = f"{{ {plain(value)} }}" if key == "description" else plain(value)
+        else:
+            text = str(value) if isinstance(value, int) else f"{{ {', '.join(map(element, value))} }}"
+        lines.append(f"{key} = {text}")
+    return "\n".join([*lines, ""]).encode()

@@ -27,6 +27,14 @@ MEASURABLE_RANGE_NM = (20.0, 1e6)
 LONE_BAND_WIDTH_NM = 10.0
 """Width given to a band that has no neighbour to tell its spacing."""
 
+_NM_PER_UNIT = {
+    **dict.fromkeys(("nm", "nanometer", "nanometers", "nanometre", "nanometres"), 1.0),
+    **dict.fromkeys(("um", "µm", "μm", "micron", "microns"), 1e3),
+    **dict.fromkeys(("micrometer", "micrometers", "micrometre", "micrometres"), 1e3),
+    **dict.fromkeys(("a", "å", "angstrom", "angstroms"), 0.1),
+    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1e9),
+}
+
 
 @dataclass(frozen=True, eq=False)
 class Bands:
@@ -129,6 +137,15 @@ def require_nanometres(centers_nm: Float64[np.ndarray, " B"]) -> None:
         )
     if first < low or last > high:
         raise SpectrumError(f"wavelengths of {first:g} to {last:g} nm; expected {low:g} to {high:g} nm")
+
+
+def nm_per_unit(unit: str) -> float | None:
+    """How many nm one of the unit is; None for what is not a unit of length that files use.
+
+    >>> nm_per_unit("Micrometers")
+    1000.0
+    """
+    return _NM_PER_UNIT.get(unit.strip().lower())
 
 
 def _require_one_axis(centers: np.ndarray) -> None:

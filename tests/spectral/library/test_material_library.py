@@ -222,14 +222,14 @@ def test_envi_scale_units_and_byte_order_are_followed(tmp_path):
     [
         ({"wavelength": None}, "'wavelength' is missing or no list of numbers"),
         ({"wavelength": "{400, 500}"}, "'wavelength' has 2 values for 3 bands"),
-        ({"wavelength_units": "Wavenumber"}, "'wavelength units' is 'wavenumber'"),
-        ({"data_type": 6}, "'data type' is 6; known"),
+        ({"wavelength_units": "Wavenumber"}, "'wavelength units' is 'Wavenumber'"),
+        ({"data_type": 6}, "'data type' is 6, complex"),
         ({"lines": 20}, "has 24 bytes; 20 spectra of 3 values need 240"),
-        ({"lines": "two"}, "'lines' is two; expected a number"),
+        ({"lines": "two"}, "'lines' is two; expected a whole number"),
         ({"lines": -1}, "'lines' is -1; expected a whole number of at least 1"),
-        ({"lines": "inf"}, "'lines' is inf; expected a finite number"),
-        ({"samples": "1e400"}, "'samples' is 1e400; expected a finite number"),
-        ({"header_offset": "nan"}, "'header offset' is nan; expected a finite number"),
+        ({"lines": "inf"}, "'lines' is inf; expected a whole number"),
+        ({"samples": "1e400"}, "'samples' is 1e400; expected a whole number"),
+        ({"header_offset": "nan"}, "'header offset' is nan; expected a whole number"),
         ({"reflectance_scale_factor": 0}, "'reflectance scale factor' is 0"),
         ({"wavelength": "{0.4, 0.5, 0.7}"}, "look like micrometres"),
         ({"spectra_names": "{oak}"}, "1 'spectra names' for 2 spectra"),
@@ -244,7 +244,11 @@ def test_a_spoilt_envi_library_is_refused_with_its_name_and_the_fault(tmp_path, 
 
 
 @pytest.mark.parametrize(
-    "filling", [" " * 200_000 + "\n", "\n" * 200_000, "a" * 200_000, "=" * 200_000, "{\n" * 100_000]
+    "filling",
+    [
+        *(" " * 200_000 + "\n", "\n" * 200_000, "a" * 200_000, "=" * 200_000, "{\n" * 100_000),
+        *("\n" + " " * 200_000 + "x\n", "\na =" + "\n" * 200_000, "\n" + "description = {{}\n" * 20_000),
+    ],
 )
 def test_a_long_envi_header_takes_time_in_proportion(tmp_path, filling):
     path, _ = written_by_spectral(tmp_path)
@@ -258,7 +262,7 @@ def test_a_long_envi_header_takes_time_in_proportion(tmp_path, filling):
 def test_missing_parts_of_an_envi_library_are_named(tmp_path):
     path, _ = written_by_spectral(tmp_path)
     path.with_suffix(".sli").unlink()
-    with pytest.raises(SpectrumError, match=r"no file of numbers beside it; expected trees\.sli"):
+    with pytest.raises(SpectrumError, match=r"no file of numbers beside this header; expected trees\.sli"):
         read_library_table(path)
     with pytest.raises(SpectrumError, match=r"none\.hdr: can't read"):
         read_library_table(tmp_path / "none.sli")

@@ -33,8 +33,9 @@ from unmix_plugin.captures.spectral_file import (
     import_extra,
     take_part,
 )
-from unmix_plugin.captures.wavelengths import StatedBands, check_bands, nm_per_unit
+from unmix_plugin.captures.wavelengths import StatedBands, check_bands
 from unmix_plugin.errors import CaptureError
+from unmix_plugin.spectral.bands import nm_per_unit
 
 if TYPE_CHECKING:
     from tifffile import TiffFile, TiffPage
