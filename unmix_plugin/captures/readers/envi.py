@@ -105,8 +105,8 @@ def _check_size(header_path: Path, data_path: Path, layout: EnviLayout) -> tuple
     height, width, num_bands = layout.shape
     raise CaptureError(
         f"{data_path}: cut short: {found} bytes; {header_path.name} promises {needed} ({height} lines x {width} "
-        f"samples x {num_bands} bands of {layout.dtype.name} after {layout.offset} bytes). Copy the file again or correct the "
-        "header"
+        f"samples x {num_bands} bands of {layout.dtype.name} after {layout.offset} bytes). Copy the file again or "
+        "correct the header"
     )
 
 
