@@ -1,8 +1,6 @@
-"""Wavelengths in text: units, and numbers in the names of bands, channels and files.
+"""Wavelengths: as a user writes them, as a file states them, and in the names of bands, channels and files.
 
-What a file says of its bands, checked: units brought to nm, and nothing impossible accepted.
-
-Wavelengths as a user writes them: lists, ranges, CSV files.
+Notation: `B` bands; wavelengths in nm.
 """
 
 from __future__ import annotations
@@ -20,74 +18,14 @@ from unmix_plugin.captures.spectral_file import BandTable
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.spectral.bands import nm_per_unit, require_nanometres
 
-_NUMBER = r"(?<![\d.,])(\d+(?:[.,]\d+)?)"
+_NUMBER = re.compile(r"(?<![\d.,])(\d+(?:[.,]\d+)?)")
 _WITH_UNIT = re.compile(
-    _NUMBER + r"[ _-]?(nm|nanomet(?:er|re)s?|[uµμ]m|micromet(?:er|re)s?|microns?)(?![a-z])", re.I
+    _NUMBER.pattern + r"[ _-]?(nm|nanomet(?:er|re)s?|[uµμ]m|micromet(?:er|re)s?|microns?)(?![a-z])", re.I
 )
-_PLAIN = re.compile(_NUMBER)
 _COUNTER = re.compile(r"(?:bands?|b|ch|channel|frame|img|image|view|page|dsc|#)[ _-]*$", re.I)
 """What precedes a number that counts instead of measuring."""
 _USUAL_NM = (200.0, 3000.0)
 """What a number without a unit must lie in to be taken for nm."""
-
-
-@dataclass(frozen=True)
-class NamedWavelengths:
-    """Wavelengths that names carry."""
-
-    centres_nm: Float64[np.ndarray, " B"]
-    evidence: str
-    """With which unit, or why they are taken for nm."""
-
-
-def wavelengths_in_names(names: Sequence[str]) -> NamedWavelengths | None:
-    """Wavelengths out of names that each carry one: with a unit, or plain numbers that increase and can be nm.
-
-    >>> wavelengths_in_names(["red 0.66 um", "red edge 0.705 um"]).centres_nm
-    array([660., 705.])
-    >>> wavelengths_in_names(["Band 1", "Band 2"])
-    """
-    with_unit = [_WITH_UNIT.findall(name) for name in names]
-    if names and all(len(found) == 1 for found in with_unit):
-        pairs = [found[0] for found in with_unit]
-        centres = [_number(number) * (nm_per_unit(unit) or 1.0) for number, unit in pairs]
-        return NamedWavelengths(np.array(centres), f"with the unit {pairs[0][1]}")
-    plain = [_varying_numbers(name, names) for name in names]
-    if any(len(found) != 1 for found in plain):
-        return None
-    centres = np.array([_number(found[0][1]) for found in plain])
-    low, high = _USUAL_NM
-    if (np.diff(centres) <= 0).any() or centres[0] < low or centres[-1] > high:
-        return None
-    return NamedWavelengths(
-        centres, f"no unit; {centres[0]:g} to {centres[-1]:g} increase and are taken as nm"
-    )
-
-
-def _varying_numbers(name: str, names: Sequence[str]) -> list[re.Match[str]]:
-    """Numbers outside of what all names begin with and end in, except counters."""
-    begin = len(_common_begin(names).rstrip("0123456789.,"))
-    end = len(_common_begin([other[::-1] for other in names])[::-1].lstrip("0123456789.,"))
-    inside = (
-        match for match in _PLAIN.finditer(name) if match.start() >= begin and match.end() <= len(name) - end
-    )
-    return [match for match in inside if not _counts(name, match)]
-
-
-def _common_begin(names: Sequence[str]) -> str:
-    first, last = min(names), max(names)
-    differs = (index for index, pair in enumerate(zip(first, last, strict=False)) if pair[0] != pair[1])
-    return first[: next(differs, len(first))]
-
-
-def _counts(name: str, match: re.Match[str]) -> bool:
-    return _COUNTER.search(name[: match.start()]) is not None
-
-
-def _number(text: str) -> float:
-    return float(text.replace(",", "."))
-
-
 _PLAUSIBLE_NM = (100.0, 30_000.0)
 """Range of cameras, from the far ultraviolet to the thermal infrared."""
 _UNUSABLE = "the file gives no wavelengths that can be used, see the notes"
@@ -109,23 +47,30 @@ class StatedBands:
 
 
 def check_bands(stated: StatedBands, num_bands: int) -> tuple[BandTable, tuple[str, ...]]:
-    """The table of an image's bands, and notes on what of it can't be used."""
+    """The table of an image's bands, with units brought to nm and nothing impossible accepted.
+
+    Returns:
+        The table, and notes on what of it is left out.
+    """
     notes: list[str] = []
     names = _fitting("names of bands", stated.names, num_bands, notes)
     centres, evidence, factor = None, BandTable.evidence, None
     if stated.centres is not None:
         evidence = _UNUSABLE
-        numbers = _numbers(f"{stated.where}: wavelengths", stated.centres, num_bands, notes)
-        if numbers is not None:
-            centres, evidence, factor = _in_nm(numbers, stated, notes)
-    if centres is None and names is not None:
-        found = wavelengths_in_names([str(name) for name in names])
-        if found is not None:
-            centres, evidence = found.centres_nm, f"names of bands, such as {names[0]!r}: {found.evidence}"
+        values = _numbers(f"{stated.where}: wavelengths", stated.centres, num_bands, notes)
+        if values is not None:
+            factor, found = _nm_per_stated(float(values.min()), float(values.max()), stated)
+            if factor is None:
+                notes.append(found)
+            else:
+                centres, evidence = values * factor, found
+    named = None if centres is not None or names is None else wavelengths_in_names(list(map(str, names)))
+    if named is not None and names is not None:
+        centres, evidence = named[0], f"names of bands, such as {names[0]!r}: {named[1]}"
     if centres is not None and (np.diff(centres) == 0).any():
         notes.append("two bands beside each other have the same wavelength")
-    fwhm = _numbers("FWHM", stated.fwhm, num_bands, notes) if stated.fwhm is not None else None
-    good = _numbers("marks of bad bands", stated.good, num_bands, notes) if stated.good is not None else None
+    fwhm = _numbers("FWHM", stated.fwhm, num_bands, notes)
+    good = _numbers("marks of bad bands", stated.good, num_bands, notes)
     table = BandTable(
         centres,
         evidence,
@@ -134,50 +79,6 @@ def check_bands(stated: StatedBands, num_bands: int) -> tuple[BandTable, tuple[s
         None if names is None else tuple(map(str, names)),
     )
     return table, tuple(notes)
-
-
-def _in_nm(
-    values: np.ndarray, stated: StatedBands, notes: list[str]
-) -> tuple[np.ndarray | None, str, float | None]:
-    """Wavelengths in nm with their evidence and factor; None where the unit isn't known or can't be true."""
-    low, high = float(values.min()), float(values.max())
-    unit = (stated.unit or "").strip()
-    factor = nm_per_unit(unit)
-    if factor is None and unit.lower() in ("", "unknown"):
-        factor = next((f for f in (1.0, 1e3) if _is_plausible(low * f, high * f)), None)
-        taken = "nm" if factor == 1.0 else "micrometres"
-        evidence = f"{stated.where}, no unit: {low:g} to {high:g} taken as {taken}"
-    else:
-        evidence = f"{stated.where}, {unit}"
-    if factor is None:
-        given = f"the unit {unit!r}" if unit else "no unit"
-        notes.append(f"{stated.where}: {low:g} to {high:g} with {given} can't be brought to nm; {_ASK}")
-    elif not _is_plausible(low * factor, high * factor):
-        notes.append(f"{stated.where}: {low:g} to {high:g} can't be in {unit}; {_ASK}")
-    else:
-        return values * factor, evidence, factor
-    return None, _UNUSABLE, None
-
-
-def _is_plausible(low_nm: float, high_nm: float) -> bool:
-    return _PLAUSIBLE_NM[0] <= low_nm and high_nm <= _PLAUSIBLE_NM[1]
-
-
-def _numbers(what: str, values: Sequence[object], count: int, notes: list[str]) -> np.ndarray | None:
-    """One finite number a band; None with a note where it is anything else."""
-    fitting = _fitting(what, values, count, notes)
-    if fitting is None:
-        return None
-    try:
-        numbers = np.array([float(str(value)) for value in fitting])
-    except ValueError as error:
-        notes.append(f"{what} are not a list of numbers ({str(error)[:80]}) and are left out")
-        return None
-    if not np.isfinite(numbers).all():
-        band = int(np.argmin(np.isfinite(numbers)))
-        notes.append(f"{what} are left out: that of band {band} (from 0) is {numbers[band]:g}")
-        return None
-    return numbers
 
 
 def _fitting(
@@ -189,6 +90,88 @@ def _fitting(
     return None
 
 
+def _numbers(what: str, values: Sequence[object] | None, count: int, notes: list[str]) -> np.ndarray | None:
+    """One finite number a band; None with a note where it is anything else."""
+    values = _fitting(what, values, count, notes)
+    if values is None:
+        return None
+    try:
+        numbers = np.array([float(str(value)) for value in values])
+    except ValueError as error:
+        notes.append(f"{what} are not a list of numbers ({str(error)[:80]}) and are left out")
+        return None
+    if not np.isfinite(numbers).all():
+        band = int(np.argmin(np.isfinite(numbers)))
+        notes.append(f"{what} are left out: that of band {band} (from 0) is {numbers[band]:g}")
+        return None
+    return numbers
+
+
+def _nm_per_stated(low: float, high: float, stated: StatedBands) -> tuple[float | None, str]:
+    """How many nm one of the file's unit is, and the evidence; None and why where wavelengths can't be true."""
+
+    def is_plausible(factor: float) -> bool:
+        return _PLAUSIBLE_NM[0] <= low * factor and high * factor <= _PLAUSIBLE_NM[1]
+
+    unit = (stated.unit or "").strip()
+    factor, evidence = nm_per_unit(unit), f"{stated.where}, {unit}"
+    if factor is None and unit.lower() in ("", "unknown"):
+        factor = next((f for f in (1.0, 1e3) if is_plausible(f)), None)
+        taken = "nm" if factor == 1.0 else "micrometres"
+        evidence = f"{stated.where}, no unit: {low:g} to {high:g} taken as {taken}"
+    if factor is None:
+        given = f"the unit {unit!r}" if unit else "no unit"
+        return None, f"{stated.where}: {low:g} to {high:g} with {given} can't be brought to nm; {_ASK}"
+    if not is_plausible(factor):
+        return None, f"{stated.where}: {low:g} to {high:g} can't be in {unit}; {_ASK}"
+    return factor, evidence
+
+
+def wavelengths_in_names(names: Sequence[str]) -> tuple[Float64[np.ndarray, " B"], str] | None:
+    """Wavelengths out of names that each carry one: with a unit, or plain numbers that increase and can be nm.
+
+    Returns:
+        Centres in nm, and with which unit or why they are taken for nm.
+
+    >>> wavelengths_in_names(["red 0.66 um", "red edge 0.705 um"])
+    (array([660., 705.]), 'with the unit um')
+    >>> wavelengths_in_names(["Band 1", "Band 2"])
+    """
+
+    def number(text: str) -> float:
+        return float(text.replace(",", "."))
+
+    with_unit = [_WITH_UNIT.findall(name) for name in names]
+    if names and all(len(found) == 1 for found in with_unit):
+        pairs = [found[0] for found in with_unit]
+        centres = [number(text) * (nm_per_unit(unit) or 1.0) for text, unit in pairs]
+        return np.array(centres), f"with the unit {pairs[0][1]}"
+    plain = [_varying_numbers(name, names) for name in names]
+    if any(len(found) != 1 for found in plain):
+        return None
+    centres = np.array([number(found[0]) for found in plain])
+    low, high = _USUAL_NM
+    if (np.diff(centres) <= 0).any() or centres[0] < low or centres[-1] > high:
+        return None
+    return centres, f"no unit; {centres[0]:g} to {centres[-1]:g} increase and are taken as nm"
+
+
+def _varying_numbers(name: str, names: Sequence[str]) -> list[str]:
+    """Numbers outside of what all names begin with and end in, except counters."""
+
+    def common_begin(texts: Sequence[str]) -> str:
+        first, last = min(texts), max(texts)
+        differs = (index for index, pair in enumerate(zip(first, last, strict=False)) if pair[0] != pair[1])
+        return first[: next(differs, len(first))]
+
+    begin = len(common_begin(names).rstrip("0123456789.,"))
+    end = len(common_begin([other[::-1] for other in names])[::-1].lstrip("0123456789.,"))
+    inside = [
+        match for match in _NUMBER.finditer(name) if begin <= match.start() and match.end() <= len(name) - end
+    ]
+    return [match[1] for match in inside if not _COUNTER.search(name[: match.start()])]
+
+
 def parse_wavelengths(text: str) -> Float64[np.ndarray, " B"]:
     """Band centres in nm from a list `620,555,503`, or from the column `wavelength` of a CSV file.
 
@@ -197,11 +180,13 @@ def parse_wavelengths(text: str) -> Float64[np.ndarray, " B"]:
     Raises:
         ConfigError: no such file, no numbers, or numbers that are not wavelengths in nm.
     """
-    words = text.split(",")
-    if not all(map(_is_number, words)):
-        words = _read_words(Path(text))
     try:
-        values = np.array([float(word) for word in words])
+        values = np.array([float(word) for word in text.split(",")])
+    except ValueError:
+        values = None
+    try:
+        if values is None:
+            values = np.array([float(word) for word in _read_words(Path(text))])
     except ValueError as error:
         raise ConfigError(
             f"--wavelengths {text}: {error}; expected numbers in nm, such as 620,555,503, or a CSV file with a "
@@ -249,14 +234,6 @@ def in_ranges(text: str, wavelengths_nm: Float64[np.ndarray, " B"]) -> Bool[np.n
             )
         named |= found
     return named
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _read_words(path: Path) -> list[str]:

@@ -1,30 +1,12 @@
-"""Files that hold many arrays by name: which is the image, and which describe its bands.
+"""Files that hold arrays by name: which is the image, which describe its bands, and how NumPy, torch, NetCDF and MATLAB
+store them.
 
 Notation: `H` rows, `W` columns, `B` bands.
-
-An image out of a file of named arrays: its axes, bands, scale and no-data value.
-
-Notation: `H` rows, `W` columns, `B` bands.
-
-NumPy's own files: .npy is mapped; of .npz the member that is an image is loaded. No pickle is ever read.
-
-Tensors that torch.save wrote: read with weights_only, which loads no code.
-
-NetCDF files of the classic kind, mapped by SciPy.
-
-Elements of a MATLAB file of version 5 to 7: which arrays of numbers it holds, and where.
-
-Read here rather than by SciPy, which ends the process on some damaged files, and which can't map numbers.
-
-Source: The MathWorks, MAT-File Format, chapter 1 (level 5).
-
-MATLAB files of version 5 to 7; those of version 7.3 are HDF5.
-
-Numbers that lie open are mapped. Compressed ones are unpacked when the first of them are asked for.
 """
 
 from __future__ import annotations
 
+import pickle
 import re
 import struct
 import zipfile
@@ -65,6 +47,14 @@ _CENTRES = re.compile(
 )
 _WIDTHS = re.compile(r"(fwhms?|band_?widths?|list_fwhm_.*)(_?(nm|um))?")
 _GOOD = re.compile(r"bbl|good_(wavelengths?|bands?)")
+_NO_DATA = ("_fillvalue", "missing_value", "data_ignore_value", "nodata", "no_data")
+_SCALES = ("scale_factor", "reflectance_scale_factor")
+_AXIS_NAMES = {
+    "b": "band bands wavelength wavelengths wl lambda channel spectral",
+    "y": "y lat latitude row rows line lines downtrack northing height",
+    "x": "x lon longitude col cols column columns sample samples crosstrack easting width",
+}
+_AXES = {name: axis for axis, names in _AXIS_NAMES.items() for name in names.split()}
 _LISTED = 12
 """How many arrays a message names."""
 
@@ -93,29 +83,71 @@ class FoundArray:
     @property
     def is_vector(self) -> bool:
         """Whether it is a list of numbers, also as MATLAB's matrix of one row or column."""
-        return (
-            self.dtype.kind in "iuf" and sum(length != 1 for length in self.shape) <= 1 and bool(self.shape)
-        )
-
-    @property
-    def length(self) -> int:
-        """Of a vector."""
-        return int(np.prod(self.shape))
+        is_list = bool(self.shape) and sum(length != 1 for length in self.shape) <= 1
+        return is_list and self.dtype.kind in "iuf"
 
 
-def find_image(path: Path, arrays: Sequence[FoundArray], options: ReadOptions) -> FoundArray:
-    """The array that is the image: the one that is named, otherwise the only one of three axes.
+def image_of_arrays(
+    path: Path, reader: str, arrays: Sequence[FoundArray], options: ReadOptions
+) -> SpectralFile:
+    """The image of a file: the array that is named, otherwise the only one of three axes.
 
     Raises:
-        CaptureError: there is none, or several that could be it.
+        CaptureError: no array, or more than one, can be the image.
     """
+    image = _find_image(path, arrays, options)
+    what = image.name or "the array"
+    size = _pixel_list_size(image, arrays, options)
+    fixed, notes = options.axes, ()
+    shape, take = image.shape, image.take
+    if len(image.shape) == 2:  # a list of pixels, column after column, or one band
+        if size is None and options.size is not None:
+            raise CaptureError(f"{path}: {what} {shape} is not a list of {prod(options.size)} pixels")
+        if size is None:
+            shape, fixed = (*image.shape, 1), "yxb"
+        elif image.shape[1] == prod(size):
+            shape, fixed = (image.shape[0], size[1], size[0]), "bxy"
+        else:
+            shape, fixed = (size[1], size[0], image.shape[1]), "xyb"
+        take = None
+    elif len(image.shape) != 3:
+        raise CaptureError(f"{path}: {what} has the shape {image.shape}; expected three axes")
+    elif fixed is None:
+        names = (name.lower().rpartition("/")[2] for name in image.dimensions or ())
+        named: Any = "".join(_AXES.get(name, "?") for name in names)
+        fixed = named if sorted(named) == ["b", "x", "y"] else None
+    stated = _state_bands(arrays, image)
+    given = options.wavelengths_nm if options.wavelengths_nm is not None else stated.centres
+    axes, notes = choose_axes(shape, fixed, None if given is None else len(given))
+    of_image = image_shape(shape, axes)
+    bands, band_notes = check_bands(stated, of_image[2])
+    scale, scale_notes = _scale(image.attributes)
+
+    def read_part(rows: slice, wanted: BandIndex) -> np.ndarray:
+        if take is not None:
+            return take(axes, rows, wanted)
+        return take_part(image.whole().reshape(shape), axes, rows, wanted)
+
+    return SpectralFile(
+        path=path,
+        reader=reader,
+        shape=of_image,
+        dtype=image.dtype,
+        read_part=read_part,
+        bands=bands,
+        scale=scale,
+        no_data=_first_number(image.attributes, _NO_DATA),
+        notes=notes + band_notes + scale_notes,
+        metadata={"dataset": image.name, "axes": axes} if len(arrays) > 1 else {"axes": axes},
+    )
+
+
+def _find_image(path: Path, arrays: Sequence[FoundArray], options: ReadOptions) -> FoundArray:
     numeric = [array for array in arrays if array.dtype.kind in "iuf" and 0 not in array.shape]
     if [(array.name, len(array.shape)) for array in arrays] == [("", 2)] and options.dataset is None:
         return arrays[0]  # the file is one matrix: one band
-    listed = (
-        ", ".join(f"{array.name or 'one array'} {array.shape}" for array in numeric[:_LISTED])
-        or "no arrays of numbers"
-    )
+    listed = ", ".join(f"{array.name or 'one array'} {array.shape}" for array in numeric[:_LISTED])
+    listed = listed or "no arrays of numbers"
     if options.dataset is not None:
         wanted = options.dataset.strip("/")
         named = [array for array in numeric if array.name.strip("/") == wanted]
@@ -127,194 +159,86 @@ def find_image(path: Path, arrays: Sequence[FoundArray], options: ReadOptions) -
         return named[0]
     images = [array for array in numeric if len(array.shape) == 3]
     if not images:
-        images = [array for array in numeric if pixel_list_size(array, arrays, options) is not None]
+        images = [array for array in numeric if _pixel_list_size(array, arrays, options) is not None]
     if len(images) > 1:
-        fitting = [image for image in images if find_vector(arrays, image, _CENTRES) is not None]
-        images = fitting or images
-    if len(images) != 1:
-        found = f"{len(images)} data sets could be the image" if images else "no data set has three axes"
-        advice = (
-            "name one (--dataset)"
-            if images
-            else "name one (--dataset), and give rows and columns if it is a list of pixels"
+        images = [image for image in images if _find_vector(arrays, image, _CENTRES) is not None] or images
+    if not images:
+        raise CaptureError(
+            f"{path}: no data set has three axes; name one (--dataset), and give rows and columns if it is a list of "
+            f"pixels. The file holds {listed}"
         )
-        raise CaptureError(f"{path}: {found}; {advice}. The file holds {listed}")
+    if len(images) > 1:
+        raise CaptureError(
+            f"{path}: {len(images)} data sets could be the image; name one (--dataset). The file holds {listed}"
+        )
     return images[0]
 
 
-def find_vector(arrays: Sequence[FoundArray], image: FoundArray, names: re.Pattern[str]) -> FoundArray | None:
-    """The list of one number a band with such a name; of several the one in the nearest group."""
-    found = [
-        array
-        for array in arrays
-        if array.is_vector and array.length in image.shape and names.fullmatch(array.own_name)
-    ]
-    return max(found, key=lambda array: _common_groups(array.name, image.name), default=None)
-
-
-def describing_vectors(
-    arrays: Sequence[FoundArray], image: FoundArray
-) -> tuple[FoundArray | None, FoundArray | None, FoundArray | None]:
-    """Lists of the centres, widths and marks of an image's bands."""
-    centres, widths, good = (find_vector(arrays, image, names) for names in (_CENTRES, _WIDTHS, _GOOD))
-    return centres, widths, good
-
-
-def names_wavelengths(name: str) -> bool:
-    """Whether an attribute of this name holds wavelengths."""
-    return _CENTRES.fullmatch(name.lower()) is not None
-
-
-def pixel_list_size(
+def _pixel_list_size(
     array: FoundArray, arrays: Sequence[FoundArray], options: ReadOptions
 ) -> tuple[int, int] | None:
-    """Rows and columns of an image that is stored as a matrix of bands and pixels; None if it is not such a matrix."""
-    size = options.size or _stated_size(arrays)
-    if len(array.shape) != 2 or size is None or size[0] * size[1] not in array.shape:
+    """Rows and columns of an image that is stored as a matrix of bands and pixels; None if it is not such a matrix.
+
+    Files of unmixing scenes give them as numbers `nRow` and `nCol`.
+    """
+    size = options.size
+    numbers = {one.own_name.rstrip("s"): one for one in arrays if one.is_vector and prod(one.shape) == 1}
+    if size is None and "nrow" in numbers and "ncol" in numbers:
+        rows, columns = (float(numbers[name].whole().reshape(-1)[0]) for name in ("nrow", "ncol"))
+        size = (int(rows), int(columns)) if 1 <= rows < 2**31 and 1 <= columns < 2**31 else None
+    if len(array.shape) != 2 or size is None or prod(size) not in array.shape:
         return None
     return size
 
 
-def _stated_size(arrays: Sequence[FoundArray]) -> tuple[int, int] | None:
-    """Rows and columns as files of unmixing scenes give them: numbers `nRow` and `nCol`."""
-    numbers = {array.own_name.rstrip("s"): array for array in arrays if array.is_vector and array.length == 1}
-    if "nrow" not in numbers or "ncol" not in numbers:
-        return None
-    rows, columns = (float(numbers[name].whole().reshape(-1)[0]) for name in ("nrow", "ncol"))
-    return (int(rows), int(columns)) if 1 <= rows < 2**31 and 1 <= columns < 2**31 else None
+def _find_vector(
+    arrays: Sequence[FoundArray], image: FoundArray, names: re.Pattern[str]
+) -> FoundArray | None:
+    """The list of one number a band with such a name; of several the one in the nearest group."""
 
+    def common_groups(name: str) -> int:
+        pairs = zip(name.strip("/").split("/")[:-1], image.name.strip("/").split("/")[:-1], strict=False)
+        least = min(name.count("/"), image.name.count("/"))
+        return next((count for count, (a, b) in enumerate(pairs) if a != b), least)
 
-def _common_groups(first: str, second: str) -> int:
-    pairs = zip(first.strip("/").split("/")[:-1], second.strip("/").split("/")[:-1], strict=False)
-    return next(
-        (count for count, (a, b) in enumerate(pairs) if a != b), min(first.count("/"), second.count("/"))
-    )
-
-
-_NO_DATA = ("_fillvalue", "missing_value", "data_ignore_value", "nodata", "no_data")
-_SCALES = ("scale_factor", "reflectance_scale_factor")
-_ROLES = {
-    **dict.fromkeys(
-        ("band", "bands", "wavelength", "wavelengths", "wl", "lambda", "channel", "spectral"), "b"
-    ),
-    **dict.fromkeys(
-        ("y", "lat", "latitude", "row", "rows", "line", "lines", "downtrack", "northing", "height"), "y"
-    ),
-    **dict.fromkeys(("x", "lon", "longitude", "col", "cols", "column", "columns", "sample", "samples"), "x"),
-    **dict.fromkeys(("crosstrack", "easting", "width"), "x"),
-}
-
-
-def image_of_arrays(
-    path: Path, reader: str, arrays: Sequence[FoundArray], options: ReadOptions
-) -> SpectralFile:
-    """The image of a file.
-
-    Raises:
-        CaptureError: no array, or more than one, can be the image.
-    """
-    image = find_image(path, arrays, options)
-    shape, take = _as_cube(path, image, arrays, options)
-    stated = _state_bands(arrays, image)
-    given = options.wavelengths_nm if options.wavelengths_nm is not None else stated.centres
-    default = _named_axes(image) if shape == image.shape else None
-    if len(image.shape) == 2 and shape != image.shape:
-        axes, axis_notes = _pixel_list_axes(image, shape), ()
-    else:
-        fixed = options.axes or default
-        axes, axis_notes = choose_axes(shape, fixed, None if given is None else len(given))
-    size = image_shape(shape, axes)
-    bands, band_notes = check_bands(stated, size[2])
-    scale, scale_notes = _scale(image.attributes)
-    return SpectralFile(
-        path=path,
-        reader=reader,
-        shape=size,
-        dtype=image.dtype,
-        read_part=lambda rows, wanted: take(axes, rows, wanted),
-        bands=bands,
-        scale=scale,
-        no_data=_first_number(image.attributes, _NO_DATA),
-        notes=axis_notes + band_notes + scale_notes,
-        metadata={"dataset": image.name, "axes": axes} if len(arrays) > 1 else {"axes": axes},
-    )
-
-
-def _as_cube(
-    path: Path, image: FoundArray, arrays: Sequence[FoundArray], options: ReadOptions
-) -> tuple[tuple[int, ...], TakePart]:
-    """Shape of three axes and how parts of it are read; a matrix is a list of pixels or an image of one band."""
-    if len(image.shape) == 3:
-        whole = image.whole
-        return image.shape, image.take or (lambda axes, rows, bands: take_part(whole(), axes, rows, bands))
-    if len(image.shape) != 2:
-        raise CaptureError(
-            f"{path}: {image.name or 'the array'} has the shape {image.shape}; expected three axes"
-        )
-    size = pixel_list_size(image, arrays, options)
-    if options.size is not None and size is None:
-        pixels = options.size[0] * options.size[1]
-        raise CaptureError(
-            f"{path}: {image.name or 'the array'} {image.shape} is not a list of {pixels} pixels"
-        )
-    rows, columns = size or (0, 0)
-    shape = (
-        (*image.shape, 1)
-        if size is None
-        else (
-            (image.shape[0], columns, rows)
-            if image.shape[1] == rows * columns
-            else (columns, rows, image.shape[1])
-        )
-    )
-    return shape, lambda axes, wanted, bands: take_part(image.whole().reshape(shape), axes, wanted, bands)
-
-
-def _pixel_list_axes(image: FoundArray, shape: tuple[int, ...]) -> Axes:
-    """Pixels are listed column after column."""
-    if shape[:2] == image.shape:
-        return "yxb"
-    return "bxy" if shape[0] == image.shape[0] else "xyb"
-
-
-def _named_axes(image: FoundArray) -> Axes | None:
-    roles = "".join(_ROLES.get(name.lower().rpartition("/")[2], "?") for name in image.dimensions or ())
-    found: Any = roles
-    return found if sorted(roles) == ["b", "x", "y"] else None
+    found = [
+        array
+        for array in arrays
+        if array.is_vector and prod(array.shape) in image.shape and names.fullmatch(array.own_name)
+    ]
+    return max(found, key=lambda array: common_groups(array.name), default=None)
 
 
 def _state_bands(arrays: Sequence[FoundArray], image: FoundArray) -> StatedBands:
     """What arrays or attributes say of the bands."""
-    centres, widths, good = describing_vectors(arrays, image)
 
     def numbers(vector: FoundArray | None) -> list[object] | None:
         return None if vector is None else vector.whole().reshape(-1).tolist()
 
-    if centres is None:
-        attribute = next((key for key in image.attributes if names_wavelengths(key)), None)
+    centres, widths, good = (_find_vector(arrays, image, names) for names in (_CENTRES, _WIDTHS, _GOOD))
+    if centres is not None:
+        where, listed = f"data set '{centres.name}'", numbers(centres)
+        name, attributes = centres.own_name, centres.attributes
+    else:
+        attribute = next((key for key in image.attributes if _CENTRES.fullmatch(key.lower())), None)
         values = np.atleast_1d(image.attributes[attribute]) if attribute is not None else np.zeros(0)
         listed = values.tolist() if values.ndim == 1 and len(values) in image.shape else None
-        unit = _unit(attribute or "", {})
-        return StatedBands(f"attribute '{attribute}'", listed, unit, numbers(widths), numbers(good))
-    unit = _unit(centres.own_name, centres.attributes)
-    return StatedBands(f"data set '{centres.name}'", numbers(centres), unit, numbers(widths), numbers(good))
-
-
-def _unit(name: str, attributes: Mapping[str, Any]) -> str | None:
-    for key, value in attributes.items():
-        if key.lower() in ("unit", "units"):
-            return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
-    suffix = name.lower()[-2:]
-    return suffix if suffix in ("nm", "um") else None
+        where, name, attributes = f"attribute '{attribute}'", attribute or "", {}
+    unit = next((value for key, value in attributes.items() if key.lower() in ("unit", "units")), None)
+    if unit is None:
+        suffix = name.lower()[-2:]
+        unit = suffix if suffix in ("nm", "um") else None
+    else:
+        unit = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else str(unit)
+    return StatedBands(where, listed, unit, numbers(widths), numbers(good))
 
 
 def _scale(attributes: Mapping[str, Any]) -> tuple[float | None, tuple[str, ...]]:
     """Stored number that stands for 1: factors above 1 divide, those below multiply, as climate files have it."""
     factor = _first_number(attributes, _SCALES)
     offset = _first_number(attributes, ("add_offset",))
-    notes = (
-        (f"an offset of {offset:g} is to be added to scaled values, which is left to you",) if offset else ()
-    )
+    note = f"an offset of {offset:g} is to be added to scaled values, which is left to you" if offset else ""
+    notes = (note,) if note else ()
     if factor is None or not np.isfinite(factor) or factor <= 0 or factor == 1:
         return None, notes
     return (factor if factor > 1 else 1 / factor), notes
@@ -328,6 +252,9 @@ def _first_number(attributes: Mapping[str, Any], names: Sequence[str]) -> float 
             except (ValueError, TypeError, IndexError):
                 continue
     return None
+
+
+# NumPy: .npy is mapped, of .npz the member that is an image is loaded. No pickle is ever read.
 
 
 def open_npy(path: Path, options: ReadOptions) -> SpectralFile:
@@ -351,11 +278,11 @@ def open_npz(path: Path, options: ReadOptions) -> SpectralFile:
         CaptureError: a member is damaged or holds objects, or none can be the image.
     """
     with zipfile.ZipFile(path) as archive:
-        arrays = [_member(path, archive, info) for info in archive.infolist()]
+        arrays = [_npz_member(path, archive, info) for info in archive.infolist()]
     return image_of_arrays(path, "npy", arrays, options)
 
 
-def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> FoundArray:
+def _npz_member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> FoundArray:
     """A member by its header."""
     with archive.open(info) as file:
         version = np.lib.format.read_magic(file)
@@ -370,12 +297,15 @@ def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Foun
             f"{path}: {info.filename} holds {info.file_size} bytes; its header promises {needed}"
         )
     name = info.filename.removesuffix(".npy")
-    return FoundArray(name, shape, dtype, lambda: loaded(_load_member, path, info.filename))
+    return FoundArray(name, shape, dtype, lambda: loaded(_load_npz_member, path, info.filename))
 
 
-def _load_member(path: Path, name: str) -> np.ndarray:
+def _load_npz_member(path: Path, name: str) -> np.ndarray:
     with zipfile.ZipFile(path) as archive, archive.open(name) as file:
         return np.lib.format.read_array(file, allow_pickle=False)
+
+
+# Tensors that torch.save wrote: read with weights_only, which loads no code.
 
 
 def open_torch(path: Path, options: ReadOptions) -> SpectralFile:
@@ -384,51 +314,40 @@ def open_torch(path: Path, options: ReadOptions) -> SpectralFile:
     Raises:
         CaptureError: the file is damaged, holds other objects than tensors, or none can be the image.
     """
-    return image_of_arrays(
-        path, "torch", [_found(path, name, tensor) for name, tensor in _tensors(path)], options
-    )
-
-
-def _tensors(path: Path) -> list[tuple[str, Any]]:
-    """Tensors by name, mapped where the file allows it."""
-    import pickle
-
     import torch
 
-    try:
-        content = _load(path)
-    except pickle.UnpicklingError as error:
-        raise CaptureError(
-            f"{path}: holds other objects than tensors, which are never loaded because they can run code; "
-            "save a plain tensor with torch.save"
-        ) from error
-    named = content.items() if isinstance(content, dict) else [("", content)]
-    return [(str(name), value) for name, value in named if isinstance(value, torch.Tensor)]
+    def tensors() -> dict[str, Any]:
+        """By name, mapped where the file allows it."""
+        with path.open("rb") as file:
+            is_mappable = file.read(2) == b"PK"
+        try:
+            content = torch.load(path, map_location="cpu", weights_only=True, mmap=is_mappable)
+        except pickle.UnpicklingError as error:
+            raise CaptureError(
+                f"{path}: holds other objects than tensors, which are never loaded because they can run code; "
+                "save a plain tensor with torch.save"
+            ) from error
+        named = content if isinstance(content, dict) else {"": content}
+        return {str(name): value for name, value in named.items() if isinstance(value, torch.Tensor)}
+
+    def numbers(tensor: torch.Tensor) -> np.ndarray:
+        """What NumPy has no type for becomes float32."""
+        tensor = tensor.detach()
+        return (tensor.float() if tensor.dtype == torch.bfloat16 else tensor.resolve_neg()).numpy()
+
+    arrays = [
+        FoundArray(
+            name,
+            tuple(tensor.shape),
+            numbers(tensor[:0] if tensor.ndim else tensor).dtype,
+            lambda name=name: numbers(tensors()[name]),
+        )
+        for name, tensor in tensors().items()
+    ]
+    return image_of_arrays(path, "torch", arrays, options)
 
 
-def _load(path: Path) -> Any:
-    import torch
-
-    with path.open("rb") as file:
-        is_mappable = file.read(2) == b"PK"
-    return torch.load(path, map_location="cpu", weights_only=True, mmap=is_mappable)
-
-
-def _found(path: Path, name: str, tensor: Any) -> FoundArray:
-    numbers = _numbers(tensor[:0] if tensor.ndim else tensor)
-
-    def whole() -> np.ndarray:
-        return _numbers(dict(_tensors(path))[name])
-
-    return FoundArray(name, tuple(tensor.shape), numbers.dtype, whole)
-
-
-def _numbers(tensor: Any) -> np.ndarray:
-    """As an array; what NumPy has no type for becomes float32."""
-    import torch
-
-    tensor = tensor.detach()
-    return (tensor.float() if tensor.dtype == torch.bfloat16 else tensor.resolve_neg()).numpy()
+# NetCDF of the classic kind, mapped by SciPy.
 
 
 def open_netcdf3(path: Path, options: ReadOptions) -> SpectralFile:
@@ -437,32 +356,31 @@ def open_netcdf3(path: Path, options: ReadOptions) -> SpectralFile:
     Raises:
         CaptureError: the file is damaged, or no variable, or more than one, can be the image.
     """
-    with _opened(path) as file:
-        arrays = [_found_netcdf3(path, name, variable) for name, variable in file.variables.items()]
+    from scipy.io import netcdf_file
+
+    def found(name: str, variable: Any) -> FoundArray:
+        """A variable, without holding on to the map of its file."""
+
+        def whole() -> np.ndarray:
+            with netcdf_file(str(path), "r", mmap=True) as file:
+                return np.array(file.variables[name].data)
+
+        def take(axes: Axes, rows: slice, bands: BandIndex) -> np.ndarray:
+            with netcdf_file(str(path), "r", mmap=True) as file:
+                return take_part(file.variables[name].data, axes, rows, bands)
+
+        attributes = dict(variable._attributes)
+        kind = variable.data.dtype
+        return FoundArray(name, variable.shape, kind, whole, take, attributes, variable.dimensions)
+
+    with netcdf_file(str(path), "r", mmap=True) as file:
+        arrays = [found(name, variable) for name, variable in file.variables.items()]
     return image_of_arrays(path, "netcdf", arrays, options)
 
 
-def _found_netcdf3(path: Path, name: str, variable: Any) -> FoundArray:
-    """A variable, without holding on to the map of its file."""
-
-    def whole() -> np.ndarray:
-        with _opened(path) as file:
-            return np.array(file.variables[name].data)
-
-    def take(axes: Axes, rows: slice, bands: BandIndex) -> np.ndarray:
-        with _opened(path) as file:
-            return take_part(file.variables[name].data, axes, rows, bands)
-
-    attributes = dict(variable._attributes)
-    return FoundArray(name, variable.shape, variable.data.dtype, whole, take, attributes, variable.dimensions)
-
-
-def _opened(path: Path) -> Any:
-    """The file, whose variables nothing may hold when it is closed."""
-    from scipy.io import netcdf_file
-
-    return netcdf_file(str(path), "r", mmap=True)
-
+# MATLAB's version 5 to 7; files of version 7.3 are HDF5. Numbers that lie open are mapped, compressed ones are unpacked
+# when the first of them are asked for. Read here rather than by SciPy, which ends the process on some damaged files
+# and can't map numbers. Source: The MathWorks, MAT-File Format, chapter 1 (level 5).
 
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
@@ -473,7 +391,7 @@ _HEAD_BYTES = 2**16
 
 
 @dataclass(frozen=True)
-class MatlabArray:
+class _MatlabArray:
     """One array of numbers; axes in MATLAB's order, the first axis fastest."""
 
     name: str
@@ -487,21 +405,34 @@ class MatlabArray:
     """Where the compressed element lies and how long it is; None where numbers lie open."""
 
 
-def list_arrays(path: Path) -> list[MatlabArray]:
-    """Arrays of real numbers; cells, structures and texts are passed over.
+def open_matlab(path: Path, options: ReadOptions) -> SpectralFile:
+    """Open the variable that is the image; cells, structures, texts and complex numbers are passed over.
 
     Raises:
-        ValueError: the file is damaged or cut short.
+        CaptureError: the file is damaged, or no variable, or more than one, can be the image.
     """
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        order = {b"IM": "<", b"MI": ">"}.get(file.read(128)[126:128])
-        if order is None:
-            raise ValueError("the header is damaged")
-        found = (
-            _array(file, order, start, kind, length) for start, kind, length in _elements(file, order, size)
-        )
-        return [array for array in found if array is not None]
+
+    def found(array: _MatlabArray) -> FoundArray:
+        def stored() -> np.ndarray:
+            if array.packed is not None:
+                return loaded(_unpack, path, array)
+            return np.memmap(path, array.stored, "r", array.offset, array.shape, order="F")
+
+        def take(axes: Axes, rows: slice, bands: BandIndex) -> np.ndarray:
+            return take_part(stored(), axes, rows, bands).astype(array.dtype)
+
+        return FoundArray(array.name, array.shape, array.dtype, lambda: stored().astype(array.dtype), take)
+
+    try:
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            order = {b"IM": "<", b"MI": ">"}.get(file.read(128)[126:128])
+            if order is None:
+                raise ValueError("the header is damaged")
+            arrays = [_matlab_array(file, order, *element) for element in _elements(file, order, size)]
+    except (ValueError, zlib.error) as error:
+        raise CaptureError(f"{path}: a damaged MATLAB file: {error}; copy it again") from error
+    return image_of_arrays(path, "matlab", [found(array) for array in arrays if array is not None], options)
 
 
 def _elements(file: BinaryIO, order: str, size: int) -> Iterator[tuple[int, int, int]]:
@@ -519,22 +450,16 @@ def _elements(file: BinaryIO, order: str, size: int) -> Iterator[tuple[int, int,
         raise ValueError("cut short within the head of an element")
 
 
-def _array(file: BinaryIO, order: str, start: int, kind: int, length: int) -> MatlabArray | None:
+def _matlab_array(file: BinaryIO, order: str, start: int, kind: int, length: int) -> _MatlabArray | None:
+    """An array of real numbers by the first bytes of its element; None for anything else."""
     file.seek(start)
-    head = file.read(min(length, _HEAD_BYTES))
-    if kind == _MATRIX:
-        return _matrix(head, order, start, length, None)
-    if kind != _COMPRESSED:
+    head, packed = file.read(min(length, _HEAD_BYTES)), None
+    if kind == _COMPRESSED:
+        head, packed = zlib.decompressobj().decompress(head, _HEAD_BYTES), (start, length)
+        kind, length = _tag(head, order, 0)[:2]
+        head, start = head[8:], 8
+    if kind != _MATRIX:
         return None
-    head = zlib.decompressobj().decompress(head, _HEAD_BYTES)
-    kind, inner = _tag(head, order, 0)[:2]
-    return _matrix(head[8:], order, 8, inner, (start, length)) if kind == _MATRIX else None
-
-
-def _matrix(
-    head: bytes, order: str, start: int, length: int, packed: tuple[int, int] | None
-) -> MatlabArray | None:
-    """An array by the first bytes of its content."""
     _, _, at, end = _tag(head, order, 0)
     (flags,) = struct.unpack_from(order + "I", head, at)
     if flags & 0xFF not in _CLASSES or flags & _IS_COMPLEX:
@@ -549,7 +474,7 @@ def _matrix(
     stored = np.dtype(order + _STORED[kind])
     if prod(shape) * stored.itemsize != count or at + count > length:
         raise ValueError(f"variable '{name}' of {shape} {stored.name} has {count} bytes")
-    return MatlabArray(name, shape, np.dtype(_CLASSES[flags & 0xFF]), stored, start + at, packed)
+    return _MatlabArray(name, shape, np.dtype(_CLASSES[flags & 0xFF]), stored, start + at, packed)
 
 
 def _tag(head: bytes, order: str, position: int) -> tuple[int, int, int, int]:
@@ -562,41 +487,15 @@ def _tag(head: bytes, order: str, position: int) -> tuple[int, int, int, int]:
     return kind, length, position + 8, position + 8 + length + (-length % 8)
 
 
-def open_matlab(path: Path, options: ReadOptions) -> SpectralFile:
-    """Open the variable that is the image.
-
-    Raises:
-        CaptureError: the file is damaged, or no variable, or more than one, can be the image.
-    """
-    try:
-        arrays = list_arrays(path)
-    except (ValueError, zlib.error) as error:
-        raise CaptureError(f"{path}: a damaged MATLAB file: {error}; copy it again") from error
-    return image_of_arrays(path, "matlab", [_found_matlab(path, array) for array in arrays], options)
-
-
-def _found_matlab(path: Path, array: MatlabArray) -> FoundArray:
-    def stored() -> np.ndarray:
-        if array.packed is not None:
-            return loaded(_unpack, path, array)
-        return np.memmap(path, array.stored, "r", array.offset, array.shape, order="F")
-
-    def take(axes: Axes, rows: slice, bands: BandIndex) -> np.ndarray:
-        return take_part(stored(), axes, rows, bands).astype(array.dtype)
-
-    return FoundArray(array.name, array.shape, array.dtype, lambda: stored().astype(array.dtype), take)
-
-
-def _unpack(path: Path, array: MatlabArray) -> np.ndarray:
+def _unpack(path: Path, array: _MatlabArray) -> np.ndarray:
     """The numbers of a compressed variable; no more is unpacked than the variable needs."""
     start, length = array.packed or (0, 0)
     with path.open("rb") as file:
         file.seek(start)
         packed = file.read(length)
-    needed = prod(array.shape) * array.stored.itemsize
-    unpacked = zlib.decompressobj().decompress(packed, array.offset + needed)
-    if len(unpacked) < array.offset + needed:
+    count = prod(array.shape)
+    needed = array.offset + count * array.stored.itemsize
+    unpacked = zlib.decompressobj().decompress(packed, needed)
+    if len(unpacked) < needed:
         raise CaptureError(f"{path}: variable '{array.name}' is cut short; copy the file again")
-    return np.frombuffer(unpacked, array.stored, offset=array.offset, count=prod(array.shape)).reshape(
-        array.shape, order="F"
-    )
+    return np.frombuffer(unpacked, array.stored, count, array.offset).reshape(array.shape, order="F")

@@ -136,10 +136,10 @@ def _with_wavelengths_of_names(bands: list[SpectralFile]) -> list[SpectralFile]:
     found = wavelengths_in_names(stems)
     if found is None:
         return bands
-    evidence = f"names of files, such as {bands[0].path.name!r}: {found.evidence}"
+    evidence = f"names of files, such as {bands[0].path.name!r}: {found[1]}"
     return [
         replace(band, bands=replace(band.bands, wavelengths_nm=np.array([nm]), evidence=evidence))
-        for band, nm in zip(bands, found.centres_nm.tolist(), strict=True)
+        for band, nm in zip(bands, found[0].tolist(), strict=True)
     ]
 
 
