@@ -1,10 +1,5 @@
-"""What kind of file something is, by its first bytes and then by its name.
-
-Any file of an instrument as a `SpectralFile`: the reader is chosen by what the file holds.
-
-Nothing but headers is read.
-
-What files of instruments and of pose programs hold, as plain values.
+"""Any file of an instrument: which kind it is, by its first bytes and then by its name; opened by the reader of that
+kind, which reads headers only; and what it says of itself, as plain values.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
-"""PNG and JPEG pictures: one band, or red, green and blue, as they are stored.
+"""PNG and JPEG pictures: one band, or red, green and blue; and folders that hold one file a band.
 
-What is gamma-encoded stays so; `metadata["encoding"]` says it.
-
-A folder that holds one file a band, as filter wheels and multi-lens cameras write it.
+Numbers are as they are stored: what is gamma-encoded stays so, and `metadata["encoding"]` says it.
 """
 
 from __future__ import annotations
@@ -48,7 +46,10 @@ def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
     with Image.open(path, formats=("PNG", "JPEG")) as picture:
         mode, (width, height), info = picture.mode, picture.size, dict(picture.info)
         orientation = picture.getexif().get(_ORIENTATION, 1)
-    is_deep = _is_deep_colour(path)
+    with path.open("rb") as file:
+        begin = file.read(_KIND_AT + 1)
+    # Pillow would cut the colours of a PNG of 16 bits to 8.
+    is_deep = begin[:4] == b"\x89PNG" and begin[_DEPTH_AT] == 16 and begin[_KIND_AT] in _WITH_COLOURS
     if mode not in _GREY and mode not in _COLOUR:
         raise CaptureError(f"{path}: a picture of mode {mode}; expected grey or RGB")
     num_bands = 1 if mode in _GREY else 3
@@ -76,13 +77,6 @@ def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
         notes=("the picture has opacity, which is not a band and is left out",) if alpha else (),
         metadata=metadata,
     )
-
-
-def _is_deep_colour(path: Path) -> bool:
-    """Whether it is a PNG with colours of 16 bits, which Pillow would cut to 8."""
-    with path.open("rb") as file:
-        begin = file.read(_KIND_AT + 1)
-    return begin[:4] == b"\x89PNG" and begin[_DEPTH_AT] == 16 and begin[_KIND_AT] in _WITH_COLOURS
 
 
 def _load(path: Path) -> np.ndarray:
@@ -125,15 +119,17 @@ def open_band_folder(folder: Path, open_band: Callable[[Path], SpectralFile]) ->
             )
     if any(band.bands.wavelengths_nm is None for band in bands):
         bands = _with_wavelengths_of_names(bands)
-    stack, others = stack_bands(_by_wavelength(bands), folder), kinds.total() - number
+    centres = [band.bands.wavelengths_nm[0] for band in bands if band.bands.wavelengths_nm is not None]
+    if len(centres) == len(bands):
+        bands = [bands[index] for index in np.argsort(centres, kind="stable")]
+    stack, others = stack_bands(bands, folder), kinds.total() - number
     noun = "picture of another kind" if others == 1 else "pictures of other kinds"
     notes = (f"{others} {noun} than {kind} in the folder left out",) if others else ()
     return replace(stack, interleave="bsq", notes=stack.notes + notes)
 
 
 def _with_wavelengths_of_names(bands: list[SpectralFile]) -> list[SpectralFile]:
-    stems = [band.path.stem for band in bands]
-    found = wavelengths_in_names(stems)
+    found = wavelengths_in_names([band.path.stem for band in bands])
     if found is None:
         return bands
     evidence = f"names of files, such as {bands[0].path.name!r}: {found[1]}"
@@ -141,14 +137,6 @@ def _with_wavelengths_of_names(bands: list[SpectralFile]) -> list[SpectralFile]:
         replace(band, bands=replace(band.bands, wavelengths_nm=np.array([nm]), evidence=evidence))
         for band, nm in zip(bands, found[0].tolist(), strict=True)
     ]
-
-
-def _by_wavelength(bands: list[SpectralFile]) -> list[SpectralFile]:
-    known = [band.bands.wavelengths_nm for band in bands]
-    centres = [nm[0] for nm in known if nm is not None]
-    if len(centres) < len(bands):
-        return bands
-    return [bands[index] for index in np.argsort(centres, kind="stable")]
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
