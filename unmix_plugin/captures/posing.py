@@ -33,7 +33,7 @@ from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, ViewRecord
 from unmix_plugin.engine.geometry.camera_paths import focus_point, meeting_point
 from unmix_plugin.errors import CaptureError, counted
-from unmix_plugin.formats.ply import write_ply
+from unmix_plugin.formats.meshes import write_ply
 from unmix_plugin.scenes.placement import Placement
 from unmix_plugin.scenes.reading.cubes import map_array
 

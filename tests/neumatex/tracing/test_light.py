@@ -13,8 +13,7 @@ import torch
 from torch.testing import assert_close
 
 from unmix_plugin.errors import ConfigError, SceneError, SpectrumError
-from unmix_plugin.formats.exr import write_exr
-from unmix_plugin.formats.spectral_exr import write_spectral_exr
+from unmix_plugin.formats.exr import write_exr, write_spectral_exr
 from unmix_plugin.neumatex.tracing.built_in_lights import NAMES, built_in_environment
 from unmix_plugin.neumatex.tracing.environment import Environment, PictureInversion, directions_of_pixels
 from unmix_plugin.neumatex.tracing.light_files import (

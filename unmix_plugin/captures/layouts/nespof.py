@@ -37,8 +37,7 @@ from unmix_plugin.captures.layouts.transforms import (
 from unmix_plugin.captures.poses.pose_set import PoseSet
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.readers.opening import open_spectral_file
-from unmix_plugin.captures.readers.read_options import ReadOptions
-from unmix_plugin.captures.spectral_file import BandTable, SpectralFile, stack_bands
+from unmix_plugin.captures.spectral_file import BandTable, ReadOptions, SpectralFile, stack_bands
 from unmix_plugin.errors import CaptureError
 
 WAVELENGTH_NAME = re.compile(r"(\d+(?:\.\d+)?)(?:\s*nm)?", re.IGNORECASE)

@@ -37,7 +37,7 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.camera_paths import upright_cameras
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.formats.exr import write_exr
-from unmix_plugin.formats.glb import write_glb
+from unmix_plugin.formats.meshes import write_glb
 from unmix_plugin.neumatex.demo.shapes import demo_mesh
 from unmix_plugin.neumatex.demo.surfaces import LayeredSurface, SpectralSurface
 from unmix_plugin.neumatex.tracing.built_in_lights import NAMES, built_in_environment

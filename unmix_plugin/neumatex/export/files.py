@@ -24,9 +24,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.formats.exr import write_exr
-from unmix_plugin.formats.files import make_folder, write_file
-from unmix_plugin.formats.png import rgba_png_bytes
-from unmix_plugin.formats.textured_glb import TexturedMesh, write_textured_glb
+from unmix_plugin.formats.files import make_folder, rgba_png_bytes, write_file
+from unmix_plugin.formats.meshes import TexturedMesh, write_textured_glb
 from unmix_plugin.neumatex.export.atlas import BakedMaterial
 from unmix_plugin.neumatex.export.pbr_fit import PbrFit
 from unmix_plugin.neumatex.tracing import layers

@@ -86,7 +86,7 @@ def _read_display(path: Path) -> Picture:
 
 def _read_exr(path: Path) -> Picture:
     from unmix_plugin.captures.readers.exr import open_exr
-    from unmix_plugin.captures.readers.read_options import ReadOptions
+    from unmix_plugin.captures.spectral_file import ReadOptions
 
     everything = (slice(None), slice(None))
     file = open_exr(path, ReadOptions())

@@ -29,10 +29,10 @@ from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 
 from unmix_plugin.errors import SceneError, SpectrumError, counted
+from unmix_plugin.formats.envi import read_library_table
 from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_power, parse_light
-from unmix_plugin.spectral.library.material_library import read_library_table
 from unmix_plugin.spectral.library.spectra_csv import resample_spectra
 
 ENVIRONMENT_SUFFIXES = (".exr", ".hdr")
@@ -268,7 +268,7 @@ def _lit_everywhere(power: Float64[np.ndarray, " B"], lamp: str, bands: Bands) -
 def _read_wavelengths(path: Path, bands: Bands) -> np.ndarray | None:
     """Channels that are wavelengths, at the bands; None where there are none."""
     from unmix_plugin.captures.readers.exr import open_exr
-    from unmix_plugin.captures.readers.read_options import ReadOptions
+    from unmix_plugin.captures.spectral_file import ReadOptions
     from unmix_plugin.errors import CaptureError
 
     try:
