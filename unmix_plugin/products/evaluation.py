@@ -34,8 +34,7 @@ from unmix_plugin.figures.pictures import (
     paint,
 )
 from unmix_plugin.figures.plotting import RIGHT, WRONG, Colour, distinct_colours, own_colours
-from unmix_plugin.formats.files import write_file
-from unmix_plugin.formats.png import rgba_png_bytes
+from unmix_plugin.formats.files import rgba_png_bytes, write_file
 from unmix_plugin.products.abundances import SHARE_SCALE, share_panels
 from unmix_plugin.products.segmentation import paint_ids
 from unmix_plugin.scenes.scene import Scene
