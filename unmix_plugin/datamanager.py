@@ -35,8 +35,8 @@ from unmix_plugin.scenes.evidence import (
 )
 from unmix_plugin.scenes.geometry.carving import carve, mask_warning, share_explained
 from unmix_plugin.scenes.geometry.lighting import judge_light
-from unmix_plugin.scenes.geometry.pose_check import check_scene_poses, parallax_warning
 from unmix_plugin.scenes.geometry.surface_evidence import SurfaceEvidence
+from unmix_plugin.scenes.geometry.view_agreement import check_scene_poses, parallax_warning
 from unmix_plugin.scenes.pixel_table import PixelRays, PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import check_recorded_scene, scene_identity

@@ -20,7 +20,7 @@ from unmix_plugin.formats.envi import read_envi_library
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, measure_cube, read_array_header
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.images import UnreadableImageError, read_colour, read_labels, read_mask
-from unmix_plugin.scenes.reading.loader import locate_files
+from unmix_plugin.scenes.reading.loader import _locate_files
 from unmix_plugin.scenes.reading.splits import split_frames
 from unmix_plugin.scenes.reading.transforms_json import read_transforms
 from unmix_plugin.scenes.scene import Normalisation, SceneOptions
@@ -96,7 +96,7 @@ def transforms_reader() -> Reader:
 def _read_transforms(path: Path) -> None:
     faults = Faults(path.parent)
     entry = read_transforms(path.parent, faults)
-    locate_files(path.parent, entry, SceneOptions(), faults)
+    _locate_files(path.parent, entry, SceneOptions(), faults)
     for method in ("auto", "filename", "interval"):
         split_frames(entry, method, 2, faults)
     for frame in entry.frames:

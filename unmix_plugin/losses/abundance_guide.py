@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from unmix_plugin.spectral.evidence import OPAQUE_ALPHA
 from unmix_plugin.spectral.unmixing.endmembers import has_spectral_shape
 from unmix_plugin.spectral.unmixing.mixture_guide import (
     MixtureCache,
@@ -20,7 +21,6 @@ from unmix_plugin.spectral.unmixing.mixture_guide import (
 
 _OBSERVED_PIXELS = 256
 """Pixels of a batch by which the error of margins is followed."""
-_OPAQUE_ALPHA = 0.99
 
 
 class AbundanceGuide(nn.Module):
@@ -72,7 +72,7 @@ class AbundanceGuide(nn.Module):
     ) -> None:
         """Follow how far margins of composited abundances are from those of the measured spectra."""
         few = {name: values[:_OBSERVED_PIXELS] for name, values in batch.items()}
-        counts = has_spectral_shape(few["spectra"]) & (few["alpha"] > _OPAQUE_ALPHA)
+        counts = has_spectral_shape(few["spectra"]) & (few["alpha"] > OPAQUE_ALPHA)
         if "alpha_trust" in few:
             counts &= few["alpha_trust"] > 0
         found = margin_variance(

@@ -1,8 +1,9 @@
-"""What alpha and light of the training views are evidence of, sensor by sensor; see `spectral.evidence`.
+"""What training views are evidence of: where alpha can be trusted, how bright places are, what each band is worth.
 
-What training pixels are worth, band by band, and what a user should know of them before training.
+The rules for single pixels are in `spectral.evidence`; here they are applied sensor by sensor, with what a user should
+know of them before training.
 
-Notation: `B` bands of the scene, `P` points, `R` pixels.
+Notation: `B` bands of the scene, `G` groups, `P` points, `R` pixels.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from unmix_plugin.scenes.reading.sensors import lonely_sensors
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bad_values import BandNoise, judge_bands
 from unmix_plugin.spectral.evidence import (
+    OPAQUE_ALPHA,
     alpha_trust,
     background_level,
     brightness,
@@ -31,7 +33,6 @@ from unmix_plugin.spectral.evidence import (
 
 _PIXELS_OF_BACKGROUND = 100_000
 """Pixels of a sensor by which the brightness of its background is judged."""
-_OPAQUE_ALPHA = 0.99
 _PIXELS_TO_GROUP = 20_000
 _COLOUR_GROUPS = 24
 _LIT_BEST = 0.9
@@ -79,12 +80,12 @@ class AlphaEvidence:
     def log_shading(self) -> list[Float[np.ndarray, "H W"]]:
         """The same without the brightness of what pixels show, by groups of pixels of like spectra."""
         block = self._largest_block
-        colours = ColourGroups.of(block)
+        colours = _ColourGroups.of(block)
         return [local_log_brightness(seen) for seen in block.pictures(colours.shading)]
 
 
 @dataclass(frozen=True)
-class ColourGroups:
+class _ColourGroups:
     """Groups of pixels whose spectra are multiples of each other, more or less."""
 
     middles: Float[Tensor, "G B"]
@@ -93,7 +94,7 @@ class ColourGroups:
     """Brightness of those of each group that are lit best."""
 
     @staticmethod
-    def of(block: PixelBlock) -> ColourGroups:
+    def of(block: PixelBlock) -> _ColourGroups:
         """From some of a block's opaque pixels."""
         from scipy.cluster.vq import kmeans2  # slow to import
 
@@ -103,7 +104,7 @@ class ColourGroups:
         spectra = block.spectra(on_device)
         spectra = spectra[_is_clear(spectra, block.alpha[on_device], valid.to(spectra.device))]
         if len(spectra) < _COLOUR_GROUPS:
-            return ColourGroups(spectra.new_zeros(0, spectra.shape[1]), spectra.new_zeros(0))
+            return _ColourGroups(spectra.new_zeros(0, spectra.shape[1]), spectra.new_zeros(0))
         rng = np.random.default_rng(0)
         middles, group = kmeans2(
             normalize(spectra, dim=-1).cpu().numpy(), _COLOUR_GROUPS, minit="++", rng=rng
@@ -115,7 +116,7 @@ class ColourGroups:
             else 1.0
             for k in range(_COLOUR_GROUPS)
         ]
-        return ColourGroups(torch.from_numpy(middles).to(spectra), torch.tensor(best).to(spectra))
+        return _ColourGroups(torch.from_numpy(middles).to(spectra), torch.tensor(best).to(spectra))
 
     def shading(self, spectra: Tensor, alpha: Tensor, valid: Tensor) -> Tensor:
         """Brightness in that of the best lit pixels of the same group; 0 for pixels that say nothing."""
@@ -126,7 +127,7 @@ class ColourGroups:
 
 
 def _is_clear(spectra: Tensor, alpha: Tensor, valid: Tensor) -> Tensor:
-    return (alpha > _OPAQUE_ALPHA) & valid & (spectra.amax(dim=-1) < 1)
+    return (alpha > OPAQUE_ALPHA) & valid & (spectra.amax(dim=-1) < 1)
 
 
 def _clear_brightness(spectra: Tensor, alpha: Tensor, valid: Tensor) -> Tensor:
@@ -143,7 +144,7 @@ def _level(block: PixelBlock) -> float | None:
 
 
 _PIXELS_TO_JUDGE_BY = 20_000
-LEAST_OVERLAP = 0.1
+_LEAST_OVERLAP = 0.1
 """Share of what a sensor sees that another must see too."""
 _MOST_POINTS = 4000
 _FEWEST_BAD = 1e-5
@@ -216,10 +217,10 @@ def rig_warnings(scene: Scene, reachable: Bool[np.ndarray, "R R R"]) -> list[str
             f"no other sensor shares a band with {', '.join(alone)}: only their poses hold their spectra together"
         )
     for name, share in _overlaps(scene, sorted(used), reachable):
-        if share < LEAST_OVERLAP:
+        if share < _LEAST_OVERLAP:
             said.append(
                 f"of what sensor {name!r} sees, the other sensors see {share:.0%} (expected at least "
-                f"{LEAST_OVERLAP:.0%}): nothing joins their spectra; check the poses and lenses of the rig"
+                f"{_LEAST_OVERLAP:.0%}): nothing joins their spectra; check the poses and lenses of the rig"
             )
     return said
 

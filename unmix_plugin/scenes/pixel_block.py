@@ -1,25 +1,17 @@
-"""A part of a block's pixels in memory, renewed from disk while training goes on, for scenes larger than memory.
-
-The block is cut into chunks of neighbouring pixels, and the chunks are put in a random order, again and again. The pool
-holds a run of that order and moves along it as steps go by, one chunk at a time: so the disk is read in large pieces,
-every chunk stays as long as any other, and what the pool holds at a step follows from the step alone. A thread reads
-the chunks that come next.
-
-Notation: `R` drawn pixels, `b` channels.
-
-Pixels of many bands kept as few numbers each: what their subspace misses is less than the noise, or kept too.
-
-A pixel that the subspace misses by more than noise can explain, or that is saturated in some band, is kept whole: it
-may show what no other pixel shows, and of a saturated value one must know that it is.
-
-Notation: `R` pixels, `b` channels of a sensor.
-
-The pixels of one sensor in memory, as small as they were stored.
+"""The pixels of one sensor in memory, as small as they were stored, or a part of them that is renewed from disk.
 
 Cubes of 8 or 16 bits stay as they are in their files and become float32 when pixels are drawn: half or a quarter of the
-memory for the same numbers. Cubes of other types are kept as float32.
+memory for the same numbers. Cubes of other types are kept as float32. Pixels of many bands may be kept as a few numbers
+each, their components in a subspace. A pixel that the subspace misses by more than noise can explain, or that is
+saturated in some band, is kept whole: it may show what no other shows, and of a saturated value one must know that it
+is.
 
-Notation: `b` channels of the sensor, `R` drawn pixels.
+Of scenes larger than memory a pool holds some pixels. The block is cut into chunks of neighbouring pixels, and these
+are put in a random order, again and again. The pool holds a run of that order and moves along it as steps go by, one
+chunk at a time: so the disk is read in large pieces, every chunk stays as long as any other, and what the pool holds at
+a step follows from the step alone. A thread reads the chunks that come next.
+
+Notation: `R` drawn pixels, `b` channels of the sensor.
 """
 
 from __future__ import annotations
@@ -38,9 +30,9 @@ from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bad_values import repaired
 from unmix_plugin.spectral.subspace import SpectralSubspace, find_subspace
 
-CHUNK_BYTES = 4 << 20
+_CHUNK_BYTES = 4 << 20
 """Of values read at once."""
-PIXELS_PER_STEP = 2048
+_PIXELS_PER_STEP = 2048
 """Drawn in a usual step: so many pixels are renewed in it, too."""
 _CHUNKS_AHEAD = 4
 """Read before they are needed."""
@@ -64,11 +56,11 @@ class PixelPool:
             num_bytes: Memory of the pool; at least two chunks are held.
             read: Stored values (pixels, b) from a first pixel to one before a last, called in another thread.
         """
-        self._chunk_pixels = max(1, min(CHUNK_BYTES // pixel_bytes, len(valid)))
+        self._chunk_pixels = max(1, min(_CHUNK_BYTES // pixel_bytes, len(valid)))
         firsts = range(0, len(valid), self._chunk_pixels)
         self._firsts = [first for first in firsts if bool(valid[first : first + self._chunk_pixels].any())]
         self._num_held = min(len(self._firsts), max(2, num_bytes // (self._chunk_pixels * pixel_bytes)))
-        self._steps_per_chunk = max(1, self._chunk_pixels // PIXELS_PER_STEP)
+        self._steps_per_chunk = max(1, self._chunk_pixels // _PIXELS_PER_STEP)
         self._valid, self._read, self._pixel_bytes = valid, read, pixel_bytes
         self._reader = ThreadPoolExecutor(1, thread_name_prefix="pixels")
         self._arriving: dict[int, Future[Tensor]] = {}
@@ -129,9 +121,9 @@ class PixelPool:
 
 FEWEST_CHANNELS = 100
 """Of a sensor whose pixels are projected without being asked for."""
-LARGEST_SHARE = 0.25
+_LARGEST_SHARE = 0.25
 """Of the memory of whole pixels that projected ones may take for that."""
-LARGEST_RESIDUAL = 2.0
+_LARGEST_RESIDUAL = 2.0
 """In multiples of the noise; of a pixel that is kept whole it is more. Noise alone makes about 1."""
 _UNSATURATED = 0.9999
 """Largest value of a pixel that isn't kept whole: 1 stands for a saturated one."""
@@ -171,7 +163,7 @@ class Projection:
     def pays(self, whole_bytes: int) -> bool:
         """Whether results stay what they are and pixels need much less memory than `whole_bytes` each."""
         num_channels = self.subspace.basis.shape[1]
-        return self.residual <= 1 and self.pixel_bytes(num_channels) <= LARGEST_SHARE * whole_bytes
+        return self.residual <= 1 and self.pixel_bytes(num_channels) <= _LARGEST_SHARE * whole_bytes
 
     def describe(self, num_channels: int) -> str:
         """What a user should know."""
@@ -220,10 +212,10 @@ class ProjectedPixels:
 
 
 def _must_stay_whole(spectra: Float[Tensor, "R b"], residuals: Float[Tensor, " R"]) -> Bool[Tensor, " R"]:
-    return (residuals > LARGEST_RESIDUAL) | (spectra > _UNSATURATED).any(dim=-1)
+    return (residuals > _LARGEST_RESIDUAL) | (spectra > _UNSATURATED).any(dim=-1)
 
 
-COMPACT_TYPES = ("f2", "u1", "i1", "i2", "u2")
+_COMPACT_TYPES = ("f2", "u1", "i1", "i2", "u2")
 """Of NumPy, at most half as large as float32."""
 _CHUNK_VALUES = 1 << 23
 """Values of a view in single precision at a time: a view of many bands takes a GB."""
@@ -268,7 +260,7 @@ class PixelBlock:
         self._width, self._height = scene.cameras.size(views[0])
         types = {scene.stored_type(view) for view in views}
         kind = types.pop() if len(types) == 1 else "f4"
-        self._is_compact = kind in COMPACT_TYPES
+        self._is_compact = kind in _COMPACT_TYPES
         self._is_unsigned = kind == "u2"  # PyTorch can't index these, but the same bits as int16
         self._kept = np.dtype("i2" if self._is_unsigned else kind if self._is_compact else "f4")
         self.num_channels = scene.sensors[self.sensor].num_channels

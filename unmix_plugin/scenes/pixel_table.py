@@ -1,14 +1,10 @@
-"""How much memory pixels take, and how much of them to hold.
+"""The measured pixels that training draws from: of each sensor a block, one after the other, as far as memory goes.
 
-All pixels of some views, drawn evenly from the valid ones: of each sensor a block, one after the other.
+Pixels become rays, as many through the pixels of a coarse sensor as through those of a sharp one. A coarse pixel is the
+mean of many fine ones, but one ray through each of those would leave a batch with a few coarse pixels: too few to learn
+from, and all their rays end in the same cells, so that the other cells seem to be seen by no view.
 
-From pixels of any size to rays: as many through the pixels of a coarse sensor as through those of a sharp one.
-
-A coarse pixel is the mean of many fine ones, but one ray through each of those would leave a batch with a few coarse
-pixels: too few to learn from, and all their rays end in the same cells, so that the other cells seem to be seen by no
-view.
-
-Notation: `R` pixels, `P` rays through each.
+Notation: `R` pixels, `b` channels of a sensor, `P` rays through each pixel.
 """
 
 from __future__ import annotations
@@ -33,6 +29,7 @@ from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.pixel_block import FEWEST_CHANNELS, DrawnPixels, PixelBlock, Projection
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bad_values import FEWEST_BANDS, deviation_limits, deviations
+from unmix_plugin.spectral.evidence import OPAQUE_ALPHA
 
 _GIB = 2**30
 _USABLE_SHARE = 0.8
@@ -61,7 +58,7 @@ def available_bytes(device: torch.device) -> int | None:
     return min(free, max(0, limit - used))
 
 
-def budget_bytes(device: torch.device, memory_gb: float | None) -> int | None:
+def _budget_bytes(device: torch.device, memory_gb: float | None) -> int | None:
     """Memory that pixels may take; None where nothing limits it.
 
     Args:
@@ -75,12 +72,12 @@ def budget_bytes(device: torch.device, memory_gb: float | None) -> int | None:
     return None if available is None else int(_USABLE_SHARE * available)
 
 
-def pool_bytes(budget: int, memory_gb: float | None) -> int:
+def _pool_bytes(budget: int, memory_gb: float | None) -> int:
     """How much of pixels on disk to hold at a time; arguments as above."""
     return budget if memory_gb is not None else min(_LARGEST_POOL, budget)
 
 
-def describe_pool(blocks: tuple[PixelBlock, ...]) -> str:
+def _describe_pool(blocks: tuple[PixelBlock, ...]) -> str:
     """What stays on disk, in words."""
     held = sum(block.pool.num_bytes for block in blocks if block.pool is not None)
     what, needed = " and ".join(block.description for block in blocks), sum(b.num_bytes for b in blocks)
@@ -91,9 +88,8 @@ def describe_pool(blocks: tuple[PixelBlock, ...]) -> str:
 
 
 Components: TypeAlias = int | Literal["auto", "none"]
-OPAQUE_ALPHA = 0.99
 _PIXELS_TO_JUDGE_BY = 20_000
-MOST_LISTED = 1 << 24
+_MOST_LISTED = 1 << 24
 """Pixels of a block that are listed one by one to sample from; of larger blocks some are."""
 
 
@@ -134,7 +130,7 @@ class PixelTable:
         if not any(bool(block.valid.any()) for block in self.blocks):
             raise ConfigError("no valid pixel is left in the training views: masks leave out every one")
         self._scene, self._seed, self._mends = scene, seed, mends
-        self.notes = self._read(budget_bytes(device, memory_gb), memory_gb, components)
+        self.notes = self._read(_budget_bytes(device, memory_gb), memory_gb, components)
         """What a user should know of pixels that are not held as they were stored."""
 
     def _read(self, budget: int | None, memory_gb: float | None, components: Components) -> list[str]:
@@ -144,10 +140,10 @@ class PixelTable:
         for sensor, (projection, block) in found.items():
             needed[sensor] = int(len(block) * (5 + projection.pixel_bytes(block.num_channels)))
         if budget is not None and sum(needed.values()) > budget:
-            held, total = pool_bytes(budget, memory_gb), sum(block.num_bytes for block in self.blocks)
+            held, total = _pool_bytes(budget, memory_gb), sum(block.num_bytes for block in self.blocks)
             for block in self.blocks:
                 block.hold_part(held * block.num_bytes // total)
-            return [describe_pool(self.blocks)]
+            return [_describe_pool(self.blocks)]
         for block in self.blocks:
             limits = self._limits(block)
             if block.sensor in found:
@@ -250,9 +246,9 @@ class PixelTable:
         """Spectra of at most `count` random valid pixels of a sensor that are opaque."""
         block = next(block for block in self.blocks if block.sensor == sensor)
         pool: Int[Tensor, " pool"]
-        if len(block) > MOST_LISTED:
+        if len(block) > _MOST_LISTED:
             some = torch.Generator().manual_seed(seed)
-            pool = torch.randint(len(block), (MOST_LISTED // 8,), generator=some).unique()
+            pool = torch.randint(len(block), (_MOST_LISTED // 8,), generator=some).unique()
             pool = pool[block.valid[pool]]
         else:
             pool = torch.arange(len(block)) if bool(block.valid.all()) else block.valid.nonzero()[:, 0]

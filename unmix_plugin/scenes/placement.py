@@ -14,10 +14,10 @@ from jaxtyping import Float, Float64
 
 from unmix_plugin.scenes.reading.faults import Faults, describe, read_number
 
-TRANSFORM_KEY, SCALE_KEY, OFFSET_KEY = "applied_transform", "applied_scale", "offset"
-ROTATION_TOLERANCE = 1e-5
+_TRANSFORM_KEY, _SCALE_KEY, _OFFSET_KEY = "applied_transform", "applied_scale", "offset"
+_ROTATION_TOLERANCE = 1e-5
 """Largest element of R^T R - 1 that passes as rounding of printed digits."""
-SCALE_RANGE = (1e-12, 1e12)
+_SCALE_RANGE = (1e-12, 1e12)
 
 
 @dataclass(frozen=True)
@@ -53,38 +53,38 @@ class Placement:
     def to_json(self) -> dict[str, Any]:
         """Keys of transforms.json; `read_placement` restores the same value."""
         return {
-            TRANSFORM_KEY: np.column_stack([self.rotation, self.translation]).tolist(),
-            SCALE_KEY: self.scale,
-            OFFSET_KEY: self.offset.tolist(),
+            _TRANSFORM_KEY: np.column_stack([self.rotation, self.translation]).tolist(),
+            _SCALE_KEY: self.scale,
+            _OFFSET_KEY: self.offset.tolist(),
         }
 
 
 def read_placement(content: dict[str, Any], faults: Faults, where: str) -> Placement:
     """What transforms.json records; the identity where it records none, and with noted faults where it is wrong."""
-    transform = _numbers(content.get(TRANSFORM_KEY), (3, 4))
-    if content.get(TRANSFORM_KEY) is None:
+    transform = _numbers(content.get(_TRANSFORM_KEY), (3, 4))
+    if content.get(_TRANSFORM_KEY) is None:
         transform = np.eye(3, 4)
     elif transform is None or not _is_rotation(transform[:, :3]):
         faults.add(
             where,
-            f"'{TRANSFORM_KEY}' is {describe(content[TRANSFORM_KEY])}; expected 3 rows of 4 numbers, a rotation and a "
-            "translation; put scale into 'applied_scale', or drop the key",
+            f"'{_TRANSFORM_KEY}' is {describe(content[_TRANSFORM_KEY])}; expected 3 rows of 4 numbers, a rotation and "
+            "a translation; put scale into 'applied_scale', or drop the key",
         )
         transform = np.eye(3, 4)
-    scale = 1.0 if content.get(SCALE_KEY) is None else read_number(content[SCALE_KEY])
-    if scale is None or not SCALE_RANGE[0] <= scale <= SCALE_RANGE[1]:
-        faults.add(where, f"'{SCALE_KEY}' is {describe(content[SCALE_KEY])}; expected a number above 0")
+    scale = 1.0 if content.get(_SCALE_KEY) is None else read_number(content[_SCALE_KEY])
+    if scale is None or not _SCALE_RANGE[0] <= scale <= _SCALE_RANGE[1]:
+        faults.add(where, f"'{_SCALE_KEY}' is {describe(content[_SCALE_KEY])}; expected a number above 0")
         scale = 1.0
-    offset = np.zeros(3) if content.get(OFFSET_KEY) is None else _numbers(content[OFFSET_KEY], (3,))
+    offset = np.zeros(3) if content.get(_OFFSET_KEY) is None else _numbers(content[_OFFSET_KEY], (3,))
     if offset is None:
-        faults.add(where, f"'{OFFSET_KEY}' is {describe(content[OFFSET_KEY])}; expected 3 finite numbers")
+        faults.add(where, f"'{_OFFSET_KEY}' is {describe(content[_OFFSET_KEY])}; expected 3 finite numbers")
         offset = np.zeros(3)
     return Placement(transform[:, :3], transform[:, 3], scale, offset)
 
 
 def _is_rotation(matrix: Float64[np.ndarray, "3 3"]) -> bool:
     with np.errstate(over="ignore", invalid="ignore"):
-        is_orthonormal = np.abs(matrix.T @ matrix - np.eye(3)).max() <= ROTATION_TOLERANCE
+        is_orthonormal = np.abs(matrix.T @ matrix - np.eye(3)).max() <= _ROTATION_TOLERANCE
     return bool(is_orthonormal) and float(np.linalg.det(matrix)) > 0
 
 

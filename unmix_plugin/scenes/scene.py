@@ -286,25 +286,25 @@ def scene_identity(summary: Mapping[str, Any]) -> dict[str, Any]:
     return {**{key: summary.get(key) for key in _COMPARED}, **rig, "files": hashes}
 
 
-Numbers: TypeAlias = tuple[float, ...]
+_Numbers: TypeAlias = tuple[float, ...]
 
 
 @dataclass(frozen=True)
-class RecordedFrame:
+class _RecordedFrame:
     """A `Normalisation` in JSON."""
 
-    rotation: tuple[Numbers, Numbers, Numbers] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    rotation: tuple[_Numbers, _Numbers, _Numbers] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
     scale: float = 1.0
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
-class RecordedScene:
+class _RecordedScene:
     """Entries of a data manager's metadata and summary; what a run lacks keeps its default."""
 
-    wavelengths_nm: Numbers = ()
-    illuminant: Numbers | None = None
+    wavelengths_nm: _Numbers = ()
+    illuminant: _Numbers | None = None
     has_alpha: bool = False
     is_unbounded: bool = False
     grid_resolution: int = 64
@@ -314,9 +314,9 @@ class RecordedScene:
     num_train_pixels: int = 0
     line_rows: tuple[int, ...] | None = None
     root: str = ""
-    normalisation: RecordedFrame | None = None
+    normalisation: _RecordedFrame | None = None
     material_names: tuple[str, ...] | None = None
-    endmembers: tuple[Numbers, ...] | None = None
+    endmembers: tuple[_Numbers, ...] | None = None
     has_labels: bool = False
     has_abundances: bool = False
     input_hashes: Mapping[str, str] = field(default_factory=dict)
@@ -332,8 +332,8 @@ def check_recorded_scene(values: Mapping[str, Any]) -> None:
         KeyError, IndexError, TypeError: a sensor is damaged.
         ConfigError: the same, found by `config_from_json`.
     """
-    known = {entry.name: values[entry.name] for entry in fields(RecordedScene) if entry.name in values}
-    scene = config_from_json(known, RecordedScene(), "the scene")
+    known = {entry.name: values[entry.name] for entry in fields(_RecordedScene) if entry.name in values}
+    scene = config_from_json(known, _RecordedScene(), "the scene")
     bands = len(scene.wavelengths_nm)
     steps = zip(scene.wavelengths_nm, scene.wavelengths_nm[1:], strict=False)
     rules = {

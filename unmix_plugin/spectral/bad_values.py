@@ -12,9 +12,9 @@ from unmix_plugin.spectral.evidence import brightness
 from unmix_plugin.spectral.unmixing.num_materials import estimate_noise
 
 FEWEST_BANDS = 8
-USUAL_SHARE, USUAL_FACTOR = 0.95, 1.5
+_USUAL_SHARE, _USUAL_FACTOR = 0.95, 1.5
 """Deviations up to that multiple of what this share of the pixels has are usual."""
-LEAST_DEVIATION = 0.3
+_LEAST_DEVIATION = 0.3
 """Of a bad value, as a share of the scene's median brightness."""
 _PEAK = 1.2
 """By how much a bad value deviates more than the values in the bands beside it, which deviate because of it."""
@@ -41,10 +41,10 @@ def deviation_limits(pixels: Float[Tensor, "N B"]) -> Float[Tensor, "B"]:
     Args:
         pixels: Spectra of the scene, background left out; at least one.
     """
-    rank = min(max(1, round(USUAL_SHARE * len(pixels))), len(pixels))
+    rank = min(max(1, round(_USUAL_SHARE * len(pixels))), len(pixels))
     usual = deviations(pixels).abs().kthvalue(rank, dim=0).values
-    floor = LEAST_DEVIATION * pixels.square().mean(dim=1).sqrt().median()
-    return torch.maximum(USUAL_FACTOR * usual, floor)
+    floor = _LEAST_DEVIATION * pixels.square().mean(dim=1).sqrt().median()
+    return torch.maximum(_USUAL_FACTOR * usual, floor)
 
 
 def repaired(
@@ -89,15 +89,15 @@ def _mirrored(places: Int[Tensor, "C 24"], size: int) -> Int[Tensor, "C 24"]:
     return torch.where(inside < size, inside, 2 * size - 2 - inside).clamp(0, size - 1)
 
 
-FEWEST_JUDGED_BANDS, PIXELS_PER_BAND = 8, 10
+_FEWEST_JUDGED_BANDS, _PIXELS_PER_BAND = 8, 10
 """Least number of bands, and of pixels for each, from which noise can be estimated."""
-PLAIN_FACTOR = 3.0
+_PLAIN_FACTOR = 3.0
 """Noise up to this multiple of the usual band's weighs nothing down."""
-PLAIN_NOISE = 0.02
+_PLAIN_NOISE = 0.02
 """Share of the median brightness up to which a band counts as clean, whatever the others are."""
-NOISE_SHARE = 0.7
+_NOISE_SHARE = 0.7
 """Standard deviation of noise, as a share of the band's own, above which a band is mostly noise."""
-DEAD_SPREAD, LEAST_WEIGHT = 1e-5, 1e-4
+_DEAD_SPREAD, _LEAST_WEIGHT = 1e-5, 1e-4
 """Standard deviation up to which a band shows one value everywhere; and its weight, before weights are scaled."""
 _SIGMA_OF_MAD = 1.4826
 
@@ -129,19 +129,19 @@ def judge_bands(pixels: Float[Tensor, "N B"]) -> BandNoise:
         pixels: Spectra of a scene, background left out.
     """
     num_bands = pixels.shape[1]
-    if num_bands < FEWEST_JUDGED_BANDS or len(pixels) < PIXELS_PER_BAND * num_bands:
+    if num_bands < _FEWEST_JUDGED_BANDS or len(pixels) < _PIXELS_PER_BAND * num_bands:
         return BandNoise.unknown(num_bands)
-    dead = pixels.double().std(dim=0) <= DEAD_SPREAD
-    if int((~dead).sum()) < FEWEST_JUDGED_BANDS:
+    dead = pixels.double().std(dim=0) <= _DEAD_SPREAD
+    if int((~dead).sum()) < _FEWEST_JUDGED_BANDS:
         return replace(BandNoise.unknown(num_bands), dead=dead)
     sigmas = pixels.new_zeros(num_bands)
     sigmas[~dead] = _robust_spread(estimate_noise(pixels[:, ~dead]))
-    usual = torch.maximum(sigmas[~dead].median(), PLAIN_NOISE * brightness(pixels[:, ~dead]).median())
-    weights = (PLAIN_FACTOR * usual / sigmas.clamp(min=1e-12)).square().clamp(LEAST_WEIGHT, 1.0)
-    weights = torch.where(dead, LEAST_WEIGHT, weights)
+    usual = torch.maximum(sigmas[~dead].median(), _PLAIN_NOISE * brightness(pixels[:, ~dead]).median())
+    weights = (_PLAIN_FACTOR * usual / sigmas.clamp(min=1e-12)).square().clamp(_LEAST_WEIGHT, 1.0)
+    weights = torch.where(dead, _LEAST_WEIGHT, weights)
     if bool((weights < 1).any()):
         weights = weights / weights.mean()
-    is_noise = (sigmas > NOISE_SHARE * pixels.std(dim=0)) & (weights < 1) & ~dead
+    is_noise = (sigmas > _NOISE_SHARE * pixels.std(dim=0)) & (weights < 1) & ~dead
     return BandNoise(sigmas, weights, is_noise, dead)
 
 

@@ -21,10 +21,10 @@ from unmix_plugin.errors import SpectrumError, counted
 VISIBLE_RANGE_NM = (380.0, 780.0)
 """What a band must lie in to count as visible: the range in which colour matching functions are noticeably non-zero."""
 
-MEASURABLE_RANGE_NM = (20.0, 1e6)
+_MEASURABLE_RANGE_NM = (20.0, 1e6)
 """Where optical sensors measure; numbers below are wavelengths in micrometres, numbers above are in no unit."""
 
-LONE_BAND_WIDTH_NM = 10.0
+_LONE_BAND_WIDTH_NM = 10.0
 """Width given to a band that has no neighbour to tell its spacing."""
 
 _NM_PER_UNIT = {
@@ -86,7 +86,7 @@ class Bands:
         """The B + 1 borders of the bands' intervals in nm, increasing."""
         centers = self.centers_nm
         if len(centers) == 1:
-            return centers + LONE_BAND_WIDTH_NM * np.array([-0.5, 0.5])
+            return centers + _LONE_BAND_WIDTH_NM * np.array([-0.5, 0.5])
         inner = (centers[1:] + centers[:-1]) / 2
         return np.concatenate([[2 * centers[0] - inner[0]], inner, [2 * centers[-1] - inner[-1]]])
 
@@ -129,7 +129,7 @@ def require_nanometres(centers_nm: Float64[np.ndarray, " B"]) -> None:
     Raises:
         SpectrumError: the wavelengths look like micrometres, or lie where no optical sensor measures.
     """
-    low, high = MEASURABLE_RANGE_NM
+    low, high = _MEASURABLE_RANGE_NM
     first, last = float(centers_nm.min()), float(centers_nm.max())
     if last < low:
         raise SpectrumError(

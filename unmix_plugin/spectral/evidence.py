@@ -1,14 +1,10 @@
-"""What a measured pixel is evidence of: how bright it is, and whether there is anything at all.
+"""What a measured pixel is evidence of, and how far a rendered one is from it.
 
 Alpha is evidence, not law: masks err by a pixel along edges, have holes and specks. Light is evidence too. Where the
 two contradict each other, alpha is not trusted, and only light counts.
 
 Notation: `R` pixels, `B` bands; spectra are on black, premultiplied by alpha. The brightness of a pixel is the root
 mean square of its spectrum.
-
-How far rendered spectra are from measured ones, over a common background.
-
-Notation: `R` pixels, `B` bands.
 """
 
 from __future__ import annotations
@@ -21,9 +17,11 @@ from torch import Tensor
 
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb
 
+OPAQUE_ALPHA = 0.99
+"""From which on a pixel shows nothing of what is behind it."""
 _TRANSPARENT = 0.5 / 255
 """Largest alpha of a pixel that shows nothing."""
-BLOWN_OUT = 0.9
+_BLOWN_OUT = 0.9
 """Value from which a band counts as saturated."""
 _SIGMAS = 6.0
 """Standard deviations of the background's noise above its median that still count as background."""
@@ -33,7 +31,7 @@ _DARK_SHARE = 0.5
 _FAINTEST_SURPLUS = 0.02
 """Brightness beyond what alpha allows that contradicts it: alpha is rounded, and edges are filtered."""
 _PLAIN_BRIGHTNESS = 0.2
-"""Median brightness of opaque pixels from which a scene counts as well exposed."""
+"""Median brightness of opaque pixels from which a scene counts as well exposed; of a pixel that keeps its weight."""
 _LARGEST_EXPOSURE = 100.0
 _BRIGHTER_PART = 0.9
 """Quantile of brightness that is compared with the median."""
@@ -53,7 +51,7 @@ def is_blown_out(spectra: Float[Tensor, "*pixels B"]) -> Bool[Tensor, "*pixels"]
 
     From 0.9 on, since cameras, filters and codecs end a little below full scale.
     """
-    return (spectra > BLOWN_OUT).any(dim=-1)
+    return (spectra > _BLOWN_OUT).any(dim=-1)
 
 
 def background_level(spectra: Float[Tensor, "R B"], alpha: Float[Tensor, "R"]) -> float | None:
@@ -154,8 +152,6 @@ def bounded_square(errors: Float[Tensor, "R C"], outliers: Float[Tensor, "R 1"])
     return torch.where(size <= outliers, errors.square(), outliers * (2 * size - outliers))
 
 
-_PLAIN_BRIGHTNESS_LOSSES = 0.2
-"""Root mean square over bands of a pixel that keeps its weight."""
 FAINT = 0.02
 """Brightness below which weights hardly grow: there is noise."""
 
@@ -167,8 +163,7 @@ def relative_weights(pred_spectra: Float[Tensor, "R B"], power: float) -> Float[
 
     Source: Mildenhall et al. 2022, NeRF in the Dark, for a power of 2.
     """
-    brightness = pred_spectra.detach().square().mean(dim=-1).sqrt()
-    return ((_PLAIN_BRIGHTNESS_LOSSES + FAINT) / (brightness + FAINT)) ** power
+    return ((_PLAIN_BRIGHTNESS + FAINT) / (brightness(pred_spectra.detach()) + FAINT)) ** power
 
 
 _SURELY_LIT = 0.05
@@ -180,7 +175,7 @@ def solid_evidence(measured: Float[Tensor, "R B"]) -> Float[Tensor, "R"]:
 
     A black pixel may show a black thing or nothing, such as what lies beside an open room.
     """
-    return (measured.square().mean(dim=-1).sqrt() / _SURELY_LIT).clamp(max=1)
+    return (brightness(measured) / _SURELY_LIT).clamp(max=1)
 
 
 def srgb_error(

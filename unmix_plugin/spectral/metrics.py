@@ -130,7 +130,7 @@ def spectral_angle(a: Float[Tensor, "*#rays B"], b: Float[Tensor, "*#rays B"]) -
 
 
 @dataclass(frozen=True)
-class EndmemberMatching:
+class _EndmemberMatching:
     """Which predicted endmember stands for which true one."""
 
     pred_ids: tuple[int, ...]
@@ -142,13 +142,13 @@ class EndmemberMatching:
 
 def match_endmembers(
     pred_endmembers: Float[Tensor, "P B"], true_endmembers: Float[Tensor, "K B"]
-) -> EndmemberMatching:
+) -> _EndmemberMatching:
     """Pair predicted with true endmembers one to one so that the sum of spectral angles is least (Hungarian method)."""
     from scipy.optimize import linear_sum_assignment
 
     angles = spectral_angle(true_endmembers.double()[:, None], pred_endmembers.double()[None])
     true_ids, pred_ids = linear_sum_assignment(angles.cpu().numpy())
-    return EndmemberMatching(
+    return _EndmemberMatching(
         pred_ids=tuple(int(i) for i in pred_ids),
         true_ids=tuple(int(i) for i in true_ids),
         angles=tuple(float(angles[t, p]) for t, p in zip(true_ids, pred_ids, strict=True)),
@@ -172,7 +172,7 @@ def endmember_angle(
 def abundance_rmse(
     pred_abundances: Float[Tensor, "H W P"],
     true_abundances: Float[Tensor, "H W K"],
-    matching: EndmemberMatching,
+    matching: _EndmemberMatching,
     mask: Bool[Tensor, "H W"] | None = None,
 ) -> float:
     """Root mean squared error of abundances over pixels and true materials; NaN where no pixel counts.

@@ -35,7 +35,7 @@ _CENTER_DECIMALS = 3
 
 
 @dataclass(frozen=True)
-class SensorBands:
+class _SensorBands:
     """What a sensor makes of spectra on given bands."""
 
     sensor: str
@@ -95,7 +95,7 @@ class Sensor:
         """Centres of the channels: mean wavelength, weighted with the response."""
         return Bands(self._mean_wavelengths(self.responses))
 
-    def seen_by(self, bands: Bands) -> SensorBands:
+    def seen_by(self, bands: Bands) -> _SensorBands:
         """The channels as means over the bands of a spectrum.
 
         A band weighs as much as of the channel's response lies in its interval, so channels narrower than the bands
@@ -114,7 +114,7 @@ class Sensor:
         left_out = [f"{names[s]} ({self._span(s)})" for s in np.flatnonzero(~is_covered).tolist()]
         if not is_covered.any():
             raise SpectrumError(f"the sensor '{self.name}' sees nothing: {covered}, {', '.join(left_out)}")
-        return SensorBands(
+        return _SensorBands(
             self.name,
             (in_bands[is_covered] / seen[is_covered, None]).T,
             Bands(self.bands.centers_nm[is_covered]),

@@ -67,7 +67,7 @@ class PcaColours:
         return ((components - self.low) / (self.high - self.low).clamp(min=1e-9)).clamp(0, 1)
 
 
-LEAST_NOISE = 0.005
+_LEAST_NOISE = 0.005
 """Noise that is assumed at least, as a share of the median brightness: what any model misses is more."""
 _SHARE, _SIGMAS_OF_SHARE = 0.95, 1.96
 """Of normal errors, so many are within so many standard deviations; spikes are among the others."""
@@ -122,7 +122,7 @@ def find_subspace(pixels: Float[Tensor, "N B"], num_components: int | None = Non
             f"a subspace of {asked} needs 1 to as many components as bands, and more pixels than bands; found "
             f"{num_pixels} pixels of {num_bands} bands"
         )
-    least = max(LEAST_NOISE * float(brightness(pixels).median()), 1e-6)
+    least = max(_LEAST_NOISE * float(brightness(pixels).median()), 1e-6)
     rank = max(1, round(_SHARE * num_pixels))
     sigmas = estimate_noise(pixels).abs().kthvalue(rank, dim=0).values.double() / _SIGMAS_OF_SHARE
     sigmas = sigmas.clamp(min=least)

@@ -6,7 +6,7 @@ import torch
 from tests.scenes.scene_factory import look_at, make_scene
 from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
 from unmix_plugin.engine.geometry.space import SceneBox
-from unmix_plugin.scenes.geometry.pose_check import parallax_warning
+from unmix_plugin.scenes.geometry.view_agreement import parallax_warning
 
 BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 

@@ -9,7 +9,7 @@ import pytest
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes import load_scene
 from unmix_plugin.scenes.demo.scene import make_demo_scene
-from unmix_plugin.scenes.geometry.pose_check import check_scene_poses, compare_conventions
+from unmix_plugin.scenes.geometry.view_agreement import check_scene_poses, compare_conventions
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 WRONG = {

@@ -16,7 +16,7 @@ from unmix_plugin.scenes.demo import scene as demo_scene
 from unmix_plugin.scenes.demo.scene import ROOM, TABLE, WORLD, make_demo_scene
 from unmix_plugin.scenes.demo.shading import render_view
 from unmix_plugin.scenes.geometry.carving import carve_world
-from unmix_plugin.scenes.geometry.world_evidence import WorldEvidence
+from unmix_plugin.scenes.geometry.view_agreement import WorldEvidence
 
 BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 

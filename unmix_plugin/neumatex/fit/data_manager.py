@@ -42,9 +42,8 @@ from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.neumatex.tracing.rays import RayMesh
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.colour.conversion import srgb_to_linear
+from unmix_plugin.spectral.evidence import OPAQUE_ALPHA
 
-OPAQUE = 0.99
-"""Alpha from which a pixel shows the object alone."""
 _CORNERS = ((0.02, 0.02), (0.98, 0.02), (0.02, 0.98), (0.98, 0.98), (0.5, 0.5))
 """Where in a pixel the mesh has to be seen, so that every place in it sees it."""
 
@@ -82,7 +81,7 @@ class PixelList:
         share = most // len(scene.split.train) + 1
         for row, view in enumerate(scene.split.train):
             picture = scene.pictures.read(view)
-            shown = torch.from_numpy(opacity(picture) >= OPAQUE) & sees_mesh(ray_mesh, scene, view)
+            shown = torch.from_numpy(opacity(picture) >= OPAQUE_ALPHA) & sees_mesh(ray_mesh, scene, view)
             rows, columns = shown.nonzero(as_tuple=True)
             if len(rows) > share:
                 kept = torch.randperm(len(rows), generator=generator)[:share]

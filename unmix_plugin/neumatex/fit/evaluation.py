@@ -22,12 +22,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from unmix_plugin.engine import Cameras
-from unmix_plugin.neumatex.fit.data_manager import OPAQUE
 from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS, SpectralDisplay, psnr_db, tone_curve
 from unmix_plugin.neumatex.tracing.families import MaterialFamily, SpectralFamily
 from unmix_plugin.neumatex.tracing.path_tracer import TracedObject, rays_radiance
 from unmix_plugin.neumatex.tracing.rays import pixel_hits
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb
+from unmix_plugin.spectral.evidence import OPAQUE_ALPHA
 from unmix_plugin.spectral.metrics import abundance_rmse, endmember_angle, match_endmembers, spectral_angle
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def evaluate_object_image(
     Args:
         outputs: Of `evaluation_outputs`.
     """
-    shown = batch["alpha"] >= OPAQUE
+    shown = batch["alpha"] >= OPAQUE_ALPHA
     light, base = outputs["light"][shown], outputs["base_colour"][shown]
     tone = TONE_MAPPINGS[int(batch["tone"])]
     predicted, true = model.compared(light, batch["numbers"][shown], tone, tone_curve("agx"))
@@ -77,7 +77,7 @@ def evaluation_outputs(
     model: NeumatexModel, traced: TracedObject, camera: Cameras, batch: dict[str, Tensor]
 ) -> dict[str, Float[Tensor, "H W C"]]:
     """`light` and `base_colour`, both linear, and `parameters` of the material, where pixels count; 0 elsewhere."""
-    shown = batch["alpha"] >= OPAQUE
+    shown = batch["alpha"] >= OPAQUE_ALPHA
     hits = pixel_hits(traced.ray_mesh, camera, 0, SUBPIXELS)
     hits = hits.select(shown.flatten()[hits.pixels])
     light = rays_radiance(
@@ -134,7 +134,7 @@ def evaluate_spectral_image(
         outputs: Of `image_evaluation.evaluation_outputs`.
     """
     assert isinstance(model.curve, SpectralDisplay)
-    shown = batch["alpha"] >= OPAQUE
+    shown = batch["alpha"] >= OPAQUE_ALPHA
     light, base = outputs["light"][shown], outputs["base_colour"][shown]
     predicted, true = light.clamp(0, 1), batch["numbers"][shown].clamp(0, 1)
     error = (predicted - true).square()

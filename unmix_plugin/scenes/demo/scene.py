@@ -91,7 +91,7 @@ def staging_for(directory: Path, what: str, overwrite: bool) -> Iterator[Path]:
             f"{directory} is not empty; choose another folder, or replace what is there with --overwrite"
         )
     try:
-        with staging_beside(directory) as staging:
+        with _staging_beside(directory) as staging:
             yield staging
     except OSError as error:  # NumPy's own has no strerror
         raise SceneError(
@@ -100,7 +100,7 @@ def staging_for(directory: Path, what: str, overwrite: bool) -> Iterator[Path]:
 
 
 @contextmanager
-def staging_beside(directory: Path) -> Iterator[Path]:
+def _staging_beside(directory: Path) -> Iterator[Path]:
     """A temporary folder on the same disk, so that what is built there can be renamed into place."""
     directory.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{directory.name}-", dir=directory.parent) as folder:
@@ -128,7 +128,7 @@ def written_once(
     if is_complete(target):
         return target
     try:
-        with staging_beside(target) as staging:
+        with _staging_beside(target) as staging:
             write(staging / target.name)
             if target.exists() and not is_complete(target):
                 target.rename(staging / "incomplete")
@@ -142,10 +142,10 @@ def written_once(
     return target
 
 
-VIEW_ANGLE_DEG = 38.0
+_VIEW_ANGLE_DEG = 38.0
 CAMERA_DISTANCE = 4.1
 LOOK_AT = (0.0, 0.0, 0.22)
-ELEVATIONS_DEG = (16.0, 68.0)
+_ELEVATIONS_DEG = (16.0, 68.0)
 
 
 def demo_cameras(size: int, views: int) -> Cameras:
@@ -154,12 +154,12 @@ def demo_cameras(size: int, views: int) -> Cameras:
     azimuths = i * np.pi * (3 - np.sqrt(5))
     # A second irrational stride decouples elevation from order, so that every 4th view samples the whole dome.
     shares = (i * np.sqrt(2) + 0.5 / views) % 1
-    low, high = np.sin(np.deg2rad(ELEVATIONS_DEG))
+    low, high = np.sin(np.deg2rad(_ELEVATIONS_DEG))
     heights = low + (high - low) * shares
     flat = np.sqrt(1 - heights**2)
     backward = np.stack([flat * np.cos(azimuths), flat * np.sin(azimuths), heights], axis=1)
     positions = np.asarray(LOOK_AT) + CAMERA_DISTANCE * backward
-    return upright_cameras(positions, backward, size, np.deg2rad(VIEW_ANGLE_DEG))
+    return upright_cameras(positions, backward, size, np.deg2rad(_VIEW_ANGLE_DEG))
 
 
 def lens_entries(cameras: Cameras) -> dict[str, Any]:
@@ -213,7 +213,7 @@ _PHONE_ANGLE_DEG = 62.0
 
 
 @dataclass(frozen=True)
-class Place:
+class _Place:
     """What there is to see, and from where."""
 
     things: Sequence[Thing]
@@ -223,7 +223,7 @@ class Place:
     """What is behind all things; None leaves their pictures an alpha."""
 
 
-def open_sky(directions: Float[np.ndarray, "R 3"]) -> Float[np.ndarray, "R K"]:
+def _open_sky(directions: Float[np.ndarray, "R 3"]) -> Float[np.ndarray, "R K"]:
     """Cyan above, white at the horizon, with broad clouds."""
     x, y, z = directions.T
     haze = np.exp(-4.0 * z.clip(0))
@@ -235,7 +235,7 @@ def open_sky(directions: Float[np.ndarray, "R 3"]) -> Float[np.ndarray, "R K"]:
     return found
 
 
-def patches(period: float, seed: float, fade: float = np.inf) -> Blend:
+def _patches(period: float, seed: float, fade: float = np.inf) -> Blend:
     """Smooth patches of a surface, about `period` of its own units wide, which fade at distances around `fade`."""
 
     def blend(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
@@ -253,7 +253,7 @@ def _ground() -> Thing:
     # A cylinder's or a box's own coordinates are over its half sizes.
     period, fade = 1.3 / _GROUND_EDGE, 9.0 / _GROUND_EDGE
     placement = Placement("box", (0.0, 0.0, _GROUND_HEIGHT - 0.5), (_GROUND_EDGE, _GROUND_EDGE, 0.5))
-    return Thing(placement, Surface("green", "yellow", patches(period, 0.7, fade)))
+    return Thing(placement, Surface("green", "yellow", _patches(period, 0.7, fade)))
 
 
 def _far_things(count: int = 14, seed: int = 5) -> list[Thing]:
@@ -267,7 +267,7 @@ def _far_things(count: int = 14, seed: int = 5) -> list[Thing]:
         names = [str(name) for name in generator.choice(MATERIALS, 2, replace=False)]
         primitive = ("box", "sphere", "cylinder")[index % 3]
         placement = Placement(primitive, center, (size, size, size), turn_deg=float(generator.uniform(0, 90)))
-        blend = plain if index % 2 else patches(1.3, float(index))
+        blend = plain if index % 2 else _patches(1.3, float(index))
         found.append(Thing(placement, Surface(names[0], names[1], blend)))
     return found
 
@@ -291,7 +291,8 @@ def _room() -> list[Thing]:
     ]
     return [
         Thing(
-            Placement("box", center, half), Surface(first, second, _in_world(half, patches(0.9, 1.3 * index)))
+            Placement("box", center, half),
+            Surface(first, second, _in_world(half, _patches(0.9, 1.3 * index))),
         )
         for index, (center, half, first, second) in enumerate(slabs)
     ]
@@ -303,7 +304,7 @@ def _in_world(half_sizes: tuple[float, float, float], blend: Blend) -> Blend:
     return lambda points: blend(points * sizes)
 
 
-def room_cameras(size: int, views: int, seed: int = 11) -> Cameras:
+def _room_cameras(size: int, views: int, seed: int = 11) -> Cameras:
     """Cameras as of a hand-held phone on one side of the room, turned towards the table and the windows behind it."""
     generator = np.random.default_rng(seed)
     shifts = generator.uniform(-1, 1, (views, 3))
@@ -314,17 +315,17 @@ def room_cameras(size: int, views: int, seed: int = 11) -> Cameras:
     return upright_cameras(positions, backward, size, np.deg2rad(_PHONE_ANGLE_DEG))
 
 
-TABLE = Place(THINGS, demo_cameras)
+TABLE = _Place(THINGS, demo_cameras)
 """The table before nothing."""
-WORLD = Place((*THINGS, _ground(), *_far_things()), demo_cameras, open_sky)
+WORLD = _Place((*THINGS, _ground(), *_far_things()), demo_cameras, _open_sky)
 """The table on a ground that runs to the horizon, with huts and trees, under a sky."""
-ROOM = Place((*THINGS, *_room(), _ground(), *_far_things(20, seed=8)), room_cameras, open_sky)
+ROOM = _Place((*THINGS, *_room(), _ground(), *_far_things(20, seed=8)), _room_cameras, _open_sky)
 """The table in a room with windows onto the same world."""
-PLACES: Mapping[str, Place] = {"table": TABLE, "world": WORLD, "room": ROOM}
+PLACES: Mapping[str, _Place] = {"table": TABLE, "world": WORLD, "room": ROOM}
 
 
 DEFAULT_SIZE, DEFAULT_BANDS, DEFAULT_VIEWS = 96, 31, 32
-SIZE_BOUNDS, BANDS_BOUNDS, VIEWS_BOUNDS = (16, 1024), (3, 512), (4, 1000)
+SIZE_BOUNDS, _BANDS_BOUNDS, VIEWS_BOUNDS = (16, 1024), (3, 512), (4, 1000)
 
 _FOLDERS = ("images", "cubes", "labels", "abundances")
 _TRANSFORMS = "transforms.json"
@@ -357,7 +358,7 @@ def make_demo_scene(
     views: int = DEFAULT_VIEWS,
     overwrite: bool = False,
     illuminant: str | Path = LAMP,
-    place: Place = TABLE,
+    place: _Place = TABLE,
 ) -> None:
     """Write a demo scene. It is built beside the folder and moved in when complete.
 
@@ -374,7 +375,7 @@ def make_demo_scene(
     """
     check_bounds(
         "a demo scene",
-        {"size": (size, SIZE_BOUNDS), "bands": (bands, BANDS_BOUNDS), "views": (views, VIEWS_BOUNDS)},
+        {"size": (size, SIZE_BOUNDS), "bands": (bands, _BANDS_BOUNDS), "views": (views, VIEWS_BOUNDS)},
     )
     with staging_for(directory, "the demo scene", overwrite) as staging:
         _write_scene(staging / "scene", size, bands, views, illuminant, place)
@@ -395,7 +396,7 @@ def is_complete(directory: Path) -> bool:
 
 
 def _write_scene(
-    folder: Path, size: int, bands: int, views: int, illuminant: str | Path = LAMP, place: Place = TABLE
+    folder: Path, size: int, bands: int, views: int, illuminant: str | Path = LAMP, place: _Place = TABLE
 ) -> None:
     sampling = Bands.of(band_centers_nm(bands))
     spectra, lamp = reflectances(sampling.centers_nm), lamp_power(sampling.centers_nm, illuminant)

@@ -39,7 +39,7 @@ MATERIALS = ("white", "red", "yellow", "green", "cyan", "purple")
 
 _PATCHES = ("white 9.5 (.05 D)", "red", "yellow", "green", "cyan", "purple")
 
-RANGE_NM = (400.0, 700.0)
+_RANGE_NM = (400.0, 700.0)
 
 LAMP = "D50"
 """CIE illuminant of the lamp and of the sky."""
@@ -50,7 +50,7 @@ Blend = Callable[[Float[np.ndarray, "P 3"]], Float[np.ndarray, " P"]]
 
 def band_centers_nm(bands: int) -> Float[np.ndarray, " B"]:
     """Evenly spaced band centres over 400-700 nm, ends included."""
-    return np.linspace(*RANGE_NM, bands)
+    return np.linspace(*_RANGE_NM, bands)
 
 
 def reflectances(wavelengths_nm: Float[np.ndarray, " B"]) -> Float[np.ndarray, "K B"]:
@@ -107,25 +107,25 @@ def smooth_step(values: Float[np.ndarray, " P"], low: float, high: float) -> Flo
     return t * t * (3 - 2 * t)
 
 
-def gingham(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
+def _gingham(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
     """Woven squares: warp and weft each carry half of the second material; a plain rim below the top."""
     stripes = [smooth_step(np.sin(points[:, axis] * 10.5 + 0.8), -0.25, 0.25) for axis in (0, 1)]
     on_top = points[:, 2] > 0.999
     return np.where(on_top, (stripes[0] + stripes[1]) / 2, 1)
 
 
-def blush(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
+def _blush(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
     """A slow gradient over one side."""
     return smooth_step(points @ np.array([0.75, 0.5, 0.43], dtype=points.dtype), -0.15, 1.1)
 
 
-def ribbon(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
+def _ribbon(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
     """A parcel's crossed ribbons, with slightly soft borders."""
     across = np.minimum(np.abs(points[:, 0]), np.abs(points[:, 1]))
     return 1 - smooth_step(across, 0.2, 0.27)
 
 
-def candy_stripes(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
+def _candy_stripes(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
     """A soft helix around the side; a plain top."""
     angle = np.arctan2(points[:, 1], points[:, 0])
     share = smooth_step(np.sin(2 * angle + points[:, 2] * 4.5), -0.45, 0.45)
@@ -138,16 +138,16 @@ def plain(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
 
 
 LAMP_POSITION = (2.6, -2.2, 4.2)
-LAMP_RADIUS = 0.55
+_LAMP_RADIUS = 0.55
 LAMP_IRRADIANCE = 0.7
 """On a surface that faces the lamp; with the sky it keeps a white wall just below 1."""
-SKY_IRRADIANCE = 0.34
-BOUNCE_SHARE = 0.35
+_SKY_IRRADIANCE = 0.34
+_BOUNCE_SHARE = 0.35
 """What a surface that faces down receives, as a share of the open sky."""
 COAT_REFLECTANCE = 0.05
 """Fresnel reflectance of the clear coats at normal incidence."""
 
-SUBPIXELS = 3
+_SUBPIXELS = 3
 """Rays along each side of a pixel."""
 
 _RAYS_AT_ONCE = 2**14
@@ -165,20 +165,20 @@ class Thing:
 
 
 THINGS = (
-    Thing(Placement("cylinder", (0.0, 0.0, -0.06), (1.3, 1.3, 0.06)), Surface("white", "red", gingham)),
+    Thing(Placement("cylinder", (0.0, 0.0, -0.06), (1.3, 1.3, 0.06)), Surface("white", "red", _gingham)),
     Thing(
         Placement("sphere", (-0.5, -0.42, 0.4), (0.44, 0.44, 0.4)),
-        Surface("green", "yellow", blush, roughness=0.1),
+        Surface("green", "yellow", _blush, roughness=0.1),
         ((-0.5, -0.42, 0.4, 0.42),),
     ),
     Thing(
         Placement("box", (0.5, 0.42, 0.3), (0.34, 0.34, 0.3), turn_deg=28.0),
-        Surface("cyan", "white", ribbon),
+        Surface("cyan", "white", _ribbon),
         ((0.5, 0.42, 0.3, 0.36),),
     ),
     Thing(
         Placement("cylinder", (-0.42, 0.56, 0.42), (0.24, 0.24, 0.42)),
-        Surface("purple", "yellow", candy_stripes),
+        Surface("purple", "yellow", _candy_stripes),
         ((-0.42, 0.56, 0.22, 0.26), (-0.42, 0.56, 0.62, 0.26)),
     ),
     Thing(
@@ -188,7 +188,7 @@ THINGS = (
     ),
 )
 
-PLACEMENTS = tuple(thing.placement for thing in THINGS)
+_PLACEMENTS = tuple(thing.placement for thing in THINGS)
 
 Sky = Callable[[Float[np.ndarray, "R 3"]], Float[np.ndarray, "R K"]]
 """From directions to what the sky there sends, in multiples of the materials as the lamp shows them."""
@@ -206,7 +206,7 @@ class ViewCoefficients:
 
 
 @dataclass(frozen=True)
-class Hits:
+class _Hits:
     """What rays see; rows of rays that hit nothing are 0."""
 
     is_hit: Bool[np.ndarray, " R"]
@@ -218,7 +218,7 @@ class Hits:
 def render_view(
     cameras: Cameras,
     index: int,
-    subpixels: int = SUBPIXELS,
+    subpixels: int = _SUBPIXELS,
     things: Sequence[Thing] = THINGS,
     lamp: tuple[float, float, float] = LAMP_POSITION,
     sky: Sky | None = None,
@@ -273,7 +273,7 @@ def trace(
     lamps: Float[np.ndarray, "#R 3"],
     things: Sequence[Thing] = THINGS,
     lamp_middle: tuple[float, float, float] = LAMP_POSITION,
-) -> Hits:
+) -> _Hits:
     """What each ray sees first, lit by one point of the lamp and by the sky. Directions have length 1.
 
     Args:
@@ -300,7 +300,7 @@ def trace(
                 points, normals, -directions[rows], thing.surface.roughness, lamp_middle
             )
             specular[rows] = lamplight * highlight
-    return Hits(is_hit, abundances, diffuse, specular)
+    return _Hits(is_hit, abundances, diffuse, specular)
 
 
 def lamp_point(
@@ -313,7 +313,7 @@ def lamp_point(
         see far apart points.
     """
     rank = i * 7 % count if count % 7 else i
-    angle, radius = rank * np.pi * (3 - np.sqrt(5)), LAMP_RADIUS * np.sqrt((rank + 0.5) / count)
+    angle, radius = rank * np.pi * (3 - np.sqrt(5)), _LAMP_RADIUS * np.sqrt((rank + 0.5) / count)
     offset = np.array([radius * np.cos(angle), radius * np.sin(angle), 0])
     return (np.array(middle) + offset).astype(np.float32)
 
@@ -322,7 +322,7 @@ def direct_light(
     points: Float[np.ndarray, "P 3"],
     normals: Float[np.ndarray, "P 3"],
     lamps: Float[np.ndarray, "#P 3"],
-    placements: Sequence[Placement] = PLACEMENTS,
+    placements: Sequence[Placement] = _PLACEMENTS,
 ) -> Float[np.ndarray, " P"]:
     """Irradiance of each point from one of the lamp's: 0 in the shadow of `placements`, no fall-off with distance."""
     towards_lamp = lamps - points
@@ -356,7 +356,7 @@ def sky_light(
             cut = ((cosines * ratio + 1) / (2 * ratio**2)).clip(0, 1) ** 1.5
             open_share *= 1 - np.where(is_cut, cut, whole)
     facing_up = (1 + normals[:, 2]) / 2
-    return SKY_IRRADIANCE * (BOUNCE_SHARE + (1 - BOUNCE_SHARE) * facing_up) * open_share
+    return _SKY_IRRADIANCE * (_BOUNCE_SHARE + (1 - _BOUNCE_SHARE) * facing_up) * open_share
 
 
 def coat_highlight(

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-Primitive = Literal["sphere", "cylinder", "box"]
+_Primitive = Literal["sphere", "cylinder", "box"]
 
 _SELF_HIT_DISTANCE = 1e-4
 """A ray that starts on a surface meets it again within this distance, scene units, by rounding alone."""
@@ -25,7 +25,7 @@ _SELF_HIT_DISTANCE = 1e-4
 class Placement:
     """A primitive put into the world: scaled, turned about the vertical, tilted about x, then moved."""
 
-    primitive: Primitive
+    primitive: _Primitive
     center: tuple[float, float, float]
     half_sizes: tuple[float, float, float]
     """Half the extent along each own axis, scene units."""

@@ -18,38 +18,43 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64, Int64
-from torch import Tensor
+from jaxtyping import Bool, Float64, Int64
 
 from unmix_plugin.engine.geometry.camera_paths import focus_point
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.errors import SceneError
-from unmix_plugin.scenes.geometry.carving import MIN_EXPLAINED, carve_box, foreground_rays, share_through
+from unmix_plugin.scenes.geometry.carving import (
+    MIN_EXPLAINED,
+    carve_box,
+    count_views,
+    foreground_rays,
+    share_through,
+)
 from unmix_plugin.scenes.geometry.matched_points import MatchedPoints
 
-OUTLIERS = 0.005
+_OUTLIERS = 0.005
 """Share of the matched places that may lie outside the box, at each of its sides."""
-PLACES_MARGIN = 0.05
+_PLACES_MARGIN = 0.05
 """By how much the box of places is wider, in their median depth: little that stands on the ground is matched."""
-FRAME_MARGIN = 1.2
+_FRAME_MARGIN = 1.2
 """The cube of views over the width of the images at the focus."""
-SHIFT_BEHIND = 0.2
+_SHIFT_BEHIND = 0.2
 """How far the cube moves away from cameras that all look one way, over half that width; a ring of cameras moves it
 little, since its directions cancel."""
-HULL_CELLS = 64
+_HULL_CELLS = 64
 """Cells along an edge when the hull's extent is sought."""
-HULL_SHARES = (2.0 / 3.0, 1.0 / 3.0)
+_HULL_SHARES = (2.0 / 3.0, 1.0 / 3.0)
 """Tried in turn: the hull's cells count for its extent if this share of the cameras that see its best seen cell see
 them, as long as the box still explains the images."""
-MIN_CONSISTENT = 0.5
+_MIN_CONSISTENT = 0.5
 """Least share of the foreground pixels that must have hull behind them: only gross contradictions fall below, since
 masks that are a little off keep far more."""
-HULL_START = 1.25
+_HULL_START = 1.25
 """The first box of the hull over the cameras' cube: room for things that reach out of the images."""
-SEEN_SHARE = 1.0 / 3.0
+_SEEN_SHARE = 1.0 / 3.0
 """Share of the training cameras that must see a place for it to belong to the box."""
-SEEN_CELLS = 32
+_SEEN_CELLS = 32
 """Cells along an edge when the region that cameras share is sought."""
 
 
@@ -75,14 +80,16 @@ def find_bounds(
         return _box_of_places(cameras, points)
     centre, half = _cube_of_views(cameras)
     if foreground is None:
-        return _cut_to_shared_view(cameras, _box(centre - half, centre + half))
+        box = _box(centre - half, centre + half)
+        is_shared = _count_views(cameras, box, _SEEN_CELLS) >= _SEEN_SHARE * len(cameras)
+        return _extent(box, is_shared, margin_cells=0) if is_shared.any() else box
     rays = foreground_rays(cameras, foreground)
-    box = _box(centre - HULL_START * half, centre + HULL_START * half)
-    hull = carve_box(cameras, foreground, box, HULL_CELLS)
+    box = _box(centre - _HULL_START * half, centre + _HULL_START * half)
+    hull = carve_box(cameras, foreground, box, _HULL_CELLS)
     # Near a camera that looks out of the others' images everything is consistent, so only shared places count.
-    count = _count_views(cameras, box, HULL_CELLS)
-    explained = share_through(rays, box, hull & (count >= HULL_SHARES[0] * count.max()))
-    if explained < MIN_CONSISTENT:
+    count = _count_views(cameras, box, _HULL_CELLS)
+    explained = share_through(rays, box, hull & (count >= _HULL_SHARES[0] * count.max()))
+    if explained < _MIN_CONSISTENT:
         raise SceneError(
             f"{root}: alpha and poses contradict: only {explained:.0%} of the pixels that are not transparent have "
             "a place behind them that no other training view looks through; check that 'transform_matrix' is camera "
@@ -90,14 +97,14 @@ def find_bounds(
         )
     box = _tighten(cameras, rays, box, hull)
     # The second look has finer cells and so a thinner margin.
-    return _tighten(cameras, rays, box, carve_box(cameras, foreground, box, HULL_CELLS))
+    return _tighten(cameras, rays, box, carve_box(cameras, foreground, box, _HULL_CELLS))
 
 
 def _box_of_places(cameras: Cameras, points: MatchedPoints) -> SceneBox:
     """What the nearer of the places span; where nothing lies behind them, all that the views show at their depth."""
     near = points.nearer
-    places, margin = near.places.double().numpy(), PLACES_MARGIN * float(near.depths.median())
-    low, high = np.quantile(places, (OUTLIERS, 1 - OUTLIERS), axis=0)
+    places, margin = near.places.double().numpy(), _PLACES_MARGIN * float(near.depths.median())
+    low, high = np.quantile(places, (_OUTLIERS, 1 - _OUTLIERS), axis=0)
     if points.are_equally_far:
         corners = _corners_at_depth(cameras, near)
         low, high = np.minimum(low, corners.min(axis=0)), np.maximum(high, corners.max(axis=0))
@@ -128,7 +135,7 @@ def _cube_of_views(cameras: Cameras) -> tuple[Float64[np.ndarray, "3"], float]:
         depths = ((focus - positions) * forward).sum(axis=-1)
         ahead = depths > 0.0
         half = float(np.median((depths * half_angles)[ahead]))
-        return focus + SHIFT_BEHIND * half * forward.mean(axis=0), FRAME_MARGIN * half
+        return focus + _SHIFT_BEHIND * half * forward.mean(axis=0), _FRAME_MARGIN * half
     middle = positions.mean(axis=0)
     spread = float(np.linalg.norm(positions - middle, axis=-1).max())
     direction = forward.mean(axis=0)
@@ -140,12 +147,6 @@ def _cube_of_views(cameras: Cameras) -> tuple[Float64[np.ndarray, "3"], float]:
     return middle + direction / length * depth, half
 
 
-def _cut_to_shared_view(cameras: Cameras, box: SceneBox) -> SceneBox:
-    """The part of a box that a third of the cameras see; the box itself if they share nothing."""
-    is_shared = _count_views(cameras, box, SEEN_CELLS) >= SEEN_SHARE * len(cameras)
-    return _extent(box, is_shared, margin_cells=0) if is_shared.any() else box
-
-
 def _tighten(cameras: Cameras, rays: RayBundle, box: SceneBox, hull: Bool[np.ndarray, "R R R"]) -> SceneBox:
     """The extent of the hull in a box, without its far ends that few cameras see, if the images allow.
 
@@ -153,8 +154,8 @@ def _tighten(cameras: Cameras, rays: RayBundle, box: SceneBox, hull: Bool[np.nda
     """
     if not hull.any():  # finer cells may find that nothing fits after all
         return box
-    count = _count_views(cameras, box, HULL_CELLS)
-    for share in HULL_SHARES:
+    count = _count_views(cameras, box, _HULL_CELLS)
+    for share in _HULL_SHARES:
         tight = _extent(box, hull & (count >= share * count.max(where=hull, initial=0)), margin_cells=1)
         t_near, t_far = tight.intersect(rays.origins, rays.directions)
         if float((t_far > t_near).double().mean()) >= MIN_EXPLAINED:
@@ -162,21 +163,10 @@ def _tighten(cameras: Cameras, rays: RayBundle, box: SceneBox, hull: Bool[np.nda
     return _extent(box, hull, margin_cells=1)
 
 
-def _cell_centres(box: SceneBox, cells: int) -> Float[Tensor, "P 3"]:
-    steps = (torch.arange(cells, dtype=torch.float32) + 0.5) / cells
-    grid = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), dim=-1).reshape(-1, 3)
-    return box.aabb[0] + grid * box.size
-
-
 def _count_views(cameras: Cameras, box: SceneBox, cells: int) -> Int64[np.ndarray, "R R R"]:
     """How many cameras see the centre of each cell."""
-    points = _cell_centres(box, cells)
-    count = torch.zeros(len(points), dtype=torch.int64)
-    for index in range(len(cameras)):
-        pixels, depths = cameras.project(points, index)
-        limits = torch.tensor(cameras.size(index), dtype=torch.float32)
-        count += ((pixels >= 0.0) & (pixels <= limits)).all(dim=-1) & (depths > 0.0)
-    return count.reshape(cells, cells, cells).numpy()
+    unit = (torch.cartesian_prod(*[torch.arange(cells)] * 3) + 0.5) / cells
+    return count_views(cameras, box.aabb[0] + unit * box.size).view(cells, cells, cells).numpy()
 
 
 def _extent(box: SceneBox, kept: Bool[np.ndarray, "R R R"], margin_cells: int) -> SceneBox:

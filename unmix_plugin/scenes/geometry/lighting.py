@@ -1,8 +1,4 @@
-"""Places on the surface of a carved hull, and how bright each view shows them.
-
-Notation: `P` places, `N` views, `R` cells along an edge.
-
-Does the light move with the camera, or differ from view to view? Judged by the hull's surface, before any training.
+"""Does the light move with the camera, or differ from view to view? Judged by the hull's surface, before any training.
 
 Where an object is turned before a fixed camera and lamp, the light follows the camera: a place gets brighter when it
 turns to the side of the image that the lamp is on. Where the light is fixed to the object, a place looks about as
@@ -16,7 +12,8 @@ Where exposures differ, all places of a view are brighter or darker than in othe
 half of the places says of the views' gains, the other half says too, whichever way the places are halved. Highlights
 and errors of the hull change some places only.
 
-Notation: `P` places, `N` views, `F` functions of a normal, `V` values, `R` cells along an edge.
+Notation: `P` places on the surface of a hull, `N` views, `F` functions of a normal, `V` values, `R` cells along an
+edge.
 """
 
 from __future__ import annotations
@@ -32,15 +29,15 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 
-NUM_PLACES = 2000
+_NUM_PLACES = 2000
 """Places that are followed."""
-LARGEST_HULL = 64
+_LARGEST_HULL = 64
 """Cells along an edge of the hull that places are taken from; finer ones are joined."""
-SMOOTHING_CELLS = 2.0
+_SMOOTHING_CELLS = 2.0
 """Standard deviation of the blur of the hull from whose slope normals are taken."""
-LEAST_FACING = 0.35
+_LEAST_FACING = 0.35
 """Cosine between normal and direction to the camera from which a place is looked at."""
-CLEAR_CELLS, MOST_CELLS = 4.0, 64
+_CLEAR_CELLS, _MOST_CELLS = 4.0, 64
 """Way from a place, in cells, that is not checked for what is in front of it; and how far it is checked."""
 
 
@@ -60,8 +57,8 @@ def hull_places(hull: Bool[np.ndarray, "R R R"], box: SceneBox) -> Places:
     inner = np.array(ndimage.binary_erosion(hull, border_value=1), dtype=bool)
     surface = hull & ~inner
     cells = np.argwhere(surface)
-    cells = cells[:: max(1, -(-len(cells) // NUM_PLACES))]
-    blurred = ndimage.gaussian_filter(hull.astype(np.float32), SMOOTHING_CELLS)
+    cells = cells[:: max(1, -(-len(cells) // _NUM_PLACES))]
+    blurred = ndimage.gaussian_filter(hull.astype(np.float32), _SMOOTHING_CELLS)
     sides = np.array(hull.shape)
     gradient = [np.asarray(part) for part in np.gradient(blurred)]
     slopes = np.stack(gradient, axis=-1)[tuple(cells.T)] * (sides / box.size.numpy())
@@ -93,7 +90,7 @@ def seen_places(
 
 def coarse_hull(hull: Bool[np.ndarray, "R R R"]) -> Bool[np.ndarray, "r r r"]:
     """The hull in fewer cells, each occupied if one of its parts is."""
-    factor = hull.shape[0] // LARGEST_HULL
+    factor = hull.shape[0] // _LARGEST_HULL
     if factor < 2 or hull.shape[0] % factor:
         return hull
     cells = hull.shape[0] // factor
@@ -125,7 +122,7 @@ def _looked_up(
     inside = (depths > 0) & (pixels >= 0).all(dim=-1)
     inside &= (pixels < torch.tensor(cameras.size(index))).all(dim=-1)
     towards = torch.nn.functional.normalize(cameras.camera_to_world[index, :, 3] - places.positions, dim=-1)
-    inside &= (towards * places.normals).sum(dim=-1) > LEAST_FACING
+    inside &= (towards * places.normals).sum(dim=-1) > _LEAST_FACING
     inside &= ~_is_hidden(places.positions, towards, hull, box)
     columns, rows = torch.where(inside[:, None], pixels, 0).unbind(-1)
     return torch.where(inside, torch.from_numpy(image).float()[rows, columns], torch.nan)
@@ -141,7 +138,7 @@ def _is_hidden(
     cells, kept = hull.shape[0], torch.from_numpy(hull)
     cell = float(box.size.max()) / cells
     hidden = torch.zeros(len(positions), dtype=torch.bool)
-    for steps in torch.arange(CLEAR_CELLS, MOST_CELLS):
+    for steps in torch.arange(_CLEAR_CELLS, _MOST_CELLS):
         unit = box.normalise(positions + steps * cell * towards)
         inside = ((unit >= 0) & (unit < 1)).all(dim=-1)
         x, y, z = (unit * cells).long().clamp(0, cells - 1).unbind(-1)
@@ -149,17 +146,17 @@ def _is_hidden(
     return hidden
 
 
-FoundLight = Literal["fixed", "camera", "per-view"]
+_FoundLight = Literal["fixed", "camera", "per-view"]
 
-MOVING_SHARE = 0.015
+_MOVING_SHARE = 0.015
 """Share of the changes of brightness that must be predicted in every half of the views. Two turntables have 0.03 and
 0.2 or more, three scenes with a fixed light none."""
-LEAST_GAIN_SPREAD = 0.04
+_LEAST_GAIN_SPREAD = 0.04
 """Standard deviation of the views' log gains that both halves of the places must agree on. Seven scenes of one exposure
 have up to 0.02, since hulls are not surfaces; with gains of +-20 % all have 0.09 or more, with +-10 % 0.04 to 0.08."""
-FEWEST_VIEWS, FEWEST_PLACES = 4, 50
+_FEWEST_VIEWS, _FEWEST_PLACES = 4, 50
 """Views that must see a place, of one half of them for a moving light; and places that must be seen by so many."""
-NUM_FITS, SMALLEST_ERROR = 10, 0.02
+_NUM_FITS, _SMALLEST_ERROR = 10, 0.02
 """Least squares fits of gains; and error of a place's log brightness below which it weighs no more."""
 
 
@@ -168,12 +165,12 @@ def judge_light(
     log_brightness: list[Float[np.ndarray, "H W"]],
     hull: Bool[np.ndarray, "R R R"],
     box: SceneBox,
-) -> FoundLight:
+) -> _FoundLight:
     """Which light the views were taken in; fixed where too little is seen to tell. Arguments as of `seen_places`."""
     places, seen = seen_places(cameras, log_brightness, hull, box)
-    if foretold_share(cameras, places, seen) > MOVING_SHARE:
+    if foretold_share(cameras, places, seen) > _MOVING_SHARE:
         return "camera"
-    return "per-view" if gain_spread(cameras, places, seen) > LEAST_GAIN_SPREAD else "fixed"
+    return "per-view" if gain_spread(cameras, places, seen) > _LEAST_GAIN_SPREAD else "fixed"
 
 
 def foretold_share(cameras: Cameras, places: Places, seen: Float[Tensor, "P N"]) -> float:
@@ -185,8 +182,13 @@ def foretold_share(cameras: Cameras, places: Places, seen: Float[Tensor, "P N"])
     if len(places.positions) == 0:
         return 0.0
     rotations = cameras.camera_to_world[:, :, :3]
-    turned = _smooth_functions(torch.einsum("pi,nij->pnj", places.normals, rotations))
-    return _least_share(seen, turned, _halves(cameras))
+    x, y, z = torch.einsum("pi,nij->pnj", places.normals, rotations).unbind(-1)
+    turned = torch.stack([x, y, x * z, y * z, x * y], dim=-1)  # polynomials that change sign with x or y
+    positions = cameras.camera_to_world[:, :, 3]
+    centred = positions - positions.mean(dim=0)
+    # The views are cut into two halves, twice: along the two axes in which their positions vary most.
+    along = centred @ torch.linalg.svd(centred, full_matrices=False).Vh[:2].T
+    return _least_share(seen, turned, (along > along.median(dim=0).values).T)
 
 
 def gain_spread(cameras: Cameras, places: Places, seen: Float[Tensor, "P N"]) -> float:
@@ -196,22 +198,24 @@ def gain_spread(cameras: Cameras, places: Places, seen: Float[Tensor, "P N"]) ->
     function of the camera's direction don't count: where brightness changes across a surface, a hull that is a little
     too large looks as if they were there. Arguments as above.
     """
-    enough = seen.isfinite().sum(dim=1) >= FEWEST_VIEWS
+    enough = seen.isfinite().sum(dim=1) >= _FEWEST_VIEWS
     seen, positions = seen[enough], places.positions[enough]
-    if len(seen) < FEWEST_PLACES:
+    if len(seen) < _FEWEST_PLACES:
         return 0.0
     directions = torch.nn.functional.normalize(
         cameras.camera_to_world[:, :, 3] - positions.mean(dim=0), dim=-1
     )
-    smooth = _low_harmonics(directions)
+    x, y, z = directions.unbind(-1)  # polynomials up to second degree on the sphere
+    smooth = torch.stack([torch.ones_like(x), x, y, z, x * y, y * z, z * x, x * x - y * y, z * z], dim=-1)
     shared = []
     for half in (positions > positions.median(dim=0).values).T:
         one, other = view_gains(seen[half]), view_gains(seen[~half])
         both = one.isfinite() & other.isfinite()
         left = int(both.sum()) - smooth.shape[1]
-        if left < FEWEST_VIEWS:
+        if left < _FEWEST_VIEWS:
             return 0.0
-        rest = _without(torch.stack([one[both], other[both]], dim=1), smooth[both])
+        gains = torch.stack([one[both], other[both]], dim=1)
+        rest = gains - smooth[both] @ torch.linalg.lstsq(smooth[both], gains, driver="gelsd").solution
         shared.append(float(rest.prod(dim=1).sum()) / left)
     return max(min(shared), 0.0) ** 0.5
 
@@ -225,41 +229,15 @@ def view_gains(seen: Float[Tensor, "P N"]) -> Float[Tensor, " N"]:
     known = seen.isfinite()
     values, weights = torch.where(known, seen, 0.0).double(), known.double()
     gains = values.new_zeros(seen.shape[1])
-    for _ in range(NUM_FITS):
+    for _ in range(_NUM_FITS):
         shares = weights / weights.sum(dim=1, keepdim=True).clamp(min=1e-12)
         means = (shares * values).sum(dim=1, keepdim=True)
         system = torch.diag(weights.sum(dim=0)) - weights.T @ shares
         gains = torch.linalg.pinv(system, hermitian=True) @ (weights * (values - means)).sum(dim=0)
         lit = values - gains
         errors = (lit - (shares * lit).sum(dim=1, keepdim=True)).abs()
-        weights = known / errors.clamp(min=SMALLEST_ERROR)
+        weights = known / errors.clamp(min=_SMALLEST_ERROR)
     return torch.where(known.any(dim=0), gains, torch.nan).float()
-
-
-def _low_harmonics(directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N F"]:
-    """Polynomials up to second degree on the sphere; F is 9."""
-    x, y, z = directions.unbind(-1)
-    return torch.stack([torch.ones_like(x), x, y, z, x * y, y * z, z * x, x * x - y * y, z * z], dim=-1)
-
-
-def _without(values: Float[Tensor, "N V"], functions: Float[Tensor, "N F"]) -> Float[Tensor, "N V"]:
-    """What of values the functions can't fit."""
-    return values - functions @ torch.linalg.lstsq(functions, values, driver="gelsd").solution
-
-
-def _halves(cameras: Cameras) -> Bool[Tensor, "2 N"]:
-    """The views cut into two halves, twice: along the two axes in which their positions vary most."""
-    positions = cameras.camera_to_world[:, :, 3]
-    centred = positions - positions.mean(dim=0)
-    axes = torch.linalg.svd(centred, full_matrices=False).Vh[:2]
-    along = centred @ axes.T
-    return (along > along.median(dim=0).values).T
-
-
-def _smooth_functions(normals: Float[Tensor, "P N 3"]) -> Float[Tensor, "P N F"]:
-    """Polynomials that change sign with x or y."""
-    x, y, z = normals.unbind(-1)
-    return torch.stack([x, y, x * z, y * z, x * y], dim=-1)
 
 
 def _least_share(
@@ -269,7 +247,7 @@ def _least_share(
     shares: list[float] = []
     for half in halves:
         parts = [_changes(values[:, chosen], functions[:, chosen]) for chosen in (half, ~half)]
-        if min(len(y) for _, y in parts) < FEWEST_PLACES * FEWEST_VIEWS:
+        if min(len(y) for _, y in parts) < _FEWEST_PLACES * _FEWEST_VIEWS:
             return 0.0
         for (x, y), (others, known) in (parts, parts[::-1]):
             fit = torch.linalg.lstsq(x, y[:, None]).solution[:, 0]
@@ -285,7 +263,7 @@ def _changes(
 ) -> tuple[Float[Tensor, "V F"], Float[Tensor, " V"]]:
     """Functions and values without their means over the views of each place, of places that enough views see."""
     known = values.isfinite()
-    enough = known.sum(dim=1) >= FEWEST_VIEWS
+    enough = known.sum(dim=1) >= _FEWEST_VIEWS
     known, values, functions = known[enough], values[enough].double(), functions[enough].double()
     counts = known.sum(dim=1, keepdim=True)
     values = torch.where(known, values, 0.0)

@@ -19,24 +19,24 @@ from jaxtyping import Float, Float32, Int
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.scenes.geometry.pose_check import ReadView, Thinning
+from unmix_plugin.scenes.geometry.view_agreement import ReadView, Thinning
 
 LONGEST_SIDE_PX = 320
 """Of the views that are compared."""
-MOST_REFERENCES = 8
+_MOST_REFERENCES = 8
 """Views, spread over all, that are each compared with views beside them."""
-NEIGHBOUR_RANKS = (0, 1, 3, 7)
+_NEIGHBOUR_RANKS = (0, 1, 3, 7)
 """Those beside a view, by their rank in distance: the nearest show most of what it does, farther ones tell depths
 better."""
-MOST_AMBIGUOUS = 0.85
+_MOST_AMBIGUOUS = 0.85
 """Of a match, its difference over that of the second best."""
-MOST_APART_PX = 1.5
+_MOST_APART_PX = 1.5
 """Of the rays of a match, in pixels of the thinned-out view."""
-SMALLEST_ANGLE_DEG = 1.0
+_SMALLEST_ANGLE_DEG = 1.0
 """Between the rays of a match."""
-LEAST_POINTS = 60
+_LEAST_POINTS = 60
 """Fewer may be chance."""
-MOST_DEPTH_RATIO = 2.0
+_MOST_DEPTH_RATIO = 2.0
 """Of far to near places that are about as far away."""
 _ENDS = torch.tensor([0.05, 0.95])
 _NEAR = 0.25
@@ -59,12 +59,12 @@ class MatchedPoints:
     def are_equally_far(self) -> bool:
         """Whether all are about as far away, as ground is below an aircraft: views end there."""
         near, far = self.depths.quantile(_ENDS)
-        return bool(far < MOST_DEPTH_RATIO * near)
+        return bool(far < _MOST_DEPTH_RATIO * near)
 
     @property
     def nearer(self) -> MatchedPoints:
         """Those before a distant background: at most twice as deep as the nearest quarter."""
-        kept = self.depths <= MOST_DEPTH_RATIO * self.depths.quantile(_NEAR)
+        kept = self.depths <= _MOST_DEPTH_RATIO * self.depths.quantile(_NEAR)
         return MatchedPoints(self.places[kept], self.views[kept], self.depths[kept])
 
 
@@ -79,7 +79,7 @@ def find_matched_points(cameras: Cameras, read_view: ReadView) -> MatchedPoints 
     pairs = _choose_pairs(cameras.camera_to_world[:, :, 3])
     features = {view: _features_of(thinning, read_view, view) for view in sorted({*sum(pairs, ())})}
     found = [_triangulate(cameras, thinning, pair, features[pair[0]], features[pair[1]]) for pair in pairs]
-    if sum(len(points.views) for points in found) < LEAST_POINTS:
+    if sum(len(points.views) for points in found) < _LEAST_POINTS:
         return None
     return MatchedPoints(
         torch.cat([points.places for points in found]),
@@ -100,11 +100,11 @@ class _Features:
 def _choose_pairs(positions: Float[Tensor, "N 3"]) -> list[tuple[int, int]]:
     """Some views and others beside them, each pair once; views at one place tell no distance."""
     away = torch.cdist(positions.double(), positions.double())
-    chosen = np.linspace(0, len(positions) - 1, min(MOST_REFERENCES, len(positions))).round().astype(int)
+    chosen = np.linspace(0, len(positions) - 1, min(_MOST_REFERENCES, len(positions))).round().astype(int)
     pairs = set()
     for view in chosen.tolist():
         others = [other for other in away[view].argsort().tolist() if away[view, other] > 1e-6 * away.max()]
-        for rank in NEIGHBOUR_RANKS:
+        for rank in _NEIGHBOUR_RANKS:
             if rank < len(others):
                 pairs.add((min(view, others[rank]), max(view, others[rank])))
     return sorted(pairs)
@@ -134,7 +134,7 @@ def _triangulate(
     if min(len(one.coords), len(other.coords)) > 1:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # of descriptors that differ by nothing
-            matches = match_descriptors(one.descriptors, other.descriptors, max_ratio=MOST_AMBIGUOUS)
+            matches = match_descriptors(one.descriptors, other.descriptors, max_ratio=_MOST_AMBIGUOUS)
         chosen = torch.from_numpy(np.array(matches, dtype=np.int64))
     ends = zip(pair, (one.coords[chosen[:, 0]], other.coords[chosen[:, 1]]), strict=True)
     rays = [cameras.generate_rays(torch.full((len(chosen),), view), coords) for view, coords in ends]
@@ -147,8 +147,8 @@ def _triangulate(
     second = (cosine * (between * along).sum(dim=-1) - (between * across).sum(dim=-1)) / sine
     gaps = (first[:, None] * along - between - second[:, None] * across).norm(dim=-1)
     pixel = thinning.stride / cameras.focal_px[pair[0]].min().double()
-    meets = (first > 0) & (second > 0) & (gaps < MOST_APART_PX * pixel * torch.minimum(first, second))
-    meets &= sine.sqrt() > np.sin(np.radians(SMALLEST_ANGLE_DEG))
+    meets = (first > 0) & (second > 0) & (gaps < _MOST_APART_PX * pixel * torch.minimum(first, second))
+    meets &= sine.sqrt() > np.sin(np.radians(_SMALLEST_ANGLE_DEG))
     reached = (first[:, None] * along)[meets].float()
     assert rays[0].axes is not None
     depths = (reached * rays[0].axes[meets]).sum(dim=-1)

@@ -1,23 +1,15 @@
-"""How far away the pixels of the training views are, where the views tell it clearly: a plane sweep.
+"""Where surfaces are in an unbounded world, as far as training views agree on it before any training: a plane sweep.
 
 Points along the rays of a coarse grid of pixels are projected into neighbouring views. A pixel's distance is where
 these agree best with it. It is known only where they agree well, and nowhere else nearly as well: on plain surfaces,
-in mirrors and in what one view alone shows it stays unknown.
+in mirrors and in what one view alone shows it stays unknown. A view looks through a cell of contracted space if the
+cell lies clearly before all known distances of the pixels around it. Known distances may be wrong in places, so three
+views must look through a cell that is empty, and few may see their surface in it.
 
-Notation: `N` views, `h x w` pixels of a view that are asked, `P` = h w, `D` distances along a ray, `F` features.
+Notation: `N` views, `h x w` pixels of a view that are asked, `P` = h w or cells, `D` distances along a ray, `F`
+features, `C` cells along an edge, `R` drawn pixels.
 
 Source: Collins 1996, A Space-Sweep Approach to True Multi-Image Matching.
-
-Which cells of contracted space are empty, since several views see what is behind them.
-
-A view looks through a cell if it lies clearly before all known distances of the pixels around it. Known distances may
-be wrong in places, so three views must look through a cell, and few may see their surface in it.
-
-Notation: `C` cells along an edge, `P` = C^3 cells, `h x w` pixels of a view with known distances.
-
-Where surfaces are in an unbounded world, as far as the training views agree on it before any training.
-
-Notation: `R` drawn pixels, `N` training views, `h x w` pixels of a view that were asked.
 """
 
 from __future__ import annotations
@@ -31,7 +23,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox, UnitSpace
-from unmix_plugin.scenes.geometry.pose_check import (
+from unmix_plugin.scenes.geometry.view_agreement import (
     LONGEST_SIDE_PX,
     NUM_AGREEING,
     ReadView,
@@ -44,24 +36,24 @@ from unmix_plugin.scenes.geometry.pose_check import (
 from unmix_plugin.scenes.pixel_block import DrawnPixels
 from unmix_plugin.scenes.scene import Scene
 
-MOST_VIEWS = 64
+_MOST_VIEWS = 64
 """Of a scene with more, so many are swept."""
-NUM_NEIGHBOURS = 5
-PIXEL_STRIDE = 2
+_NUM_NEIGHBOURS = 5
+_PIXEL_STRIDE = 2
 """Of the thinned-out view, pixels from one that is asked to the next."""
-STEP = 1 / 32
+_STEP = 1 / 32
 """Distance of the planes within the box, in half edges of the box; outside they lie farther apart, as samples do."""
-FARTHEST = 64.0
+_FARTHEST = 64.0
 """The last plane, in half edges of the box from its middle."""
-MOST_DISAGREEMENT = 0.3
+_MOST_DISAGREEMENT = 0.3
 """Of a pixel whose distance is known, against that of unrelated pixels."""
-CLEARLY = 0.7
+_CLEARLY = 0.7
 """Most disagreement there, over the least at planes that are not beside it."""
-BESIDE = 3
+_BESIDE = 3
 """Planes that count as beside one."""
-LEAST_KNOWN = 0.35
+_LEAST_KNOWN = 0.35
 """Of all pixels. Where fewer are known views may differ in exposure, and brightness is taken over that around it."""
-SURROUNDINGS = 21
+_SURROUNDINGS = 21
 """Edge of what is around a pixel, in pixels of the thinned-out view."""
 _CHANCE_PIXELS = 4000
 
@@ -79,35 +71,35 @@ class SweptDepths:
 
 
 def sweep_depths(cameras: Cameras, box: SceneBox, read_view: ReadView) -> SweptDepths | None:
-    """Distances of the pixels of all views, or of `MOST_VIEWS`; None if views are too few, too small or too plain.
+    """Distances of the pixels of all views, or of `_MOST_VIEWS`; None if views are too few, too small or too plain.
 
     Args:
         cameras: Of the training views, all of one size, each with one pose.
         box: In the cameras' space.
         read_view: Reads a part of a view.
     """
-    count = min(len(cameras), MOST_VIEWS)
+    count = min(len(cameras), _MOST_VIEWS)
     views = np.linspace(0, len(cameras) - 1, count).round().astype(int).tolist()
     if count < NUM_AGREEING + 1:
         return None
     thinning = Thinning.to(LONGEST_SIDE_PX, cameras, read_view)
-    if min(cameras.width, cameras.height) // thinning.stride < PIXEL_STRIDE:
+    if min(cameras.width, cameras.height) // thinning.stride < _PIXEL_STRIDE:
         return None
     images = [thinning.read(read_view, view) for view in views]
     lenses = thinned_lenses(cameras[views], images[0], thinning.stride, thinning.first)
     found = _sweep_all(images, lenses, box)
     if found is None:
         return None
-    if torch.isfinite(found).float().mean() < LEAST_KNOWN:
+    if torch.isfinite(found).float().mean() < _LEAST_KNOWN:
         relative = _sweep_all([_over_surroundings(image) for image in images], lenses, box)
         found = found if relative is None else torch.where(torch.isfinite(found), found, relative)
-    return SweptDepths(tuple(views), found, thinning.stride * PIXEL_STRIDE)
+    return SweptDepths(tuple(views), found, thinning.stride * _PIXEL_STRIDE)
 
 
 def _over_surroundings(image: Float[Tensor, "H W B"]) -> Float[Tensor, "H W B"]:
     """Spectra over the mean brightness around them: the same whatever the exposure."""
     brightness = image.mean(dim=-1)[None]
-    width = SURROUNDINGS
+    width = _SURROUNDINGS
     around = torch.nn.functional.avg_pool2d(brightness, width, 1, width // 2, count_include_pad=False)[0]
     return image / (around + 0.02 * float(brightness.mean()) + 1e-9)[..., None]
 
@@ -124,7 +116,7 @@ def _sweep_all(
     if chance <= 0.0:
         return None
     poses = cameras.camera_to_world.double().numpy()
-    neighbours = choose_neighbours(poses, len(images), NUM_NEIGHBOURS)
+    neighbours = choose_neighbours(poses, len(images), _NUM_NEIGHBOURS)
     swept = [_sweep(view, neighbours[view], cameras, box, features, chance) for view in range(len(images))]
     return torch.stack(swept)
 
@@ -138,9 +130,9 @@ def _sweep(
     chance: float,
 ) -> Float[Tensor, "h w"]:
     """Distances of one view's pixels, inf where unknown."""
-    first = PIXEL_STRIDE // 2
-    own = features[view][first::PIXEL_STRIDE, first::PIXEL_STRIDE]
-    rows, columns = (torch.arange(side) * PIXEL_STRIDE + first + 0.5 for side in own.shape[:2])
+    first = _PIXEL_STRIDE // 2
+    own = features[view][first::_PIXEL_STRIDE, first::_PIXEL_STRIDE]
+    rows, columns = (torch.arange(side) * _PIXEL_STRIDE + first + 0.5 for side in own.shape[:2])
     coords = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=-1).flatten(0, 1)
     rays = cameras.generate_rays(torch.full((len(coords),), view), coords)
     pose = cameras.camera_to_world[view]
@@ -153,9 +145,9 @@ def _sweep(
     ]
     costs = torch.stack(seen, dim=-1).sort(dim=-1).values[..., :NUM_AGREEING].mean(dim=-1) / chance
     least, plane = costs.min(dim=1)
-    is_beside = (torch.arange(costs.shape[1]) - plane[:, None]).abs() <= BESIDE
+    is_beside = (torch.arange(costs.shape[1]) - plane[:, None]).abs() <= _BESIDE
     next_best = costs.masked_fill(is_beside, torch.inf).min(dim=1).values
-    is_known = (least < MOST_DISAGREEMENT) & (least < CLEARLY * next_best)
+    is_known = (least < _MOST_DISAGREEMENT) & (least < _CLEARLY * next_best)
     found = distances.gather(1, plane[:, None])[:, 0]
     return found.masked_fill(~is_known, torch.inf).view(own.shape[:2])
 
@@ -163,9 +155,9 @@ def _sweep(
 def _planes(box: SceneBox, origin: Float[Tensor, "3"], axis: Float[Tensor, "3"]) -> Float[Tensor, " D"]:
     """Depths along an optical axis, as far apart as samples in contracted space."""
     half, middle, found, depth = float(box.size.max()) / 2, box.aabb.mean(dim=0), [], 0.0
-    while (radius := float((origin + depth * axis - middle).abs().max()) / half) <= FARTHEST:
+    while (radius := float((origin + depth * axis - middle).abs().max()) / half) <= _FARTHEST:
         near = max(radius, 1.0)
-        length = STEP * half * near * max(near / 2, 1.0)
+        length = _STEP * half * near * max(near / 2, 1.0)
         found.append(depth + length / 2)
         depth += length
     return torch.tensor(found)
@@ -181,11 +173,11 @@ def _patch_means(differences: Float[Tensor, "P D"], own: Float[Tensor, "h w F"])
     return means.flatten(1).T
 
 
-WITNESSES = 3
+_WITNESSES = 3
 """Views that must look through a cell."""
-MOST_CONTRADICTION = 0.15
+_MOST_CONTRADICTION = 0.15
 """Views that may see a surface in it, over those that look through it."""
-MARGIN = 1.5
+_MARGIN = 1.5
 """Between a cell's centre and a surface behind it, in edges of the cell."""
 
 
@@ -202,13 +194,13 @@ def seen_through(depths: SweptDepths, cameras: Cameras, box: SceneBox, cells: in
     unit = (torch.cartesian_prod(*[torch.arange(cells)] * 3) + 0.5) / cells
     points = space.from_unit(unit)
     radii = space.centred(points).abs().amax(dim=-1).clamp(min=1.0)
-    margins = MARGIN * 4.0 / cells * float(space.half_edge) * radii.square()
+    margins = _MARGIN * 4.0 / cells * float(space.half_edge) * radii.square()
     through, surfaces = torch.zeros(2, len(points))
     for view, distances in zip(depths.views, depths.distances, strict=True):
         nearest, own, away = _looked_up(cameras, view, points, distances, depths.stride)
         through += torch.isfinite(own) & (away + margins < nearest)
         surfaces += (away - own).abs() <= margins
-    is_empty = (through >= WITNESSES) & (surfaces <= MOST_CONTRADICTION * through)
+    is_empty = (through >= _WITNESSES) & (surfaces <= _MOST_CONTRADICTION * through)
     return is_empty.view(cells, cells, cells)
 
 
@@ -239,6 +231,7 @@ class SurfaceEvidence:
         self._cameras = scene.cameras[list(scene.train_indices)]
         self._box = scene.scene_box
         self._depths: SweptDepths | None = None
+        self._placed: tuple[Cameras, Tensor, Tensor] | None = None
         if scene.is_unbounded and not scene.is_rig and self._cameras.key_poses is None:
             train = scene.train_indices
             self._depths = sweep_depths(
@@ -262,16 +255,20 @@ class SurfaceEvidence:
     def points(self, pixels: DrawnPixels) -> Float[Tensor, "R 3"]:
         """Places that drawn pixels show, model space; NaN where unknown."""
         assert self._depths is not None
-        depths, device = self._depths, pixels.corners.device
-        swept = torch.full((len(self._cameras),), -1)
-        swept[list(depths.views)] = torch.arange(len(depths.views))
-        views, corners = pixels.cameras.cpu(), pixels.corners.cpu()
-        rays = self._cameras.generate_rays(views, corners + 0.5)
-        columns, rows = (corners // depths.stride).unbind(-1)
+        if (
+            self._placed is None or self._placed[1].device != pixels.corners.device
+        ):  # of one training, all of one
+            swept = torch.full((len(self._cameras),), -1)
+            swept[list(self._depths.views)] = torch.arange(len(self._depths.views))
+            device = pixels.corners.device
+            self._placed = self._cameras.to(device), swept.to(device), self._depths.distances.to(device)
+        cameras, swept, distances = self._placed
+        rays = cameras.generate_rays(pixels.cameras, pixels.corners + 0.5)
+        columns, rows = (pixels.corners // self._depths.stride).unbind(-1)
         rows, columns = (
-            at.clamp(max=side - 1)
-            for at, side in zip((rows, columns), depths.distances.shape[1:], strict=True)
+            at.clamp(max=side - 1) for at, side in zip((rows, columns), distances.shape[1:], strict=True)
         )
-        found = depths.distances[swept[views], rows, columns].masked_fill(swept[views] < 0, torch.inf)
+        view = swept[pixels.cameras]
+        found = distances[view, rows, columns].masked_fill(view < 0, torch.inf)
         known = torch.where(torch.isfinite(found), found, torch.nan)
-        return (rays.origins + known[:, None] * rays.directions).to(device)
+        return rays.origins + known[:, None] * rays.directions

@@ -37,7 +37,7 @@ class UnreadableArrayError(ValueError):
 
 
 @dataclass(frozen=True)
-class ArrayHeader:
+class _ArrayHeader:
     """What a .npy file says of itself before any value is read."""
 
     shape: tuple[int, ...]
@@ -46,7 +46,7 @@ class ArrayHeader:
     """Float or integer type."""
 
 
-def read_array_header(path: Path) -> ArrayHeader:
+def read_array_header(path: Path) -> _ArrayHeader:
     """Read and check the header of a .npy file; no value and no pickle is read.
 
     Raises:
@@ -79,7 +79,7 @@ def read_array_header(path: Path) -> ArrayHeader:
         raise UnreadableArrayError(
             f"is cut short: {found_bytes} bytes of values found, {expected_bytes} expected for shape {shape}"
         )
-    return ArrayHeader(shape, dtype)
+    return _ArrayHeader(shape, dtype)
 
 
 def parse_header(file: Any, version: tuple[int, int]) -> tuple[tuple[int, ...], bool, np.dtype]:
@@ -98,29 +98,29 @@ def map_array(path: Path) -> np.ndarray:
         return np.load(path, mmap_mode="r", allow_pickle=False)
 
 
-BLOCK_VALUES = 1 << 20
+_BLOCK_VALUES = 1 << 20
 """Values looked at together; 4 MiB as float32."""
-EXCESS_SHARE = 0.01
+_EXCESS_SHARE = 0.01
 """Share of values above 1 that is still taken for saturated highlights when no scale was given; also share of values
 far below 0 that a cube with noise around black may have."""
-EXCESS_VALUE = 10.0
+_EXCESS_VALUE = 10.0
 """Greatest value that is still taken for a highlight when no scale was given."""
-NOISE = 0.1
+_NOISE = 0.1
 """Negative values above minus this may be noise around black."""
-EXCESS_SHARE_SCALED = 0.5
+_EXCESS_SHARE_SCALED = 0.5
 """Share of values above 1 at which a scale that was given must be wrong."""
-SENSOR_BITS = (8, 10, 12, 14, 16)
+_SENSOR_BITS = (8, 10, 12, 14, 16)
 """Of cameras; the greatest number of each stands for 1."""
-REFLECTANCE_SCALE = 10000.0
+_REFLECTANCE_SCALE = 10000.0
 """Of reflectances kept as integers, as satellites deliver them."""
-FLOAT_SCALES = (100.0, 255.0, REFLECTANCE_SCALE, 65535.0)
+_FLOAT_SCALES = (100.0, 255.0, _REFLECTANCE_SCALE, 65535.0)
 """Per cent, or integers kept as floats."""
 
 InvalidPixels = Literal["refuse", "mask", "clip"]
 
 
 @dataclass(frozen=True)
-class CubeValues:
+class _CubeValues:
     """What one cube holds; counts are of single values unless they say pixels."""
 
     sha256: str
@@ -145,7 +145,7 @@ class CubeValues:
     @property
     def is_noise(self) -> bool:
         """Whether what is negative may be noise around black."""
-        return self.num_far_negative <= EXCESS_SHARE * self.num_values
+        return self.num_far_negative <= _EXCESS_SHARE * self.num_values
 
     @property
     def num_invalid_pixels(self) -> int:
@@ -153,11 +153,11 @@ class CubeValues:
         return 0 if self.invalid is None else int(self.invalid.sum())
 
 
-def measure_cube(path: Path, value_scale: float | None, invalid_pixels: InvalidPixels) -> CubeValues:
+def measure_cube(path: Path, value_scale: float | None, invalid_pixels: InvalidPixels) -> _CubeValues:
     """Read a checked (H, W, B) cube once."""
     cube = map_array(path)
     height, width, bands = cube.shape
-    rows = max(1, BLOCK_VALUES // max(1, width * bands))
+    rows = max(1, _BLOCK_VALUES // max(1, width * bands))
     digest, is_in_file_order = hashlib.sha256(), cube.flags.c_contiguous
     head, end = (cube.offset, cube.offset + cube.nbytes) if is_in_file_order else (-1, 0)  # type: ignore[attr-defined]
     digest.update(_read_bytes(path, 0, head))
@@ -177,12 +177,12 @@ def measure_cube(path: Path, value_scale: float | None, invalid_pixels: InvalidP
             continue
         finite = np.isfinite(block)
         totals += _odd_values(block, finite)
-        invalid[first : first + rows] = find_invalid(block, invalid_pixels)
+        invalid[first : first + rows] = _find_invalid(block, invalid_pixels)
         greatest = max(greatest, float(stored.max(where=finite, initial=0.0)))
         least = min(least, float(block.min(where=finite, initial=0.0)))
     if is_in_file_order:
         digest.update(_read_bytes(path, end))
-    return CubeValues(
+    return _CubeValues(
         digest.hexdigest(),
         cube.size,
         height * width,
@@ -208,7 +208,7 @@ def _odd_values(
         np.isnan(block).sum(),
         np.isinf(block).sum(),
         ((block < 0.0) & finite).sum(),
-        ((block < -NOISE) & finite).sum(),
+        ((block < -_NOISE) & finite).sum(),
         ((block > 1.0) & finite).sum(),
     )
 
@@ -226,15 +226,15 @@ def read_cube(
     """
     values = _read_scaled(path, value_scale, part)
     if invalid_pixels != "refuse":
-        values[find_invalid(values, invalid_pixels)] = 0.0
+        values[_find_invalid(values, invalid_pixels)] = 0.0
     return np.clip(values, 0.0, 1.0, out=values)
 
 
 def read_invalid(
     path: Path, value_scale: float | None, invalid_pixels: InvalidPixels
 ) -> Bool[np.ndarray, "H W"]:
-    """`find_invalid` of a file."""
-    return find_invalid(_read_scaled(path, value_scale), invalid_pixels)
+    """`_find_invalid` of a file."""
+    return _find_invalid(_read_scaled(path, value_scale), invalid_pixels)
 
 
 def _read_scaled(
@@ -245,7 +245,7 @@ def _read_scaled(
     return values if value_scale is None else np.divide(values, np.float32(value_scale), out=values)
 
 
-def find_invalid(values: np.ndarray, invalid_pixels: InvalidPixels) -> Bool[np.ndarray, "*pixels"]:
+def _find_invalid(values: np.ndarray, invalid_pixels: InvalidPixels) -> Bool[np.ndarray, "*pixels"]:
     """Pixels of (..., B) values, already divided, that can't be used: NaN, infinite or negative in some band.
 
     With `clip` negative values count as 0 and don't make a pixel invalid.
@@ -254,7 +254,7 @@ def find_invalid(values: np.ndarray, invalid_pixels: InvalidPixels) -> Bool[np.n
     return ~np.all(sound if invalid_pixels == "clip" else sound & (values >= 0.0), axis=-1)
 
 
-def is_far_out_of_range(values: CubeValues, value_scale: float | None) -> bool:
+def _is_far_out_of_range(values: _CubeValues, value_scale: float | None) -> bool:
     """Whether a cube's values cannot be meant as [0, 1].
 
     Saturated highlights above 1 are common and are clipped; a cube that is above 1 in more than a few places, or by
@@ -262,44 +262,44 @@ def is_far_out_of_range(values: CubeValues, value_scale: float | None) -> bool:
     """
     share = values.num_above_one / values.num_values
     if value_scale is None:
-        return share > EXCESS_SHARE or values.greatest > EXCESS_VALUE
-    return share > EXCESS_SHARE_SCALED
+        return share > _EXCESS_SHARE or values.greatest > _EXCESS_VALUE
+    return share > _EXCESS_SHARE_SCALED
 
 
-def propose_scale(greatest: float, is_integer: bool) -> float:
+def _propose_scale(greatest: float, is_integer: bool) -> float:
     """The `value_scale` that most likely brings stored values up to `greatest` into [0, 1].
 
-    >>> [propose_scale(greatest, True) for greatest in (243.0, 4000.0, 9100.0, 12000.0, 40000.0)]
+    >>> [_propose_scale(greatest, True) for greatest in (243.0, 4000.0, 9100.0, 12000.0, 40000.0)]
     [255.0, 4095.0, 10000.0, 16383.0, 65535.0]
-    >>> propose_scale(87.0, False), propose_scale(3.14, False)
+    >>> _propose_scale(87.0, False), propose_scale(3.14, False)
     (100.0, 3.2)
     """
-    for scale in _integer_scales() if is_integer else FLOAT_SCALES:
-        if greatest <= scale and (is_integer or greatest > EXCESS_VALUE):
+    for scale in _integer_scales() if is_integer else _FLOAT_SCALES:
+        if greatest <= scale and (is_integer or greatest > _EXCESS_VALUE):
             return scale
     digits = int(np.floor(np.log10(max(greatest, 1e-30)))) - 1
     return float(np.round(np.ceil(greatest / 10.0**digits) * 10.0**digits, max(0, -digits)))
 
 
-def describe_scale(scale: float) -> str:
+def _describe_scale(scale: float) -> str:
     """What a scale stands for, for messages; empty for one that nothing is known of.
 
-    >>> describe_scale(4095.0), describe_scale(3.2)
+    >>> _describe_scale(4095.0), describe_scale(3.2)
     (' (12 bits; reflectances times 10000 need 10000)', '')
     """
-    bits = {float(2**bits - 1): bits for bits in SENSOR_BITS}.get(scale)
+    bits = {float(2**bits - 1): bits for bits in _SENSOR_BITS}.get(scale)
     if bits is None:
-        return " (reflectances times 10000; 14 bits need 16383)" if scale == REFLECTANCE_SCALE else ""
+        return " (reflectances times 10000; 14 bits need 16383)" if scale == _REFLECTANCE_SCALE else ""
     return f" ({bits} bits{'; reflectances times 10000 need 10000' if 8 < bits < 16 else ''})"
 
 
 def _integer_scales() -> list[float]:
-    return sorted([float(2**bits - 1) for bits in SENSOR_BITS] + [REFLECTANCE_SCALE])
+    return sorted([float(2**bits - 1) for bits in _SENSOR_BITS] + [_REFLECTANCE_SCALE])
 
 
 _MOST_READERS = 8
 """Cubes read at once: hashing and comparing take longer than a disk, and don't hold each other up."""
-Size = tuple[int, int]
+_Size = tuple[int, int]
 """Height and width in pixels."""
 
 
@@ -308,7 +308,7 @@ def check_cube_headers(
     located: tuple[dict[str, Path], ...],
     operators: Sequence[np.ndarray | None],
     faults: Faults,
-) -> tuple[list[Size | None], list[ArrayHeader | None]]:
+) -> tuple[list[_Size | None], list[_ArrayHeader | None]]:
     """Check shapes and types against sizes and sensors.
 
     Args:
@@ -316,14 +316,14 @@ def check_cube_headers(
     Returns:
         Sizes of the frames' images, None where nothing tells one, and the sound headers.
     """
-    shared: tuple[Size, str] | None = None
+    shared: tuple[_Size, str] | None = None
     bands: tuple[int, str] | None = None
-    sizes: list[Size | None] = []
-    headers: list[ArrayHeader | None] = []
+    sizes: list[_Size | None] = []
+    headers: list[_ArrayHeader | None] = []
     for frame, paths, operator in zip(entry.frames, located, operators, strict=True):
         path = paths.get("hyperspectral_file_path")
         where = frame.name_of("hyperspectral_file_path")
-        header = None if path is None else read_header(path, "(H, W, B)", where, faults)
+        header = None if path is None else _read_header(path, "(H, W, B)", where, faults)
         expected = _stated_size(frame) or shared
         headers.append(header)
         if header is not None:
@@ -331,8 +331,8 @@ def check_cube_headers(
             if expected is None:
                 expected = shared = found, f"as {where} has"
             if found != expected[0]:
-                message = f"expected {describe_size(expected[0])}, {expected[1]}"
-                faults.add(where, f"the cube has {describe_size(found)} pixels (width x height); {message}")
+                message = f"expected {_describe_size(expected[0])}, {expected[1]}"
+                faults.add(where, f"the cube has {_describe_size(found)} pixels (width x height); {message}")
                 headers[-1] = None
             wanted = bands if operator is None else (len(operator), _bands_from(frame))
             if wanted is None:
@@ -346,14 +346,14 @@ def check_cube_headers(
 def check_cube_values(
     entry: SceneEntry,
     located: tuple[dict[str, Path], ...],
-    headers: list[ArrayHeader | None],
+    headers: list[_ArrayHeader | None],
     value_scale: float | None,
     invalid_pixels: InvalidPixels,
     faults: Faults,
-) -> list[CubeValues | None]:
+) -> list[_CubeValues | None]:
     """Read and check every value of the cubes that have a header; returns what each frame's cube holds."""
 
-    def measure(paths: dict[str, Path], header: ArrayHeader | None) -> CubeValues | None:
+    def measure(paths: dict[str, Path], header: _ArrayHeader | None) -> _CubeValues | None:
         if header is None:
             return None
         return measure_cube(paths["hyperspectral_file_path"], value_scale, invalid_pixels)
@@ -371,7 +371,7 @@ def check_cube_values(
     return measured
 
 
-def read_header(path: Path, layout: str, where: str, faults: Faults) -> ArrayHeader | None:
+def _read_header(path: Path, layout: str, where: str, faults: Faults) -> _ArrayHeader | None:
     """The header of an array of three axes, none of length 0; None and a noted fault otherwise."""
     try:
         header = read_array_header(path)
@@ -388,17 +388,17 @@ def read_header(path: Path, layout: str, where: str, faults: Faults) -> ArrayHea
 
 
 def check_abundances(
-    path: Path, size: Size | None, num_materials: int | None, where: str, faults: Faults
+    path: Path, size: _Size | None, num_materials: int | None, where: str, faults: Faults
 ) -> None:
     """Check one frame's true abundances."""
-    header = read_header(path, "(H, W, K)", where, faults)
+    header = _read_header(path, "(H, W, K)", where, faults)
     if header is None:
         return
     found = header.shape[0], header.shape[1]
     if size is not None and found != size:
         faults.add(
             where,
-            f"has {describe_size(found)} pixels (width x height); expected {describe_size(size)} as the cubes have",
+            f"has {_describe_size(found)} pixels (width x height); expected {_describe_size(size)} as the cubes have",
         )
     if num_materials is not None and header.shape[2] != num_materials:
         faults.add(
@@ -409,12 +409,14 @@ def check_abundances(
         faults.add(where, "has abundances outside [0, 1] or NaN; expected fractions")
 
 
-def describe_size(size: Size) -> str:
+def _describe_size(size: _Size) -> str:
     """Width x height."""
     return f"{size[1]} x {size[0]}"
 
 
-def _note_invalid(named: list[tuple[str, CubeValues]], invalid_pixels: InvalidPixels, faults: Faults) -> None:
+def _note_invalid(
+    named: list[tuple[str, _CubeValues]], invalid_pixels: InvalidPixels, faults: Faults
+) -> None:
     """Unusable pixels; counts are summed over the frames, so that one message serves them all."""
     usable = []
     for where, values in named:
@@ -446,23 +448,23 @@ def _note_invalid(named: list[tuple[str, CubeValues]], invalid_pixels: InvalidPi
         faults.add(where, f"{cube} {found} values in {invalid} of {pixels} pixels{lowest}; {remedy}")
 
 
-def _note_scales(measured: list[tuple[str, CubeValues]], scale: float | None, faults: Faults) -> None:
+def _note_scales(measured: list[tuple[str, _CubeValues]], scale: float | None, faults: Faults) -> None:
     """Integer cubes and cubes in other units; one proposal serves the whole scene, from its greatest value."""
     integers = [(where, values) for where, values in measured if values.is_integer]
     if integers and scale is None:
         greatest = max(values.greatest for _, values in integers)
-        proposal = propose_scale(greatest, is_integer=True)
+        proposal = _propose_scale(greatest, is_integer=True)
         message = (
             f"the cube holds integers (up to {greatest:g} in this scene); give --value-scale {proposal:g}"
         )
         for where, _ in integers:
-            faults.add(where, f"{message}, the number that stands for 1{describe_scale(proposal)}")
+            faults.add(where, f"{message}, the number that stands for 1{_describe_scale(proposal)}")
     is_judged = [(w, v) for w, v in measured if not (v.is_integer and scale is None)]
-    far = [(where, values) for where, values in is_judged if is_far_out_of_range(values, scale)]
+    far = [(where, values) for where, values in is_judged if _is_far_out_of_range(values, scale)]
     if not far:
         return
     greatest = max(values.greatest for _, values in far)
-    proposal = propose_scale(greatest, all(values.is_integer for _, values in far))
+    proposal = _propose_scale(greatest, all(values.is_integer for _, values in far))
     given = "" if scale is None else f" after division by --value-scale {scale:g}"
     advice = f"give --value-scale {proposal:g}"
     if scale is None:
@@ -474,7 +476,7 @@ def _note_scales(measured: list[tuple[str, CubeValues]], scale: float | None, fa
         )
 
 
-def _stated_size(frame: FrameEntry) -> tuple[Size, str] | None:
+def _stated_size(frame: FrameEntry) -> tuple[_Size, str] | None:
     lens = frame.intrinsics
     if lens is None or lens.width is None or lens.height is None:
         return None

@@ -15,7 +15,7 @@ from unmix_plugin.errors import SceneError
 
 MAX_LISTED = 20
 """Faults written out in one message; the rest is counted."""
-MAX_PLACES = 3
+_MAX_PLACES = 3
 """Places written out for a fault that many frames share."""
 
 
@@ -65,8 +65,8 @@ class Faults:
 
 
 def _name_places(places: list[str]) -> str:
-    shown = ", ".join(places[:MAX_PLACES])
-    hidden = len(places) - MAX_PLACES
+    shown = ", ".join(places[:_MAX_PLACES])
+    hidden = len(places) - _MAX_PLACES
     return f"{shown} and {hidden} more" if hidden > 0 else shown
 
 
@@ -119,7 +119,7 @@ def read_number(value: Any) -> float | None:
     return number if math.isfinite(number) else None
 
 
-HASH_BLOCK_BYTES = 1 << 20
+_HASH_BLOCK_BYTES = 1 << 20
 
 
 def resolve_path(
@@ -160,6 +160,6 @@ def sha256_of(path: Path) -> str:
     """SHA-256 of a file of any size, read in small blocks."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
-        while block := file.read(HASH_BLOCK_BYTES):
+        while block := file.read(_HASH_BLOCK_BYTES):
             digest.update(block)
     return digest.hexdigest()

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 FORMATS = ("PNG", "JPEG", "TIFF")
 """Pillow reads more formats, some of which start other programs."""
-COLOUR_MODES = {"RGB": "RGB", "RGBA": "RGBA", "L": "RGB", "LA": "RGBA", "1": "RGB"}
+_COLOUR_MODES = {"RGB": "RGB", "RGBA": "RGBA", "L": "RGB", "LA": "RGBA", "1": "RGB"}
 """How each pillow mode of 8 bits is brought to RGB or RGBA; palettes are looked at separately."""
 
 UNLABELLED = 255
@@ -44,9 +44,9 @@ def read_colour(path: Path, size: Size) -> UInt8[np.ndarray, "H W C"]:
     def convert(image: Image.Image) -> np.ndarray:
         if image.mode == "P":
             return np.asarray(image.convert("RGBA" if "transparency" in image.info else "RGB"))
-        if image.mode not in COLOUR_MODES:
+        if image.mode not in _COLOUR_MODES:
             raise UnreadableImageError(f"is a picture of mode {image.mode}; expected 8-bit RGB or RGBA")
-        return np.asarray(image.convert(COLOUR_MODES[image.mode]))
+        return np.asarray(image.convert(_COLOUR_MODES[image.mode]))
 
     return _read(path, size, convert)
 
@@ -97,18 +97,18 @@ def _read(path: Path, size: Size, convert: Callable[[Image.Image], np.ndarray]) 
         ) from error
 
 
-Pictures = list[Bool[np.ndarray, "_ _"] | None]
+_Pictures = list[Bool[np.ndarray, "_ _"] | None]
 """For each frame, None where it has no such picture."""
 
 
 def check_colours(
     entry: SceneEntry, located: tuple[dict[str, Path], ...], sizes: Sequence[Size | None], faults: Faults
-) -> Pictures | None:
+) -> _Pictures | None:
     """Check all pictures; returns where each is not fully transparent, or None if the scene has no alpha.
 
     It has if some pixel of a picture is not opaque; then every frame must have a picture with an alpha channel.
     """
-    seen: Pictures = []
+    seen: _Pictures = []
     is_readable = []
     example = None
     for frame, paths, size in zip(entry.frames, located, sizes, strict=True):
@@ -130,9 +130,9 @@ def check_colours(
 
 def check_masks(
     entry: SceneEntry, located: tuple[dict[str, Path], ...], sizes: Sequence[Size | None], faults: Faults
-) -> Pictures:
+) -> _Pictures:
     """Check all masks; returns which pixels they keep."""
-    masks: Pictures = []
+    masks: _Pictures = []
     for frame, paths, size in zip(entry.frames, located, sizes, strict=True):
         masks.append(_read_picture_checks(frame, paths, "mask_path", read_mask, size, faults))
         if masks[-1] is not None and not masks[-1].any():

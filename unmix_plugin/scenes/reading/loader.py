@@ -1,14 +1,11 @@
-"""Cameras and model space of a scene: which box the training views show, and whether the world goes on behind it.
-
-From a scene folder to a validated `Scene`.
+"""From a scene folder to a validated `Scene`.
 
 Each check notes its faults and goes on, so that one reading names them all. Only one frame's values are in memory at a
-time.
+time. Model space is found last: which box the training views show, and whether the world goes on behind it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
@@ -22,9 +19,13 @@ from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.errors import SceneError, SpectrumError
 from unmix_plugin.scenes.geometry.bounds import find_bounds
-from unmix_plugin.scenes.geometry.matched_points import MatchedPoints, find_matched_points
-from unmix_plugin.scenes.geometry.pose_check import ReadView, commonest, compare_conventions, describe
-from unmix_plugin.scenes.geometry.world_evidence import find_world_evidence
+from unmix_plugin.scenes.geometry.matched_points import find_matched_points
+from unmix_plugin.scenes.geometry.view_agreement import (
+    commonest,
+    compare_conventions,
+    describe,
+    find_world_evidence,
+)
 from unmix_plugin.scenes.reading.cubes import (
     check_abundances,
     check_cube_headers,
@@ -35,244 +36,13 @@ from unmix_plugin.scenes.reading.faults import Faults, resolve_path, sha256_of
 from unmix_plugin.scenes.reading.images import Size, check_colours, check_labels, check_masks
 from unmix_plugin.scenes.reading.sensors import check_coverage, group_by_sensor, read_operators
 from unmix_plugin.scenes.reading.splits import Split, split_frames
-from unmix_plugin.scenes.reading.transforms_json import FILE_NAME, Intrinsics, SceneEntry, read_transforms
+from unmix_plugin.scenes.reading.transforms_json import FILE_NAME, SceneEntry, read_transforms
 from unmix_plugin.scenes.scene import Frame, Normalisation, Scene, SceneOptions
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, read_illuminant_csv, read_spectra_csv
 from unmix_plugin.spectral.sensor import SceneSensor
 
-
-def make_cameras(entry: SceneEntry, sizes: list[Size], normalisation: Normalisation) -> Cameras:
-    """Cameras of all frames.
-
-    Args:
-        entry: Without faults.
-        sizes: Height and width of each frame's image.
-        normalisation: From the space of transforms.json to that of the cameras.
-    """
-    lenses = [frame.intrinsics for frame in entry.frames if frame.intrinsics is not None]
-    assert len(lenses) == len(entry.frames)
-    centers = [
-        [
-            0.5 * side if value is None else value
-            for value, side in zip(lens.center_px, size[::-1], strict=True)
-        ]
-        for lens, size in zip(lenses, sizes, strict=True)
-    ]
-    focal_px = [lens.focal_at(width) for lens, (_, width) in zip(lenses, sizes, strict=True)]
-    return Cameras.of_sizes(
-        camera_to_world=_model_poses(world_poses(entry), normalisation),
-        focal_px=torch.tensor(focal_px, dtype=torch.float32),
-        center_px=torch.tensor(centers, dtype=torch.float32),
-        distortion=_distortion(lenses),
-        sizes=[(width, height) for height, width in sizes],
-        key_poses=_key_poses(entry, normalisation),
-    )
-
-
-def world_poses(entry: SceneEntry) -> Float64[np.ndarray, "N 3 4"]:
-    """One pose a frame, as transforms.json has it; of a line camera halfway through the image."""
-    poses = [frame.pose for frame in entry.frames if frame.pose is not None]
-    assert len(poses) == len(entry.frames)
-    return np.stack(poses)
-
-
-def _model_poses(
-    poses: Float64[np.ndarray, "n 3 4"], normalisation: Normalisation
-) -> Float[torch.Tensor, "n 3 4"]:
-    rotations = normalisation.rotation @ poses[:, :, :3]
-    positions = normalisation.to_model(poses[:, :, 3])
-    return torch.from_numpy(np.concatenate([rotations, positions[:, :, None]], axis=-1)).float()
-
-
-def _key_poses(entry: SceneEntry, normalisation: Normalisation) -> KeyPoses | None:
-    """Poses by height in the image, where a frame is of a line camera; row r is taken at r + 0.5."""
-    if all(frame.line_poses is None for frame in entry.frames):
-        return None
-    parts = []
-    for frame, pose in zip(entry.frames, world_poses(entry), strict=True):
-        lines = frame.line_poses
-        rows, poses = (np.zeros(1), pose[None]) if lines is None else (lines.rows, lines.poses)
-        heights = torch.from_numpy(rows + 0.5).float()
-        parts.append(KeyPoses(_model_poses(poses, normalisation), heights, (len(rows),)))
-    return KeyPoses.join(parts)
-
-
-def _distortion(lenses: list[Intrinsics]) -> Float[torch.Tensor, "N D"]:
-    """Coefficients of all lenses: six where any has higher radial terms, otherwise four."""
-    count = max(len(lens.coefficients) for lens in lenses)
-    rows = [(*lens.distortion, *lens.higher_radial)[:count] for lens in lenses]
-    return torch.tensor(rows, dtype=torch.float32)
-
-
-def find_model_space(
-    root: Path, entry: SceneEntry, checked: CheckedFiles, train: tuple[int, ...], options: SceneOptions
-) -> tuple[Normalisation, SceneBox, bool]:
-    """The box that the training views show, how its longest edge becomes [-1, 1], and whether the world goes on.
-
-    The similarity starts from the space of transforms.json. The box is found in a space centred on the training
-    cameras, where coordinates are of order 1.
-
-    Raises:
-        SceneError: alpha and poses contradict.
-    """
-    cubes = list(checked.cube_hashes)
-    first = _centred_on(world_poses(entry)[list(train), :, 3])
-    cameras = make_cameras(entry, checked.sizes, first)[list(train)]
-    foreground = None if checked.foreground is None else [checked.foreground[index] for index in train]
-    alike = commonest([checked.sensor_indices[index] for index in train])
-
-    def read_view(view: int, part: tuple[slice, ...]) -> Float32[np.ndarray, "H W B"]:
-        return read_cube(cubes[train[alike[view]]], options.value_scale, options.invalid_pixels, part)
-
-    points = None
-    if foreground is None and meeting_point(cameras.camera_to_world.double().numpy()) is None:
-        points = _matched_points(cameras, alike, read_view)
-    try:
-        first_box = find_bounds(root, cameras, foreground, points)
-    except SceneError as error:
-        alike_poses = world_poses(entry)[[train[row] for row in alike]]
-        hint = describe(compare_conventions(alike_poses, cameras[alike], read_view))
-        raise SceneError(f"{error}\n{hint}" if hint else str(error)) from error
-    is_unbounded = options.world == "unbounded"
-    if options.world == "auto" and foreground is None and not (points and points.are_equally_far):
-        is_unbounded = find_world_evidence(first_box, cameras[alike], read_view).goes_on
-    low, high = first_box.aabb.double().numpy()
-    scale = float(2.0 / (high - low).max())
-    half = 0.5 * scale * (high - low)
-    translation = first.translation - 0.5 * (low + high) / first.scale
-    box = SceneBox(torch.from_numpy(np.stack([-half, half])).float())
-    return Normalisation(first.rotation, translation, first.scale * scale), box, is_unbounded
-
-
-def _centred_on(positions: np.ndarray) -> Normalisation:
-    """A space in which the farthest of these (N, 3) is 1 from their middle, the origin."""
-    middle = positions.mean(axis=0)
-    radius = float(np.linalg.norm(positions - middle, axis=-1).max())
-    return Normalisation(np.eye(3), -middle, 1.0 / radius if radius > 0.0 else 1.0)
-
-
-def _matched_points(cameras: Cameras, alike: Sequence[int], read_view: ReadView) -> MatchedPoints | None:
-    """Places that views of one sensor agree on, by the numbers of all cameras."""
-    found = find_matched_points(cameras[list(alike)], read_view)
-    return None if found is None else replace(found, views=torch.tensor(alike)[found.views])
-
-
-def read_illuminant(
-    path: Path, wavelengths_nm: Float64[np.ndarray, " B"], where: str, faults: Faults
-) -> Float64[np.ndarray, " B"] | None:
-    """Relative power of the light, greatest value 1; None and a noted fault if it cannot be had at these bands."""
-    try:
-        return read_illuminant_csv(path, Bands(wavelengths_nm))
-    except SpectrumError as error:
-        faults.add(where, str(error))
-        return None
-
-
-def read_endmembers(
-    path: Path,
-    wavelengths_nm: Float64[np.ndarray, " B"],
-    materials: tuple[str, ...] | None,
-    where: str,
-    faults: Faults,
-) -> SpectraTable | None:
-    """True endmembers in the order of `materials`, matched by name; None and a noted fault if they do not fit."""
-    try:
-        table = read_spectra_csv(path).resampled(Bands(wavelengths_nm))
-    except SpectrumError as error:
-        faults.add(where, str(error))
-        return None
-    if materials is None:
-        return table
-    if sorted(materials) != sorted(table.names):
-        faults.add(where, f"{path} names {list(table.names)}; expected the 'materials' {list(materials)}")
-        return None
-    order = [table.names.index(name) for name in materials]
-    return SpectraTable(table.bands, materials, table.spectra[order])
-
-
-@dataclass(frozen=True)
-class CheckedFiles:
-    """What the checks found on their way through the files."""
-
-    sizes: list[Size]
-    """Of each frame's images."""
-    sensors: tuple[SceneSensor, ...]
-    sensor_indices: tuple[int, ...]
-    """Which sensor took each frame."""
-    foreground: tuple[Bool[np.ndarray, "_ _"], ...] | None
-    """For each frame the pixels that may show something: not fully transparent, or not to be trusted. None where the
-    scene has no alpha."""
-    cube_hashes: dict[Path, str]
-    """SHA-256 of each cube, in the order of the frames."""
-
-
-def locate_files(
-    root: Path, entry: SceneEntry, options: SceneOptions, faults: Faults
-) -> tuple[dict[str, Path], ...]:
-    """The files of each frame by the key that names them; a file that two frames share as their cube is a fault."""
-    located: list[dict[str, Path]] = []
-    owner: dict[Path, str] = {}
-    for frame in entry.frames:
-        paths: dict[str, Path] = {}
-        for key, text in frame.paths.items():
-            path = resolve_path(root, text, options.allow_outside_paths, frame.where, faults)
-            if path is not None:
-                paths[key] = path
-        cube = paths.get("hyperspectral_file_path")
-        if cube is not None:
-            first = owner.setdefault(cube.resolve(), frame.where)
-            if first != frame.where:
-                text = frame.paths["hyperspectral_file_path"]
-                faults.add(frame.where, f"is a duplicate: its cube {text!r} is that of {first} too; drop one")
-        located.append(paths)
-    return tuple(located)
-
-
-def check_files(
-    entry: SceneEntry,
-    located: tuple[dict[str, Path], ...],
-    num_materials: int | None,
-    options: SceneOptions,
-    faults: Faults,
-) -> CheckedFiles | None:
-    """Read and check all files of all frames; None with noted faults if no cube is sound."""
-    entries = [
-        (frame.where, frame.sensor, paths.get("responses_path"))
-        for frame, paths in zip(entry.frames, located, strict=True)
-    ]
-    operators = read_operators(entries, entry.wavelengths_nm, faults)
-    sizes, headers = check_cube_headers(entry, located, operators, faults)
-    values = check_cube_values(entry, located, headers, options.value_scale, options.invalid_pixels, faults)
-    seen = check_colours(entry, located, sizes, faults)
-    masks = check_masks(entry, located, sizes, faults)
-    check_labels(entry, located, sizes, num_materials, faults)
-    for frame, paths, size in zip(entry.frames, located, sizes, strict=True):
-        if "abundance_file_path" in paths:
-            where = frame.name_of("abundance_file_path")
-            check_abundances(paths["abundance_file_path"], size, num_materials, where, faults)
-    cubes = [cube for cube in values if cube is not None]
-    known_sizes = [size for size in sizes if size is not None]
-    known_operators = [operator for operator in operators if operator is not None]
-    if len(cubes) != len(values) or len(known_operators) != len(operators) or not cubes:
-        return None
-    foreground = None
-    if seen is not None:
-        foreground = tuple(
-            (np.ones(size, bool) if shown is None else shown)
-            | (False if cube.invalid is None else cube.invalid)
-            | (False if mask is None else ~mask)
-            for shown, cube, mask, size in zip(seen, cubes, masks, known_sizes, strict=True)
-        )
-    paths = [paths["hyperspectral_file_path"] for paths in located]
-    sensors, indices = group_by_sensor(entries, known_operators, known_sizes, faults)
-    hashes = {path: cube.sha256 for path, cube in zip(paths, cubes, strict=True)}
-    return CheckedFiles(known_sizes, sensors, indices, foreground, hashes)
-
-
-SCALE_RANGE = (1e-30, 1e30)
-"""Of `value_scale`: what float32 can divide by."""
-MEASURED_KEYS = ("hyperspectral_file_path", "file_path", "mask_path", "responses_path")
+_MEASURED_KEYS = ("hyperspectral_file_path", "file_path", "mask_path", "responses_path")
 """Files of a frame that a training reads; the others are the truth, for evaluation only."""
 
 
@@ -289,16 +59,26 @@ def load_scene(root: Path, options: SceneOptions | None = None) -> Scene:
     """
     options = SceneOptions() if options is None else options
     faults = Faults(root)
-    _check_options(options, faults)
+    if (
+        options.value_scale is not None and not 1e-30 <= options.value_scale <= 1e30
+    ):  # float32 divides by these
+        found = f"is {options.value_scale:g}"
+        faults.add(
+            "--value-scale", f"{found}; expected a positive number, the stored value that stands for 1"
+        )
+        faults.raise_if_any()
     entry = read_transforms(root, faults)
     if options.value_scale is None:
         options = replace(options, value_scale=entry.value_scale)
-    located = locate_files(root, entry, options, faults)
+    located = _locate_files(root, entry, options, faults)
     truth = _read_truth(root, entry, options, faults)
     names = truth.material_names
-    checked = check_files(entry, located, None if names is None else len(names), options, faults)
+    checked = _check_files(entry, located, None if names is None else len(names), options, faults)
     if checked is not None:
-        _check_line_poses(entry, checked.sizes, faults)
+        for frame, (height, _) in zip(entry.frames, checked.sizes, strict=True):
+            fault = None if frame.line_poses is None else frame.line_poses.fault(height)
+            if fault is not None:
+                faults.add(frame.where, fault)
     split = split_frames(entry, options.eval_split, options.eval_interval, faults)
     if checked is not None and split.train and entry.wavelengths_nm is not None:
         used = {checked.sensor_indices[index] for index in split.train}
@@ -314,13 +94,6 @@ def load_scene(root: Path, options: SceneOptions | None = None) -> Scene:
     return _assemble(root, entry, located, checked, truth, split, options)
 
 
-def _check_line_poses(entry: SceneEntry, sizes: list[Size], faults: Faults) -> None:
-    for frame, (height, _) in zip(entry.frames, sizes, strict=True):
-        fault = None if frame.line_poses is None else frame.line_poses.fault(height)
-        if fault is not None:
-            faults.add(frame.where, fault)
-
-
 @dataclass(frozen=True)
 class _Truth:
     """What a scene says of its materials and light; None where it says nothing."""
@@ -330,16 +103,6 @@ class _Truth:
     endmembers: Float64[np.ndarray, "K B"] | None
     light_paths: tuple[Path, ...]
     material_paths: tuple[Path, ...]
-
-
-def _check_options(options: SceneOptions, faults: Faults) -> None:
-    scale = options.value_scale
-    low, high = SCALE_RANGE
-    if scale is not None and not low <= scale <= high:
-        faults.add(
-            "--value-scale", f"is {scale:g}; expected a positive number, the stored value that stands for 1"
-        )
-        faults.raise_if_any()
 
 
 def _read_truth(root: Path, entry: SceneEntry, options: SceneOptions, faults: Faults) -> _Truth:
@@ -353,7 +116,7 @@ def _read_truth(root: Path, entry: SceneEntry, options: SceneOptions, faults: Fa
             continue
         paths[key] = (path,)
         if key == "illuminant_path":
-            illuminant = read_illuminant(path, entry.wavelengths_nm, f"'{key}'", faults)
+            illuminant = _read_illuminant(path, entry.wavelengths_nm, f"'{key}'", faults)
         else:
             table = read_endmembers(path, entry.wavelengths_nm, names, f"'{key}'", faults)
             names, endmembers = (names, None) if table is None else (table.names, table.spectra)
@@ -366,16 +129,16 @@ def _assemble(
     root: Path,
     entry: SceneEntry,
     located: tuple[dict[str, Path], ...],
-    checked: CheckedFiles,
+    checked: _CheckedFiles,
     truth: _Truth,
     split: Split,
     options: SceneOptions,
 ) -> Scene:
     assert entry.wavelengths_nm is not None
-    normalisation, scene_box, is_unbounded = find_model_space(root, entry, checked, split.train, options)
-    inputs = [path for paths in located for key, path in paths.items() if key in MEASURED_KEYS]
+    normalisation, scene_box, is_unbounded = _find_model_space(root, entry, checked, split.train, options)
+    inputs = [path for paths in located for key, path in paths.items() if key in _MEASURED_KEYS]
     inputs += [root / FILE_NAME, *truth.light_paths]
-    truths = [path for paths in located for key, path in paths.items() if key not in MEASURED_KEYS]
+    truths = [path for paths in located for key, path in paths.items() if key not in _MEASURED_KEYS]
     truths += truth.material_paths
     hashes = checked.cube_hashes
     evaluated = [located[index] for index in split.evaluation]
@@ -431,3 +194,219 @@ def _name_frames(
 
 def _relative(path: Path, root: Path) -> str:
     return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
+
+
+@dataclass(frozen=True)
+class _CheckedFiles:
+    """What the checks found on their way through the files."""
+
+    sizes: list[Size]
+    """Of each frame's images."""
+    sensors: tuple[SceneSensor, ...]
+    sensor_indices: tuple[int, ...]
+    """Which sensor took each frame."""
+    foreground: tuple[Bool[np.ndarray, "_ _"], ...] | None
+    """For each frame the pixels that may show something: not fully transparent, or not to be trusted. None where the
+    scene has no alpha."""
+    cube_hashes: dict[Path, str]
+    """SHA-256 of each cube, in the order of the frames."""
+
+
+def _locate_files(
+    root: Path, entry: SceneEntry, options: SceneOptions, faults: Faults
+) -> tuple[dict[str, Path], ...]:
+    """The files of each frame by the key that names them; a file that two frames share as their cube is a fault."""
+    located: list[dict[str, Path]] = []
+    owner: dict[Path, str] = {}
+    for frame in entry.frames:
+        paths: dict[str, Path] = {}
+        for key, text in frame.paths.items():
+            path = resolve_path(root, text, options.allow_outside_paths, frame.where, faults)
+            if path is not None:
+                paths[key] = path
+        cube = paths.get("hyperspectral_file_path")
+        if cube is not None:
+            first = owner.setdefault(cube.resolve(), frame.where)
+            if first != frame.where:
+                text = frame.paths["hyperspectral_file_path"]
+                faults.add(frame.where, f"is a duplicate: its cube {text!r} is that of {first} too; drop one")
+        located.append(paths)
+    return tuple(located)
+
+
+def _check_files(
+    entry: SceneEntry,
+    located: tuple[dict[str, Path], ...],
+    num_materials: int | None,
+    options: SceneOptions,
+    faults: Faults,
+) -> _CheckedFiles | None:
+    """Read and check all files of all frames; None with noted faults if no cube is sound."""
+    entries = [
+        (frame.where, frame.sensor, paths.get("responses_path"))
+        for frame, paths in zip(entry.frames, located, strict=True)
+    ]
+    operators = read_operators(entries, entry.wavelengths_nm, faults)
+    sizes, headers = check_cube_headers(entry, located, operators, faults)
+    values = check_cube_values(entry, located, headers, options.value_scale, options.invalid_pixels, faults)
+    seen = check_colours(entry, located, sizes, faults)
+    masks = check_masks(entry, located, sizes, faults)
+    check_labels(entry, located, sizes, num_materials, faults)
+    for frame, paths, size in zip(entry.frames, located, sizes, strict=True):
+        if "abundance_file_path" in paths:
+            where = frame.name_of("abundance_file_path")
+            check_abundances(paths["abundance_file_path"], size, num_materials, where, faults)
+    cubes = [cube for cube in values if cube is not None]
+    known_sizes = [size for size in sizes if size is not None]
+    known_operators = [operator for operator in operators if operator is not None]
+    if len(cubes) != len(values) or len(known_operators) != len(operators) or not cubes:
+        return None
+    foreground = None
+    if seen is not None:
+        foreground = tuple(
+            (np.ones(size, bool) if shown is None else shown)
+            | (False if cube.invalid is None else cube.invalid)
+            | (False if mask is None else ~mask)
+            for shown, cube, mask, size in zip(seen, cubes, masks, known_sizes, strict=True)
+        )
+    paths = [paths["hyperspectral_file_path"] for paths in located]
+    sensors, indices = group_by_sensor(entries, known_operators, known_sizes, faults)
+    hashes = {path: cube.sha256 for path, cube in zip(paths, cubes, strict=True)}
+    return _CheckedFiles(known_sizes, sensors, indices, foreground, hashes)
+
+
+def _read_illuminant(
+    path: Path, wavelengths_nm: Float64[np.ndarray, " B"], where: str, faults: Faults
+) -> Float64[np.ndarray, " B"] | None:
+    """Relative power of the light, greatest value 1; None and a noted fault if it cannot be had at these bands."""
+    try:
+        return read_illuminant_csv(path, Bands(wavelengths_nm))
+    except SpectrumError as error:
+        faults.add(where, str(error))
+        return None
+
+
+def read_endmembers(
+    path: Path,
+    wavelengths_nm: Float64[np.ndarray, " B"],
+    materials: tuple[str, ...] | None,
+    where: str,
+    faults: Faults,
+) -> SpectraTable | None:
+    """True endmembers in the order of `materials`, matched by name; None and a noted fault if they do not fit."""
+    try:
+        table = read_spectra_csv(path).resampled(Bands(wavelengths_nm))
+    except SpectrumError as error:
+        faults.add(where, str(error))
+        return None
+    if materials is None:
+        return table
+    if sorted(materials) != sorted(table.names):
+        faults.add(where, f"{path} names {list(table.names)}; expected the 'materials' {list(materials)}")
+        return None
+    order = [table.names.index(name) for name in materials]
+    return SpectraTable(table.bands, materials, table.spectra[order])
+
+
+def make_cameras(entry: SceneEntry, sizes: list[Size], normalisation: Normalisation) -> Cameras:
+    """Cameras of all frames.
+
+    Args:
+        entry: Without faults.
+        sizes: Height and width of each frame's image.
+        normalisation: From the space of transforms.json to that of the cameras.
+    """
+    lenses = [frame.intrinsics for frame in entry.frames if frame.intrinsics is not None]
+    assert len(lenses) == len(entry.frames)
+    centers = [
+        [
+            0.5 * side if value is None else value
+            for value, side in zip(lens.center_px, size[::-1], strict=True)
+        ]
+        for lens, size in zip(lenses, sizes, strict=True)
+    ]
+    count = max(
+        len(lens.coefficients) for lens in lenses
+    )  # six where any has higher radial terms, otherwise four
+    distortion = [(*lens.distortion, *lens.higher_radial)[:count] for lens in lenses]
+    focal_px = [lens.focal_at(width, height) for lens, (height, width) in zip(lenses, sizes, strict=True)]
+    return Cameras.of_sizes(
+        camera_to_world=_model_poses(_world_poses(entry), normalisation),
+        focal_px=torch.tensor(focal_px, dtype=torch.float32),
+        center_px=torch.tensor(centers, dtype=torch.float32),
+        distortion=torch.tensor(distortion, dtype=torch.float32),
+        sizes=[(width, height) for height, width in sizes],
+        key_poses=_key_poses(entry, normalisation),
+    )
+
+
+def _world_poses(entry: SceneEntry) -> Float64[np.ndarray, "N 3 4"]:
+    """One pose a frame, as transforms.json has it; of a line camera halfway through the image."""
+    poses = [frame.pose for frame in entry.frames if frame.pose is not None]
+    assert len(poses) == len(entry.frames)
+    return np.stack(poses)
+
+
+def _model_poses(
+    poses: Float64[np.ndarray, "n 3 4"], normalisation: Normalisation
+) -> Float[torch.Tensor, "n 3 4"]:
+    rotations = normalisation.rotation @ poses[:, :, :3]
+    positions = normalisation.to_model(poses[:, :, 3])
+    return torch.from_numpy(np.concatenate([rotations, positions[:, :, None]], axis=-1)).float()
+
+
+def _key_poses(entry: SceneEntry, normalisation: Normalisation) -> KeyPoses | None:
+    """Poses by height in the image, where a frame is of a line camera; row r is taken at r + 0.5."""
+    if all(frame.line_poses is None for frame in entry.frames):
+        return None
+    parts = []
+    for frame, pose in zip(entry.frames, _world_poses(entry), strict=True):
+        lines = frame.line_poses
+        rows, poses = (np.zeros(1), pose[None]) if lines is None else (lines.rows, lines.poses)
+        heights = torch.from_numpy(rows + 0.5).float()
+        parts.append(KeyPoses(_model_poses(poses, normalisation), heights, (len(rows),)))
+    return KeyPoses.join(parts)
+
+
+def _find_model_space(
+    root: Path, entry: SceneEntry, checked: _CheckedFiles, train: tuple[int, ...], options: SceneOptions
+) -> tuple[Normalisation, SceneBox, bool]:
+    """The box that the training views show, how its longest edge becomes [-1, 1], and whether the world goes on.
+
+    The similarity starts from the space of transforms.json. The box is found in a space centred on the training
+    cameras, where coordinates are of order 1.
+
+    Raises:
+        SceneError: alpha and poses contradict.
+    """
+    cubes = list(checked.cube_hashes)
+    positions = _world_poses(entry)[list(train), :, 3]
+    middle = positions.mean(axis=0)
+    radius = float(np.linalg.norm(positions - middle, axis=-1).max())
+    first = Normalisation(np.eye(3), -middle, 1.0 / radius if radius > 0.0 else 1.0)
+    cameras = make_cameras(entry, checked.sizes, first)[list(train)]
+    foreground = None if checked.foreground is None else [checked.foreground[index] for index in train]
+    alike = commonest([checked.sensor_indices[index] for index in train])
+
+    def read_view(view: int, part: tuple[slice, ...]) -> Float32[np.ndarray, "H W B"]:
+        return read_cube(cubes[train[alike[view]]], options.value_scale, options.invalid_pixels, part)
+
+    points = None
+    if foreground is None and meeting_point(cameras.camera_to_world.double().numpy()) is None:
+        points = find_matched_points(cameras[alike], read_view)
+        points = None if points is None else replace(points, views=torch.tensor(alike)[points.views])
+    try:
+        first_box = find_bounds(root, cameras, foreground, points)
+    except SceneError as error:
+        alike_poses = _world_poses(entry)[[train[row] for row in alike]]
+        hint = describe(compare_conventions(alike_poses, cameras[alike], read_view))
+        raise SceneError(f"{error}\n{hint}" if hint else str(error)) from error
+    is_unbounded = options.world == "unbounded"
+    if options.world == "auto" and foreground is None and not (points and points.are_equally_far):
+        is_unbounded = find_world_evidence(first_box, cameras[alike], read_view).goes_on
+    low, high = first_box.aabb.double().numpy()
+    scale = float(2.0 / (high - low).max())
+    half = 0.5 * scale * (high - low)
+    translation = first.translation - 0.5 * (low + high) / first.scale
+    box = SceneBox(torch.from_numpy(np.stack([-half, half])).float())
+    return Normalisation(first.rotation, translation, first.scale * scale), box, is_unbounded

@@ -13,8 +13,8 @@ from typing import Literal
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.transforms_json import FILE_NAME, SceneEntry
 
-SPLIT_NAMES = ("train", "eval", "val", "test")
-SPLIT_NAME = re.compile(
+_SPLIT_NAMES = ("train", "eval", "val", "test")
+_SPLIT_NAME = re.compile(
     r"(train(?:ing)?|eval(?:uation)?|val(?:idation)?|test(?:ing)?)(?![a-z])", re.IGNORECASE
 )
 """A folder or file name that starts with a split's name as a word of its own: train_000, test, val-3, eval7."""
@@ -101,9 +101,9 @@ def _name_split(paths: dict[str, str]) -> str | None:
     for key in ("file_path", "hyperspectral_file_path"):
         path = PurePosixPath(paths.get(key, ""))
         for word in (path.name, path.parent.name):
-            match = SPLIT_NAME.match(word)
+            match = _SPLIT_NAME.match(word)
             if match:
-                return next(name for name in SPLIT_NAMES if match.group(1).lower().startswith(name))
+                return next(name for name in _SPLIT_NAMES if match.group(1).lower().startswith(name))
     return None
 
 

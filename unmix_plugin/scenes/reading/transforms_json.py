@@ -2,14 +2,12 @@
 
 Nothing here opens a file other than transforms.json; a value of the wrong type becomes a noted fault and None. Keys of
 a frame come before those of the whole scene (nerfstudio's rule).
-
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -29,25 +27,47 @@ from unmix_plugin.scenes.reading.faults import (
 )
 from unmix_plugin.spectral.bands import require_nanometres
 
-SUPPORTED_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")
-GREATEST_PX = 1e9
+FILE_NAME = "transforms.json"
+_FILE_KEYS = (
+    "file_path",
+    "hyperspectral_file_path",
+    "seg_file_path",
+    "mask_path",
+    "abundance_file_path",
+    "responses_path",
+)
+_SPLIT_KEYS = ("train_filenames", "val_filenames", "test_filenames")
+
+_SUPPORTED_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")
+_GREATEST_PX = 1e9
 """Of focal lengths and principal points; beyond, and below its inverse, float32 loses what is projected."""
-SMALLEST_ANGLE = 1e-6
+_SMALLEST_ANGLE = 1e-6
 """Field of view in radians that is still one, and how much less than pi it must be."""
-BENDING_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
+_BENDING_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Also the order of nerfstudio's `distortion_params`."""
+_A_NUMBER = "a finite number, at most 1e9"
+
+_RIGID_TOLERANCE = 5e-3
+"""Largest element of R^T R - 1 that passes as rounding of printed digits; the rotation nearest to R is then taken."""
+_MAX_DISTANCE = 1e9
+"""Camera positions beyond this are damage; squares of larger ones would leave float32."""
+_ROW_POSES, _KEY_POSES = "row_poses", "key_poses"
+_GREATEST_TURN_DEG = 90.0
+"""Between neighbouring key poses: beyond, it is unclear which way the camera turned."""
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Lens of one frame. Sizes in pixels; None where the cube decides."""
+    """Lens of one frame. Sizes in pixels; None where the file says nothing."""
 
+    model: Any
+    """What `camera_model` says; OPENCV where it is absent. Only `read_intrinsics` refuses models."""
     width: int | None
     height: int | None
-    focal_px: tuple[float, float] | None
-    """None where `camera_angle_x` is given and the width not yet known."""
-    angle_x: float | None
-    """Horizontal field of view in radians."""
+    focal_px: tuple[float | None, float | None]
+    """Along x and y."""
+    angles: tuple[float | None, float | None]
+    """Fields of view along x and y, radians."""
     center_px: tuple[float | None, float | None]
     """None is the middle of the image."""
     distortion: tuple[float, float, float, float]
@@ -60,118 +80,94 @@ class Intrinsics:
         """k1, k2, p1, p2, and k3, k4 where one of them is not 0."""
         return (*self.distortion, *(self.higher_radial if any(self.higher_radial) else ()))
 
-    def focal_at(self, width: int) -> tuple[float, float]:
-        """Focal lengths x, y in pixels for images of this width."""
-        if self.focal_px is not None:
-            return self.focal_px
-        focal = 0.5 * width / math.tan(0.5 * (self.angle_x or 1.0))
-        return (focal, focal)
+    def focal_at(self, width: int, height: int) -> tuple[float, float] | None:
+        """Focal lengths x, y in pixels of an image of this size; None if the file gives none.
+
+        Each is the one given, or follows from the field of view, or is that of the other axis.
+        """
+        x, y = (
+            focal if focal is not None or angle is None else 0.5 * side / math.tan(0.5 * angle)
+            for focal, angle, side in zip(self.focal_px, self.angles, (width, height), strict=True)
+        )
+        x, y = y if x is None else x, x if y is None else y
+        return None if x is None or y is None else (x, y)
+
+
+def read_lens(
+    content: dict[str, Any], frame: dict[str, Any], where: str, faults: Faults
+) -> Intrinsics | None:
+    """The lens keys of a frame of any transforms.json, whatever its model and whether or not it has a focal length.
+
+    For every reader of such files: numbers are finite, sizes whole, focal lengths above 0, angles between 0 and pi.
+
+    Args:
+        content: The whole file, whose keys hold for frames that lack them.
+        frame: Keys of the frame.
+        where: How messages call the frame.
+        faults: Where faults are noted.
+    Returns:
+        None, with noted faults, if a number is impossible.
+    """
+    noted_before = faults.noted
+
+    def read(key: str, low: float, high: float, expected: str, is_whole: bool = False) -> float | None:
+        source = frame if frame.get(key) is not None else content
+        value = source.get(key)
+        number, owner = read_number(value), FILE_NAME if source is content else where
+        if value is not None and (number is None or abs(number) > _GREATEST_PX):
+            faults.add(owner, f"'{key}' is {describe(value)}; expected {_A_NUMBER}")
+        elif number is not None and (not low <= number <= high or (is_whole and number != int(number))):
+            faults.add(owner, f"'{key}' is {number:g}; expected {expected}")
+        return number
+
+    sides = [read(key, 1, _GREATEST_PX, "a whole number of pixels", is_whole=True) for key in ("w", "h")]
+    focal_px, angles, center_px = (
+        (read(f"{key}x", low, high, expected), read(f"{key}y", low, high, expected))
+        for key, low, high, expected in (
+            ("fl_", 1 / _GREATEST_PX, _GREATEST_PX, "a focal length above 0 in pixels"),
+            ("camera_angle_", _SMALLEST_ANGLE, math.pi - _SMALLEST_ANGLE, "radians between 0 and pi"),
+            ("c", -_GREATEST_PX, _GREATEST_PX, _A_NUMBER),
+        )
+    )
+    bending = [read(key, -_GREATEST_PX, _GREATEST_PX, _A_NUMBER) for key in _BENDING_KEYS]
+    listed = frame.get("distortion_params", content.get("distortion_params"))
+    if listed is not None:
+        bending = [read_number(value) for value in listed] if isinstance(listed, list) else []
+        if len(bending) != len(_BENDING_KEYS) or any(
+            number is None or abs(number) > _GREATEST_PX for number in bending
+        ):
+            names = ", ".join(_BENDING_KEYS)
+            faults.add(where, f"'distortion_params' is {describe(listed)}; expected the numbers {names}")
+    if faults.noted > noted_before:
+        return None
+    width, height = (None if side is None else int(side) for side in sides)
+    k1, k2, k3, k4, p1, p2 = (number or 0.0 for number in bending)
+    model = frame.get("camera_model", content.get("camera_model", "OPENCV"))
+    return Intrinsics(model, width, height, focal_px, angles, center_px, (k1, k2, p1, p2), (k3, k4))
 
 
 def read_intrinsics(
     content: dict[str, Any], frame: dict[str, Any], where: str, faults: Faults
 ) -> Intrinsics | None:
-    """Read the lens of a frame; None and noted faults if it is not to be used."""
+    """As `read_lens`, for lenses that rays are cast through; None and noted faults if it is not to be used."""
     noted_before = faults.noted
-    numbers = _Numbers(content, frame, where, faults)
+    lens = read_lens(content, frame, where, faults)
     model = frame.get("camera_model", content.get("camera_model", "OPENCV"))
-    if model not in SUPPORTED_MODELS:
-        names = ", ".join(SUPPORTED_MODELS)
-        owner = where if "camera_model" in frame else "transforms.json"
+    if model not in _SUPPORTED_MODELS:
         faults.add(
-            owner,
-            f"camera_model {describe(model)} is not supported; expected one of {names}: undistort first",
+            where if "camera_model" in frame else FILE_NAME,
+            f"camera_model {describe(model)} is not supported; expected one of {', '.join(_SUPPORTED_MODELS)}: "
+            "undistort first",
         )
-    width, height = numbers.read_size("w"), numbers.read_size("h")
-    focal_x, focal_y = numbers.read("fl_x"), numbers.read("fl_y")
-    angle_x = numbers.read("camera_angle_x")
-    _check_focal(focal_x, focal_y, angle_x, numbers, where, faults)
-    bending = numbers.read_bending()
-    if model in ("PINHOLE", "SIMPLE_PINHOLE") and any(bending.values()):
-        faults.add(where, f"camera_model {model} comes with distortion {bending}; expected OPENCV or zeros")
-    if faults.noted > noted_before:
-        return None
-    focal_px = None if focal_x is None else (focal_x, focal_x if focal_y is None else focal_y)
-    return Intrinsics(
-        width=width,
-        height=height,
-        focal_px=focal_px,
-        angle_x=angle_x,
-        center_px=(numbers.read("cx"), numbers.read("cy")),
-        distortion=(bending["k1"], bending["k2"], bending["p1"], bending["p2"]),
-        higher_radial=(bending["k3"], bending["k4"]),
-    )
-
-
-def _check_focal(
-    focal_x: float | None,
-    focal_y: float | None,
-    angle_x: float | None,
-    numbers: _Numbers,
-    where: str,
-    faults: Faults,
-) -> None:
-    for key, focal in (("fl_x", focal_x), ("fl_y", focal_y)):
-        if focal is not None and not 1.0 / GREATEST_PX <= focal <= GREATEST_PX:
-            faults.add(where, f"'{key}' is {focal:g}; expected a focal length above 0 in pixels")
-    if angle_x is not None and not SMALLEST_ANGLE <= angle_x <= math.pi - SMALLEST_ANGLE:
-        faults.add(where, f"'camera_angle_x' is {angle_x:g}; expected radians between 0 and pi")
-    if not numbers.has("fl_x") and not numbers.has("camera_angle_x"):
+    if all(source.get(key) is None for source in (frame, content) for key in ("fl_x", "camera_angle_x")):
         faults.add(
             where, "'fl_x' is absent; expected the focal length in pixels, for a frame or the whole scene"
         )
-
-
-class _Numbers:
-    """Numbers of a frame, or of the scene where the frame has none; each fault is noted where the number is."""
-
-    def __init__(self, content: dict[str, Any], frame: dict[str, Any], where: str, faults: Faults) -> None:
-        self._content, self._frame, self._where, self._faults = content, frame, where, faults
-
-    def has(self, key: str) -> bool:
-        return self._frame.get(key) is not None or self._content.get(key) is not None
-
-    def read(self, key: str) -> float | None:
-        source = self._frame if self._frame.get(key) is not None else self._content
-        value = source.get(key)
-        if value is None:
-            return None
-        number = read_number(value)
-        if number is None or abs(number) > GREATEST_PX:
-            where = self._where if source is self._frame else "transforms.json"
-            self._faults.add(where, f"'{key}' is {describe(value)}; expected a finite number, at most 1e9")
-            return None
-        return number
-
-    def read_size(self, key: str) -> int | None:
-        number = self.read(key)
-        if number is not None and (number < 1 or number != int(number)):
-            self._faults.add(self._where, f"'{key}' is {number:g}; expected a whole number of pixels")
-            return None
-        return None if number is None else int(number)
-
-    def read_bending(self) -> dict[str, float]:
-        bending = {key: self.read(key) or 0.0 for key in BENDING_KEYS}
-        listed = self._frame.get("distortion_params", self._content.get("distortion_params"))
-        if listed is None:
-            return bending
-        values = [read_number(value) for value in listed] if isinstance(listed, list) else []
-        if len(values) != len(BENDING_KEYS) or any(
-            value is None or abs(value) > GREATEST_PX for value in values
-        ):
-            names = ", ".join(BENDING_KEYS)
-            self._faults.add(
-                self._where, f"'distortion_params' is {describe(listed)}; expected the numbers {names}"
-            )
-            return bending
-        return {key: value or 0.0 for key, value in zip(BENDING_KEYS, values, strict=True)}
-
-
-RIGID_TOLERANCE = 5e-3
-"""Largest element of R^T R - 1 that passes as rounding of printed digits; the rotation nearest to R is then taken."""
-
-MAX_DISTANCE = 1e9
-"""Camera positions beyond this are damage; squares of larger ones would leave float32."""
+    if lens is not None and model in ("PINHOLE", "SIMPLE_PINHOLE") and any(lens.coefficients):
+        (k1, k2, p1, p2), (k3, k4) = lens.distortion, lens.higher_radial
+        bending = dict(zip(_BENDING_KEYS, (k1, k2, k3, k4, p1, p2), strict=True))
+        faults.add(where, f"camera_model {model} comes with distortion {bending}; expected OPENCV or zeros")
+    return None if faults.noted > noted_before else lens
 
 
 def read_pose(
@@ -194,7 +190,7 @@ def read_pose(
     rotation, position = rows[:3, :3], rows[:3, 3]
     with np.errstate(over="ignore", invalid="ignore"):
         deviation = np.abs(rotation.T @ rotation - np.eye(3)).max()
-    if not deviation <= RIGID_TOLERANCE:
+    if not deviation <= _RIGID_TOLERANCE:
         lengths = ", ".join(f"{math.hypot(*axis):.4g}" for axis in rotation.T)  # hypot does not overflow
         message = f"{name} is not rigid: its axes have lengths ({lengths}) and R^T R is off the identity"
         faults.add(where, f"{message} by {deviation:.3g}; expected a rotation without scale or shear")
@@ -202,7 +198,7 @@ def read_pose(
     if np.linalg.det(rotation) < 0.0:
         faults.add(where, f"{name} is a reflection (determinant -1); expected a rotation, flip one axis")
         return None
-    if np.abs(position).max() > MAX_DISTANCE:
+    if np.abs(position).max() > _MAX_DISTANCE:
         faults.add(
             where,
             f"{name} puts the camera at {position.tolist()}; expected less than 1e9 units away",
@@ -213,14 +209,11 @@ def read_pose(
 
 
 def _read_rows(matrix: Any) -> Float64[np.ndarray, "rows 4"] | None:
-    if not isinstance(matrix, list) or len(matrix) not in (3, 4):
-        return None
-    if not all(isinstance(row, list) and len(row) == 4 for row in matrix):
+    is_matrix = isinstance(matrix, list) and len(matrix) in (3, 4)
+    if not is_matrix or not all(isinstance(row, list) and len(row) == 4 for row in matrix):
         return None
     numbers = [[read_number(value) for value in row] for row in matrix]
-    if any(number is None for row in numbers for number in row):
-        return None
-    return np.array(numbers, dtype=np.float64)
+    return None if any(None in row for row in numbers) else np.array(numbers, dtype=np.float64)
 
 
 def _found(matrix: Any) -> str:
@@ -235,13 +228,8 @@ def _found(matrix: Any) -> str:
     return describe(matrix)
 
 
-ROW_POSES, KEY_POSES = "row_poses", "key_poses"
-GREATEST_TURN_DEG = 90.0
-"""Between neighbouring key poses: beyond, it is unclear which way the camera turned."""
-
-
 @dataclass(frozen=True)
-class LinePoses:
+class _LinePoses:
     """Checked poses of one line camera."""
 
     rows: Float64[np.ndarray, " n"]
@@ -263,20 +251,20 @@ class LinePoses:
         if self.is_by_row:
             if len(self.rows) == num_rows:
                 return None
-            found = f"'{ROW_POSES}' has {len(self.rows)} poses, but the cube has {num_rows} rows"
+            found = f"'{_ROW_POSES}' has {len(self.rows)} poses, but the cube has {num_rows} rows"
             return f"{found}; expected one pose a row"
         first, last = float(self.rows[0]), float(self.rows[-1])
         if first <= 0 and last >= num_rows - 1:
             return None
         return (
-            f"'{KEY_POSES}' reach from row {first:g} to row {last:g}, but the cube has rows 0 to {num_rows - 1}; "
+            f"'{_KEY_POSES}' reach from row {first:g} to row {last:g}, but the cube has rows 0 to {num_rows - 1}; "
             "expected the first key pose at row 0 or before it, and the last at the last row or after it"
         )
 
 
-def read_line_poses(frame: dict[str, Any], where: str, faults: Faults) -> LinePoses | None:
+def _read_line_poses(frame: dict[str, Any], where: str, faults: Faults) -> _LinePoses | None:
     """The poses of a line camera; None for a frame camera, and with a noted fault where they are wrong."""
-    given = [key for key in (ROW_POSES, KEY_POSES) if frame.get(key) is not None]
+    given = [key for key in (_ROW_POSES, _KEY_POSES) if frame.get(key) is not None]
     if not given:
         return None
     if len(given) == 2 or frame.get("transform_matrix") is not None:
@@ -287,61 +275,41 @@ def read_line_poses(frame: dict[str, Any], where: str, faults: Faults) -> LinePo
     if not isinstance(entries, list) or len(entries) < 2:
         faults.add(where, f"'{given[0]}' is {describe(entries)}; expected a list of at least two poses")
         return None
-    is_by_row = given[0] == ROW_POSES
-    found = _row_poses(entries, where, faults) if is_by_row else _key_poses(entries, where, faults)
-    return None if found is None else _checked(*found, is_by_row, where, faults)
-
-
-def _row_poses(entries: list[Any], where: str, faults: Faults) -> tuple[list[float], list[np.ndarray]] | None:
-    poses = []
-    for row, matrix in enumerate(entries):
-        pose = read_pose(matrix, f"{where} '{ROW_POSES}'[{row}]", faults, "the pose")
-        if pose is None:  # one is enough: a list of a thousand rows has them all wrong in one way
-            return None
-        poses.append(pose)
-    return [float(row) for row in range(len(poses))], poses
-
-
-def _key_poses(entries: list[Any], where: str, faults: Faults) -> tuple[list[float], list[np.ndarray]] | None:
     rows, poses = [], []
     for index, entry in enumerate(entries):
-        here = f"{where} '{KEY_POSES}'[{index}]"
-        row = read_number(entry.get("row")) if isinstance(entry, dict) else None
-        if row is None:
-            found = (
-                f"has the row {describe(entry.get('row'))}"
-                if isinstance(entry, dict)
-                else f"is {describe(entry)}"
+        here, name, matrix, row = f"{where} '{given[0]}'[{index}]", "the pose", entry, float(index)
+        if given[0] == _KEY_POSES:
+            keys = entry if isinstance(entry, dict) else {}
+            name, matrix, number = (
+                "'transform_matrix'",
+                keys.get("transform_matrix"),
+                read_number(keys.get("row")),
             )
-            faults.add(here, f"{found}; expected an object with 'row' (a number) and 'transform_matrix'")
+            if number is None:
+                found = f"has the row {describe(keys.get('row'))}" if keys else f"is {describe(entry)}"
+                faults.add(here, f"{found}; expected an object with 'row' (a number) and 'transform_matrix'")
+                return None
+            row = number
+        pose = read_pose(matrix, here, faults, name)
+        if pose is None:  # one is enough: a list of a thousand rows has them all wrong in one way
             return None
-        pose = read_pose(entry.get("transform_matrix"), here, faults)
-        if pose is None:
+        if rows and row <= rows[-1]:
+            faults.add(where, f"the rows of '{_KEY_POSES}' must increase; got {rows[-1]:g} then {row:g}")
             return None
         rows.append(row)
         poses.append(pose)
-    return rows, poses
-
-
-def _checked(
-    rows: list[float], poses: list[np.ndarray], is_by_row: bool, where: str, faults: Faults
-) -> LinePoses | None:
-    for before, after in pairwise(rows):
-        if not after > before:
-            faults.add(where, f"the rows of '{KEY_POSES}' must increase; got {before:g} then {after:g}")
-            return None
     stacked = np.stack(poses)
     products = np.einsum("nab,nab->n", stacked[1:, :, :3], stacked[:-1, :, :3])
     turns = np.rad2deg(np.arccos(np.clip((products - 1) / 2, -1, 1)))
     largest = int(turns.argmax())
-    if turns[largest] > GREATEST_TURN_DEG:
+    if turns[largest] > _GREATEST_TURN_DEG:
         faults.add(
             where,
             f"the camera turns by {turns[largest]:.0f} degrees from row {rows[largest]:g} to row "
-            f"{rows[largest + 1]:g}; expected at most {GREATEST_TURN_DEG:g}, give more key poses",
+            f"{rows[largest + 1]:g}; expected at most {_GREATEST_TURN_DEG:g}, give more key poses",
         )
         return None
-    return LinePoses(np.array(rows), stacked, is_by_row)
+    return _LinePoses(np.array(rows), stacked, given[0] == _ROW_POSES)
 
 
 @dataclass(frozen=True)
@@ -372,18 +340,6 @@ def _read_sensor_entry(frame: dict[str, Any], where: str, faults: Faults) -> Sen
     return SensorEntry(name, tuple(bands))
 
 
-FILE_NAME = "transforms.json"
-SPLIT_KEYS = ("train_filenames", "val_filenames", "test_filenames")
-FILE_KEYS = (
-    "file_path",
-    "hyperspectral_file_path",
-    "seg_file_path",
-    "mask_path",
-    "abundance_file_path",
-    "responses_path",
-)
-
-
 @dataclass(frozen=True)
 class FrameEntry:
     """One element of `frames`; None where a value is absent or faulty."""
@@ -391,14 +347,14 @@ class FrameEntry:
     where: str
     """How messages call it."""
     paths: dict[str, str]
-    """The values of `FILE_KEYS` that are there."""
+    """The values of `_FILE_KEYS` that are there."""
     pose: Float64[np.ndarray, "3 4"] | None
     """Camera to world, rotation orthonormal; of a line camera in the middle of its image."""
     intrinsics: Intrinsics | None
     """Lens of this frame."""
     sensor: SensorEntry = SensorEntry()
     """What it was taken with."""
-    line_poses: LinePoses | None = None
+    line_poses: _LinePoses | None = None
     """Poses by row, where it was taken by a line camera."""
 
     def name_of(self, key: str) -> str:
@@ -485,13 +441,13 @@ def _read_frame(
     if not isinstance(frame, dict):
         faults.add(where, f"is {describe(frame)}; expected an object")
         return FrameEntry(where, {}, None, None)
-    paths = {key: _read_text(frame, key, where, faults) for key in FILE_KEYS}
+    paths = {key: _read_text(frame, key, where, faults) for key in _FILE_KEYS}
     if needs_cube and frame.get("hyperspectral_file_path") is None:
         faults.add(where, "has no 'hyperspectral_file_path'; expected the path of its (H, W, B) .npy cube")
     if frame.get("hyperspectral_file_path") is None and frame.get("file_path") is None and not needs_cube:
         faults.add(where, "has no 'file_path'; expected the path of its picture")
     noted = faults.noted
-    lines = read_line_poses(frame, where, faults)
+    lines = _read_line_poses(frame, where, faults)
     is_frame_camera = lines is None and faults.noted == noted
     pose = read_pose(frame.get("transform_matrix"), where, faults) if is_frame_camera else None
     return FrameEntry(
@@ -573,7 +529,7 @@ def _read_materials(content: dict[str, Any], faults: Faults) -> tuple[str, ...] 
 
 def _read_split_lists(content: dict[str, Any], faults: Faults) -> dict[str, tuple[str, ...]]:
     lists: dict[str, tuple[str, ...]] = {}
-    for key in SPLIT_KEYS:
+    for key in _SPLIT_KEYS:
         values = content.get(key)
         if values is None:
             continue

@@ -153,7 +153,7 @@ def _incandescent(wavelengths_nm: Float64[np.ndarray, " N"]) -> Float64[np.ndarr
     return 100.0 * (560.0 / wavelengths_nm) ** 5 * radiation
 
 
-ColourMode = Literal["true-colour", "false-colour"]
+_ColourMode = Literal["true-colour", "false-colour"]
 
 XYZ_TO_LINEAR_SRGB = np.array(
     [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]
@@ -171,7 +171,7 @@ _MIN_WHITE = 0.2
 scaling it to white would amplify noise."""
 
 
-def colour_mode(bands: Bands) -> ColourMode:
+def colour_mode(bands: Bands) -> _ColourMode:
     """Whether `rgb_matrix` gives colours as an eye would see them, or a false-colour composite.
 
     True colour takes a band centre in each of 380-500, 500-600 and 600-780 nm, and a noticeable response of each sRGB

@@ -36,14 +36,14 @@ def reflectance_to_lab(
         SpectrumError: the bands hold no visible light.
     """
     lit = light[:, None] * xyz_matrix(bands, torch.float64).numpy()
-    return xyz_to_lab(reflectance @ lit, lit.sum(axis=0))
+    return _xyz_to_lab(reflectance @ lit, lit.sum(axis=0))
 
 
 def srgb_to_lab(srgb: Float[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape 3"]:
     """L*a*b* of sRGB colours in [0, 1] on a display whose white is D65."""
     to_xyz = np.linalg.inv(XYZ_TO_LINEAR_SRGB)
     linear = srgb_to_linear(torch.from_numpy(np.asarray(srgb, dtype=np.float64))).numpy()
-    return xyz_to_lab(linear @ to_xyz.T, to_xyz.sum(axis=1))
+    return _xyz_to_lab(linear @ to_xyz.T, to_xyz.sum(axis=1))
 
 
 def lab_to_srgb(lab: Float[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape 3"]:
@@ -57,7 +57,7 @@ def lab_to_srgb(lab: Float[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*sha
     return linear_to_srgb(torch.from_numpy(linear)).numpy()
 
 
-def xyz_to_lab(
+def _xyz_to_lab(
     xyz: Float[np.ndarray, "*shape 3"], white: Float[np.ndarray, "3"]
 ) -> Float64[np.ndarray, "*shape 3"]:
     """CIE 1976 L*a*b* (CIE 15:2018, section 8.2.1) of tristimulus values in the unit of `white`'s."""

@@ -1,17 +1,9 @@
-"""Formulas over wavelengths, such as `(r800-r670)/(r800+r670)`: read once, evaluated on tensors; nothing is executed.
+"""Spectral indices: one number a pixel from its reflectance at a few wavelengths, by name or by formula.
 
-Grammar, binding as in Python, upper and lower case alike:
-
-    sum      = product (("+" | "-") product)*
-    product  = factor (("*" | "/") factor)*
-    factor   = "-" factor | power
-    power    = atom [("**" | "^") factor]
-    atom     = number | rNNN | function "(" sum ("," sum)* ")" | "(" sum ")"
-
-`rNNN` or `rNNN.N` is the reflectance at NNN nm. Reading makes a postfix program: operands first, then what is done to
-them.
-
-Spectral indices: one number a pixel from its reflectance at a few wavelengths, by name or by formula.
+A formula such as `(r800-r670)/(r800+r670)` is written in numbers, wavelengths (`r800`, `r800.5`: the reflectance
+there), operators that bind as in Python, and six functions, upper and lower case alike. Each token is checked and
+written again with names of our own for its operands before Python parses it to a tree, of which only the nodes of
+these operations are evaluated: nothing that a user wrote is executed.
 
 Notation: `B` bands, `*rays` any leading axes. Reflectance is what an index is defined on; ratios alone take radiance in
 a light of equal power just as well. Between two band centres reflectance is interpolated linearly, in the outer half of
@@ -20,11 +12,12 @@ an outermost band it is that band's; beyond, an index is refused: nothing is ext
 
 from __future__ import annotations
 
+import ast
 import difflib
 import math
 import re
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import reduce
 from typing import NoReturn
 
@@ -37,48 +30,59 @@ from unmix_plugin.spectral.bands import Bands
 
 MAX_LENGTH = 500
 """Characters of a formula."""
-MAX_NESTING = 50
+_MAX_NESTING = 50
 """Parentheses, minus signs and exponents within one another."""
 
-ALLOWED = "numbers, r800 (the reflectance at 800 nm), + - * / ** ^, parentheses, sqrt log exp abs min max"
+_ALLOWED = "numbers, r800 (the reflectance at 800 nm), + - * / ** ^, parentheses, sqrt log exp abs min max"
 
 _TOKEN = re.compile(
-    r"(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e[+-]?[0-9]+)?)"
-    r"|(?P<word>[a-z_][a-z0-9_.]*)|(?P<sign>\*\*|[-+*/^(),])|(?P<end>\Z)|(?P<other>.)",
+    r"\s*(?:(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e[+-]?[0-9]+)?)"
+    r"|(?P<word>[a-z_][a-z0-9_.]*)|(?P<sign>\*\*|[-+*/^(),])|(?P<end>\Z)|(?P<other>.))",
     re.IGNORECASE | re.DOTALL,
 )
-_WAVELENGTH = re.compile(r"r([0-9]+(?:\.[0-9]+)?)", re.IGNORECASE)
-_BLANK = re.compile(r"\s*")
+_WAVELENGTH = re.compile(r"r([0-9]+(?:\.[0-9]+)?)")
+
+
+def _power(base: Tensor, exponent: Tensor) -> Tensor:
+    # The zeros carry what is undefined: alone, NaN**0 and 1**NaN are 1.
+    return base**exponent + 0 * base + 0 * exponent
+
+
+_OPERATORS: dict[type[ast.AST], Callable[..., Tensor]] = {
+    ast.Add: torch.add,
+    ast.Sub: torch.sub,
+    ast.Mult: torch.mul,
+    ast.Div: torch.div,
+    ast.Pow: _power,
+    ast.USub: torch.neg,
+}
+_FUNCTIONS: dict[str, tuple[Callable[..., Tensor], int, float]] = {
+    "sqrt": (torch.sqrt, 1, 1),
+    "log": (torch.log, 1, 1),
+    "exp": (torch.exp, 1, 1),
+    "abs": (torch.abs, 1, 1),
+    "min": (lambda *values: reduce(torch.minimum, values), 2, math.inf),
+    "max": (lambda *values: reduce(torch.maximum, values), 2, math.inf),
+}
+"""With the least and the greatest number of arguments."""
 
 
 @dataclass(frozen=True)
-class Wavelength:
-    """A step that puts the reflectance at a wavelength on the stack."""
-
-    nm: float
-
-
-@dataclass(frozen=True)
-class Operation:
-    """A step that replaces the last `count` values on the stack by one."""
-
-    name: str
-    count: int
-
-
-@dataclass(frozen=True)
-class Formula:
+class _Formula:
     """A formula that was read: over at least one wavelength."""
 
     text: str
     """As it was written, without blanks around it."""
-    steps: tuple[float | Wavelength | Operation, ...]
-    """Postfix program; a number is pushed as it is."""
+    numbers: dict[str, float]
+    """Numbers by their name in the tree."""
+    wavelengths: dict[str, float]
+    """Wavelengths in nm by their name in the tree."""
+    tree: ast.expr = field(compare=False, repr=False)
 
     @property
     def wavelengths_nm(self) -> tuple[float, ...]:
         """The wavelengths that it takes, increasing, each once."""
-        return tuple(sorted({step.nm for step in self.steps if isinstance(step, Wavelength)}))
+        return tuple(sorted(set(self.wavelengths.values())))
 
     def evaluate(
         self, at: Callable[[float], Float[Tensor, "*rays"]], like: Float[Tensor, "..."]
@@ -89,22 +93,29 @@ class Formula:
             at: Reflectance at one of `wavelengths_nm`; asked again at each mention, so that few are held at a time.
             like: Of the type and on the device to compute with.
         """
-        stack: list[Tensor] = []
-        for step in self.steps:
-            if isinstance(step, Operation):
-                operands = stack[-step.count :]
-                del stack[-step.count :]
-                value = _OPERATIONS[step.name](*operands)
-            elif isinstance(step, Wavelength):
-                value = at(step.nm)
-            else:  # a number too large for the type is refused by PyTorch
-                value = like.new_full((), step if step <= torch.finfo(like.dtype).max else torch.nan)
+
+        def value(node: ast.expr) -> Tensor:
+            match node:
+                case ast.Name(id=name) if name in self.wavelengths:
+                    found = at(self.wavelengths[name])
+                case ast.Name(id=name):  # a number too large for the type is refused by PyTorch
+                    number = self.numbers[name]
+                    found = like.new_full((), number if number <= torch.finfo(like.dtype).max else torch.nan)
+                case ast.UnaryOp(op=sign, operand=operand):
+                    found = _OPERATORS[type(sign)](value(operand))
+                case ast.BinOp(left=left, op=sign, right=right):
+                    found = _OPERATORS[type(sign)](value(left), value(right))
+                case ast.Call(func=ast.Name(id=name), args=args):
+                    found = _FUNCTIONS[name][0](*map(value, args))
+                case _:
+                    raise ConfigError(f"index formula {self.text!r}: allowed are {_ALLOWED}")
             # At every step, or 1 / (1 / 0) would be 0.
-            stack.append(value.masked_fill(~value.isfinite(), torch.nan))
-        return stack.pop()
+            return found.masked_fill(~found.isfinite(), torch.nan)
+
+        return value(self.tree)
 
 
-def parse_formula(text: str) -> Formula:
+def parse_formula(text: str) -> _Formula:
     """Read a formula.
 
     Raises:
@@ -116,223 +127,186 @@ def parse_formula(text: str) -> Formula:
     text = text.strip()
     if len(text) > MAX_LENGTH:
         raise ConfigError(f"an index formula has at most {MAX_LENGTH} characters; this one has {len(text)}")
-    formula = Formula(text, tuple(_Reader(text).read()))
-    if not formula.wavelengths_nm:
+    reader = _Reader(text)
+    for match in _TOKEN.finditer(text):
+        reader.take(match)
+    if not reader.wavelengths:
         raise ConfigError(
             f"the index formula {text!r} takes no wavelength; write r800 for the reflectance at 800 nm"
         )
-    return formula
+    tree = ast.parse("".join(reader.expression), mode="eval").body
+    return _Formula(text, reader.numbers, reader.wavelengths, tree)
+
+
+@dataclass
+class _Level:
+    """What stands between two parentheses, or all of a formula."""
+
+    function: str = ""
+    place: int = 0
+    num_arguments: int = 1
+    chain: int = 0
+    """Minus signs and exponents that the next operand stands within."""
 
 
 class _Reader:
-    """Recursive descent over one text; `steps` grows as operands and operations are recognised."""
+    """Token by token, what may follow is checked and `expression` grows: Python over names of our own only."""
 
     def __init__(self, text: str) -> None:
         self.text = text
-        self.depth = 0
-        self.steps: list[float | Wavelength | Operation] = []
-        self.end = 0
-        self.advance()
+        self.expression: list[str] = []
+        self.numbers: dict[str, float] = {}
+        self.wavelengths: dict[str, float] = {}
+        self.levels = [_Level()]
+        self.called: _Level | None = None
+        self.needs_operand = True
 
-    def read(self) -> list[float | Wavelength | Operation]:
-        self.sum()
-        if self.token:
-            self.fail("expected an operator or the end")
-        return self.steps
+    def take(self, match: re.Match[str]) -> None:
+        kind = match.lastgroup or "end"
+        token, place = match[kind].lower(), match.start(kind)
+        if self.called is not None and token != "(":
+            self.fail(f"expected ( after {self.called.function}", place, match[kind])
+        problem = self.operand(kind, token, place) if self.needs_operand else self.operator(kind, token)
+        if problem:
+            self.fail(problem, place, match[kind])
 
-    def advance(self) -> None:
-        """Step to the next token; the empty one ends the text."""
-        blank = _BLANK.match(self.text, self.end)
-        match = _TOKEN.match(self.text, blank.end() if blank else self.end)
-        assert match is not None, "the pattern has an alternative for any character and for the end"
-        self.kind, self.token = match.lastgroup, match.group()
-        self.start, self.end = match.span()
-
-    def take(self, *signs: str) -> str:
-        """The token and a step onwards if it is one of these, otherwise nothing."""
-        token = self.token if self.token in signs else ""
-        if token:
-            self.advance()
-        return token
-
-    def sum(self) -> None:
-        self.product()
-        while sign := self.take("+", "-"):
-            self.product()
-            self.steps.append(Operation(sign, 2))
-
-    def product(self) -> None:
-        self.factor()
-        while sign := self.take("*", "/"):
-            self.factor()
-            self.steps.append(Operation(sign, 2))
-
-    def factor(self) -> None:
-        self.depth += 1
-        if self.depth > MAX_NESTING:
-            self.fail(f"nested deeper than {MAX_NESTING}")
-        if self.take("-"):
-            self.factor()
-            self.steps.append(Operation("negative", 1))
+    def operand(self, kind: str, token: str, place: int) -> str | None:
+        """Takes what starts or is an operand; returns what is wrong."""
+        wavelength = _WAVELENGTH.fullmatch(token)
+        if sum(1 + level.chain for level in self.levels) > _MAX_NESTING:
+            return f"nested deeper than {_MAX_NESTING}"
+        if kind == "number" or wavelength:
+            name = f"v{len(self.expression)}"
+            values = self.wavelengths if wavelength else self.numbers
+            values[name] = float(wavelength[1] if wavelength else token)
+            token, self.needs_operand = name, False
+        elif token == "-":
+            self.levels[-1].chain += 1
+        elif token == "(":
+            self.levels.append(self.called or _Level())
+            self.called = None
+        elif token in _FUNCTIONS:
+            self.called = _Level(token, place)
         else:
-            self.atom()
-            if self.take("**", "^"):
-                self.factor()
-                self.steps.append(Operation("**", 2))
-        self.depth -= 1
+            return "expected a number, a wavelength, a function or ("
+        self.expression.append(token)
+        return None
 
-    def atom(self) -> None:
-        wavelength = _WAVELENGTH.fullmatch(self.token)
-        if wavelength:
-            self.steps.append(Wavelength(float(wavelength.group(1))))
-            self.advance()
-        elif self.kind == "number":
-            self.steps.append(float(self.token))
-            self.advance()
-        elif self.token.lower() in _ARGUMENT_COUNTS:
-            self.call()
-        elif self.take("("):
-            self.sum()
-            self.close()
-        else:
-            self.fail("expected a number, a wavelength, a function or (")
+    def operator(self, kind: str, token: str) -> str | None:
+        """Takes what may follow an operand; returns what is wrong."""
+        level = self.levels[-1]
+        if token in ("**", "^"):
+            level.chain += 1
+            token = "**"
+        elif token in ("+", "-", "*", "/") or (token == "," and level.function):
+            level.chain = 0
+            level.num_arguments += token == ","
+        elif token == ")" and len(self.levels) > 1:
+            self.close(self.levels.pop())
+        elif len(self.levels) > 1:
+            return "expected )"
+        elif kind != "end":
+            return "expected an operator or the end"
+        self.expression.append(token)
+        self.needs_operand = token not in (")", "")
+        return None
 
-    def call(self) -> None:
-        name, place = self.token.lower(), self.start
-        self.advance()
-        if not self.take("("):
-            self.fail(f"expected ( after {name}")
-        self.sum()
-        count = 1
-        while self.take(","):
-            self.sum()
-            count += 1
-        self.close()
-        least, most = _ARGUMENT_COUNTS[name]
-        if not least <= count <= most:
-            takes = "one argument" if most == 1 else f"at least {least} arguments"
-            self.fail(f"{name} takes {takes}, not {count}", place)
-        self.steps.append(Operation(name, count))
+    def close(self, level: _Level) -> None:
+        if level.function:
+            _, least, most = _FUNCTIONS[level.function]
+            if not least <= level.num_arguments <= most:
+                takes = "one argument" if most == 1 else f"at least {least} arguments"
+                self.fail(f"{level.function} takes {takes}, not {level.num_arguments}", level.place)
 
-    def close(self) -> None:
-        if not self.take(")"):
-            self.fail("expected )")
-
-    def fail(self, problem: str, place: int | None = None) -> NoReturn:
-        column = self.start if place is None else place
-        found = "" if place is not None else f", found {self.token!r}" if self.token else ", found the end"
+    def fail(self, problem: str, place: int, token: str | None = None) -> NoReturn:
+        found = "" if token is None else f", found {token!r}" if token else ", found the end"
         shown = " ".join(self.text.splitlines())  # one line, so that the caret is below its column
         raise ConfigError(
-            f"index formula, column {column + 1}: {problem}{found}\n  {shown}\n  {' ' * column}^\n"
-            f"allowed are {ALLOWED}"
+            f"index formula, column {place + 1}: {problem}{found}\n  {shown}\n  {' ' * place}^\n"
+            f"allowed are {_ALLOWED}"
         )
 
 
-def _power(base: Tensor, exponent: Tensor) -> Tensor:
-    # The zeros carry what is undefined: alone, NaN**0 and 1**NaN are 1.
-    return base**exponent + 0 * base + 0 * exponent
-
-
-_OPERATIONS: dict[str, Callable[..., Tensor]] = {
-    "+": torch.add,
-    "-": torch.sub,
-    "*": torch.mul,
-    "/": torch.div,
-    "**": _power,
-    "negative": torch.neg,
-    "sqrt": torch.sqrt,
-    "log": torch.log,
-    "exp": torch.exp,
-    "abs": torch.abs,
-    "min": lambda *values: reduce(torch.minimum, values),
-    "max": lambda *values: reduce(torch.maximum, values),
-}
-_ARGUMENT_COUNTS = {
-    **dict.fromkeys(("sqrt", "log", "exp", "abs"), (1, 1)),
-    **dict.fromkeys(("min", "max"), (2, math.inf)),
-}
-
-
 @dataclass(frozen=True)
-class NamedIndex:
+class _NamedIndex:
     """A published index, at the centre wavelengths that we take for its bands."""
 
     title: str
     """Full name."""
     formula: str
-    """In the grammar of `index_formula`."""
+    """As `parse_formula` reads it."""
     source: str
     """Who published it."""
     usual_range: tuple[float, float] = (-1.0, 1.0)
     """Values that pictures spread their colours over."""
 
 
-NAMED_INDICES: dict[str, NamedIndex] = {
-    "ndvi": NamedIndex(
+NAMED_INDICES: dict[str, _NamedIndex] = {
+    "ndvi": _NamedIndex(
         "normalised difference vegetation index", "(r800-r670)/(r800+r670)", "Rouse et al. 1974"
     ),
-    "gndvi": NamedIndex(
+    "gndvi": _NamedIndex(
         "green normalised difference vegetation index",
         "(r800-r550)/(r800+r550)",
         "Gitelson, Kaufman & Merzlyak 1996",
     ),
-    "evi": NamedIndex(
+    "evi": _NamedIndex(
         "enhanced vegetation index", "2.5*(r800-r670)/(r800+6*r670-7.5*r470+1)", "Huete et al. 2002"
     ),
-    "savi": NamedIndex("soil-adjusted vegetation index", "1.5*(r800-r670)/(r800+r670+0.5)", "Huete 1988"),
-    "osavi": NamedIndex(
+    "savi": _NamedIndex("soil-adjusted vegetation index", "1.5*(r800-r670)/(r800+r670+0.5)", "Huete 1988"),
+    "osavi": _NamedIndex(
         "optimised soil-adjusted vegetation index",
         "(r800-r670)/(r800+r670+0.16)",
         "Rondeaux, Steven & Baret 1996",
     ),
-    "ndre": NamedIndex("normalised difference red edge", "(r790-r720)/(r790+r720)", "Barnes et al. 2000"),
-    "pri": NamedIndex(
+    "ndre": _NamedIndex("normalised difference red edge", "(r790-r720)/(r790+r720)", "Barnes et al. 2000"),
+    "pri": _NamedIndex(
         "photochemical reflectance index",
         "(r531-r570)/(r531+r570)",
         "Gamon, Peñuelas & Field 1992, in the form of Gamon, Serrano & Surfus 1997",
         (-0.2, 0.2),
     ),
-    "mcari": NamedIndex(
+    "mcari": _NamedIndex(
         "modified chlorophyll absorption ratio index",
         "((r700-r670)-0.2*(r700-r550))*(r700/r670)",
         "Daughtry et al. 2000",
         (0.0, 1.0),
     ),
-    "tvi": NamedIndex(
+    "tvi": _NamedIndex(
         "triangular vegetation index",
         "0.5*(120*(r750-r550)-200*(r670-r550))",
         "Broge & Leblanc 2001",
         (0.0, 50.0),
     ),
-    "sipi": NamedIndex(
+    "sipi": _NamedIndex(
         "structure-insensitive pigment index (carotenoids to chlorophyll a)",
         "(r800-r445)/(r800-r680)",
         "Peñuelas, Baret & Filella 1995",
         (0.0, 2.0),
     ),
-    "psri": NamedIndex(
+    "psri": _NamedIndex(
         "plant senescence reflectance index", "(r678-r500)/r750", "Merzlyak et al. 1999", (-0.5, 0.5)
     ),
-    "cri1": NamedIndex(
+    "cri1": _NamedIndex(
         "carotenoid reflectance index 1", "1/r510-1/r550", "Gitelson et al. 2002", (0.0, 15.0)
     ),
-    "ari1": NamedIndex(
+    "ari1": _NamedIndex(
         "anthocyanin reflectance index 1",
         "1/r550-1/r700",
         "Gitelson, Merzlyak & Chivkunova 2001",
         (0.0, 10.0),
     ),
-    "ndwi": NamedIndex(
+    "ndwi": _NamedIndex(
         "normalised difference water index (open water)", "(r550-r800)/(r550+r800)", "McFeeters 1996"
     ),
-    "ndwi-gao": NamedIndex(
+    "ndwi-gao": _NamedIndex(
         "normalised difference water index (water in leaves)", "(r860-r1240)/(r860+r1240)", "Gao 1996"
     ),
-    "nbr": NamedIndex("normalised burn ratio", "(r830-r2215)/(r830+r2215)", "Key & Benson 2006"),
-    "redness": NamedIndex(
+    "nbr": _NamedIndex("normalised burn ratio", "(r830-r2215)/(r830+r2215)", "Key & Benson 2006"),
+    "redness": _NamedIndex(
         "redness index of soils (iron oxides)", "(r660-r560)/(r660+r560)", "Escadafal & Huete 1991"
     ),
-    "iron-oxide": NamedIndex("iron oxide ratio, red over blue", "r660/r485", "Segal 1982", (0.0, 5.0)),
+    "iron-oxide": _NamedIndex("iron oxide ratio, red over blue", "r660/r485", "Segal 1982", (0.0, 5.0)),
 }
 """By the name after `index:`, in the order in which they are listed."""
 
@@ -348,7 +322,7 @@ class SpectralIndex:
     usual_range: tuple[float, float] | None
     """Values that pictures spread their colours over; None for a formula, of which nothing is known."""
     bands: Bands
-    formula: Formula
+    formula: _Formula
 
     def __call__(self, reflectance: Float[Tensor, "*rays B"]) -> Float[Tensor, "*rays"]:
         """The index of each spectrum; NaN where any part of the formula is undefined, as in 0/0, or overflows.
@@ -404,16 +378,16 @@ def _require_formula(text: str) -> str:
     """The text, unless it is empty or no more than a word, which can only be a name."""
     if not text:
         raise ConfigError(
-            f"index: is followed by nothing; give a name ({', '.join(NAMED_INDICES)}) or a formula of {ALLOWED}"
+            f"index: is followed by nothing; give a name ({', '.join(NAMED_INDICES)}) or a formula of {_ALLOWED}"
         )
     if not re.fullmatch(r"[a-z_][\w-]*", text, re.IGNORECASE) or re.search(r"\br[0-9]", text, re.IGNORECASE):
         return text
     near = difflib.get_close_matches(text.lower(), NAMED_INDICES, n=3, cutoff=0.5)
     hint = f"nearest: {', '.join(near)}" if near else f"known: {', '.join(NAMED_INDICES)}"
-    raise ConfigError(f"there is no index {text!r}; {hint}; or give a formula of {ALLOWED}")
+    raise ConfigError(f"there is no index {text!r}; {hint}; or give a formula of {_ALLOWED}")
 
 
-def _missing(formula: Formula, bands: Bands) -> list[float]:
+def _missing(formula: _Formula, bands: Bands) -> list[float]:
     return [nm for nm in formula.wavelengths_nm if not bands.contains(nm)]
 
 

@@ -50,7 +50,7 @@ class Background:
         Raises:
             SpectrumError: fewer than two pixels that count, or all are equal.
         """
-        counted = spectra[is_defined(spectra)].double()
+        counted = spectra[_is_defined(spectra)].double()
         if len(counted) < 2:
             raise SpectrumError(
                 f"the background has {len(counted)} pixels in which something is and its reflectance is known in all "
@@ -74,7 +74,7 @@ class Background:
         return (spectra.double() - self.mean) @ self.whitening.T
 
 
-def is_defined(spectra: Float[Tensor, "*rays B"]) -> Bool[Tensor, "*rays"]:
+def _is_defined(spectra: Float[Tensor, "*rays B"]) -> Bool[Tensor, "*rays"]:
     """Which spectra are finite in all bands and not zero in all."""
     return spectra.isfinite().all(dim=-1) & (spectra != 0).any(dim=-1)
 
@@ -106,28 +106,28 @@ def adaptive_coherence(
     return (found @ wanted / lengths).clamp(0, 1).square()
 
 
-DetectionMethod = Literal["angle", "mf", "ace"]
+_DetectionMethod = Literal["angle", "mf", "ace"]
 """Spectral angle, matched filter, adaptive coherence estimator."""
 
-GREATEST_REFLECTANCE = 2.0
+_GREATEST_REFLECTANCE = 2.0
 """A target of mf or ace with a value above it is not in reflectances; glossy and fluorescent surfaces exceed 1."""
 
 _LEAST_DISTANCE = 1e-4
 """From the background's mean to a target, in standard deviations: the rounding of float32 reaches a tenth of it."""
 
 _GRAMMAR = re.compile(
-    rf"((?P<method>{'|'.join(get_args(DetectionMethod))}):)?(?P<file>.+?\.csv)(#(?P<name>.*?))?"
+    rf"((?P<method>{'|'.join(get_args(_DetectionMethod))}):)?(?P<file>.+?\.csv)(#(?P<name>.*?))?"
     r"(\s*(?P<side>[<>])\s*(?P<limit>[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?)\s*)?",
     re.IGNORECASE | re.DOTALL,
 )
 _EXAMPLES = "paint.csv, ace:paint.csv, mf:paint.csv#gold or 'paint.csv#gold<0.1'"
 
-_SIDES: dict[DetectionMethod, str] = {"angle": "<", "mf": ">", "ace": ">"}
+_SIDES: dict[_DetectionMethod, str] = {"angle": "<", "mf": ">", "ace": ">"}
 """On which side of a threshold a pixel is like the target."""
 
 _POSSIBLE = {"angle": (0.0, math.pi), "mf": (-math.inf, math.inf), "ace": (0.0, 1.0)}
 _USUAL = {"angle": (0.0, 0.5), "mf": (0.0, 1.0), "ace": (0.0, 1.0)}
-_LABELS: dict[DetectionMethod, tuple[str, str]] = {
+_LABELS: dict[_DetectionMethod, tuple[str, str]] = {
     "angle": ("spectral angle in radians to", "0 = the same but for brightness"),
     "mf": ("matched filter score of", "1 = like the target, 0 = like the background's mean"),
     "ace": ("adaptive coherence with", "1 = differs from the background as the target does, 0 = does not"),
@@ -135,10 +135,10 @@ _LABELS: dict[DetectionMethod, tuple[str, str]] = {
 
 
 @dataclass(frozen=True)
-class Target:
+class _Target:
     """A spectrum to look for, and how."""
 
-    method: DetectionMethod
+    method: _DetectionMethod
     name: str
     file: str
     """Where the spectrum is from, for messages and legends."""
@@ -161,7 +161,7 @@ class Target:
         """What pictures show."""
         return _USUAL[self.method] if self.threshold is None else (0.0, 1.0)
 
-    def fit(self, background: Float[Tensor, "N B"]) -> TargetScore:
+    def fit(self, background: Float[Tensor, "N B"]) -> _TargetScore:
         """The score, judged against a sample of the scene's reflectances; the angle ignores it.
 
         Raises:
@@ -173,7 +173,7 @@ class Target:
                 f"the target '{self.name}' has {len(self.reflectance)} bands, the background {background.shape[1]}"
             )
         if self.method == "angle":
-            return TargetScore(self, None)
+            return _TargetScore(self, None)
         found = Background.fit(background)
         target = self.reflectance.to(found.mean)
         if not found.whiten(target).norm() > _LEAST_DISTANCE:
@@ -181,14 +181,14 @@ class Target:
                 f"the target '{self.name}' ({self.file}) is the mean of the background, so nothing tells them apart; "
                 "choose views that show more than the target, or the spectral angle"
             )
-        return TargetScore(self, found)
+        return _TargetScore(self, found)
 
 
 @dataclass(frozen=True)
-class TargetScore:
+class _TargetScore:
     """From reflectances to scores, or to 1 and 0 with a threshold."""
 
-    target: Target
+    target: _Target
     background: Background | None
     """None for the spectral angle."""
 
@@ -204,10 +204,10 @@ class TargetScore:
         if (limit := self.target.threshold) is not None:
             passes = scores < limit if self.target.method == "angle" else scores > limit
             scores = torch.where(scores.isnan(), scores, passes.double())
-        return torch.where(is_defined(reflectance), scores, torch.nan).to(reflectance.dtype)
+        return torch.where(_is_defined(reflectance), scores, torch.nan).to(reflectance.dtype)
 
 
-def parse_target(text: str, bands: Bands) -> Target:
+def parse_target(text: str, bands: Bands) -> _Target:
     """The text after `target:` in the name of an output, `[METHOD:]FILE.csv[#NAME][<VALUE | >VALUE]`.
 
     Raises:
@@ -220,18 +220,18 @@ def parse_target(text: str, bands: Bands) -> Target:
     if match is None:
         raise ConfigError(f"target:{text} must be target:[METHOD:]FILE.csv[#NAME][<VALUE], as in {_EXAMPLES}")
     prefix = match["method"] or ""
-    named: DetectionMethod | None = next((known for known in _SIDES if known == prefix), None)
+    named: _DetectionMethod | None = next((known for known in _SIDES if known == prefix), None)
     file = match["file"] if named or not prefix else f"{prefix}:{match['file']}"
-    method: DetectionMethod = "angle" if named is None else named
+    method: _DetectionMethod = "angle" if named is None else named
     threshold = None if match["limit"] is None else _threshold(method, match["side"], float(match["limit"]))
     table = _table(file, bands)
     name = _chosen(match["name"], table, file)
     reflectance = table.spectra[table.names.index(name)]
     _validate(reflectance, method, f"'{name}' ({file})")
-    return Target(method, name, Path(file).name, torch.from_numpy(reflectance.copy()), threshold)
+    return _Target(method, name, Path(file).name, torch.from_numpy(reflectance.copy()), threshold)
 
 
-def _threshold(method: DetectionMethod, side: str, limit: float) -> float:
+def _threshold(method: _DetectionMethod, side: str, limit: float) -> float:
     if side != _SIDES[method]:
         alike = "small" if method == "angle" else "large"
         raise ConfigError(
@@ -273,8 +273,8 @@ def _chosen(name: str | None, table: SpectraTable, file: str) -> str:
     raise ConfigError(f"{file} has no spectrum {name!r}; {hint}it has {listed}")
 
 
-def _validate(reflectance: np.ndarray, method: DetectionMethod, what: str) -> None:
-    if method != "angle" and reflectance.max() > GREATEST_REFLECTANCE:
+def _validate(reflectance: np.ndarray, method: _DetectionMethod, what: str) -> None:
+    if method != "angle" and reflectance.max() > _GREATEST_REFLECTANCE:
         raise SpectrumError(
             f"the target {what} must be in reflectances, 1 for white; found {reflectance.max():g} "
             "(divide percent by 100)"

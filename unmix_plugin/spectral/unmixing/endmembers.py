@@ -317,7 +317,7 @@ _LIT_SCALE = 0.75
 _MOST_PIXELS = 5000
 
 
-def brightness_factor(
+def _brightness_factor(
     endmembers: Float[Tensor, "K B"], pixels: Float[Tensor, "N B"], generator: torch.Generator
 ) -> float:
     """The one factor on all endmembers with which nearly every pixel is a mixture of amounts that sum to at most 0.75.
@@ -368,7 +368,7 @@ def given_endmembers(
             f"{path} has {len(table.names)} spectra but num-endmembers is {count}; give both the same number"
         )
     radiance = (torch.as_tensor(table.spectra, dtype=torch.float32) * lamp).clamp(min=0)
-    return radiance * brightness_factor(radiance, pixels, generator)
+    return radiance * _brightness_factor(radiance, pixels, generator)
 
 
 _DARK_MATERIAL = 0.25

@@ -24,7 +24,7 @@ _SAMPLES_PER_PRODUCT = 65_536
 
 
 @dataclass(frozen=True)
-class KmeansResult:
+class _KmeansResult:
     """Clusters, largest first."""
 
     endmembers: Float[Tensor, "K B"]
@@ -42,7 +42,7 @@ def normalised_kmeans(
     restarts: int = 5,
     max_iterations: int = 100,
     brightness_quantile: float = 0.95,
-) -> KmeansResult:
+) -> _KmeansResult:
     """Cluster spectra by shape; the best of several restarts.
 
     Args:
@@ -63,7 +63,7 @@ def normalised_kmeans(
     order = torch.bincount(ids, minlength=num_clusters).argsort(descending=True, stable=True)
     ids = order.argsort()[ids]
     endmembers = scale_to_lit_pixels(centres[order], pixels, ids, brightness_quantile)
-    return KmeansResult(endmembers, ids, inertia)
+    return _KmeansResult(endmembers, ids, inertia)
 
 
 def scale_to_lit_pixels(

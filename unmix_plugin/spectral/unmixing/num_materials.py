@@ -21,15 +21,15 @@ from torch import Tensor
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.unmixing.two_material_mixtures import two_material_fits
 
-LEAST_SHARE = 0.2
+_LEAST_SHARE = 0.2
 """A further material must take away at least this share of the mean distance that is left."""
 
-LEAST_FALL = 0.004
+_LEAST_FALL = 0.004
 """And at least so much of it: about an angle in radians, a hundredth of that between common materials."""
 
 
 @dataclass(frozen=True)
-class MaterialCount:
+class _MaterialCount:
     """A proposed number of materials and the evidence for it."""
 
     number: int
@@ -55,8 +55,8 @@ class MaterialCount:
             lines.append(f"{number:9d}  {distance:13.4f}  {1 - distance / max(before, 1e-12):12.0%}{mark}")
             before = distance
         lines.append(
-            f"proposed: the last before one that takes away less than {LEAST_SHARE:.0%} of the distance, or less than "
-            f"{LEAST_FALL:g}; noise, {self.noise_distance:.4f}, is left out"
+            f"proposed: the last before one that takes away less than {_LEAST_SHARE:.0%} of the distance, or less than "
+            f"{_LEAST_FALL:g}; noise, {self.noise_distance:.4f}, is left out"
         )
         if self.signal_dimensions is not None:
             lines.append(f"HySime: {self.signal_dimensions} dimensions hold more signal than noise")
@@ -65,7 +65,7 @@ class MaterialCount:
 
 def propose_num_materials(
     pixels: Float[Tensor, "N B"], generator: torch.Generator, most_materials: int = 12
-) -> MaterialCount:
+) -> _MaterialCount:
     """Number of materials from the elbow of the distance to mixtures of two, and HySime's count beside it.
 
     Args:
@@ -81,7 +81,7 @@ def propose_num_materials(
     noise = _noise_distance(pixels) if is_enough else 0.0
     # Distances in independent directions add as squares.
     distances = tuple(math.sqrt(max(fit.mean_distance**2 - noise**2, 0.0)) for fit in fits)
-    return MaterialCount(elbow(distances), distances, noise, hysime(pixels) if is_enough else None)
+    return _MaterialCount(elbow(distances), distances, noise, hysime(pixels) if is_enough else None)
 
 
 def elbow(mean_distances: tuple[float, ...]) -> int:
@@ -95,7 +95,7 @@ def elbow(mean_distances: tuple[float, ...]) -> int:
     """
     number = 1
     for before, after in pairwise(mean_distances):
-        if before - after < max(LEAST_FALL, LEAST_SHARE * before):
+        if before - after < max(_LEAST_FALL, _LEAST_SHARE * before):
             break
         number += 1
     return number

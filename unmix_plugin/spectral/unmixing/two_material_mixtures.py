@@ -34,10 +34,10 @@ from torch.nn.functional import normalize
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.unmixing.kmeans_normalised import normalised_kmeans
 
-MOST_ENDMEMBERS = 64
+_MOST_ENDMEMBERS = 64
 """More are not searched for: time and memory grow with the square of the candidates."""
 
-NUM_CANDIDATES = 80
+_NUM_CANDIDATES = 80
 _NUM_JUDGES = 3000
 
 _DISTINCT = 4e-10
@@ -48,7 +48,7 @@ _LEAST_GAIN = 1e-7
 
 
 @dataclass(frozen=True)
-class TwoMaterialFit:
+class _TwoMaterialFit:
     """Endmembers and how well two of them at a time explain the pixels."""
 
     endmembers: Float[Tensor, "K B"]
@@ -59,7 +59,7 @@ class TwoMaterialFit:
 
 def two_material_fits(
     pixels: Float[Tensor, "N B"], most_endmembers: int, generator: torch.Generator
-) -> list[TwoMaterialFit]:
+) -> list[_TwoMaterialFit]:
     """The best sets found of 1, 2, ... endmembers; fewer sets if there are fewer distinct shapes.
 
     Args:
@@ -69,21 +69,21 @@ def two_material_fits(
     Raises:
         SpectrumError: more than 64 endmembers, no pixels, or a zero spectrum.
     """
-    if not 1 <= most_endmembers <= MOST_ENDMEMBERS:
+    if not 1 <= most_endmembers <= _MOST_ENDMEMBERS:
         raise SpectrumError(
-            f"mixtures of two are searched for 1 to {MOST_ENDMEMBERS} endmembers; {most_endmembers} were asked for; "
+            f"mixtures of two are searched for 1 to {_MOST_ENDMEMBERS} endmembers; {most_endmembers} were asked for; "
             "ask for fewer or take another method"
         )
-    num_candidates = max(1, min(NUM_CANDIDATES, count_shapes(pixels, NUM_CANDIDATES)))
+    num_candidates = max(1, min(_NUM_CANDIDATES, _count_shapes(pixels, _NUM_CANDIDATES)))
     candidates = normalised_kmeans(pixels, num_candidates, generator, restarts=1).endmembers
     judges = pixels[torch.randperm(len(pixels), generator=generator)[:_NUM_JUDGES].to(pixels.device)]
     candidates = normalize(candidates.double(), dim=1)
-    search = PairSearch(distances_to_pairs(normalize(judges.double(), dim=1), candidates))
+    search = _PairSearch(distances_to_pairs(normalize(judges.double(), dim=1), candidates))
     fits, chosen = [], []
     for _ in range(min(most_endmembers, num_candidates)):
         chosen = search.improved(search.grown(chosen))
         spectra = candidates[chosen].to(pixels.dtype)
-        fits.append(TwoMaterialFit(spectra, float(search.distances(chosen).mean())))
+        fits.append(_TwoMaterialFit(spectra, float(search.distances(chosen).mean())))
     return fits
 
 
@@ -136,7 +136,7 @@ def mean_pair_distance(pixels: Float[Tensor, "N B"], endmembers: Float[Tensor, "
     return float(torch.cat(nearest).mean()) if len(pixels) else 0.0
 
 
-class PairSearch:
+class _PairSearch:
     """Sets of candidates, judged by the mean distance of pixels to the nearest pair in the set."""
 
     def __init__(self, pair_distances: Float[Tensor, "M M N"]) -> None:
@@ -179,7 +179,7 @@ class PairSearch:
         return torch.minimum(nearest, self.distances(chosen)).mean(dim=1)
 
 
-def count_shapes(pixels: Float[Tensor, "N B"], enough: int) -> int:
+def _count_shapes(pixels: Float[Tensor, "N B"], enough: int) -> int:
     """Number of distinct shapes; counting stops at `enough`."""
     left, count = normalize(pixels, dim=1), 0
     while count < enough and len(left) > 0:
@@ -214,8 +214,8 @@ def pooled_pair_endmembers(
     Raises:
         SpectrumError: more than 64 endmembers, or more than there are distinct shapes.
     """
-    num_candidates = count_shapes(pixels, NUM_CANDIDATES)
-    if num_candidates < NUM_CANDIDATES or num_endmembers > NUM_CANDIDATES:
+    num_candidates = _count_shapes(pixels, _NUM_CANDIDATES)
+    if num_candidates < _NUM_CANDIDATES or num_endmembers > _NUM_CANDIDATES:
         return two_material_endmembers(pixels, num_endmembers, generator)
     judges = _some(pixels, _NUM_JUDGES_POOLED_PAIRS, generator).double()
     pool, draws = [], []
@@ -236,7 +236,7 @@ def _some(pixels: Float[Tensor, "N B"], count: int, generator: torch.Generator) 
 def _candidates(pixels: Float[Tensor, "N B"], count: int, generator: torch.Generator) -> Float[Tensor, "M B"]:
     """Mean shapes of clusters of some of the pixels; of all if those show fewer shapes."""
     few = _some(pixels, _NUM_SEEDS, generator)
-    few = few if count_shapes(few, count) == count else pixels
+    few = few if _count_shapes(few, count) == count else pixels
     means = normalised_kmeans(few, count, generator, restarts=1, max_iterations=_ITERATIONS).endmembers
     return normalize(means.double(), dim=1)
 
@@ -245,7 +245,7 @@ def _grown_sets(judges: Float[Tensor, "N B"], candidates: Float[Tensor, "M B"], 
     """The best sets found of 1, 2, ... candidates."""
     lengths = judges.norm(dim=1)
     weights = (lengths / (_DARK * lengths.quantile(0.95))).clamp(max=1).sqrt()
-    search = PairSearch(distances_to_pairs(normalize(judges, dim=1), candidates).pow_(_POWER).mul_(weights))
+    search = _PairSearch(distances_to_pairs(normalize(judges, dim=1), candidates).pow_(_POWER).mul_(weights))
     sets: list[list[int]] = [[]]
     for _ in range(min(most, len(candidates))):
         sets.append(search.improved(search.grown(sets[-1])))

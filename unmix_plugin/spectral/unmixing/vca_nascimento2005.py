@@ -23,7 +23,7 @@ _RANK_TOLERANCE = 1e-7
 
 
 @dataclass(frozen=True)
-class VcaResult:
+class _VcaResult:
     """What VCA found."""
 
     endmembers: Float[Tensor, "K B"]
@@ -36,7 +36,7 @@ class VcaResult:
 
 def vca(
     pixels: Float[Tensor, "N B"], num_endmembers: int, generator: torch.Generator, snr_db: float | None = None
-) -> VcaResult:
+) -> _VcaResult:
     """Find K corners of the data's simplex one by one, each the extreme pixel along a random direction orthogonal to
     those found.
 
@@ -59,7 +59,7 @@ def vca(
     else:
         denoised, points = _project_perspectively(data, num_endmembers)
     indices = _extreme_points(points, generator)
-    return VcaResult(denoised[indices].to(pixels.dtype), indices, snr_db)
+    return _VcaResult(denoised[indices].to(pixels.dtype), indices, snr_db)
 
 
 def estimate_snr_db(pixels: Float[Tensor, "N B"], num_endmembers: int) -> float:

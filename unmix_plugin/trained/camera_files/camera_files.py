@@ -20,7 +20,7 @@ from jaxtyping import Float64
 from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.scenes.placement import read_placement
 from unmix_plugin.scenes.reading.faults import Faults, describe, read_number
-from unmix_plugin.scenes.reading.transforms_json import Intrinsics, read_intrinsics
+from unmix_plugin.scenes.reading.transforms_json import read_intrinsics
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.trained.camera_files.camera_json import (
     FORMAT_VERSION,
@@ -112,7 +112,7 @@ def _frame_view(
     faults = Faults(path)
     lens = read_intrinsics({}, values, where, faults)
     faults.raise_if_any()
-    assert isinstance(lens, Intrinsics)
+    assert lens is not None
     if lens.width is None or lens.height is None:
         raise ConfigError(
             f"{path}: {where}: 'w' and 'h' are absent; expected the size of the picture in pixels"
@@ -120,7 +120,9 @@ def _frame_view(
     width, height = check_size(lens.width, lens.height, f"{path}: {where}")
     x, y = lens.center_px
     centre = (width / 2 if x is None else x, height / 2 if y is None else y)
-    return one_view(name, pose, lens.focal_at(width), centre, lens.coefficients, (width, height))
+    focal_px = lens.focal_at(width, height)
+    assert focal_px is not None
+    return one_view(name, pose, focal_px, centre, lens.coefficients, (width, height))
 
 
 def _names(entries: Sequence[dict[str, Any]], path: Path) -> list[str]:
