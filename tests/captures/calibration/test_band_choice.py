@@ -12,7 +12,6 @@ from unmix_plugin.captures.calibration.bands import (
     drop_found,
     find_saturation,
     noise_shares,
-    repeated_wavelengths,
 )
 
 WAVELENGTHS_NM = np.linspace(400.0, 900.0, 12)
@@ -78,7 +77,7 @@ def test_bands_are_sorted_and_binned_by_wavelength():
 
 
 def test_a_wavelength_is_used_once():
-    np.testing.assert_array_equal(repeated_wavelengths(np.array([500.0, 510.0, 500.0])), [False, False, True])
+    assert list(BandChoice(np.array([500.0, 510.0, 500.0]), {}).without_repeated().dropped) == [2]
 
 
 @pytest.mark.parametrize(("top", "expected"), [(4095, 4095.0), (3900, 3900.0), (None, 65535.0)])

@@ -1,15 +1,11 @@
-"""Which pixels of an image are kept, and how they are averaged: cropping, then binning.
-
-Notation: `H x W` pixels of the file, `h x w` of what is written.
-
-Stored numbers of any file as numbers that are proportional to light, apart from an offset.
-
-From stored numbers to values: dark frame, white reference, exposure, binning.
+"""From stored numbers to values: cropping, dark frame, white reference, exposure, binning.
 
     value = (stored - dark) / (white - dark) * reflectance of the panel * exposure of white / exposure of view
 
-with what is not given left out. Notation: `h x W` pixels of the file, `n x w` of the result; `b` kept bands of the
-file, `c` bands of the result.
+with what is not given left out.
+
+Notation: `H x W` pixels and `B` bands of the file, of which `h` rows and `b` bands are read; `n x w` pixels and `c`
+bands of the result.
 """
 
 from __future__ import annotations
@@ -21,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from unmix_plugin.captures.calibration.references import Reference, WhiteReference, linear
-from unmix_plugin.captures.poses.pose_set import Lens
+from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.spectral_file import SpectralFile
 from unmix_plugin.errors import ConfigError
 
@@ -169,49 +165,37 @@ class Calibration:
         if not sound.all():
             values[~sound] = 0.0
             saturated[~sound] = False
+        values, saturated = self.raster.averaged(values), self.raster.any_in_square(saturated)
+        if self.bin_bands > 1:
+            values = self._in_bins(values).mean(axis=-1)
+            saturated = self._in_bins(saturated).any(axis=-1)
         return CalibratedRows(
-            self._binned_bands(self.raster.averaged(values)).astype(np.float32, copy=False),
-            self._any_band(self.raster.any_in_square(saturated)),
-            self.raster.any_in_square(~sound),
+            values.astype(np.float32, copy=False), saturated, self.raster.any_in_square(~sound)
         )
 
     def _values(self, file: SpectralFile, whole: np.ndarray, rows: slice) -> Float32[np.ndarray, "h W b"]:
         columns, bands = self.raster.columns, self.bands
         values = linear(file, whole, rows)[:, columns]  # a new array, free to be changed
-        factor = np.float32(self.gain * self.exposure_factor(file))
-        if self.dark is not None:
-            values -= self.dark.rows(rows, columns, bands)
+        exposure = exposure_of(file)
+        is_known = exposure is not None and self.exposure is not None
+        factor = np.float32(self.gain * (self.exposure / exposure if is_known else 1.0))
+        dark = None if self.dark is None else self.dark.rows(rows, columns, bands)
+        if dark is not None:
+            values -= dark
         if self.white is not None:
-            factor = factor * self.white_gain(rows)
+            light = self.white.reference.rows(rows, columns, bands)
+            if dark is not None:
+                light = light - dark
+            # NaN where the white is not above the dark.
+            light = np.where(light > 0, light, np.float32(np.nan))
+            factor = factor * (self.white.reflectance[bands].astype(np.float32) / light)
         values *= factor
         return values
 
-    def white_gain(self, rows: slice) -> Float32[np.ndarray, "h W b"]:
-        """Factors from counts above dark to reflectance; NaN where the white is not above the dark."""
-        assert self.white is not None
-        columns, bands = self.raster.columns, self.bands
-        light = self.white.reference.rows(rows, columns, bands)
-        if self.dark is not None:
-            light = light - self.dark.rows(rows, columns, bands)
-        light = np.where(light > 0, light, np.float32(np.nan))
-        return self.white.reflectance[bands].astype(np.float32) / light
-
-    def exposure_factor(self, file: SpectralFile) -> float:
-        """What a view's values are multiplied by, so that exposures do not matter; 1 where one is not known."""
-        exposure = exposure_of(file)
-        return 1.0 if exposure is None or self.exposure is None else self.exposure / exposure
-
-    def _binned_bands(self, values: np.ndarray) -> np.ndarray:
-        if self.bin_bands == 1:
-            return values
+    def _in_bins(self, values: np.ndarray) -> np.ndarray:
+        """Kept bands by bins, (n, w, b) to (n, w, c, bands of a bin)."""
         used = values[..., : self.num_bands * self.bin_bands]
-        return used.reshape(*values.shape[:-1], self.num_bands, self.bin_bands).mean(axis=-1)
-
-    def _any_band(self, marks: np.ndarray) -> np.ndarray:
-        if self.bin_bands == 1:
-            return marks
-        used = marks[..., : self.num_bands * self.bin_bands]
-        return np.any(used.reshape(*marks.shape[:-1], self.num_bands, self.bin_bands), axis=-1)
+        return used.reshape(*values.shape[:-1], self.num_bands, self.bin_bands)
 
 
 def find_missing(stored: np.ndarray, no_data: float | None) -> Bool[np.ndarray, "h W"]:
@@ -223,8 +207,9 @@ def find_missing(stored: np.ndarray, no_data: float | None) -> Bool[np.ndarray, 
     if stored.dtype.kind == "f":
         missing |= ~np.isfinite(stored).all(axis=-1)
     if no_data is not None and np.isfinite(no_data):
-        same = stored == stored.dtype.type(no_data) if _is_in_range(no_data, stored.dtype) else None
-        if same is not None:
+        limits = None if stored.dtype.kind == "f" else np.iinfo(stored.dtype)
+        if limits is None or (limits.min <= no_data <= limits.max and no_data == int(no_data)):
+            same = stored == stored.dtype.type(no_data)
             missing |= same.all(axis=-1) if no_data == 0 else same.any(axis=-1)
     return missing
 
@@ -235,10 +220,3 @@ def exposure_of(file: SpectralFile) -> float | None:
     if not isinstance(exposure, int | float) or not isinstance(gain, int | float):
         return None
     return float(exposure * gain) if exposure > 0 and gain > 0 else None
-
-
-def _is_in_range(number: float, dtype: np.dtype) -> bool:
-    if dtype.kind == "f":
-        return True
-    limits = np.iinfo(dtype)
-    return limits.min <= number <= limits.max and number == int(number)

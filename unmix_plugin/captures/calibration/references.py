@@ -1,8 +1,6 @@
 """Dark frames and white references: what a pixel and band of the detector reads without light, and with all of it.
 
 Notation: `H x W` pixels, `B` bands of the file; `h` some rows, `b` some bands.
-
-How much a white panel reflects, and whether its image can serve.
 """
 
 from __future__ import annotations
@@ -11,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Float32, Float64
 
 from unmix_plugin.captures.radiometry import radiometric_model
 from unmix_plugin.captures.spectral_file import SpectralFile
@@ -19,13 +17,16 @@ from unmix_plugin.errors import CaptureError, ConfigError, SpectrumError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 
-SRGB = "sRGB"
-"""Value of `metadata['encoding']` of pictures for people."""
+BLOCK_VALUES = 1 << 22
+"""Values read together."""
+_PATTERN_BLOCK_PX = 8
+_MOST_PATTERN = 4.0
+"""Ratio of the variance of blocks' means to that which noise alone would leave, above which rows differ."""
 
 
 def is_srgb(file: SpectralFile) -> bool:
     """Whether the file is a picture for people."""
-    return file.metadata.get("encoding") == SRGB
+    return file.metadata.get("encoding") == "sRGB"
 
 
 def linear(file: SpectralFile, stored: np.ndarray, rows: slice) -> Float32[np.ndarray, "h W b"]:
@@ -38,25 +39,13 @@ def linear(file: SpectralFile, stored: np.ndarray, rows: slice) -> Float32[np.nd
     Raises:
         CaptureError: the calibration in the file is damaged.
     """
-    if is_srgb(file):
-        return srgb_to_linear(stored)
+    if is_srgb(file):  # IEC 61966-2-1:1999
+        top = np.iinfo(stored.dtype).max
+        levels = np.arange(top + 1) / top
+        light = np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
+        return light.astype(np.float32)[stored]
     model = radiometric_model(file)
     return stored.astype(np.float32) if model is None else model.apply(stored.astype(np.float32), rows)
-
-
-def srgb_to_linear(stored: np.ndarray) -> Float32[np.ndarray, "*shape"]:
-    """Linear light in [0, 1] of integers that are encoded as sRGB (IEC 61966-2-1:1999)."""
-    top = np.iinfo(stored.dtype).max
-    levels = np.arange(top + 1) / top
-    light = np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
-    return light.astype(np.float32)[stored]
-
-
-BLOCK_VALUES = 1 << 22
-"""Values read together."""
-PATTERN_BLOCK_PX = 8
-MOST_PATTERN = 4.0
-"""Ratio of the variance of blocks' means to that which noise alone would leave, above which rows differ."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +70,15 @@ class Reference:
         return mean if mean.shape[1] == 1 else mean[:, columns]
 
 
+@dataclass(frozen=True)
+class WhiteReference:
+    """A white panel and what is known of it."""
+
+    reference: Reference
+    reflectance: Float64[np.ndarray, " B"]
+    """Of the panel at every band of the file, above 0."""
+
+
 def open_reference(file: SpectralFile, what: str, cube: SpectralFile) -> Reference:
     """A reference for the cubes of one sensor.
 
@@ -99,7 +97,7 @@ def open_reference(file: SpectralFile, what: str, cube: SpectralFile) -> Referen
     mean, pattern = _column_means(file)
     if not np.isfinite(mean).all():
         raise CaptureError(f"{file.path}: the {what} holds NaN or infinite values; take it again")
-    if (height, width) == cube.shape[:2] and height > 1 and pattern > MOST_PATTERN:
+    if (height, width) == cube.shape[:2] and height > 1 and pattern > _MOST_PATTERN:
         how = f"pixel by pixel, as its rows differ ({pattern:.1f} times what noise explains)"
         return Reference(file, what, mean, True, how)
     lines = f"mean of {height} line{'s' if height > 1 else ''}"
@@ -156,7 +154,7 @@ def _column_means(file: SpectralFile) -> tuple[Float32[np.ndarray, "1 W B"], flo
 
 def _pattern(residual: Float64[np.ndarray, "H W"]) -> float:
     """Variance of the means of square blocks, as a multiple of what pixels that differ by noise alone would give."""
-    side = PATTERN_BLOCK_PX
+    side = _PATTERN_BLOCK_PX
     height, width = (length // side * side for length in residual.shape)
     variance = residual.var()
     if height == 0 or width == 0 or not variance > 0:
@@ -177,61 +175,21 @@ def _stretched(mean: Float32[np.ndarray, "1 V B"], width: int) -> Float32[np.nda
     return mean[:, low] * (1 - part) + mean[:, high] * part
 
 
-LEAST_WHITE = 0.01
-"""Signal of the white reference in a band, as a share of the greatest, below which the band is too dark."""
-
-
-@dataclass(frozen=True)
-class WhiteReference:
-    """A white panel and what is known of it."""
-
-    reference: Reference
-    reflectance: Float64[np.ndarray, " B"]
-    """Of the panel at every band of the file, above 0."""
-
-
-MOST_SATURATED = 0.5
-"""Share of a white reference's values at the detector's top at which it can't serve."""
-
-
-def panel_reflectance(text: str, wavelengths_nm: Float64[np.ndarray, " B"]) -> Float64[np.ndarray, " B"]:
-    """Reflectance of the panel at each band, from a number or a CSV file (wavelength,reflectance).
-
-    Raises:
-        ConfigError: neither, or not above 0 and at most 1.5.
-        SpectrumError: the file is damaged or does not reach all bands.
-    """
-    try:
-        values = np.full(len(wavelengths_nm), float(text))
-    except ValueError:
-        if not Path(text).is_file():
-            raise ConfigError(
-                f"--white-reflectance {text}: neither a number nor a file; expected 0.99 or a CSV file"
-            ) from None
-        table = read_spectra_csv(Path(text))
-        if len(table.names) != 1:
-            raise SpectrumError(
-                f"{text}: expected one column beside 'wavelength'; found {len(table.names)}"
-            ) from None
-        order = np.argsort(wavelengths_nm, kind="stable")
-        distinct, back = np.unique(wavelengths_nm[order], return_inverse=True)
-        values = np.empty(len(wavelengths_nm))
-        values[order] = table.resampled(Bands(distinct)).spectra[0][back]
-    if not (np.isfinite(values).all() and values.min() > 0.0 and values.max() <= 1.5):
-        raise ConfigError(
-            f"--white-reflectance {text} is {values.min():g} to {values.max():g}; expected a reflectance above 0, such "
-            "as 0.99 (per cent are divided by 100 first)"
-        )
-    return values
-
-
 def white_reference(
-    reference: Reference, dark: Reference | None, reflectance: Float64[np.ndarray, " B"]
+    reference: Reference,
+    dark: Reference | None,
+    reflectance: str,
+    wavelengths_nm: Float64[np.ndarray, " B"],
 ) -> WhiteReference:
-    """A white reference that is brighter than the dark.
+    """A white panel that is brighter than the dark.
 
+    Args:
+        reflectance: Of the panel: a number, or a CSV file (wavelength,reflectance).
+        wavelengths_nm: Of all bands of the file.
     Raises:
-        CaptureError: it is not.
+        CaptureError: it is not brighter.
+        ConfigError: the reflectance is neither, or not above 0 and at most 1.5.
+        SpectrumError: the CSV file is damaged or does not reach all bands.
     """
     light = panel_signal(reference, dark)
     if not (light > 0).mean() > 0.5:
@@ -240,31 +198,31 @@ def white_reference(
             f"{reference.file.path}: the white reference is not brighter than {dark_name} in "
             f"{(light <= 0).mean():.0%} of its bands; are white and dark swapped?"
         )
-    return WhiteReference(reference, reflectance)
+    try:
+        values = np.full(len(wavelengths_nm), float(reflectance))
+    except ValueError:
+        values = _read_reflectance(reflectance, wavelengths_nm)
+    if not (np.isfinite(values).all() and values.min() > 0.0 and values.max() <= 1.5):
+        raise ConfigError(
+            f"--white-reflectance {reflectance} is {values.min():g} to {values.max():g}; expected a reflectance above "
+            "0, such as 0.99 (per cent are divided by 100 first)"
+        )
+    return WhiteReference(reference, values)
+
+
+def _read_reflectance(path: str, wavelengths_nm: Float64[np.ndarray, " B"]) -> Float64[np.ndarray, " B"]:
+    if not Path(path).is_file():
+        raise ConfigError(
+            f"--white-reflectance {path}: neither a number nor a file; expected 0.99 or a CSV file"
+        )
+    table = read_spectra_csv(Path(path))
+    if len(table.names) != 1:
+        raise SpectrumError(f"{path}: expected one column beside 'wavelength'; found {len(table.names)}")
+    distinct, back = np.unique(wavelengths_nm, return_inverse=True)
+    return table.resampled(Bands(distinct)).spectra[0][back]
 
 
 def panel_signal(reference: Reference, dark: Reference | None) -> Float64[np.ndarray, " B"]:
     """Mean counts of the white above dark at each band of the file."""
     signal = reference.mean.astype(np.float64).mean(axis=(0, 1))
     return signal if dark is None else signal - dark.mean.astype(np.float64).mean(axis=(0, 1))
-
-
-def too_dark(signal: Float64[np.ndarray, " B"]) -> Bool[np.ndarray, " B"]:
-    """Bands in which there is hardly any light on the panel."""
-    return signal < LEAST_WHITE * signal.max()
-
-
-def refuse_saturated(reference: Reference, saturation: float | None) -> None:
-    """Refuse a white reference that is mostly at the detector's top.
-
-    Raises:
-        CaptureError: it is.
-    """
-    if saturation is None:
-        return
-    share = float((reference.mean >= saturation).mean())
-    if share > MOST_SATURATED:
-        raise CaptureError(
-            f"{reference.file.path}: {share:.0%} of the white reference is saturated ({saturation:g} and above); take "
-            "it again with a shorter exposure"
-        )

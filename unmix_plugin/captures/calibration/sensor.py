@@ -1,6 +1,6 @@
-"""All decisions on one sensor, taken before a view is written: bands, references, saturation, scale, colours.
+"""All decisions on one sensor, taken before a view is written: bands, references, saturation, scale.
 
-The calibrated value that is written as 1, the same for all views and bands of a scene.
+Notation: `N` sampled pixels, `B` bands of the file, `c` bands of the scene.
 """
 
 from __future__ import annotations
@@ -12,26 +12,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from unmix_plugin.captures.calibration import references as white_panel
-from unmix_plugin.captures.calibration.bands import (
-    BandChoice,
-    draw_sample,
-    drop_found,
-    find_saturation,
-    repeated_wavelengths,
-    require_bands,
-)
-from unmix_plugin.captures.calibration.calibration import (
-    Calibration,
-    Raster,
-    exposure_of,
-)
+from unmix_plugin.captures.calibration.bands import BandChoice, draw_sample, drop_found, find_saturation
+from unmix_plugin.captures.calibration.calibration import Calibration, Raster, exposure_of
 from unmix_plugin.captures.calibration.references import (
     Reference,
     WhiteReference,
     is_srgb,
     open_reference,
     panel_reference,
+    panel_signal,
+    white_reference,
 )
 from unmix_plugin.captures.capture import CaptureView
 from unmix_plugin.captures.options import ProcessOptions
@@ -39,6 +29,16 @@ from unmix_plugin.captures.radiometry import radiometric_model
 from unmix_plugin.captures.spectral_file import SpectralFile
 from unmix_plugin.captures.wavelengths import in_ranges
 from unmix_plugin.errors import CaptureError, ConfigError, counted
+
+_MOST_SATURATED = 0.5
+"""Share of a white reference's values at the detector's top at which it can't serve."""
+_LEAST_WHITE = 0.01
+"""Signal of the white reference in a band, as a share of the greatest, below which the band is too dark."""
+_BRIGHT_PERCENTILE = 99.9
+_MOST_ABOVE_ONE = 0.01
+"""Share of reflectances above 1 that is still taken for highlights."""
+_LEAST_BRIGHT = 0.05
+"""Bright values below this would lose digits if they were kept."""
 
 
 @dataclass(frozen=True)
@@ -91,37 +91,57 @@ def prepare_sensor(
         ConfigError: an option does not fit the files.
     """
     files = [view.cube for view in views]
-    choice, notes = _stated_bands(files[0], options), []
+    first, binning = files[0], options.bin_bands
+    model = radiometric_model(first)
+    choice, notes = _stated_bands(first, options), []
     dark, white = _references(views, choice, options, references)
-    saturation, how = _saturation(files, choice, options)
-    raster = Raster.of(files[0].shape[0], files[0].shape[1], options.crop, options.bin_pixels)
-    evidence: dict[str, Any] = {"saturation": {"stored": saturation, "evidence": how}}
+    if options.saturation is not None:
+        saturation, how = options.saturation, "given with --saturation"
+    elif model is not None:
+        saturation, how = model.saturated, f"known of {model.maker}"
+    else:
+        saturation, how = find_saturation(files, choice.kept)
+    raster = Raster.of(first.shape[0], first.shape[1], options.crop, options.bin_pixels)
     lamp = None
     if white is not None:
-        white_panel.refuse_saturated(white.reference, saturation)
-        signal = white_panel.panel_signal(white.reference, dark)
+        share = 0.0 if saturation is None else float((white.reference.mean >= saturation).mean())
+        if share > _MOST_SATURATED:
+            raise CaptureError(
+                f"{white.reference.file.path}: {share:.0%} of the white reference is saturated ({saturation:g} and "
+                "above); take it again with a shorter exposure"
+            )
+        signal = panel_signal(white.reference, dark)
         lamp = signal / white.reflectance
-        choice = choice.without(white_panel.too_dark(signal), "the white reference has no light there")
-    require_bands(choice, options.bin_bands, str(files[0].path))
-    exposure, said = _common_exposure(files, white)
-    notes += said
-    calibration = Calibration(raster, choice.kept, 1, dark, white, saturation, _gain(files[0]), exposure)
+        choice = choice.without(
+            signal < _LEAST_WHITE * signal.max(), "the white reference has no light there"
+        )
+    choice.require(binning, str(first.path))
+    # A maker's calibration accounts for exposures already.
+    exposure, said = _common_exposure(files, white) if model is None else (None, [])
+    gain = 1.0 if first.scale is None or is_srgb(first) else 1.0 / first.scale
+    calibration = Calibration(raster, choice.kept, 1, dark, white, saturation, gain, exposure)
     sample = draw_sample(files, calibration)
     choice, noted = drop_found(choice, sample, options.max_noise)
-    notes += noted
-    require_bands(choice, options.bin_bands, str(files[0].path))
+    notes += [*said, *noted]
+    choice.require(binning, str(first.path))
     still_kept = np.isin(calibration.bands, choice.kept)
-    calibration = replace(calibration, bands=choice.kept, bin_bands=options.bin_bands)
-    evidence |= _reference_evidence(dark, white) | _band_evidence(files[0], choice) | _light_evidence(views)
+    calibration = replace(calibration, bands=choice.kept, bin_bands=binning)
+    if lamp is not None:
+        lamp = _binned(lamp[choice.kept][None].astype(np.float32), binning)[0].astype(np.float64)
+        lamp = np.clip(lamp, 0.0, None) / lamp.max()
+    # Floating-point numbers may have been brought to what stands for 1 already.
+    has_one = is_srgb(first) or first.scale is not None or (first.dtype.kind == "f" and model is None)
+    evidence = {"saturation": {"stored": saturation, "evidence": how}}
+    evidence |= _reference_evidence(dark, white) | _band_evidence(first, choice) | _light_evidence(views)
     return Sensor(
         name,
         calibration,
         choice,
-        _unit(files[0], white),
-        white is not None or _has_one(files[0]),
-        _binned(sample.values[:, still_kept], options.bin_bands),
+        _unit(first, white),
+        white is not None or has_one,
+        _binned(sample.values[:, still_kept], binning),
         evidence,
-        None if lamp is None else _lamp_of(lamp, choice, options.bin_bands),
+        lamp,
         tuple(notes),
     )
 
@@ -133,8 +153,7 @@ def _stated_bands(file: SpectralFile, options: ProcessOptions) -> BandChoice:
             f"{file.path}: the wavelengths of its {file.shape[2]} bands are unknown ({file.bands.evidence}); give them "
             "with --wavelengths, as a list in nm or a CSV file"
         )
-    choice = BandChoice(wavelengths, {})
-    choice = choice.without(repeated_wavelengths(wavelengths), "an earlier band has the same wavelength")
+    choice = BandChoice(wavelengths, {}).without_repeated()
     if file.bands.bad is not None:
         choice = choice.without(file.bands.bad, "marked as bad in the file")
     if options.drop_bands is not None:
@@ -148,40 +167,24 @@ def _references(
     cube = views[0].cube
     dark = None if references.dark is None else open_reference(references.dark, "dark frame", cube)
     if options.white_rectangle is not None:
-        panel = _panel(references.views or views, options.white_rectangle)
+        wanted, top, left, height, width = options.white_rectangle
+        shown = references.views or views
+        view = next((view for view in shown if wanted in (view.name, view.release)), None)
+        if view is None:
+            names = ", ".join(view.name for view in shown[:5])
+            raise ConfigError(f"--white-rectangle {wanted}: no view of this name; the first are {names}")
+        panel = panel_reference(view.cube, (top, left, height, width), view.name)
     elif references.white is not None:
         panel = open_reference(references.white, "white reference", cube)
     else:
         return dark, None
-    reflectance = white_panel.panel_reflectance(options.white_reflectance, choice.wavelengths_nm)
-    return dark, white_panel.white_reference(panel, dark, reflectance)
-
-
-def _panel(views: Sequence[CaptureView], rectangle: tuple[str, int, int, int, int]) -> Reference:
-    view = next((view for view in views if rectangle[0] in (view.name, view.release)), None)
-    if view is None:
-        names = ", ".join(view.name for view in views[:5])
-        raise ConfigError(f"--white-rectangle {rectangle[0]}: no view of this name; the first are {names}")
-    return panel_reference(view.cube, rectangle[1:], view.name)
-
-
-def _saturation(
-    files: Sequence[SpectralFile], choice: BandChoice, options: ProcessOptions
-) -> tuple[float | None, str]:
-    if options.saturation is not None:
-        return options.saturation, "given with --saturation"
-    model = radiometric_model(files[0])
-    return (
-        find_saturation(files, choice.kept) if model is None else (model.saturated, f"known of {model.maker}")
-    )
+    return dark, white_reference(panel, dark, options.white_reflectance, choice.wavelengths_nm)
 
 
 def _common_exposure(
     files: Sequence[SpectralFile], white: WhiteReference | None
 ) -> tuple[float | None, list[str]]:
     """The exposure that all values are brought to, and what to tell of it."""
-    if radiometric_model(files[0]) is not None:
-        return None, []  # it accounts for exposures already
     found = [exposure_of(file) for file in files]
     of_white = None if white is None else exposure_of(white.reference.file)
     known = [exposure for exposure in found if exposure is not None]
@@ -200,16 +203,6 @@ def _common_exposure(
     ]
 
 
-def _gain(file: SpectralFile) -> float:
-    return 1.0 if file.scale is None or is_srgb(file) else 1.0 / file.scale
-
-
-def _has_one(file: SpectralFile) -> bool:
-    """Whether a file says which number stands for 1; floating-point numbers may have been brought to it already."""
-    is_float = file.dtype.kind == "f" and radiometric_model(file) is None
-    return is_srgb(file) or file.scale is not None or is_float
-
-
 def _unit(file: SpectralFile, white: WhiteReference | None) -> str:
     if white is not None:
         return "reflectance"
@@ -219,11 +212,6 @@ def _unit(file: SpectralFile, white: WhiteReference | None) -> str:
     if model is not None:
         return model.description
     return "relative radiance" if file.scale is None else "values divided by the scale factor of the files"
-
-
-def _lamp_of(lamp: Float64[np.ndarray, " B"], choice: BandChoice, binning: int) -> Float64[np.ndarray, " c"]:
-    kept = _binned(lamp[choice.kept][None].astype(np.float32), binning)[0].astype(np.float64)
-    return np.clip(kept, 0.0, None) / kept.max()
 
 
 def _binned(values: Float32[np.ndarray, "N b"], binning: int) -> Float32[np.ndarray, "N c"]:
@@ -259,13 +247,6 @@ def _band_evidence(file: SpectralFile, choice: BandChoice) -> dict[str, Any]:
     }
 
 
-BRIGHT_PERCENTILE = 99.9
-MOST_ABOVE_ONE = 0.01
-"""Share of reflectances above 1 that is still taken for highlights."""
-LEAST_BRIGHT = 0.05
-"""Bright values below this would lose digits if they were kept."""
-
-
 def choose_scale(sensors: Sequence[Sensor], given: float | None) -> tuple[float, str]:
     """The scale and why.
 
@@ -283,14 +264,14 @@ def choose_scale(sensors: Sequence[Sensor], given: float | None) -> tuple[float,
             )
         return given, "given with --scale"
     values = np.concatenate([sensor.sample.ravel() for sensor in sensors])
-    bright = float(np.percentile(values, BRIGHT_PERCENTILE)) if len(values) else 0.0
+    bright = float(np.percentile(values, _BRIGHT_PERCENTILE)) if len(values) else 0.0
     if not bright > 0:
         raise CaptureError(
-            f"{BRIGHT_PERCENTILE:g} % of the calibrated values are not above 0 (up to {values.max(initial=0):g}); "
+            f"{_BRIGHT_PERCENTILE:g} % of the calibrated values are not above 0 (up to {values.max(initial=0):g}); "
             "check the dark frame: is it as bright as the views?"
         )
     above = float((values > 1.0).mean())
-    if all(sensor.is_absolute for sensor in sensors) and above <= MOST_ABOVE_ONE and bright >= LEAST_BRIGHT:
+    if all(sensor.is_absolute for sensor in sensors) and above <= _MOST_ABOVE_ONE and bright >= _LEAST_BRIGHT:
         return 1.0, f"values are kept ({sensors[0].unit}); {above:.2%} of the sampled ones are above 1"
     scale = float(f"{bright:.4g}")
-    return scale, f"the {BRIGHT_PERCENTILE:g}th percentile of the sampled values"
+    return scale, f"the {_BRIGHT_PERCENTILE:g}th percentile of the sampled values"

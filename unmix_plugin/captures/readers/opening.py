@@ -9,7 +9,7 @@ import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from unmix_plugin.captures.readers.exr import open_exr
 from unmix_plugin.captures.readers.hdf5 import open_hdf5
 from unmix_plugin.captures.readers.pictures import open_band_folder, open_picture
 from unmix_plugin.captures.readers.tiff import open_tiff
-from unmix_plugin.captures.spectral_file import ReadOptions, SpectralFile, unreadable
+from unmix_plugin.captures.spectral_file import BandTable, ReadOptions, SpectralFile, unreadable
 from unmix_plugin.errors import CaptureError
 
 _BEGINNINGS = {
@@ -52,14 +52,47 @@ _REFUSED = {
 _KNOWN = "ENVI, TIFF, OpenEXR, MATLAB, HDF5, NetCDF, .npy, .npz, .pt, PNG, JPEG, or a folder with one picture a band"
 _HDF5_STARTS = (512, 1024, 2048, 4096)
 """Where the mark of HDF5 may follow bytes of another program."""
+_LARGEST_PROOF = 2**28
+"""Bytes of a row that is read as a proof; of larger ones a single band, or nothing."""
+_LONGEST_TEXT = 500
+_LLFF_COLUMNS = 17
+_POSE_SUFFIXES = (".json", ".xml", ".bin", ".txt")
 
 
-def file_kind(path: Path) -> str:
-    """Name of the reader for a file or folder.
+def open_spectral_file(path: Path, options: ReadOptions | None = None) -> SpectralFile:
+    """Open a file, or a folder that holds one picture a band, without reading its numbers.
 
+    Args:
+        path: For ENVI the header or the file of numbers.
+        options: What the user gives, which overrides the file.
     Raises:
-        CaptureError: it is missing, empty, or of a kind that no reader reads.
+        CaptureError: the file is missing, damaged or of no known kind, or the options don't fit it.
     """
+    options = options or ReadOptions()
+    try:
+        opened = _READERS[_file_kind(path)](path, options)
+        height, width, num_bands = opened.shape
+        size = f"{height} rows x {width} columns x {num_bands} bands"
+        if 0 in opened.shape:
+            raise CaptureError(f"{path}: the image has no pixels: {size}")
+        given = options.wavelengths_nm
+        if given is None:
+            return opened
+        if len(given) != num_bands:
+            raise CaptureError(
+                f"{opened.path}: {len(given)} wavelengths were given for {size}; expected one a band"
+            )
+        return replace(
+            opened, bands=replace(opened.bands, wavelengths_nm=given, evidence="given by the user")
+        )
+    except CaptureError:
+        raise
+    except Exception as error:
+        raise unreadable(path, error) from error
+
+
+def _file_kind(path: Path) -> str:
+    """Name of the reader for a file or folder."""
     if path.is_dir():
         return "folder"
     if not path.is_file():
@@ -85,7 +118,13 @@ def _by_content(path: Path, begin: bytes) -> str | None:
     if any(begin[start : start + 8] == b"\x89HDF\r\n\x1a\n" for start in _HDF5_STARTS):
         return "hdf5"
     if begin.startswith(b"PK\x03\x04") and zipfile.is_zipfile(path):
-        return _kind_of_zip(path)
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+        if any(name.endswith("/data.pkl") for name in names):
+            return "torch"
+        if names and all(name.endswith(".npy") for name in names):
+            return "npz"
+        raise CaptureError(f"{path}: a zip archive ({', '.join(names[:3]) or 'empty'}); unpack it first")
     if is_envi_header(path) or (path.suffix.lower() != ".hdr" and header_beside(path) is not None):
         return "envi"
     refused = next((why for magic, why in _REFUSED.items() if begin.lstrip().startswith(magic)), None)
@@ -94,19 +133,7 @@ def _by_content(path: Path, begin: bytes) -> str | None:
     return _SUFFIXES.get(path.suffix.lower())
 
 
-def _kind_of_zip(path: Path) -> str:
-    with zipfile.ZipFile(path) as archive:
-        names = archive.namelist()
-    if any(name.endswith("/data.pkl") for name in names):
-        return "torch"
-    if names and all(name.endswith(".npy") for name in names):
-        return "npz"
-    raise CaptureError(f"{path}: a zip archive ({', '.join(names[:3]) or 'empty'}); unpack it first")
-
-
-Reader: TypeAlias = Callable[[Path, ReadOptions], SpectralFile]
-
-_READERS: dict[str, Reader] = {
+_READERS: dict[str, Callable[[Path, ReadOptions], SpectralFile]] = {
     "envi": open_envi,
     "tiff": open_tiff,
     "exr": open_exr,
@@ -118,125 +145,55 @@ _READERS: dict[str, Reader] = {
     "picture": open_picture,
     "torch": open_torch,
     "folder": lambda path, options: open_band_folder(
-        path, lambda band: _READERS[file_kind(band)](band, options)
+        path, lambda band: _READERS[_file_kind(band)](band, options)
     ),
 }
-
-
-def open_spectral_file(path: Path, options: ReadOptions | None = None) -> SpectralFile:
-    """Open a file, or a folder that holds one picture a band, without reading its numbers.
-
-    Args:
-        path: For ENVI the header or the file of numbers.
-        options: What the user gives, which overrides the file.
-    Raises:
-        CaptureError: the file is missing, damaged or of no known kind, or the options don't fit it.
-    """
-    options = options or ReadOptions()
-    try:
-        opened = _READERS[file_kind(path)](path, options)
-        if 0 in opened.shape:
-            raise CaptureError(f"{path}: the image has no pixels: {_size(opened)}")
-        return _with_wavelengths(opened, options)
-    except CaptureError:
-        raise
-    except Exception as error:
-        raise unreadable(path, error) from error
-
-
-def _with_wavelengths(opened: SpectralFile, options: ReadOptions) -> SpectralFile:
-    given = options.wavelengths_nm
-    if given is None:
-        return opened
-    if len(given) != opened.shape[2]:
-        raise CaptureError(
-            f"{opened.path}: {len(given)} wavelengths were given for {_size(opened)}; expected one a band"
-        )
-    return replace(opened, bands=replace(opened.bands, wavelengths_nm=given, evidence="given by the user"))
-
-
-def _size(opened: SpectralFile) -> str:
-    height, width, num_bands = opened.shape
-    return f"{height} rows x {width} columns x {num_bands} bands"
-
-
-_LARGEST_PROOF = 2**28
-"""Bytes of a row that is read as a proof; of larger ones a single band, or nothing."""
-_LONGEST_TEXT = 500
-_LLFF_COLUMNS = 17
-_POSE_SUFFIXES = (".json", ".xml", ".bin", ".txt")
-FACTS = (
-    *(
-        "reader",
-        "shape",
-        "dtype",
-        "interleave",
-        "wavelengths_nm",
-        "wavelength_evidence",
-        "fwhm_nm",
-        "band_names",
-    ),
-    *("bad_bands", "scale", "no_data", "poses", "notes", "metadata"),
-)
-"""What is reported of every file, None where it has no such thing."""
 
 
 def inspect_file(path: Path, options: ReadOptions | None = None) -> dict[str, Any]:
     """Facts about a file or folder, as JSON-able values: an image, poses, or both.
 
-    The last row of an image is read, so that a file that is cut short is found out.
+    The same facts of every file, None where it has no such thing; indices of bands count from 0. The last row of an
+    image is read, so that a file that is cut short is found out.
 
     Raises:
         CaptureError: the file is neither, or is damaged.
     """
+    opened = refused = None
     try:
         opened = open_spectral_file(path, options)
-        _prove(opened)
+        height, width, num_bands = opened.shape
+        row_bytes = width * opened.dtype.itemsize
+        if row_bytes <= _LARGEST_PROOF:
+            first = 0 if row_bytes * num_bands <= _LARGEST_PROOF else num_bands - 1
+            opened.read(slice(height - 1, height), slice(first, num_bands))
     except CaptureError as error:
-        poses = _poses_of(path, error)
-        return {"file": str(path), **dict.fromkeys(FACTS), **poses}
-    facts = describe(opened)
-    if path.suffix.lower() == ".npy" and opened.shape[1:] == (_LLFF_COLUMNS, 1):
-        facts |= _poses_of(path, None)
-    return {"file": str(path), **facts}
-
-
-def describe(opened: SpectralFile) -> dict[str, Any]:
-    """What an opened image says of itself; indices of bands count from 0."""
-    bands = opened.bands
-    return {
-        "reader": opened.reader,
-        "shape": list(opened.shape),
-        "dtype": opened.dtype.newbyteorder("=").name,
-        "interleave": opened.interleave,
+        opened, refused = None, error
+    bands = BandTable(evidence="") if opened is None else opened.bands
+    facts = {
+        "file": str(path),
+        "reader": opened and opened.reader,
+        "shape": opened and list(opened.shape),
+        "dtype": opened and opened.dtype.newbyteorder("=").name,
+        "interleave": opened and opened.interleave,
         "wavelengths_nm": _listed(bands.wavelengths_nm),
-        "wavelength_evidence": bands.evidence,
+        "wavelength_evidence": bands.evidence or None,
         "fwhm_nm": _listed(bands.fwhm_nm),
         "band_names": None if bands.names is None else list(bands.names),
         "bad_bands": None if bands.bad is None else np.flatnonzero(bands.bad).tolist(),
-        "scale": _number(opened.scale),
-        "no_data": _number(opened.no_data),
+        "scale": opened and _plain(opened.scale),
+        "no_data": opened and _plain(opened.no_data),
         "poses": None,
-        "notes": list(opened.notes),
-        "metadata": _plain(opened.metadata),
+        "notes": opened and list(opened.notes),
+        "metadata": opened and _plain(opened.metadata),
     }
-
-
-def _prove(opened: SpectralFile) -> None:
-    """Read the last row, or one band of it."""
-    height, width, num_bands = opened.shape
-    row_bytes = width * opened.dtype.itemsize
-    if row_bytes <= _LARGEST_PROOF:
-        first = 0 if row_bytes * num_bands <= _LARGEST_PROOF else num_bands - 1
-        opened.read(slice(height - 1, height), slice(first, num_bands))
+    if opened is None or (path.suffix.lower() == ".npy" and opened.shape[1:] == (_LLFF_COLUMNS, 1)):
+        facts |= _poses_of(path, refused)
+    return facts
 
 
 def _poses_of(path: Path, refused: CaptureError | None) -> dict[str, Any]:
-    """Number of cameras and notes of a file of poses.
-
-    Raises:
-        CaptureError: it holds none, and is not an image either: the more fitting of both reasons.
-    """
+    """Number of cameras and notes of a file of poses; where it is not an image either, the more fitting reason."""
     from unmix_plugin.captures.poses.reading import read_poses
 
     try:
@@ -252,11 +209,6 @@ def _listed(values: np.ndarray | None) -> list[float] | None:
     return None if values is None else [round(value, 6) for value in values.tolist()]
 
 
-def _number(value: float | None) -> float | str | None:
-    """JSON has no word for numbers that are not finite."""
-    return value if value is None or math.isfinite(value) else str(value)
-
-
 def _plain(value: Any) -> Any:
     """JSON-able, with long texts cut."""
     if isinstance(value, dict):
@@ -265,8 +217,8 @@ def _plain(value: Any) -> Any:
         return [_plain(item) for item in value]
     if isinstance(value, np.generic):
         return _plain(value.item())
-    if isinstance(value, float):
-        return _number(value)
+    if isinstance(value, float):  # JSON has no word for numbers that are not finite
+        return value if math.isfinite(value) else str(value)
     if value is None or isinstance(value, bool | int):
         return value
     text = str(value)
