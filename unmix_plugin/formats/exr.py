@@ -1,13 +1,9 @@
-"""OpenEXR images: named channels of one size, losslessly compressed, with attributes.
-
-Notation: `H x W` pixels.
-
-Spectral OpenEXR: one channel a band, named for its wavelength.
-
-Notation: `H x W` pixels, `B` bands.
+"""OpenEXR images: named channels of one size, losslessly compressed, with attributes; and spectra as channels.
 
 Source: Fichet et al. 2021, An OpenEXR Layout for Spectral Images, JCGT 10(3). Channels are emissive and unpolarised:
 `S0.<wavelength>nm` with a decimal comma, since a dot parts layers.
+
+Notation: `H x W` pixels, `B` bands.
 """
 
 from __future__ import annotations
@@ -26,7 +22,6 @@ def write_exr(path: Path, channels: Mapping[str, np.ndarray], attributes: Mappin
     """Write channels (H, W) of float32, float16 or uint32 as one scanline image, ZIP compressed.
 
     A dot in a channel's name parts layers. Readers get the channels in the order of their names.
-
     """
     import OpenEXR
 
@@ -37,7 +32,9 @@ def write_exr(path: Path, channels: Mapping[str, np.ndarray], attributes: Mappin
         try:
             OpenEXR.File(header, pixels).write(str(temporary))
         except (OSError, RuntimeError) as error:
-            raise cannot_write(path, _reason(error)) from error
+            # What the library says after the file's (temporary) name.
+            reason = str(error).rpartition('". ')[2].strip().rstrip(".")
+            raise cannot_write(path, reason) from error
     return path
 
 
@@ -46,15 +43,10 @@ def layer_names(layer: str, channels: Sequence[str]) -> list[str]:
     return [f"{layer}.{channel.replace('.', '_')}" for channel in channels]
 
 
-def _reason(error: Exception) -> str:
-    """What the library says after the file's (temporary) name."""
-    return str(error).rpartition('". ')[2].strip().rstrip(".")
-
-
-def channel_name(wavelength_nm: float) -> str:
+def _channel_name(wavelength_nm: float) -> str:
     """Channel of a band.
 
-    >>> channel_name(450.0)
+    >>> _channel_name(450.0)
     'S0.450,000000nm'
     """
     return f"S0.{wavelength_nm:.6f}nm".replace(".", ",").replace(",", ".", 1)
@@ -82,7 +74,7 @@ def write_spectral_exr(
     """
     if spectra.shape[2] != len(bands):
         raise ValueError(f"{len(bands)} wavelengths for spectra of shape {spectra.shape}")
-    channels = {channel_name(nm): spectra[..., i] for i, nm in enumerate(bands.centers_nm.tolist())}
+    channels = {_channel_name(nm): spectra[..., i] for i, nm in enumerate(bands.centers_nm.tolist())}
     if rgb is not None:
         channels.update({name: rgb[..., i] for i, name in enumerate("RGB")})
     if alpha is not None:

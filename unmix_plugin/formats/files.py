@@ -1,10 +1,4 @@
-"""Writing results: formats as bytes, files that are whole or not there, and nothing overwritten by accident.
-
-Images on disk as they are in memory: a header and then row after row, of which only a few are held at a time.
-
-NumPy's own format, written row after row.
-
-PNG pictures: colours with opacity, and ids with a palette.
+"""Files that are whole or not there: nothing overwritten by accident, images row after row, arrays and PNG as bytes.
 
 Notation: `H x W` pixels, `N` colours.
 """
@@ -34,7 +28,20 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 
-__all__ = ["array_bytes", "make_folder", "refuse_to_overwrite", "write_file"]
+__all__ = [
+    "RowSink",
+    "array_bytes",
+    "indexed_png_bytes",
+    "make_folder",
+    "npy_rows",
+    "raw_rows",
+    "refuse_to_overwrite",
+    "rgba_png_bytes",
+    "write_file",
+]
+
+RowSink: TypeAlias = Callable[[np.ndarray], None]
+"""Takes the next rows of an image, (rows, W, ...), from the top down."""
 
 
 def refuse_to_overwrite(paths: Collection[Path], overwrite: bool) -> None:
@@ -58,10 +65,6 @@ def array_bytes(array: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
-RowSink: TypeAlias = Callable[[np.ndarray], None]
-"""Takes the next rows of an image, (rows, W, ...), from the top down."""
-
-
 @contextmanager
 def raw_rows(path: Path, header: bytes, shape: tuple[int, ...], dtype: np.dtype) -> Iterator[RowSink]:
     """Context that gives a sink for the rows of an image; at its end the file is complete and has its name.
@@ -76,30 +79,28 @@ def raw_rows(path: Path, header: bytes, shape: tuple[int, ...], dtype: np.dtype)
     """
     given = 0
 
+    def write(values: np.ndarray) -> None:
+        with write_errors_as(path):
+            write_all(descriptor, values.reshape(-1).view(np.uint8).data)
+
     def add(rows: np.ndarray) -> None:
         nonlocal given
         if rows.shape[1:] != shape[1:]:
             raise ValueError(f"rows of {path.name} have shape {shape[1:]}; got {rows.shape[1:]}")
         given += len(rows)
-        with write_errors_as(path):
-            _write(descriptor, np.ascontiguousarray(rows, dtype=dtype))
+        write(np.ascontiguousarray(rows, dtype=dtype))
 
     with whole_file(path) as temporary:
         with write_errors_as(path):
             flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
             descriptor = os.open(temporary, flags, 0o666)
         try:
-            with write_errors_as(path):
-                _write(descriptor, np.frombuffer(header, dtype=np.uint8))
+            write(np.frombuffer(header, dtype=np.uint8))
             yield add
         finally:
             os.close(descriptor)
         if given != shape[0]:
             raise ValueError(f"{path.name} has {shape[0]} rows; got {given}")
-
-
-def _write(descriptor: int, values: np.ndarray) -> None:
-    write_all(descriptor, values.reshape(-1).view(np.uint8).data)
 
 
 @contextmanager

@@ -1,22 +1,14 @@
-"""PLY: points or meshes with any number of properties a vertex, binary, little-endian.
+"""Meshes and points as PLY, Wavefront OBJ and binary glTF.
 
-Notation: `P` vertices, `F` faces.
+PLY is binary, little-endian, with any number of properties a vertex. An OBJ has its materials in a file beside it, and
+colours of vertices after their positions. A GLB holds one mesh, in colours and any other numbers a vertex, or in the
+textures of a metallic-roughness material.
 
-Wavefront OBJ with a material library beside it; colours of vertices follow their positions.
+Written here rather than by plyfile, which takes seconds for the faces of a fine mesh, and by trimesh, which rounds
+colours to 8 bits and knows no samplers.
+Source: Khronos Group, glTF 2.0 specification, sections 3.7 (meshes), 3.9 (materials), 4 (GLB) and appendix B.
 
 Notation: `P` vertices, `F` faces, `M` materials.
-
-Binary glTF 2.0 (.glb): one mesh with a colour and any other numbers a vertex.
-
-Source: Khronos Group, glTF 2.0 specification, sections 3.7 (meshes) and 4 (GLB).
-
-Notation: `P` vertices, `F` faces.
-
-Binary glTF 2.0 (.glb) of a mesh with the textures of a metallic-roughness material.
-
-Source: Khronos Group, glTF 2.0 specification, sections 3.7 (meshes), 3.9 (materials) and appendix B.
-
-Notation: `P` vertices, `F` faces.
 """
 
 from __future__ import annotations
@@ -37,6 +29,10 @@ from unmix_plugin import __version__
 from unmix_plugin.formats.files import write_file
 
 _TYPES = {"float32": "float", "float64": "double", "uint8": "uchar", "int32": "int"}
+_FLOAT, _UNSIGNED_INT = 5126, 5125
+_VERTEX_BUFFER, _INDEX_BUFFER = 34962, 34963
+_JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
+_LINEAR, _LINEAR_MIPMAPS, _CLAMP = 9729, 9987, 33071
 _READ_TYPES = {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
 _READ_TYPES |= {"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2"}
 _READ_TYPES |= {"ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"}
@@ -171,126 +167,6 @@ def write_obj(
     return [write_file(obj_path, text.getvalue().encode("utf-8")), library_path]
 
 
-FLOAT, UNSIGNED_INT = 5126, 5125
-VERTEX_BUFFER, INDEX_BUFFER = 34962, 34963
-_JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
-
-
-def write_glb(
-    path: Path,
-    positions: Float32[np.ndarray, "P 3"],
-    normals: Float32[np.ndarray, "P 3"],
-    linear_rgb: Float32[np.ndarray, "P 3"],
-    faces: Int[np.ndarray, "F 3"],
-    numbers: Mapping[str, np.ndarray],
-    extras: Mapping[str, Any],
-) -> Path:
-    """Write a mesh.
-
-    Args:
-        path: File; its folder is made.
-        positions: Of the vertices.
-        normals: Unit vectors.
-        linear_rgb: Colours, linear light in sRGB primaries, [0, 1], as glTF wants them.
-        faces: Indices of vertices.
-        numbers: More of each vertex, (P,) float32, by a name that starts with `_`.
-        extras: What else the file says of the mesh, as JSON has it.
-    """
-    builder = GlbBuilder()
-    attributes = {
-        "POSITION": builder.add(positions, "VEC3", FLOAT, VERTEX_BUFFER, has_bounds=True),
-        "NORMAL": builder.add(normals, "VEC3", FLOAT, VERTEX_BUFFER),
-        "COLOR_0": builder.add(linear_rgb, "VEC3", FLOAT, VERTEX_BUFFER),
-    }
-    for name, values in numbers.items():
-        attributes[name] = builder.add(values, "SCALAR", FLOAT, VERTEX_BUFFER)
-    indices = builder.add(faces.astype("<u4").ravel(), "SCALAR", UNSIGNED_INT, INDEX_BUFFER)
-    material = {"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0}}
-    return builder.write(path, attributes, indices, material, extras)
-
-
-class GlbBuilder:
-    """The binary part and what describes it."""
-
-    def __init__(self) -> None:
-        self.data = bytearray()
-        self.views: list[dict[str, Any]] = []
-        self.accessors: list[dict[str, Any]] = []
-
-    def add(
-        self, values: np.ndarray, kind: str, component: int, target: int, has_bounds: bool = False
-    ) -> int:
-        """Append an array of 4-byte numbers; the index of its accessor."""
-        raw = np.ascontiguousarray(values, dtype="<u4" if component == UNSIGNED_INT else "<f4").tobytes()
-        view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": len(raw), "target": target}
-        accessor = {
-            "bufferView": len(self.views),
-            "componentType": component,
-            "count": len(values),
-            "type": kind,
-        }
-        if has_bounds and len(values):
-            accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
-        self.data += raw
-        self.views.append(view)
-        self.accessors.append(accessor)
-        return len(self.accessors) - 1
-
-    def add_file(self, content: bytes) -> int:
-        """Append a file, such as a picture; the index of its view."""
-        self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": len(content)})
-        self.data += content + b"\0" * (-len(content) % 4)
-        return len(self.views) - 1
-
-    def write(
-        self,
-        path: Path,
-        attributes: Mapping[str, int],
-        indices: int,
-        material: Mapping[str, Any],
-        extras: Mapping[str, Any],
-        **textures: Sequence[Mapping[str, Any]],
-    ) -> Path:
-        """Write a file of one mesh in one material.
-
-        Args:
-            path: File; its folder is made.
-            attributes: Accessor of each attribute of the vertices.
-            indices: Accessor of the faces.
-            material: As glTF has it.
-            extras: What else the file says of the mesh, as JSON has it.
-            textures: What the material points to: `textures`, `samplers`, `images`.
-        Raises:
-            RunError: the disk is full or refuses.
-        """
-        primitive = {"attributes": dict(attributes), "indices": indices, "material": 0}
-        content = {
-            "asset": {"version": "2.0", "generator": f"unmix-nerf {__version__}"},
-            "scene": 0,
-            "scenes": [{"nodes": [0]}],
-            "nodes": [{"mesh": 0, "name": "surface"}],
-            "meshes": [{"primitives": [primitive], "extras": dict(extras)}],
-            "materials": [material],
-            **textures,
-            "accessors": self.accessors,
-            "bufferViews": self.views,
-            "buffers": [{"byteLength": len(self.data)}],
-        }
-        return write_file(path, _container(json.dumps(content).encode(), bytes(self.data)))
-
-
-def _container(text: bytes, data: bytes) -> bytes:
-    """Header and two chunks, padded to multiples of four bytes."""
-    text += b" " * (-len(text) % 4)
-    data += b"\0" * (-len(data) % 4)
-    chunks = struct.pack("<II", len(text), _JSON_CHUNK) + text
-    chunks += struct.pack("<II", len(data), _BINARY_CHUNK) + data
-    return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
-
-
-_LINEAR, _LINEAR_MIPMAPS, _CLAMP = 9729, 9987, 33071
-
-
 @dataclass(frozen=True)
 class TexturedMesh:
     """Triangles with texture coordinates, and the pictures that these point into."""
@@ -307,6 +183,31 @@ class TexturedMesh:
     """Linear: green is roughness, blue metallicity."""
 
 
+def write_glb(
+    path: Path,
+    positions: Float32[np.ndarray, "P 3"],
+    normals: Float32[np.ndarray, "P 3"],
+    linear_rgb: Float32[np.ndarray, "P 3"],
+    faces: Int[np.ndarray, "F 3"],
+    numbers: Mapping[str, np.ndarray],
+    extras: Mapping[str, Any],
+) -> Path:
+    """Write a mesh in colours of its vertices.
+
+    Args:
+        path: File; its folder is made.
+        positions: Of the vertices.
+        normals: Unit vectors.
+        linear_rgb: Colours, linear light in sRGB primaries, [0, 1], as glTF wants them.
+        faces: Indices of vertices.
+        numbers: More of each vertex, (P,) float32, by a name that starts with `_`.
+        extras: What else the file says of the mesh, as JSON has it.
+    """
+    material = {"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0}}
+    attributes = {"POSITION": positions, "NORMAL": normals, "COLOR_0": linear_rgb, **numbers}
+    return _write_mesh(path, attributes, faces, material, {}, extras)
+
+
 def write_textured_glb(path: Path, mesh: TexturedMesh, extras: Mapping[str, Any]) -> Path:
     """Write a mesh with its material, pictures included.
 
@@ -317,40 +218,78 @@ def write_textured_glb(path: Path, mesh: TexturedMesh, extras: Mapping[str, Any]
     Raises:
         RunError: the disk is full or refuses.
     """
-    builder = GlbBuilder()
-    attributes = {
-        "POSITION": builder.add(mesh.positions, "VEC3", FLOAT, VERTEX_BUFFER, has_bounds=True),
-        "NORMAL": builder.add(mesh.normals, "VEC3", FLOAT, VERTEX_BUFFER),
-        "TEXCOORD_0": builder.add(mesh.uv, "VEC2", FLOAT, VERTEX_BUFFER),
+    material = {
+        "name": "material",
+        "doubleSided": True,
+        "pbrMetallicRoughness": {
+            "baseColorTexture": {"index": 0},
+            "metallicRoughnessTexture": {"index": 1},
+            "metallicFactor": 1.0,
+            "roughnessFactor": 1.0,
+        },
     }
-    indices = builder.add(mesh.faces.astype("<u4").ravel(), "SCALAR", UNSIGNED_INT, INDEX_BUFFER)
+    attributes = {"POSITION": mesh.positions, "NORMAL": mesh.normals, "TEXCOORD_0": mesh.uv}
+    pictures = {"base_colour": mesh.base_colour_png, "metallic_roughness": mesh.metallic_roughness_png}
+    return _write_mesh(path, attributes, mesh.faces, material, pictures, extras)
+
+
+def _write_mesh(
+    path: Path,
+    attributes: Mapping[str, np.ndarray],
+    faces: Int[np.ndarray, "F 3"],
+    material: Mapping[str, Any],
+    pictures: Mapping[str, bytes],
+    extras: Mapping[str, Any],
+) -> Path:
+    """A file of one mesh in one material: attributes of vertices, faces and pictures in one buffer."""
+    data, views, accessors = bytearray(), [], []
+
+    def add(content: bytes, **view: int) -> int:
+        """Append bytes, padded to a multiple of four; the index of their view."""
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": len(content), **view})
+        data.extend(content + b"\0" * (-len(content) % 4))
+        return len(views) - 1
+
+    for name, values in attributes.items():
+        accessor = {
+            "bufferView": add(np.ascontiguousarray(values, "<f4").tobytes(), target=_VERTEX_BUFFER),
+            "componentType": _FLOAT,
+            "count": len(values),
+            "type": "SCALAR" if values.ndim == 1 else f"VEC{values.shape[1]}",
+        }
+        if name == "POSITION" and len(values):
+            accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
+        accessors.append(accessor)
+    view = add(faces.astype("<u4").tobytes(), target=_INDEX_BUFFER)
+    accessors.append(
+        {"bufferView": view, "componentType": _UNSIGNED_INT, "count": faces.size, "type": "SCALAR"}
+    )
     images = [
-        {"name": name, "mimeType": "image/png", "bufferView": builder.add_file(content)}
-        for name, content in (
-            ("base_colour", mesh.base_colour_png),
-            ("metallic_roughness", mesh.metallic_roughness_png),
-        )
+        {"name": name, "mimeType": "image/png", "bufferView": add(content)}
+        for name, content in pictures.items()
     ]
     sampler = {"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAPS, "wrapS": _CLAMP, "wrapT": _CLAMP}
-    return builder.write(
-        path,
-        attributes,
-        indices,
-        _MATERIAL,
-        extras,
-        textures=[{"sampler": 0, "source": 0}, {"sampler": 0, "source": 1}],
-        samplers=[sampler],
-        images=images,
-    )
-
-
-_MATERIAL = {
-    "name": "material",
-    "doubleSided": True,
-    "pbrMetallicRoughness": {
-        "baseColorTexture": {"index": 0},
-        "metallicRoughnessTexture": {"index": 1},
-        "metallicFactor": 1.0,
-        "roughnessFactor": 1.0,
-    },
-}
+    textures = {
+        "textures": [{"sampler": 0, "source": index} for index in range(len(images))],
+        "samplers": [sampler],
+        "images": images,
+    }
+    indices = {name: index for index, name in enumerate(attributes)}
+    primitive = {"attributes": indices, "indices": len(accessors) - 1, "material": 0}
+    content = {
+        "asset": {"version": "2.0", "generator": f"unmix-nerf {__version__}"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "name": "surface"}],
+        "meshes": [{"primitives": [primitive], "extras": dict(extras)}],
+        "materials": [material],
+        **(textures if images else {}),
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(data)}],
+    }
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<II", len(text), _JSON_CHUNK) + text
+    chunks += struct.pack("<II", len(data), _BINARY_CHUNK) + data
+    return write_file(path, b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks)

@@ -168,7 +168,7 @@ class Calibration:
         values, saturated = self.raster.averaged(values), self.raster.any_in_square(saturated)
         if self.bin_bands > 1:
             values = self._in_bins(values).mean(axis=-1)
-            saturated = self._in_bins(saturated).any(axis=-1)
+            saturated = np.any(self._in_bins(saturated), axis=-1)
         return CalibratedRows(
             values.astype(np.float32, copy=False), saturated, self.raster.any_in_square(~sound)
         )
@@ -177,8 +177,10 @@ class Calibration:
         columns, bands = self.raster.columns, self.bands
         values = linear(file, whole, rows)[:, columns]  # a new array, free to be changed
         exposure = exposure_of(file)
-        is_known = exposure is not None and self.exposure is not None
-        factor = np.float32(self.gain * (self.exposure / exposure if is_known else 1.0))
+        if exposure is None or self.exposure is None:
+            factor = np.float32(self.gain)
+        else:
+            factor = np.float32(self.gain * (self.exposure / exposure))
         dark = None if self.dark is None else self.dark.rows(rows, columns, bands)
         if dark is not None:
             values -= dark
