@@ -1,36 +1,28 @@
-"""Reflectances of real surfaces that colour-science carries, each over the range in which it was measured.
-
-The tables of `cqs` and `cie2017` go on beyond what was measured by repeating the outermost value; these flat ends are
-cut off here, so that they are not taken for data.
-
-Libraries of known materials: a reflectance by its name, and which known materials a spectrum resembles.
-
-Notation: `N` spectra, `B` bands. Each material keeps its own sampling; nothing is extrapolated unless asked for.
+"""Libraries of known materials: a reflectance by its name, and which known materials a spectrum resembles.
 
 Spectra are compared by their angle, which is blind to scale, over the bands that lie in the range of the material, as
 reflectances: a spectrum that was lit by a known light is divided by it first.
+
+Notation: `N` spectra, `B` bands. Each material keeps its own sampling; nothing is extrapolated unless asked for.
 """
 
 from __future__ import annotations
 
 import difflib
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Float, Float64
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, resample_spectra
 from unmix_plugin.spectral.metrics import spectral_angle
-
-Measured = tuple[str, Bands, Float64[np.ndarray, " B"], str]
-"""Name, sampling, reflectance and source."""
 
 _CRI_NAMES = (
     "light greyish red",
@@ -52,54 +44,14 @@ _CRI_NAMES = (
 """Appearance under daylight of the test colour samples of CIE 13.3:1995 and the one added in 2024, in their order."""
 
 
-def measured_reflectances() -> Iterator[Measured]:
-    """Every measured surface of colour-science: name `set/sample`, sampling, reflectance in [0, 1], source.
-
-    Sets: `pmc`, skin, fruit, vegetables, leaves and paints; `checker`, the ColorChecker; `cri`, test colour samples of
-    CIE 13.3; `cqs`, saturated ones of NIST's colour quality scale; `cie2017`, the 99 samples of CIE 224:2017.
-    """
-    # Guarded because importing colour-science changes how NumPy prints.
-    with np.printoptions():
-        from colour import SpectralShape
-        from colour.characterisation import SDS_COLOURCHECKERS
-        from colour.quality.cfi2017 import load_TCS_CIE2017
-        from colour.quality.datasets import SDS_TCS, SDS_VS
-
-    yield from _each("pmc", SDS_COLOURCHECKERS["PMC"], "Preferred Memory Color chart")
-    yield from _each("checker", SDS_COLOURCHECKERS["ColorChecker N Ohta"], "ColorChecker, Ohta 1997")
-    known = SDS_TCS.get("CIE 2024", SDS_TCS)  # colour-science below 0.4.7 has the fourteen of 1995 alone
-    samples: dict[str, Any] = dict(zip(_CRI_NAMES, known.values(), strict=False))
-    yield from _each("cri", samples, "test colour samples, CIE 13.3:1995 and CIE 2024")
-    for name, bands, values, source in _each("cqs", SDS_VS["NIST CQS 9.0"], "colour quality scale 9.0, NIST"):
-        yield name, *_without_flat_ends(bands, values), source
-    table = load_TCS_CIE2017(SpectralShape(380, 780, 5))
-    bands, source = Bands.of(np.asarray(table.wavelengths)), "test colour samples, CIE 224:2017"
-    for index, values in enumerate(np.asarray(table.values, dtype=np.float64).T):
-        yield f"cie2017/{index + 1:02d}", *_without_flat_ends(bands, values), source
-
-
-def _each(group: str, distributions: Mapping[str, Any], source: str) -> Iterator[Measured]:
-    for sample, found in distributions.items():
-        bands = Bands.of(np.asarray(found.wavelengths))
-        yield f"{group}/{sample}", bands, np.asarray(found.values, dtype=np.float64), source
-
-
-def _without_flat_ends(
-    bands: Bands, values: Float64[np.ndarray, " B"]
-) -> tuple[Bands, Float64[np.ndarray, " C"]]:
-    changes = np.flatnonzero(np.diff(values))
-    inside = slice(changes[0], changes[-1] + 2)
-    return Bands.of(bands.centers_nm[inside]), values[inside]
-
-
 Comparison = Literal["scale", "continuum"]
 """What is taken out before angles are measured: the scale, or the convex hull above the spectrum as well, which leaves
 the absorptions."""
 
-FEWEST_BANDS = 3
+_FEWEST_BANDS = 3
 """Bands that a comparison takes at least: two positive numbers are always nearly parallel."""
 
-LEAST_OVERLAP = 0.5
+_LEAST_OVERLAP = 0.5
 """Part of a spectrum's bands that a material must cover to be compared with it."""
 
 DARK_LIGHT = 1e-3
@@ -214,12 +166,17 @@ class MaterialLibrary:
         reflectance = spectra if light is None else spectra / np.where(lit, light, 1.0)
         found: list[list[LibraryMatch]] = [[] for _ in spectra]
         for material in self.materials:
-            shared = lit & _covered(material.bands, bands)
-            if shared.sum() < max(FEWEST_BANDS, LEAST_OVERLAP * len(bands)):
+            low, high = material.bands.centers_nm[[0, -1]]
+            shared = lit & (bands.centers_nm >= low) & (bands.centers_nm <= high)
+            if shared.sum() < max(_FEWEST_BANDS, _LEAST_OVERLAP * len(bands)):
                 continue
             centers = bands.centers_nm[shared]
             known = np.interp(centers, material.bands.centers_nm, material.reflectance)
-            angles = _angles(reflectance[:, shared].astype(np.float64), known, centers, comparison)
+            compared = reflectance[:, shared].astype(np.float64)
+            if comparison == "continuum":
+                compared = continuum_removed(compared, centers)
+                known = continuum_removed(known[None], centers)[0]
+            angles = spectral_angle(torch.from_numpy(compared), torch.from_numpy(known)).numpy()
             for matches, angle in zip(found, angles, strict=True):
                 matches.append(LibraryMatch(material.name, float(angle), len(centers), material.source))
         return [sorted(matches, key=lambda match: match.angle_rad)[:count] for matches in found]
@@ -237,8 +194,56 @@ class MaterialLibrary:
 
 @lru_cache(maxsize=1)
 def measured_library() -> MaterialLibrary:
-    """The measured reflectances that colour-science carries, 183 of them; named `set/sample`."""
-    return MaterialLibrary(tuple(LibraryMaterial(*values) for values in measured_reflectances()))
+    """The measured reflectances that colour-science carries, 183 of them; named `set/sample`.
+
+    Sets: `pmc`, skin, fruit, vegetables, leaves and paints; `checker`, the ColorChecker; `cri`, test colour samples of
+    CIE 13.3; `cqs`, saturated ones of NIST's colour quality scale; `cie2017`, the 99 samples of CIE 224:2017. The
+    tables of `cqs` and `cie2017` go on beyond what was measured by repeating the outermost value; these flat ends are
+    cut off, so that they are not taken for data.
+    """
+    # Guarded because importing colour-science changes how NumPy prints.
+    with np.printoptions():
+        from colour import SpectralShape
+        from colour.characterisation import SDS_COLOURCHECKERS
+        from colour.quality.cfi2017 import load_TCS_CIE2017
+        from colour.quality.datasets import SDS_TCS, SDS_VS
+
+    known = SDS_TCS.get("CIE 2024", SDS_TCS)  # colour-science below 0.4.7 has the fourteen of 1995 alone
+    samples: dict[str, Any] = dict(zip(_CRI_NAMES, known.values(), strict=False))
+    table = load_TCS_CIE2017(SpectralShape(380, 780, 5))
+    bands = Bands.of(np.asarray(table.wavelengths))
+    cie2017 = [
+        LibraryMaterial(f"cie2017/{index:02d}", bands, values, "test colour samples, CIE 224:2017")
+        for index, values in enumerate(np.asarray(table.values, dtype=np.float64).T, 1)
+    ]
+    cqs = _materials("cqs", SDS_VS["NIST CQS 9.0"], "colour quality scale 9.0, NIST")
+    return MaterialLibrary(
+        (
+            *_materials("pmc", SDS_COLOURCHECKERS["PMC"], "Preferred Memory Color chart"),
+            *_materials("checker", SDS_COLOURCHECKERS["ColorChecker N Ohta"], "ColorChecker, Ohta 1997"),
+            *_materials("cri", samples, "test colour samples, CIE 13.3:1995 and CIE 2024"),
+            *map(_without_flat_ends, (*cqs, *cie2017)),
+        )
+    )
+
+
+def _materials(group: str, distributions: Mapping[str, Any], source: str) -> list[LibraryMaterial]:
+    return [
+        LibraryMaterial(
+            f"{group}/{sample}",
+            Bands.of(np.asarray(found.wavelengths)),
+            np.asarray(found.values, dtype=np.float64),
+            source,
+        )
+        for sample, found in distributions.items()
+    ]
+
+
+def _without_flat_ends(material: LibraryMaterial) -> LibraryMaterial:
+    changes = np.flatnonzero(np.diff(material.reflectance))
+    inside = slice(changes[0], changes[-1] + 2)
+    bands = Bands.of(material.bands.centers_nm[inside])
+    return replace(material, bands=bands, reflectance=material.reflectance[inside])
 
 
 def continuum_removed(
@@ -268,24 +273,6 @@ def _upper_hull(
             corners.pop()
         corners.append(index)
     return np.interp(wavelengths_nm, wavelengths_nm[corners], spectrum[corners])
-
-
-def _angles(
-    spectra: Float64[np.ndarray, "N B"],
-    known: Float64[np.ndarray, " B"],
-    wavelengths_nm: Float64[np.ndarray, " B"],
-    comparison: Comparison,
-) -> Float64[np.ndarray, " N"]:
-    if comparison == "continuum":
-        spectra = continuum_removed(spectra, wavelengths_nm)
-        known = continuum_removed(known[None], wavelengths_nm)[0]
-    return spectral_angle(torch.from_numpy(spectra), torch.from_numpy(known)).numpy()
-
-
-def _covered(measured: Bands, bands: Bands) -> Bool[np.ndarray, " B"]:
-    """Which band centres lie in the measured range."""
-    low, high = measured.centers_nm[[0, -1]]
-    return (bands.centers_nm >= low) & (bands.centers_nm <= high)
 
 
 def _last_part(name: str) -> str:

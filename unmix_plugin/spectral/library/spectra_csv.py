@@ -91,7 +91,12 @@ def read_spectra_csv(path: Path) -> SpectraTable:
     """
     try:
         header, rows = _read_rows(path)
-        names = _parse_header(header)
+        if header[0].lower() not in ("wavelength", "wavelength_nm", "wavelengths"):
+            raise SpectrumError(f"the first column must be headed 'wavelength' (in nm); found '{header[0]}'")
+        if len(header) == 1:
+            raise SpectrumError("no spectra: there is no column beside 'wavelength'")
+        names = tuple(header[1:])
+        _validate_names(names)
         values = np.array([_parse_row(row, line, header) for line, row in rows], dtype=np.float64)
         if len(values) == 0:
             raise SpectrumError("there is a header but no row of values")
@@ -155,29 +160,24 @@ def _read_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     return [cell.strip() for cell in rows[0][1]], rows[1:]
 
 
-def _parse_header(header: list[str]) -> tuple[str, ...]:
-    if header[0].lower() not in ("wavelength", "wavelength_nm", "wavelengths"):
-        raise SpectrumError(f"the first column must be headed 'wavelength' (in nm); found '{header[0]}'")
-    if len(header) == 1:
-        raise SpectrumError("no spectra: there is no column beside 'wavelength'")
-    names = tuple(header[1:])
-    _validate_names(names)
-    return names
-
-
 def _parse_row(row: list[str], line: int, header: list[str]) -> list[float]:
     if len(row) != len(header):
         raise SpectrumError(f"line {line} has {len(row)} values, the header has {len(header)}")
-    return [
-        _parse_number(cell, f"line {line}, column '{name}'") for cell, name in zip(row, header, strict=True)
-    ]
-
-
-def _parse_number(cell: str, where: str) -> float:
     try:
-        return float(cell)
+        return [float(cell) for cell in row]
     except ValueError:
-        raise SpectrumError(f"{where}: '{cell.strip()}' is not a number") from None
+        wrong = next(i for i, cell in enumerate(row) if not _is_number(cell))
+        raise SpectrumError(
+            f"line {line}, column '{header[wrong]}': '{row[wrong].strip()}' is not a number"
+        ) from None
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
 
 
 def _validate_names(names: tuple[str, ...]) -> None:
