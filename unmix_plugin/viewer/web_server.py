@@ -1,4 +1,7 @@
-"""viser's server as the viewer needs it: no public tunnel, no uploads, connections that can be closed."""
+"""viser's server as the viewer needs it: our title, no public tunnel, no uploads, connections that can be closed.
+
+viser has no setting for these. All that this package uses of its private parts is here, as they are in viser 1.1.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +13,11 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-from unittest import mock
+from typing import Any
 
-if TYPE_CHECKING:
-    import viser
+import viser
+from viser import infra
+from viser._messages import FileTransferPart, FileTransferStartUpload
 
 LABEL = "unmix-nerf"
 
@@ -35,16 +38,33 @@ _READING_S = 2.0
 """How long a page that is turned away shows why before its connection is closed."""
 
 
+class _PageServer(infra.WebsockServer):
+    """Sends viser's page under our title, dark where the browser's user prefers that."""
+
+    def __init__(self, *, http_server_root: Path, **options: Any) -> None:
+        folder = Path(tempfile.mkdtemp(prefix="unmix-viewer-"))
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        page = (http_server_root / "index.html").read_text()
+        (folder / "index.html").write_text(page.replace("<title>Viser</title>", _HEAD, 1))
+        super().__init__(http_server_root=folder, **options)
+
+
+class _LocalServer(viser.ViserServer):
+    """Never opens a public tunnel."""
+
+    def request_share_url(self, verbose: bool = True) -> str | None:
+        return None
+
+
 def open_server(host: str, port: int) -> viser.ViserServer:
     """A server that listens."""
-    import viser
-
-    class LocalServer(viser.ViserServer):
-        def request_share_url(self, verbose: bool = True) -> str | None:
-            return None
-
-    with quiet(), _own_page():
-        server = LocalServer(host=host, port=port, label=LABEL, verbose=False)
+    original = infra.WebsockServer
+    infra.WebsockServer = _PageServer
+    try:
+        with quiet():
+            server = _LocalServer(host=host, port=port, label=LABEL, verbose=False)
+    finally:
+        infra.WebsockServer = original
     websocket_server = server._websock_server
     _refuse_uploads(websocket_server)
 
@@ -55,26 +75,6 @@ def open_server(host: str, port: int) -> viser.ViserServer:
 
     websocket_server.on_client_connect(accept)
     return server
-
-
-@contextlib.contextmanager
-def _own_page() -> Iterator[None]:
-    """Context in which servers send viser's page under our title, dark where the browser's user prefers that.
-
-    viser has no setting for either, and reads its page from a folder that only its websocket server has.
-    """
-    from viser import infra
-
-    original, folder = infra.WebsockServer, Path(tempfile.mkdtemp(prefix="unmix-viewer-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-
-    def with_own_page(http_server_root: Path, **options: Any) -> infra.WebsockServer:
-        page = (http_server_root / "index.html").read_text()
-        (folder / "index.html").write_text(page.replace("<title>Viser</title>", _HEAD, 1))
-        return original(http_server_root=folder, **options)
-
-    with mock.patch.object(infra, "WebsockServer", with_own_page):
-        yield
 
 
 def headers_of(client: viser.ClientHandle) -> dict[str, str] | None:
@@ -124,8 +124,6 @@ def _connection_of(client: viser.ClientHandle) -> Any:
 
 def _refuse_uploads(handler: Any) -> None:
     """No control takes files, and viser would keep what a page sends, whether or not the page is served."""
-    from viser._messages import FileTransferPart, FileTransferStartUpload
-
     for kind in (FileTransferStartUpload, FileTransferPart):
         if kind in handler._incoming_handlers:
             handler.unregister_handler(kind)
