@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,7 +11,7 @@ import pytest
 
 from tests.method_factory import make_model
 from tests.viewer.pages import serving
-from tests.viewer.view_factory import source_of_model
+from tests.viewer.view_factory import make_source, source_of_model
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.viewer.rendering.scene import SceneSource
 from unmix_plugin.viewer.server import Viewer
@@ -27,8 +29,20 @@ def source(tmp_path: Path, model: UnmixModel) -> SceneSource:
     return source_of_model(model, tmp_path)
 
 
-@pytest.fixture
-def viewer(source: SceneSource) -> Iterator[Viewer]:
-    """The same source, served at any free port."""
-    with serving(source) as (running, _):
+@pytest.fixture(scope="module")
+def shared_viewer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Viewer]:
+    """Such a source, served at any free port to all pages of a module."""
+    with serving(make_source(tmp_path_factory.mktemp("run"))) as (running, _):
         yield running
+
+
+@pytest.fixture
+def viewer(shared_viewer: Viewer) -> Viewer:
+    """The same without the pages and the files of the tests before."""
+    until = time.monotonic() + 60
+    while shared_viewer.num_clients:
+        assert time.monotonic() < until
+        time.sleep(0.01)
+    for folder in (shared_viewer.services.folder, shared_viewer.services.recipes_folder):
+        shutil.rmtree(folder, ignore_errors=True)
+    return shared_viewer

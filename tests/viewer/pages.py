@@ -29,7 +29,7 @@ def page_of(viewer, **settings):
 
 
 @contextmanager
-def opened(viewer, rows=48, **settings):
+def opened(viewer, rows=24, **settings):
     """A page that has its first picture and all of its controls; its finest picture has few rows."""
     with page_of(viewer, **settings) as page:
         page.look_from(0.3)

@@ -1,4 +1,4 @@
-"""Between a browser's camera and ours: conversions undo each other, and nothing absurd gets in."""
+"""Between a browser's camera and ours: conversions undo each other, nothing absurd gets in; paths of cameras."""
 
 import math
 
@@ -14,8 +14,7 @@ from unmix_plugin.errors import ConfigError
 from unmix_plugin.viewer.view_cameras import (
     camera_of,
     checked_pose,
-    depth_along_axis,
-    pixel_rays,
+    path_poses,
     pose_of,
     quaternion,
     rotation_matrix,
@@ -95,23 +94,28 @@ def test_a_picture_never_has_more_pixels_than_allowed_nor_none(height, aspect):
     assert 1 <= camera.width * camera.height <= 5000
 
 
-def test_rays_of_pixels_are_those_of_the_whole_image():
-    camera = camera_of(some_pose(), 10)
-    whole = camera.image_rays(0, (0.25, 0.75))
-    chosen = torch.tensor([0, 7, 33, 149])
-    some = pixel_rays(camera, chosen, (0.25, 0.75))
-    assert_close(some.directions, whole.directions[chosen])
-    assert_close(some.origins, whole.origins[chosen])
-
-
-def test_depth_along_the_axis_is_the_depth_of_a_projection():
-    camera = camera_of(some_pose(), 12)
-    bundle = camera.image_rays(0)
-    distance = torch.rand(len(bundle), generator=torch.Generator().manual_seed(0)) + 1
-    _, expected = camera.project(bundle.origins + distance[:, None] * bundle.directions, 0)
-    depth = depth_along_axis(camera, distance.view(camera.height, camera.width))
-    assert_close(depth.flatten(), expected, atol=1e-5, rtol=1e-5)
-
-
 def test_up_is_the_axis_of_the_world_that_the_cameras_hold_upright():
     assert up_direction(ring(8)) == (0.0, 0.0, 1.0)
+
+
+def test_a_path_goes_through_its_key_frames_in_their_order():
+    keys = [some_pose(index) for index in (0, 2, 1, 3)]
+    poses = path_poses(keys, 31)
+    assert len(poses) == 31
+    for index, key in enumerate(keys):
+        pose = poses[10 * index]
+        np.testing.assert_allclose(pose.position, key.position, atol=1e-6)
+        np.testing.assert_allclose(rotation_matrix(pose.wxyz), rotation_matrix(key.wxyz), atol=1e-6)
+        assert pose.fov == pytest.approx(key.fov)
+
+
+def test_a_path_is_smooth():
+    positions = np.array([pose.position for pose in path_poses([some_pose(i) for i in range(4)], 301)])
+    speeds = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    assert np.abs(np.diff(speeds)).max() < 0.02 * speeds.max()
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_a_path_needs_two_key_frames(count):
+    with pytest.raises(ConfigError, match="at least two key frames"):
+        path_poses([some_pose()] * count, 10)

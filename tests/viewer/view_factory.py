@@ -1,9 +1,10 @@
-"""Sources, cameras and render loops for tests of the viewer."""
+"""Sources, cameras and render loops, driven by hand or in a thread of their own, for tests of the viewer."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,9 @@ from unmix_plugin.trained.snapshot import unmix_scene
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.layers.layers import LAYERS, LayerAids, layer_named, render_reference
 from unmix_plugin.viewer.layers.painting import LayerSettings, Legend, Picture
-from unmix_plugin.viewer.rendering.pictures import Shown, View
-from unmix_plugin.viewer.rendering.scene import SceneSource
+from unmix_plugin.viewer.rendering.pictures import PictureMaker, Shown, Speedometer, num_channels
+from unmix_plugin.viewer.rendering.render_loop import RenderLoop, View
+from unmix_plugin.viewer.rendering.scene import SceneAids, SceneSource
 from unmix_plugin.viewer.session import Services
 from unmix_plugin.viewer.view_cameras import ViewPose, pose_of
 
@@ -124,3 +126,50 @@ class Screen:
         with self._changed:
             self.reports.append(text)
             self._changed.notify_all()
+
+
+LARGEST = 32
+
+
+class FixedSpeed(Speedometer):
+    """A speed that is set, not measured."""
+
+    def add(self, rays, seconds):
+        pass
+
+
+def make_loop(source, slow_speed=None):
+    """A loop that waits to be driven; `slow_speed` is a speed at which moving pictures are small."""
+    with source.borrowed() as scene:
+        channels = num_channels(scene.materials)
+    maker = PictureMaker(source, SceneAids(source, has_materials=True), channels)
+    if slow_speed is not None:
+        maker.speed = FixedSpeed(slow_speed)
+    return RenderLoop(maker)
+
+
+def finish(loop):
+    """Drive a loop until nothing is left to do."""
+    for _ in range(10_000):
+        if not loop.step():
+            return
+    raise AssertionError("there is always more to do")
+
+
+def finest(loop, screen):
+    """The picture that a screen has in the end."""
+    finish(loop)
+    assert not screen.shown[-1].is_moving
+    return screen.shown[-1]
+
+
+@contextmanager
+def running_loop(source, slow_speed=None):
+    """A loop in a thread of its own."""
+    loop = make_loop(source, slow_speed)
+    loop.start()
+    try:
+        yield loop
+    finally:
+        loop.stop()
+    assert not loop._thread.is_alive()

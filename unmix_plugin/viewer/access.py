@@ -16,14 +16,12 @@ from urllib.parse import urlsplit
 from unmix_plugin.engine.training.training_control import SHARE_BOUNDS
 from unmix_plugin.errors import ConfigError
 
-LOCAL_HOST = "127.0.0.1"
-
 
 @dataclass(frozen=True)
 class ViewerOptions:
-    """How the viewer is served."""
+    """How the viewer is served; impossible settings are a `ConfigError`."""
 
-    host: str = LOCAL_HOST
+    host: str = "127.0.0.1"
     """Address to listen at. Any but this machine's loopback lets others reach the viewer: give a token then."""
     port: int = 7007
     """Port to listen at; if it is taken the next free one is used, and said."""
@@ -34,11 +32,6 @@ class ViewerOptions:
     apart."""
 
     def __post_init__(self) -> None:
-        """Refuse impossible settings.
-
-        Raises:
-            ConfigError: a port out of range, an empty host or an empty token.
-        """
         if not 0 <= self.port <= 65535:
             raise ConfigError(f"--viewer.port is a number from 0 (any free one) to 65535; found {self.port}")
         if not self.host.strip():
@@ -49,7 +42,7 @@ class ViewerOptions:
 
 @dataclass(frozen=True)
 class TrainingViewerOptions(ViewerOptions):
-    """How a training is shown in the browser."""
+    """How a training is shown in the browser; impossible settings are a `ConfigError`."""
 
     enabled: bool = False
     """Serve the viewer while training; on by default where the output is a terminal."""
@@ -60,11 +53,6 @@ class TrainingViewerOptions(ViewerOptions):
     quarter of that."""
 
     def __post_init__(self) -> None:
-        """Refuse impossible settings.
-
-        Raises:
-            ConfigError: as `ViewerOptions`, or a share out of range.
-        """
         super().__post_init__()
         low, high = SHARE_BOUNDS
         if not low <= self.share <= high:
@@ -72,7 +60,7 @@ class TrainingViewerOptions(ViewerOptions):
 
 
 _PORTS_TRIED = 100
-ANYWHERE = ("0.0.0.0", "::", "")
+_ANYWHERE = ("0.0.0.0", "::", "")
 """Hosts that mean every address of this machine."""
 
 
@@ -83,64 +71,11 @@ def free_port(host: str, port: int) -> int:
         ConfigError: the host is not an address of this machine, or no port near is free.
     """
     for candidate in range(port, min(port + _PORTS_TRIED, 65536)):
-        found = _bound_port(host, candidate)
-        if found is not None:
+        if (found := _bound_port(host, candidate)) is not None:
             return found
     raise ConfigError(
         f"no free port from {port} to {port + _PORTS_TRIED - 1} at {host}; choose another --viewer.port"
     )
-
-
-def is_local(host: str) -> bool:
-    """Whether only this machine can reach a host address."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
-
-
-def url_of(host: str, port: int) -> str:
-    """What to type into a browser, on this machine if the viewer listens everywhere.
-
-    >>> url_of("127.0.0.1", 7007), url_of("::1", 7007)
-    ('http://127.0.0.1:7007', 'http://[::1]:7007')
-    """
-    shown = "localhost" if host in ANYWHERE else host
-    return f"http://[{shown}]:{port}" if ":" in shown else f"http://{shown}:{port}"
-
-
-def start_notices(
-    options: ViewerOptions, port: int, environment: Mapping[str, str] | None = None
-) -> list[str]:
-    """What a user should read when the viewer starts: its URL first, then what they must know."""
-    lines = [f"viewer: {url_of(options.host, port)}"]
-    if options.port not in (0, port):
-        lines.append(f"port {options.port} is taken, hence {port}")
-    if not is_local(options.host):
-        reach = f"{socket.gethostname()}:{port}"
-        protected = (
-            "with the token; it travels unencrypted"
-            if options.token
-            else "and change, render and save files in the run folder: give --viewer.token to ask for a word first"
-        )
-        lines.append(f"warning: everyone who reaches {reach} can use the viewer {protected}")
-    elif "SSH_CONNECTION" in (os.environ if environment is None else environment):
-        lines.append(
-            f"from your own machine: {tunnel_command(port, environment)}, then open the address there"
-        )
-    return lines
-
-
-def tunnel_command(port: int, environment: Mapping[str, str] | None = None) -> str:
-    """The ssh command that makes the viewer of a remote machine reachable from where its user sits."""
-    known = os.environ if environment is None else environment
-    parts = known.get("SSH_CONNECTION", "").split()
-    server = parts[2] if len(parts) == 4 else socket.gethostname()
-    user = known.get("USER") or known.get("LOGNAME")
-    port_flag = f" -p {parts[3]}" if len(parts) == 4 and parts[3] != "22" else ""
-    return f"ssh -N -L {port}:127.0.0.1:{port}{port_flag} {f'{user}@' if user else ''}{server}"
 
 
 def _bound_port(host: str, port: int) -> int | None:
@@ -163,6 +98,60 @@ def _bound_port(host: str, port: int) -> int | None:
         ) from error
 
 
+def start_notices(options: ViewerOptions, port: int, environment: Mapping[str, str]) -> list[str]:
+    """What a user should read when the viewer starts: its URL first, then what they must know.
+
+    Args:
+        options: As given.
+        port: Where it listens.
+        environment: Variables of the process.
+    """
+    lines = [f"viewer: {_url_of(options.host, port)}"]
+    if options.port not in (0, port):
+        lines.append(f"port {options.port} is taken, hence {port}")
+    if not _is_local(options.host):
+        reach = f"{socket.gethostname()}:{port}"
+        protected = (
+            "with the token; it travels unencrypted"
+            if options.token
+            else "and change, render and save files in the run folder: give --viewer.token to ask for a word first"
+        )
+        lines.append(f"warning: everyone who reaches {reach} can use the viewer {protected}")
+    elif "SSH_CONNECTION" in environment:
+        lines.append(
+            f"from your own machine: {_tunnel_command(port, environment)}, then open the address there"
+        )
+    return lines
+
+
+def _is_local(host: str) -> bool:
+    """Whether only this machine can reach a host address."""
+    return host == "localhost" or (_is_address(host) and ipaddress.ip_address(host).is_loopback)
+
+
+def _is_address(host: str) -> bool:
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
+
+
+def _url_of(host: str, port: int) -> str:
+    """What to type into a browser, on this machine if the viewer listens everywhere."""
+    shown = "localhost" if host in _ANYWHERE else host
+    return f"http://[{shown}]:{port}" if ":" in shown else f"http://{shown}:{port}"
+
+
+def _tunnel_command(port: int, environment: Mapping[str, str]) -> str:
+    """The ssh command that makes the viewer of a remote machine reachable from where its user sits."""
+    parts = environment.get("SSH_CONNECTION", "").split()
+    server = parts[2] if len(parts) == 4 else socket.gethostname()
+    user = environment.get("USER") or environment.get("LOGNAME")
+    port_flag = f" -p {parts[3]}" if len(parts) == 4 and parts[3] != "22" else ""
+    return f"ssh -N -L {port}:127.0.0.1:{port}{port_flag} {f'{user}@' if user else ''}{server}"
+
+
 MOST_CLIENTS = 16
 """Pages that are served at once."""
 
@@ -176,20 +165,11 @@ class Gate:
     A page's guess waits for its turn; the right token is never turned down because others guessed wrong.
     """
 
-    def __init__(self, token: str | None) -> None:
-        """
-        Args:
-            token: What pages must give; None lets everyone in.
-        """
+    def __init__(self, token: str) -> None:
         self._token = token
         self._lock = threading.Lock()
         self._address_of: dict[int, str] = {}
         self._guesses: dict[int, str] = {}
-
-    @property
-    def is_open(self) -> bool:
-        """Whether no token is asked for."""
-        return self._token is None
 
     def enter(self, page: int, address: str) -> bool:
         """Note a page that is asked for the token; False if too many from its address are already."""
@@ -217,10 +197,10 @@ class Gate:
             chosen: dict[str, int] = {}
             for page in self._guesses:
                 chosen.setdefault(self._address_of[page], page)
-            return {page: self._is_token(self._guesses.pop(page)) for page in chosen.values()}
-
-    def _is_token(self, word: str) -> bool:
-        return self._token is None or hmac.compare_digest(word.encode(), self._token.encode())
+            token = self._token.encode()
+            return {
+                page: hmac.compare_digest(self._guesses.pop(page).encode(), token) for page in chosen.values()
+            }
 
 
 def is_own_page(headers: Mapping[str, str] | None, host: str) -> bool:
@@ -239,19 +219,10 @@ def is_own_page(headers: Mapping[str, str] | None, host: str) -> bool:
     if "origin" not in known:
         return True  # not a browser: those always send it
     asked = known.get("host", "")
-    return urlsplit(known["origin"]).netloc == asked and _is_own_name(urlsplit(f"//{asked}").hostname, host)
-
-
-def _is_own_name(name: str | None, host: str) -> bool:
-    if name is None:
+    name = urlsplit(f"//{asked}").hostname
+    if name is None or urlsplit(known["origin"]).netloc != asked:
         return False
     own = {"localhost", host.lower()}
-    if host in ANYWHERE:
+    if host in _ANYWHERE:
         own |= {socket.gethostname().lower(), socket.getfqdn().lower()}
-    if name in own:
-        return True
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
+    return name in own or _is_address(name)

@@ -19,16 +19,15 @@ from jaxtyping import Float
 
 from unmix_plugin.errors import ConfigError, UnmixError
 from unmix_plugin.figures.plotting import css_colour
-from unmix_plugin.spectral.bands import Bands
 
 if TYPE_CHECKING:
     import viser
 
 
-LONGEST_TEXT = 100_000
-"""Letters of a text that are looked at."""
+_LONGEST_TEXT, _LONGEST_NAME = 100_000, 64
+"""Letters of a text and of a file's name that are looked at."""
 
-_LONGEST_NAME = 64
+_LOG = logging.getLogger("unmix_plugin.viewer")
 _ChoiceT = TypeVar("_ChoiceT")
 
 
@@ -63,8 +62,8 @@ def index_in(menu: Any) -> int:
 
 
 def text(value: Any) -> str:
-    """What was typed, cut to `LONGEST_TEXT`; empty for what is not text."""
-    return value[:LONGEST_TEXT] if isinstance(value, str) else ""
+    """What was typed, cut to `_LONGEST_TEXT`; empty for what is not text."""
+    return value[:_LONGEST_TEXT] if isinstance(value, str) else ""
 
 
 def new_file(folder: Path, name: Any, suffix: str, fallback: str) -> Path:
@@ -87,9 +86,6 @@ def new_file(folder: Path, name: Any, suffix: str, fallback: str) -> Path:
     raise ConfigError(f"too many files named {stem} in {folder}; choose another name")
 
 
-_LOG = logging.getLogger("unmix_plugin.viewer")
-
-
 @contextmanager
 def failures_said(what: str, say: Callable[[str], None]) -> Iterator[None]:
     """Context that lets no error out.
@@ -100,14 +96,12 @@ def failures_said(what: str, say: Callable[[str], None]) -> Iterator[None]:
     """
     try:
         yield
+        return
     except UnmixError as error:
-        _say(what, say, str(error))
+        message = str(error)
     except Exception as error:  # noqa: BLE001 - internal errors must not end the thread that serves everyone
         _LOG.exception(what)
-        _say(what, say, f"{what}: {type(error).__name__}: {error}")
-
-
-def _say(what: str, say: Callable[[str], None], message: str) -> None:
+        message = f"{what}: {type(error).__name__}: {error}"
     try:
         say(message)
     except Exception:  # noqa: BLE001 - the page to tell has gone
@@ -115,7 +109,7 @@ def _say(what: str, say: Callable[[str], None], message: str) -> None:
 
 
 WAIT_S = 0.4
-"""How long typing must pause."""
+"""How long typing must pause before a text is read: browsers send every letter."""
 
 
 class Debounced:
@@ -137,42 +131,35 @@ class Debounced:
         with self._lock:
             self._due_s = self._clock() + WAIT_S
 
-    def tick(self) -> None:
-        """Do the work if the last event was long enough ago; called now and then."""
+    def tick(self, at_once: bool = False) -> None:
+        """Do the work if the last event was long enough ago, or at once if there is any; called now and then."""
         with self._lock:
-            is_due = self._due_s is not None and self._clock() >= self._due_s
+            is_due = self._due_s is not None and (at_once or self._clock() >= self._due_s)
+            if is_due:
+                self._due_s = None
         if is_due:
-            self.finish()
-
-    def finish(self) -> None:
-        """Do the work now if there is something left to do."""
-        with self._lock:
-            was_waiting, self._due_s = self._due_s is not None, None
-        if was_waiting:
             self._work()
 
 
 BLOCK_STYLE = "padding:0.2em 0.8em;font-size:0.85em;line-height:1.35"
+_ROW = '<div style="display:flex;align-items:center;gap:0.5em">'
 
 
 def paragraph(text: str, is_warning: bool = False) -> str:
-    """A line of text."""
+    """A line of text as HTML; here and below every text is escaped: names of endmembers are users' own words."""
     colour = ";color:#c92a2a" if is_warning else ""
     return f'<div style="{BLOCK_STYLE}{colour}">{escape(text)}</div>'
 
 
 def bars(entries: Sequence[tuple[str, float, Sequence[float]]]) -> str:
     """Names, values in [0, 1] and sRGB colours as horizontal bars."""
-    rows = []
-    for name, value, colour in entries:
-        width = 100 * min(max(value, 0.0), 1.0)
-        rows.append(
-            '<div style="display:flex;align-items:center;gap:0.5em">'
-            f'<span style="flex:0 0 8.5em;overflow:hidden;text-overflow:ellipsis">{escape(name)}</span>'
-            '<span style="flex:1;background:#8883;height:0.8em">'
-            f'<span style="display:block;height:100%;width:{width:.1f}%;background:{css_colour(colour)}"></span></span>'
-            f'<span style="flex:0 0 2.6em;text-align:right">{value:.2f}</span></div>'
-        )
+    rows = (
+        f'{_ROW}<span style="flex:0 0 8.5em;overflow:hidden;text-overflow:ellipsis">{escape(name)}</span>'
+        '<span style="flex:1;background:#8883;height:0.8em"><span style="display:block;height:100%;'
+        f'width:{100 * min(max(value, 0.0), 1.0):.1f}%;background:{css_colour(colour)}"></span></span>'
+        f'<span style="flex:0 0 2.6em;text-align:right">{value:.2f}</span></div>'
+        for name, value, colour in entries
+    )
     return f'<div style="{BLOCK_STYLE}">{"".join(rows)}</div>'
 
 
@@ -186,15 +173,12 @@ def table(rows: Sequence[tuple[str, str]]) -> str:
 
 
 def swatches(entries: Sequence[tuple[str, Sequence[float]]]) -> str:
+    """Names below each other, each behind a square of its sRGB colour."""
     items = "".join(
-        '<div style="display:flex;align-items:center;gap:0.5em">'
-        f'<span style="width:0.9em;height:0.9em;background:{css_colour(colour)}"></span>{escape(name)}</div>'
+        f'{_ROW}<span style="width:0.9em;height:0.9em;background:{css_colour(colour)}"></span>{escape(name)}</div>'
         for name, colour in entries
     )
     return f'<div style="{BLOCK_STYLE}">{items}</div>'
-
-
-_ASPECT = 1.5
 
 
 @dataclass(frozen=True)
@@ -213,62 +197,44 @@ class Chart:
     """Lines over wavelength or over anything else; hidden while it has none."""
 
     def __init__(self, gui: viser.GuiApi, title: str, x_label: str = "wavelength (nm)") -> None:
-        self._title, self._x_label = title, x_label
+        self._gui, self._x_label = gui, x_label
         self._handle: viser.GuiUplotHandle | None = None
-        self._gui = gui
         self._place = gui.add_folder(title, visible=False)
 
-    def draw(self, bands: Bands, lines: Sequence[Line]) -> None:
-        """Show spectra."""
-        self.plot(bands.centers_nm, lines)
-
-    def plot(self, x: Float[np.ndarray, " N"], lines: Sequence[Line]) -> None:
-        """Show lines over any axis."""
-        if len(x) == 0 or not lines:
-            self.clear()
-            return
-        data = (
-            np.asarray(x, np.float64),
-            *(np.nan_to_num(np.asarray(line.values, np.float64)) for line in lines),
+    def draw(self, x: Float[np.ndarray, " N"], lines: Sequence[Line]) -> None:
+        """Show lines over a common axis; nothing without lines or values."""
+        if len(x) == 0:
+            lines = ()
+        values = (np.nan_to_num(np.asarray(line.values, np.float64)) for line in lines)
+        data = (np.asarray(x, np.float64), *values)
+        series: tuple[Any, ...] = (
+            {"label": self._x_label},
+            *(
+                {"label": line.name, "stroke": css_colour(line.colour), "width": 1 if line.is_thin else 2.5}
+                | ({"dash": (6, 4)} if line.is_dashed else {})
+                for line in lines
+            ),
         )
-        series: tuple[Any, ...] = ({"label": self._x_label}, *(_series(line) for line in lines))
+        self._place.visible = bool(lines)
         if self._handle is not None and len(self._handle.series) == len(series):
             self._handle.data, self._handle.series = data, series
-        else:
-            self._remove()
-            scales: Any = {"x": {"time": False, "auto": True}, "y": {"auto": True}}
-            with self._place:
-                self._handle = self._gui.add_uplot(data=data, series=series, scales=scales, aspect=_ASPECT)
-        self._place.visible = True
-
-    def clear(self) -> None:
-        """Show nothing."""
-        self._remove()
-        self._place.visible = False
-
-    def _remove(self) -> None:
+            return
         if self._handle is not None:
             self._handle.remove()
             self._handle = None
+        if lines:
+            scales: Any = {"x": {"time": False, "auto": True}, "y": {"auto": True}}
+            with self._place:
+                self._handle = self._gui.add_uplot(data=data, series=series, scales=scales, aspect=1.5)
 
 
-def _series(line: Line) -> dict[str, Any]:
-    dash = {"dash": (6, 4)} if line.is_dashed else {}
-    return {
-        "label": line.name,
-        "stroke": css_colour(line.colour),
-        "width": 1 if line.is_thin else 2.5,
-        **dash,
-    }
-
-
-_SHOWN_S = 8.0
-_LONGEST = 2000
-"""Characters of a notice."""
+_NOTICE_S = 8.0
+_LONGEST_NOTICE = 2000
+"""Characters."""
 
 
 class Notices:
-    """Notices to a client: warnings and notes on edits replace the ones before."""
+    """Notices in a corner of a client's page: warnings and notes on edits replace the ones before."""
 
     def __init__(self, client: viser.ClientHandle) -> None:
         self._client = client
@@ -277,19 +243,20 @@ class Notices:
         self._note: viser.NotificationHandle | None = None
         self._notes: tuple[str, ...] = ()
 
-    def say(self, title: str, text: str) -> viser.NotificationHandle:
+    def say(self, title: str, text: str, colour: Literal["teal", "red"] = "teal") -> viser.NotificationHandle:
         """Show a notice."""
-        return self._add(title, text, "teal")
+        text = text[:_LONGEST_NOTICE]
+        return self._client.add_notification(title, text, auto_close_seconds=_NOTICE_S, color=colour)
 
     def warn(self, text: str, title: str) -> None:
         """Show a warning in place of the one before: a control that is dragged causes many. The same one is shown once
         in 8 s."""
         before, self._warning_said = self._warning_said, (time.monotonic(), text)
-        if before[1] == text and self._warning_said[0] - before[0] < _SHOWN_S:
+        if before[1] == text and self._warning_said[0] - before[0] < _NOTICE_S:
             return
         if self._warning is not None:
             self._warning.remove()
-        self._warning = self._add(title, text, "red")
+        self._warning = self.say(title, text, "red")
 
     def show_notes(self, notes: tuple[str, ...]) -> None:
         """Show what is new among the notes of the edit in force, in place of those shown before."""
@@ -299,8 +266,3 @@ class Notices:
             if self._note is not None:
                 self._note.remove()
             self._note = self.say("edited", "; ".join(new))
-
-    def _add(self, title: str, text: str, colour: Literal["teal", "red"]) -> viser.NotificationHandle:
-        return self._client.add_notification(
-            title, text[:_LONGEST], auto_close_seconds=_SHOWN_S, color=colour
-        )

@@ -9,11 +9,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import replace
+from typing import Any
 
 from unmix_plugin.editing import (
     Gloss,
     Isolate,
-    Light,
     Operation,
     Recipe,
     Remove,
@@ -41,12 +41,7 @@ class RecipeHistory:
         self.present = present or Recipe()
 
     def take(self, recipe: Recipe, subject: Hashable = None) -> None:
-        """Put another recipe in force.
-
-        Args:
-            recipe: The new one.
-            subject: What is changed; None for a change that is undone by itself.
-        """
+        """Put another recipe in force; `subject` is what is changed, None for a change that is undone by itself."""
         if recipe == self.present:
             return
         now, (last_subject, changed_at) = self._clock(), self._last_change
@@ -88,11 +83,6 @@ def with_swap(recipe: Recipe, swap: Swap) -> Recipe:
     return _with_operations(recipe, [*recipe.operations, swap])
 
 
-def with_light(recipe: Recipe, light: Light | None) -> Recipe:
-    """The recipe in another light; None for the scene's own."""
-    return replace(recipe, illuminant=light)
-
-
 def with_visible(recipe: Recipe, hidden: Iterable[int], isolated: int | None) -> Recipe:
     """The recipe that shows all endmembers but the hidden ones, or the isolated one alone."""
     others = [one for one in recipe.operations if not isinstance(one, Remove | Isolate)]
@@ -129,20 +119,15 @@ def numbered(recipe: Recipe, names: tuple[str, ...]) -> Recipe:
     def number_of(endmember: str | int) -> str | int:
         return present.index(endmember) if endmember in present else endmember
 
-    def with_numbers(one: Operation) -> Operation:
-        if isinstance(one, Swap):
-            return replace(one, first=number_of(one.first), second=number_of(one.second))
-        if isinstance(one, Remove | Isolate):
-            return replace(one, endmembers=tuple(number_of(name) for name in one.endmembers))
-        if isinstance(one, Gloss) and one.endmember is None:
-            return one
-        assert isinstance(one, Replace | Retint | Scale | Rename | Gloss)
-        assert one.endmember is not None
-        return replace(one, endmember=number_of(one.endmember))
-
     operations: list[Operation] = []
     for one in recipe.operations:
-        operations.append(changed := with_numbers(one))
+        given = {name: getattr(one, name, None) for name in ("endmember", "first", "second")}
+        changes: dict[str, Any] = {
+            name: number_of(value) for name, value in given.items() if value is not None
+        }
+        if isinstance(one, Remove | Isolate):
+            changes["endmembers"] = tuple(number_of(name) for name in one.endmembers)
+        operations.append(changed := replace(one, **changes))
         if isinstance(changed, Rename) and changed.endmember in range(len(present)):
             present[int(changed.endmember)] = changed.name
     return replace(recipe, operations=tuple(operations))

@@ -1,19 +1,17 @@
-"""What a page shows before it has given the token.
-
-The viewer's life cycle: listen, admit clients, keep their sessions, shut down cleanly.
-"""
+"""The viewer's life cycle: listen, admit pages or ask them for the token, keep their sessions, shut down cleanly."""
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+
+import viser
 
 from unmix_plugin.editing import Recipe
-from unmix_plugin.viewer import page as html
 from unmix_plugin.viewer.access import (
     MOST_CLIENTS,
     Gate,
@@ -22,7 +20,7 @@ from unmix_plugin.viewer.access import (
     is_own_page,
     start_notices,
 )
-from unmix_plugin.viewer.page import failures_said, text
+from unmix_plugin.viewer.page import failures_said, paragraph, text
 from unmix_plugin.viewer.panels import PANELS
 from unmix_plugin.viewer.rendering.scene import SceneSource
 from unmix_plugin.viewer.session import KeptPages, SceneReader, Services, Session, browser_of
@@ -37,82 +35,29 @@ from unmix_plugin.viewer.web_server import (
     send_what_is_queued,
 )
 
-if TYPE_CHECKING:
-    import viser
+_TICK_S = 0.5
+_UNWATCHED_S = 5
 
 
-class TokenPrompt:
+class _TokenPrompt:
     """Asks one page for the token."""
 
     def __init__(self, client: viser.ClientHandle, gate: Gate) -> None:
         self.client = client
-        gui = client.gui
-        self._note = gui.add_html(html.paragraph("This viewer asks for the token that it was started with."))
-        self._word = gui.add_text("token", "")
-        self._button = gui.add_button("enter")
+        self.note = client.gui.add_html(paragraph("This viewer asks for the token that it was started with."))
+        self._word = client.gui.add_text("token", "")
+        self._button = client.gui.add_button("enter")
 
-        def enter(_: Any) -> None:
-            self._note.content = html.paragraph("checking")
+        def enter(_: object) -> None:
+            self.note.content = paragraph("checking")
             gate.guess(client.client_id, text(self._word.value))
 
         self._button.on_click(enter)
 
-    def refuse(self) -> None:
-        """Say that the guess was wrong."""
-        self._note.content = html.paragraph("That is not the token.", is_warning=True)
-
     def remove(self) -> None:
         """Make room for the panels."""
-        for handle in (self._note, self._word, self._button):
+        for handle in (self.note, self._word, self._button):
             handle.remove()
-
-
-class _TokenPrompts:
-    """Pages that have yet to give the token."""
-
-    def __init__(self, gate: Gate, admit: Callable[[viser.ClientHandle], None]) -> None:
-        """
-        Args:
-            gate: Checks what they give.
-            admit: Serves a page that gave the token.
-        """
-        self._gate, self._admit = gate, admit
-        self._prompts: dict[int, TokenPrompt] = {}
-        self._lock = threading.Lock()
-
-    def ask(self, client: viser.ClientHandle, address: str) -> bool:
-        """Ask a page; False if too many from its address are asked already."""
-        if not self._gate.enter(client.client_id, address):
-            return False
-        with client.atomic():  # nobody can answer before the answer is listened for
-            prompt = TokenPrompt(client, self._gate)
-            with self._lock:
-                self._prompts[client.client_id] = prompt
-        return True
-
-    def leave(self, client: viser.ClientHandle) -> None:
-        """Forget a page."""
-        self._gate.leave(client.client_id)
-        with self._lock:
-            self._prompts.pop(client.client_id, None)
-
-    def tick(self) -> None:
-        """Check a guess from each address; called at a steady pace."""
-        for page, is_right in self._gate.verdicts().items():
-            with self._lock:
-                prompt = self._prompts.get(page)
-            if prompt is None:
-                continue
-            if not is_right:
-                prompt.refuse()
-                continue
-            self.leave(prompt.client)
-            prompt.remove()
-            self._admit(prompt.client)
-
-
-_TICK_S = 0.5
-_UNWATCHED_S = 5
 
 
 class Viewer:
@@ -139,11 +84,11 @@ class Viewer:
         """
         self._options = options
         self._say = say
-        self._gate = Gate(options.token)
-        self._prompts = _TokenPrompts(self._gate, self._open)
+        self._gate = None if options.token is None else Gate(options.token)
+        self._prompts: dict[int, _TokenPrompt] = {}
         self._sites_warned_of: set[str] = set()
         self._kept_pages = KeptPages()
-        self._services = Services(source, read_scene, recipe, options.environments)
+        self.services = Services(source, read_scene, recipe, options.environments)
         self._sessions: dict[int, Session] = {}
         self._lock = threading.Lock()
         self._stopped = threading.Event()
@@ -160,15 +105,16 @@ class Viewer:
         """
         # A page that is closed while it is being sent something is not a reason to print anything.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-        port = free_port(self._options.host, self._options.port)
-        self._server = open_server(self._options.host, port)
-        self.port = self._server.get_port()
-        self._dress(self._server)
-        self._services.start()
-        self._server.on_client_connect(self._connected)
-        self._server.on_client_disconnect(self._disconnected)
+        server = open_server(self._options.host, free_port(self._options.host, self._options.port))
+        self._server, self.port = server, server.get_port()
+        server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        server.gui.set_panel_label(LABEL)
+        self._look_at_the_scene(server)
+        self.services.start()
+        server.on_client_connect(self._connected)
+        server.on_client_disconnect(self._disconnected)
         self._ticker.start()
-        for line in start_notices(self._options, self.port):
+        for line in start_notices(self._options, self.port, os.environ):
             self._say(line)
 
     def stop(self) -> None:
@@ -184,7 +130,7 @@ class Viewer:
             session.close()
         if self._server is not None and sessions:
             send_what_is_queued(self._server)
-        self._services.stop()
+        self.services.stop()
         if self._server is not None:
             with quiet():
                 self._server.stop()
@@ -195,11 +141,6 @@ class Viewer:
     def num_clients(self) -> int:
         """Pages that are served."""
         return len(self._sessions)
-
-    @property
-    def services(self) -> Services:
-        """What all sessions share."""
-        return self._services
 
     def wait(self, while_watched: bool = False) -> None:
         """Serve until Ctrl-C, SIGTERM or SIGHUP, which raise KeyboardInterrupt, or until stopped by another thread.
@@ -215,11 +156,9 @@ class Viewer:
                 if while_watched and unwatched_s >= _UNWATCHED_S:
                     return
 
-    def _dress(self, server: viser.ViserServer) -> None:
-        """Set the theme, and where pages start to look from."""
-        server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
-        server.gui.set_panel_label(LABEL)
-        scene = self._services.source.record
+    def _look_at_the_scene(self, server: viser.ViserServer) -> None:
+        """Let pages start from a camera of the scene."""
+        scene = self.services.source.record
         up = up_direction(scene.train_cameras)
         server.scene.set_up_direction(up)
         server.scene.world_axes.visible = False
@@ -230,22 +169,28 @@ class Viewer:
 
     def _connected(self, client: viser.ClientHandle) -> None:
         """Admit a page, ask it for the token, or refuse it."""
-        with failures_said("this page could not be served", lambda text: _warn(client, text)):
-            reason = self._refusal(client)
-            if not reason and self._gate.is_open:
+        with failures_said("this page could not be served", lambda said: _warn(client, said)):
+            reason, gate = self._refusal(client), self._gate
+            if not reason and gate is None:
                 self._open(client)
-            elif not reason and not self._prompts.ask(client, address_of(client)):
-                reason = "too many pages are asked for the token already: close one and load this page again"
+            elif not reason and gate is not None:
+                if gate.enter(client.client_id, address_of(client)):
+                    with client.atomic():  # nobody can answer before the answer is listened for
+                        self._prompts[client.client_id] = _TokenPrompt(client, gate)
+                else:
+                    reason = (
+                        "too many pages are asked for the token already: close one and load this page again"
+                    )
             if reason:
                 _warn(client, reason)
                 close_soon(client)
 
     def _refusal(self, client: viser.ClientHandle) -> str:
         """Why a page is not served; empty if it is."""
-        if self.num_clients >= MOST_CLIENTS:
+        if len(self._sessions) >= MOST_CLIENTS:
             return f"{MOST_CLIENTS} pages are open already: close one and load this page again"
         headers = headers_of(client)
-        if not self._gate.is_open or is_own_page(headers, self._options.host):
+        if self._gate is not None or is_own_page(headers, self._options.host):
             return ""
         site = (headers or {}).get("Origin", "unknown")[:100]
         if site not in self._sites_warned_of and len(self._sites_warned_of) < MOST_CLIENTS:
@@ -258,7 +203,7 @@ class Viewer:
 
     def _open(self, client: viser.ClientHandle) -> None:
         browser = browser_of(client)
-        session = Session(client, self._services, self._kept_pages.take(browser), browser)
+        session = Session(client, self.services, self._kept_pages.take(browser), browser)
         with self._lock:
             if self._stopped.is_set() or client.client_id in self._sessions:
                 return
@@ -268,21 +213,36 @@ class Viewer:
             self._disconnected(client)  # it left before it was noted
 
     def _disconnected(self, client: viser.ClientHandle) -> None:
-        self._prompts.leave(client)
+        self._forget_prompt(client)
         with self._lock:
             session = self._sessions.pop(client.client_id, None)
         if session is not None:
             session.close()
             self._kept_pages.leave(session.browser, session.state)
 
+    def _forget_prompt(self, client: viser.ClientHandle) -> None:
+        self._prompts.pop(client.client_id, None)
+        if self._gate is not None:
+            self._gate.leave(client.client_id)
+
     def _tick(self) -> None:
         """Let panels follow a run that goes on, and check tokens."""
         while not self._stopped.wait(_TICK_S):
             with failures_said("panels could not be renewed", self._say):
-                self._prompts.tick()
-                self._services.tick()
+                self._check_tokens()
+                self.services.tick()
                 for session in list(self._sessions.values()):
                     session.tick()
+
+    def _check_tokens(self) -> None:
+        for page, is_right in ({} if self._gate is None else self._gate.verdicts()).items():
+            prompt = self._prompts.get(page)
+            if prompt is not None and is_right:
+                self._forget_prompt(prompt.client)
+                prompt.remove()
+                self._open(prompt.client)
+            elif prompt is not None:
+                prompt.note.content = paragraph("That is not the token.", is_warning=True)
 
 
 @contextmanager
@@ -302,4 +262,4 @@ def _interrupting_signals() -> Iterator[None]:
 
 
 def _warn(client: viser.ClientHandle, reason: str) -> None:
-    client.gui.add_html(html.paragraph(reason, is_warning=True))
+    client.gui.add_html(paragraph(reason, is_warning=True))

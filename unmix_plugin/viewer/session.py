@@ -1,11 +1,4 @@
-"""What pages leave behind, so that a page that is loaded again goes on where it was.
-
-How loss and PSNR went, in a bounded number of points.
-
-What all clients of a viewer share: the scene, the render loop, what was measured, the folder for files.
-
-One client: its view, panels and notices. Nothing that a client does affects another one or the server.
-"""
+"""What all pages of a viewer share, what each one has, and what a page leaves behind for when it is loaded again."""
 
 from __future__ import annotations
 
@@ -23,19 +16,19 @@ from jaxtyping import Float64
 
 from unmix_plugin.editing import Light, Recipe
 from unmix_plugin.editing.light import relighting_factors
+from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.training.progress import TrainingStatus
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_names
-from unmix_plugin.trained.protocol import RenderableScene
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.relighting import LightChoice, RelightableScene, relit
-from unmix_plugin.trained.run_views import RunView, recorded_views
+from unmix_plugin.trained.run_views import recorded_views
 from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.viewer import page as html
 from unmix_plugin.viewer.layers.layers import layers_of
 from unmix_plugin.viewer.layers.painting import ColourMapLegend, LayerSettings, first_settings, legend_html
-from unmix_plugin.viewer.page import Notices, failures_said, number
+from unmix_plugin.viewer.page import Notices, failures_said, number, paragraph
 from unmix_plugin.viewer.recipes import RecipeHistory, numbered
 from unmix_plugin.viewer.rendering.captures import VideoQueue
 from unmix_plugin.viewer.rendering.pictures import (
@@ -43,25 +36,161 @@ from unmix_plugin.viewer.rendering.pictures import (
     HEIGHT_BOUNDS,
     PictureMaker,
     Shown,
-    View,
     num_channels,
 )
-from unmix_plugin.viewer.rendering.render_loop import RenderLoop
+from unmix_plugin.viewer.rendering.render_loop import RenderLoop, View
 from unmix_plugin.viewer.rendering.scene import Edit, MeasuredViews, SceneAids, SceneSource, usable_views
 from unmix_plugin.viewer.view_cameras import ViewPose, camera_of, point_ahead, pose_from, pose_of
 
 if TYPE_CHECKING:
     import viser
 
-    from unmix_plugin.engine.geometry.cameras import Cameras
-    from unmix_plugin.spectral.materials import Materials
+SceneReader = Callable[[], Scene]
+"""Reads the scene that a run was trained on.
+
+Raises:
+    UnmixError: it is not at hand, or another one.
+"""
+
+_MOST_POINTS = 400
+
+
+class TrainingCurve:
+    """How loss and PSNR went, in points that are thinned evenly as they become many."""
+
+    def __init__(self) -> None:
+        self._points: list[TrainingStatus] = []
+        self._stride, self._seen = 1, 0
+        self._lock = threading.Lock()
+
+    def add(self, status: TrainingStatus | None) -> None:
+        """Take in a status, if it is one later than the last."""
+        with self._lock:
+            if status is None or (self._points and status.step <= self._points[-1].step):
+                return
+            if self._seen % self._stride == 0:
+                self._points.append(status)
+            self._seen += 1
+            if len(self._points) > _MOST_POINTS:
+                self._points = self._points[::2]
+                self._stride *= 2
+
+    def line(self, name: str) -> tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"]]:
+        """Steps, and `loss` or `psnr` of the points; none where one has no such value."""
+        with self._lock:
+            points = list(self._points)
+        found = [getattr(point, name) for point in points]
+        if None in found:
+            return np.zeros(0), np.zeros(0)
+        return np.array([float(point.step) for point in points]), np.array(found, dtype=np.float64)
+
+
+class Services:
+    """Shared by the sessions of all clients."""
+
+    def __init__(
+        self,
+        source: SceneSource,
+        read_scene: SceneReader,
+        recipe: Recipe | None = None,
+        environments: Sequence[Path] = (),
+    ) -> None:
+        """Computes nothing yet; the scene is read beside everything else once `start` is called.
+
+        Args:
+            source: The model.
+            read_scene: Reads the scene.
+            recipe: What every client sees the scene with at first.
+            environments: Files of lights to offer beside those of the scene.
+        Raises:
+            ConfigError: the recipe does not fit the run, or its method has no environments.
+            SceneError: an environment map is missing, damaged or unusable.
+        """
+        self.source = source
+        self.views = recorded_views(source.record)
+        self.scene: Scene | None = None
+        """The scene, once it is read."""
+        self.folder = source.run.exports / "viewer"
+        """Where files go that clients ask for: in the run folder, and nowhere else."""
+        self.recipes_folder = source.run.path / "recipes"
+        self.videos = VideoQueue()
+        self.curve = TrainingCurve()
+        self._read_scene = read_scene
+        self._reader = threading.Thread(target=self._read, name="unmix-viewer-scene", daemon=True)
+        paths = tuple(str(path.resolve()) for path in environments)
+        with source.borrowed() as scene:
+            for path in paths:
+                relit(scene, LightChoice(path), "of this run")
+            self.layers = layers_of(scene)
+            self.has_materials = isinstance(scene, TrainedScene)
+            self.lights: tuple[str, ...] = (
+                (*scene.lights, *paths) if isinstance(scene, RelightableScene) else ()
+            )
+            """Names of the scene's lights, and the paths of those that a user gives."""
+            channels = (
+                num_channels(scene.materials) if isinstance(scene, TrainedScene) else 4 * len(scene.outputs)
+            )
+        self.aids = SceneAids(source, self.has_materials)
+        self.maker = PictureMaker(source, self.aids, channels, self.layers)
+        self.loop = RenderLoop(self.maker)
+        self.first_recipe = Recipe()
+        """Every client's first recipe; endmembers are given by their numbers."""
+        if recipe is not None:
+            self.first_recipe = numbered(recipe, self.maker.edited(Edit()).materials.names)
+            self.maker.edited(Edit(self.first_recipe))
+
+    @cached_property
+    def usable_lights(self) -> tuple[str, ...]:
+        """Names of the lights that the scene can be shown in."""
+        scene = self.maker.edited(Edit())
+        return tuple(name for name in illuminant_names() if _is_usable(name, scene.bands, scene.light_power))
+
+    def start(self) -> None:
+        """Begin to render, and to read the scene."""
+        self.loop.start()
+        self._reader.start()
+
+    def tick(self) -> None:
+        """Note how training goes; called twice a second."""
+        if self.source.control is not None:
+            self.curve.add(self.source.control.status)
+
+    def stop(self) -> None:
+        """End rendering; waits for the scene if it is still being read."""
+        self.videos.stop()
+        self.loop.stop()
+        if self._reader.is_alive():
+            # Not left behind: a thread in native code when the interpreter ends takes the process down with it.
+            self._reader.join()
+
+    def _read(self) -> None:
+        """Read the scene; without it the viewer only lacks what was measured."""
+        if self.has_materials:
+            _ = self.usable_lights  # takes a second, which the first page need not wait for
+        missing = "the scene is not at hand: "
+        with failures_said(
+            "the scene could not be read", lambda reason: self.aids.set_measured(None, missing + reason)
+        ):
+            scene = self.scene = self._read_scene()
+            if self.has_materials and usable_views(scene):
+                self.aids.set_measured(MeasuredViews(scene, self.source))
+            elif self.has_materials:
+                self.aids.set_measured(None, "no training view has all bands")
+
+
+def _is_usable(light: str, bands: Bands, recorded: Float64[np.ndarray, " B"] | None) -> bool:
+    try:
+        relighting_factors(bands, recorded, Light(light))
+    except SpectrumError:
+        return False
+    return True
 
 
 KEPT_S = 600.0
 """How long what a page left is kept."""
 
 _MOST_KEPT = 64
-_KEY = "unmix-nerf"
+_STORAGE_KEY = "unmix-nerf"
 _ANSWER_S = 2.0
 
 
@@ -94,181 +223,21 @@ class KeptPages:
         """The state of the browser's page that was closed last and has not come back; None if there is none."""
         with self._lock:
             self._left = [kept for kept in self._left if self._clock() - kept[0] < KEPT_S]
-            for index in range(len(self._left) - 1, -1, -1):
-                if self._left[index][1] == browser:
-                    return self._left.pop(index)[2]
-        return None
+            mine = [index for index, kept in enumerate(self._left) if kept[1] == browser]
+            return self._left.pop(mine[-1])[2] if mine else None
 
 
 def browser_of(client: viser.ClientHandle) -> str:
     """The name that a page's browser keeps for this viewer, a new one if it has none or does not say."""
     try:
-        known = client.local_storage.get_item(_KEY, _ANSWER_S)
+        known = client.local_storage.get_item(_STORAGE_KEY, _ANSWER_S)
     except (RuntimeError, TimeoutError):  # storage is blocked, or the page has gone
         known = None
     if isinstance(known, str) and 0 < len(known) < 100:
         return known
     name = secrets.token_hex(16)
-    client.local_storage.set_item(_KEY, name)
+    client.local_storage.set_item(_STORAGE_KEY, name)
     return name
-
-
-_MOST_POINTS = 400
-
-
-class TrainingCurve:
-    """Points of a training, thinned evenly as they become many."""
-
-    def __init__(self) -> None:
-        self._points: list[TrainingStatus] = []
-        self._stride = 1
-        self._seen = 0
-        self._lock = threading.Lock()
-
-    def add(self, status: TrainingStatus | None) -> None:
-        """Take in a status, if it is one later than the last."""
-        with self._lock:
-            if status is None or (self._points and status.step <= self._points[-1].step):
-                return
-            if self._seen % self._stride == 0:
-                self._points.append(status)
-            self._seen += 1
-            if len(self._points) > _MOST_POINTS:
-                self._points = self._points[::2]
-                self._stride *= 2
-
-    def line(self, name: str) -> tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"]]:
-        """Steps, and `loss` or `psnr` of the points; none where one has no such value."""
-        with self._lock:
-            points = list(self._points)
-        found = [getattr(point, name) for point in points]
-        if None in found:
-            return np.zeros(0), np.zeros(0)
-        return np.array([float(point.step) for point in points]), np.array(found, dtype=np.float64)
-
-
-SceneReader = Callable[[], Scene]
-"""Reads the scene that a run was trained on.
-
-Raises:
-    UnmixError: it is not at hand, or another one.
-"""
-
-
-class Services:
-    """Shared by the sessions of all clients."""
-
-    def __init__(
-        self,
-        source: SceneSource,
-        read_scene: SceneReader,
-        recipe: Recipe | None = None,
-        environments: Sequence[Path] = (),
-    ) -> None:
-        """Computes nothing yet; the scene is read beside everything else once `start` is called.
-
-        Args:
-            source: The model.
-            read_scene: Reads the scene.
-            recipe: What every client sees the scene with at first.
-            environments: Files of lights to offer beside those of the scene.
-        Raises:
-            ConfigError: the recipe does not fit the run, or its method has no environments.
-            SceneError: an environment map is missing, damaged or unusable.
-        """
-        self.source = source
-        self.views = recorded_views(source.record)
-        self.num_train = len(source.record.train_cameras)
-        self.scene: Scene | None = None
-        """The scene, once it is read."""
-        self.videos = VideoQueue()
-        self.curve = TrainingCurve()
-        self._read_scene = read_scene
-        self._reader = threading.Thread(target=self._read, name="unmix-viewer-scene", daemon=True)
-        with source.borrowed() as scene:
-            self.layers = layers_of(scene)
-            self.has_materials = isinstance(scene, TrainedScene)
-            self.lights = _lights(scene, environments)
-            channels = (
-                num_channels(scene.materials) if isinstance(scene, TrainedScene) else 4 * len(scene.outputs)
-            )
-        self.aids = SceneAids(source, self.has_materials)
-        self.maker = PictureMaker(source, self.aids, channels, self.layers)
-        self.loop = RenderLoop(self.maker)
-        self.first_recipe = Recipe()
-        """Every client's first recipe; endmembers are given by their numbers."""
-        if recipe is not None:
-            self.first_recipe = numbered(recipe, self.maker.edited(Edit()).materials.names)
-            self.maker.edited(Edit(self.first_recipe))
-
-    @property
-    def folder(self) -> Path:
-        """Where files go that clients ask for: in the run folder, and nowhere else."""
-        return self.source.run.exports / "viewer"
-
-    @property
-    def recipes_folder(self) -> Path:
-        """Where recipes of this run are kept."""
-        return self.source.run.path / "recipes"
-
-    @cached_property
-    def usable_lights(self) -> tuple[str, ...]:
-        """Names of the lights that the scene can be shown in."""
-        scene = self.maker.edited(Edit())
-        return tuple(name for name in illuminant_names() if _is_usable(name, scene.bands, scene.light_power))
-
-    def start(self) -> None:
-        """Begin to render, and to read the scene."""
-        self.loop.start()
-        self._reader.start()
-
-    def tick(self) -> None:
-        """Note how training goes; called twice a second."""
-        if self.source.control is not None:
-            self.curve.add(self.source.control.status)
-
-    def stop(self) -> None:
-        """End rendering; waits for the scene if it is still being read."""
-        self.videos.stop()
-        self.loop.stop()
-        if self._reader.is_alive():
-            # Not left behind: a thread in native code when the interpreter ends takes the process down with it.
-            self._reader.join()
-
-    def view_named(self, name: str) -> RunView | None:
-        """A view of the scene by its name."""
-        return next((view for view in self.views if view.name == name), None)
-
-    def _read(self) -> None:
-        """Read the scene; without it the viewer only lacks what was measured."""
-        if self.has_materials:
-            _ = self.usable_lights  # takes a second, which the first page need not wait for
-        with failures_said("the scene could not be read", self._note_missing):
-            scene = self._read_scene()
-            self.scene = scene
-            if self.has_materials and usable_views(scene):
-                self.aids.set_measured(MeasuredViews(scene, self.source))
-            elif self.has_materials:
-                self.aids.set_measured(None, "no training view has all bands")
-
-    def _note_missing(self, reason: str) -> None:
-        self.aids.set_measured(None, f"the scene is not at hand: {reason}")
-
-
-def _is_usable(light: str, bands: Bands, recorded: Float64[np.ndarray, " B"] | None) -> bool:
-    try:
-        relighting_factors(bands, recorded, Light(light))
-    except SpectrumError:
-        return False
-    return True
-
-
-def _lights(scene: RenderableScene, environments: Sequence[Path]) -> tuple[str, ...]:
-    """Names of a scene's lights, and the paths of those that a user gives."""
-    paths = tuple(str(path.resolve()) for path in environments)
-    for path in paths:
-        relit(scene, LightChoice(path), "of this run")
-    return (*scene.lights, *paths) if isinstance(scene, RelightableScene) else ()
 
 
 _MOVING_QUALITY, _RESTING_QUALITY = 80, 90
@@ -291,7 +260,7 @@ class Panel:
 
 
 class Session:
-    """What the server keeps for a client from its admission to its disconnection."""
+    """One client, from its admission to its disconnection; nothing that it does affects another one or the server."""
 
     def __init__(
         self,
@@ -307,19 +276,17 @@ class Session:
             state: What the page showed before it was loaded again, if it was.
             browser: The name that the page's browser keeps.
         """
-        self.client = client
-        self.services = services
-        self.browser = browser
+        self.client, self.services, self.browser = client, services, browser
         self.history = RecipeHistory(services.first_recipe) if state is None else state.history
         light = LightChoice() if state is None else state.light
         self.view = View(show=self._show, report=self._report, edit=Edit(self.history.present, light))
         if state is None:
             self.view.settings = self._first_settings()
-            self.view.largest_height = _first_height(client.camera.image_height)
+            rows = number(client.camera.image_height, DEFAULT_HEIGHT, HEIGHT_BOUNDS[1], DEFAULT_HEIGHT)
+            self.view.largest_height = int(rows) // 16 * 16
         else:
             self.view.settings, self.view.pose = state.settings, state.pose
             self.view.largest_height, self.view.subpixels = state.largest_height, state.subpixels
-        self._returns = state is not None
         self.is_closed = False
         self._lock = threading.RLock()
         self.on_tick: list[Callable[[], None]] = []
@@ -328,11 +295,11 @@ class Session:
         """Called when materials or light have changed."""
         self.on_close: list[Callable[[], None]] = []
         """Called when the client has gone."""
+        self.value_range_shown: tuple[float, float] | None = None
+        """Ends of the colour map of the picture shown; None where it has none."""
         self._legend: viser.GuiHtmlHandle | None = None
         self._status: viser.GuiHtmlHandle | None = None
         self._legend_shown = ""
-        self.value_range_shown: tuple[float, float] | None = None
-        """Ends of the colour map of the picture shown; None where it has none."""
         self._object_owners: set[str] = set()
         self._notices = Notices(client)
 
@@ -344,26 +311,27 @@ class Session:
 
     def open(self, panels: Sequence[Panel]) -> None:
         """Build the panels, in the order of their tabs, and begin to render."""
-        gui = self.client.gui
-        self._status = gui.add_html(html.paragraph("waiting for the first picture"))
+        gui, view = self.client.gui, self.view
+        self._status = gui.add_html(paragraph("waiting for the first picture"))
         self._legend = gui.add_html("")
         tabs = gui.add_tab_group()
         for panel in panels:
             if panel.applies(self.services):
                 with tabs.add_tab(panel.title):
                     panel.build(self)
-        self.services.loop.add(self.view)
+        self.services.loop.add(view)
         if self.is_closed:  # the client left while its panels were built
-            self.services.loop.remove(self.view)
+            self.services.loop.remove(view)
             return
         if self.services.has_materials:
-            self._show_notes(self.services.maker.edited(self.view.edit).notes)
+            self._show_notes(self.services.maker.edited(view.edit).notes)
+        kept = view.pose
         self.client.camera.on_update(self._moved)
-        if self._returns and self.view.pose is not None:
-            self.services.loop.move(self.view, self.view.pose)
-            self.look_from(camera_of(self.view.pose, 64))
-        else:
+        if kept is None:
             self._moved(self.client.camera)
+        else:
+            self.services.loop.move(view, kept)
+            self.look_from(camera_of(kept, 64))
 
     def close(self) -> None:
         """Stop rendering for the client."""
@@ -409,10 +377,6 @@ class Session:
         if not self.is_closed:
             self._notices.show_notes(notes)
 
-    def restyle(self, settings: LayerSettings) -> None:
-        """Show another layer, or the same otherwise."""
-        self.services.loop.restyle(self.view, settings)
-
     def materials(self) -> Materials:
         """The materials as this client sees them."""
         return self.services.maker.edited(self.view.edit).materials
@@ -434,10 +398,6 @@ class Session:
         for tell in self.on_edit:
             tell()
         self._show_notes(notes)
-
-    def change_light(self, light: LightChoice) -> None:
-        """Show a scene whose light can be exchanged under another one."""
-        self.services.loop.change_edit(self.view, Edit(self.view.edit.recipe, light))
 
     def show_objects(self, owner: str, has_some: bool) -> None:
         """Note whether a panel shows objects of the browser's own, which need depth to be hidden behind the picture."""
@@ -478,24 +438,16 @@ class Session:
             jpeg_quality=_MOVING_QUALITY if shown.is_moving else _RESTING_QUALITY,
             depth=shown.depth,
         )
-        if self._legend is not None:
-            text = legend_html(shown.legend)
-            if text != self._legend_shown:
-                self._legend_shown = self._legend.content = text
-            self.value_range_shown = (
-                (shown.legend.low, shown.legend.high) if isinstance(shown.legend, ColourMapLegend) else None
-            )
+        legend = shown.legend
+        self.value_range_shown = (legend.low, legend.high) if isinstance(legend, ColourMapLegend) else None
+        if self._legend is not None and (content := legend_html(legend)) != self._legend_shown:
+            self._legend_shown = self._legend.content = content
         if self._status is not None and not self.view.has_reported:
             speed = self.services.maker.speed.rays_per_second
             more = ", refining" if shown.is_moving else ""
-            self._status.content = html.paragraph(f"{width} x {height}, {speed / 1000:.0f} k rays/s{more}")
+            self._status.content = paragraph(f"{width} x {height}, {speed / 1000:.0f} k rays/s{more}")
 
     def _report(self, text: str) -> None:
         """Show in the panel what is wrong with the picture, until it is right again."""
         if self._status is not None and not self.is_closed and text:
-            self._status.content = html.paragraph(text, is_warning=True)
-
-
-def _first_height(canvas_rows: Any) -> int:
-    """Rows of the finest picture of a new page: those of its canvas, within reason."""
-    return int(number(canvas_rows, DEFAULT_HEIGHT, HEIGHT_BOUNDS[1], fallback=DEFAULT_HEIGHT)) // 16 * 16
+            self._status.content = paragraph(text, is_warning=True)

@@ -17,13 +17,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int
-from torch import Tensor
+from jaxtyping import Float, Float64
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
+from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.trained.run_views import RunView
 
 if TYPE_CHECKING:
     import viser
@@ -122,26 +120,6 @@ def pose_of(camera: Cameras) -> ViewPose:
     )
 
 
-def pixel_rays(
-    camera: Cameras, pixels: Int[Tensor, " R"], offset: tuple[float, float] = (0.5, 0.5)
-) -> RayBundle:
-    """Rays through some pixels of a camera, given as row * width + column."""
-    rows = torch.div(pixels, camera.width, rounding_mode="floor")
-    coords = torch.stack([pixels - rows * camera.width + offset[0], rows + offset[1]], dim=-1)
-    return camera.generate_rays(torch.zeros_like(pixels), coords.to(torch.float32))
-
-
-def depth_along_axis(camera: Cameras, ray_distance: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
-    """Distance along the viewing axis, of distances along the rays; for cameras without distortion."""
-    x = (torch.arange(camera.width, device=ray_distance.device) + 0.5 - camera.center_px[0, 0].item()) / (
-        camera.focal_px[0, 0].item()
-    )
-    y = (torch.arange(camera.height, device=ray_distance.device) + 0.5 - camera.center_px[0, 1].item()) / (
-        camera.focal_px[0, 1].item()
-    )
-    return ray_distance / torch.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2)
-
-
 def up_direction(cameras: Cameras) -> tuple[float, float, float]:
     """What is up in model space: the cameras' mean upward axis, or the axis of model space that it nearly is."""
     mean = cameras.camera_to_world[:, :, 1].double().mean(dim=0)
@@ -178,11 +156,6 @@ def quaternion(rotation: Float[np.ndarray, "3 3"]) -> tuple[float, float, float,
     return (w, x, y, z)
 
 
-MOST_KEY_FRAMES = 100
-SECONDS_BOUNDS = (0.5, 120.0)
-FPS_BOUNDS = (1, 60)
-
-
 def path_poses(key_frames: Sequence[ViewPose], num_frames: int) -> list[ViewPose]:
     """Poses along the path: through every key frame, positions and fields of view by splines, turns by slerp.
 
@@ -206,11 +179,4 @@ def path_poses(key_frames: Sequence[ViewPose], num_frames: int) -> list[ViewPose
     return [
         checked_pose(quaternion(rotation), row[:3], float(row[3]), aspect)
         for row, rotation in zip(smooth, turns(times).as_matrix(), strict=True)
-    ]
-
-
-def path_views(poses: Sequence[ViewPose], width: int, height: int) -> list[RunView]:
-    """The path as views of a size, for a camera file."""
-    return [
-        RunView(f"path_{index:04d}", sized_camera(pose, width, height)) for index, pose in enumerate(poses)
     ]

@@ -3,16 +3,16 @@
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from torch.testing import assert_close
 
 from tests.viewer.view_factory import make_aids, make_frame, make_source, paint_layer
-from unmix_plugin.errors import ConfigError
+from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.spectral.colour.conversion import band_composite_matrix, linear_to_srgb
 from unmix_plugin.spectral.materials import Coefficients
 from unmix_plugin.trained.run_materials import endmember_colours
+from unmix_plugin.viewer.layers import layers as layers_module
 from unmix_plugin.viewer.layers.layers import LAYERS
 from unmix_plugin.viewer.layers.painting import (
     BACKGROUNDS,
@@ -21,26 +21,27 @@ from unmix_plugin.viewer.layers.painting import (
     SwatchLegend,
     TextLegend,
     colour_table,
+    over_background,
+    paint_values,
 )
 
 PAINTED = [name for name in LAYERS if name != "error"]
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    """A frame of which every pixel is somewhere between empty and solid, and what layers need."""
-    source = make_source(tmp_path_factory.mktemp("run"))
-    return make_frame(source), make_aids(source)
+def source(tmp_path_factory):
+    return make_source(tmp_path_factory.mktemp("run"))
 
 
 @pytest.fixture(scope="module")
-def frame(scene):
-    return scene[0]
+def frame(source):
+    """A frame of which every pixel is somewhere between empty and solid."""
+    return make_frame(source)
 
 
 @pytest.fixture(scope="module")
-def aids(scene):
-    return scene[1]
+def aids(source):
+    return make_aids(source)
 
 
 def painted(frame, aids, layer, **settings) -> tuple[Any, Any]:
@@ -145,12 +146,6 @@ def test_an_abundance_is_the_share_of_what_is_seen(frame, aids):
     assert legend.label == "abundance of endmember_1"
 
 
-def test_an_endmember_that_is_not_there_is_the_last(frame, aids):
-    last, _ = painted(frame, aids, "abundance", endmember=len(frame.materials.names) - 1)
-    beyond, _ = painted(frame, aids, "abundance", endmember=200)
-    assert_close(beyond, last)
-
-
 def test_pure_pixels_have_the_colours_of_all_figures(frame, aids):
     count = len(frame.materials.names)
     colours = torch.as_tensor(endmember_colours(frame.materials), dtype=torch.float32)
@@ -179,9 +174,7 @@ def test_half_transparent_light_is_mixed_with_the_background_in_linear_light(fra
     assert_close(picture, linear_to_srgb((opaque["linear_rgb"] + 1) / 2), atol=1e-4, rtol=0)
 
 
-def test_principal_components_keep_their_colours_when_the_camera_moves(tmp_path):
-    source = make_source(tmp_path)
-    aids = make_aids(source)
+def test_principal_components_keep_their_colours_when_the_camera_moves(source, aids):
     first = make_frame(source, source.record.train_cameras[0])
     part = first.map(lambda packed: packed[4:12, 6:18])
     whole, _ = painted(first, aids, "pca")
@@ -189,9 +182,7 @@ def test_principal_components_keep_their_colours_when_the_camera_moves(tmp_path)
     assert_close(cropped, whole[4:12, 6:18], atol=1e-5, rtol=0)
 
 
-def test_scales_stay_the_same_when_the_camera_moves(tmp_path):
-    source = make_source(tmp_path)
-    aids = make_aids(source)
+def test_scales_stay_the_same_when_the_camera_moves(source, aids):
     legends = [
         painted(make_frame(source, source.record.train_cameras[index]), aids, "band")[1] for index in range(3)
     ]
@@ -235,5 +226,95 @@ def test_a_single_material_has_every_layer(tmp_path):
         assert picture.isfinite().all(), layer
 
 
-def test_the_error_layer_exists_even_though_it_needs_the_scene():
-    assert np.array_equal(sorted(set(LAYERS) - set(PAINTED)), ["error"])
+FORMULA = "(r650-r450)/(r650+r450)"
+
+
+def with_materials(frame, materials):
+    """The same view with other spectra."""
+    return replace(frame, scene=replace(frame.scene, materials=materials))
+
+
+@pytest.mark.parametrize("light", [None, [0.2, 0.4, 0.6, 0.8, 1.0]])
+def test_an_index_is_the_output_of_renders_over_the_background_where_that_is_undefined(
+    frame, aids, light, monkeypatch
+):
+    monkeypatch.setattr(layers_module, "_CHUNK", 100)  # fewer than there are pixels
+    lit = replace(frame.materials, light=None if light is None else torch.tensor(light))
+    shown = with_materials(frame, lit)
+    values = shown[f"index:{FORMULA}"]
+    assert 0.05 < float(values.isnan().float().mean()) < 0.95
+    settings = LayerSettings(layer="index", index=FORMULA, value_range=(-1.0, 1.0), background="white")
+    picture, legend = paint_layer(shown, settings, aids)
+    opacity = frame.coefficients.accumulation * values.isfinite()
+    expected = over_background(paint_values(values, (-1.0, 1.0), "viridis"), opacity, settings)
+    assert_close(picture, expected, atol=1e-5, rtol=0)
+    assert_close(picture[values.isnan()], torch.ones_like(picture[values.isnan()]))
+    assert isinstance(legend, ColourMapLegend)
+    assert ("of radiance: light unknown" in legend.label) == (light is None)
+
+
+def test_the_light_of_the_scene_is_divided_out(frame, aids):
+    power = torch.tensor([0.2, 0.4, 0.6, 0.8, 1.0])
+    materials = frame.materials
+    lit = replace(
+        materials,
+        endmembers=materials.endmembers * power,
+        specular_spectra=materials.specular_spectra * power,
+        light=power,
+    )
+    before, _ = painted(frame, aids, "index", index=FORMULA, value_range=(-1.0, 1.0))
+    after, _ = painted(with_materials(frame, lit), aids, "index", index=FORMULA, value_range=(-1.0, 1.0))
+    assert_close(after, before, atol=2e-3, rtol=0)
+
+
+def test_a_named_index_has_its_usual_range_unless_one_is_chosen(frame, aids):
+    _, legend = painted(frame, aids, "index", index="pri")
+    assert (legend.low, legend.high) == (-0.2, 0.2)
+    assert legend.label.startswith("photochemical reflectance index, (r531-r570)/(r531+r570)")
+    _, legend = painted(frame, aids, "index", index="pri", value_range=(0.0, 0.1))
+    assert (legend.low, legend.high) == (0.0, 0.1)
+
+
+def test_a_formula_has_the_range_that_is_seen_from_everywhere(source, aids):
+    legends = [
+        painted(make_frame(source, source.record.train_cameras[index]), aids, "index", index="1+r650")[1]
+        for index in range(3)
+    ]
+    reference = aids.reference
+    with source.borrowed() as scene:
+        seen = 1 + reference.spectra(scene.materials)[:, 4]
+    expected = torch.quantile(seen, torch.tensor([0.01, 0.99])).tolist()
+    for legend in legends:
+        assert (legend.low, legend.high) == pytest.approx(expected, abs=1e-5)
+    assert expected[0] > 0.9
+
+
+@pytest.mark.parametrize("formula", ["r650-r650", "log(r650-r650)"])
+def test_a_formula_that_is_everywhere_the_same_or_nowhere_defined_still_has_a_scale(frame, aids, formula):
+    picture, legend = painted(frame, aids, "index", index=formula)
+    assert picture.isfinite().all()
+    assert (legend.low, legend.high) == (0.0, 1.0)
+
+
+def test_a_long_formula_is_shortened_in_the_legend(frame, aids):
+    _, legend = painted(frame, aids, "index", index="+".join(["r650"] * 90))
+    assert len(legend.label) < 160
+    assert "..." in legend.label
+
+
+def test_an_index_that_is_not_chosen_says_what_to_do(frame, aids):
+    with pytest.raises(ConfigError, match=r"type a formula of the wavelengths from 425 to 675 nm.*r650/r450"):
+        painted(frame, aids, "index", index="")
+
+
+@pytest.mark.parametrize(
+    ("index", "error", "message"),
+    [
+        ("prri", ConfigError, "nearest: pri"),
+        ("r650/", ConfigError, "r650/"),
+        ("ndvi", SpectrumError, "needs 800 nm"),
+    ],
+)
+def test_an_index_that_cannot_be_shown_says_why(frame, aids, index, error, message):
+    with pytest.raises(error, match=message):
+        painted(frame, aids, "index", index=index)

@@ -1,21 +1,60 @@
-"""When is rendered, and how finely: movements are answered at once, rest brings finer pictures, layers cost nothing.
-
-The loop is driven by hand, piece by piece.
-"""
+"""When to render: by hand, piece by piece; what goes wrong; in a thread of its own beside a training."""
 
 import threading
+import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from tests.viewer.rendering.loop_driver import LARGEST, finest, finish, make_loop
-from tests.viewer.view_factory import Screen, some_pose
+from tests.method_factory import make_model
+from tests.viewer.view_factory import (
+    LARGEST,
+    Screen,
+    finest,
+    finish,
+    make_loop,
+    running_loop,
+    some_pose,
+    source_of_model,
+)
 from unmix_plugin.editing import Light, Recipe, Remove, Scale
+from unmix_plugin.engine.training.training_control import TrainingControl
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.viewer.layers.painting import LayerSettings
-from unmix_plugin.viewer.rendering.pictures import Capture, FrameRender, PictureMaker, num_channels
+from unmix_plugin.viewer.rendering.pictures import FrameRender, PictureMaker, num_channels
+from unmix_plugin.viewer.rendering.render_loop import Capture
 from unmix_plugin.viewer.rendering.scene import Edit, SceneAids
 from unmix_plugin.viewer.view_cameras import camera_of
+
+
+@pytest.fixture
+def loop(source):
+    return make_loop(source, slow_speed=5000.0)
+
+
+@pytest.fixture
+def screen(loop):
+    shown = Screen()
+    shown.view.largest_height = LARGEST
+    loop.add(shown.view)
+    return shown
+
+
+@pytest.fixture
+def rendered(monkeypatch):
+    """How many rays were rendered since the list was cleared."""
+    counts = []
+    original = FrameRender.render_block
+
+    def counting(self, scene, num_rays):
+        counts.append(done := original(self, scene, num_rays))
+        return done
+
+    monkeypatch.setattr(FrameRender, "render_block", counting)
+    return counts
 
 
 def test_a_movement_is_answered_with_a_small_picture_and_rest_with_finer_ones(loop, screen):
@@ -57,7 +96,7 @@ def test_switching_layers_renders_nothing(loop, screen, rendered):
 
 
 def test_a_movement_interrupts_what_is_refined(loop, screen):
-    screen.view.largest_height = 512
+    screen.view.largest_height = 256
     loop.move(screen.view, some_pose(0))
     assert loop.step()
     assert loop.step()
@@ -82,13 +121,13 @@ def test_only_the_last_of_many_movements_is_answered_and_refined(loop, screen):
 
 def test_every_view_has_its_own_camera_size_and_layer(loop):
     screens = [Screen() for _ in range(3)]
-    for index, (screen, height) in enumerate(zip(screens, (32, 48, 64), strict=True)):
+    for index, (screen, height) in enumerate(zip(screens, (16, 24, 32), strict=True)):
         screen.view.largest_height = height
         loop.add(screen.view)
         loop.restyle(screen.view, LayerSettings(layer=("rgb", "depth", "segmentation")[index]))
         loop.move(screen.view, some_pose(index))
     finish(loop)
-    assert [screen.shown[-1].picture.shape[0] for screen in screens] == [32, 48, 64]
+    assert [screen.shown[-1].picture.shape[0] for screen in screens] == [16, 24, 32]
     assert len({screen.shown[-1].picture.mean() for screen in screens}) == 3
 
 
@@ -195,14 +234,14 @@ def test_more_rays_a_pixel_are_cast_for_the_finest_picture_only(loop, screen, mo
 
     monkeypatch.setattr(FrameRender, "__init__", noting)
     loop.move(screen.view, some_pose())
-    loop.change_quality(screen.view, 48, 2)
+    loop.change_quality(screen.view, 24, 2)
     finest(loop, screen)
-    assert created[-1] == (48, 2)
+    assert created[-1] == (24, 2)
     assert all(subpixels == 1 for height, subpixels in created[:-1])
 
 
 def test_a_picture_never_takes_more_memory_than_is_set_aside(source, monkeypatch):
-    monkeypatch.setattr("unmix_plugin.viewer.rendering.pictures.LARGEST_FRAME_BYTES", 40_000)
+    monkeypatch.setattr("unmix_plugin.viewer.rendering.pictures.LARGEST_FRAME_BYTES", 20_000)
     loop, screen = make_loop(source), Screen()
     screen.view.largest_height = 2048
     loop.add(screen.view)
@@ -210,4 +249,132 @@ def test_a_picture_never_takes_more_memory_than_is_set_aside(source, monkeypatch
     picture = finest(loop, screen).picture
     with source.borrowed() as scene:
         channels = num_channels(scene.materials)
-    assert picture.shape[0] * picture.shape[1] * channels * 4 <= 40_000
+    assert picture.shape[0] * picture.shape[1] * channels * 4 <= 20_000
+
+
+def test_a_layer_that_cannot_be_shown_is_said_and_the_next_one_works(loop, screen):
+    loop.move(screen.view, some_pose())
+    finish(loop)
+    loop.restyle(screen.view, LayerSettings(layer="error"))
+    finish(loop)
+    assert screen.reports[-1].startswith("no error to show")
+    count = len(screen.shown)
+    loop.restyle(screen.view, LayerSettings(layer="rgb"))
+    finish(loop)
+    assert len(screen.shown) == count + 1
+    assert screen.reports[-1] == ""
+
+
+def test_a_defect_in_a_picture_is_said_logged_and_ends_nothing(loop, screen, monkeypatch, caplog):
+    original = FrameRender.render_block
+    monkeypatch.setattr(FrameRender, "render_block", lambda *_: 1 / 0)
+    loop.move(screen.view, some_pose())
+    finish(loop)
+    assert len(screen.reports) == 1  # not tried again and again
+    assert "ZeroDivisionError" in screen.reports[0]
+    assert "Traceback" in caplog.text
+    monkeypatch.setattr(FrameRender, "render_block", original)
+    loop.move(screen.view, some_pose(1))
+    finest(loop, screen)
+
+
+def test_a_client_that_cannot_be_shown_anything_does_not_end_the_loop(loop, screen, caplog):
+    gone = Screen()
+    gone.view.show = lambda _: (_ for _ in ()).throw(ConnectionError("gone"))
+    gone.view.report = lambda _: (_ for _ in ()).throw(ConnectionError("gone"))
+    loop.add(gone.view)
+    loop.move(gone.view, some_pose())
+    loop.move(screen.view, some_pose())
+    finest(loop, screen)
+    assert "ConnectionError" in caplog.text
+
+
+def test_a_view_that_is_removed_in_mid_render_is_shown_nothing_more(loop, screen):
+    screen.view.largest_height = 256
+    loop.move(screen.view, some_pose())
+    assert loop.step()
+    assert loop.step()
+    loop.remove(screen.view)
+    count = len(screen.shown)
+    finish(loop)
+    assert len(screen.shown) == count
+    assert screen.view.frame is None
+    assert loop._views == []
+
+
+def test_an_edit_that_does_not_fit_is_said(loop, screen):
+    loop.move(screen.view, some_pose())
+    finish(loop)
+    loop.change_edit(screen.view, Edit(Recipe((Scale(99, 2.0),))))
+    finish(loop)
+    assert "there is no endmember 99" in screen.reports[-1]
+
+
+def test_a_capture_that_is_cancelled_or_left_is_told_so(loop):
+    reasons = []
+    for _ in range(2):
+        render = FrameRender(camera_of(some_pose(), 400))
+        loop.capture(Capture(render, Edit(), lambda _, reason: reasons.append(reason)))
+    loop._captures[0].is_cancelled = True
+    assert loop.step()
+    loop.stop()
+    assert reasons == ["cancelled", "the viewer was stopped"]
+
+
+def test_a_capture_that_ends_while_the_loop_is_stopped_is_told_once(loop):
+    reasons = []
+    render = FrameRender(camera_of(some_pose(), 16))
+    capture = Capture(render, Edit(), lambda _, reason: reasons.append(reason), lambda _: loop.stop())
+    loop.capture(capture)
+    while loop.step():
+        pass
+    assert reasons == ["the viewer was stopped"]
+
+
+def test_an_error_of_ours_in_a_report_is_a_sentence(loop, screen, monkeypatch):
+    def refuse(*_):
+        raise ConfigError("the scene has gone")
+
+    monkeypatch.setattr(FrameRender, "render_block", refuse)
+    loop.move(screen.view, replace(some_pose(), fov=0.5))
+    finish(loop)
+    assert screen.reports == ["the scene has gone"]
+
+
+def test_while_training_runs_pictures_follow_it(tmp_path, monkeypatch):
+    monkeypatch.setattr("unmix_plugin.viewer.rendering.pictures.REFRESH_S", 0.05)
+    control, model = TrainingControl(), make_model()
+    source = source_of_model(model, tmp_path, control)
+    with running_loop(source) as loop, control.running():
+        screen = Screen()
+        screen.view.largest_height = LARGEST
+        loop.add(screen.view)
+        loop.move(screen.view, some_pose())
+        until = time.monotonic() + 120
+        while len(screen.shown) < 6:
+            assert time.monotonic() < until
+            with control.device.training_turn(), torch.no_grad():
+                model.endmembers.add_(0.01)
+                screen.wait(0.01)  # a step that takes time earns the viewer its share
+        means = [shown.picture.mean() for shown in screen.shown]
+        assert max(means) - min(means) > 1
+    assert not screen.reports
+
+
+def test_when_training_ends_the_finest_picture_shows_its_last_step(tmp_path):
+    control, model = TrainingControl(), make_model()
+    source = source_of_model(model, tmp_path, control)
+    with running_loop(source) as loop:
+        screen = Screen()
+        screen.view.largest_height = LARGEST
+        loop.add(screen.view)
+        with control.running():
+            for _ in range(5):
+                loop.move(screen.view, some_pose())
+                with control.device.training_turn(), torch.no_grad():
+                    model.endmembers.mul_(0.5)
+        version = source.version
+        screen.wait_until(lambda: screen.view.frame_version == version and not screen.shown[-1].is_moving)
+        assert isinstance(screen.view.frame, MaterialView)
+        shown = screen.view.frame.materials.endmembers
+        torch.testing.assert_close(shown, model.endmembers.detach())

@@ -1,32 +1,15 @@
-"""Some rays through the whole scene that stay the same while the camera moves: colour scales and principal axes are
-taken from them, so that colours mean the same from everywhere.
+"""What can be shown of a rendered view: functions to a picture and its legend, and what they need of the run.
 
-Notation: `N` reference rays that end on something, `B` bands.
+Titles, kinds and ranges are those of the table of outputs; here is how they are painted.
 
-What layers need to know of the run beside the view itself.
-
-One thing that can be shown of a rendered view.
-
-Layers that follow from the outputs that a scene names: each is painted by its kind.
-
-Notation: `H x W` pixels; pictures are sRGB in [0, 1].
-
-The layer of a spectral index: what is seen as one number a pixel, of its reflectance.
-
-Notation: pictures are (H, W, 3) sRGB in [0, 1]; `N` reference rays.
-
-What can be shown: pure functions from a rendered view to a picture and its legend.
-
-Titles, kinds and ranges are those of the registry of outputs; here is how materials are painted.
-
-Notation: pictures are (H, W, 3) sRGB in [0, 1]; what is transparent shows the background. `light` is linear RGB seen on
-black.
+Notation: pictures are (H, W, 3) sRGB in [0, 1]; what is transparent shows the background. `N` reference rays that end
+on something, `B` bands.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -45,7 +28,7 @@ from unmix_plugin.spectral.colour.conversion import (
     rgb_matrix,
     srgb_to_linear,
 )
-from unmix_plugin.spectral.maps.indices import SpectralIndex, parse_index
+from unmix_plugin.spectral.maps.indices import parse_index
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials
 from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.spectral.subspace import PcaColours
@@ -74,7 +57,8 @@ _NUM_RAYS = 6000
 
 @dataclass(frozen=True)
 class _Reference:
-    """Coefficients of the reference rays."""
+    """Coefficients of some rays through the whole scene that stay the same while the camera moves: colour scales and
+    principal axes are taken from them, so that colours mean the same from everywhere."""
 
     coefficients: Coefficients
     """(N, ...)."""
@@ -84,19 +68,6 @@ class _Reference:
     def spectra(self, materials: Materials) -> Float[Tensor, "N B"]:
         """What the rays show with the given materials, as if each ended fully on what it ended on."""
         return materials.spectra(self.coefficients) / self.coefficients.accumulation[:, None]
-
-    def range_of(self, values: Float[Tensor, "N"]) -> tuple[float, float]:
-        """From 0, or the 1st percentile of values that may be negative, to the 99th percentile."""
-        return _percentile_range(values, low_at_most=0.0)
-
-
-def _percentile_range(values: Float[Tensor, "N"], low_at_most: float = math.inf) -> tuple[float, float]:
-    """From the 1st percentile, or `low_at_most` if that is less, to the 99th; never empty."""
-    if len(values) == 0:
-        return (0.0, 1.0)
-    low, high = torch.quantile(values.float(), values.new_tensor([0.01, 0.99]).float()).tolist()
-    low = min(low, low_at_most)
-    return (low, high if high > low + 1e-6 else low + 1.0)
 
 
 @torch.no_grad()
@@ -117,6 +88,15 @@ def render_reference(scene: TrainedScene, cameras: Cameras) -> _Reference:
         parts.append(seen.map(lambda packed, chosen=is_seen: packed[chosen]))
         points.append(ends[is_seen])
     return _Reference(Coefficients.concatenate(parts), torch.cat(points))
+
+
+def _percentile_range(values: Float[Tensor, "N"], low_at_most: float = math.inf) -> tuple[float, float]:
+    """From the 1st percentile, or `low_at_most` if that is less, to the 99th; never empty."""
+    if len(values) == 0:
+        return (0.0, 1.0)
+    low, high = torch.quantile(values.float(), values.new_tensor([0.01, 0.99]).float()).tolist()
+    low = min(low, low_at_most)
+    return (low, high if high > low + 1e-6 else low + 1.0)
 
 
 _MOST_REMEMBERED = 32
@@ -197,96 +177,73 @@ def layer_named(name: str, layers: Mapping[str, Layer]) -> Layer:
     return layers[name]
 
 
-_Paint = Callable[[Tensor, RenderedView, LayerSettings, Output], tuple[Picture, Legend]]
+_PAINTED_KINDS: dict[OutputKind, frozenset[str]] = {
+    "srgb": frozenset({"tone"}),
+    "linear": frozenset({"tone"}),
+    "picture": frozenset(),
+    "grey": frozenset({"scale"}),
+    "map": frozenset({"scale"}),
+    "labels": frozenset(),
+    "shares": frozenset(),
+    "vectors": frozenset(),
+}
+"""Kinds of outputs that can be painted without knowing more of them, and the controls of their layers."""
 
 
 def _layer_of(output: Output) -> Layer:
     """The layer of an output of a kind that can be painted."""
-    paint, controls = _PAINTERS[output.kind]
 
-    def paint_output(
-        frame: RenderedView, settings: LayerSettings, _: LayerAids | None
-    ) -> tuple[Picture, Legend]:
-        return paint(frame[output.name], frame, settings, output)
+    def paint(frame: RenderedView, settings: LayerSettings, _: LayerAids | None) -> tuple[Picture, Legend]:
+        values, opacity, legend = frame[output.name], frame.opacity, TextLegend(output.what)
+        if output.kind in ("srgb", "linear"):
+            light = values if output.kind == "linear" else srgb_to_linear(values.clamp(0, 1))
+            return tone_mapped(light, frame.coverage, settings), legend
+        if output.kind in ("grey", "map"):
+            return _paint_map(values, opacity, settings, output)
+        palette = colour_table("turbo")[torch.arange(256) * 389 % 1024].to(
+            opacity
+        )  # neighbours are far apart
+        if output.kind == "labels":
+            opacity, values = (values != NOTHING_ID).to(opacity), palette[values.long()]
+        elif output.kind == "shares":
+            palette = palette[: values.shape[-1]]
+            values = values / values.sum(dim=-1, keepdim=True).clamp(min=1e-6) @ palette
+            names = [f"{output.title} {number}" for number in range(len(palette))]
+            legend = _swatches(names, palette)
+        elif output.kind == "vectors":
+            values = (values + 1) / 2
+            legend = TextLegend(f"{output.what}; red, green, blue: x, y, z from -1 to 1")
+        return over_background(values.clamp(0, 1), opacity, settings), legend
 
-    return Layer(output.name, output.title, paint_output, controls, output.kind == "labels")
-
-
-def _paint_srgb(
-    values: Tensor, frame: RenderedView, settings: LayerSettings, output: Output
-) -> tuple[Picture, Legend]:
-    return _paint_linear(srgb_to_linear(values.clamp(0, 1)), frame, settings, output)
-
-
-def _paint_linear(
-    values: Tensor, frame: RenderedView, settings: LayerSettings, output: Output
-) -> tuple[Picture, Legend]:
-    return tone_mapped(values, frame.coverage, settings), TextLegend(output.what)
-
-
-def _paint_picture(
-    values: Tensor, frame: RenderedView, settings: LayerSettings, output: Output
-) -> tuple[Picture, Legend]:
-    return over_background(values.clamp(0, 1), frame.opacity, settings), TextLegend(output.what)
-
-
-def _paint_vectors(
-    values: Tensor, frame: RenderedView, settings: LayerSettings, output: Output
-) -> tuple[Picture, Legend]:
-    legend = TextLegend(f"{output.what}; red, green, blue: x, y, z from -1 to 1")
-    return over_background(((values + 1) / 2).clamp(0, 1), frame.opacity, settings), legend
+    return Layer(output.name, output.title, paint, _PAINTED_KINDS[output.kind], output.kind == "labels")
 
 
 def _paint_map(
-    values: Tensor, frame: RenderedView, settings: LayerSettings, output: Output
+    values: Float[Tensor, "H W"], opacity: Float[Tensor, "H W"], settings: LayerSettings, output: Output
 ) -> tuple[Picture, Legend]:
     is_known = values.isfinite()
-    seen = values[is_known & (frame.opacity > OCCUPIED_ACCUMULATION)]
-    scale = settings.value_range or output.value_range or _percentile_range(seen)
-    picture = paint_values(values, scale, settings.colour_map)
-    legend = ColourMapLegend(settings.colour_map, *scale, output.what)
+    seen = values[is_known & (opacity > OCCUPIED_ACCUMULATION)]
+    scale = output.value_range or _percentile_range(seen)
     # Opacity itself is shown everywhere, also where there is little of it.
-    opacity = is_known.to(picture) if output.name == "accumulation" else frame.opacity * is_known
-    return over_background(picture, opacity, settings), legend
+    part = is_known.to(opacity) if output.name == "accumulation" else opacity * is_known
+    return _paint_scaled(values, part, settings, scale, output.what)
 
 
-def _paint_labels(
-    values: Tensor, frame: RenderedView, settings: LayerSettings, output: Output
+def _paint_scaled(
+    values: Float[Tensor, "H W"],
+    part: Float[Tensor, "H W"],
+    settings: LayerSettings,
+    scale: tuple[float, float],
+    label: str,
 ) -> tuple[Picture, Legend]:
-    palette = _palette().to(frame.opacity)
-    is_something = (values != NOTHING_ID).to(palette)
-    return over_background(palette[values.long()], is_something, settings), TextLegend(output.what)
+    """Values in the colours of a scale, or of the user's own, over the background where they fill but a part."""
+    shown = settings.value_range or scale
+    picture = paint_values(values, shown, settings.colour_map)
+    return over_background(picture, part, settings), ColourMapLegend(settings.colour_map, *shown, label)
 
 
-def _paint_shares(
-    values: Tensor, frame: RenderedView, settings: LayerSettings, output: Output
-) -> tuple[Picture, Legend]:
-    """The colours that labels have, mixed by the shares."""
-    palette = _palette()[: values.shape[-1]].to(values)
-    shares = values / values.sum(dim=-1, keepdim=True).clamp(min=1e-6)
-    names = (f"{output.title} {number}" for number in range(len(palette)))
-    legend = SwatchLegend(tuple(zip(names, map(tuple, palette.tolist()), strict=True)))
-    return over_background(shares @ palette, frame.opacity, settings), legend
-
-
-def _palette() -> Tensor:
-    """A colour for each id, (256, 3); those of neighbours are far apart."""
-    return colour_table("turbo")[torch.arange(256) * 389 % 1024]
-
-
-_PAINTERS: dict[OutputKind, tuple[_Paint, frozenset[str]]] = {
-    "srgb": (_paint_srgb, frozenset({"tone"})),
-    "linear": (_paint_linear, frozenset({"tone"})),
-    "picture": (_paint_picture, frozenset()),
-    "grey": (_paint_map, frozenset({"scale"})),
-    "map": (_paint_map, frozenset({"scale"})),
-    "labels": (_paint_labels, frozenset()),
-    "shares": (_paint_shares, frozenset()),
-    "vectors": (_paint_vectors, frozenset()),
-}
-
-_PAINTED_KINDS = frozenset(_PAINTERS)
-"""Kinds of outputs that can be painted without knowing more of them."""
+def _swatches(names: Sequence[str], colours: Float[Tensor, "K 3"]) -> SwatchLegend:
+    return SwatchLegend(tuple(zip(names, map(tuple, colours.tolist()), strict=True)))
 
 
 _CHUNK = 1 << 16
@@ -302,43 +259,26 @@ def _paint_index(frame: MaterialView, settings: LayerSettings, aids: LayerAids) 
         ConfigError: none is chosen, an unknown one, or a formula that can't be read.
         SpectrumError: the bands do not cover what it needs.
     """
-    materials = frame.materials
-    index = _chosen_index(settings, materials.bands)
-    values = _index_values(index, frame)
-    scale = (
-        settings.value_range
-        or index.usual_range
-        or _seen_range(index, aids.reference.coefficients, materials)
-    )
-    what = index.what if len(index.what) <= _LONGEST_LABEL else f"{index.what[:_LONGEST_LABEL]}..."
-    label = what if materials.light is not None else f"{what}; of radiance: light unknown"
-    picture = paint_values(values, scale, settings.colour_map)
-    opacity = frame.coefficients.accumulation * values.isfinite()
-    return over_background(picture, opacity, settings), ColourMapLegend(settings.colour_map, *scale, label)
-
-
-def _chosen_index(settings: LayerSettings, bands: Bands) -> SpectralIndex:
+    materials, bands = frame.materials, frame.materials.bands
     if not settings.index:
-        edges = bands.edges_nm
+        edges, centers = bands.edges_nm, bands.centers_nm
         raise ConfigError(
             f"no spectral index is chosen: type a formula of the wavelengths from {edges[0]:g} to {edges[-1]:g} nm "
-            f"that the bands cover, such as r{float(bands.centers_nm[-1]):g}/r{float(bands.centers_nm[0]):g}"
+            f"that the bands cover, such as r{float(centers[-1]):g}/r{float(centers[0]):g}"
         )
-    return parse_index(settings.index, bands)
-
-
-def _index_values(index: SpectralIndex, view: MaterialView) -> Float[Tensor, "H W"]:
-    """The index of every pixel, chunk by chunk: the spectra of a whole picture may not fit into memory."""
-    rows = view.coefficients.flatten()
+    index, rows = parse_index(settings.index, bands), frame.coefficients.flatten()
+    # Chunk by chunk: the spectra of a whole picture may not fit into memory.
     chunks = [rows.map(lambda _, part=part: part) for part in rows.packed.split(_CHUNK)]
-    values = torch.cat([index(view.materials.reflectance(chunk)) for chunk in chunks])
-    return values.unflatten(0, view.opacity.shape)
-
-
-def _seen_range(index: SpectralIndex, reference: Coefficients, materials: Materials) -> tuple[float, float]:
-    """From the 1st to the 99th percentile of the index of the reference rays."""
-    values = index(materials.reflectance(reference))
-    return _percentile_range(values[values.isfinite()])
+    values = torch.cat([index(materials.reflectance(chunk)) for chunk in chunks]).unflatten(
+        0, frame.opacity.shape
+    )
+    scale = settings.value_range or index.usual_range
+    if scale is None:
+        seen = index(materials.reflectance(aids.reference.coefficients))
+        scale = _percentile_range(seen[seen.isfinite()])
+    what = index.what if len(index.what) <= _LONGEST_LABEL else f"{index.what[:_LONGEST_LABEL]}..."
+    label = what if materials.light is not None else f"{what}; of radiance: light unknown"
+    return _paint_scaled(values, frame.opacity * values.isfinite(), settings, scale, label)
 
 
 def _paint_colour(diffuse: bool, specular: bool) -> _Painter:
@@ -364,22 +304,21 @@ def _paint_false_colour(frame: MaterialView, settings: LayerSettings, _: LayerAi
 
 
 def _paint_band(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
-    bands = frame.materials.bands
+    materials, bands = frame.materials, frame.materials.bands
     band = bands.nearest(covered(bands, settings.wavelength_nm))
     column = torch.eye(len(bands))[:, band : band + 1]
     reference = aids.reference.coefficients
-    solid = frame.materials.through(reference, column)[:, 0] / reference.accumulation.clamp(min=1e-3)
-    scale = aids.reference.range_of(solid)
-    label = f"radiance at {bands.centers_nm[band]:.0f} nm"
-    values = _unpremultiplied(frame.materials.through(frame.coefficients, column), frame.coverage)[..., 0]
-    return _paint_seen(values, frame.coverage, settings, scale, label)
+    solid = materials.through(reference, column)[:, 0] / reference.accumulation.clamp(min=1e-3)
+    values = _unpremultiplied(materials.through(frame.coefficients, column), frame.coverage)[..., 0]
+    scale, label = _percentile_range(solid, low_at_most=0.0), f"radiance at {bands.centers_nm[band]:.0f} nm"
+    return _paint_scaled(values, frame.coverage, settings, scale, label)
 
 
 def _paint_abundance(frame: MaterialView, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
-    index = min(max(settings.endmember, 0), len(frame.materials.names) - 1)
+    names = frame.materials.names
+    index = min(max(settings.endmember, 0), len(names) - 1)
     values = _unpremultiplied(frame.coefficients.abundances, frame.opacity)[..., index]
-    label = f"abundance of {frame.materials.names[index]}"
-    return _paint_seen(values, frame.opacity, settings, (0.0, 1.0), label)
+    return _paint_scaled(values, frame.opacity, settings, (0.0, 1.0), f"abundance of {names[index]}")
 
 
 def _paint_abundances(
@@ -387,69 +326,43 @@ def _paint_abundances(
 ) -> tuple[Picture, Legend]:
     colours = aids.colours_of(frame.materials)
     picture = _unpremultiplied(frame.coefficients.abundances, frame.opacity) @ colours
-    return over_background(picture, frame.coefficients.accumulation, settings), _swatches(frame, colours)
+    return over_background(picture, frame.opacity, settings), _swatches(frame.materials.names, colours)
 
 
 def _paint_segmentation(
     frame: MaterialView, settings: LayerSettings, aids: LayerAids
 ) -> tuple[Picture, Legend]:
-    ids = frame["segmentation"]
-    colours = aids.colours_of(frame.materials)
+    ids, colours = frame["segmentation"], aids.colours_of(frame.materials)
     palette = torch.cat([colours, colours.new_zeros(256 - len(colours), 3)])
-    is_something = (ids != NOTHING_ID).to(colours.dtype)
-    return over_background(palette[ids.long()], is_something, settings), _swatches(frame, colours)
+    picture = over_background(palette[ids.long()], (ids != NOTHING_ID).to(colours.dtype), settings)
+    return picture, _swatches(frame.materials.names, colours)
 
 
 def _paint_pca(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
     colours = aids.pca_of(frame.materials)
-    components = (
-        _unpremultiplied(frame.materials.through(frame.coefficients, colours.axes), frame.opacity)
-        - colours.mean @ colours.axes
-    )
+    seen = _unpremultiplied(frame.materials.through(frame.coefficients, colours.axes), frame.opacity)
+    components = seen - colours.mean @ colours.axes
     stretched = (components - colours.low) / (colours.high - colours.low).clamp(min=1e-9)
     legend = TextLegend("red, green, blue: first, second, third principal component of the spectra")
-    return over_background(stretched.clamp(0, 1), frame.coefficients.accumulation, settings), legend
+    return over_background(stretched.clamp(0, 1), frame.opacity, settings), legend
 
 
 def _paint_depth(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
-    scale = settings.value_range or aids.depth_range(frame)
-    picture = paint_values(frame.depth, scale, settings.colour_map)
-    legend = ColourMapLegend(settings.colour_map, *scale, "distance along the viewing axis, world units")
-    return over_background(picture, frame.coefficients.accumulation, settings), legend
+    label = "distance along the viewing axis, world units"
+    return _paint_scaled(frame.depth, frame.opacity, settings, aids.depth_range(frame), label)
 
 
 def _paint_error(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
     if aids.error_of is None:
         raise ConfigError(f"no error to show: {aids.why_no_error}")
     values, is_known, view = aids.error_of(frame)
-    scale = settings.value_range or (0.0, 0.1)
-    picture = paint_values(values, scale, settings.colour_map)
     label = f"mean absolute error of the bands against training view {view}, where it sees the same"
-    legend = ColourMapLegend(settings.colour_map, *scale, label)
-    return over_background(picture, is_known.to(picture.dtype), settings), legend
-
-
-def _paint_seen(
-    values: Float[Tensor, "H W"],
-    part: Float[Tensor, "H W"],
-    settings: LayerSettings,
-    scale: tuple[float, float],
-    label: str,
-) -> tuple[Picture, Legend]:
-    """Values of what is seen in the colours of a scale, over the background where it fills but a part of a pixel."""
-    shown = settings.value_range or scale
-    picture = paint_values(values, shown, settings.colour_map)
-    legend = ColourMapLegend(settings.colour_map, *shown, label)
-    return over_background(picture, part, settings), legend
+    return _paint_scaled(values, is_known.to(values), settings, (0.0, 0.1), label)
 
 
 def _unpremultiplied(values: Float[Tensor, "H W C"], part: Float[Tensor, "H W"]) -> Float[Tensor, "H W C"]:
     """Values of what is seen in a part of each pixel, rather than of what is seen on black."""
     return values / part.clamp(min=1e-3)[..., None]
-
-
-def _swatches(frame: MaterialView, colours: Float[Tensor, "K 3"]) -> SwatchLegend:
-    return SwatchLegend(tuple(zip(frame.materials.names, map(tuple, colours.tolist()), strict=True)))
 
 
 def covered(bands: Bands, wavelength_nm: float) -> float:

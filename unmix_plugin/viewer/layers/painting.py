@@ -1,8 +1,7 @@
 """How values and light become pictures, as a user has chosen to see them, and what the colours mean.
 
 Notation: pictures are (H, W, 3) sRGB in [0, 1]; `light` is linear RGB in sRGB primaries, 0 and up, 1 = the
-sensor's full
-scale before exposure.
+sensor's full scale before exposure.
 """
 
 from __future__ import annotations
@@ -23,8 +22,14 @@ from unmix_plugin.figures.plotting import css_colour
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import agx, linear_to_srgb, srgb_to_linear
 from unmix_plugin.spectral.maps.indices import available_indices
-from unmix_plugin.viewer import page as html
-from unmix_plugin.viewer.page import choice, number, text
+from unmix_plugin.viewer.page import BLOCK_STYLE, choice, number, paragraph, swatches, text
+
+_ViewTransform = Literal["srgb", "agx"]
+VIEW_TRANSFORMS: dict[_ViewTransform, str] = {
+    "srgb": "sRGB (exact up to white)",
+    "agx": "AgX (keeps highlights)",
+}
+"""Names and what users read."""
 
 BACKGROUNDS = {"grey": 0.92, "white": 1.0, "black": 0.0}
 """sRGB value of what shows nothing; grey is that of the figures."""
@@ -84,16 +89,12 @@ def _checked_range(value: Any, before: tuple[float, float] | None) -> tuple[floa
     return (low, high) if low < high else before
 
 
-def _checked_wavelengths(value: Any, before: tuple[float, float, float]) -> tuple[float, float, float]:
-    try:
-        red, green, blue = value
-    except (TypeError, ValueError):
+def _checked_wavelengths(value: Any, before: tuple[float, float, float]) -> tuple[float, ...]:
+    if not isinstance(value, list | tuple) or len(value) != 3:
         return before
-    checked = [
-        number(one, *_WAVELENGTH_BOUNDS, fallback=old)
-        for one, old in zip((red, green, blue), before, strict=True)
-    ]
-    return (checked[0], checked[1], checked[2])
+    return tuple(
+        number(one, *_WAVELENGTH_BOUNDS, fallback=old) for one, old in zip(value, before, strict=True)
+    )
 
 
 _CHECKS: dict[str, Callable[[Any, Any], Any]] = {
@@ -111,31 +112,6 @@ _CHECKS: dict[str, Callable[[Any, Any], Any]] = {
     "view_transform": lambda value, before: choice(value, VIEW_TRANSFORMS, before),
     "background": lambda value, before: choice(value, BACKGROUNDS, before),
 }
-
-
-_ViewTransform = Literal["srgb", "agx"]
-VIEW_TRANSFORMS: dict[_ViewTransform, str] = {
-    "srgb": "sRGB (exact up to white)",
-    "agx": "AgX (keeps highlights)",
-}
-"""Names and what users read."""
-
-
-def to_display(
-    light: Float[Tensor, "*pixels 3"], exposure_ev: float, gamma: float, transform: _ViewTransform
-) -> Float[Tensor, "*pixels 3"]:
-    """Light as a display shows it.
-
-    Args:
-        light: Linear RGB.
-        exposure_ev: Stops: each doubles the light.
-        gamma: Applied last; above 1 lifts what is dark.
-        transform: `srgb` clips at white; `agx` compresses 16.5 stops, as film does.
-    """
-    exposed = light * 2.0**exposure_ev
-    shown = agx(exposed) if transform == "agx" else linear_to_srgb(exposed.clamp(0, 1))
-    shown = shown.clamp(0, 1)
-    return shown if math.isclose(gamma, 1.0) else shown.pow(1 / gamma)
 
 
 Picture: TypeAlias = Float[Tensor, "H W 3"]
@@ -168,6 +144,23 @@ class TextLegend:
 
 
 Legend: TypeAlias = ColourMapLegend | SwatchLegend | TextLegend
+
+
+def to_display(
+    light: Float[Tensor, "*pixels 3"], exposure_ev: float, gamma: float, transform: _ViewTransform
+) -> Float[Tensor, "*pixels 3"]:
+    """Light as a display shows it.
+
+    Args:
+        light: Linear RGB.
+        exposure_ev: Stops: each doubles the light.
+        gamma: Applied last; above 1 lifts what is dark.
+        transform: `srgb` clips at white; `agx` compresses 16.5 stops, as film does.
+    """
+    exposed = light * 2.0**exposure_ev
+    shown = agx(exposed) if transform == "agx" else linear_to_srgb(exposed.clamp(0, 1))
+    shown = shown.clamp(0, 1)
+    return shown if math.isclose(gamma, 1.0) else shown.pow(1 / gamma)
 
 
 def paint_values(values: Float[Tensor, "H W"], scale: tuple[float, float], colour_map: str) -> Picture:
@@ -212,19 +205,15 @@ def as_bytes(picture: Picture) -> UInt8[np.ndarray, "H W 3"]:
 
 def legend_html(shown: Legend) -> str:
     """What the colours of a picture mean."""
-    if isinstance(shown, ColourMapLegend):
-        return _colour_bar(shown)
+    if isinstance(shown, TextLegend):
+        return paragraph(shown.text)
     if isinstance(shown, SwatchLegend):
-        return html.swatches(shown.entries)
-    return html.paragraph(shown.text)
-
-
-def _colour_bar(shown: ColourMapLegend) -> str:
-    table_rows = colour_table(shown.colour_map)
-    chosen = np.linspace(0, len(table_rows) - 1, 17).round().astype(int)
-    stops = ",".join(css_colour(table_rows[index].tolist()) for index in chosen)
+        return swatches(shown.entries)
+    table = colour_table(shown.colour_map)
+    chosen = np.linspace(0, len(table) - 1, 17).round().astype(int)
+    stops = ",".join(css_colour(table[index].tolist()) for index in chosen)
     return (
-        f'<div style="{html.BLOCK_STYLE}"><div>{escape(shown.label)}</div>'
+        f'<div style="{BLOCK_STYLE}"><div>{escape(shown.label)}</div>'
         f'<div style="height:0.9em;background:linear-gradient(to right,{stops})"></div>'
         '<div style="display:flex;justify-content:space-between">'
         f"<span>{shown.low:.4g}</span><span>{(shown.low + shown.high) / 2:.4g}</span>"

@@ -8,17 +8,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from unmix_plugin.editing import recipe_to_yaml
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.formats.files import write_file
+from unmix_plugin.formats.files import rgba_png_bytes, write_file
 from unmix_plugin.trained.camera_files.camera_files import camera_file_bytes
+from unmix_plugin.trained.protocol import RenderedView
+from unmix_plugin.trained.run_views import RunView
 from unmix_plugin.trained.world_frame import world_frame
 from unmix_plugin.viewer.page import new_file, number
 from unmix_plugin.viewer.rendering.captures import (
     SIDE_BOUNDS,
-    PictureCanvas,
-    PictureRequest,
     SpectraCanvas,
     StripCapture,
     VideoJob,
@@ -27,20 +29,14 @@ from unmix_plugin.viewer.rendering.captures import (
     render_argv,
 )
 from unmix_plugin.viewer.session import Session
-from unmix_plugin.viewer.view_cameras import (
-    FPS_BOUNDS,
-    MOST_KEY_FRAMES,
-    SECONDS_BOUNDS,
-    ViewPose,
-    camera_of,
-    path_poses,
-    path_views,
-    sized_camera,
-)
+from unmix_plugin.viewer.view_cameras import ViewPose, camera_of, path_poses, sized_camera
 
+_MOST_KEY_FRAMES = 100
+_SECONDS_BOUNDS = (0.5, 120.0)
+_FPS_BOUNDS = (1, 60)
 _PREVIEW_FPS = 12
 _LARGEST_DOWNLOAD = 1 << 26
-_NO_KEY = "none yet"
+_NO_KEYS: tuple[str, ...] = ("none yet",)
 
 
 class CapturePanel:
@@ -53,32 +49,32 @@ class CapturePanel:
         self._keys: list[ViewPose] = []
         self._preview = threading.Event()
         gui = session.client.gui
+
+        def add_button(label: str, work: Callable[[], None]) -> None:
+            gui.add_button(label).on_click(session.guarded(work))
+
         with gui.add_folder("picture"):
             self._width = gui.add_number("width", 1024, min=SIDE_BOUNDS[0], max=SIDE_BOUNDS[1], step=1)
             self._height = gui.add_number("height", 1024, min=SIDE_BOUNDS[0], max=SIDE_BOUNDS[1], step=1)
             self._name = gui.add_text("file name", "view")
             self._progress = gui.add_progress_bar(0.0)
-            gui.add_button("save a screenshot (PNG)").on_click(session.guarded(self._save_picture))
+            add_button("save a screenshot (PNG)", self._save_picture)
             if session.services.has_materials:
-                gui.add_button("save the spectra (EXR)").on_click(session.guarded(self._save_spectra))
-            gui.add_button("cancel").on_click(session.guarded(self._cancel))
+                add_button("save the spectra (EXR)", self._save_spectra)
+            add_button("cancel", self._cancel)
         with gui.add_folder("camera path"):
-            gui.add_button("add a key frame here").on_click(session.guarded(self._add_key))
-            self._key = gui.add_dropdown("key frame", _no_keys())
+            add_button("add a key frame here", self._add_key)
+            self._key = gui.add_dropdown("key frame", _NO_KEYS)
             keys = gui.add_button_group("this one", ("look", "replace", "remove"))
             keys.on_click(session.guarded(lambda: self._change_key(str(keys.value))))
-            self._seconds = gui.add_number(
-                "seconds", 4.0, min=SECONDS_BOUNDS[0], max=SECONDS_BOUNDS[1], step=0.5
-            )
-            self._fps = gui.add_number("frames a second", 24, min=FPS_BOUNDS[0], max=FPS_BOUNDS[1], step=1)
+            low, high = _SECONDS_BOUNDS
+            self._seconds = gui.add_number("seconds", 4.0, min=low, max=high, step=0.5)
+            self._fps = gui.add_number("frames a second", 24, min=_FPS_BOUNDS[0], max=_FPS_BOUNDS[1], step=1)
             preview = gui.add_button_group("preview", ("play", "stop"))
             preview.on_click(session.guarded(lambda: self._play(preview.value == "play")))
-            gui.add_button("save the path").on_click(
-                session.guarded(lambda: self._say_saved(self._save_path()))
-            )
-            gui.add_button("render a video").on_click(session.guarded(self._render_video))
-
-            gui.add_button("cancel the video").on_click(session.guarded(self._cancel_video))
+            add_button("save the path", lambda: session.say("saved", str(self._save_path())))
+            add_button("render a video", self._render_video)
+            add_button("cancel the video", self._cancel_video)
             self._video_progress = gui.add_progress_bar(0.0)
         session.on_close.append(self._abandon)
 
@@ -91,66 +87,62 @@ class CapturePanel:
         if self._capture is not None:
             self._capture.cancel()
 
-    def _size(self) -> tuple[int, int]:
-        """Width and height asked for.
-
-        Raises:
-            ConfigError: one is out of bounds.
-        """
-        return _side(self._width), _side(self._height)
-
     def _camera(self, num_bands: int | None = None) -> Cameras:
         """What the client sees, in the size asked for: the vertical field of view stays.
 
         Raises:
             ConfigError: too small or too large a picture, or one with too many spectra.
         """
-        width, height = self._size()
+        width, height = _side(self._width), _side(self._height)
         check_size(width, height, num_bands)
         return sized_camera(self._session.pose(), width, height)
 
     def _save_picture(self) -> None:
         camera = self._camera()
-        session, canvas = self._session, PictureCanvas(camera)
-        settings, maker = session.view.settings, session.services.maker
+        settings, maker = self._session.view.settings, self._session.services.maker
+        pixels = np.zeros((camera.height, camera.width, 3), np.uint8)
         path = self._new_file(".png")
 
-        def finish() -> None:
-            canvas.write(path, f"{settings.layer}, {camera.width} x {camera.height} pixels")
-            self._hand_over(path)
+        def take(row: int, frame: RenderedView) -> None:
+            strip = maker.paint(frame, settings, False, False).picture
+            pixels[row : row + len(strip)] = strip
 
-        self._begin(
-            camera,
-            lambda row, frame: canvas.take(row, maker.paint(frame, settings, False, False).picture),
-            finish,
-        )
+        def finish() -> None:
+            what = f"{settings.layer}, {camera.width} x {camera.height} pixels"
+            self._hand_over(write_file(path, rgba_png_bytes(pixels, what)))
+
+        self._begin(camera, take, finish)
 
     def _save_spectra(self) -> None:
-        bands = self._session.materials().bands
-        camera = self._camera(len(bands))
-        canvas, path = SpectraCanvas(camera, len(bands)), self._new_file(".exr")
+        num_bands = len(self._session.materials().bands)
+        camera = self._camera(num_bands)
+        canvas, path = SpectraCanvas(camera, num_bands), self._new_file(".exr")
         self._begin(camera, canvas.take, lambda: self._hand_over(canvas.write(path)))
 
-    def _begin(self, camera: Cameras, take: Callable[..., None], finish: Callable[[], None]) -> None:
+    def _begin(
+        self, camera: Cameras, take: Callable[[int, RenderedView], None], finish: Callable[[], None]
+    ) -> None:
         if self._capture is not None:
             raise ConfigError("a picture is being rendered already; wait for it or cancel it")
         session = self._session
 
         def done(reason: str) -> None:
             self._capture = None
-            self._show_progress(0.0)
+            show_progress(0.0)
             if reason:
                 session.warn(reason, "no picture")
             else:
                 session.guarded(finish)()
 
-        request = PictureRequest(camera, session.view.edit, session.view.subpixels)
-        self._capture = StripCapture(session.services.loop, request, take, done, self._show_progress)
-        self._capture.start()
+        def show_progress(fraction: float) -> None:
+            if not session.is_closed:
+                self._progress.value = 100.0 * fraction
 
-    def _show_progress(self, fraction: float | int) -> None:
-        if not self._session.is_closed:
-            self._progress.value = 100.0 * fraction
+        view = session.view
+        self._capture = StripCapture(
+            session.services.loop, camera, view.edit, view.subpixels, take, done, show_progress
+        )
+        self._capture.start()
 
     def _new_file(self, suffix: str) -> Path:
         return new_file(self._session.services.folder, self._name.value, suffix, "view")
@@ -159,20 +151,17 @@ class CapturePanel:
         """Offer a file that was written to the browser as well, if it is not too large."""
         if path.stat().st_size <= _LARGEST_DOWNLOAD:
             self._session.client.send_file_download(path.name, path.read_bytes())
-        self._say_saved(path)
-
-    def _say_saved(self, path: Path) -> None:
         self._session.say("saved", str(path))
 
     def _add_key(self) -> None:
-        if len(self._keys) >= MOST_KEY_FRAMES:
-            raise ConfigError(f"a path has at most {MOST_KEY_FRAMES} key frames")
+        if len(self._keys) >= _MOST_KEY_FRAMES:
+            raise ConfigError(f"a path has at most {_MOST_KEY_FRAMES} key frames")
         self._keys.append(self._session.pose())
         self._list_keys(len(self._keys) - 1)
 
     def _list_keys(self, chosen: int) -> None:
         count = len(self._keys)
-        names = tuple(f"{index + 1} of {count}" for index in range(count)) or _no_keys()
+        names = tuple(f"{index + 1} of {count}" for index in range(count)) or _NO_KEYS
         self._key.options = names
         self._key.value = names[min(max(chosen, 0), len(names) - 1)]
 
@@ -189,12 +178,21 @@ class CapturePanel:
             del self._keys[index]
             self._list_keys(index)
 
+    def _path(self, frames_per_second: float) -> list[ViewPose]:
+        """The path through the key frames.
+
+        Raises:
+            ConfigError: there are fewer than two.
+        """
+        seconds = number(self._seconds.value, *_SECONDS_BOUNDS, fallback=4.0)
+        return path_poses(self._keys, max(2, round(seconds * frames_per_second)))
+
     def _play(self, is_on: bool) -> None:
         """Move the client's camera along the path, in a thread of its own."""
         self._preview.set()
         if not is_on:
             return
-        poses = path_poses(self._keys, max(2, int(self._duration() * _PREVIEW_FPS)))
+        poses = self._path(_PREVIEW_FPS)
         stopped = self._preview = threading.Event()
 
         def play() -> None:
@@ -205,16 +203,16 @@ class CapturePanel:
 
         threading.Thread(target=play, name="unmix-viewer-preview", daemon=True).start()
 
-    def _duration(self) -> float:
-        return number(self._seconds.value, *SECONDS_BOUNDS, fallback=4.0)
-
     def _save_path(self) -> Path:
         """Write the path as a camera file for `unmix-render`."""
-        frames_per_second = number(self._fps.value, *FPS_BOUNDS, fallback=24)
-        poses = path_poses(self._keys, max(2, round(self._duration() * frames_per_second)))
-        width, height = self._size()
+        frames_per_second = number(self._fps.value, *_FPS_BOUNDS, fallback=24)
+        poses = self._path(frames_per_second)
+        width, height = _side(self._width) // 2 * 2, _side(self._height) // 2 * 2
+        views = [
+            RunView(f"path_{index:04d}", sized_camera(pose, width, height))
+            for index, pose in enumerate(poses)
+        ]
         services = self._session.services
-        views = path_views(poses, width - width % 2, height - height % 2)
         path = new_file(services.folder, f"{self._name.value}-path", ".json", "path")
         space = world_frame(services.source.record)
         return write_file(path, camera_file_bytes(views, frames_per_second, space))
@@ -224,8 +222,7 @@ class CapturePanel:
         if self._video is not None:
             raise ConfigError("a video is being rendered already; wait for it or cancel it")
         output = output_of(session.view.settings)
-        width, height = self._size()
-        check_size(width, height)
+        check_size(_side(self._width), _side(self._height))
         cameras = self._save_path()
         recipe = None
         if session.view.edit.has_recipe:
@@ -234,19 +231,19 @@ class CapturePanel:
         folder = cameras.with_suffix("")
         argv = render_argv(services.source.run.path, cameras, output, folder, recipe, session.view.edit.light)
 
-        def progress(fraction: float) -> None:
+        def show_progress(fraction: float) -> None:
             if not session.is_closed:
                 self._video_progress.value = 100.0 * fraction
 
         def done(video: Path | None, reason: str) -> None:
             self._video = None
-            progress(0.0)
+            show_progress(0.0)
             if video is None:
                 session.warn(reason, "no video")
             else:
                 session.guarded(lambda: self._hand_over(video))()
 
-        self._video = VideoJob(argv, folder, progress, done)
+        self._video = VideoJob(argv, folder, show_progress, done)
         services.videos.start(self._video)
         session.say("video", f"unmix-render writes it to {folder}, after those of other pages")
 
@@ -266,7 +263,3 @@ def _side(control: Any) -> int:
     if not low <= found <= high:
         raise ConfigError(f"{control.label} is a number of pixels from {low} to {high}; found {found:g}")
     return int(found)
-
-
-def _no_keys() -> tuple[str, ...]:
-    return (_NO_KEY,)

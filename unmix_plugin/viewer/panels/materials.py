@@ -1,13 +1,9 @@
-"""Known materials that the spectra of a scene resemble.
-
-The recipe of one client: undo and redo, its text, its files.
-
-Materials and light: every change is an edit of a recipe, the same that `--edits` takes, and can be undone.
-"""
+"""Materials and light: every change is an edit of a recipe, the same that `--edits` takes, and can be undone."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -32,17 +28,18 @@ from unmix_plugin.formats.files import write_file
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.library.material_library import LibraryMatch, measured_library
 from unmix_plugin.spectral.materials import Materials
-from unmix_plugin.viewer import page as html
-from unmix_plugin.viewer.page import Chart, Debounced, Line, index_in, new_file, number, text
-from unmix_plugin.viewer.recipes import (
-    change_of,
-    numbered,
-    visibility,
-    with_change,
-    with_light,
-    with_swap,
-    with_visible,
+from unmix_plugin.viewer.page import (
+    Chart,
+    Debounced,
+    Line,
+    index_in,
+    new_file,
+    number,
+    swatches,
+    table,
+    text,
 )
+from unmix_plugin.viewer.recipes import change_of, numbered, visibility, with_change, with_swap, with_visible
 from unmix_plugin.viewer.rendering.scene import Edit
 from unmix_plugin.viewer.session import Session
 
@@ -50,53 +47,45 @@ _ALIKE_RAD = 0.1
 """Spectral angle up to which two materials are alike."""
 
 
-def nearest_materials(
-    spectra: Float[np.ndarray, "N B"], materials: Materials, count: int = 3
+def _nearest_materials(
+    spectra: Float[np.ndarray, "N B"], materials: Materials, count: int
 ) -> list[list[LibraryMatch]]:
     """Known materials that spectra resemble, seen in the light of `materials`."""
     light = None if materials.light is None else materials.light.cpu().double().numpy()
     return measured_library().nearest(spectra, materials.bands, light, count)
 
 
-def likeness_rows(spectrum: Float[np.ndarray, "B"], materials: Materials) -> list[tuple[str, str]]:
-    """Rows of a table of the known materials that a spectrum resembles."""
-    matches = nearest_materials(spectrum[None], materials)[0]
-    return [("like" if rank == 0 else "", likeness(match)) for rank, match in enumerate(matches)]
-
-
-def likeness(match: LibraryMatch) -> str:
+def _likeness(match: LibraryMatch) -> str:
     """A known material and its spectral angle; matches that say little are marked."""
     remark = "" if match.angle_rad <= _ALIKE_RAD else ", not alike"
     return f"{match.name} ({match.angle_rad:.3f} rad{remark})"
 
 
+def likeness_rows(spectrum: Float[np.ndarray, "B"], materials: Materials) -> list[tuple[str, str]]:
+    """Rows of a table of the three known materials that a spectrum resembles most."""
+    matches = _nearest_materials(spectrum[None], materials, 3)[0]
+    return [("like" if rank == 0 else "", _likeness(match)) for rank, match in enumerate(matches)]
+
+
 _NO_RECIPE = "none saved yet"
 
 
-class RecipeControls:
-    """Keeps the recipe in force and lets it be undone, saved and loaded."""
+class _RecipeControls:
+    """The recipe of one client: undo and redo, its text, its files."""
 
     def __init__(self, session: Session, refused: Callable[[], None]) -> None:
-        """
-        Args:
-            session: Of the client.
-            refused: Called when a change does not fit the run, so that controls can show what is in force.
-        """
+        """`refused` is called when a change does not fit the run, so that controls can show what is in force."""
         self._session, self._refused = session, refused
         self._gui = session.client.gui
-        self._history = session.history
 
     @property
-    def recipe(self) -> Recipe:
+    def present(self) -> Recipe:
         """The one in force; endmembers are given by their numbers."""
-        return self._history.present
+        return self._session.history.present
 
     def change(self, recipe: Recipe, subject: Hashable = None) -> None:
         """Put a recipe in force if it fits the run.
 
-        Args:
-            recipe: The new one.
-            subject: As `RecipeHistory.take` has it.
         Raises:
             UnmixError: it does not; nothing has changed.
         """
@@ -106,7 +95,7 @@ class RecipeControls:
         except UnmixError:
             self._refused()
             raise
-        self._history.take(recipe, subject)
+        self._session.history.take(recipe, subject)
         self._session.change_edit(edit)
 
     def add_history(self) -> None:
@@ -117,7 +106,8 @@ class RecipeControls:
             if buttons.value == "start again":
                 self.change(Recipe())
                 return
-            recipe = self._history.undone() if buttons.value == "undo" else self._history.redone()
+            history = self._session.history
+            recipe = history.undone() if buttons.value == "undo" else history.redone()
             if recipe is None:
                 raise ConfigError("there is nothing more to undo or redo")
             self._session.change_edit(Edit(recipe))
@@ -135,10 +125,10 @@ class RecipeControls:
 
     def show(self) -> None:
         """Show the text of the recipe in force."""
-        self._text.value = recipe_to_yaml(self.recipe)
+        self._text.value = recipe_to_yaml(self.present)
 
     def _save(self) -> None:
-        content = recipe_to_yaml(self.recipe).encode()
+        content = recipe_to_yaml(self.present).encode()
         folder = self._session.services.recipes_folder
         path = write_file(new_file(folder, self._name.value, ".yml", "recipe"), content)
         self._saved.options = self._files()
@@ -151,8 +141,9 @@ class RecipeControls:
         self._saved.options = files
         if self._saved.value not in files or self._saved.value == _NO_RECIPE:
             raise ConfigError("choose one of the recipes saved in the run folder")
-        recipe = read_recipe(self._session.services.recipes_folder / str(self._saved.value))
-        self.change(numbered(recipe, self._session.services.maker.edited(Edit()).materials.names))
+        services = self._session.services
+        recipe = read_recipe(services.recipes_folder / str(self._saved.value))
+        self.change(numbered(recipe, services.maker.edited(Edit()).materials.names))
 
     def _files(self) -> tuple[str, ...]:
         folder = self._session.services.recipes_folder
@@ -176,7 +167,7 @@ class MaterialsPanel:
         self._is_showing = False
         self._named = 0
         self._gui = session.client.gui
-        self._recipe = RecipeControls(session, refused=self._show_chosen)
+        self._recipe = _RecipeControls(session, refused=self._show_chosen)
         self._listing = self._gui.add_html("")
         self._light = self._gui.add_dropdown("light", self._lights())
         self._on(self._light, self._change_light)
@@ -205,21 +196,16 @@ class MaterialsPanel:
             replace_button = gui.add_button("replace by the known material")
             self._other = gui.add_dropdown("other endmember", names, initial_value=names[-1])
             swap_button = gui.add_button("swap with the other")
-        for control, make in (
-            (self._factor, lambda index: Scale(index, _factor(self._factor.value))),
-            (self._colour, lambda index: Retint(index, _srgb(self._colour.value))),
-            (self._gloss, self._glossed),
-            (self._gloss_colour, self._glossed),
-        ):
-            self._on(control, lambda make=make: self._change_endmember(make(self._index)))
+        self._on(self._factor, lambda: self._change(Scale(self._index, _factor(self._factor.value))))
+        self._on(self._colour, lambda: self._change(Retint(self._index, _srgb(self._colour.value))))
+        for control in (self._gloss, self._gloss_colour):
+            self._on(control, self._change_gloss)
         for control in (self._is_visible, self._is_alone):
             self._on(control, lambda control=control: self._change_visibility(control))
         self._typed_name = Debounced(self._rename)
         self._on(self._name, self._type_name)
         self._session.on_tick.append(self._typed_name.tick)
-        replace_button.on_click(
-            self._session.guarded(lambda: self._change_endmember(self._replacement(self._index)))
-        )
+        replace_button.on_click(self._session.guarded(self._replace))
         swap_button.on_click(self._session.guarded(self._swap))
 
     @property
@@ -229,15 +215,10 @@ class MaterialsPanel:
 
     def _on(self, control: Any, work: Callable[[], None]) -> None:
         """Do something when a user changes a control, not when the panel itself does."""
+        control.on_update(self._session.guarded(lambda: None if self._is_showing else work()))
 
-        def change() -> None:
-            if not self._is_showing:
-                work()
-
-        control.on_update(self._session.guarded(change))
-
-    def _change_endmember(self, change: Replace | Retint | Scale | Rename | Gloss) -> None:
-        self._recipe.change(with_change(self._recipe.recipe, change), (type(change), change.endmember))
+    def _change(self, change: Replace | Retint | Scale | Rename | Gloss) -> None:
+        self._recipe.change(with_change(self._recipe.present, change), (type(change), change.endmember))
 
     def _type_name(self) -> None:
         self._named = self._index
@@ -247,68 +228,65 @@ class MaterialsPanel:
         """Take the name that was typed, once nothing more is; an empty field waits for more."""
         name = text(self._name.value).strip()
         if name:
-            self._change_endmember(Rename(self._named, name))
+            self._change(Rename(self._named, name))
 
     def _choose(self) -> None:
-        self._typed_name.finish()
+        self._typed_name.tick(at_once=True)
         self._show_chosen()
 
     def _change_light(self) -> None:
-        name = str(self._light.value)
-        if name not in self._lights(self._recipe.recipe.illuminant):
+        name, recipe = str(self._light.value), self._recipe.present
+        if name not in self._lights(recipe.illuminant):
             raise ConfigError(f"there is no light {name[:40]!r} to choose")
-        self._recipe.change(with_light(self._recipe.recipe, None if name == _OWN_LIGHT else Light(name)))
+        self._recipe.change(replace(recipe, illuminant=None if name == _OWN_LIGHT else Light(name)))
 
     def _change_visibility(self, control: Any) -> None:
-        hidden, _ = visibility(self._recipe.recipe)
+        hidden, _ = visibility(self._recipe.present)
         index = self._index
         if control is self._is_alone:
             alone = index if self._is_alone.value is True else None
-            changed = with_visible(self._recipe.recipe, hidden - {index}, alone)
+            changed = with_visible(self._recipe.present, hidden - {index}, alone)
         else:
             now_hidden = hidden - {index} if self._is_visible.value is True else hidden | {index}
-            changed = with_visible(self._recipe.recipe, now_hidden, None)
+            changed = with_visible(self._recipe.present, now_hidden, None)
         self._recipe.change(changed)
 
-    def _glossed(self, index: int) -> Gloss:
-        red, green, blue = self._gloss_colour.value[:3]
-        colour = None if (red, green, blue) == _WHITE else _srgb(self._gloss_colour.value)
-        return Gloss(index, _factor(self._gloss.value), colour)
+    def _change_gloss(self) -> None:
+        is_white = tuple(self._gloss_colour.value[:3]) == _WHITE
+        colour = None if is_white else _srgb(self._gloss_colour.value)
+        self._change(Gloss(self._index, _factor(self._gloss.value), colour))
 
-    def _replacement(self, index: int) -> Replace:
-        return Replace(index, LibrarySpectrum(text(self._library.value)), extrapolate=True)
+    def _replace(self) -> None:
+        known = LibrarySpectrum(text(self._library.value))
+        self._change(Replace(self._index, known, extrapolate=True))
 
     def _swap(self) -> None:
-        self._recipe.change(with_swap(self._recipe.recipe, Swap(self._index, index_in(self._other))))
+        self._recipe.change(with_swap(self._recipe.present, Swap(self._index, index_in(self._other))))
 
     def _show_materials(self) -> None:
-        """Show the materials as they are now."""
+        """Show the materials as they are now; the menus have the same endmembers chosen as before."""
         materials = self._session.materials()
-        self._show_names(materials.names)
-        colours, spectra = self._session.colours_of(materials), materials.endmembers.double().cpu().numpy()
-        lines = zip(materials.names, spectra, colours, strict=True)
-        self._chart.draw(materials.bands, [Line(name, row, colour) for name, row, colour in lines])
-        self._listing.content = self._list(materials, colours)
-        self._show_chosen(materials)
-
-    def _show_names(self, names: tuple[str, ...]) -> None:
-        """Let the menus have the names of the endmembers, each with the same one chosen as before."""
         self._is_showing = True
         try:
             for menu in (self._chosen, self._other):
                 index = index_in(menu)
-                if tuple(menu.options) != names:
-                    menu.options = names
-                    menu.value = names[index]
+                if tuple(menu.options) != materials.names:
+                    menu.options = materials.names
+                    menu.value = materials.names[index]
         finally:
             self._is_showing = False
+        colours, spectra = self._session.colours_of(materials), materials.endmembers.double().cpu().numpy()
+        lines = zip(materials.names, spectra, colours, strict=True)
+        self._chart.draw(materials.bands.centers_nm, [Line(name, row, colour) for name, row, colour in lines])
+        self._listing.content = self._list(materials, colours)
+        self._show_chosen(materials)
 
     def _show_chosen(self, materials: Materials | None = None) -> None:
         """Let the controls say what the recipe does to the endmember chosen."""
         self._is_showing = True
         try:
             materials = self._session.materials() if materials is None else materials
-            index, recipe = self._index, self._recipe.recipe
+            index, recipe = self._index, self._recipe.present
             hidden, isolated = visibility(recipe)
             self._is_visible.value = index not in hidden and (not isolated or index in isolated)
             self._is_alone.value = index in isolated
@@ -324,7 +302,7 @@ class MaterialsPanel:
             self._light.options = self._lights(recipe.illuminant)
             self._light.value = _OWN_LIGHT if recipe.illuminant is None else str(recipe.illuminant.light)
             spectrum = materials.endmembers[index].double().cpu().numpy()
-            self._alike.content = html.table(likeness_rows(spectrum, materials))
+            self._alike.content = table(likeness_rows(spectrum, materials))
             self._recipe.show()
         finally:
             self._is_showing = False
@@ -339,7 +317,7 @@ class MaterialsPanel:
 
     def _colour_of(self, materials: Materials, index: int) -> tuple[int, int, int]:
         """8-bit sRGB colour that was asked for an endmember, or that of its spectrum in full light."""
-        retint = change_of(self._recipe.recipe, Retint, index)
+        retint = change_of(self._recipe.present, Retint, index)
         if isinstance(retint, Retint):
             return _bytes(torch.tensor(retint.colour))
         linear = materials.endmembers[index] @ rgb_matrix(materials.bands).to(materials.endmembers)
@@ -347,15 +325,15 @@ class MaterialsPanel:
 
     def _list(self, materials: Materials, colours: list[tuple[float, ...]]) -> str:
         """Every endmember with its colour, its nearest known material, and whether it is hidden."""
-        hidden, isolated = visibility(self._recipe.recipe)
+        hidden, isolated = visibility(self._recipe.present)
         spectra = materials.endmembers[:_LONGEST_LIST].double().cpu().numpy()
-        matches = nearest_materials(spectra, materials, 1)
+        matches = _nearest_materials(spectra, materials, 1)
         entries = []
         for index, (name, found) in enumerate(zip(materials.names, matches, strict=False)):
             is_gone = index in hidden or (isolated and index not in isolated)
-            like = f", like {likeness(found[0])}" if found else ""
+            like = f", like {_likeness(found[0])}" if found else ""
             entries.append((f"{name}{' (hidden)' if is_gone else ''}{like}", colours[index]))
-        return html.swatches(entries)
+        return swatches(entries)
 
 
 def _factor(value: Any) -> float:

@@ -1,10 +1,6 @@
-"""What a point is made of: a ray through a click, its spectrum, its abundances, what training views measured there.
+"""Click a point: its spectrum, what it is made of, and what training views measured there; several are compared.
 
 Notation: `B` bands, `K` endmembers.
-
-Click a point: its spectrum, what it is made of, and what training views measured there; several are compared.
-
-Click a point of a scene without endmembers: the numbers of its outputs there.
 """
 
 from __future__ import annotations
@@ -17,16 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
-from torch import Tensor
+from jaxtyping import Float64
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.formats.files import write_file
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Materials
 from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.viewer import page as html
-from unmix_plugin.viewer.page import Chart, Line, new_file, number
+from unmix_plugin.viewer.page import Chart, Line, bars, new_file, number, paragraph, table
 from unmix_plugin.viewer.panels.materials import likeness_rows
 from unmix_plugin.viewer.rendering.pictures import PictureMaker
 from unmix_plugin.viewer.rendering.scene import Edit, MeasuredViews
@@ -61,19 +55,9 @@ class ProbedPoint:
     """Name of that view."""
 
     @property
-    def position(self) -> Float[Tensor, "3"]:
-        """The point as a tensor."""
-        return torch.tensor(self.point)
-
-    @property
-    def material(self) -> int:
-        """The endmember of the largest share."""
-        return int(self.abundances.argmax())
-
-    @property
     def name(self) -> str:
-        """Its name."""
-        return self.materials.names[self.material]
+        """Of the endmember of the largest share."""
+        return self.materials.names[int(self.abundances.argmax())]
 
 
 def probe_through(
@@ -89,11 +73,12 @@ def probe_through(
     Raises:
         ConfigError: nothing is there.
     """
-    last_column, last_row = camera.width - 1, camera.height - 1
-    found = scene.probe(camera, min(max(int(column), 0), last_column), min(max(int(row), 0), last_row))
+    pixel = min(max(int(column), 0), camera.width - 1), min(max(int(row), 0), camera.height - 1)
+    found = scene.probe(camera, *pixel)
     if found.opacity < OCCUPIED_ACCUMULATION or found.position is None or found.world_position is None:
         raise ConfigError("nothing is there to probe: less than half of the light ends on something")
-    (x, y, z), (world_x, world_y, world_z) = found.position.tolist(), found.world_position.tolist()
+    x, y, z = found.position.tolist()
+    world_x, world_y, world_z = found.world_position.tolist()
     endmembers = scene.materials.endmembers.double().cpu().numpy()
     return ProbedPoint(
         number,
@@ -128,7 +113,8 @@ def take_probe(
     """
     with maker.edit_turn(edit) as (scene, shown):
         taken = probe_through(shown, camera, *place, number)
-        found = measured and measured.measurement(taken.position, camera, shown.light_power, scene)
+        point = torch.tensor(taken.point)
+        found = measured and measured.measurement(point, camera, shown.light_power, scene)
     if found is None:
         return taken
     view = f"{found.view}, before the edits" if edit.recipe.operations else found.view
@@ -165,12 +151,11 @@ def abundances_csv(probes: Sequence[ProbedPoint]) -> bytes:
 
 def _csv(header: Sequence[str], rows: Sequence[Sequence[str]]) -> bytes:
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerows([header, *rows])
+    csv.writer(text, lineterminator="\n").writerows([header, *rows])
     return text.getvalue().encode()
 
 
-MOST_PROBES = 12
+_MOST_PROBES = 12
 """Probes that a client keeps; the first goes when another comes."""
 
 _COLOURS = (
@@ -185,8 +170,9 @@ _SHOWN_SHARE = 0.08
 """Endmembers of at least this share: what they add to a probe's spectrum is drawn beside it."""
 
 _PROBED_ROWS = 512
-_PROBE_RADIUS = 0.015
-_NONE = "none yet"
+_MARKER_RADIUS = 0.015
+_NO_PROBES: tuple[str, ...] = ("none yet",)
+_INVITATION = "Click a point of the picture."
 
 
 class ProbePanel:
@@ -199,71 +185,66 @@ class ProbePanel:
         self._taken = 0
         gui = session.client.gui
         self._is_on = gui.add_checkbox("probe where I click", True)
-        self._chosen = gui.add_dropdown("probe", _no_probes())
+        self._chosen = gui.add_dropdown("probe", _NO_PROBES)
         self._chosen.on_update(session.guarded(self._show_chosen))
-        self._text = gui.add_html(html.paragraph("Click a point of the picture."))
+        self._text = gui.add_html(paragraph(_INVITATION))
         self._bars = gui.add_html("")
         self._chart = Chart(gui, "spectrum")
         self._comparison = Chart(gui, "all probes")
         gui.add_button("save as CSV").on_click(session.guarded(self._save))
         gui.add_button("forget all").on_click(session.guarded(self._forget))
-        session.client.scene.on_click()(self._clicked)
-
-    def _clicked(self, event: viser.SceneClickEvent) -> None:
-        x, y = event.screen_pos
-        self._session.guarded(lambda: self._take(x, y))()
+        session.client.scene.on_click()(
+            lambda event: session.guarded(lambda: self._take(*event.screen_pos))()
+        )
 
     def _take(self, x: Any, y: Any) -> None:
         """Probe a point of the canvas, given in parts of its width and height."""
         if self._is_on.value is not True:
             return
-        column, row = (number(value, 0.0, 1.0, fallback=0.5) for value in (x, y))
         session, services = self._session, self._session.services
-        camera = camera_of(session.pose(), _PROBED_ROWS)
-        place = (column * camera.width, row * camera.height)
+        camera, place = _clicked(session, x, y)
         taken = take_probe(
             services.maker, session.view.edit, camera, place, self._taken + 1, services.aids.measured
         )
         self._taken += 1
         self._probes.append(taken)
-        while len(self._probes) > MOST_PROBES:
+        while len(self._probes) > _MOST_PROBES:
             self._drop(self._probes[0])
+        red, green, blue = (int(255 * value) for value in _colour(taken))
         self._markers[taken.number] = session.client.scene.add_icosphere(
-            f"/probes/{taken.number}", _PROBE_RADIUS, color=_marker(taken), position=taken.point
+            f"/probes/{taken.number}", _MARKER_RADIUS, color=(red, green, blue), position=taken.point
         )
         session.show_objects("probe", True)
         self._chosen.options = tuple(_label(one) for one in self._probes)
         self._chosen.value = _label(taken)  # which shows it
 
     def _show_chosen(self) -> None:
-        chosen = next((one for one in self._probes if _label(one) == self._chosen.value), None)
-        if chosen is not None:
-            self._show(chosen)
-
-    def _show(self, shown: ProbedPoint) -> None:
-        rows = [
-            ("material", shown.name),
-            ("position", ", ".join(f"{value:.4g}" for value in shown.world)),
-            ("measured in", shown.measured_in or "no training view at hand sees the point"),
-            *likeness_rows(shown.predicted, shown.materials),
-        ]
-        self._text.content = html.table(rows)
-        names, bands = shown.materials.names, shown.materials.bands
+        shown = next((one for one in self._probes if _label(one) == self._chosen.value), None)
+        if shown is None:
+            return
+        self._text.content = table(
+            [
+                ("material", shown.name),
+                ("position", ", ".join(f"{value:.4g}" for value in shown.world)),
+                ("measured in", shown.measured_in or "no training view at hand sees the point"),
+                *likeness_rows(shown.predicted, shown.materials),
+            ]
+        )
+        names, wavelengths = shown.materials.names, shown.materials.bands.centers_nm
         colours = self._session.colours_of(shown.materials)
         entries = zip(names, shown.abundances.tolist(), colours, strict=True)
-        self._bars.content = html.bars(sorted(entries, key=lambda entry: -entry[1])[:16])
+        self._bars.content = bars(sorted(entries, key=lambda entry: -entry[1])[:16])
         lines = [Line("predicted", shown.predicted, _colour(shown))]
         if shown.measured is not None:
-            lines.append(
-                Line(f"measured, {shown.measured_in}", shown.measured, (0.35, 0.35, 0.35), is_dashed=True)
-            )
+            grey = (0.35, 0.35, 0.35)
+            lines.append(Line(f"measured, {shown.measured_in}", shown.measured, grey, is_dashed=True))
         lines += [
             Line(names[index], shown.contributions[index], colours[index], is_thin=True)
             for index in np.flatnonzero(shown.abundances >= _SHOWN_SHARE)
         ]
-        self._chart.draw(bands, lines)
+        self._chart.draw(wavelengths, lines)
         self._comparison.draw(
-            bands, [Line(f"probe {one.number}", one.predicted, _colour(one)) for one in self._probes]
+            wavelengths, [Line(f"probe {one.number}", one.predicted, _colour(one)) for one in self._probes]
         )
 
     def _save(self) -> None:
@@ -276,16 +257,16 @@ class ProbePanel:
         ):
             path = write_file(new_file(folder, name, ".csv", name), content)
             self._session.client.send_file_download(path.name, content)
-        self._session.say("saved", f"{path.parent}: spectra and abundances of {len(self._probes)} probes")
+        self._session.say("saved", f"{folder}: spectra and abundances of {len(self._probes)} probes")
 
     def _forget(self) -> None:
         for one in list(self._probes):
             self._drop(one)
         self._session.show_objects("probe", False)
-        self._chosen.options = _no_probes()
-        self._text.content, self._bars.content = html.paragraph("Click a point of the picture."), ""
-        self._chart.clear()
-        self._comparison.clear()
+        self._chosen.options = _NO_PROBES
+        self._text.content, self._bars.content = paragraph(_INVITATION), ""
+        for chart in (self._chart, self._comparison):
+            chart.draw(np.zeros(0), ())
 
     def _drop(self, one: ProbedPoint) -> None:
         self._probes.remove(one)
@@ -300,42 +281,34 @@ def _colour(one: ProbedPoint) -> tuple[float, float, float]:
     return _COLOURS[(one.number - 1) % len(_COLOURS)]
 
 
-def _marker(one: ProbedPoint) -> tuple[int, int, int]:
-    red, green, blue = (int(255 * value) for value in _colour(one))
-    return red, green, blue
+def _clicked(session: Session, x: Any, y: Any) -> tuple[Cameras, tuple[float, float]]:
+    """The camera of a client's canvas, and the column and row of a click given in parts of its width and height."""
+    camera = camera_of(session.pose(), _PROBED_ROWS)
+    x, y = (number(value, 0.0, 1.0, fallback=0.5) for value in (x, y))
+    return camera, (min(x * camera.width, camera.width - 1), min(y * camera.height, camera.height - 1))
 
 
-def _no_probes() -> tuple[str, ...]:
-    return (_NONE,)
-
-
-_PROBED_ROWS_VALUES_PANEL = 512
 _MOST_NUMBERS = 8
 
 
 class ValuesPanel:
-    """Shows what a scene is at the point that was clicked last."""
+    """The numbers of the outputs of a scene without endmembers at the point that was clicked last."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._text = session.client.gui.add_html(html.paragraph("Click a point of the picture."))
-        session.client.scene.on_click()(self._clicked)
+        self._text = session.client.gui.add_html(paragraph(_INVITATION))
+        session.client.scene.on_click()(
+            lambda event: session.guarded(lambda: self._take(*event.screen_pos))()
+        )
 
-    def _clicked(self, event: viser.SceneClickEvent) -> None:
-        x, y = event.screen_pos
-        self._session.guarded(lambda: self._take(x, y))()
-
-    def _take(self, x: float, y: float) -> None:
-        """Probe a point of the canvas, given in parts of its width and height."""
-        camera = camera_of(self._session.pose(), _PROBED_ROWS_VALUES_PANEL)
-        column = min(int(number(x, 0.0, 1.0, fallback=0.5) * camera.width), camera.width - 1)
-        row = min(int(number(y, 0.0, 1.0, fallback=0.5) * camera.height), camera.height - 1)
+    def _take(self, x: Any, y: Any) -> None:
+        camera, (column, row) = _clicked(self._session, x, y)
         with self._session.services.source.borrowed() as scene:
-            found = scene.probe(camera, column, row)
+            found = scene.probe(camera, int(column), int(row))
         rows = [
             (name, ", ".join(f"{value:.4g}" for value in values[:_MOST_NUMBERS]))
             for name, values in found.values.items()
         ]
         if found.world_position is not None:
             rows.append(("position", ", ".join(f"{value:.3f}" for value in found.world_position)))
-        self._text.content = html.table(rows)
+        self._text.content = table(rows)

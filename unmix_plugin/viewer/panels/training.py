@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from unmix_plugin.engine.training.progress import TrainingStatus
 from unmix_plugin.engine.training.training_control import SHARE_BOUNDS
-from unmix_plugin.viewer import page as html
-from unmix_plugin.viewer.page import Chart, Line, number
+from unmix_plugin.viewer.page import Chart, Line, number, table
 from unmix_plugin.viewer.session import Services, Session
 
 _LOSS_COLOUR, _PSNR_COLOUR = (0.85, 0.3, 0.1), (0.1, 0.4, 0.8)
@@ -49,7 +48,7 @@ class TrainingPanel:
         """Renew the figures, and now and then the curves."""
         control, status = self._control, self._control.status
         self._pause.label = "resume" if control.is_paused else "pause"
-        self._state.content = html.table(_rows(status, self._condition(), control.is_running))
+        self._state.content = table(_rows(status, self._condition(), control.is_running))
         for steering in self._steering:
             steering.disabled = not control.is_running
         self._bar.value = 0.0 if status is None else 100 * status.progress
@@ -69,7 +68,7 @@ class TrainingPanel:
         curve = self._session.services.curve
         for chart, name, colour in ((self._loss, "loss", _LOSS_COLOUR), (self._psnr, "psnr", _PSNR_COLOUR)):
             steps, values = curve.line(name)
-            chart.plot(steps, [Line(name, values, colour)])
+            chart.draw(steps, [Line(name, values, colour)])
 
     def _toggle(self) -> None:
         if self._control.is_paused:

@@ -1,29 +1,21 @@
-"""What is shown, and how: layer, wavelengths, colour map, tones.
-
-Which light falls on an object: the environment, how it is turned, how bright it is.
-
-Objects of the browser's own beside the picture: cameras with their images, the scene box, a point cloud, probes.
-
-Where the client looks from, how finely pictures are rendered, and which objects are shown with them.
-"""
+"""What is shown, in which light, from where and how finely; and objects of the browser's own beside the picture."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
-from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.maps.indices import available_indices
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.relighting import LightChoice
-from unmix_plugin.trained.run_views import RunView
 from unmix_plugin.viewer.layers.layers import covered, layer_named
 from unmix_plugin.viewer.layers.painting import (
     BACKGROUNDS,
@@ -34,21 +26,19 @@ from unmix_plugin.viewer.layers.painting import (
 )
 from unmix_plugin.viewer.page import Debounced, choice, index_in, number, text
 from unmix_plugin.viewer.rendering.pictures import DEFAULT_HEIGHT, HEIGHT_BOUNDS, SUBPIXEL_BOUNDS
+from unmix_plugin.viewer.rendering.scene import Edit
 from unmix_plugin.viewer.session import Session
 from unmix_plugin.viewer.view_cameras import pose_of
 
 if TYPE_CHECKING:
     import viser
 
-    from unmix_plugin.spectral.materials import Materials
-
-
 _TRANSFORMS = {title: name for name, title in VIEW_TRANSFORMS.items()}
 _NO_INDEX = "none for these bands"
 
 
 class LayerPanel:
-    """Chooses the layer; shows the controls that it has."""
+    """Chooses the layer, and shows the controls that it has: wavelengths, colour map, tones."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
@@ -57,9 +47,8 @@ class LayerPanel:
         self._of_control: dict[str, list[Any]] = {}
         self._layers = session.services.layers
         titles = {one.title: name for name, one in self._layers.items()}
-        layer = self._gui.add_dropdown(
-            "layer", tuple(titles), initial_value=layer_named(settings.layer, self._layers).title
-        )
+        shown = layer_named(settings.layer, self._layers).title
+        layer = self._gui.add_dropdown("layer", tuple(titles), initial_value=shown)
         self._connect(layer, "layer", lambda: titles.get(layer.value, layer.value))
         if session.services.has_materials:
             self._add_spectral(session.materials())
@@ -72,16 +61,24 @@ class LayerPanel:
         self._show_controls()
 
     def _add_spectral(self, materials: Materials) -> None:
-        """What is chosen by wavelength or by endmember."""
+        """What is chosen by wavelength, by endmember or by an index."""
         bands, settings = materials.bands, self._settings
-        edges = bands.edges_nm
-        self._low_nm, self._high_nm = float(edges[0]), float(edges[-1])
-        wavelength = self._wavelength_slider("wavelength (nm)", covered(bands, settings.wavelength_nm))
+        low_nm, high_nm = float(bands.edges_nm[0]), float(bands.edges_nm[-1])
+        step = round(max((high_nm - low_nm) / 500, 0.01), 2)
+        start = covered(bands, settings.wavelength_nm)
+        wavelength = self._gui.add_slider("wavelength (nm)", low_nm, high_nm, step, start)
         self._connect(wavelength, "wavelength_nm", lambda: wavelength.value, "wavelength")
-        self._add_false_colour()
-        endmember = materials.names[min(settings.endmember, len(materials.names) - 1)]
-        self._endmember = self._gui.add_dropdown("endmember", materials.names, initial_value=endmember)
-        self._connect(self._endmember, "endmember", self._chosen_endmember, "endmember")
+        sliders = [
+            self._gui.add_slider(f"{name} (nm)", low_nm, high_nm, step, start)
+            for name, start in zip(("red", "green", "blue"), settings.false_colour_nm, strict=True)
+        ]
+        for slider in sliders:
+            self._connect(
+                slider, "false_colour_nm", lambda: tuple(one.value for one in sliders), "false-colour"
+            )
+        name = materials.names[min(settings.endmember, len(materials.names) - 1)]
+        self._endmember = self._gui.add_dropdown("endmember", materials.names, initial_value=name)
+        self._connect(self._endmember, "endmember", lambda: index_in(self._endmember), "endmember")
         self._add_index(bands)
         self._session.on_edit.append(self._show_names)
 
@@ -91,20 +88,6 @@ class LayerPanel:
         if tuple(self._endmember.options) != names:
             self._endmember.options = names
             self._endmember.value = names[min(self._settings.endmember, len(names) - 1)]
-
-    def _add_false_colour(self) -> None:
-        sliders = [
-            self._wavelength_slider(f"{name} (nm)", start)
-            for name, start in zip(("red", "green", "blue"), self._settings.false_colour_nm, strict=True)
-        ]
-        for slider in sliders:
-            self._connect(
-                slider, "false_colour_nm", lambda: tuple(one.value for one in sliders), "false-colour"
-            )
-
-    def _wavelength_slider(self, label: str, start: float) -> viser.GuiSliderHandle[float]:
-        step = max((self._high_nm - self._low_nm) / 500, 0.01)
-        return self._gui.add_slider(label, self._low_nm, self._high_nm, round(step, 2), start)
 
     def _add_index(self, bands: Bands) -> None:
         """The named indices that the bands allow, and a formula that overrides them."""
@@ -144,7 +127,6 @@ class LayerPanel:
             return tuple(end.value for end in ends) if is_own.value else None
 
         def start_from_shown() -> None:
-            """The range begins as the one that is shown."""
             if is_own.value and self._session.value_range_shown is not None:
                 for end, value in zip(ends, self._session.value_range_shown, strict=True):
                     end.value = value
@@ -160,9 +142,8 @@ class LayerPanel:
         self._connect(exposure, "exposure_ev", lambda: exposure.value, "tone")
         gamma = self._gui.add_slider("gamma", *GAMMA_BOUNDS, 0.05, settings.gamma)
         self._connect(gamma, "gamma", lambda: gamma.value, "tone")
-        transform = self._gui.add_dropdown(
-            "tones", tuple(_TRANSFORMS), initial_value=VIEW_TRANSFORMS[settings.view_transform]
-        )
+        shown = VIEW_TRANSFORMS[settings.view_transform]
+        transform = self._gui.add_dropdown("tones", tuple(_TRANSFORMS), initial_value=shown)
         self._connect(transform, "view_transform", lambda: _TRANSFORMS.get(transform.value), "tone")
 
     def _connect(self, control: Any, setting: str, read: Callable[[], Any], kind: str | None = None) -> None:
@@ -175,10 +156,7 @@ class LayerPanel:
         self._settings = self._settings.changed(setting, read())
         if setting in ("layer", "value_range"):
             self._show_controls()
-        self._session.restyle(self._settings)
-
-    def _chosen_endmember(self) -> int:
-        return index_in(self._endmember)
+        self._session.services.loop.restyle(self._session.view, self._settings)
 
     def _show_controls(self) -> None:
         wanted = layer_named(self._settings.layer, self._layers).controls
@@ -189,11 +167,11 @@ class LayerPanel:
                 control.visible = kind in wanted
 
 
-_ROTATION_BOUNDS, _EXPOSURE_BOUNDS = (-180.0, 180.0), (-6.0, 6.0)
+_ROTATION_BOUNDS, _BRIGHTNESS_BOUNDS = (-180.0, 180.0), (-6.0, 6.0)
 
 
 class LightPanel:
-    """Chooses and turns the light."""
+    """Chooses the light that falls on an object: the environment, how it is turned, how bright it is."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
@@ -204,7 +182,7 @@ class LightPanel:
         self._rotation = gui.add_slider("turned by (deg)", *_ROTATION_BOUNDS, 1.0, light.rotation_deg)
         self._exposure = gui.add_slider(
             "brightness (stops)",
-            *_EXPOSURE_BOUNDS,
+            *_BRIGHTNESS_BOUNDS,
             0.1,
             light.exposure_stops,
             hint="Of the light itself; the exposure of the picture is under view.",
@@ -214,110 +192,35 @@ class LightPanel:
 
     def _change(self) -> None:
         name = choice(self._name.value, self._lights, self._lights[0])
-        self._session.change_light(
-            LightChoice(
-                None if name == self._lights[0] else name,
-                number(self._rotation.value, *_ROTATION_BOUNDS, fallback=0.0),
-                number(self._exposure.value, *_EXPOSURE_BOUNDS, fallback=0.0),
-            )
+        light = LightChoice(
+            None if name == self._lights[0] else name,
+            number(self._rotation.value, *_ROTATION_BOUNDS, fallback=0.0),
+            number(self._exposure.value, *_BRIGHTNESS_BOUNDS, fallback=0.0),
         )
-
-
-_LARGEST_FRUSTUM = 0.12
-_FRUSTUM_SHARE = 0.3
-"""Size of a frustum in the distance to its nearest neighbour, so that frusta do not cover each other."""
-_POINT_SIZE = 0.012
-_MOST_POINTS = 20_000
-_THUMBNAIL_HEIGHT = 96
-_TRAIN_COLOUR, _EVAL_COLOUR = (40, 120, 200), (220, 120, 30)
-
-Thumbnail = UInt8[np.ndarray, "H W 3"]
-
-
-def add_cameras(
-    client: viser.ClientHandle,
-    views: list[RunView],
-    num_train: int,
-    thumbnails: Mapping[str, Thumbnail | None],
-) -> list[viser.CameraFrustumHandle]:
-    """One frustum a view, with its image where there is one; the first `num_train` are training views."""
-    handles, size = [], _frustum_size(views)
-    for index, view in enumerate(views):
-        pose = pose_of(view.camera)
-        handles.append(
-            client.scene.add_camera_frustum(
-                f"/cameras/{index:04d}",
-                fov=pose.fov,
-                aspect=pose.aspect,
-                scale=size,
-                color=_TRAIN_COLOUR if index < num_train else _EVAL_COLOUR,
-                image=thumbnails.get(view.name),
-                wxyz=pose.wxyz,
-                position=pose.position,
-            )
-        )
-    return handles
-
-
-def _frustum_size(views: list[RunView]) -> float:
-    places = torch.cat([view.camera.camera_to_world[:, :, 3] for view in views]).cpu()
-    if len(places) < 2:
-        return _LARGEST_FRUSTUM
-    nearest = torch.cdist(places, places).fill_diagonal_(torch.inf).min(dim=1).values
-    return min(_LARGEST_FRUSTUM, max(_FRUSTUM_SHARE * float(nearest.median()), 1e-3))
-
-
-def add_box(client: viser.ClientHandle, box: SceneBox) -> viser.LineSegmentsHandle:
-    """The twelve edges of the scene box."""
-    low, high = box.aabb.cpu().numpy()
-    corners = np.array([[(low, high)[(i >> axis) & 1][axis] for axis in range(3)] for i in range(8)])
-    edges = [(i, i | 1 << axis) for axis in range(3) for i in range(8) if not i & 1 << axis]
-    points = np.array([[corners[start], corners[end]] for start, end in edges], dtype=np.float32)
-    return client.scene.add_line_segments("/box", points, colors=(120, 120, 120))
-
-
-def add_points(
-    client: viser.ClientHandle, points: Float[torch.Tensor, "N 3"], colours: UInt8[np.ndarray, "N 3"]
-) -> viser.PointCloudHandle:
-    """A cloud of surface points; every n-th where there are too many."""
-    step = max(1, -(-len(points) // _MOST_POINTS))
-    return client.scene.add_point_cloud(
-        "/points", points[::step].cpu().numpy(), colours[::step], point_size=_POINT_SIZE
-    )
-
-
-def thumbnail(scene: Scene, name: str) -> Thumbnail | None:
-    """A view as measured, in few pixels; None for a name that the scene does not have."""
-    index = next((index for index, frame in enumerate(scene.frames) if frame.name == name), None)
-    if index is None:
-        return None
-    picture = scene.srgb(index)
-    if picture is not None:
-        step = max(1, picture.shape[0] // _THUMBNAIL_HEIGHT)
-        return np.ascontiguousarray((picture[::step, ::step] * 255 + 0.5).astype(np.uint8))
-    cube = scene.cube(index)
-    step = max(1, cube.shape[0] // _THUMBNAIL_HEIGHT)
-    spectra = torch.from_numpy(np.ascontiguousarray(cube[::step, ::step]))
-    sensor = scene.sensor_of(index)
-    false_colours = torch.from_numpy(sensor.false_colours).to(spectra)
-    weights = rgb_matrix(Bands.of(scene.wavelengths_nm)) if sensor.sees_all_bands else false_colours
-    linear = (spectra @ weights).clamp(0, 1)
-    return (linear_to_srgb(linear) * 255 + 0.5).to(torch.uint8).numpy()
+        view = self._session.view
+        self._session.services.loop.change_edit(view, Edit(view.edit.recipe, light))
 
 
 _HEIGHT_STEP = 16
+_LARGEST_FRUSTUM = 0.12
+_FRUSTUM_SHARE = 0.3
+"""Size of a frustum in the distance to its nearest neighbour, so that frusta do not cover each other."""
+_TRAIN_COLOUR, _EVAL_COLOUR = (40, 120, 200), (220, 120, 30)
+_THUMBNAIL_HEIGHT = 96
+_POINT_SIZE = 0.012
+_MOST_POINTS = 20_000
 
 
 class ScenePanel:
-    """Cameras, quality and objects."""
+    """Where the client looks from, how finely pictures are rendered, and which objects are shown with them."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
         self._objects: dict[str, list[Any]] = {}
         gui, services = session.client.gui, session.services
+        self._views = {view.name: view.camera for view in services.views}
         with gui.add_folder("camera"):
-            names = tuple(view.name for view in services.views)
-            self._view = gui.add_dropdown("view of the scene", names)
+            self._view = gui.add_dropdown("view of the scene", tuple(self._views))
             gui.add_button("look from there").on_click(session.guarded(self._look_from_view))
         with gui.add_folder("quality"):
             self._height = gui.add_slider(
@@ -338,7 +241,7 @@ class ScenePanel:
             if services.has_materials:
                 self._add_switch("point cloud", self._add_points)
 
-    def _add_switch(self, label: str, make: Any) -> None:
+    def _add_switch(self, label: str, make: Callable[[], list[Any]]) -> None:
         switch = self._session.client.gui.add_checkbox(label, False)
 
         def change() -> None:
@@ -351,10 +254,10 @@ class ScenePanel:
         switch.on_update(self._session.guarded(change))
 
     def _look_from_view(self) -> None:
-        view = self._session.services.view_named(str(self._view.value))
-        if view is None:
-            raise ConfigError(f"there is no view {str(self._view.value)[:40]!r}")
-        self._session.look_from(view.camera)
+        name = str(self._view.value)
+        if name not in self._views:
+            raise ConfigError(f"there is no view {name[:40]!r}")
+        self._session.look_from(self._views[name])
 
     def _change_quality(self) -> None:
         height = int(number(self._height.value, *HEIGHT_BOUNDS, fallback=DEFAULT_HEIGHT))
@@ -362,24 +265,67 @@ class ScenePanel:
         self._session.services.loop.change_quality(self._session.view, height, subpixels)
 
     def _add_cameras(self) -> list[viser.CameraFrustumHandle]:
-        services = self._session.services
-        scene = services.scene
-        thumbnails = (
-            {} if scene is None else {view.name: thumbnail(scene, view.name) for view in services.views}
+        """A frustum for each view, with its image where there is one; a click looks from there."""
+        services, cameras = self._session.services, list(self._views.values())
+        size, places = (
+            _LARGEST_FRUSTUM,
+            torch.cat([camera.camera_to_world[:, :, 3] for camera in cameras]).cpu(),
         )
-        handles = add_cameras(self._session.client, list(services.views), services.num_train, thumbnails)
-        for handle, view in zip(handles, services.views, strict=True):
-            handle.on_click(self._session.guarded(lambda camera=view.camera: self._session.look_from(camera)))
+        if len(places) > 1:
+            nearest = torch.cdist(places, places).fill_diagonal_(torch.inf).min(dim=1).values
+            size = min(size, max(_FRUSTUM_SHARE * float(nearest.median()), 1e-3))
+        handles = []
+        for index, (name, camera) in enumerate(self._views.items()):
+            pose, is_train = pose_of(camera), index < len(services.source.record.train_cameras)
+            handle = self._session.client.scene.add_camera_frustum(
+                f"/cameras/{index:04d}",
+                fov=pose.fov,
+                aspect=pose.aspect,
+                scale=size,
+                color=_TRAIN_COLOUR if is_train else _EVAL_COLOUR,
+                image=None if services.scene is None else _thumbnail(services.scene, name),
+                wxyz=pose.wxyz,
+                position=pose.position,
+            )
+            handle.on_click(self._session.guarded(lambda camera=camera: self._session.look_from(camera)))
+            handles.append(handle)
         return handles
 
-    def _add_box(self) -> list[Any]:
-        return [add_box(self._session.client, self._session.services.source.record.scene_box)]
+    def _add_box(self) -> list[viser.LineSegmentsHandle]:
+        """The twelve edges of the scene box."""
+        low, high = self._session.services.source.record.scene_box.aabb.cpu().numpy()
+        corners = np.array([[(low, high)[(i >> axis) & 1][axis] for axis in range(3)] for i in range(8)])
+        edges = [(i, i | 1 << axis) for axis in range(3) for i in range(8) if not i & 1 << axis]
+        points = np.array([[corners[start], corners[end]] for start, end in edges], dtype=np.float32)
+        scene = self._session.client.scene
+        return [scene.add_line_segments("/box", points, colors=(120, 120, 120))]
 
-    def _add_points(self) -> list[Any]:
-        """Surface points in the colours that the materials have now."""
+    def _add_points(self) -> list[viser.PointCloudHandle]:
+        """Surface points in the colours that the materials have now; every n-th where there are too many."""
         aids, materials = self._session.services.aids.for_layers(), self._session.materials()
         assert aids is not None
-        spectra = aids.reference.spectra(materials)
+        spectra, points = aids.reference.spectra(materials), aids.reference.points.cpu().numpy()
         linear = (spectra @ rgb_matrix(materials.bands).to(spectra)).clamp(0, 1)
-        colours = (linear_to_srgb(linear) * 255).byte().cpu().numpy().astype(np.uint8)
-        return [add_points(self._session.client, aids.reference.points, colours)]
+        colours = (linear_to_srgb(linear) * 255).byte().cpu().numpy()
+        step = max(1, -(-len(points) // _MOST_POINTS))
+        scene = self._session.client.scene
+        return [scene.add_point_cloud("/points", points[::step], colours[::step], point_size=_POINT_SIZE)]
+
+
+def _thumbnail(scene: Scene, name: str) -> UInt8[np.ndarray, "H W 3"] | None:
+    """A view as measured, in few pixels; None for a name that the scene does not have."""
+    index = next((index for index, frame in enumerate(scene.frames) if frame.name == name), None)
+    if index is None:
+        return None
+    picture = scene.srgb(index)
+    if picture is not None:
+        step = max(1, picture.shape[0] // _THUMBNAIL_HEIGHT)
+        return np.ascontiguousarray((picture[::step, ::step] * 255 + 0.5).astype(np.uint8))
+    cube = scene.cube(index)
+    step = max(1, cube.shape[0] // _THUMBNAIL_HEIGHT)
+    spectra = torch.from_numpy(np.ascontiguousarray(cube[::step, ::step]))
+    sensor = scene.sensor_of(index)
+    false_colours = torch.from_numpy(sensor.false_colours).to(spectra)
+    weights = rgb_matrix(Bands.of(scene.wavelengths_nm)) if sensor.sees_all_bands else false_colours
+    linear = (spectra @ weights).clamp(0, 1)
+    return (linear_to_srgb(linear) * 255 + 0.5).to(torch.uint8).numpy()

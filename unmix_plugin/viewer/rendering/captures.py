@@ -1,8 +1,7 @@
-"""Pictures of any size, rendered strip by strip beside the views, so that memory does not grow with resolution.
+"""What leaves the viewer: pictures of any size, rendered strip by strip beside the views so that memory does not grow
+with resolution, and videos, rendered by `unmix-render` in a process of its own.
 
 Notation: `H x W` pixels, `B` bands.
-
-Videos, rendered by `unmix-render` in a process of its own.
 """
 
 from __future__ import annotations
@@ -15,23 +14,22 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.formats.exr import write_spectral_exr
-from unmix_plugin.formats.files import rgba_png_bytes, write_file
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
 from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.trained.protocol import RenderedView
 from unmix_plugin.trained.relighting import LightChoice
 from unmix_plugin.viewer.layers.painting import LayerSettings
-from unmix_plugin.viewer.rendering.pictures import Capture, FrameRender
-from unmix_plugin.viewer.rendering.render_loop import RenderLoop
+from unmix_plugin.viewer.rendering.pictures import FrameRender
+from unmix_plugin.viewer.rendering.render_loop import Capture, RenderLoop
 from unmix_plugin.viewer.rendering.scene import Edit
 
 SIDE_BOUNDS = (16, 8192)
@@ -40,140 +38,6 @@ SIDE_BOUNDS = (16, 8192)
 _MOST_PIXELS = 1 << 25
 _LARGEST_SPECTRA_BYTES = 1 << 29
 _STRIP_PIXELS = 1 << 17
-
-
-@dataclass(frozen=True)
-class PictureRequest:
-    """A picture asked for."""
-
-    camera: Cameras
-    """One camera."""
-    edit: Edit
-    subpixels: int
-    """Rays through a pixel along each of its edges."""
-
-
-class StripCapture:
-    """Renders a picture in strips from top to bottom and hands each on."""
-
-    def __init__(
-        self,
-        loop: RenderLoop,
-        request: PictureRequest,
-        take: Callable[[int, RenderedView], None],
-        done: Callable[[str], None],
-        progress: Callable[[float], None],
-    ) -> None:
-        """
-        Args:
-            loop: Renders between what is more urgent.
-            request: What to render.
-            take: Takes the first row of a strip and the strip.
-            done: Told the end: an empty text, or what went wrong.
-            progress: Told the part that is rendered.
-        """
-        self._loop, self._request = loop, request
-        self._take, self._done, self._progress = take, done, progress
-        self._rows = max(1, _STRIP_PIXELS // request.camera.width)
-        self._first_row = 0
-        self._capture: Capture | None = None
-        self._is_cancelled = False
-
-    def start(self) -> None:
-        """Begin with the first strip, or go on with the next."""
-        camera = self._request.camera
-        last = min(self._first_row + self._rows, camera.height)
-        strip = camera.crop(0, self._first_row, camera.width, last - self._first_row)
-        render = FrameRender(strip, self._request.subpixels, is_finished=True)
-        share = (last - self._first_row) / camera.height
-        begun = self._first_row / camera.height
-        self._capture = Capture(
-            render,
-            self._request.edit,
-            self._strip_done,
-            lambda fraction: self._progress(begun + share * fraction),
-        )
-        self._loop.capture(self._capture)
-
-    def cancel(self) -> None:
-        """Stop after the block under way."""
-        self._is_cancelled = True
-        if self._capture is not None:
-            self._capture.is_cancelled = True
-
-    def _strip_done(self, frame: RenderedView | None, reason: str) -> None:
-        if frame is None:
-            self._done(reason)
-            return
-        try:
-            self._take(self._first_row, frame)
-            self._first_row += frame.camera.height
-            if self._is_cancelled:
-                self._done("cancelled")
-            elif self._first_row < self._request.camera.height:
-                self.start()
-            else:
-                self._done("")
-        except Exception as error:
-            self._done(f"{type(error).__name__}: {error}")
-            raise
-
-
-class PictureCanvas:
-    """Collects strips of a painted picture."""
-
-    def __init__(self, camera: Cameras) -> None:
-        self.pixels: UInt8[np.ndarray, "H W 3"] = np.zeros((camera.height, camera.width, 3), np.uint8)
-
-    def take(self, first_row: int, strip: UInt8[np.ndarray, "rows W 3"]) -> None:
-        """Put a strip in its place."""
-        self.pixels[first_row : first_row + len(strip)] = strip
-
-    def write(self, path: Path, description: str) -> Path:
-        """Write a PNG.
-
-        Raises:
-            RunError: the disk is full or refuses.
-        """
-        return write_file(path, rgba_png_bytes(self.pixels, description))
-
-
-class SpectraCanvas:
-    """Collects strips of spectra."""
-
-    def __init__(self, camera: Cameras, num_bands: int) -> None:
-        shape = (camera.height, camera.width)
-        self.spectra: Float32[np.ndarray, "H W B"] = np.zeros((*shape, num_bands), np.float32)
-        self.linear_rgb: Float32[np.ndarray, "H W 3"] = np.zeros((*shape, 3), np.float32)
-        self.coverage: Float32[np.ndarray, "H W"] = np.zeros(shape, np.float32)
-        self._bands = None
-
-    def take(self, first_row: int, frame: RenderedView) -> None:
-        """Put a strip in its place."""
-        assert isinstance(frame, MaterialView)
-        rows = slice(first_row, first_row + frame.camera.height)
-        self._bands = frame.materials.bands
-        self.spectra[rows] = frame["spectral"].cpu().numpy()
-        self.linear_rgb[rows] = (
-            frame.materials.through(frame.coefficients, rgb_matrix(self._bands)).cpu().numpy()
-        )
-        self.coverage[rows] = frame.coverage.cpu().numpy()
-
-    def write(self, path: Path) -> Path:
-        """Write a spectral EXR.
-
-        Raises:
-            RunError: the disk is full or refuses.
-        """
-        assert self._bands is not None
-        return write_spectral_exr(
-            path,
-            self.spectra,
-            self._bands,
-            self.linear_rgb,
-            self.coverage,
-            "radiance on black, 1 = full scale",
-        )
 
 
 def check_size(width: int, height: int, num_bands: int | None = None) -> None:
@@ -195,30 +59,99 @@ def check_size(width: int, height: int, num_bands: int | None = None) -> None:
         )
 
 
+@dataclass(eq=False)
+class StripCapture:
+    """Renders a picture in strips from top to bottom and hands each on, once started."""
+
+    loop: RenderLoop
+    """Renders between what is more urgent."""
+    camera: Cameras
+    """One camera."""
+    edit: Edit
+    subpixels: int
+    """Rays through a pixel along each of its edges."""
+    take: Callable[[int, RenderedView], None]
+    """Takes the first row of a strip and the strip."""
+    done: Callable[[str], None]
+    """Told the end: an empty text, or what went wrong."""
+    progress: Callable[[float], None]
+    """Told the part that is rendered."""
+    _first_row: int = 0
+    _capture: Capture | None = field(default=None, repr=False)
+    _is_cancelled: bool = False
+
+    def start(self) -> None:
+        """Begin with the first strip, or go on with the next."""
+        width, height, first = self.camera.width, self.camera.height, self._first_row
+        count = min(max(1, _STRIP_PIXELS // width), height - first)
+        strip = self.camera.crop(0, first, width, count)
+        self._capture = Capture(
+            FrameRender(strip, self.subpixels, is_finished=True),
+            self.edit,
+            self._strip_done,
+            lambda fraction: self.progress((first + count * fraction) / height),
+        )
+        self.loop.capture(self._capture)
+
+    def cancel(self) -> None:
+        """Stop after the block under way."""
+        self._is_cancelled = True
+        if self._capture is not None:
+            self._capture.is_cancelled = True
+
+    def _strip_done(self, frame: RenderedView | None, reason: str) -> None:
+        if frame is None:
+            self.done(reason)
+            return
+        try:
+            self.take(self._first_row, frame)
+            self._first_row += frame.camera.height
+            if self._is_cancelled:
+                self.done("cancelled")
+            elif self._first_row < self.camera.height:
+                self.start()
+            else:
+                self.done("")
+        except Exception as error:
+            self.done(f"{type(error).__name__}: {error}")
+            raise
+
+
+class SpectraCanvas:
+    """Collects strips of spectra."""
+
+    def __init__(self, camera: Cameras, num_bands: int) -> None:
+        shape = (camera.height, camera.width)
+        self.spectra: Float32[np.ndarray, "H W B"] = np.zeros((*shape, num_bands), np.float32)
+        self.linear_rgb: Float32[np.ndarray, "H W 3"] = np.zeros((*shape, 3), np.float32)
+        self.coverage: Float32[np.ndarray, "H W"] = np.zeros(shape, np.float32)
+        self._bands = None
+
+    def take(self, first_row: int, frame: RenderedView) -> None:
+        """Put a strip in its place."""
+        assert isinstance(frame, MaterialView)
+        rows, materials = slice(first_row, first_row + frame.camera.height), frame.materials
+        self._bands = materials.bands
+        self.spectra[rows] = frame["spectral"].cpu().numpy()
+        self.linear_rgb[rows] = materials.through(frame.coefficients, rgb_matrix(self._bands)).cpu().numpy()
+        self.coverage[rows] = frame.coverage.cpu().numpy()
+
+    def write(self, path: Path) -> Path:
+        """Write a spectral EXR.
+
+        Raises:
+            RunError: the disk is full or refuses.
+        """
+        assert self._bands is not None
+        what = "radiance on black, 1 = full scale"
+        return write_spectral_exr(path, self.spectra, self._bands, self.linear_rgb, self.coverage, what)
+
+
 _LAUNCH = "from unmix_plugin.commands.render import main; main()"
 _LONGEST_MESSAGE = 1000
 _WAIT_S = 10.0
 _LINES_KEPT = 100
 _PROGRESS = re.compile(r"rendering: (\d+) of ([1-9]\d*) done")
-
-
-def output_of(settings: LayerSettings) -> str:
-    """The output of renders that a layer shows.
-
-    Raises:
-        ConfigError: renders have no such output.
-    """
-    if settings.layer == "band":
-        return f"band:{settings.wavelength_nm:g}nm"
-    if settings.layer == "false-colour":
-        return "false-colour:" + ",".join(f"{value:g}" for value in settings.false_colour_nm)
-    if settings.layer == "index" and settings.index:
-        return f"index:{settings.index}"
-    if settings.layer == "abundance":
-        return "abundances"
-    if settings.layer in ("error", "index"):
-        raise ConfigError(f"videos can't show the layer {settings.layer}; choose another one")
-    return settings.layer
 
 
 @dataclass(eq=False)
@@ -316,6 +249,25 @@ def _end(process: subprocess.Popen[str]) -> None:
             return
         except subprocess.TimeoutExpired:
             continue
+
+
+def output_of(settings: LayerSettings) -> str:
+    """The output of renders that a layer shows.
+
+    Raises:
+        ConfigError: renders have no such output.
+    """
+    if settings.layer == "band":
+        return f"band:{settings.wavelength_nm:g}nm"
+    if settings.layer == "false-colour":
+        return "false-colour:" + ",".join(f"{value:g}" for value in settings.false_colour_nm)
+    if settings.layer == "index" and settings.index:
+        return f"index:{settings.index}"
+    if settings.layer == "abundance":
+        return "abundances"
+    if settings.layer in ("error", "index"):
+        raise ConfigError(f"videos can't show the layer {settings.layer}; choose another one")
+    return settings.layer
 
 
 def render_argv(

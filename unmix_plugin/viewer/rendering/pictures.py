@@ -1,17 +1,9 @@
-"""How fine to render, and how much at once: from a measured speed to picture sizes and block sizes.
+"""From a camera to a picture: how fine it gets, its rays block by block, its paint and its depth.
 
 While a camera moves each picture must come soon, so it is small; once it rests, pictures of twice the height follow
-until the height asked for is reached.
-
-Views rendered block by block, so that nothing waits long for the device.
+until the height asked for is reached. Blocks are so short that nothing waits long for the device.
 
 Notation: `P` pixels of a view, row after row.
-
-Depth pictures for the browser, which hides its own objects behind what is rendered.
-
-What one client looks at, and how far its picture has come. Changed only under the render loop's lock.
-
-The work of the render loop: what size a picture gets, rendering its blocks, painting it.
 """
 
 from __future__ import annotations
@@ -19,9 +11,9 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -40,19 +32,22 @@ from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.layers.layers import LAYERS, Layer, layer_named
 from unmix_plugin.viewer.layers.painting import LayerSettings, Legend, as_bytes
 from unmix_plugin.viewer.rendering.scene import Edit, SceneAids, SceneSource
-from unmix_plugin.viewer.view_cameras import ViewPose, camera_of, depth_along_axis, pixel_rays
+from unmix_plugin.viewer.view_cameras import ViewPose, camera_of
 
-MOVING_S, LONGEST_MOVING_S = 1 / 30, 0.07
+HEIGHT_BOUNDS = (16, 2048)
+DEFAULT_HEIGHT = 512
+SUBPIXEL_BOUNDS = (1, 4)
+
+_MOVING_S, _LONGEST_MOVING_S = 1 / 30, 0.07
 """Time for a moving picture: as on a fast device, and as on one that would otherwise show nothing but blur."""
 
-LEAST_MOVING_PIXELS, FEWEST_PIXELS = 4096, 256
-"""A moving picture has so many pixels if they take no longer than `LONGEST_MOVING_S`, and never fewer than these."""
+_LEAST_MOVING_PIXELS, _FEWEST_PIXELS = 4096, 256
+"""A moving picture has so many pixels if they take no longer than `_LONGEST_MOVING_S`, and never fewer than these."""
 
-BLOCK_S = 0.03
+_BLOCK_S = 0.03
 """Time that a block takes: how long anything more urgent waits."""
 
 _BLOCK_BOUNDS = (256, 1 << 17)
-_FIRST_GUESS = 20_000.0
 _MEMORY = 0.7
 
 
@@ -60,45 +55,36 @@ _MEMORY = 0.7
 class Speedometer:
     """Rays a second, as measured recently."""
 
-    rays_per_second: float = _FIRST_GUESS
+    rays_per_second: float = 20_000.0
 
     def add(self, rays: int, seconds: float) -> None:
         """Take in a measurement; short ones say less, but the least block counts still."""
-        if rays <= 0 or seconds <= 0:
-            return
-        measured = rays / seconds
-        # Geometric, since speeds of empty and of full parts of a picture differ by factors.
-        self.rays_per_second = math.exp(
-            _MEMORY * math.log(self.rays_per_second) + (1 - _MEMORY) * math.log(measured)
-        )
+        if rays > 0 and seconds > 0:
+            # Geometric, since speeds of empty and of full parts of a picture differ by factors.
+            self.rays_per_second = self.rays_per_second**_MEMORY * (rays / seconds) ** (1 - _MEMORY)
 
     @property
     def block_rays(self) -> int:
         """Rays to render in one go."""
         low, high = _BLOCK_BOUNDS
-        return int(min(max(self.rays_per_second * BLOCK_S, low), high))
+        return int(min(max(self.rays_per_second * _BLOCK_S, low), high))
 
 
-def moving_height(rays_per_second: float, aspect: float, largest_height: int) -> int:
+def _moving_height(rays_per_second: float, aspect: float, largest_height: int) -> int:
     """Rows of a picture of a moving camera."""
     pixels = max(
-        rays_per_second * MOVING_S,
-        min(LEAST_MOVING_PIXELS, rays_per_second * LONGEST_MOVING_S),
-        FEWEST_PIXELS,
+        rays_per_second * _MOVING_S,
+        min(_LEAST_MOVING_PIXELS, rays_per_second * _LONGEST_MOVING_S),
+        _FEWEST_PIXELS,
     )
     return max(1, min(int(math.sqrt(pixels / aspect)), largest_height))
 
 
-def finer_height(height: int, largest_height: int) -> int | None:
+def _finer_height(height: int, largest_height: int) -> int | None:
     """Rows of the next picture of a camera at rest; None after the finest."""
     if height >= largest_height:
         return None
     return largest_height if 2 * height * 1.2 >= largest_height else 2 * height
-
-
-def affordable_height(rays_per_second: float, seconds: float, aspect: float, largest_height: int) -> int:
-    """Rows of the finest picture that takes no longer than `seconds`."""
-    return max(1, min(int(math.sqrt(rays_per_second * seconds / aspect)), largest_height))
 
 
 _CPU_CHUNK, _CUDA_CHUNK = 4096, 1 << 16
@@ -124,16 +110,12 @@ class FrameRender:
         self._offsets = [(x, y) for y in centres for x in centres]
         self._num_pixels = camera.width * camera.height
         self._stride = _coprime_stride(self._num_pixels)
+        self.num_rays = self._num_pixels * len(self._offsets)
+        """Rays of the whole view."""
         self._rays_done = 0
         self._coefficients: Coefficients | None = None
         self._strips: list[dict[str, Tensor]] = []
-        self._opacities: list[Tensor] = []
         self._num_wanted = 1
-
-    @property
-    def num_rays(self) -> int:
-        """Rays of the whole view."""
-        return self._num_pixels * len(self._offsets)
 
     @property
     def rays_left(self) -> int:
@@ -147,9 +129,11 @@ class FrameRender:
         while done < num_rays and self.rays_left:
             count = min(num_rays - done, chunk)
             if isinstance(scene, TrainedScene):
-                done += self._render_chunk(scene, count)
+                rendered = self._render_chunk(scene, count)
             else:
-                done += self._render_rows(scene, count)
+                rendered = self._render_rows(scene, count)
+            self._rays_done += rendered
+            done += rendered
         return done
 
     def _render_chunk(self, scene: TrainedScene, num_rays: int) -> int:
@@ -157,20 +141,22 @@ class FrameRender:
         end = min(start + num_rays, self._num_pixels)
         # Spread over the picture, so that every block has its share of what is empty and of what is costly.
         pixels = torch.arange(start, end, device=scene.device) * self._stride % self._num_pixels
-        bundle = pixel_rays(self.camera.to(scene.device), pixels, self._offsets[turn])
+        rows, columns = pixels // self.camera.width, pixels % self.camera.width
+        x, y = self._offsets[turn]
+        coords = torch.stack([columns + x, rows + y], dim=-1).to(torch.float32)
+        bundle = self.camera.to(scene.device).generate_rays(torch.zeros_like(pixels), coords)
         block = scene.renderer.composite(scene.field, bundle)
         if self._coefficients is None:
             self._coefficients = block.map(lambda packed: packed.new_zeros(self._num_pixels, packed.shape[1]))
         self._coefficients.packed[pixels] += block.packed / len(self._offsets)
-        self._rays_done += end - start
         return end - start
 
     def _render_rows(self, scene: RenderableScene, num_rays: int) -> int:
         """Whole rows from top to bottom, of a scene that only renders views; one ray a pixel."""
         width, turns = self.camera.width, len(self._offsets)
         first = self._rays_done // (width * turns)
-        last = min(first + max(1, num_rays // (width * turns)), self.camera.height)
-        camera = self.camera.crop(0, first, width, last - first).to(scene.device)
+        count = min(max(1, num_rays // (width * turns)), self.camera.height - first)
+        camera = self.camera.crop(0, first, width, count).to(scene.device)
         if isinstance(scene, EstimatedScene) and self._is_finished:
             strip = scene.look(camera, self._subpixels)
         elif isinstance(scene, EstimatedScene):
@@ -179,23 +165,20 @@ class FrameRender:
             self._num_wanted = strip.num_wanted
         else:
             strip = scene.look(camera)
-        self._strips.append({output.name: strip[output.name] for output in scene.outputs})
-        self._opacities.append(strip.opacity)
-        self._rays_done = last * width * turns
-        return (last - first) * width * turns
+        named = {output.name: strip[output.name] for output in scene.outputs}
+        self._strips.append({"accumulation": strip.opacity, **named})
+        return count * width * turns
 
     def frame(self, scene: RenderableScene) -> RenderedView:
         """The finished view, with the materials of a scene that has some."""
         assert self.rays_left == 0
-        if not isinstance(scene, TrainedScene):
-            names = (output.name for output in scene.outputs)
-            tensors = {name: torch.cat([strip[name] for strip in self._strips]) for name in names}
-            tensors = {"accumulation": torch.cat(self._opacities), **tensors}
-            view = ModelView(self.camera, tensors, num_wanted=self._num_wanted)
-            return view if self._before is None else self._before.averaged(view)
-        assert self._coefficients is not None
-        image = self._coefficients.unflatten(self.camera.height, self.camera.width)
-        return MaterialView(scene, self.camera, image)
+        if isinstance(scene, TrainedScene):
+            assert self._coefficients is not None
+            image = self._coefficients.unflatten(self.camera.height, self.camera.width)
+            return MaterialView(scene, self.camera, image)
+        tensors = {name: torch.cat([strip[name] for strip in self._strips]) for name in self._strips[0]}
+        view = ModelView(self.camera, tensors, num_wanted=self._num_wanted)
+        return view if self._before is None else self._before.averaged(view)
 
 
 def num_channels(materials: Materials) -> int:
@@ -211,33 +194,33 @@ def _coprime_stride(count: int) -> int:
     return stride
 
 
-FAR = 160.0
+_FAR = 160.0
 """Depth of what is transparent, scene units; the browser's own limit is 167."""
 
-_STEP = 512e-5
+_DEPTH_STEP = 512e-5
 """Depths are rounded to so many scene units: the browser's unit is 1e-5, and with empty low bits the PNG that they are
 packed into is made in a third of the time."""
 
-
-_MOST_ROWS = 256
+_MOST_DEPTH_ROWS = 256
 """Finer pictures get the depth of every n-th pixel: edges of hidden objects need no more, and packing takes long."""
 
 
-def picture_depth(frame: MaterialView) -> Float32[np.ndarray, "rows columns"]:
-    """Depth along the viewing axis, scene units, of the pixels or of every n-th; `FAR` where less than half of the
-    light ends."""
-    coefficients = frame.coefficients
+def _picture_depth(frame: MaterialView) -> Float32[np.ndarray, "rows columns"]:
+    """Depth along the viewing axis, scene units, of the pixels or of every n-th; far where less than half of the
+    light ends. The browser hides its own objects behind it."""
+    coefficients, camera = frame.coefficients, frame.camera
     distance = coefficients.distance / coefficients.accumulation.clamp(min=1e-6)
-    depth = depth_along_axis(frame.camera, distance).clamp(0, FAR)
-    depth = torch.where(coefficients.accumulation > OCCUPIED_ACCUMULATION, depth, FAR)
-    every = -(-depth.shape[0] // _MOST_ROWS)
+    sides = (camera.width, camera.height)
+    x, y = (
+        (torch.arange(side) + 0.5 - float(camera.center_px[0, axis])) / float(camera.focal_px[0, axis])
+        for axis, side in enumerate(sides)
+    )
+    per_distance = torch.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2).to(distance)
+    depth = (distance / per_distance).clamp(0, _FAR)
+    depth = torch.where(coefficients.accumulation > OCCUPIED_ACCUMULATION, depth, _FAR)
+    every = -(-depth.shape[0] // _MOST_DEPTH_ROWS)
     chosen = depth[every // 2 :: every, every // 2 :: every]
-    return ((chosen / _STEP).round() * _STEP).cpu().numpy().astype(np.float32)
-
-
-HEIGHT_BOUNDS = (16, 2048)
-DEFAULT_HEIGHT = 512
-SUBPIXEL_BOUNDS = (1, 4)
+    return ((chosen / _DEPTH_STEP).round() * _DEPTH_STEP).cpu().numpy().astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -254,64 +237,6 @@ class Shown:
     """Whether a finer picture follows at once."""
     is_labels: bool = False
     """Whether its colours are exact."""
-
-
-@dataclass(eq=False)
-class View:
-    """One client's view; compared by identity."""
-
-    show: Callable[[Shown], None]
-    """Sends a picture."""
-    report: Callable[[str], None]
-    """Says what went wrong; an empty text that all is well again."""
-    settings: LayerSettings = LayerSettings()
-    edit: Edit = Edit()
-    largest_height: int = DEFAULT_HEIGHT
-    """Rows of the finest picture."""
-    subpixels: int = 1
-    """Rays through a pixel of the finest picture, along each of its edges."""
-    wants_depth: bool = False
-    """Whether objects of the client's own are to be hidden behind what is seen."""
-    pose: ViewPose | None = None
-    frame: RenderedView | None = None
-    """The picture shown last."""
-    frame_edit: Edit = Edit()
-    """What `frame` was rendered with."""
-    frame_version: int = -1
-    """The model's version that `frame` shows."""
-    moved_at: float | None = None
-    """When the first camera movement without a picture yet came; None if there is none."""
-    restyled_at: float | None = None
-    """The same for changes that need no rendering."""
-    render: FrameRender | None = None
-    """The finer picture under way."""
-    render_version: int = -1
-    served_at: float = 0.0
-    """When a block was last rendered for it."""
-    shown_at: float = 0.0
-    is_stuck: bool = False
-    """Whether its last picture failed; it is tried again once something changes."""
-    has_reported: bool = False
-    """Whether its client was told of a failure."""
-
-    @property
-    def asked_at(self) -> float | None:
-        """Since when it waits for a picture at once."""
-        return self.restyled_at if self.moved_at is None else self.moved_at
-
-
-@dataclass(eq=False)
-class Capture:
-    """A picture to be rendered apart from any view, of any size, when there is nothing more urgent."""
-
-    render: FrameRender
-    edit: Edit
-    done: Callable[[RenderedView | None, str], None]
-    """Takes the frame, or None and what went wrong; called in the render loop's thread."""
-    progress: Callable[[float], None] = field(default=lambda _: None)
-    """Takes the fraction rendered so far, now and then."""
-    served_at: float = 0.0
-    is_cancelled: bool = False
 
 
 RESTING_COST = 6.0
@@ -357,7 +282,7 @@ class PictureMaker:
     def first_render(self, pose: ViewPose, largest_height: int) -> FrameRender:
         """A small picture, for a camera that moved."""
         largest = self.target_height(pose, largest_height)
-        height = moving_height(self.speed.rays_per_second, pose.aspect, largest)
+        height = _moving_height(self.speed.rays_per_second, pose.aspect, largest)
         return FrameRender(camera_of(pose, height, self._largest_pixels))
 
     def finer_render(
@@ -367,7 +292,7 @@ class PictureMaker:
         target = self.target_height(pose, largest_height)
         if isinstance(frame, ModelView) and frame.camera.height >= target and wants_more(frame):
             return FrameRender(frame.camera, subpixels, frame)
-        height = finer_height(frame.camera.height, target) or target
+        height = _finer_height(frame.camera.height, target) or target
         is_last = height == target and not self.source.is_changing
         return FrameRender(camera_of(pose, height, self._largest_pixels), subpixels if is_last else 1)
 
@@ -378,7 +303,7 @@ class PictureMaker:
             return largest
         share = self.source.device.guest_share
         speed = self.speed.rays_per_second * share / (share + RESTING_COST * (1 - share))
-        return affordable_height(speed, REFRESH_S, pose.aspect, largest)
+        return max(1, min(int(math.sqrt(speed * REFRESH_S / pose.aspect)), largest))
 
     def advance(self, render: FrameRender, edit: Edit, num_rays: int, cost: float) -> RenderedView | None:
         """Render a block; the frame if that was the last.
@@ -406,15 +331,13 @@ class PictureMaker:
         with self.edit_turn(edit) as (_, shown):
             return shown
 
-    def _ask(self, change: int) -> None:
-        """Note that a page waits for the device, or no longer: otherwise the render loop would take turn after turn."""
-        with self._queue:
-            self._num_asking += change
-            self._queue.notify_all()
-
     @contextmanager
     def edit_turn(self, edit: Edit) -> Iterator[tuple[TrainedScene, TrainedScene]]:
-        """Context with the scene before and after an edit, and the device."""
+        """Context with the scene before and after an edit, and the device.
+
+        Raises:
+            UnmixError: the edit does not fit the run.
+        """
         self._ask(1)
         with ExitStack() as stack:
             try:
@@ -423,6 +346,12 @@ class PictureMaker:
                 self._ask(-1)
             shown = edit.apply(scene, self.source.version, self._aids.see)
             yield scene, require_materials(shown, "of this run")
+
+    def _ask(self, change: int) -> None:
+        """Note that a page waits for the device, or no longer: otherwise the render loop would take turn after turn."""
+        with self._queue:
+            self._num_asking += change
+            self._queue.notify_all()
 
     def with_materials_of(self, edit: Edit, frame: RenderedView) -> RenderedView:
         """What a frame would be with other materials on the same shapes.
@@ -442,7 +371,7 @@ class PictureMaker:
         with torch.no_grad():
             frame = _without_traces(frame)
             picture, legend = layer.paint(frame, settings, aids)
-        depth = picture_depth(frame) if with_depth and isinstance(frame, MaterialView) else None
+        depth = _picture_depth(frame) if with_depth and isinstance(frame, MaterialView) else None
         return Shown(as_bytes(picture), depth, legend, is_moving, layer.is_labels)
 
 

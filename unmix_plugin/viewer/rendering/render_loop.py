@@ -9,16 +9,82 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from unmix_plugin.trained.protocol import RenderedView
 from unmix_plugin.viewer.layers.painting import LayerSettings
 from unmix_plugin.viewer.page import failures_said
-from unmix_plugin.viewer.rendering.pictures import RESTING_COST, Capture, PictureMaker, View, wants_more
+from unmix_plugin.viewer.rendering.pictures import (
+    DEFAULT_HEIGHT,
+    RESTING_COST,
+    FrameRender,
+    PictureMaker,
+    Shown,
+    wants_more,
+)
 from unmix_plugin.viewer.rendering.scene import Edit
 from unmix_plugin.viewer.view_cameras import ViewPose
 
 _POLL_S = 0.05
 _JOIN_S = 20.0
+
+
+@dataclass(eq=False)
+class View:
+    """What one client looks at, and how far its picture has come; changed only under the loop's lock."""
+
+    show: Callable[[Shown], None]
+    """Sends a picture."""
+    report: Callable[[str], None]
+    """Says what went wrong; an empty text that all is well again."""
+    settings: LayerSettings = LayerSettings()
+    edit: Edit = Edit()
+    largest_height: int = DEFAULT_HEIGHT
+    """Rows of the finest picture."""
+    subpixels: int = 1
+    """Rays through a pixel of the finest picture, along each of its edges."""
+    wants_depth: bool = False
+    """Whether objects of the client's own are to be hidden behind what is seen."""
+    pose: ViewPose | None = None
+    frame: RenderedView | None = None
+    """The picture shown last."""
+    frame_edit: Edit = Edit()
+    """What `frame` was rendered with."""
+    frame_version: int = -1
+    """The model's version that `frame` shows."""
+    moved_at: float | None = None
+    """When the first camera movement without a picture yet came; None if there is none."""
+    restyled_at: float | None = None
+    """The same for changes that need no rendering."""
+    render: FrameRender | None = None
+    """The finer picture under way."""
+    render_version: int = -1
+    served_at: float = 0.0
+    """When a block was last rendered for it."""
+    shown_at: float = 0.0
+    is_stuck: bool = False
+    """Whether its last picture failed; it is tried again once something changes."""
+    has_reported: bool = False
+    """Whether its client was told of a failure."""
+
+    @property
+    def asked_at(self) -> float | None:
+        """Since when it waits for a picture at once."""
+        return self.restyled_at if self.moved_at is None else self.moved_at
+
+
+@dataclass(eq=False)
+class Capture:
+    """A picture to be rendered apart from any view, of any size, when there is nothing more urgent."""
+
+    render: FrameRender
+    edit: Edit
+    done: Callable[[RenderedView | None, str], None]
+    """Takes the frame, or None and what went wrong; called in the render loop's thread."""
+    progress: Callable[[float], None] = lambda _: None
+    """Told the part that is rendered."""
+    is_cancelled: bool = False
+    served_at: float = 0.0
 
 
 class RenderLoop:
@@ -43,14 +109,10 @@ class RenderLoop:
             self._changed.notify_all()
         if self._thread.is_alive():
             self._thread.join(_JOIN_S)
-        for capture in self._captures:
+        with self._changed:
+            unfinished, self._captures = self._captures, []
+        for capture in unfinished:
             capture.done(None, "the viewer was stopped")
-        self._captures.clear()
-
-    @property
-    def num_views(self) -> int:
-        """How many are served."""
-        return len(self._views)
 
     def add(self, view: View) -> None:
         """Serve a view."""
@@ -149,19 +211,16 @@ class RenderLoop:
         served = min([*unfinished, *self._captures], key=lambda one: one.served_at, default=None)
         if isinstance(served, View):
             return lambda: self._guarded(served, self._refine)
-        if served is not None:
-            return lambda: self._advance_capture(served)
-        return None
+        return None if served is None else lambda: self._advance_capture(served)
 
     def _has_more(self, view: View) -> bool:
         if view.render is not None or view.frame is None or view.pose is None:
             return view.render is not None
         if view.frame.camera.height < self._maker.target_height(view.pose, view.largest_height):
             return True
-        is_stale = view.frame_version != self._maker.source.version
-        if not is_stale and wants_more(view.frame):
-            return True
-        return is_stale and time.monotonic() - view.shown_at > _POLL_S
+        if view.frame_version == self._maker.source.version:
+            return wants_more(view.frame)
+        return time.monotonic() - view.shown_at > _POLL_S
 
     def _guarded(self, view: View, work: Callable[[View], None]) -> None:
         """Do a piece of work for a view; what goes wrong is said to its client, and the loop goes on."""
@@ -244,6 +303,8 @@ class RenderLoop:
         if frame is None and not reasons:
             return
         with self._changed:
+            if capture not in self._captures:
+                return  # `stop` has said that it will not be finished
             self._captures.remove(capture)
         with failures_said("the picture could not be handed over", reasons.append):
             capture.done(frame, "".join(reasons))

@@ -1,12 +1,6 @@
-"""Where the viewer's scene comes from: a finished run, or a training that is under way.
-
-Recipes as the viewer applies them: cheaply, and again as training changes the scene.
-
-What the training views measured: spectra of points that they see, and errors of a rendered view.
+"""The scene that a viewer shows: of a run or of a training, edited; what training views measured of it.
 
 Notation: `P` points, `B` bands. A training view sees a point if nothing that the model renders is in front of it.
-
-What layers and edits need of the scene beside the view itself: made again as training goes on.
 """
 
 from __future__ import annotations
@@ -118,23 +112,8 @@ def source_of_training(trainer: Trainer, record: SceneRecord) -> SceneSource:
     return source
 
 
-_RENEWAL_S = 0.5
+_EDIT_RENEWAL_S = 0.5
 """Seconds between two edited scenes while training changes the unedited one."""
-
-_See = Callable[[TrainedScene], Coefficients]
-"""What cameras see of a scene, for edits that depend on it."""
-
-
-@dataclass(frozen=True)
-class _Kept:
-    """The edited scene made last."""
-
-    edited: RenderableScene
-    version: int
-    made_at: float
-
-    def serves(self, version: int) -> bool:
-        return self.version == version or time.monotonic() - self.made_at < _RENEWAL_S
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,52 +123,47 @@ class Edit:
     recipe: Recipe = Recipe()
     light: LightChoice = LightChoice()
     """For scenes whose light can be exchanged; such scenes have no recipes."""
-    _kept: list[_Kept] = field(default_factory=list, repr=False)
+    _kept: list[tuple[RenderableScene, int, float]] = field(default_factory=list, repr=False)
+    """The edited scene made last, the version that it was made of, and when."""
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
-
-    @property
-    def is_none(self) -> bool:
-        """Whether nothing is changed."""
-        return not self.has_recipe and self.light == LightChoice()
 
     @property
     def has_recipe(self) -> bool:
         """Whether materials, or the light of a scene of mixed materials, are changed."""
         return bool(self.recipe.operations) or self.recipe.illuminant is not None
 
-    @property
-    def changes_geometry(self) -> bool:
-        """Whether pictures must be rendered for it: shape or gloss change."""
-        return changes_geometry(self.recipe)
-
     def reuses(self, other: Edit) -> bool:
         """Whether what was rendered with `other` can be shown with this edit's materials."""
-        if self.light != other.light:
-            return False
-        return self is other or (not self.changes_geometry and not other.changes_geometry)
+        is_same_shape = not changes_geometry(self.recipe) and not changes_geometry(other.recipe)
+        return self is other or (is_same_shape and self.light == other.light)
 
-    def apply(self, scene: RenderableScene, version: int, see: _See) -> RenderableScene:
+    def apply(
+        self, scene: RenderableScene, version: int, see: Callable[[TrainedScene], Coefficients]
+    ) -> RenderableScene:
         """The edited scene; must be called while the scene is lent.
 
         Args:
-            scene: The unedited one.
+            scene: The unedited one, which is left alone.
             version: Rises as training changes it.
-            see: Asked only if the recipe depends on pictures.
+            see: What cameras see of a scene; asked only if the recipe depends on pictures.
         Raises:
             ConfigError: the recipe does not fit the run.
         """
-        if self.is_none:
+        if not self.has_recipe and self.light == LightChoice():
             return scene
         with self._lock:
-            if not self._kept or not self._kept[0].serves(version):
-                self._kept[:] = [_Kept(self._applied(scene, see), version, time.monotonic())]
-            return self._kept[0].edited
-
-    def _applied(self, scene: RenderableScene, see: _See) -> RenderableScene:
-        if self.light != LightChoice():
-            return relit(scene, self.light, "of this run")
-        scene = require_materials(scene, "of this run")
-        return edit_scene(scene, self.recipe, see(scene) if self.recipe.wants_pictures else None)
+            if self._kept:
+                edited, kept_version, made_at = self._kept[0]
+                if kept_version == version or time.monotonic() - made_at < _EDIT_RENEWAL_S:
+                    return edited
+            if self.light != LightChoice():
+                edited = relit(scene, self.light, "of this run")
+            else:
+                scene = require_materials(scene, "of this run")
+                seen = see(scene) if self.recipe.wants_pictures else None
+                edited = edit_scene(scene, self.recipe, seen)
+            self._kept[:] = [(edited, version, time.monotonic())]
+            return edited
 
 
 _TOLERANCE = 0.03
@@ -197,13 +171,13 @@ _TOLERANCE = 0.03
 
 _VIEWS_KEPT = 4
 _STEPS_KEPT = 200
-"""Depths rendered so many training steps ago are rendered again."""
+"""What was rendered so many training steps ago is rendered again."""
 
 _VIEWS_TRIED = 6
 
 
 @dataclass(frozen=True)
-class _Measurement:
+class Measurement:
     """What a training view measured of a point."""
 
     view: str
@@ -235,24 +209,22 @@ class MeasuredViews:
             Errors; where they are known; the name of the view.
         """
         index = int(self._by_nearness(frame.camera)[0])
-        height, width = frame.camera.height, frame.camera.width
-        errors = torch.zeros(height * width)
-        is_known = torch.zeros(height * width, dtype=torch.bool)
-        seen = (frame.coefficients.accumulation.flatten() > OCCUPIED_ACCUMULATION).nonzero()[:, 0]
+        coefficients, device = frame.coefficients.flatten(), frame.coefficients.accumulation.device
+        errors = torch.zeros(frame.camera.height * frame.camera.width)
+        is_known = torch.zeros(len(errors), dtype=torch.bool)
+        seen = (coefficients.accumulation > OCCUPIED_ACCUMULATION).nonzero()[:, 0]
         if len(seen):
-            points = _end_points(frame)[seen]
+            rays = frame.camera.to(device).image_rays(0)
+            points = (rays.origins + coefficients.ray_distance[:, None] * rays.directions)[seen]
             rows, columns, sees = self._pixels_of(points, index)
             cube = self._in_light(self._scene.cube(self._indices[index]), frame.scene.light_power)
-            spectra = frame.materials.spectra(
-                frame.coefficients.flatten().map(lambda packed: packed[seen[sees]])
-            ).cpu()
-            measured = cube[rows[sees], columns[sees]]
+            spectra = frame.materials.spectra(coefficients.map(lambda packed: packed[seen[sees]])).cpu()
             places = seen[sees].cpu()
-            errors[places] = (spectra - measured).abs().mean(dim=-1)
+            errors[places] = (spectra - cube[rows[sees], columns[sees]]).abs().mean(dim=-1)
             is_known[places] = True
-        device = frame.coefficients.accumulation.device
+        shape = (frame.camera.height, frame.camera.width)
         name = self._scene.frames[self._indices[index]].name
-        return errors.view(height, width).to(device), is_known.view(height, width).to(device), name
+        return errors.view(shape).to(device), is_known.view(shape).to(device), name
 
     def measurement(
         self,
@@ -260,7 +232,7 @@ class MeasuredViews:
         camera: Cameras,
         light: Float64[np.ndarray, " B"] | None,
         scene: TrainedScene,
-    ) -> _Measurement | None:
+    ) -> Measurement | None:
         """What the training view nearest to a camera measured of a point; None where no view tried sees it.
 
         Args:
@@ -274,7 +246,7 @@ class MeasuredViews:
             if bool(sees[0]):
                 cube = self._scene.cube(self._indices[index])
                 spectrum = self._in_light(cube[int(rows[0]), int(columns[0])].copy(), light)
-                return _Measurement(self._scene.frames[self._indices[index]].name, spectrum)
+                return Measurement(self._scene.frames[self._indices[index]].name, spectrum)
         return None
 
     def _in_light(
@@ -327,33 +299,20 @@ class MeasuredViews:
         return distance
 
 
-def _end_points(frame: MaterialView) -> Float[Tensor, "P 3"]:
-    """Where the rays of all pixels end."""
-    coefficients = frame.coefficients
-    bundle = frame.camera.to(coefficients.accumulation.device).image_rays(0)
-    distance = coefficients.ray_distance.flatten()
-    return bundle.origins + distance[:, None] * bundle.directions
-
-
-_RENEWAL_STEPS = 200
-"""Training steps after which the rays are rendered again."""
-
-
 class SceneAids:
-    """Rays through the whole scene, what cameras see of it, and what was measured."""
+    """What layers and edits need of the scene beside the view itself: made again as training goes on."""
 
     def __init__(self, source: SceneSource, has_materials: bool) -> None:
         self.measured: MeasuredViews | None = None
         """What the training views measured, once the scene is read."""
-        self.why_not_measured = "the scene is still being read"
-        """What is said where `measured` is missing."""
+        self._why_not_measured = "the scene is still being read"
         self._source, self._has_materials = source, has_materials
         self._for_layers: tuple[int, LayerAids] | None = None
         self._seen: tuple[int, Coefficients] | None = None
 
     def set_measured(self, measured: MeasuredViews | None, why_not: str = "") -> None:
         """Note what was measured, or why that is unknown."""
-        self.measured, self.why_not_measured = measured, why_not
+        self.measured, self._why_not_measured = measured, why_not
         self._for_layers = None
 
     def for_layers(self) -> LayerAids | None:
@@ -362,21 +321,18 @@ class SceneAids:
             return None
         kept, version = self._for_layers, self._source.version
         age = 0 if kept is None else version - kept[0]
-        if kept is None or age >= _RENEWAL_STEPS or (age > 0 and not self._source.is_changing):
-            kept = self._for_layers = (version, self._made())
+        if kept is None or age >= _STEPS_KEPT or (age > 0 and not self._source.is_changing):
+            error_of = None if self.measured is None else self.measured.error
+            why_not, record = self._why_not_measured, self._source.record
+            with self._source.borrowed_materials() as scene:
+                reference = render_reference(scene, record.train_cameras)
+            kept = (version, LayerAids(reference, record.scene_box, error_of, why_not))
+            self._for_layers = kept
         return kept[1]
 
     def see(self, scene: TrainedScene) -> Coefficients:
         """What the training cameras see of the unedited scene, not long ago; called while it is lent."""
         version = self._source.version
-        if self._seen is None or version - self._seen[0] >= _RENEWAL_STEPS:
+        if self._seen is None or version - self._seen[0] >= _STEPS_KEPT:
             self._seen = (version, sample_seen(scene))
         return self._seen[1]
-
-    def _made(self) -> LayerAids:
-        error_of = None if self.measured is None else self.measured.error
-        why_not = self.why_not_measured
-        record = self._source.record
-        with self._source.borrowed_materials() as scene:
-            reference = render_reference(scene, record.train_cameras)
-        return LayerAids(reference, record.scene_box, error_of, why_not)

@@ -23,7 +23,6 @@ from unmix_plugin.viewer.recipes import (
     numbered,
     visibility,
     with_change,
-    with_light,
     with_swap,
     with_visible,
 )
@@ -53,12 +52,6 @@ def test_visibility_is_one_edit_whatever_was_hidden_before():
     assert alone.operations == (Scale(0, 2.0), Isolate((3,)))
     assert visibility(alone) == (frozenset(), frozenset({3}))
     assert with_visible(alone, set(), None).operations == (Scale(0, 2.0),)
-
-
-def test_light_is_set_and_taken_away():
-    lit = with_light(Recipe((Scale(0, 2.0),)), Light("A"))
-    assert lit.illuminant == Light("A")
-    assert with_light(lit, None) == Recipe((Scale(0, 2.0),))
 
 
 def test_changes_are_undone_and_redone_in_order():
@@ -107,7 +100,7 @@ def test_unknown_names_are_left_for_whoever_applies_the_recipe():
 
 @pytest.mark.parametrize("isolated", [None, 2])
 def test_what_a_panel_builds_is_what_is_read_from_its_file(isolated):
-    recipe = with_light(Recipe(), Light("FL2"))
+    recipe = Recipe(illuminant=Light("FL2"))
     recipe = with_change(recipe, Retint(0, (0.2, 0.4, 0.6)))
     recipe = with_change(recipe, Rename(1, "clay"))
     recipe = with_visible(with_swap(recipe, Swap(0, 2)), {0}, isolated)

@@ -1,11 +1,12 @@
-"""A page that is loaded again goes on where it was."""
+"""What pages share, and what a page that is loaded again goes on with."""
 
 import numpy as np
 
 from tests.viewer.pages import decoded, opened, page_of, show_layer
+from unmix_plugin.engine.training.progress import TrainingStatus
 from unmix_plugin.viewer.layers.painting import LayerSettings
 from unmix_plugin.viewer.recipes import RecipeHistory
-from unmix_plugin.viewer.session import KEPT_S, KeptPages, PageState
+from unmix_plugin.viewer.session import KEPT_S, KeptPages, PageState, TrainingCurve
 
 
 def state(rows):
@@ -41,11 +42,11 @@ def test_a_reload_keeps_camera_layer_and_edits_and_another_browser_starts_anew(v
         page.set("brightness", 3.0)
         page.wait_until(lambda: "scale" in page.controls[page.control("recipe")]["value"])
         before = show_layer(page, "all abundances")
-        page.wait_until(lambda: len(decoded(page.last_picture)) == 48)
+        page.wait_until(lambda: len(decoded(page.last_picture)) == 24)
         before = decoded(page.last_picture)
     with page_of(viewer, storage=storage) as page:
         page.look_from(0.3)
-        page.wait_until(lambda: bool(page.pictures) and len(decoded(page.last_picture)) == 48)
+        page.wait_until(lambda: bool(page.pictures) and len(decoded(page.last_picture)) == 24)
         np.testing.assert_allclose(decoded(page.last_picture), before, atol=2)
         assert page.controls[page.control("layer")]["value"] == "all abundances"
         assert "scale" in page.controls[page.control("recipe")]["value"]
@@ -54,3 +55,36 @@ def test_a_reload_keeps_camera_layer_and_edits_and_another_browser_starts_anew(v
     with opened(viewer) as page:
         assert page.controls[page.control("layer")]["value"] == "colour"
         assert page.controls[page.control("recipe")]["value"] == "edits: []\n"
+
+
+def status(step, psnr: float | None = 20.0):
+    return TrainingStatus(step, float(step), step / 10_000, 1.0 / step, psnr, 100.0)
+
+
+def test_a_short_curve_has_every_point_once():
+    curve = TrainingCurve()
+    for step in (1, 2, 2, 3, 1):
+        curve.add(status(step))
+    curve.add(None)
+    steps, losses = curve.line("loss")
+    assert steps.tolist() == [1, 2, 3]
+    assert losses.tolist() == [1, 1 / 2, 1 / 3]
+
+
+def test_a_long_curve_stays_small_and_covers_the_whole_training():
+    curve = TrainingCurve()
+    for step in range(1, 10_001):
+        curve.add(status(step))
+    steps, losses = curve.line("loss")
+    assert 100 <= len(steps) <= 400
+    assert steps[0] == 1
+    assert steps[-1] > 9_900
+    np.testing.assert_allclose(losses, 1 / steps)
+    assert np.ptp(np.diff(steps)) == 0
+
+
+def test_a_training_without_psnr_has_no_curve_of_it():
+    curve = TrainingCurve()
+    curve.add(status(1, None))
+    steps, values = curve.line("psnr")
+    assert len(steps) == len(values) == 0

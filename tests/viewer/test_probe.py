@@ -13,6 +13,9 @@ from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.viewer.panels.probe import abundances_csv, probe_through, spectra_csv
 from unmix_plugin.viewer.view_cameras import camera_of, pose_of
 
+TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+WORLD = Normalisation(TURN, np.array([0.3, -2.0, 5.0]), 0.25)
+
 
 @pytest.fixture
 def camera(source):
@@ -31,25 +34,24 @@ def test_a_probe_is_what_the_picture_shows_there(source, camera, taken):
         shown = scene.render(camera, ["spectral", "abundances"])
     np.testing.assert_allclose(taken.predicted, shown["spectral"][row, column].numpy(), rtol=1e-5)
     assert taken.abundances.sum() == pytest.approx(1)
-    assert taken.material == int(shown["abundances"][row, column].argmax())
+    assert taken.name == taken.materials.names[int(shown["abundances"][row, column].argmax())]
 
 
 def test_a_probe_lies_on_the_ray_through_the_click(camera, taken):
-    coords, depth = camera.project(taken.position[None], 0)
+    coords, depth = camera.project(torch.tensor([taken.point]), 0)
     assert depth[0] > 0
     assert coords[0].tolist() == pytest.approx([camera.width / 2, camera.height / 2], abs=1.0)
 
 
-def test_a_probe_tells_where_it_is_in_the_world_that_exports_are_in(source, camera):
-    frame = Normalisation(
-        np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([0.3, -2.0, 5.0]), 0.25
-    )
+def test_what_users_read_of_a_place_is_in_the_world(source, camera, taken):
     with source.borrowed() as scene:
-        moved = replace(scene, frame=frame)
-        taken = probe_through(moved, camera, camera.width / 2, camera.height / 2, 1)
-    np.testing.assert_allclose(taken.world, frame.to_world(np.array(taken.point)), rtol=1e-9)
-    row = list(csv.reader(io.StringIO(abundances_csv([taken]).decode())))[1]
-    np.testing.assert_allclose([float(value) for value in row[1:4]], taken.world, rtol=1e-7)
+        shown = replace(scene, frame=WORLD)
+        moved = probe_through(shown, camera, camera.width / 2, camera.height / 2, 1)
+    assert moved.point == taken.point
+    expected = WORLD.to_world(np.array([taken.point]))[0]
+    np.testing.assert_allclose(moved.world, expected, rtol=1e-6)
+    rows = list(csv.reader(io.StringIO(abundances_csv([moved]).decode())))
+    np.testing.assert_allclose([float(value) for value in rows[1][1:4]], expected, rtol=1e-6)
 
 
 def test_where_nothing_is_there_is_nothing_to_probe(source, camera):

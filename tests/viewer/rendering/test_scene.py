@@ -1,4 +1,4 @@
-"""What training views measured: of a point that they see, and of every pixel of a rendered view."""
+"""Recipes on a scene that may be training, and what training views measured of it."""
 
 from dataclasses import replace
 
@@ -7,7 +7,10 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.method_factory import make_scene
+from tests.method_factory import make_model, make_scene, scene_of
+from tests.viewer.view_factory import ring
+from unmix_plugin.editing import Gloss, Light, Recipe, Remove, Rename, Retint, Scale, Swap, sample_seen
+from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes import load_scene
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.spectral.bands import Bands
@@ -15,8 +18,89 @@ from unmix_plugin.spectral.materials import Coefficients, Materials
 from unmix_plugin.trained.material_view import MaterialView
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.panels.probe import take_probe
+from unmix_plugin.viewer.rendering import scene as scene_module
 from unmix_plugin.viewer.rendering.pictures import PictureMaker
 from unmix_plugin.viewer.rendering.scene import Edit, MeasuredViews, SceneAids
+
+
+@pytest.fixture
+def trained():
+    """A scene that nothing trains."""
+    return scene_of(make_model(), ring())
+
+
+def unseen(_):
+    raise AssertionError("this edit does not depend on pictures")
+
+
+def test_no_edit_is_the_scene_itself(trained):
+    assert Edit().apply(trained, 0, unseen) is trained
+
+
+def test_an_edit_leaves_the_scene_alone(trained):
+    before = trained.materials.endmembers.clone()
+    edited = Edit(Recipe((Scale(0, 2.0), Rename(1, "clay")), Light("A"))).apply(trained, 0, unseen)
+    assert isinstance(edited, TrainedScene)
+    assert_close(trained.materials.endmembers, before)
+    assert edited.materials.names[1] == "clay"
+    assert not torch.allclose(edited.materials.endmembers, before)
+
+
+def test_an_edited_scene_is_made_once_for_a_scene_that_stays(trained, monkeypatch):
+    made = []
+    original = scene_module.edit_scene
+    monkeypatch.setattr(scene_module, "edit_scene", lambda *args: made.append(1) or original(*args))
+    edit = Edit(Recipe((Scale(0, 2.0),)))
+    first = edit.apply(trained, 5, unseen)
+    assert all(edit.apply(trained, 5, unseen) is first for _ in range(10))
+    assert made == [1]
+
+
+def test_an_edited_scene_follows_a_training_but_not_every_step(trained, monkeypatch):
+    edit = Edit(Recipe((Scale(0, 0.5),)))
+    first = edit.apply(trained, 1, unseen)
+    assert edit.apply(trained, 2, unseen) is first
+    monkeypatch.setattr(scene_module, "_EDIT_RENEWAL_S", 0.0)
+    later = replace(trained, materials=replace(trained.materials, endmembers=torch.full((3, 5), 0.4)))
+    renewed = edit.apply(later, 3, unseen)
+    assert isinstance(renewed, TrainedScene)
+    assert_close(renewed.materials.endmembers[0], torch.full((5,), 0.2))
+
+
+def test_pictures_are_looked_at_only_for_edits_that_depend_on_them(trained):
+    asked = []
+
+    def see(unedited):
+        asked.append(unedited)
+        return sample_seen(unedited)
+
+    Edit(Recipe((Retint(0, (0.5, 0.4, 0.3), "spectrum"),))).apply(trained, 0, see)
+    assert asked == []
+    Edit(Recipe((Retint(0, (0.5, 0.4, 0.3)),))).apply(trained, 0, see)
+    assert asked == [trained]
+
+
+@pytest.mark.parametrize(
+    ("recipe", "renders"),
+    [
+        (Recipe(), False),
+        (Recipe((Scale(0, 2.0), Swap(0, 1)), Light("A")), False),
+        (Recipe((Gloss(None, 0.5),)), False),
+        (Recipe((Gloss(0, 0.5),)), True),
+        (Recipe((Remove((0,)),)), True),
+    ],
+)
+def test_pictures_are_rendered_anew_only_where_shapes_or_gloss_change(recipe, renders):
+    edit = Edit(recipe)
+    assert edit.reuses(Edit()) is not renders
+    assert Edit().reuses(edit) is not renders
+    assert edit.reuses(edit)
+
+
+def test_an_edit_that_does_not_fit_says_so(trained):
+    with pytest.raises(ConfigError, match="there is no endmember 7"):
+        Edit(Recipe((Scale(7, 2.0),))).apply(trained, 0, unseen)
+
 
 BALL = 0.5
 

@@ -1,0 +1,244 @@
+"""Pictures in strips are the pictures of the whole; videos are rendered by `unmix-render`, one at a time."""
+
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tyro
+
+from tests.viewer.view_factory import make_frame, make_services, some_pose
+from unmix_plugin.commands.render import RenderOptions
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.products.render.formats import choose_formats
+from unmix_plugin.trained.relighting import LightChoice
+from unmix_plugin.viewer.layers.layers import LAYERS
+from unmix_plugin.viewer.layers.painting import LayerSettings
+from unmix_plugin.viewer.rendering import captures
+from unmix_plugin.viewer.rendering.captures import (
+    SpectraCanvas,
+    StripCapture,
+    VideoJob,
+    VideoQueue,
+    check_size,
+    output_of,
+    render_argv,
+)
+from unmix_plugin.viewer.rendering.scene import Edit
+from unmix_plugin.viewer.view_cameras import sized_camera
+
+
+@pytest.fixture
+def services(source):
+    running = make_services(source)
+    yield running
+    running.stop()
+
+
+def captured(services, camera, take, subpixels=1):
+    """Capture a picture strip by strip; what it ended with, and the parts told."""
+    ended, reasons, parts = threading.Event(), [], []
+
+    def done(reason):
+        reasons.append(reason)
+        ended.set()
+
+    StripCapture(services.loop, camera, Edit(), subpixels, take, done, parts.append).start()
+    assert ended.wait(120)
+    return reasons[0], parts
+
+
+@pytest.mark.parametrize("layer", ["rgb", "depth", "segmentation"])
+def test_strips_make_up_the_picture_of_the_whole(services, source, monkeypatch, layer):
+    monkeypatch.setattr(captures, "_STRIP_PIXELS", 100)
+    camera = sized_camera(some_pose(), 31, 23)
+    settings, pixels = LayerSettings(layer=layer), np.zeros((23, 31, 3), int)
+
+    def take(row, frame):
+        pixels[row : row + frame.camera.height] = services.maker.paint(frame, settings, False, False).picture
+
+    reason, parts = captured(services, camera, take)
+    assert reason == ""
+    assert len(parts) >= 8
+    assert parts == sorted(parts)
+    assert parts[-1] == pytest.approx(1.0)
+    whole = services.maker.paint(make_frame(source, camera), settings, False, False).picture
+    assert np.abs(pixels - whole.astype(int)).max() <= 1
+
+
+def test_spectra_of_strips_are_those_of_the_whole(services, source, monkeypatch):
+    monkeypatch.setattr(captures, "_STRIP_PIXELS", 64)
+    camera = sized_camera(some_pose(), 17, 13)
+    canvas = SpectraCanvas(camera, 5)
+    reason, _ = captured(services, camera, canvas.take)
+    assert reason == ""
+    frame = make_frame(source, camera)
+    np.testing.assert_allclose(canvas.spectra, frame["spectral"].numpy(), atol=1e-5)
+    np.testing.assert_allclose(canvas.coverage, frame.coverage.numpy(), atol=1e-5)
+
+
+def test_a_strip_that_cannot_be_taken_ends_the_capture(services, caplog):
+    def refuse(*_):
+        raise OSError("the disk is full")
+
+    reason, _ = captured(services, sized_camera(some_pose(), 16, 16), refuse)
+    assert reason == "OSError: the disk is full"
+    services.stop()
+    assert "the disk is full" in caplog.text
+
+
+def test_a_capture_can_be_cancelled(services, monkeypatch):
+    monkeypatch.setattr(captures, "_STRIP_PIXELS", 64)
+    ended, reasons = threading.Event(), []
+
+    def done(reason):
+        reasons.append(reason)
+        ended.set()
+
+    capture = StripCapture(
+        services.loop,
+        sized_camera(some_pose(), 100, 100),
+        Edit(),
+        1,
+        lambda *_: capture.cancel(),
+        done,
+        lambda _: None,
+    )
+    capture.start()
+    assert ended.wait(120)
+    assert reasons == ["cancelled"]
+
+
+@pytest.mark.parametrize(
+    ("size", "message"),
+    [
+        ((8192, 8192, None), "67108864|too many for one picture"),
+        ((4096, 4096, 31), "spectra of 4096 x 4096 pixels"),
+    ],
+)
+def test_pictures_that_would_not_fit_are_refused(size, message):
+    with pytest.raises(ConfigError, match=message):
+        check_size(*size)
+    check_size(4096, 4096)
+    check_size(1024, 1024, 31)
+
+
+@pytest.mark.parametrize("layer", [name for name in LAYERS if name != "error"])
+def test_every_layer_that_renders_know_is_an_output_of_theirs(layer, source):
+    chosen = LayerSettings(wavelength_nm=500.0, false_colour_nm=(650.0, 550.0, 450.0), index="r650 / r500")
+    output = output_of(replace(chosen, layer=layer))
+    with source.borrowed() as scene:
+        products = choose_formats((output,), ("mp4",), scene, True)
+    assert [product.format for product in products] == ["mp4"]
+
+
+@pytest.mark.parametrize("layer", ["error", "index"])
+def test_the_error_and_an_index_that_is_not_chosen_are_no_outputs(layer):
+    with pytest.raises(ConfigError, match=f"videos can't show the layer {layer}"):
+        output_of(LayerSettings(layer=layer))
+
+
+def test_the_words_are_those_of_the_command(tmp_path):
+    paths = (tmp_path, tmp_path / "path.json", "rgb", tmp_path / "out", tmp_path / "recipe.yml")
+    light = LightChoice("studio", rotation_deg=-30.0, exposure_stops=0.5)
+    options = tyro.cli(RenderOptions, args=render_argv(*paths, light))
+    assert (options.run, options.cameras) == (tmp_path, str(tmp_path / "path.json"))
+    assert (options.outputs, options.formats, options.overwrite) == (("rgb",), ("mp4",), True)
+    assert options.edits == tmp_path / "recipe.yml"
+    assert options.environment == "studio"
+    assert (options.environment_rotation, options.environment_exposure) == (-30.0, 0.5)
+    plain = tyro.cli(RenderOptions, args=render_argv(*paths[:4], None))
+    assert (plain.edits, plain.environment) == (None, RenderOptions().environment)
+
+
+@pytest.fixture
+def run_instead(monkeypatch):
+    """Run Python code in place of the command."""
+    return lambda code: monkeypatch.setattr(captures, "_LAUNCH", code)
+
+
+class Ending:
+    """A video, and how it ended."""
+
+    def __init__(self, folder):
+        self.parts, self.video, self.reason = [], None, None
+        self._ended = threading.Event()
+        self.job = VideoJob(["--some", "words"], folder, self.parts.append, self._done)
+
+    def _done(self, video, reason):
+        self.video, self.reason = video, reason
+        self._ended.set()
+
+    def wait(self):
+        assert self._ended.wait(120)
+        return self
+
+
+def rendered(folder, queue=None):
+    one = Ending(folder)
+    (queue or VideoQueue()).start(one.job)
+    return one.wait()
+
+
+WRITE = "import sys, pathlib; pathlib.Path({folder!r}, 'a.mp4').write_bytes(b'video')"
+
+
+def test_the_video_is_handed_over(tmp_path, run_instead):
+    run_instead(WRITE.format(folder=str(tmp_path)) + "; assert sys.argv[1:] == ['--some', 'words']")
+    assert rendered(tmp_path).video == tmp_path / "a.mp4"
+
+
+def test_progress_is_told_as_the_command_prints_it(tmp_path, run_instead):
+    run_instead("print('rendering: 1 of 4 done'); print('other'); print('rendering: 3 of 4 done')")
+    assert rendered(tmp_path).parts == [0.25, 0.75]
+
+
+def test_the_command_prints_progress_as_it_is_read(capsys):
+    from rich.console import Console
+
+    from unmix_plugin.commands.reporting import follow
+
+    list(follow(Console(), "rendering", [1, 2]))
+    found = captures._PROGRESS.match(capsys.readouterr().out)
+    assert found is not None
+    assert found.groups() == ("0", "2")
+
+
+def test_a_failure_is_said_with_its_reason(tmp_path, run_instead):
+    run_instead("import sys; sys.exit('no checkpoint')")
+    ended = rendered(tmp_path)
+    assert (ended.video, ended.reason) == (None, "rendering the video failed: no checkpoint")
+
+
+WAIT = "import sys, time, pathlib; print('rendering: 0 of 1 done', flush=True); time.sleep(60)"
+
+
+def test_videos_are_rendered_in_turn_and_can_be_cancelled(tmp_path, run_instead):
+    run_instead(WAIT)
+    queue, first, second, third = VideoQueue(), *(Ending(tmp_path) for _ in range(3))
+    begun = threading.Event()
+    first.job.progress = lambda _: begun.set()
+    queue.start(first.job)
+    assert begun.wait(120)
+    queue.start(second.job)
+    queue.cancel(second.job)
+    run_instead("print('rendering: 1 of 1 done')")
+    queue.start(third.job)
+    assert third.parts == []
+    queue.cancel(first.job)
+    assert [one.wait().reason for one in (first, second)] == ["cancelled", "cancelled"]
+    assert third.wait().parts == [1.0]
+
+
+def test_stopping_ends_the_encoder_that_the_render_started(tmp_path, run_instead):
+    run_instead(
+        "import subprocess, sys; child = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)']);"
+        "print('rendering: 0 of 1 done', flush=True); child.wait()"
+    )
+    queue, one, begun = VideoQueue(), Ending(tmp_path), threading.Event()
+    one.job.progress = lambda _: begun.set()
+    queue.start(one.job)
+    assert begun.wait(120)
+    queue.stop()
+    # Its output is read to the end, which comes only once the encoder, which shares it, has ended.
+    assert one.wait().reason == "cancelled"

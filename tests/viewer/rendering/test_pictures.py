@@ -1,0 +1,156 @@
+"""How fine to render; pictures in blocks are the pictures that a scene renders at once; depth for the browser."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.testing import assert_close
+
+from tests.viewer.view_factory import make_frame, make_source
+from unmix_plugin.trained.material_view import MaterialView
+from unmix_plugin.trained.trained_scene import TrainedScene
+from unmix_plugin.viewer.rendering.pictures import (
+    _BLOCK_S,
+    _FAR,
+    _FEWEST_PIXELS,
+    _LONGEST_MOVING_S,
+    FrameRender,
+    Speedometer,
+    _finer_height,
+    _moving_height,
+    _picture_depth,
+    num_channels,
+)
+from unmix_plugin.viewer.view_cameras import camera_of, pose_of
+
+
+@pytest.mark.parametrize(
+    ("specular", "subpixels", "block"),
+    [("none", 1, 7), ("dictionary", 2, 31), ("full", 1, 31), ("full", 2, 10_000)],
+)
+def test_blocks_give_what_the_scene_gives_at_once(tmp_path, specular, subpixels, block):
+    source = make_source(tmp_path, specular=specular)
+    camera = camera_of(pose_of(source.record.train_cameras[0]), 6)
+    with source.borrowed() as scene:
+        assert isinstance(scene, TrainedScene)
+        expected = scene.look(camera, subpixels).coefficients
+        render = FrameRender(camera, subpixels)
+        total = 0
+        while render.rays_left:
+            total += render.render_block(scene, block)
+        frame = render.frame(scene)
+        assert isinstance(frame, MaterialView)
+        assert num_channels(scene.materials) == expected.packed.shape[-1]
+    assert total == render.num_rays == camera.width * camera.height * subpixels**2
+    assert frame.coefficients.num_endmembers == expected.num_endmembers
+    assert_close(frame.coefficients.packed, expected.packed, atol=1e-5, rtol=1e-5)
+
+
+def test_a_block_is_spread_over_the_picture(source):
+    camera = camera_of(pose_of(source.record.train_cameras[0]), 20)
+    render = FrameRender(camera)
+    with source.borrowed() as scene:
+        render.render_block(scene, render.num_rays // 10)
+    assert render._coefficients is not None
+    rows = (render._coefficients.accumulation != 0).view(camera.height, camera.width)
+    seen = make_frame(source, camera).coefficients.accumulation > 0
+    halves = rows[:10].sum() / seen[:10].sum(), rows[10:].sum() / seen[10:].sum()
+    assert all(0.05 < float(half) < 0.15 for half in halves)
+
+
+def test_what_training_changes_later_does_not_change_a_frame(source, model):
+    frame = make_frame(source)
+    before = frame.materials.endmembers.clone()
+    with source.device.training_turn(), torch.no_grad():
+        model.endmembers.add_(1)
+    assert_close(frame.materials.endmembers, before)
+    assert_close(make_frame(source).materials.endmembers, before + 1)
+    assert not frame.materials.endmembers.requires_grad
+
+
+def test_a_render_leaves_the_model_in_the_mode_it_was_in(source, model):
+    model.train()
+    with source.borrowed() as scene:
+        assert not scene.field.training
+        scene.look(source.record.train_cameras[0])
+    assert model.training
+    assert model.field.training
+
+
+speeds = st.floats(1e3, 1e8)
+
+
+@given(speeds, st.floats(0.2, 5), st.integers(16, 2048))
+def test_a_moving_picture_takes_no_longer_than_its_time(speed, aspect, largest):
+    height = _moving_height(speed, aspect, largest)
+    assert 1 <= height <= largest
+    pixels = height * height * aspect
+    assert pixels <= max(speed * _LONGEST_MOVING_S, _FEWEST_PIXELS) * 1.01
+
+
+def test_a_fast_device_shows_moving_pictures_in_full_size():
+    assert _moving_height(3e7, 1.0, 512) == 512
+
+
+@given(st.integers(1, 512), st.integers(16, 2048))
+def test_pictures_become_finer_until_the_finest_and_then_no_more(start, largest):
+    heights = [min(start, largest)]
+    while (finer := _finer_height(heights[-1], largest)) is not None:
+        assert finer > heights[-1]
+        heights.append(finer)
+    assert heights[-1] == largest
+    assert len(heights) <= 13
+
+
+def test_a_speedometer_follows_what_is_measured():
+    speed = Speedometer()
+    for _ in range(30):
+        speed.add(1000, 0.01)
+    assert speed.rays_per_second == pytest.approx(1e5, rel=0.01)
+    assert speed.block_rays == pytest.approx(1e5 * _BLOCK_S, rel=0.01)
+
+
+def test_measurements_that_say_nothing_change_nothing():
+    speed = Speedometer()
+    before = speed.rays_per_second
+    speed.add(0, 1.0)
+    speed.add(100, 0.0)
+    assert speed.rays_per_second == before
+
+
+def test_blocks_have_bounds_whatever_is_measured():
+    assert Speedometer(1.0).block_rays == 256
+    assert Speedometer(1e12).block_rays == 1 << 17
+
+
+def test_depth_is_along_the_axis_where_something_is_and_far_elsewhere(source):
+    camera = camera_of(pose_of(source.record.train_cameras[0]), 32)
+    frame = make_frame(source, camera)
+    depth = _picture_depth(frame)
+    accumulation = frame.coefficients.accumulation.numpy()
+    assert depth.shape == (camera.height, camera.width)
+    assert (depth[accumulation <= 0.5] == np.float32(np.round(_FAR / 512e-5) * 512e-5)).all()
+    seen = accumulation > 0.5
+    assert seen.any()
+    bundle = camera.image_rays(0)
+    distance = (frame.coefficients.distance / frame.coefficients.accumulation.clamp(min=1e-6)).flatten()
+    _, expected = camera.project(bundle.origins + distance[:, None] * bundle.directions, 0)
+    expected = expected.view(camera.height, camera.width).numpy()
+    assert np.abs(depth[seen] - expected[seen]).max() < 0.003
+
+
+def test_fine_pictures_have_the_depth_of_every_nth_pixel(source):
+    camera = camera_of(pose_of(source.record.train_cameras[0]), 300)
+    frame = make_frame(source, camera)
+    coefficients = frame.coefficients
+    depth = _picture_depth(frame)
+    assert depth.shape == (150, camera.width // 2)
+    far = coefficients.accumulation[1::2, 1::2].numpy() <= 0.5
+    assert ((depth > 100) == far).all()
+
+
+def test_depths_have_empty_low_bits_in_the_units_of_the_browser(source):
+    depth = _picture_depth(make_frame(source))
+    units = np.round(depth.astype(np.float64) * 100_000).astype(np.int64)
+    assert_close(units % 512, np.zeros_like(units))

@@ -1,0 +1,170 @@
+"""What comes from a browser is made harmless; nothing that a user typed is ever markup."""
+
+import math
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.viewer import page as html
+from unmix_plugin.viewer import page as inputs
+from unmix_plugin.viewer.layers.painting import ColourMapLegend, SwatchLegend, TextLegend, legend_html
+from unmix_plugin.viewer.page import WAIT_S, Debounced, choice, new_file, number, text
+
+anything = st.one_of(
+    st.none(), st.booleans(), st.integers(), st.floats(), st.text(), st.lists(st.integers()), st.binary()
+)
+
+
+@given(anything)
+def test_a_number_is_always_finite_and_within_bounds(value):
+    found = number(value, -2.0, 3.0, fallback=0.5)
+    assert math.isfinite(found)
+    assert -2 <= found <= 3
+
+
+@given(anything)
+def test_a_choice_is_always_a_known_one(value):
+    assert choice(value, ("a", "b"), "a") in ("a", "b")
+    assert choice("b", ("a", "b"), "a") == "b"
+
+
+@given(anything)
+def test_a_text_is_always_a_text_of_bounded_length(value):
+    assert isinstance(text(value), str)
+    assert len(text("x" * 200_000)) == inputs._LONGEST_TEXT
+
+
+@given(st.text(max_size=300))
+def test_a_file_lies_in_its_folder_whatever_it_is_called(name):
+    folder = Path("/somewhere/run")
+    path = new_file(folder, name, ".png", "view")
+    assert path.parent == folder
+    assert path.suffix == ".png"
+    assert path.name not in (".png", "..png")
+    assert not path.name.startswith(".")
+    assert path.name.isascii()
+    assert len(path.name) < 100
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("../../etc/passwd", "etc_passwd.png"),
+        ("/absolute", "absolute.png"),
+        ("a b", "a_b.png"),
+        ("shot.png", "shot.png"),
+        ("", "view.png"),
+        (None, "view.png"),
+        ("..", "view.png"),
+        ("v1.2", "v1.2.png"),
+    ],
+)
+def test_names_are_kept_as_far_as_they_are_safe(tmp_path, name, expected):
+    assert new_file(tmp_path, name, ".png", "view").name == expected
+
+
+def test_no_file_is_ever_overwritten(tmp_path):
+    for expected in ("shot.png", "shot-2.png", "shot-3.png"):
+        path = new_file(tmp_path, "shot", ".png", "view")
+        assert path.name == expected
+        path.touch()
+
+
+def test_endless_files_of_one_name_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(Path, "exists", lambda _: True)
+    with pytest.raises(ConfigError, match="too many files named shot"):
+        new_file(tmp_path, "shot", ".png", "view")
+
+
+def test_work_is_done_once_after_the_last_event():
+    now, done = [0.0], []
+    field = Debounced(lambda: done.append(now[0]), lambda: now[0])
+    for _ in range(5):
+        field.note()
+        now[0] += WAIT_S / 2
+        field.tick()
+    assert done == []
+    assert field.is_waiting
+    now[0] += WAIT_S
+    field.tick()
+    field.tick()
+    assert done == [now[0]]
+    assert not field.is_waiting
+
+
+def test_work_can_be_finished_at_once_and_only_if_there_is_some():
+    done = []
+    field = Debounced(lambda: done.append(1), lambda: 0.0)
+    field.tick(at_once=True)
+    assert done == []
+    field.note()
+    field.tick(at_once=True)
+    field.tick()
+    assert done == [1]
+
+
+EVIL = "<script>alert(1)</script><img src=x onerror='alert(2)'> & \"quotes\""
+
+
+class Collector(HTMLParser):
+    """Tags and text of a page, and whether every tag is closed."""
+
+    def __init__(self):
+        super().__init__()
+        self.tags, self.text, self.open = [], "", []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+
+
+def parsed(content):
+    collector = Collector()
+    collector.feed(content)
+    collector.close()
+    assert collector.open == []
+    return collector
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        html.paragraph(EVIL),
+        html.paragraph(EVIL, is_warning=True),
+        html.bars([(EVIL, 0.5, (1.0, 0.0, 0.0))]),
+        html.table([(EVIL, EVIL)]),
+        legend_html(TextLegend(EVIL)),
+        legend_html(SwatchLegend(((EVIL, (0.1, 0.2, 0.3)),))),
+        legend_html(ColourMapLegend("viridis", 0.0, 1.0, EVIL)),
+        html.swatches([(EVIL, (0.0, 0.0, 0.0))]),
+    ],
+)
+def test_words_of_users_are_shown_and_never_run(content):
+    found = parsed(content)
+    assert not {"script", "img"} & set(found.tags)
+    assert EVIL in found.text
+
+
+def test_a_colour_bar_says_its_values_and_goes_from_end_to_end():
+    content = legend_html(ColourMapLegend("gray", -1.0, 3.0, "radiance"))
+    found = parsed(content)
+    assert [value in found.text for value in ("-1", "1", "3", "radiance")] == [True] * 4
+    assert "#000000" in content
+    assert "#ffffff" in content
+
+
+def test_bars_are_as_long_as_their_values_and_never_longer_than_the_panel():
+    content = html.bars(
+        [("a", 0.25, (1.0, 0.0, 0.0)), ("b", 7.0, (0.0, 1.0, 0.0)), ("c", -1.0, (0.0, 0.0, 1.0))]
+    )
+    assert [f"width:{width}" in content for width in ("25.0%", "100.0%", "0.0%")] == [True] * 3
