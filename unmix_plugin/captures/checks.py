@@ -1,20 +1,13 @@
-"""A written view as the checks look at it: its camera, its picture, what was measured while it was written.
+"""What looks wrong with a scene that is written: places of cameras, pictures, exposure, moving light.
+
+*Moving light* is measured on sparse points in pairs of near views. Under fixed lamps a matt point keeps its brightness
+from view to view. Lamps that move along with the camera make a pattern that stands still in the picture, bright in the
+middle or towards a lamp: points that cross it get brighter on one side and darker on the other. So the logarithm of the
+ratio of brightness has a slope along the direction of movement, the same in all pairs. On a ball lit from the camera
+the slope, per radius and radian of movement, is about 1; lamps on both sides make it negative. Strong vignetting that
+nothing corrects has a slope too.
 
 Notation: `H x W` pixels, `N` views, `P` points.
-
-Where the cameras are: how many there are, from which sides they look, and whether neighbours see the same.
-
-Views that differ from the others: blurred ones, and jumps of exposure.
-
-Whether the light moves with the camera, as on a turntable, measured on sparse points in pairs of near views.
-
-Under fixed lamps a matt point keeps its brightness from view to view. Lamps that move along with the camera make a
-pattern that stands still in the picture, bright in the middle or towards a lamp: points that cross it get brighter on
-one side and darker on the other. So the logarithm of the ratio of brightness has a slope along the direction of
-movement, the same in all pairs. On a ball lit from the camera the slope, per radius and radian of movement, is about 1;
-lamps on both sides make it negative. Strong vignetting that nothing corrects has a slope too.
-
-One page of text: what looks wrong, what was measured, what was done.
 """
 
 from __future__ import annotations
@@ -32,6 +25,36 @@ from unmix_plugin.captures.poses.pose_set import PosedCamera
 from unmix_plugin.captures.writing.view_files import ViewRecord
 from unmix_plugin.engine.geometry.camera_paths import meeting_point
 from unmix_plugin.errors import counted
+
+FEW_VIEWS = 15
+NARROW_DEG = 12.0
+"""Cameras that are all within this range of elevation see the object from one height only."""
+WIDE_RING_DEG = 180.0
+"""Part of a circle from which a ring counts as one."""
+GAP_DEG = 75.0
+LEAST_OVERLAP = 0.4
+"""Share of a view that another one should see too."""
+FAR_NEIGHBOUR_DEG = 35.0
+SATURATED_SHARE, MISSING_SHARE = 0.01, 0.05
+BLURRED = 0.6
+"""Detail of a view against the median of all, below which it is blurred."""
+LEAST_VIEWS = 4
+"""That blur and exposure are compared among."""
+JUMP, JUMP_DEVIATIONS = 0.15, 4.0
+"""Logarithm of a gain against the others that counts as a jump, also as a multiple of the usual deviation."""
+LEAST_SHARED_POINTS = 50
+NEIGHBOURS = 6
+"""Views that one is compared with: the nearest."""
+PAIR_ANGLES_DEG = (4.0, 25.0)
+"""Between the views of a pair in which moving light is measured."""
+LEAST_PAIR_POINTS, LEAST_PAIRS, MOST_PAIRS = 60, 6, 200
+MOST_CHANGE = 0.7
+"""Logarithm of a ratio beyond which a pixel shows another surface."""
+LEAST_SLOPE, CERTAINTY = 0.15, 4.0
+"""Slopes below, up or down, count as none; standard errors of the slope that are beyond doubt."""
+_WIDTH = 110
+
+_Points = Float64[np.ndarray, "P 3"]
 
 
 @dataclass(frozen=True)
@@ -59,7 +82,7 @@ class SeenView:
         return -self.camera.camera_to_world[:, 2]
 
     @cached_property
-    def luminance(self) -> Float32[np.ndarray, "H W"]:
+    def _luminance(self) -> Float32[np.ndarray, "H W"]:
         """Linear luminance of the picture, smoothed over 3 x 3 pixels; NaN where the view shows nothing."""
         from PIL import Image
         from scipy import ndimage
@@ -72,68 +95,119 @@ class SeenView:
         smooth = ndimage.uniform_filter(light, 3)
         return np.where(pixels[..., 3] > 127, smooth, np.nan).astype(np.float32)
 
-    def pixels_of(self, points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, "P 2"]:
+    def pixels_of(self, points: _Points) -> Float64[np.ndarray, "P 2"]:
         """Where points are seen, x and y in pixels; NaN outside the picture or behind the camera."""
+        assert self.camera.lens is not None
         found = self.camera.pixels_of(points)
-        found[~self._inside(found)] = np.nan
+        x, y = found.T
+        inside = (x >= 0) & (x < self.camera.lens.width) & (y >= 0) & (y < self.camera.lens.height)
+        found[~inside] = np.nan  # comparisons are false for NaN
         return found
 
-    def has_before_it(self, points: Float64[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
+    def has_before_it(self, points: _Points) -> Bool[np.ndarray, " P"]:
         """Points nearer to the camera than the middle of all: those behind it are mostly hidden."""
         distances = np.linalg.norm(points - self.position, axis=1)
         return distances < np.linalg.norm(np.median(points, axis=0) - self.position)
 
-    def brightness_at(self, pixels: Float64[np.ndarray, "P 2"]) -> Float64[np.ndarray, " P"]:
-        """Luminance at pixels of `pixels_of`; NaN where it is."""
+    def log_brightness_of(self, points: _Points) -> Float64[np.ndarray, " P"]:
+        """Logarithm of the luminance at points; not finite where they are not seen."""
+        pixels = self.pixels_of(points)
         found = np.full(len(pixels), np.nan)
         inside = np.isfinite(pixels).all(axis=1)
         columns, rows = np.floor(pixels[inside]).astype(int).T
-        found[inside] = self.luminance[rows, columns]
-        return found
-
-    def _inside(self, pixels: Float64[np.ndarray, "P 2"]) -> Bool[np.ndarray, " P"]:
-        assert self.camera.lens is not None
-        width, height = self.camera.lens.width, self.camera.lens.height
-        x, y = pixels.T
-        return (x >= 0) & (x < width) & (y >= 0) & (y < height)  # false for NaN
+        found[inside] = self._luminance[rows, columns]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.log(found)
 
 
-def log_ratio(
-    first: SeenView, second: SeenView, points: Float64[np.ndarray, "P 3"]
-) -> Float64[np.ndarray, " P"]:
-    """Logarithm of how much brighter points are in the second view than in the first; not finite where unseen."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.log(second.brightness_at(second.pixels_of(points))) - np.log(
-            first.brightness_at(first.pixels_of(points))
+@dataclass(frozen=True)
+class Checked:
+    """What the checks say, one sentence each."""
+
+    findings: tuple[str, ...]
+    """What looks wrong."""
+    measured: tuple[str, ...]
+    """What was looked at, with its numbers."""
+
+
+def check_views(views: Sequence[SeenView], points: _Points | None) -> Checked:
+    """All checks.
+
+    Args:
+        views: Of one sensor, in order.
+        points: Sparse points, if there are any.
+    """
+    findings, measured = [], []
+    if len(views) < FEW_VIEWS:
+        findings.append(
+            f"only {len(views)} views: expect holes and fog; {FEW_VIEWS} or more all around serve better"
         )
+    findings += _pixels(views)
+    for found, said in (
+        _ring(views),
+        _overlap(views, points),
+        _blur(views),
+        _exposure(views, points),
+        _moving_light(views, points),
+    ):
+        findings += found
+        measured.append(said)
+    return Checked(tuple(findings), tuple(measured))
 
 
-def angles_between(views: Sequence[SeenView]) -> Float64[np.ndarray, "N N"]:
+def report_text(title: str, checked: Checked, done: Sequence[str]) -> str:
+    """One page of text: what looks wrong, what was measured, what was done.
+
+    Args:
+        title: First line.
+        checked: Of the checks.
+        done: What was done, one sentence each.
+    """
+    wrong = checked.findings or ("nothing that these checks can see",)
+    parts = [title, ""]
+    for heading, lines in (
+        ("What looks wrong", wrong),
+        ("What was measured", checked.measured),
+        ("What was done", done),
+    ):
+        parts.append(heading)
+        parts += [
+            textwrap.fill(line, _WIDTH, initial_indent="- ", subsequent_indent="  ", break_long_words=False)
+            for line in lines
+        ]
+        parts.append("")
+    return "\n".join(parts)
+
+
+def _angles_between(views: Sequence[SeenView]) -> Float64[np.ndarray, "N N"]:
     """Angles between optical axes, degrees."""
     axes = np.stack([view.axis for view in views])
     return np.degrees(np.arccos(np.clip(axes @ axes.T, -1.0, 1.0)))
 
 
-FEW_VIEWS = 15
-NARROW_DEG = 12.0
-"""Cameras that are all within this range of elevation see the object from one height only."""
-WIDE_RING_DEG = 180.0
-"""Part of a circle from which a ring counts as one."""
-GAP_DEG = 75.0
-LEAST_OVERLAP = 0.4
-"""Share of a view that another one should see too."""
-FAR_NEIGHBOUR_DEG = 35.0
-_SAMPLES = 8
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
-def few_views(views: Sequence[SeenView]) -> list[str]:
-    """Whether there are enough views."""
-    if len(views) >= FEW_VIEWS:
-        return []
-    return [f"only {len(views)} views: expect holes and fog; {FEW_VIEWS} or more all around serve better"]
+def _pixels(views: Sequence[SeenView]) -> list[str]:
+    """Views with many saturated or missing pixels, or without matter."""
+    findings = []
+    for what, limit in (("saturated", SATURATED_SHARE), ("missing", MISSING_SHARE)):
+        shares = {
+            view.name: getattr(view.record, f"{what}_pixels") / view.record.num_pixels for view in views
+        }
+        many = [f"{name} ({part:.0%})" for name, part in shares.items() if part > limit]
+        if many:
+            findings.append(
+                f"{counted(len(many), 'view')} with more than {limit:.0%} {what} pixels: {_some(many)}"
+            )
+    empty = [view.name for view in views if view.record.matter_share == 0.0]
+    if empty:
+        findings.append(f"{counted(len(empty), 'view')} without any matter, by the mask: {_some(empty)}")
+    return findings
 
 
-def ring(views: Sequence[SeenView]) -> tuple[list[str], str]:
+def _ring(views: Sequence[SeenView]) -> tuple[list[str], str]:
     """From which sides the cameras look, and what is missing."""
     poses = np.stack([view.camera.camera_to_world for view in views])
     focus = meeting_point(poses)
@@ -160,9 +234,7 @@ def ring(views: Sequence[SeenView]) -> tuple[list[str], str]:
     return findings, said
 
 
-def overlap(
-    views: Sequence[SeenView], points: Float64[np.ndarray, "P 3"] | None = None
-) -> tuple[list[str], str]:
+def _overlap(views: Sequence[SeenView], points: _Points | None) -> tuple[list[str], str]:
     """Whether each view shows something that another view shows from a similar side.
 
     A grid of rays of each view is followed to the depth of the middle of the scene: where the cameras look, or that of
@@ -175,7 +247,7 @@ def overlap(
         focus = np.median(points, axis=0)
     if focus is None or len(views) < 2:
         return [], "overlap is not judged: the cameras look at no one place, and there are no sparse points"
-    between = angles_between(views)
+    between = _angles_between(views)
     shares = np.zeros(len(views))
     nearest = np.zeros(len(views))
     for index, view in enumerate(views):
@@ -202,14 +274,12 @@ def overlap(
     )
 
 
-def _points_seen(view: SeenView, focus: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "P 3"]:
+def _points_seen(view: SeenView, focus: Float64[np.ndarray, "3"]) -> _Points:
     """Points on a grid of the view's rays, at the depth of the middle; lenses are taken without distortion."""
     lens = view.camera.lens
     assert lens is not None
-    x, y = np.meshgrid(
-        (np.arange(_SAMPLES) + 0.5) / _SAMPLES * lens.width,
-        (np.arange(_SAMPLES) + 0.5) / _SAMPLES * lens.height,
-    )
+    steps = (np.arange(8) + 0.5) / 8
+    x, y = np.meshgrid(steps * lens.width, steps * lens.height)
     across = (x.ravel() - lens.center_px[0]) / lens.focal_px[0]
     down = (y.ravel() - lens.center_px[1]) / lens.focal_px[1]
     rays = np.column_stack([across, -down, -np.ones_like(across)]) @ view.camera.camera_to_world[:, :3].T
@@ -217,20 +287,7 @@ def _points_seen(view: SeenView, focus: Float64[np.ndarray, "3"]) -> Float64[np.
     return view.position + depth * rays
 
 
-BLURRED = 0.6
-"""Detail of a view against the median of all, below which it is blurred."""
-LEAST_VIEWS = 4
-JUMP = 0.15
-"""Logarithm of a gain against the others that counts as a jump."""
-JUMP_DEVIATIONS = 4.0
-LEAST_POINTS = 50
-NEIGHBOURS = 6
-"""Views that one is compared with: the nearest."""
-SATURATED_SHARE = 0.01
-MISSING_SHARE = 0.05
-
-
-def blur(views: Sequence[SeenView]) -> tuple[list[str], str]:
+def _blur(views: Sequence[SeenView]) -> tuple[list[str], str]:
     """Views with less fine detail than the others."""
     details = np.array([view.record.detail for view in views])
     middle = float(np.median(details))
@@ -241,144 +298,60 @@ def blur(views: Sequence[SeenView]) -> tuple[list[str], str]:
         for view, detail in zip(views, details, strict=True)
         if detail < BLURRED * middle
     ]
-    findings = (
-        [f"{counted(len(blurred), 'view')} less sharp than the others: {_some(blurred)}"] if blurred else []
-    )
-    return (
-        findings,
-        f"finest structures have {middle:.2f} times the contrast of those twice as large (median of views)",
-    )
+    said = f"finest structures have {middle:.2f} times the contrast of those twice as large (median of views)"
+    if not blurred:
+        return [], said
+    return [f"{counted(len(blurred), 'view')} less sharp than the others: {_some(blurred)}"], said
 
 
-def exposure(views: Sequence[SeenView], points: Float64[np.ndarray, "P 3"] | None) -> tuple[list[str], str]:
+def _exposure(views: Sequence[SeenView], points: _Points | None) -> tuple[list[str], str]:
     """Views whose sparse points are brighter or darker than the same points in the views nearest to them."""
-    if points is None or len(points) < LEAST_POINTS or len(views) < LEAST_VIEWS:
-        return (
-            [],
-            "exposure is not compared: it takes sparse points, which come with estimated poses and COLMAP",
+    if points is None or len(points) < LEAST_SHARED_POINTS or len(views) < LEAST_VIEWS:
+        missing = (
+            "exposure is not compared: it takes sparse points, which come with estimated poses and COLMAP"
         )
-    gains = _gains(views, points)
-    if np.isnan(gains).any():
-        return [], "exposure is not compared: too few sparse points are seen in every view"
-    usual = 1.4826 * float(np.median(np.abs(gains - np.median(gains))))
-    limit = max(JUMP, JUMP_DEVIATIONS * usual)
-    jumps = [
-        f"{view.name} ({np.exp(gain):.2f} times as bright)"
-        for view, gain in zip(views, gains, strict=True)
-        if abs(gain) > limit
-    ]
-    findings = (
-        [f"exposure jumps in {counted(len(jumps), 'view')}, judged by sparse points: {_some(jumps)}"]
-        if jumps
-        else []
-    )
-    return (
-        findings,
-        f"sparse points vary by {np.expm1(usual):.0%} in brightness from view to view (robust deviation)",
-    )
-
-
-def _gains(views: Sequence[SeenView], points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, " N"]:
-    """Logarithm of how much brighter a view is than the views around it; NaN where too few points tell."""
-    angles = angles_between(views) + 360.0 * np.eye(len(views))
+        return [], missing
+    angles = _angles_between(views) + 360.0 * np.eye(len(views))
     before = [view.has_before_it(points) for view in views]
-    gains = np.full(len(views), np.nan)
+    gains = np.full(len(views), np.nan)  # logarithms, against the views around
     for index, view in enumerate(views):
         ratios = []
         for other in np.argsort(angles[index])[:NEIGHBOURS]:
             shared = points[before[index] & before[other]]
-            found = log_ratio(views[other], view, shared)
+            found = view.log_brightness_of(shared) - views[other].log_brightness_of(shared)
             found = found[np.isfinite(found)]
-            if len(found) >= LEAST_POINTS // 2:
+            if len(found) >= LEAST_SHARED_POINTS // 2:
                 ratios.append(float(np.median(found)))
         if len(ratios) >= 2:
             gains[index] = np.median(ratios)
-    return gains
+    if np.isnan(gains).any():
+        return [], "exposure is not compared: too few sparse points are seen in every view"
+    usual = 1.4826 * float(np.median(np.abs(gains - np.median(gains))))
+    said = f"sparse points vary by {np.expm1(usual):.0%} in brightness from view to view (robust deviation)"
+    jumps = [
+        f"{view.name} ({np.exp(gain):.2f} times as bright)"
+        for view, gain in zip(views, gains, strict=True)
+        if abs(gain) > max(JUMP, JUMP_DEVIATIONS * usual)
+    ]
+    if not jumps:
+        return [], said
+    return [f"exposure jumps in {counted(len(jumps), 'view')}, judged by sparse points: {_some(jumps)}"], said
 
 
-def pixels(views: Sequence[SeenView]) -> list[str]:
-    """Views with many saturated or missing pixels."""
-    findings = []
-    for what, share, limit in (
-        ("saturated", "saturated_pixels", SATURATED_SHARE),
-        ("missing", "missing_pixels", MISSING_SHARE),
-    ):
-        shares = {view.name: getattr(view.record, share) / view.record.num_pixels for view in views}
-        many = [f"{name} ({part:.0%})" for name, part in shares.items() if part > limit]
-        if many:
-            findings.append(
-                f"{counted(len(many), 'view')} with more than {limit:.0%} {what} pixels: {_some(many)}"
-            )
-    empty = [view.name for view in views if view.record.matter_share == 0.0]
-    if empty:
-        findings.append(f"{counted(len(empty), 'view')} without any matter, by the mask: {_some(empty)}")
-    return findings
-
-
-def _some(names: list[str]) -> str:
-    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
-
-
-ANGLES_DEG = (4.0, 25.0)
-"""Between the views of a pair."""
-LEAST_POINTS_OF_SLOPE, LEAST_PAIRS = 60, 6
-MOST_PAIRS = 200
-MOST_CHANGE = 0.7
-"""Logarithm of a ratio beyond which a pixel shows another surface."""
-LEAST_SLOPE = 0.15
-"""Slopes below, up or down, count as none."""
-CERTAINTY = 4.0
-"""Standard errors of the slope that are beyond doubt."""
-
-
-@dataclass(frozen=True)
-class MovingLight:
-    """What was measured."""
-
-    slope: float
-    """0 under fixed lamps."""
-    error: float
-    """Standard error of the slope."""
-    pairs: int
-
-    @property
-    def moves(self) -> bool:
-        """Whether the light moves with the camera, beyond doubt."""
-        return abs(self.slope) > max(LEAST_SLOPE, CERTAINTY * self.error)
-
-
-def measure(views: Sequence[SeenView], points: Float64[np.ndarray, "P 3"] | None) -> MovingLight | None:
-    """The slope over all pairs of near views; None where there are too few points or pairs."""
-    if points is None or len(points) < LEAST_POINTS_OF_SLOPE:
-        return None
-    slopes = []
-    for first, second in _pairs(views):
-        slope = _slope(views[first], views[second], points)
-        if slope is not None:
-            slopes.append(slope)
-    if len(slopes) < LEAST_PAIRS:
-        return None
-    values = np.array(slopes)
-    middle = float(np.median(values))
-    deviation = 1.4826 * float(np.median(np.abs(values - middle)))
-    return MovingLight(middle, 1.2533 * deviation / float(np.sqrt(len(values))), len(values))
-
-
-def moving_light(
-    views: Sequence[SeenView], points: Float64[np.ndarray, "P 3"] | None
-) -> tuple[list[str], str]:
-    """What to tell of it."""
-    found = measure(views, points)
+def _moving_light(views: Sequence[SeenView], points: _Points | None) -> tuple[list[str], str]:
+    """Whether the light moves with the camera, as on a turntable."""
+    found = _slope_of_light(views, points)
     if found is None:
         return (
             [],
             "whether light moves with the camera is not measured: it takes sparse points and near views",
         )
+    slope, error, pairs = found
     said = (
-        f"the brightness of sparse points has a slope of {found.slope:.2f} +- {found.error:.2f} along the movement of "
-        f"the camera ({found.pairs} pairs of views; 0 is fixed light)"
+        f"the brightness of sparse points has a slope of {slope:.2f} +- {error:.2f} along the movement of "
+        f"the camera ({pairs} pairs of views; 0 is fixed light)"
     )
-    if not found.moves:
+    if abs(slope) <= max(LEAST_SLOPE, CERTAINTY * error):
         return [], said
     finding = (
         f"light moves with the camera, as when an object is turned before fixed lamps: {said}. Shading of a point then "
@@ -387,24 +360,33 @@ def moving_light(
     return [finding], said
 
 
-def _pairs(views: Sequence[SeenView]) -> list[tuple[int, int]]:
-    angles = angles_between(views)
-    low, high = ANGLES_DEG
-    first, second = np.nonzero((angles >= low) & (angles <= high))
-    pairs = list(zip(first.tolist(), second.tolist(), strict=True))
-    return pairs[:: max(1, len(pairs) // MOST_PAIRS)]
+def _slope_of_light(views: Sequence[SeenView], points: _Points | None) -> tuple[float, float, int] | None:
+    """The slope over all pairs of near views, its standard error, the number of pairs; None with too few of them."""
+    if points is None or len(points) < LEAST_PAIR_POINTS:
+        return None
+    angles, (low, high) = _angles_between(views), PAIR_ANGLES_DEG
+    pairs = np.argwhere((angles >= low) & (angles <= high))
+    pairs = pairs[:: max(1, len(pairs) // MOST_PAIRS)]
+    slopes = [_slope(views[first], views[second], points) for first, second in pairs.tolist()]
+    values = np.array([slope for slope in slopes if slope is not None])
+    if len(values) < LEAST_PAIRS:
+        return None
+    middle = float(np.median(values))
+    deviation = 1.4826 * float(np.median(np.abs(values - middle)))
+    return middle, 1.2533 * deviation / float(np.sqrt(len(values))), len(values)
 
 
-def _slope(first: SeenView, second: SeenView, points: Float64[np.ndarray, "P 3"]) -> float | None:
+def _slope(first: SeenView, second: SeenView, points: _Points) -> float | None:
     """Slope of log brightness along the direction in which the camera moves, per radius and radian."""
     points = points[first.has_before_it(points) & second.has_before_it(points)]
-    before, ratio = first.pixels_of(points), log_ratio(first, second, points)
+    before = first.pixels_of(points)
+    ratio = second.log_brightness_of(points) - first.log_brightness_of(points)
     rotation = first.camera.camera_to_world[:, :3]
     turned = (second.position - first.position) @ rotation
     direction = np.array([turned[0], -turned[1]])
     length = float(np.linalg.norm(direction))
     good = np.isfinite(ratio) & (np.abs(ratio) < MOST_CHANGE)
-    if good.sum() < LEAST_POINTS_OF_SLOPE or length == 0.0:
+    if good.sum() < LEAST_PAIR_POINTS or length == 0.0:
         return None
     along = before[good] @ (direction / length)
     middle = np.median(along)
@@ -417,56 +399,3 @@ def _slope(first: SeenView, second: SeenView, points: Float64[np.ndarray, "P 3"]
 
 
 _WIDTH = 110
-
-
-@dataclass(frozen=True)
-class Checked:
-    """What the checks say, one sentence each."""
-
-    findings: tuple[str, ...]
-    """What looks wrong."""
-    measured: tuple[str, ...]
-    """What was looked at, with its numbers."""
-
-
-def check_views(views: Sequence[SeenView], points: np.ndarray | None) -> Checked:
-    """All checks.
-
-    Args:
-        views: Of one sensor, in order.
-        points: Sparse points (P, 3), if there are any.
-    """
-    findings, measured = [*few_views(views), *pixels(views)], []
-    for found, said in (
-        ring(views),
-        overlap(views, points),
-        blur(views),
-        exposure(views, points),
-        moving_light(views, points),
-    ):
-        findings += found
-        measured.append(said)
-    return Checked(tuple(findings), tuple(measured))
-
-
-def report_text(title: str, checked: Checked, done: Sequence[str]) -> str:
-    """The page.
-
-    Args:
-        title: First line.
-        checked: Of the checks.
-        done: What was done, one sentence each.
-    """
-    wrong = checked.findings or ("nothing that these checks can see",)
-    parts = [title, ""]
-    for heading, lines in (
-        ("What looks wrong", wrong),
-        ("What was measured", checked.measured),
-        ("What was done", done),
-    ):
-        parts += [heading, *(_bullet(line) for line in lines), ""]
-    return "\n".join(parts)
-
-
-def _bullet(line: str) -> str:
-    return textwrap.fill(line, _WIDTH, initial_indent="- ", subsequent_indent="  ", break_long_words=False)

@@ -1,13 +1,9 @@
-"""Matter and background of each view: from files, or from a background that is white or black.
+"""Matter and background of each view: from files of the capture, from a background that is white or black, or unknown.
 
-The border of the views tells how bright the background is and how much it varies; a threshold between it and the rest
+The border of the views tells how bright a background is and how much it varies; a threshold between it and the rest
 follows from that. Specks are then removed and small holes are filled.
 
 Notation: `H x W` pixels, `B` bands; values in [0, 1] as they are written.
-
-Where the opacity of views comes from: files, a background that is white or black, or nowhere.
-
-What pictures of a capture say of a view's pixels: how opaque they are, which are to be ignored, what they show.
 """
 
 from __future__ import annotations
@@ -30,6 +26,8 @@ from unmix_plugin.errors import CaptureError
 
 Background = Literal["white", "black"]
 
+HALF, OPAQUE = 127, 255
+"""Grey above which a mask is white; opacity of matter that covers a pixel."""
 SMALL_SHARE = 5e-4
 """Specks and holes smaller than this share of the picture are removed."""
 DEVIATIONS = 6.0
@@ -38,94 +36,6 @@ LEAST_DISTANCE = 0.02
 """Between level and threshold, as a share of the brightest pixels; JPEG and shading vary a background by about this."""
 LEAST_WHITE, MOST_BLACK = 0.5, 0.2
 """Level of a white or black background, as a share of the brightest pixels."""
-
-
-@dataclass(frozen=True)
-class BackgroundRule:
-    """Which pixels are background."""
-
-    kind: Background
-    threshold: float
-    """Background is at least this bright in every band (white), or at most this bright in the mean (black)."""
-    level: float
-    """Median of the border."""
-    deviation: float
-    """Robust standard deviation of the border."""
-
-    def matter(self, values: Float32[np.ndarray, "h W B"]) -> Bool[np.ndarray, "h W"]:
-        """Pixels that are not background."""
-        brightness = background_brightness(self.kind, values)
-        return brightness < self.threshold if self.kind == "white" else brightness > self.threshold
-
-
-def background_brightness(kind: Background, values: Float32[np.ndarray, "*pixels B"]) -> np.ndarray:
-    """What tells background from matter: white is bright in every band, black is dark in the mean."""
-    return values.min(axis=-1) if kind == "white" else values.mean(axis=-1)
-
-
-def find_background(kind: Background, border: Float32[np.ndarray, "N B"], brightest: float) -> BackgroundRule:
-    """The rule that fits pixels at the border of the views.
-
-    Args:
-        kind: What the background is said to be.
-        border: Spectra at the border of all views.
-        brightest: A high percentile of what the kind is judged by, over whole views.
-    Raises:
-        CaptureError: most of the border is not white or black.
-    """
-    brightness = background_brightness(kind, border)
-    level = float(np.median(brightness))
-    deviation = 1.4826 * float(np.median(np.abs(brightness - level)))
-    distance = max(DEVIATIONS * deviation, LEAST_DISTANCE * brightest)
-    share = level / brightest if brightest > 0 else 0.0
-    if (kind == "white" and share < LEAST_WHITE) or (kind == "black" and share > MOST_BLACK):
-        expected = f"more than {LEAST_WHITE:.0%}" if kind == "white" else f"less than {MOST_BLACK:.0%}"
-        raise CaptureError(
-            f"--mask {kind}: the border of the views is at {share:.0%} of the brightest pixels; expected {expected}, "
-            "as the background should reach to the border: choose another --mask"
-        )
-    threshold = level - distance if kind == "white" else level + distance
-    return BackgroundRule(kind, threshold, level, deviation)
-
-
-@dataclass(frozen=True)
-class CleanMask:
-    """A mask without specks and small holes, and what was changed."""
-
-    matter: Bool[np.ndarray, "H W"]
-    specks: int
-    holes: int
-    """Numbers of connected parts."""
-
-
-def clean(matter: Bool[np.ndarray, "H W"]) -> CleanMask:
-    """Remove specks, then fill holes, each connected by edges and smaller than `SMALL_SHARE` of the picture.
-
-    >>> mask = np.zeros((100, 100), bool)
-    >>> mask[20:80, 20:80] = True
-    >>> mask[40, 40] = False
-    >>> mask[5, 5] = True
-    >>> done = clean(mask)
-    >>> int(done.matter.sum()), done.specks, done.holes
-    (3600, 1, 1)
-    """
-    smallest = max(4, round(SMALL_SHARE * matter.size))
-    kept, specks = _without_small(matter, smallest)
-    background, holes = _without_small(~kept, smallest)
-    return CleanMask(~background, specks, holes)
-
-
-def _without_small(mask: Bool[np.ndarray, "H W"], smallest: int) -> tuple[Bool[np.ndarray, "H W"], int]:
-    from scipy import ndimage
-
-    parts = np.empty(mask.shape, np.int32)
-    ndimage.label(mask, output=parts)
-    sizes = np.bincount(parts.ravel())
-    is_small = sizes < smallest
-    is_small[0] = False
-    return mask & ~is_small[parts], int(is_small.sum())
-
-
 BORDER_SHARE = 0.02
 """Width of the border that a background is judged by, as a share of the view's."""
 MOST_BORDER_PIXELS = 20000
@@ -165,6 +75,54 @@ def choose_mask(views: Sequence[CaptureView], asked: MaskKind | None) -> tuple[M
     return "none", [note]
 
 
+@dataclass(frozen=True)
+class BackgroundRule:
+    """Which pixels are background."""
+
+    kind: Background
+    threshold: float
+    """Background is at least this bright in every band (white), or at most this bright in the mean (black)."""
+    level: float
+    """Median of the border."""
+    deviation: float
+    """Robust standard deviation of the border."""
+
+    def matter(self, values: Float32[np.ndarray, "h W B"]) -> Bool[np.ndarray, "h W"]:
+        """Pixels that are not background."""
+        brightness = _brightness(self.kind, values)
+        return brightness < self.threshold if self.kind == "white" else brightness > self.threshold
+
+
+def _brightness(kind: Background, values: Float32[np.ndarray, "*pixels B"]) -> np.ndarray:
+    """What tells background from matter: white is bright in every band, black is dark in the mean."""
+    return values.min(axis=-1) if kind == "white" else values.mean(axis=-1)
+
+
+def find_background(kind: Background, border: Float32[np.ndarray, "N B"], brightest: float) -> BackgroundRule:
+    """The rule that fits pixels at the border of the views.
+
+    Args:
+        kind: What the background is said to be.
+        border: Spectra at the border of all views.
+        brightest: A high percentile of what the kind is judged by, over whole views.
+    Raises:
+        CaptureError: most of the border is not white or black.
+    """
+    brightness = _brightness(kind, border)
+    level = float(np.median(brightness))
+    deviation = 1.4826 * float(np.median(np.abs(brightness - level)))
+    distance = max(DEVIATIONS * deviation, LEAST_DISTANCE * brightest)
+    share = level / brightest if brightest > 0 else 0.0
+    if (kind == "white" and share < LEAST_WHITE) or (kind == "black" and share > MOST_BLACK):
+        expected = f"more than {LEAST_WHITE:.0%}" if kind == "white" else f"less than {MOST_BLACK:.0%}"
+        raise CaptureError(
+            f"--mask {kind}: the border of the views is at {share:.0%} of the brightest pixels; expected {expected}, "
+            "as the background should reach to the border: choose another --mask"
+        )
+    threshold = level - distance if kind == "white" else level + distance
+    return BackgroundRule(kind, threshold, level, deviation)
+
+
 def background_rule(
     sensor: Sensor,
     views: Sequence[CaptureView],
@@ -190,7 +148,7 @@ def white_background_note(
     """A hint at `--mask white` if the border of most views is almost white; arguments as `background_rule` has them."""
     pixels = _border(sensor, views[:: max(1, -(-len(views) // LOOKED_AT))], scale)
     least = ALMOST_WHITE * (1.0 if sensor.is_absolute else _brightest("white", sample, pixels))
-    share = float(np.mean(background_brightness("white", pixels) >= least)) if len(pixels) else 0.0
+    share = float(np.mean(_brightness("white", pixels) >= least)) if len(pixels) else 0.0
     if least <= 0 or share < WHITE_BORDER:
         return []
     note = (
@@ -203,7 +161,7 @@ def white_background_note(
 def _brightest(
     kind: Background, sample: Float32[np.ndarray, "N c"], border: Float32[np.ndarray, "M c"]
 ) -> float:
-    everywhere = np.concatenate([background_brightness(kind, sample), background_brightness(kind, border)])
+    everywhere = np.concatenate([_brightness(kind, sample), _brightness(kind, border)])
     return float(np.percentile(np.clip(everywhere, 0.0, 1.0), BRIGHT_PERCENTILE)) if len(everywhere) else 0.0
 
 
@@ -225,9 +183,34 @@ def _border(sensor: Sensor, views: Sequence[CaptureView], scale: float) -> Float
     return np.clip(np.concatenate(border) / np.float32(scale), 0.0, 1.0)
 
 
-HALF = 127
-"""Grey above which a mask is white."""
-OPAQUE = 255
+def clean(matter: Bool[np.ndarray, "H W"]) -> tuple[Bool[np.ndarray, "H W"], int, int]:
+    """Remove specks, then fill holes, each connected by edges and smaller than `SMALL_SHARE` of the picture.
+
+    Returns:
+        The mask, and how many specks were removed and holes filled.
+
+    >>> mask = np.zeros((100, 100), bool)
+    >>> mask[20:80, 20:80] = True
+    >>> mask[40, 40] = False
+    >>> mask[5, 5] = True
+    >>> cleaned, specks, holes = clean(mask)
+    >>> int(cleaned.sum()), specks, holes
+    (3600, 1, 1)
+    """
+    smallest = max(4, round(SMALL_SHARE * matter.size))
+    kept, specks = _without_small(matter, smallest)
+    background, holes = _without_small(~kept, smallest)
+    return ~background, specks, holes
+
+
+def _without_small(mask: Bool[np.ndarray, "H W"], smallest: int) -> tuple[Bool[np.ndarray, "H W"], int]:
+    from scipy import ndimage
+
+    parts = np.empty(mask.shape, np.int32)
+    ndimage.label(mask, output=parts)
+    is_small = np.bincount(parts.ravel()) < smallest
+    is_small[0] = False
+    return mask & ~is_small[parts], int(is_small.sum())
 
 
 @dataclass(frozen=True)
@@ -260,8 +243,7 @@ def read_view_masks(view: CaptureView, raster: Raster, use_opacity: bool) -> Vie
     valid, opacity = np.ones((raster.height, raster.width), bool), None
     alpha = _alpha(view) if use_opacity else None
     if alpha is not None:
-        mean = raster.averaged(_cut(alpha, raster).astype(np.float32))
-        opacity = np.rint(mean).astype(np.uint8)
+        opacity = np.rint(raster.averaged(_cut(alpha, raster).astype(np.float32))).astype(np.uint8)
     if view.mask is not None:
         mask = _cut(_read(view.mask, "L", view), raster)
         if use_opacity and opacity is None:

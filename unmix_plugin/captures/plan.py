@@ -1,7 +1,4 @@
-"""Everything that is decided before the first view is written.
-
-What a user should know of captures that are pictures for people: how they are taken for measurements.
-"""
+"""Everything that is decided before the first view is written."""
 
 from __future__ import annotations
 
@@ -45,13 +42,15 @@ class Plan:
 
     def fingerprint(self, options: ProcessOptions) -> dict[str, Any]:
         """What must be the same for views to be gone on with: options, decisions and input files."""
-        asked = {key: _plain(value) for key, value in asdict(options).items()}
-        files = [path for view in self.views for path in input_files(view)]
-        files += self.reference_files
-        left_out = ("output_dir", "overwrite", "poses")
+        asked = {
+            key: str(value) if isinstance(value, Path) else value
+            for key, value in asdict(options).items()
+            if key not in ("output_dir", "overwrite", "poses")
+        }
+        files = [path for view in self.views for path in input_files(view)] + list(self.reference_files)
         return {
             "version": __version__,
-            "options": {key: value for key, value in asked.items() if key not in left_out},
+            "options": asked,
             "decisions": self.decisions,
             "files": stamps(files),
         }
@@ -71,20 +70,29 @@ def make_plan(
     by_sensor: dict[str, list[CaptureView]] = defaultdict(list)
     for view in views:
         by_sensor[view.sensor].append(view)
-    sensors = {
-        name: prepare_sensor(name, same, options, replace(references, views=_of_sensor(capture, name)))
-        for name, same in by_sensor.items()
-    }
+    sensors: dict[str, Sensor] = {}
+    for name, same in by_sensor.items():
+        all_of_it = tuple(view for view in capture.views if view.sensor == name)
+        sensors[name] = prepare_sensor(name, same, options, replace(references, views=all_of_it))
     scale, why = choose_scale(list(sensors.values()), options.scale)
     mask, said_of_mask = choose_mask(views, options.mask)
-    recipes = {name: _recipe(sensor, by_sensor[name], scale, mask) for name, sensor in sensors.items()}
-    decisions = {
-        "scale": {"calibrated": scale, "evidence": why},
-        "mask": mask,
-        "sensors": {
-            name or "all views": _evidence(sensor, recipes[name]) for name, sensor in sensors.items()
-        },
-    }
+    recipes: dict[str, ViewRecipe] = {}
+    evidence: dict[str, dict[str, Any]] = {}
+    for name, sensor in sensors.items():
+        raster, sample = sensor.calibration.raster, sensor.sample / np.float32(scale)
+        colours, rule = Colours.of(Bands(sensor.centers_nm), sample), None
+        if mask in ("white", "black"):
+            rule = background_rule(sensor, by_sensor[name], scale, mask, sample)
+        recipes[name] = ViewRecipe(sensor.calibration, scale, colours, rule, mask == "files")
+        evidence[name or "all views"] = {
+            "unit": sensor.unit,
+            "bands": len(sensor.centers_nm),
+            "size": [raster.height, raster.width],
+            "colours": colours.description,
+            **sensor.evidence,
+            "background": None if rule is None else asdict(rule),
+        }
+    decisions = {"scale": {"calibrated": scale, "evidence": why}, "mask": mask, "sensors": evidence}
     said = [note for sensor in sensors.values() for note in sensor.notes]
     said += said_of_mask
     if options.mask is None and not any(map(has_opacity, views)):
@@ -107,38 +115,10 @@ def make_plan(
     )
 
 
-def _evidence(sensor: Sensor, recipe: ViewRecipe) -> dict[str, Any]:
-    """What was decided on a sensor, for the record."""
-    raster, background = recipe.calibration.raster, recipe.background
-    return {
-        "unit": sensor.unit,
-        "bands": len(sensor.centers_nm),
-        "size": [raster.height, raster.width],
-        "colours": recipe.colours.description,
-        **sensor.evidence,
-        "background": None if background is None else asdict(background),
-    }
-
-
-def _of_sensor(capture: Capture, name: str) -> tuple[CaptureView, ...]:
-    return tuple(view for view in capture.views if view.sensor == name)
-
-
 def input_files(view: CaptureView) -> list[Path]:
     """Every file that a view is made of."""
     more = [path for path in (view.picture, view.mask, view.labels) if path is not None]
     return [*view.cube.files, *more]
-
-
-def _recipe(sensor: Sensor, views: Sequence[CaptureView], scale: float, mask: MaskKind) -> ViewRecipe:
-    sample = sensor.sample / np.float32(scale)
-    colours = Colours.of(Bands(sensor.centers_nm), sample)
-    rule = background_rule(sensor, views, scale, mask, sample) if mask in ("white", "black") else None
-    return ViewRecipe(sensor.calibration, scale, colours, rule, mask == "files")
-
-
-def _plain(value: Any) -> Any:
-    return str(value) if isinstance(value, Path) else value
 
 
 def notes_on_pictures(files: Sequence[SpectralFile]) -> list[str]:
@@ -147,7 +127,14 @@ def notes_on_pictures(files: Sequence[SpectralFile]) -> list[str]:
     notes = []
     if any(map(is_srgb, pictures)):
         notes.append("pictures are taken as sRGB and brought to linear light")
-    notes += _order_of_colours(pictures)
+    for centres in (file.bands.wavelengths_nm for file in pictures):
+        if centres is not None and len(centres) == 3 and centres[0] < centres[2]:
+            red, green, blue = (f"{centre:g}" for centre in centres)
+            notes.append(
+                f"the channels of pictures are red, green and blue in this order: {red} nm is taken for red, "
+                f"{green} nm for green, {blue} nm for blue. If this is wrong, give --wavelengths {blue},{green},{red}"
+            )
+            break
     turned = sum(file.metadata.get("orientation", 1) != 1 for file in pictures)
     if turned:
         notes.append(
@@ -155,16 +142,3 @@ def notes_on_pictures(files: Sequence[SpectralFile]) -> list[str]:
             "stored pixels; if yours were made from turned pictures, store these turned"
         )
     return notes
-
-
-def _order_of_colours(pictures: Sequence[SpectralFile]) -> list[str]:
-    for file in pictures:
-        centres = file.bands.wavelengths_nm
-        if centres is not None and len(centres) == 3 and centres[0] < centres[2]:
-            red, green, blue = (f"{centre:g}" for centre in centres)
-            note = (
-                f"the channels of pictures are red, green and blue in this order: {red} nm is taken for red, "
-                f"{green} nm for green, {blue} nm for blue. If this is wrong, give --wavelengths {blue},{green},{red}"
-            )
-            return [note]
-    return []

@@ -1,14 +1,11 @@
-"""The cameras of a capture's views, from wherever the user says.
+"""The cameras of a capture's views: found, given to views by name and by rig, and placed in the scene's world.
 
-Poses of all lenses of a rig from those of some.
+The lenses of a rig get poses from each other: where two have poses in the same releases of the shutter, their offset
+follows from these. Otherwise the rotations that the files give are used, and the lenses are taken to be in one place
+(`RigRelatives`: Euler angles in degrees, R = Rx Ry Rz, from the axes of the lens to those of the reference lens, with
++x right, +y down, +z forward).
 
-Where two lenses have poses in the same releases, their offset follows from these. Otherwise the rotations that the
-files give are used, and the lenses are taken to be in one place (`RigRelatives`: Euler angles in degrees, R = Rx Ry Rz,
-from the axes of the lens to those of the reference lens, with +x right, +y down, +z forward).
-
-Where a scene is placed: +z up, its middle in the origin, its cameras at most 1 away; recorded to be undone.
-
-Poses of written views, estimated from pictures of their cubes.
+The scene's world has +z up, its middle in the origin, its cameras at most 1 away; how it came about is recorded.
 """
 
 from __future__ import annotations
@@ -20,20 +17,19 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float64, UInt8
+from jaxtyping import Bool, Float64
 
 from unmix_plugin.captures.camera_tags import tag_numbers
 from unmix_plugin.captures.capture import Capture, CaptureView
 from unmix_plugin.captures.plan import Plan
-from unmix_plugin.captures.poses.estimation import contrast_picture, estimate_poses, mean_weights
+from unmix_plugin.captures.poses.estimation import contrast_picture, estimate_poses
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.matching import match_poses
-from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
+from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, ViewRecord
 from unmix_plugin.engine.geometry.camera_paths import focus_point, meeting_point
 from unmix_plugin.errors import CaptureError, counted
-from unmix_plugin.formats.meshes import write_ply
 from unmix_plugin.scenes.placement import Placement
 from unmix_plugin.scenes.reading.cubes import map_array
 
@@ -42,6 +38,14 @@ LEAST_VIEWS = 2
 """One to train on and one for evaluation."""
 MOST_STRETCH = 0.01
 """By which the shapes of a lens's image and of a cube may differ, as a share."""
+LEAST_TURN_DEG = 10.0
+"""Horizontal axes of cameras that span less than this do not tell the vertical."""
+MOST_SWAY_DEG = 30.0
+"""Between the axes of cameras that look down and their mean, about."""
+
+_Pose: TypeAlias = Float64[np.ndarray, "4 4"]
+_Offsets: TypeAlias = dict[tuple[str, str], _Pose]
+"""From the camera space of the second lens to that of the first, by the names of both, OpenGL axes."""
 
 
 @dataclass(frozen=True)
@@ -49,20 +53,24 @@ class PosedViews:
     """Views with their cameras, in the scene's world."""
 
     views: tuple[CaptureView, ...]
-    cameras: dict[str, PosedCamera]
-    """By view, each with the lens of the whole image in its file."""
     poses: PoseSet
-    """In the scene's world, with the sparse points."""
+    """In the scene's world: cameras by view, each with the lens of the whole image in its file; the sparse points."""
     keys: dict[str, Any]
     """What transforms.json records of the way from the source's world to the scene's; nothing where the poses were
     estimated: the scene's world, which stands upright, is then the one that exports return to."""
     notes: tuple[str, ...]
 
-    def lens(self, view: str) -> Lens:
-        """The lens of a view's whole image."""
-        lens = self.cameras[view].lens
-        assert lens is not None
-        return lens
+
+@dataclass(frozen=True)
+class PlacedPoses:
+    """Poses in the world of a scene."""
+
+    poses: PoseSet
+    """In the scene's world; its offset is 0."""
+    placement: Placement
+    """From the source's world to the scene's."""
+    notes: tuple[str, ...]
+    """How up axis, middle and scale were found, one sentence each."""
 
 
 def given_poses(capture: Capture, where: str | None) -> PoseSet:
@@ -85,8 +93,51 @@ def given_poses(capture: Capture, where: str | None) -> PoseSet:
     path = Path(where)
     if not path.exists() and (capture.root / where).exists():
         path = capture.root / where
-    sizes = {view.name: (view.cube.shape[1], view.cube.shape[0]) for view in capture.views}
-    return read_poses(path, sizes)
+    return read_poses(path, {view.name: (view.cube.shape[1], view.cube.shape[0]) for view in capture.views})
+
+
+def estimated_poses(plan: Plan, records: Mapping[str, ViewRecord], scene: Path, work: Path) -> PoseSet:
+    """Structure from motion on all views.
+
+    Args:
+        plan: Of the scene.
+        records: Of its views, which are all written.
+        scene: Folder that they are in.
+        work: Folder for files of the estimation.
+    Returns:
+        Poses by view, with lenses of the whole images as the capture has them.
+    Raises:
+        CaptureError: pycolmap is not installed, or too few views could be registered.
+    """
+    shown = {name: _shown(scene, record) for name, record in records.items()}
+    pictures = {
+        name: contrast_picture(
+            map_array(scene / record.paths["hyperspectral_file_path"]), FULL_SCALE, shown[name]
+        )
+        for name, record in records.items()
+    }
+    sensors = {view.name: view.sensor for view in plan.views}
+    poses = estimate_poses(pictures, work, sensors, shown if plan.mask != "none" else None)
+    cameras = {}
+    for view in plan.views:
+        camera = poses.cameras.get(view.name)
+        if camera is not None and camera.lens is not None:
+            raster = plan.recipes[view.sensor].calibration.raster
+            whole = raster.lens_of_file(camera.lens, view.cube.shape[0], view.cube.shape[1])
+            cameras[view.name] = replace(camera, lens=whole)
+    return replace(poses, cameras=cameras)
+
+
+def _shown(scene: Path, record: ViewRecord) -> Bool[np.ndarray, "H W"]:
+    """Pixels of matter that were measured."""
+    from PIL import Image
+
+    with Image.open(scene / record.paths["file_path"]) as picture:
+        shown = np.asarray(picture.convert("RGBA"))[..., 3] > 127
+    if "mask_path" in record.paths:
+        with Image.open(scene / record.paths["mask_path"]) as mask:
+            shown = shown & (np.asarray(mask.convert("L")) > 0)
+    return shown
 
 
 def pose_views(views: Sequence[CaptureView], poses: PoseSet) -> PosedViews:
@@ -95,36 +146,30 @@ def pose_views(views: Sequence[CaptureView], poses: PoseSet) -> PosedViews:
     Raises:
         CaptureError: fewer than two views have a camera, or a lens does not fit its view.
     """
-    matches = match_poses(poses, [(view.name, _files_of(view)) for view in views])
-    cameras, completed = complete_rigs(views, matches.cameras)
-    matched = [note for note in matches.notes if not (completed and "without pose" in note)]
+    files = [
+        (view.name, [*view.cube.files, *([] if view.picture is None else [view.picture])]) for view in views
+    ]
+    cameras, said = match_poses(poses, files)
+    cameras, completed = complete_rigs(views, cameras)
+    matched = [note for note in said if not (completed and "without pose" in note)]
     posed = tuple(view for view in views if view.name in cameras)
     if len(posed) < LEAST_VIEWS:
         raise CaptureError(
             f"{poses.source}: {len(posed)} of {len(views)} views has a pose; a scene needs {LEAST_VIEWS} or more. "
-            + "; ".join(matches.notes)
+            + "; ".join(said)
         )
     fitted = {
-        view.name: replace(cameras[view.name], lens=fit_lens(cameras[view.name].lens or view.lens, view))
+        view.name: replace(cameras[view.name], lens=_lens_of(cameras[view.name].lens or view.lens, view))
         for view in posed
     }
     has_many_lenses = len({view.sensor for view in posed if view.release}) > 1
     placed = place_poses(replace(poses, cameras=fitted), is_flight=has_many_lenses)
-    return PosedViews(
-        posed,
-        placed.poses.cameras,
-        placed.poses,
-        placed.placement.to_json() if poses.has_world else {},
-        (*poses.notes, *matched, *completed, *placed.notes),
-    )
+    keys = placed.placement.to_json() if poses.has_world else {}
+    return PosedViews(posed, placed.poses, keys, (*poses.notes, *matched, *completed, *placed.notes))
 
 
-def fit_lens(lens: Lens | None, view: CaptureView) -> Lens:
-    """The lens in pixels of the view's file, of which it may be given at another resolution.
-
-    Raises:
-        CaptureError: there is none, or its image has another shape than the cube.
-    """
+def _lens_of(lens: Lens | None, view: CaptureView) -> Lens:
+    """The lens in pixels of the view's file, of which it may be given at another resolution."""
     height, width, _ = view.cube.shape
     if lens is None:
         raise CaptureError(
@@ -135,14 +180,11 @@ def fit_lens(lens: Lens | None, view: CaptureView) -> Lens:
         return lens
     across, down = width / lens.width, height / lens.height
     if abs(across / down - 1.0) > MOST_STRETCH:
+        turned = ", or store them turned as EXIF's orientation says"
         raise CaptureError(
             f"view {view.name} has {width} x {height} pixels (width x height), its lens is given for {lens.width} x "
             f"{lens.height}; expected the same shape: give the poses of these images"
-            + (
-                ", or store them turned as EXIF's orientation says"
-                if "orientation" in view.cube.metadata
-                else ""
-            )
+            f"{turned if 'orientation' in view.cube.metadata else ''}"
         )
     return replace(
         lens,
@@ -151,17 +193,6 @@ def fit_lens(lens: Lens | None, view: CaptureView) -> Lens:
         focal_px=(lens.focal_px[0] * across, lens.focal_px[1] * down),
         center_px=(lens.center_px[0] * across, lens.center_px[1] * down),
     )
-
-
-def _files_of(view: CaptureView) -> list[Path]:
-    picture = [] if view.picture is None else [view.picture]
-    return [*view.cube.files, *picture]
-
-
-Pose: TypeAlias = Float64[np.ndarray, "4 4"]
-Offsets: TypeAlias = dict[tuple[str, str], Pose]
-"""From the camera space of the second lens to that of the first, by the names of both, OpenGL axes."""
-OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0])
 
 
 def complete_rigs(
@@ -180,7 +211,6 @@ def complete_rigs(
         if view.release:
             releases[view.release].append(view)
     offsets = _measured_offsets(releases, cameras)
-    measured = set(offsets)
     completed, how = dict(cameras), Counter[tuple[str, str]]()
     for members in releases.values():
         posed = [view for view in members if view.name in cameras]
@@ -189,103 +219,75 @@ def complete_rigs(
                 continue
             base, offset = _offset_to(view, posed, offsets)
             if base is None or offset is None:
-                how[(view.sensor, "unknown" if posed else "unposed")] += 1
-                continue
-            pose = _square(cameras[base.name].camera_to_world) @ offset
-            completed[view.name] = PosedCamera(pose[:3], view.lens)
-            how[(view.sensor, "poses" if (base.sensor, view.sensor) in measured else "files")] += 1
-    return completed, tuple(_say(sensor, kind, count) for (sensor, kind), count in how.items())
-
-
-def _say(sensor: str, kind: str, count: int) -> str:
-    return (
-        f"{counted(count, 'view')} of lens {sensor} "
-        + {
-            "unposed": "left out: no lens of their release has a pose",
-            "unknown": "left out: there is no pose, and nothing says where the lens is on the rig",
-            "poses": "got the pose of another lens of their release, moved as in other releases",
-            "files": "got the pose of another lens of their release, turned as the files say, at the same place",
-        }[kind]
+                kind = "unknown" if posed else "unposed"
+            else:
+                pose = _square(cameras[base.name].camera_to_world) @ offset
+                completed[view.name] = PosedCamera(pose[:3], view.lens)
+                kind = "poses" if (base.sensor, view.sensor) in offsets else "files"
+            how[view.sensor, kind] += 1
+    said = {
+        "unposed": "left out: no lens of their release has a pose",
+        "unknown": "left out: there is no pose, and nothing says where the lens is on the rig",
+        "poses": "got the pose of another lens of their release, moved as in other releases",
+        "files": "got the pose of another lens of their release, turned as the files say, at the same place",
+    }
+    notes = (
+        f"{counted(count, 'view')} of lens {sensor} {said[kind]}" for (sensor, kind), count in how.items()
     )
-
-
-def _offset_to(
-    view: CaptureView, posed: Sequence[CaptureView], offsets: Offsets
-) -> tuple[CaptureView | None, Pose | None]:
-    """A posed view of the release and the offset from it, measured ones first."""
-    for base in posed:
-        if (base.sensor, view.sensor) in offsets:
-            return base, offsets[base.sensor, view.sensor]
-    rotation = rig_rotation(view)
-    for base in posed:
-        other = rig_rotation(base)
-        if rotation is not None and other is not None:
-            offset = np.eye(4)
-            offset[:3, :3] = OPENCV_TO_OPENGL @ other.T @ rotation @ OPENCV_TO_OPENGL
-            return base, offset
-    return None, None
-
-
-def rig_rotation(view: CaptureView) -> Float64[np.ndarray, "3 3"] | None:
-    """From the axes of the lens to those of the reference lens, as the file says; None where it doesn't."""
-    angles = tag_numbers(view.cube.metadata.get("xmp") or {}, "RigRelatives")
-    if angles is None or len(angles) != 3 or not np.isfinite(angles).all():
-        return None
-    (cx, cy, cz), (sx, sy, sz) = np.cos(np.deg2rad(angles)), np.sin(np.deg2rad(angles))
-    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
-    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-    about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-    return about_x @ about_y @ about_z
+    return completed, tuple(notes)
 
 
 def _measured_offsets(
     releases: Mapping[str, Sequence[CaptureView]], cameras: Mapping[str, PosedCamera]
-) -> Offsets:
+) -> _Offsets:
     """Offsets between lenses with poses in one release: mean rotation, median place."""
-    found: dict[tuple[str, str], list[Pose]] = defaultdict(list)
+    found: dict[tuple[str, str], list[_Pose]] = defaultdict(list)
     for members in releases.values():
-        poses = {
-            view.sensor: _square(cameras[view.name].camera_to_world)
-            for view in members
-            if view.name in cameras
-        }
+        posed = [view for view in members if view.name in cameras]
+        poses = {view.sensor: _square(cameras[view.name].camera_to_world) for view in posed}
         for first, base in poses.items():
             for second, other in poses.items():
                 if first != second:
                     found[first, second].append(np.linalg.inv(base) @ other)
-    return {pair: _mean(np.stack(offsets)) for pair, offsets in found.items()}
+    offsets = {}
+    for pair, those in found.items():
+        stacked, mean = np.stack(those), np.eye(4)
+        left, _, right = np.linalg.svd(stacked[:, :3, :3].mean(axis=0))
+        mean[:3, :3] = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+        mean[:3, 3] = np.median(stacked[:, :3, 3], axis=0)
+        offsets[pair] = mean
+    return offsets
 
 
-def _mean(offsets: Float64[np.ndarray, "N 4 4"]) -> Pose:
-    left, _, right = np.linalg.svd(offsets[:, :3, :3].mean(axis=0))
-    mean = np.eye(4)
-    mean[:3, :3] = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
-    mean[:3, 3] = np.median(offsets[:, :3, 3], axis=0)
-    return mean
+def _offset_to(
+    view: CaptureView, posed: Sequence[CaptureView], offsets: _Offsets
+) -> tuple[CaptureView | None, _Pose | None]:
+    """A posed view of the release and the offset from it, measured ones first."""
+    for base in posed:
+        if (base.sensor, view.sensor) in offsets:
+            return base, offsets[base.sensor, view.sensor]
+    rotation = _rig_rotation(view)
+    for base in posed:
+        other = _rig_rotation(base)
+        if rotation is not None and other is not None:
+            offset = np.eye(4)
+            offset[:3, :3] = FLIP @ other.T @ rotation @ FLIP
+            return base, offset
+    return None, None
 
 
-def _square(pose: Float64[np.ndarray, "3 4"]) -> Pose:
+def _rig_rotation(view: CaptureView) -> Float64[np.ndarray, "3 3"] | None:
+    """From the axes of the lens to those of the reference lens, as the file says; None where it doesn't."""
+    from scipy.spatial.transform import Rotation
+
+    angles = tag_numbers(view.cube.metadata.get("xmp") or {}, "RigRelatives")
+    if angles is None or len(angles) != 3 or not np.isfinite(angles).all():
+        return None
+    return Rotation.from_euler("XYZ", angles, degrees=True).as_matrix()
+
+
+def _square(pose: Float64[np.ndarray, "3 4"]) -> _Pose:
     return np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
-
-
-POINTS_FILE = "points.ply"
-"""Of a scene folder; its `ply_file_path`."""
-LEAST_TURN_DEG = 10.0
-"""Horizontal axes of cameras that span less than this do not tell the vertical."""
-MOST_SWAY_DEG = 30.0
-"""Between the axes of cameras that look down and their mean, about."""
-
-
-@dataclass(frozen=True)
-class PlacedPoses:
-    """Poses in the world of a scene."""
-
-    poses: PoseSet
-    """In the scene's world; its offset is 0."""
-    placement: Placement
-    """From the source's world to the scene's."""
-    notes: tuple[str, ...]
-    """How up axis, middle and scale were found, one sentence each."""
 
 
 def place_poses(poses: PoseSet, is_flight: bool = False) -> PlacedPoses:
@@ -305,31 +307,15 @@ def place_poses(poses: PoseSet, is_flight: bool = False) -> PlacedPoses:
     scale = 1.0 / reach if reach > 0 else 1.0
     rotation = _turn_to_z(up)
     inner = Placement(rotation, -rotation @ middle, scale)
-    cameras = {name: moved(camera, inner) for name, camera in poses.cameras.items()}
-    points = None if poses.points is None else inner.to_scene(poses.points)
-    how_large = [f"1 unit of the scene is {1.0 / scale:.6g} of the source"] if poses.has_world else []
-    notes = (how_up, how_middle, *how_large)
-    placed = replace(poses, cameras=cameras, points=points, offset=np.zeros(3), up=np.array([0.0, 0.0, 1.0]))
-    return PlacedPoses(placed, replace(inner, offset=poses.offset), notes)
-
-
-def write_points(folder: Path, poses: PoseSet) -> str | None:
-    """Write the sparse points beside a scene's transforms.json; the name for `ply_file_path`, None without points.
-
-    Args:
-        poses: In the scene's world.
-    Raises:
-        RunError: the disk is full or refuses.
-    """
-    if poses.points is None or len(poses.points) == 0:
-        return None
-    columns = {axis: poses.points[:, index].astype(np.float32) for index, axis in enumerate("xyz")}
-    if poses.colours is not None:
-        columns |= {name: poses.colours[:, index] for index, name in enumerate(("red", "green", "blue"))}
-    write_ply(
-        folder / POINTS_FILE, columns, comments=["sparse points of structure from motion, scene coordinates"]
+    placed = replace(
+        poses,
+        cameras={name: moved(camera, inner) for name, camera in poses.cameras.items()},
+        points=None if poses.points is None else inner.to_scene(poses.points),
+        offset=np.zeros(3),
+        up=np.array([0.0, 0.0, 1.0]),
     )
-    return POINTS_FILE
+    how_large = [f"1 unit of the scene is {1.0 / scale:.6g} of the source"] if poses.has_world else []
+    return PlacedPoses(placed, replace(inner, offset=poses.offset), (how_up, how_middle, *how_large))
 
 
 def moved(camera: PosedCamera, similarity: Placement) -> PosedCamera:
@@ -363,9 +349,8 @@ def _find_middle(
 ) -> tuple[Float64[np.ndarray, "3"], str]:
     met, nearest = meeting_point(poses), focus_point(poses)
     if met is None and points is not None and len(points) > 0:
-        return np.median(points, axis=0), (
-            "the middle is that of the sparse points, as the cameras look at no one place"
-        )
+        how = "the middle is that of the sparse points, as the cameras look at no one place"
+        return np.median(points, axis=0), how
     if nearest is not None:
         return nearest, "the middle is the point nearest to all optical axes"
     return poses[:, :, 3].mean(axis=0), "the middle is that of the cameras"
@@ -379,50 +364,3 @@ def _turn_to_z(up: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.eye(3) + cross + cross @ cross / (1.0 + cosine)
-
-
-def estimated_poses(plan: Plan, records: Mapping[str, ViewRecord], scene: Path, work: Path) -> PoseSet:
-    """Structure from motion on all views.
-
-    Args:
-        plan: Of the scene.
-        records: Of its views, which are all written.
-        scene: Folder that they are in.
-        work: Folder for files of the estimation.
-    Returns:
-        Poses by view, with lenses of the whole images as the capture has them.
-    Raises:
-        CaptureError: pycolmap is not installed, or too few views could be registered.
-    """
-    shown = {name: _shown(scene, record) for name, record in records.items()}
-    pictures = {name: _contrast_of(scene, records[name], shown[name]) for name in records}
-    sensors = {view.name: view.sensor for view in plan.views}
-    poses = estimate_poses(pictures, work, sensors, shown if plan.mask != "none" else None)
-    cameras = {}
-    for view in plan.views:
-        camera = poses.cameras.get(view.name)
-        if camera is None or camera.lens is None:
-            continue
-        raster = plan.recipes[view.sensor].calibration.raster
-        whole = raster.lens_of_file(camera.lens, view.cube.shape[0], view.cube.shape[1])
-        cameras[view.name] = replace(camera, lens=whole)
-    return replace(poses, cameras=cameras)
-
-
-def _contrast_of(scene: Path, record: ViewRecord, shown: Bool[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W"]:
-    cube = map_array(scene / record.paths["hyperspectral_file_path"])
-    height, width, bands = cube.shape
-    weights = mean_weights(np.ones(bands, bool)) / FULL_SCALE
-    return contrast_picture(lambda rows: cube[rows], (height, width), weights, shown)
-
-
-def _shown(scene: Path, record: ViewRecord) -> Bool[np.ndarray, "H W"]:
-    """Pixels of matter that were measured."""
-    from PIL import Image
-
-    with Image.open(scene / record.paths["file_path"]) as picture:
-        shown = np.asarray(picture.convert("RGBA"))[..., 3] > 127
-    if "mask_path" in record.paths:
-        with Image.open(scene / record.paths["mask_path"]) as mask:
-            shown = shown & (np.asarray(mask.convert("L")) > 0)
-    return shown

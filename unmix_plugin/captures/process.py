@@ -1,13 +1,9 @@
-"""From a capture to a scene: look at it, decide, write view after view, and name the folder when all is there.
-
-Views of one sensor are alike: same size, same bands, same type of numbers.
-"""
+"""From a capture to a scene: look at it, decide, write view after view, and name the folder when all is there."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -15,7 +11,7 @@ from unmix_plugin.captures.calibration.sensor import References
 from unmix_plugin.captures.capture import Capture, CaptureView
 from unmix_plugin.captures.layouts.registry import LAYOUTS, LayoutOptions, find_views
 from unmix_plugin.captures.options import ProcessOptions
-from unmix_plugin.captures.plan import Plan, input_files, make_plan
+from unmix_plugin.captures.plan import input_files, make_plan
 from unmix_plugin.captures.posing import ESTIMATE, estimated_poses, given_poses, pose_views
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import ReadOptions, SpectralFile
@@ -29,6 +25,8 @@ Say = Callable[[str], None]
 """Tells the user something, one line."""
 Follow = Callable[[str, Sequence[CaptureView]], Iterable[CaptureView]]
 """Goes through views and shows how far it is."""
+LARGEST_DIFFERENCE_NM = 0.1
+"""Between the same bands of views of one sensor."""
 
 
 def process_capture(options: ProcessOptions, say: Say, follow: Follow) -> list[str]:
@@ -57,7 +55,14 @@ def process_capture(options: ProcessOptions, say: Say, follow: Follow) -> list[s
     folder = WorkFolder(options.output_dir)
     if folder.begin(plan.fingerprint(options)):
         say(f"going on with {folder.path}")
-    records = _write_views(plan, folder, follow)
+    records: dict[str, ViewRecord] = {}
+    for view in follow("writing views", plan.views):
+        record = folder.done(view.name)
+        if record is None:
+            record = write_view(view, plan.recipes[view.sensor], folder.path)
+            record = replace(record, sources=hashes(input_files(view)))
+            folder.note(record)
+        records[view.name] = record
     if posed is None:
         say("estimating poses ...")
         posed = pose_views(plan.views, estimated_poses(plan, records, folder.path, folder.poses))
@@ -90,10 +95,11 @@ def _check(options: ProcessOptions) -> None:
 def _open_capture(options: ProcessOptions) -> Capture:
     wavelengths = None if options.wavelengths is None else parse_wavelengths(options.wavelengths)
     references = tuple(path for path in (options.dark, options.white) if path is not None)
-    capture = find_views(
-        options.layout, options.data, LayoutOptions(wavelengths, options.dataset, options.axes, references)
-    )
-    refuse_unlike_views(capture.views)
+    asked = LayoutOptions(wavelengths, options.dataset, options.axes, references)
+    capture = find_views(options.layout, options.data, asked)
+    first: dict[str, SpectralFile] = {}
+    for view in capture.views:
+        _refuse_unlike(view.cube, first.setdefault(view.sensor, view.cube))
     output = options.output_dir.resolve()
     for view in capture.views:
         if any(path.resolve().is_relative_to(output) for path in input_files(view)):
@@ -104,45 +110,17 @@ def _open_capture(options: ProcessOptions) -> Capture:
 
 
 def _open_references(options: ProcessOptions) -> References:
-    read = ReadOptions(options.dataset, None, options.axes)
-    return References(_open(options.dark, "--dark", read), _open(options.white, "--white", read))
-
-
-def _open(path: Path | None, flag: str, read: ReadOptions) -> SpectralFile | None:
-    if path is None:
-        return None
-    if not path.exists():
-        raise CaptureError(f"{flag} {path}: no such file; give the image of the reference")
-    return open_spectral_file(path, read)
-
-
-def _write_views(plan: Plan, folder: WorkFolder, follow: Follow) -> dict[str, ViewRecord]:
-    records = {}
-    for view in follow("writing views", plan.views):
-        record = folder.done(view.name)
-        if record is None:
-            record = write_view(view, plan.recipes[view.sensor], folder.path)
-            record = replace(record, sources=hashes(input_files(view)))
-            folder.note(record)
-        records[view.name] = record
-    return records
-
-
-LARGEST_DIFFERENCE_NM = 0.1
-
-
-def refuse_unlike_views(views: Sequence[CaptureView]) -> None:
-    """Refuse views that differ from the first of their sensor.
-
-    Raises:
-        CaptureError: they do.
-    """
-    first: dict[str, SpectralFile] = {}
-    for view in views:
-        _refuse_unlike(view.cube, first.setdefault(view.sensor, view.cube))
+    opened = []
+    for path, flag in ((options.dark, "--dark"), (options.white, "--white")):
+        if path is not None and not path.exists():
+            raise CaptureError(f"{flag} {path}: no such file; give the image of the reference")
+        read = ReadOptions(options.dataset, None, options.axes)
+        opened.append(None if path is None else open_spectral_file(path, read))
+    return References(*opened)
 
 
 def _refuse_unlike(cube: SpectralFile, first: SpectralFile) -> None:
+    """Views of one sensor have the same size, bands and type of numbers."""
     if cube.shape != first.shape:
         found, expected = (" x ".join(map(str, file.shape)) for file in (cube, first))
         raise CaptureError(

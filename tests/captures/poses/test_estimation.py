@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from tests.captures.poses.alignment import align_poses
 from tests.scenes.scene_factory import look_at
 from unmix_plugin.captures.poses import estimation
-from unmix_plugin.captures.poses.estimation import estimate_poses
+from unmix_plugin.captures.poses.estimation import contrast_picture, estimate_poses
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 from unmix_plugin.errors import CaptureError
@@ -85,3 +85,20 @@ def test_without_pycolmap_the_extra_is_named(room, tmp_path, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", {}.get)
     with pytest.raises(CaptureError, match=r"pip install 'unmix-nerf\[sfm\]'"):
         estimate_poses(room[0], tmp_path)
+
+
+def test_dark_texture_uses_the_whole_range_and_what_does_not_count_is_black():
+    cube = np.random.default_rng(0).uniform(100, 200, (150, 80, 3))
+    valid = np.ones((150, 80), bool)
+    valid[:, :20] = False
+    cube[:, :20], cube[5, 50, 1] = 9e4, np.nan
+    picture = contrast_picture(cube, 65535, valid)
+    assert not picture[:, :20].any()
+    assert picture[5, 50] == 0
+    assert picture[:, 20:].max() - np.percentile(picture[:, 20:], 5) > 150
+
+
+def test_a_flat_or_empty_picture_is_no_noise():
+    everywhere = np.ones((8, 8), bool)
+    assert np.unique(contrast_picture(np.full((8, 8, 2), 0.3), 1.0, everywhere)).tolist() == [128]
+    assert not contrast_picture(np.full((8, 8, 2), np.nan), 1.0, everywhere).any()

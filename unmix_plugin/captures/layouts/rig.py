@@ -8,11 +8,8 @@ Every file is a view, with the lens as its sensor. Files of one release share an
 their name up to the band. Pictures in colour are left out, as nothing says what their channels measure; so are thermal
 bands.
 
-Which lens and release of the shutter each file of a multispectral camera belongs to.
-
-The lens that a multispectral camera writes into its files (tags of Pix4D's namespace, and DJI's).
-
-Their pixels have 0 at the centre of the first pixel, ours 0.5: principal points are moved by half a pixel.
+Lenses are those that the camera writes into its files (tags of Pix4D's namespace, and DJI's). Their pixels have 0 at
+the centre of the first pixel, ours 0.5: principal points are moved by half a pixel.
 """
 
 from __future__ import annotations
@@ -41,6 +38,22 @@ TIFF_SUFFIXES = (".tif", ".tiff")
 COLOUR_SUFFIXES = (".jpg", ".jpeg")
 THERMAL_NM = 3000.0
 """Bands from here on measure heat."""
+BAND_ENDING = re.compile(
+    r"(?:_MS)?[_-](\d{1,2}|GRE|GREEN|RED|REG|REDEDGE|RE|NIR|BLUE|RGB|G|R|B|D|W)$", re.IGNORECASE
+)
+"""Of a file's stem."""
+DJI_NUMBER = re.compile(r"(DJI_\d+)(\d)$", re.IGNORECASE)
+"""Of a Phantom 4 Multispectral: the last digit is the band, 0 the colour picture."""
+EVAL_INTERVAL = 8
+"""Every so many releases, one is for evaluation."""
+UNIQUE_TAGS = ("MicaSense:CaptureId", "CaptureUUID", "CaptureId")
+MM_OF_UNIT: dict[float, float] = {2.0: 25.4, 3.0: 10.0, 4.0: 1.0, 5.0: 1e-3}
+"""Millimetres in EXIF's FocalPlaneResolutionUnit: inch, cm, mm, micrometre."""
+TAGS = "lens in the XMP"
+LONGEST_MM = 50.0
+"""Focal length without a unit from which it is in pixels; these cameras have about 5 mm."""
+LIMIT_PX = 10.0
+"""By how much the lens with k1, k2, p1, p2 may differ from the camera's; poses usually bring a better one."""
 
 
 def find_rig(root: Path, options: LayoutOptions) -> Capture:
@@ -53,18 +66,18 @@ def find_rig(root: Path, options: LayoutOptions) -> Capture:
     excluded = {path.resolve() for path in options.exclude}
     paths = [path for path in sorted(root.rglob("*")) if path.is_file() and path.resolve() not in excluded]
     paths = [path for path in paths if not any(part.startswith(".") for part in path.relative_to(root).parts)]
-    opened = [open_band_file(path, root) for path in paths if path.suffix.lower() in TIFF_SUFFIXES]
+    opened = [_open_band_file(path, root) for path in paths if path.suffix.lower() in TIFF_SUFFIXES]
     bands = [item for item in opened if item.file.shape[2] == 1 and not _is_thermal(item.file)]
     if not bands:
         raise CaptureError(
             f"{root} holds no TIFF files of single bands; expected IMG_0000_1.tif, IMG_..._GRE.TIF or "
             "DJI_..._MS_G.TIF: give the folder of the flight, or use the layout 'cubes' for other files"
         )
-    sensors = sensor_names(bands)
-    releases = release_names(bands, str(root))
+    sensors = _sensor_names(bands)
+    releases = _release_names(bands, str(root))
     splits = splits_of(releases)
     names = view_names([str(item.file.path.relative_to(root)) for item in bands], str(root))
-    notes = [*_left_out(opened, paths), *_odd(bands, releases)]
+    notes = _notes(opened, bands, paths, releases)
     views: list[CaptureView] = []
     lens_notes: Counter[tuple[str, str]] = Counter()
     for item, name, sensor, release in zip(bands, names, sensors, releases, strict=True):
@@ -86,11 +99,7 @@ def _is_thermal(file: SpectralFile) -> bool:
 
 
 def _check_lenses(views: Sequence[CaptureView]) -> None:
-    """Refuse a lens twice in one release, and files of one lens that differ.
-
-    Raises:
-        CaptureError: that is so.
-    """
+    """Refuse a lens twice in one release, and files of one lens that differ."""
     first: dict[str, CaptureView] = {}
     taken: dict[tuple[str, str], CaptureView] = {}
     for view in views:
@@ -101,9 +110,11 @@ def _check_lenses(views: Sequence[CaptureView]) -> None:
                 f"{view.release}; expected one file: remove the copy"
             )
         same = first.setdefault(view.sensor, view)
+        tables = (same.cube.bands.wavelengths_nm, view.cube.bands.wavelengths_nm)
+        centres = [None if table is None else float(table[0]) for table in tables]
         for what, expected, found in (
             ("pixels", same.cube.shape[:2], view.cube.shape[:2]),
-            ("nm", _centre(same.cube), _centre(view.cube)),
+            ("nm", *centres),
         ):
             if expected != found:
                 raise CaptureError(
@@ -112,17 +123,8 @@ def _check_lenses(views: Sequence[CaptureView]) -> None:
                 )
 
 
-def _centre(file: SpectralFile) -> float | None:
-    wavelengths = file.bands.wavelengths_nm
-    return None if wavelengths is None else float(wavelengths[0])
-
-
 def _with_given_bands(views: list[CaptureView], options: LayoutOptions) -> list[CaptureView]:
-    """Wavelengths of a user, one a lens in the order of their names.
-
-    Raises:
-        CaptureError: another number of them than of lenses.
-    """
+    """Wavelengths of a user, one a lens in the order of their names."""
     given = options.wavelengths_nm
     if given is None:
         return views
@@ -139,53 +141,36 @@ def _with_given_bands(views: list[CaptureView], options: LayoutOptions) -> list[
     return [replace(view, cube=replace(view.cube, bands=tables[view.sensor])) for view in views]
 
 
-def _left_out(opened: Iterable[BandFile], paths: Iterable[Path]) -> list[str]:
-    files = [item.file for item in opened]
-    thermal = sum(file.shape[2] == 1 and _is_thermal(file) for file in files)
-    colour = sum(file.shape[2] > 1 for file in files) + sum(
-        path.suffix.lower() in COLOUR_SUFFIXES for path in paths
-    )
-    notes = [f"{counted(thermal, 'thermal image')} left out"] if thermal else []
-    notes += (
-        [f"{counted(colour, 'colour picture')} left out: nothing says what their channels measure"]
-        if colour
-        else []
-    )
-    return notes
-
-
-def _odd(bands: Sequence[BandFile], releases: Sequence[str]) -> list[str]:
-    turned = sum(
-        (exif_number(item.file.metadata.get("exif") or {}, "Orientation") or 1) > 1 for item in bands
-    )
+def _notes(
+    opened: Sequence[_BandFile], bands: Sequence[_BandFile], paths: Iterable[Path], releases: Sequence[str]
+) -> list[str]:
+    """What was left out or ignored, and what is incomplete."""
+    notes = []
+    thermal = sum(item.file.shape[2] == 1 and _is_thermal(item.file) for item in opened)
+    colour = sum(item.file.shape[2] > 1 for item in opened)
+    colour += sum(path.suffix.lower() in COLOUR_SUFFIXES for path in paths)
+    exif = [item.file.metadata.get("exif") or {} for item in bands]
+    turned = sum((exif_number(values, "Orientation") or 1) > 1 for values in exif)
     counts = Counter(releases)
     incomplete = [release for release, count in counts.items() if count < max(counts.values())]
-    notes = (
-        [
+    if thermal:
+        notes.append(f"{counted(thermal, 'thermal image')} left out")
+    if colour:
+        notes.append(
+            f"{counted(colour, 'colour picture')} left out: nothing says what their channels measure"
+        )
+    if turned:
+        notes.append(
             f"EXIF's orientation of {counted(turned, 'file')} is ignored: poses and lenses refer to the stored raster"
-        ]
-        if turned
-        else []
-    )
+        )
     if incomplete:
         shown = ", ".join(incomplete[:3])
         notes.append(f"{len(incomplete)} of {len(counts)} releases lack a band: {shown}")
     return notes
 
 
-BAND_ENDING = re.compile(
-    r"(?:_MS)?[_-](\d{1,2}|GRE|GREEN|RED|REG|REDEDGE|RE|NIR|BLUE|RGB|G|R|B|D|W)$", re.IGNORECASE
-)
-"""Of a file's stem."""
-DJI_NUMBER = re.compile(r"(DJI_\d+)(\d)$", re.IGNORECASE)
-"""Of a Phantom 4 Multispectral: the last digit is the band, 0 the colour picture."""
-EVAL_INTERVAL = 8
-"""Every so many releases, one is for evaluation."""
-UNIQUE_TAGS = ("MicaSense:CaptureId", "CaptureUUID", "CaptureId")
-
-
 @dataclass(frozen=True)
-class BandFile:
+class _BandFile:
     """One file before it is a view."""
 
     file: SpectralFile
@@ -199,7 +184,7 @@ class BandFile:
         return self.file.metadata.get("xmp") or {}
 
 
-def open_band_file(path: Path, root: Path) -> BandFile:
+def _open_band_file(path: Path, root: Path) -> _BandFile:
     file = open_spectral_file(path)
     number = DJI_NUMBER.fullmatch(path.stem)
     found = BAND_ENDING.search(path.stem)
@@ -209,10 +194,10 @@ def open_band_file(path: Path, root: Path) -> BandFile:
     elif found is not None:
         base, ending = path.stem[: found.start()], found[1]
     folder = path.parent.relative_to(root)
-    return BandFile(file, str(folder / base) if folder.parts else base, ending.lower())
+    return _BandFile(file, str(folder / base) if folder.parts else base, ending.lower())
 
 
-def sensor_names(bands: Sequence[BandFile]) -> list[str]:
+def _sensor_names(bands: Sequence[_BandFile]) -> list[str]:
     """Names of the lenses: the band's, with the index in the rig where several share it; or the file's ending."""
     titles = [tag_text(item.tags, "BandName") or item.ending or "band" for item in bands]
     slugs = [re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-") or "band" for title in titles]
@@ -226,13 +211,10 @@ def sensor_names(bands: Sequence[BandFile]) -> list[str]:
     ]
 
 
-def release_names(bands: Sequence[BandFile], where: str) -> list[str]:
+def _release_names(bands: Sequence[_BandFile], where: str) -> list[str]:
     """Names of the releases: the name up to the band of the first file of each, with its folder where names repeat.
 
     Identifiers count where they join files; cameras that write another one into every file are grouped by name.
-
-    Raises:
-        CaptureError: two releases would have one name.
     """
     identifiers = [tag_text(item.tags, *UNIQUE_TAGS) or "" for item in bands]
     counts = Counter(identifier for identifier in identifiers if identifier)
@@ -255,78 +237,68 @@ def splits_of(releases: Iterable[str]) -> dict[str, Split]:
     return {release: "eval" if release in evaluated else "train" for release in names}
 
 
-MM_OF_UNIT: dict[float, float] = {2.0: 25.4, 3.0: 10.0, 4.0: 1.0, 5.0: 1e-3}
-"""Millimetres in EXIF's FocalPlaneResolutionUnit: inch, cm, mm, micrometre."""
-TAGS = "lens in the XMP"
-LONGEST_MM = 50.0
-"""Focal length without a unit from which it is in pixels; these cameras have about 5 mm."""
-HALF_PIXEL = 0.5
-LIMIT_PX = 10.0
-"""By how much the lens with k1, k2, p1, p2 may differ from the camera's; poses usually bring a better one."""
-
-
 def lens_of(file: SpectralFile) -> tuple[Lens | None, tuple[str, ...]]:
     """The lens of a file, and what there is to say of it; no lens where its tags don't tell one.
 
     Raises:
         CaptureError: its model differs from every OPENCV lens by too much, or folds the image over.
     """
-    lens, notes = _stated_lens(file, file.metadata.get("xmp") or {}, file.metadata.get("exif") or {})
-    if lens is None:
-        return None, notes
-    numbers = (*lens.focal_px, *lens.center_px, *lens.distortion)
-    if not np.isfinite(numbers).all() or min(lens.focal_px) <= 0.0:
-        return None, ("no lens in the file's tags: its numbers make no sense",)
+    tags = file.metadata.get("xmp") or {}
+    try:
+        if tag_numbers(tags, "DewarpData") is not None:
+            lens, notes = _dji_lens(file, tags), ()
+        else:
+            lens, notes = _pix4d_lens(file, tags, file.metadata.get("exif") or {})
+        numbers = (*lens.focal_px, *lens.center_px, *lens.distortion)
+        if not np.isfinite(numbers).all() or min(lens.focal_px) <= 0.0:
+            raise _NoLensError("its numbers make no sense")
+    except _NoLensError as why:
+        return None, (f"no lens in the file's tags: {why}",)
     return lens, notes
 
 
-def _stated_lens(
-    file: SpectralFile, tags: XmpTags, exif: dict[str, Any]
-) -> tuple[Lens | None, tuple[str, ...]]:
-    if tag_numbers(tags, "DewarpData") is not None:
-        return _dji_lens(file, tags)
-    resolution = _resolution(exif)
+class _NoLensError(Exception):
+    """Tags tell no lens; the text says why."""
+
+
+def _pix4d_lens(file: SpectralFile, tags: XmpTags, exif: dict[str, Any]) -> tuple[Lens, tuple[str, ...]]:
+    unit = MM_OF_UNIT.get(exif_number(exif, "FocalPlaneResolutionUnit") or 4.0, 1.0)
+    across = (exif_number(exif, "FocalPlaneXResolution") or 0.0) / unit  # pixels a millimetre
+    down = (exif_number(exif, "FocalPlaneYResolution") or 0.0) / unit or across
     centre_mm = tag_numbers(tags, "Camera:PrincipalPoint")
-    if resolution is None or centre_mm is None or len(centre_mm) != 2:
-        return None, ("no lens in the file's tags: principal point or focal plane resolution is absent",)
-    centre = (centre_mm[0] * resolution[0] + HALF_PIXEL, centre_mm[1] * resolution[1] + HALF_PIXEL)
+    if across <= 0.0 or centre_mm is None or len(centre_mm) != 2:
+        raise _NoLensError("principal point or focal plane resolution is absent")
+    centre = (centre_mm[0] * across + 0.5, centre_mm[1] * down + 0.5)
     fisheye = tag_numbers(tags, "FisheyePolynomial")
     if fisheye is not None and (tag_text(tags, "Camera:ModelType") or "fisheye").lower() == "fisheye":
-        return _fisheye_lens(file, tags, fisheye, centre)
-    return _perspective_lens(file, tags, resolution, centre)
-
-
-def _resolution(exif: dict[str, Any]) -> tuple[float, float] | None:
-    """Pixels a millimetre along x and y."""
-    unit = MM_OF_UNIT.get(exif_number(exif, "FocalPlaneResolutionUnit") or 4.0, 1.0)
-    across = (exif_number(exif, "FocalPlaneXResolution") or 0.0) / unit
-    down = (exif_number(exif, "FocalPlaneYResolution") or 0.0) / unit
-    return (across, down or across) if across > 0.0 else None
-
-
-def _perspective_lens(
-    file: SpectralFile, tags: XmpTags, resolution: tuple[float, float], centre: tuple[float, float]
-) -> tuple[Lens | None, tuple[str, ...]]:
+        matrix = tag_numbers(tags, "FisheyeAffineMatrix")
+        if matrix is None or len(matrix) != 4:
+            raise _NoLensError("FisheyeAffineMatrix is absent")
+        height, width = file.shape[:2]
+        try:
+            lens, note = _fit_fisheye((width, height), tuple(fisheye), tuple(matrix), centre)
+        except CaptureError as error:
+            raise CaptureError(f"{file.path}, {error}") from error
+        return lens, (note,)
     focal = tag_numbers(tags, "PerspectiveFocalLength")
     if focal is None or focal[0] <= 0.0:
-        return None, ("no lens in the file's tags: PerspectiveFocalLength is absent",)
+        raise _NoLensError("PerspectiveFocalLength is absent")
     unit = tag_text(tags, "PerspectiveFocalLengthUnits") or ("mm" if focal[0] < LONGEST_MM else "px")
-    focal_px = (focal[0] * resolution[0], focal[0] * resolution[1]) if unit == "mm" else (focal[0], focal[0])
+    focal_px = (focal[0] * across, focal[0] * down) if unit == "mm" else (focal[0], focal[0])
     distortion = tag_numbers(tags, "PerspectiveDistortion") or []
     k1, k2, k3, p1, p2 = distortion if len(distortion) == 5 else [0.0] * 5
     return _lens(file, focal_px, centre, (k1, k2, k3), (p1, p2)), ()
 
 
-def _dji_lens(file: SpectralFile, tags: XmpTags) -> tuple[Lens | None, tuple[str, ...]]:
+def _dji_lens(file: SpectralFile, tags: XmpTags) -> Lens:
     """`DewarpData`: a date; fx, fy, cx, cy, k1, k2, p1, p2, k3, where cx, cy count from the optical centre."""
     text = (tag_text(tags, "DewarpData") or "").rpartition(";")[2]
     numbers = tag_numbers({"DewarpData": text}, "DewarpData") or []
     middle = [(tag_numbers(tags, f"CalibratedOpticalCenter{axis}") or [math.nan])[0] for axis in "XY"]
     if len(numbers) != 9 or not np.isfinite(middle).all():
-        return None, ("no lens in the file's tags: DewarpData or CalibratedOpticalCenter is incomplete",)
+        raise _NoLensError("DewarpData or CalibratedOpticalCenter is incomplete")
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = numbers
-    centre = (middle[0] + cx + HALF_PIXEL, middle[1] + cy + HALF_PIXEL)
-    return _lens(file, (fx, fy), centre, (k1, k2, k3), (p1, p2)), ()
+    return _lens(file, (fx, fy), (middle[0] + cx + 0.5, middle[1] + cy + 0.5), (k1, k2, k3), (p1, p2))
 
 
 def _lens(
@@ -336,31 +308,11 @@ def _lens(
     radial: tuple[float, float, float],
     tangential: tuple[float, float],
 ) -> Lens:
-    """A lens of the file's size.
-
-    Raises:
-        CaptureError: its distortion folds the image over.
-    """
     height, width = file.shape[:2]
     lens = Lens(width, height, focal_px, centre, (*radial[:2], *tangential), (radial[2], 0.0))
     if lens.higher_radial[0]:
         require_unfolded(lens, f"{file.path}, {TAGS}")
     return lens
-
-
-def _fisheye_lens(
-    file: SpectralFile, tags: XmpTags, polynomial: list[float], centre: tuple[float, float]
-) -> tuple[Lens | None, tuple[str, ...]]:
-    """Pix4D's fisheye: radius p0 + p1 t + p2 t^2 + p3 t^3 with t = 2/pi times the angle, then the matrix C, D; E, F."""
-    numbers = tag_numbers(tags, "FisheyeAffineMatrix")
-    if numbers is None or len(numbers) != 4:
-        return None, ("no lens in the file's tags: FisheyeAffineMatrix is absent",)
-    height, width = file.shape[:2]
-    try:
-        lens, note = _fit_fisheye((width, height), tuple(polynomial), tuple(numbers), centre)
-    except CaptureError as error:
-        raise CaptureError(f"{file.path}, {error}") from error
-    return lens, (note,)
 
 
 @lru_cache
@@ -370,7 +322,10 @@ def _fit_fisheye(
     matrix: tuple[float, ...],
     centre: tuple[float, float],
 ) -> tuple[Lens, str]:
-    """The lens nearest to a fisheye; all files of a lens have the same."""
+    """Radius p0 + p1 t + p2 t^2 + p3 t^3 with t = 2/pi times the angle, then the matrix C, D; E, F.
+
+    Remembered, as all files of a lens have the same.
+    """
     affine = np.array(matrix).reshape(2, 2)
 
     def project(ideal: Points) -> Points:

@@ -1,13 +1,9 @@
 """Poses estimated from the pictures themselves: structure from motion with COLMAP, one lens a sensor.
 
-Pictures in which features are found: 8 bits, stretched, with local contrast, made from spectral cubes.
+COLMAP runs as a process of its own, `python -m unmix_plugin.captures.poses.estimation SETTINGS.json`, because it ends
+the one that it runs in when a check of its own fails, can't be interrupted, and talks to standard error.
 
 Notation: `H x W` pixels, `B` bands.
-
-Structure from motion with pycolmap, as a process of its own: `python -m ... SETTINGS.json`.
-
-A process, because COLMAP ends the one that it runs in when a check of its own fails, can't be interrupted, and talks to
-standard error.
 """
 
 from __future__ import annotations
@@ -17,19 +13,17 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, Shaped, UInt8
+from jaxtyping import Bool, Shaped, UInt8
 
 from unmix_plugin.captures.poses.colmap import read_colmap
 from unmix_plugin.captures.poses.pose_set import PoseSet, name_some
 from unmix_plugin.errors import CaptureError
-
-Picture = UInt8[np.ndarray, "H W"] | UInt8[np.ndarray, "H W 3"]
 
 LEAST_VIEWS = 3
 LEAST_SHARE = 0.5
@@ -38,6 +32,24 @@ MOST_EXHAUSTIVE = 100
 """Views up to which all pairs are matched; beyond, neighbours in the order of names."""
 RIM_PX = 4
 """Beside the edge of a mask, where features are those of the silhouette and not of the surface."""
+PERCENTILES = (1.0, 99.5)
+GAMMA = 0.5
+"""Values are light; shadows need the room that eyes, and detectors made for photographs, expect."""
+LOCAL_CONTRAST, TILES = 0.02, 8
+"""A side is cut into so many tiles, each with a contrast of its own."""
+ENOUGH = 0.9
+"""Share of registered images with which no other focal length is tried."""
+FOCAL_FACTORS = (1.2, 3.0, 7.0)
+"""First focal lengths to try, over the longer side: wide, tele and far lenses."""
+PEAK_THRESHOLD = 0.003
+"""Of features: half of COLMAP's, as matter in a laboratory has less texture than a street."""
+MOST_FEATURES = 8192
+"""Of a picture."""
+SEED = 0
+GAIN = 0.02
+"""Part of the reprojection error that distortion has to remove to be kept."""
+GREATEST_BEND = 0.1
+"""Of half the diagonal: what distortion may move the corner of a picture by."""
 LOG = "colmap.log"
 _WHAT_TO_DO = (
     "take more views with smaller steps (10 degrees) and much overlap, mask a background that stands still while the "
@@ -46,7 +58,7 @@ _WHAT_TO_DO = (
 
 
 def estimate_poses(
-    pictures: Mapping[str, Picture],
+    pictures: Mapping[str, UInt8[np.ndarray, "H W"]],
     folder: Path,
     sensor_of: Mapping[str, str] | None = None,
     masks: Mapping[str, Bool[np.ndarray, "H W"]] | None = None,
@@ -55,7 +67,7 @@ def estimate_poses(
     """Find where pictures were taken from.
 
     Args:
-        pictures: By the name of the view; with high contrast (see `contrast`).
+        pictures: By the name of the view; with high contrast (see `contrast_picture`).
         folder: For COLMAP's files and its log; is made.
         sensor_of: Sensor of each view; views of one have one lens and one size. None is one for all.
         masks: True on matter; features are found there, but not on its rim.
@@ -66,7 +78,13 @@ def estimate_poses(
     Raises:
         CaptureError: pycolmap is not installed, or fewer than half of the views, or than 3, could be registered.
     """
-    _require_pycolmap()
+    from scipy.ndimage import binary_erosion
+
+    if importlib.util.find_spec("pycolmap") is None:
+        raise CaptureError(
+            "poses can't be estimated: pycolmap is not installed; pip install 'unmix-nerf[sfm]', or give poses of "
+            "another program"
+        )
     if len(pictures) < LEAST_VIEWS:
         raise CaptureError(
             f"{len(pictures)} views; expected at least {LEAST_VIEWS} to estimate poses from: {_WHAT_TO_DO}"
@@ -75,30 +93,21 @@ def estimate_poses(
     _write_pictures(folder, {files[name]: picture for name, picture in pictures.items()}, "images")
     if masks is not None:
         shown = {
-            f"{files[name]}.png": 255 * without_rim(mask, RIM_PX).astype(np.uint8)
+            f"{files[name]}.png": 255 * binary_erosion(mask, iterations=RIM_PX).astype(np.uint8)
             for name, mask in masks.items()
         }
         _write_pictures(folder, shown, "masks")
     sensors: dict[str, list[str]] = {}
     for name in sorted(pictures):
         sensors.setdefault((sensor_of or {}).get(name, ""), []).append(files[name])
-    settings = SfmSettings(
+    settings = _Settings(
         folder=str(folder.resolve()),
         sensors=tuple(map(tuple, sensors.values())),
         has_masks=masks is not None,
         sequential=len(pictures) > MOST_EXHAUSTIVE,
         threads=threads or min(os.cpu_count() or 1, 8),
     )
-    models = _run(settings, folder)
-    return _best(models, files, folder)
-
-
-def _require_pycolmap() -> None:
-    if importlib.util.find_spec("pycolmap") is None:
-        raise CaptureError(
-            "poses can't be estimated: pycolmap is not installed; pip install 'unmix-nerf[sfm]', or give poses of "
-            "another program"
-        )
+    return _best(_run(settings, folder), files, folder)
 
 
 def _write_pictures(folder: Path, pictures: Mapping[str, UInt8[np.ndarray, "..."]], kind: str) -> None:
@@ -110,11 +119,12 @@ def _write_pictures(folder: Path, pictures: Mapping[str, UInt8[np.ndarray, "..."
         Image.fromarray(pixels).save(place / name)
 
 
-def _run(settings: SfmSettings, folder: Path) -> list[dict]:
+def _run(settings: _Settings, folder: Path) -> list[dict]:
     """Start the process that reconstructs, with its output in the log file."""
-    result = folder / "result.json"
+    result, asked = folder / "result.json", folder.resolve() / "settings.json"
     result.unlink(missing_ok=True)
-    command = [sys.executable, "-m", "unmix_plugin.captures.poses.estimation", str(write_settings(settings))]
+    asked.write_text(json.dumps(asdict(settings)), encoding="utf-8")
+    command = [sys.executable, "-m", "unmix_plugin.captures.poses.estimation", str(asked)]
     with (folder / LOG).open("wb") as log:
         status = subprocess.run(
             command, stdout=log, stderr=log, stdin=subprocess.DEVNULL, check=False
@@ -148,95 +158,38 @@ def _best(models: list[dict], files: Mapping[str, str], folder: Path) -> PoseSet
     return replace(poses, cameras=cameras, source="estimated by COLMAP", has_world=False, notes=tuple(notes))
 
 
-ReadRows = Callable[[slice], Shaped[np.ndarray, "h W B"]]
-"""Some rows of a cube, all bands."""
-
-_PERCENTILES = (1.0, 99.5)
-_GAMMA = 0.5
-"""Values are light; shadows need the room that eyes, and detectors made for photographs, expect."""
-_LOCAL_CONTRAST = 0.02
-_TILES = 8
-"""A side is cut into so many tiles, each with a contrast of its own."""
-_ROWS = 64
-"""Read at once."""
-
-
 def contrast_picture(
-    read_rows: ReadRows,
-    size: tuple[int, int],
-    weights: Float[np.ndarray, " B"],
-    valid: Bool[np.ndarray, "H W"] | None = None,
+    cube: Shaped[np.ndarray, "H W B"], full_scale: float, valid: Bool[np.ndarray, "H W"]
 ) -> UInt8[np.ndarray, "H W"]:
-    """A picture of a cube that is never in memory as a whole.
+    """A picture in which features are found: the mean of all bands, stretched, with local contrast.
 
     Args:
-        read_rows: The cube, calibrated or not.
-        size: H, W.
-        weights: Of bands in the mean; 0 leaves a band out. Use the same for all views, so that they look alike.
-        valid: Pixels that count for the stretch; others become black. Pixels that are not finite never count.
+        cube: May lie on disk; some rows are read at a time.
+        full_scale: Number that stands for 1.
+        valid: Pixels that count for the stretch; others become black, as do those that are not finite.
     """
-    height, width = size
-    mean = np.empty((height, width), np.float32)
-    used = np.flatnonzero(weights)
-    for start in range(0, height, _ROWS):
-        rows = slice(start, min(start + _ROWS, height))
-        mean[rows] = read_rows(rows)[..., used].astype(np.float32) @ weights[used].astype(np.float32)
-    return stretch(mean, valid)
-
-
-def stretch(
-    values: Float32[np.ndarray, "H W"], valid: Bool[np.ndarray, "H W"] | None = None
-) -> UInt8[np.ndarray, "H W"]:
-    """Values between two percentiles as a picture with local contrast; black where they don't count."""
     from skimage.exposure import equalize_adapthist
 
-    counts = np.isfinite(values) if valid is None else valid & np.isfinite(values)
+    height, width, bands = cube.shape
+    mean = np.empty((height, width), np.float32)
+    weights = np.full(bands, 1.0 / bands / full_scale, np.float32)
+    for start in range(0, height, 64):
+        mean[start : start + 64] = cube[start : start + 64].astype(np.float32) @ weights
+    counts = valid & np.isfinite(mean)
     if not counts.any():
-        return np.zeros(values.shape, np.uint8)
-    low, high = np.percentile(values[counts], _PERCENTILES)
+        return np.zeros(mean.shape, np.uint8)
+    low, high = np.percentile(mean[counts], PERCENTILES)
     if high <= low:
         return np.where(counts, np.uint8(128), np.uint8(0))
-    level = np.clip((np.where(counts, values, low) - low) / (high - low), 0.0, 1.0) ** _GAMMA
-    tile = [max(side // _TILES, 1) for side in values.shape]
-    local = equalize_adapthist(level, kernel_size=tile, clip_limit=_LOCAL_CONTRAST)
+    level = np.clip((np.where(counts, mean, low) - low) / (high - low), 0.0, 1.0) ** GAMMA
+    tile = [max(side // TILES, 1) for side in mean.shape]
+    local = equalize_adapthist(level, kernel_size=tile, clip_limit=LOCAL_CONTRAST)
     return np.where(counts, np.round(255.0 * local), 0.0).astype(np.uint8)
 
 
-def mean_weights(good: Bool[np.ndarray, " B"]) -> Float64[np.ndarray, " B"]:
-    """Weights that average the good bands; all of them if none is good."""
-    weights = good.astype(np.float64) if good.any() else np.ones(len(good))
-    return weights / weights.sum()
-
-
-def without_rim(mask: Bool[np.ndarray, "H W"], pixels: int) -> Bool[np.ndarray, "H W"]:
-    """A mask of matter without its rim, whose features belong to the silhouette and not to the surface."""
-    from scipy.ndimage import binary_erosion
-
-    return binary_erosion(mask, iterations=pixels) if pixels > 0 else mask
-
-
-LEAST_MODEL = 3
-"""Images of the smallest model that is kept."""
-ENOUGH = 0.9
-"""Share of registered images with which no other focal length is tried."""
-FOCAL_FACTORS = (1.2, 3.0, 7.0)
-"""First focal lengths to try, over the longer side: wide, tele and far lenses."""
-PEAK_THRESHOLD = 0.003
-"""Of features: half of COLMAP's, as matter in a laboratory has less texture than a street."""
-CAMERA_MODEL = "SIMPLE_RADIAL"
-"""COLMAP's name of a lens with one number of distortion."""
-MOST_FEATURES = 8192
-"""Of a picture."""
-SEED = 0
-GAIN = 0.02
-"""Part of the reprojection error that distortion has to remove to be kept."""
-GREATEST_BEND = 0.1
-"""Of half the diagonal: what distortion may move the corner of a picture by."""
-
-
 @dataclass(frozen=True)
-class SfmSettings:
-    """What to reconstruct."""
+class _Settings:
+    """What the process reconstructs."""
 
     folder: str
     """Holds `images` and gets `database.db` and `models`."""
@@ -249,19 +202,12 @@ class SfmSettings:
     threads: int
 
 
-def write_settings(settings: SfmSettings) -> Path:
-    """The file to start the process with."""
-    path = Path(settings.folder) / "settings.json"
-    path.write_text(json.dumps(asdict(settings)), encoding="utf-8")
-    return path
-
-
-def main(path: Path) -> None:
+def _reconstruct(path: Path) -> None:
     """Reconstruct, and write `result.json`: folder, registered images and reprojection error of each model."""
     import pycolmap
 
     values = json.loads(path.read_text(encoding="utf-8"))
-    settings = SfmSettings(**{**values, "sensors": tuple(map(tuple, values["sensors"]))})
+    settings = _Settings(**{**values, "sensors": tuple(map(tuple, values["sensors"]))})
     pycolmap.set_random_seed(SEED)
     folder = Path(settings.folder)
     database = folder / "database.db"
@@ -278,12 +224,12 @@ def main(path: Path) -> None:
     (folder / "result.json").write_text(json.dumps(found), encoding="utf-8")
 
 
-def _extract(pycolmap: Any, settings: SfmSettings, database: Path) -> None:
+def _extract(pycolmap: Any, settings: _Settings, database: Path) -> None:
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads, options.use_gpu = settings.threads, False
     options.sift.max_num_features, options.sift.peak_threshold = MOST_FEATURES, PEAK_THRESHOLD
     reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = CAMERA_MODEL
+    reader.camera_model = "SIMPLE_RADIAL"  # a lens with one number of distortion
     if settings.has_masks:
         reader.mask_path = Path(settings.folder) / "masks"
     for names in settings.sensors:
@@ -298,7 +244,7 @@ def _extract(pycolmap: Any, settings: SfmSettings, database: Path) -> None:
         )
 
 
-def _match(pycolmap: Any, settings: SfmSettings, database: Path) -> None:
+def _match(pycolmap: Any, settings: _Settings, database: Path) -> None:
     options = pycolmap.FeatureMatchingOptions()
     options.num_threads, options.use_gpu = settings.threads, False
     verification = pycolmap.TwoViewGeometryOptions()
@@ -318,15 +264,12 @@ def _set_focal(pycolmap: Any, database: Path, factor: float) -> None:
             opened.update_camera(camera)
 
 
-def _map(pycolmap: Any, settings: SfmSettings, database: Path, output: Path) -> list[dict[str, Any]]:
+def _map(pycolmap: Any, settings: _Settings, database: Path, output: Path) -> list[dict[str, Any]]:
     """Models from one first focal length, without distortion, which a few views of a far lens would let run away."""
     output.mkdir(parents=True, exist_ok=True)
     options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads, options.random_seed, options.min_model_size = (
-        settings.threads,
-        SEED,
-        LEAST_MODEL,
-    )
+    options.num_threads, options.random_seed = settings.threads, SEED
+    options.min_model_size = LEAST_VIEWS
     options.max_num_models = 5
     options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = False
     options.max_focal_length_ratio = options.mapper.max_focal_length_ratio = 50.0
@@ -351,9 +294,8 @@ def _with_distortion(pycolmap: Any, model: Any) -> Any:
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_extra_params, options.print_summary = True, False
     pycolmap.bundle_adjustment(bent, options)
-    is_better = (
-        bent.compute_mean_reprojection_error() < (1.0 - GAIN) * model.compute_mean_reprojection_error()
-    )
+    limit = (1.0 - GAIN) * model.compute_mean_reprojection_error()
+    is_better = bent.compute_mean_reprojection_error() < limit
     return bent if is_better and all(map(_is_plausible, bent.cameras.values())) else model
 
 
@@ -368,4 +310,4 @@ def _is_plausible(camera: Any) -> bool:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    _reconstruct(Path(sys.argv[1]))

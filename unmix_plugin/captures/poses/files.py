@@ -1,11 +1,9 @@
-"""Files of unknown origin: JSON, XML and numbers in it, sizes of pictures."""
+"""JSON and XML of unknown origin, and numbers in XML."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
-from typing import Any, TypeAlias
+from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -73,38 +71,3 @@ def number_of(parent: ElementTree.Element, tag: str, where: str, default: float 
     """The number in a child; the default without one."""
     values = numbers_of(parent.find(tag), 1, where)
     return default if values is None else float(values[0])
-
-
-Size: TypeAlias = tuple[int, int]
-"""Width, height in pixels."""
-
-
-@dataclass(frozen=True)
-class PictureSizes:
-    """Where the size of a picture is looked up: among given ones, then in the file itself."""
-
-    given: Mapping[str, Size] = field(default_factory=dict)
-    """By name, file name or stem."""
-    folder: Path | None = None
-    """Where names of files start."""
-
-    def of(self, name: str) -> Size | None:
-        """Size of a picture; None if nothing tells it."""
-        path = PurePosixPath(name.replace("\\", "/"))
-        for key in (name, path.name, path.stem):
-            if key in self.given:
-                return self.given[key]
-        if len(set(self.given.values())) == 1:
-            return next(iter(self.given.values()))
-        return self._from_file(name)
-
-    def _from_file(self, name: str) -> Size | None:
-        from PIL import Image
-
-        if self.folder is None:
-            return None
-        try:
-            with Image.open(self.folder / name) as picture:
-                return picture.size
-        except (OSError, ValueError, Image.DecompressionBombError):
-            return None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet, name_some
@@ -13,24 +12,10 @@ from unmix_plugin.errors import CaptureError, counted
 BY_ORDER = "#"
 """Names of cameras whose source gives none begin with it; they are matched in the order of names."""
 
-Keys = Callable[[str], str]
 
-
-@dataclass(frozen=True)
-class Matches:
-    """Cameras of the views of a capture."""
-
-    cameras: dict[str, PosedCamera]
-    """By the name of the view; views without pose are not in it."""
-    unposed: tuple[str, ...]
-    """Views for which no camera was found."""
-    unused: tuple[str, ...]
-    """Cameras that belong to no view."""
-    notes: tuple[str, ...]
-    """How they were matched and what is odd, one sentence each."""
-
-
-def match_poses(poses: PoseSet, views: Sequence[tuple[str, Sequence[str | Path]]]) -> Matches:
+def match_poses(
+    poses: PoseSet, views: Sequence[tuple[str, Sequence[str | Path]]]
+) -> tuple[dict[str, PosedCamera], list[str]]:
     """Find the camera of each view.
 
     Names are compared whole, then as folder and name, file name, and name without suffix, each only where it is unique
@@ -38,6 +23,9 @@ def match_poses(poses: PoseSet, views: Sequence[tuple[str, Sequence[str | Path]]
 
     Args:
         views: Name and files of each view; the files as paths, of which the trailing parts count.
+    Returns:
+        Cameras by the name of the view, without views that have none; how they were matched and what is odd, one
+        sentence each.
     Raises:
         CaptureError: no view has a pose.
     """
@@ -47,20 +35,36 @@ def match_poses(poses: PoseSet, views: Sequence[tuple[str, Sequence[str | Path]]
     if found is None:
         found, how = _by_names(owners, wanted), "by name"
     if not found:
-        found, how = _by_common_part(owners, wanted), "by the part of the names that differs"
+        cameras, named = _cores(owners), _cores(wanted)
+        found = {named[core]: cameras[core] for core in named if core in cameras}
+        how = "by the part of the names that differs"
     if not found:
         raise CaptureError(
             f"no view has a pose: views are called {name_some(list(wanted)) or '(none)'}, the cameras of "
             f"{poses.source} {name_some(list(owners))}; expected the same names, apart from folders and suffixes: "
             "rename one of them"
         )
-    unposed = tuple(name for name in wanted if name not in found)
-    unused = tuple(name for name in owners if name not in set(found.values()))
+    unposed = [name for name in wanted if name not in found]
+    unused = [name for name in owners if name not in set(found.values())]
+    cameras_of, views_of = _owners_of(owners, _stem), _owners_of(wanted, _stem)
+    shared = [  # several views or cameras have one name
+        view
+        for view in unposed
+        if any(
+            cameras_of.get(_stem(name)) and len(cameras_of[_stem(name)]) + len(views_of[_stem(name)]) > 2
+            for name in wanted[view]
+        )
+    ]
     notes = [f"{len(found)} of {len(wanted)} views were matched {how}"]
-    notes += [f"views without pose: {', '.join(unposed)}"] if unposed else []
-    notes += [f"{counted(len(unused), 'camera')} without view: {name_some(unused)}"] if unused else []
-    cameras = {view: poses.cameras[found[view]] for view in wanted if view in found}
-    return Matches(cameras, unposed, unused, (*notes, *_ambiguous(owners, unposed, wanted)))
+    if unposed:
+        notes.append(f"views without pose: {', '.join(unposed)}")
+    if unused:
+        notes.append(f"{counted(len(unused), 'camera')} without view: {name_some(unused)}")
+    if shared:
+        notes.append(
+            f"several views or cameras share the name of {name_some(shared)}; give them names of their own"
+        )
+    return {view: poses.cameras[found[view]] for view in wanted if view in found}, notes
 
 
 def _by_order(owners: list[str], wanted: list[str]) -> dict[str, str] | None:
@@ -77,7 +81,7 @@ def _by_order(owners: list[str], wanted: list[str]) -> dict[str, str] | None:
 
 def _by_names(owners: dict[str, list[str]], wanted: dict[str, list[str]]) -> dict[str, str]:
     found: dict[str, str] = {}
-    for key in (_whole, _folder_and_stem, _file_name, _stem):
+    for key in _KEYS:
         cameras, views = _owners_of(owners, key), _owners_of(wanted, key)
         for view, names in wanted.items():
             hits = (cameras.get(key(name), set()) for name in names if len(views[key(name)]) == 1)
@@ -85,11 +89,6 @@ def _by_names(owners: dict[str, list[str]], wanted: dict[str, list[str]]) -> dic
             if view not in found and hit is not None and hit not in found.values():
                 found[view] = hit
     return found
-
-
-def _by_common_part(owners: dict[str, list[str]], wanted: dict[str, list[str]]) -> dict[str, str]:
-    cameras, views = _cores(owners), _cores(wanted)
-    return {views[core]: cameras[core] for core in views if core in cameras}
 
 
 def _cores(names: Iterable[str]) -> dict[str, str]:
@@ -112,34 +111,11 @@ def _cores(names: Iterable[str]) -> dict[str, str]:
 
 def _common_length(texts: list[str]) -> int:
     """Number of characters that all texts begin with."""
-    columns = zip(*texts, strict=False)
-    return next(
-        (index for index, column in enumerate(columns) if len(set(column)) > 1),
-        min(map(len, texts), default=0),
-    )
+    alike = [len(set(column)) == 1 for column in zip(*texts, strict=False)]
+    return alike.index(False) if False in alike else len(alike)
 
 
-def _ambiguous(
-    owners: dict[str, list[str]], unposed: Sequence[str], wanted: dict[str, list[str]]
-) -> list[str]:
-    """A sentence if views have no pose because several views or cameras share a name."""
-    cameras, views = _owners_of(owners, _stem), _owners_of(wanted, _stem)
-    shared = [
-        view
-        for view in unposed
-        if any(
-            cameras.get(_stem(name)) and len(cameras[_stem(name)]) + len(views[_stem(name)]) > 2
-            for name in wanted[view]
-        )
-    ]
-    return (
-        [f"several views or cameras share the name of {name_some(shared)}; give them names of their own"]
-        if shared
-        else []
-    )
-
-
-def _owners_of(names: dict[str, list[str]], key: Keys) -> dict[str, set[str]]:
+def _owners_of(names: dict[str, list[str]], key: Callable[[str], str]) -> dict[str, set[str]]:
     by_key: dict[str, set[str]] = defaultdict(set)
     for owner, all_names in names.items():
         for name in all_names:
@@ -147,24 +123,20 @@ def _owners_of(names: dict[str, list[str]], key: Keys) -> dict[str, set[str]]:
     return by_key
 
 
-def _path(name: str) -> PurePosixPath:
-    return PurePosixPath(name.replace("\\", "/"))
-
-
-def _whole(name: str) -> str:
-    return str(_path(name))
-
-
-def _folder_and_stem(name: str) -> str:
-    path = _path(name)
-    return f"{path.parent.name}/{_stem(name)}"
-
-
-def _file_name(name: str) -> str:
-    return _path(name).name
-
-
 def _stem(name: str) -> str:
     """File name without its suffix; a dot before digits is not a suffix, as in `view.0001`."""
     path = _path(name)
     return path.name if path.suffix[1:].isdecimal() else path.stem
+
+
+def _path(name: str) -> PurePosixPath:
+    return PurePosixPath(name.replace("\\", "/"))
+
+
+_KEYS: tuple[Callable[[str], str], ...] = (
+    lambda name: str(_path(name)),
+    lambda name: f"{_path(name).parent.name}/{_stem(name)}",
+    lambda name: _path(name).name,
+    _stem,
+)
+"""What names are compared by, in turn."""

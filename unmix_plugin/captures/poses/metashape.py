@@ -3,10 +3,8 @@
 A camera's matrix leads from the camera (OpenCV axes) to its component; the component's or the chunk's similarity leads
 to the world, often geocentric (metres from the middle of the Earth).
 
-Metashape's sensors as our lens.
-
-u = w / 2 + cx + x' f + x' b1 + y' b2, v = h / 2 + cy + y' f, with x', y' bent by k1..k4 and by p1, p2, which are
-OpenCV's p2, p1.
+A sensor's lens: u = w / 2 + cx + x' f + x' b1 + y' b2, v = h / 2 + cy + y' f, with x', y' bent by k1..k4 and by p1, p2,
+which are OpenCV's p2, p1.
 """
 
 from __future__ import annotations
@@ -19,11 +17,12 @@ from jaxtyping import Float64
 
 from unmix_plugin.captures.poses.files import number_of, numbers_of
 from unmix_plugin.captures.poses.lens import Lens, Points, fit_lens, project_fisheye, project_opencv
-from unmix_plugin.captures.poses.pose_set import FLIP, PoseSet, RawCamera, make_pose_set, name_some
+from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, make_pose_set, name_some
 from unmix_plugin.errors import CaptureError, counted
 
-EARTH_RADII = (6.2e6, 6.6e6)
+_EARTH_RADII = (6.2e6, 6.6e6)
 """Metres from the middle of the Earth between which a position is geocentric."""
+_RADIAL = ("k1", "k2", "k3", "k4")
 
 
 def read_metashape(path: Path, root: ElementTree.Element) -> PoseSet:
@@ -44,17 +43,24 @@ def read_metashape(path: Path, root: ElementTree.Element) -> PoseSet:
     aligned = _aligned(chunk, path, notes)
     worlds = _worlds(chunk, path)
     aligned = _of_one_world(aligned, worlds, notes)
-    lenses = _lenses(chunk, {camera.get("sensor_id") for camera in aligned}, path, notes)
+    used = {camera.get("sensor_id") for camera in aligned}
+    lenses: dict[str | None, Lens | None] = {}
+    for sensor in chunk.iterfind("sensors/sensor"):
+        if sensor.get("id") in used:
+            lenses[sensor.get("id")], said = _lens(sensor, str(path))
+            notes += said
     raw = [
-        RawCamera(
+        (
             camera.get("label") or f"camera {camera.get('id')}",
-            _to_world(camera, worlds.get(camera.get("component_id"), worlds[None]), path),
-            lenses.get(camera.get("sensor_id")),
+            PosedCamera(
+                _to_world(camera, worlds.get(camera.get("component_id"), worlds[None]), path),
+                lenses.get(camera.get("sensor_id")),
+            ),
         )
         for camera in aligned
     ]
-    middle = np.mean([camera.matrix[:, 3] for camera in raw], axis=0)
-    is_geocentric = EARTH_RADII[0] < np.linalg.norm(middle) < EARTH_RADII[1]
+    middle = np.mean([camera.camera_to_world[:, 3] for _, camera in raw], axis=0)
+    is_geocentric = _EARTH_RADII[0] < np.linalg.norm(middle) < _EARTH_RADII[1]
     notes += ["coordinates are geocentric; up is away from the Earth's middle"] if is_geocentric else []
     has_world = any(np.abs(world - np.eye(4)).max() > 0 for world in worlds.values())
     up = middle if is_geocentric else np.array([0.0, 0.0, 1.0]) if has_world else None
@@ -73,12 +79,9 @@ def _aligned(chunk: ElementTree.Element, path: Path, notes: list[str]) -> list[E
             f"{path}: none of {len(cameras)} cameras is enabled and has a transform; align photos in Metashape first"
         )
     if missing:
-        slaves = any(camera.get("master_id") for camera in enabled if camera.find("transform") is None)
-        why = (
-            ", some of them lenses of a rig, whose places beside the first lens are not read"
-            if slaves
-            else ""
-        )
+        why = ""
+        if any(camera.get("master_id") for camera in enabled if camera.find("transform") is None):
+            why = ", some of them lenses of a rig, whose places beside the first lens are not read"
         notes.append(f"{counted(len(missing), 'camera')} without transform{why}: {name_some(missing)}")
     return aligned
 
@@ -100,15 +103,12 @@ def _similarity(element: ElementTree.Element, path: Path) -> Float64[np.ndarray,
     if len(element) == 0:
         values = numbers_of(element, 16, where)
         return np.eye(4) if values is None else values.reshape(4, 4)
-    parts = (
+    rotation, translation = (
         numbers_of(element.find(tag), count, where) for tag, count in (("rotation", 9), ("translation", 3))
     )
-    rotation, translation = parts
-    scale = numbers_of(element.find("scale"), 1, where)
     matrix = np.eye(4)
-    matrix[:3, :3] = (1.0 if scale is None else scale[0]) * (
-        np.eye(3) if rotation is None else rotation.reshape(3, 3)
-    )
+    matrix[:3, :3] = np.eye(3) if rotation is None else rotation.reshape(3, 3)
+    matrix[:3, :3] *= number_of(element, "scale", where, default=1.0)
     matrix[:3, 3] = 0.0 if translation is None else translation
     return matrix
 
@@ -144,26 +144,8 @@ def _to_world(
     return np.column_stack([matrix[:3, :3] / scale @ FLIP, matrix[:3, 3]])
 
 
-def _lenses(
-    chunk: ElementTree.Element, used: set[str | None], path: Path, notes: list[str]
-) -> dict[str | None, Lens | None]:
-    lenses: dict[str | None, Lens | None] = {}
-    for sensor in chunk.iterfind("sensors/sensor"):
-        if sensor.get("id") in used:
-            lenses[sensor.get("id")], said = metashape_lens(sensor, str(path))
-            notes += said
-    return lenses
-
-
-RADIAL = ("k1", "k2", "k3", "k4")
-
-
-def metashape_lens(sensor: ElementTree.Element, where: str) -> tuple[Lens | None, list[str]]:
-    """The lens of a sensor, None without any focal length; and what is not exactly as in the file.
-
-    Raises:
-        CaptureError: it is not a frame or fisheye camera, or the nearest lens is off by more than half a pixel.
-    """
+def _lens(sensor: ElementTree.Element, where: str) -> tuple[Lens | None, list[str]]:
+    """The lens of a sensor, None without any focal length; and what is not exactly as in the file."""
     name = sensor.get("label", "?")
     where = f"{where}: sensor {name}"
     calibration, size = _calibration(sensor, where)
@@ -176,7 +158,7 @@ def metashape_lens(sensor: ElementTree.Element, where: str) -> tuple[Lens | None
         )
     width, height = size
     values = {
-        tag: number_of(calibration, tag, where) for tag in ("f", "cx", "cy", "b1", "b2", "p1", "p2", *RADIAL)
+        tag: number_of(calibration, tag, where) for tag in ("f", "cx", "cy", "b1", "b2", "p1", "p2", *_RADIAL)
     }
     f_x = number_of(calibration, "fx", where, values["f"] + values["b1"])
     f_y = number_of(calibration, "fy", where, values["f"])
@@ -184,7 +166,7 @@ def metashape_lens(sensor: ElementTree.Element, where: str) -> tuple[Lens | None
     if min(f_x, f_y) <= 0:
         raise CaptureError(f"{where} has the focal length {min(f_x, f_y):g}; expected pixels above 0")
     focal, center = (f_x, f_y), (width / 2 + values["cx"], height / 2 + values["cy"])
-    radial = tuple(values[key] for key in RADIAL)
+    radial = tuple(values[key] for key in _RADIAL)
     tangential = (values["p2"], values["p1"])
     if kind == "frame" and not skew:
         bends = (radial[0], radial[1], *tangential), (radial[2], radial[3])

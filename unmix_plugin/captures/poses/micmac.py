@@ -14,17 +14,17 @@ from jaxtyping import Float64
 
 from unmix_plugin.captures.poses.files import load_xml, number_of, numbers_of
 from unmix_plugin.captures.poses.lens import Lens, Points, fit_lens
-from unmix_plugin.captures.poses.pose_set import FLIP, PoseSet, RawCamera, find_offset, make_pose_set
+from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, find_offset, make_pose_set
 from unmix_plugin.errors import CaptureError
 
-PREFIX = "Orientation-"
-CONVENTION = "eConvApero_DistM2C"
+_PREFIX = "Orientation-"
+_CONVENTION = "eConvApero_DistM2C"
 
 
 def find_orientations(folder: Path) -> list[Path]:
     """Orientation files of a folder, otherwise of the only folder `Ori-...` in it."""
-    own = sorted(folder.glob(f"{PREFIX}*.xml"))
-    below = [sorted(place.glob(f"{PREFIX}*.xml")) for place in sorted(folder.glob("Ori-*"))]
+    own = sorted(folder.glob(f"{_PREFIX}*.xml"))
+    below = [sorted(place.glob(f"{_PREFIX}*.xml")) for place in sorted(folder.glob("Ori-*"))]
     below = [files for files in below if files]
     if own or not below:
         return own
@@ -49,9 +49,9 @@ def read_micmac(paths: list[Path]) -> PoseSet:
         if orientation is None:
             raise CaptureError(f"{path} holds no <OrientationConique>; expected an orientation of MicMac")
         lens = _lens(orientation, path, lenses, notes)
-        name = path.name.removeprefix(PREFIX).removesuffix(".xml")
-        raw.append(RawCamera(name, _matrix(orientation, str(path)), lens))
-    is_far = find_offset(np.stack([camera.matrix[:, 3] for camera in raw])).any()
+        name = path.name.removeprefix(_PREFIX).removesuffix(".xml")
+        raw.append((name, PosedCamera(_matrix(orientation, str(path)), lens)))
+    is_far = find_offset(np.stack([camera.camera_to_world[:, 3] for _, camera in raw])).any()
     up = np.array([0.0, 0.0, 1.0]) if is_far else None
     folder = paths[0].parent
     return make_pose_set(raw, f"MicMac's {folder.name}", str(folder), None, up, dict.fromkeys(notes))
@@ -59,10 +59,10 @@ def read_micmac(paths: list[Path]) -> PoseSet:
 
 def _matrix(orientation: ElementTree.Element, where: str) -> Float64[np.ndarray, "3 4"]:
     convention = (
-        orientation.findtext("ConvOri/KnownConv") or orientation.findtext("Externe/KnownConv") or CONVENTION
+        orientation.findtext("ConvOri/KnownConv") or orientation.findtext("Externe/KnownConv") or _CONVENTION
     )
-    if convention.strip() != CONVENTION:
-        raise CaptureError(f"{where} has the convention {convention.strip()}; expected {CONVENTION}")
+    if convention.strip() != _CONVENTION:
+        raise CaptureError(f"{where} has the convention {convention.strip()}; expected {_CONVENTION}")
     center = numbers_of(orientation.find("Externe/Centre"), 3, where)
     code = orientation.find("Externe/ParamRotation/CodageMatr")
     rows = [None if code is None else numbers_of(code.find(tag), 3, where) for tag in ("L1", "L2", "L3")]
@@ -80,7 +80,11 @@ def _lens(orientation: ElementTree.Element, path: Path, lenses: dict[str, Lens],
     if key not in lenses:
         where = str(path)
         if inner is None:
-            file = _calibration_file(path, name)
+            file = path.parent / Path(name.replace("\\", "/")).name  # whatever folder it was written in
+            if not name or not file.is_file():
+                raise CaptureError(
+                    f"{path} names the calibration {name!r}, which is not beside it; copy it into {path.parent}"
+                )
             where, root = str(file), load_xml(file)
             inner = root if root.tag == "CalibrationInternConique" else root.find("CalibrationInternConique")
         if inner is None:
@@ -90,16 +94,6 @@ def _lens(orientation: ElementTree.Element, path: Path, lenses: dict[str, Lens],
         lenses[key], said = _calibration(inner, where)
         notes += said
     return lenses[key]
-
-
-def _calibration_file(path: Path, name: str) -> Path:
-    """The file of the calibration: beside the orientation, whatever folder it was written in."""
-    file = path.parent / Path(name.replace("\\", "/")).name
-    if not name or not file.is_file():
-        raise CaptureError(
-            f"{path} names the calibration {name!r}, which is not beside it; copy it into {path.parent}"
-        )
-    return file
 
 
 def _calibration(inner: ElementTree.Element, where: str) -> tuple[Lens, list[str]]:

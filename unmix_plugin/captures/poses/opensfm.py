@@ -14,8 +14,8 @@ from jaxtyping import Float64
 from unmix_plugin.captures.poses.lens import Lens, fit_lens, project_fisheye
 from unmix_plugin.captures.poses.pose_set import (
     FLIP,
+    PosedCamera,
     PoseSet,
-    RawCamera,
     SparsePoints,
     make_pose_set,
     name_some,
@@ -23,8 +23,8 @@ from unmix_plugin.captures.poses.pose_set import (
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.scenes.reading.faults import describe, read_number
 
-PLAIN = ("perspective", "simple_radial", "radial", "brown")
-FISHEYES = ("fisheye", "fisheye_opencv")
+_PLAIN = ("perspective", "simple_radial", "radial", "brown")
+_FISHEYES = ("fisheye", "fisheye_opencv")
 
 
 def is_reconstruction(content: Any) -> bool:
@@ -59,9 +59,8 @@ def read_opensfm(path: Path, content: Any) -> PoseSet:
             lenses[camera], note = _lens(best["cameras"][camera], f"{path}: camera {camera}")
             notes += [] if note is None else [note]
         rotation = pose[:, :3].T
-        raw.append(
-            RawCamera(name, np.column_stack([rotation @ FLIP, -rotation @ pose[:, 3]]), lenses[camera])
-        )
+        matrix = np.column_stack([rotation @ FLIP, -rotation @ pose[:, 3]])
+        raw.append((name, PosedCamera(matrix, lenses[camera])))
     notes += [f"{len(loose)} shots have no pose: {name_some(loose)}"] if loose else []
     up = np.array([0.0, 0.0, 1.0])
     return make_pose_set(raw, f"OpenSfM's {path.name}", str(path), _points(best, str(path)), up, notes)
@@ -113,22 +112,18 @@ def _lens(camera: Any, where: str) -> tuple[Lens, str | None]:
     if not (0 < width < 1e6 and 0 < height < 1e6) or min(focal) <= 0:
         raise CaptureError(f"{where}: width, height or focal length is missing or not above 0")
     kind = values.get("projection_type", "perspective")
-    if kind not in PLAIN + FISHEYES:
+    if kind not in _PLAIN + _FISHEYES:
         raise CaptureError(
-            f"{where} is {describe(kind)}; expected one of {', '.join(PLAIN + FISHEYES)}: undistort with OpenSfM first"
+            f"{where} is {describe(kind)}; expected one of {', '.join(_PLAIN + _FISHEYES)}: undistort with OpenSfM"
         )
     side = max(width, height)
     focal = (side * focal[0], side * focal[1])
     center = (width / 2 + side * number("c_x"), height / 2 + side * number("c_y"))
     radial = tuple(number(key) for key in ("k1", "k2", "k3", "k4"))
     tangential = (number("p1"), number("p2"))
-    if kind in FISHEYES:
-        return fit_lens(
-            lambda ideal: project_fisheye(ideal, focal, center, radial),
-            Lens(width, height, focal, center),
-            kind,
-            where,
-        )
+    if kind in _FISHEYES:
+        start = Lens(width, height, focal, center)
+        return fit_lens(lambda ideal: project_fisheye(ideal, focal, center, radial), start, kind, where)
     return Lens(width, height, focal, center, (radial[0], radial[1], *tangential), (radial[2], 0.0)), None
 
 
@@ -141,7 +136,7 @@ def _points(content: dict[str, Any], where: str) -> SparsePoints | None:
         raise CaptureError(f"{where}: a point has no 3 finite 'coordinates'; the file is damaged")
     colours = [_vector(point.get("color")) for point in points]
     known = [np.zeros(3) if colour is None else np.clip(colour, 0, 255) for colour in colours]
-    return SparsePoints(np.array(positions), np.array(known).round().astype(np.uint8))
+    return np.array(positions), np.array(known).round().astype(np.uint8)
 
 
 def _object(content: dict[str, Any], key: str) -> dict[str, Any]:

@@ -1,9 +1,14 @@
-"""Cameras by the name of their image, with the sparse points that came with them; what a reader found is made one."""
+"""Cameras by the name of their image, with the sparse points that came with them.
+
+World space is the source's, less an offset, so that float32 has digits enough for geo-referenced cameras. Readers hand
+over what is written; `make_pose_set` refuses what is no pose and makes the others rigid.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float64, UInt8
@@ -11,97 +16,22 @@ from jaxtyping import Float64, UInt8
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.errors import CaptureError, counted
 
+FLIP = np.diag([1.0, -1.0, -1.0])
+"""From OpenGL to OpenCV camera axes and back, from the right."""
 SHEAR_TOLERANCE = 5e-3
 """Largest element of R^T R - 1, after the scale is taken out, that passes as rounding of printed digits."""
 SCALE_TOLERANCE = 1e-3
 """Scales this near to 1 are rounding too, and not mentioned."""
 GREATEST_POSITION = 1e9
 """Positions beyond this are damage."""
-FLIP = np.diag([1.0, -1.0, -1.0])
-"""From OpenGL to OpenCV camera axes and back, from the right."""
+FAR = 100.0
+"""Cameras further from the origin than this many times their spread are geo-referenced."""
+FAR_ALONE = 1e4
+"""The same for one camera, in units of the source."""
 MAX_NAMED = 3
 
-
-def make_rigid(
-    matrices: Mapping[str, Float64[np.ndarray, "3 4"]], where: str
-) -> tuple[dict[str, Float64[np.ndarray, "3 4"]], tuple[str, ...]]:
-    """The poses with orthonormal rotations of determinant 1; positions are kept.
-
-    Args:
-        matrices: Camera to world by the name of the image, any camera axes that are right-handed.
-        where: The file, for messages.
-    Returns:
-        The poses, and what was changed, one sentence each.
-    Raises:
-        CaptureError: there is no camera, or a matrix is not a similarity: zeros, not finite, sheared, mirrored, far
-            away.
-    """
-    if not matrices:
-        raise CaptureError(f"{where} has no camera; expected one for each view, export it again")
-    _refuse(matrices, where)
-    scales = {name: float(np.cbrt(np.linalg.det(matrix[:, :3]))) for name, matrix in matrices.items()}
-    rigid = {
-        name: np.column_stack([nearest_rotation(matrix[:, :3]), matrix[:, 3]])
-        for name, matrix in matrices.items()
-    }
-    first = next(iter(rigid.values()))
-    if len(rigid) > 1 and all(np.array_equal(first, pose) for pose in rigid.values()):
-        raise CaptureError(
-            f"{where}: all {len(rigid)} cameras have the same pose; expected different ones, estimate them again"
-        )
-    scaled = [scale for scale in scales.values() if abs(scale - 1.0) > SCALE_TOLERANCE]
-    if not scaled:
-        return rigid, ()
-    low, high = min(scaled), max(scaled)
-    factor = f"{low:.4g}" if high - low <= 1e-3 * high else f"{low:.4g} to {high:.4g}"
-    note = f"the rotations of {len(scaled)} of {len(rigid)} cameras were scaled by {factor}; made rigid, positions kept"
-    return rigid, (note,)
-
-
-def nearest_rotation(matrix: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"]:
-    """The orthonormal matrix nearest to a scaled one."""
-    u, _, vt = np.linalg.svd(matrix)
-    return u @ vt
-
-
-def name_some(names: Sequence[str]) -> str:
-    """A few names for a message, and how many more there are."""
-    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
-    return ", ".join(names[:MAX_NAMED]) + more
-
-
-def _refuse(matrices: Mapping[str, Float64[np.ndarray, "3 4"]], where: str) -> None:
-    faulty: dict[str, list[str]] = {}
-    for name, matrix in matrices.items():
-        if (fault := _fault(matrix)) is not None:
-            faulty.setdefault(fault, []).append(name)
-    if not faulty:
-        return
-    listed = "; ".join(f"{name_some(names)}: {fault}" for fault, names in faulty.items())
-    raise CaptureError(
-        f"{where} has {sum(map(len, faulty.values()))} of {len(matrices)} camera matrices that are not poses: "
-        f"{listed}; "
-        "expected camera to world, a rotation (or a scaled one) and a position: remove these frames or export again"
-    )
-
-
-def _fault(matrix: Float64[np.ndarray, "3 4"]) -> str | None:
-    """What is wrong with a matrix; None if it is a similarity."""
-    if not np.isfinite(matrix).all():
-        return "the matrix has numbers that are not finite"
-    if np.abs(matrix).max() > GREATEST_POSITION:
-        return "the camera is more than 1e9 units away, or its rotation scaled by more"
-    left = matrix[:, :3]
-    lengths = np.linalg.norm(left, axis=0)
-    if lengths.max() < 1e-9:
-        return "the rotation is all zeros"
-    gram = left.T @ left / np.mean(lengths**2)
-    if np.abs(gram - np.eye(3)).max() > SHEAR_TOLERANCE:
-        axes = ", ".join(f"{length:.4g}" for length in lengths)
-        return f"the rotation is sheared (its axes have lengths {axes})"
-    if np.linalg.det(left) < 0:
-        return "the rotation is a mirror image (determinant below 0), so an axis has the wrong sign"
-    return None
+SparsePoints: TypeAlias = tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"] | None]
+"""Positions and sRGB of structure from motion's points."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +46,7 @@ class PosedCamera:
     """More files of the same image that the source names, such as its cube."""
 
     def pixels_of(self, points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, "P 2"]:
-        """Where points are seen by its lens; NaN for points behind the camera."""
+        """Where its lens sees points; NaN for points behind the camera."""
         assert self.lens is not None
         x, y, z = ((points - self.camera_to_world[:, 3]) @ self.camera_to_world[:, :3] @ FLIP).T
         depth = np.where(z > 1e-9, z, np.nan)
@@ -145,33 +75,8 @@ class PoseSet:
     """What was changed or is odd: rotations made rigid, frames without files, ..."""
 
 
-FAR = 100.0
-"""Cameras further from the origin than this many times their spread are geo-referenced."""
-FAR_ALONE = 1e4
-"""The same for one camera, in units of the source."""
-
-
-@dataclass(frozen=True)
-class RawCamera:
-    """A camera as written: OpenGL axes, but maybe scaled, sheared or not finite."""
-
-    name: str
-    matrix: Float64[np.ndarray, "3 4"]
-    """Camera to world."""
-    lens: Lens | None
-    other_names: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class SparsePoints:
-    """Points of structure from motion."""
-
-    positions: Float64[np.ndarray, "P 3"]
-    colours: UInt8[np.ndarray, "P 3"] | None
-
-
 def make_pose_set(
-    cameras: Iterable[RawCamera],
+    cameras: Iterable[tuple[str, PosedCamera]],
     source: str,
     where: str,
     points: SparsePoints | None = None,
@@ -181,19 +86,16 @@ def make_pose_set(
     """Check and tidy what a reader found: rigid rotations, one camera a name, coordinates near 0.
 
     Args:
+        cameras: With matrices as they are written, which may be scaled, sheared or not finite.
         where: The file, for messages.
         up: Against gravity, in the source's coordinates.
     Raises:
         CaptureError: a name twice with different poses, or a matrix is not a pose.
     """
     unique, repeated = _unique(cameras, where)
-    poses, made_rigid = make_rigid({name: camera.matrix for name, camera in unique.items()}, where)
-    offset = find_offset(np.stack([pose[:, 3] for pose in poses.values()]))
+    rigid, made_rigid = _make_rigid({name: camera.camera_to_world for name, camera in unique.items()}, where)
+    offset = find_offset(np.stack([pose[:, 3] for pose in rigid.values()]))
     moved = np.column_stack([np.zeros((3, 3)), offset])
-    posed = {
-        name: PosedCamera(poses[name] - moved, camera.lens, camera.other_names)
-        for name, camera in unique.items()
-    }
     said = [*notes, *made_rigid]
     if repeated:
         said.append(
@@ -201,16 +103,19 @@ def make_pose_set(
         )
     if offset.any():
         said.append(f"coordinates are large: less the offset {', '.join(f'{value:.0f}' for value in offset)}")
-    kept = _finite(points)
-    if points is not None and kept is not None and len(kept.positions) < len(points.positions):
-        said.append(f"{len(points.positions) - len(kept.positions)} sparse points are not finite: left out")
+    positions, colours = points if points is not None and len(points[0]) else (None, None)
+    if positions is not None:
+        good = np.isfinite(positions).all(axis=1)
+        if not good.all():
+            said.append(f"{(~good).sum()} sparse points are not finite: left out")
+        positions, colours = positions[good] - offset, None if colours is None else colours[good]
     return PoseSet(
-        cameras=posed,
-        source=source,
-        points=None if kept is None else kept.positions - offset,
-        colours=None if kept is None else kept.colours,
-        offset=offset,
-        up=None if up is None else up / np.linalg.norm(up),
+        {name: replace(camera, camera_to_world=rigid[name] - moved) for name, camera in unique.items()},
+        source,
+        positions,
+        colours,
+        offset,
+        None if up is None else up / np.linalg.norm(up),
         notes=tuple(said),
     )
 
@@ -224,24 +129,80 @@ def find_offset(positions: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "3
     return np.round(middle) if is_far else np.zeros(3)
 
 
-def _unique(cameras: Iterable[RawCamera], where: str) -> tuple[dict[str, RawCamera], list[str]]:
-    unique: dict[str, RawCamera] = {}
+def name_some(names: Sequence[str]) -> str:
+    """A few names for a message, and how many more there are."""
+    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
+    return ", ".join(names[:MAX_NAMED]) + more
+
+
+def _unique(
+    cameras: Iterable[tuple[str, PosedCamera]], where: str
+) -> tuple[dict[str, PosedCamera], list[str]]:
+    unique: dict[str, PosedCamera] = {}
     repeated: list[str] = []
-    for camera in cameras:
-        first = unique.setdefault(camera.name, camera)
+    for name, camera in cameras:
+        first = unique.setdefault(name, camera)
         if first is camera:
             continue
-        if not np.array_equal(first.matrix, camera.matrix) or first.lens != camera.lens:
+        if not np.array_equal(first.camera_to_world, camera.camera_to_world) or first.lens != camera.lens:
             raise CaptureError(
-                f"{where} has two cameras of the name {camera.name} with different poses; expected one for each "
-                "image: rename or remove one"
+                f"{where} has two cameras of the name {name} with different poses; expected one for each image: rename "
+                "or remove one"
             )
-        repeated.append(camera.name)
+        repeated.append(name)
     return unique, repeated
 
 
-def _finite(points: SparsePoints | None) -> SparsePoints | None:
-    if points is None or len(points.positions) == 0:
-        return None
-    good = np.isfinite(points.positions).all(axis=1)
-    return SparsePoints(points.positions[good], None if points.colours is None else points.colours[good])
+def _make_rigid(
+    matrices: Mapping[str, Float64[np.ndarray, "3 4"]], where: str
+) -> tuple[dict[str, Float64[np.ndarray, "3 4"]], list[str]]:
+    """The poses with orthonormal rotations of determinant 1, positions kept; and what was changed."""
+    if not matrices:
+        raise CaptureError(f"{where} has no camera; expected one for each view, export it again")
+    faulty: dict[str, list[str]] = {}
+    for name, matrix in matrices.items():
+        if (fault := _fault(matrix)) is not None:
+            faulty.setdefault(fault, []).append(name)
+    if faulty:
+        listed = "; ".join(f"{name_some(names)}: {fault}" for fault, names in faulty.items())
+        raise CaptureError(
+            f"{where} has {sum(map(len, faulty.values()))} of {len(matrices)} camera matrices that are not poses: "
+            f"{listed}; expected camera to world, a rotation (or a scaled one) and a position: remove these frames or "
+            "export again"
+        )
+    rigid, scaled = {}, []
+    for name, matrix in matrices.items():
+        u, _, vt = np.linalg.svd(matrix[:, :3])
+        rigid[name] = np.column_stack([u @ vt, matrix[:, 3]])
+        scale = float(np.cbrt(np.linalg.det(matrix[:, :3])))
+        scaled += [scale] if abs(scale - 1.0) > SCALE_TOLERANCE else []
+    first = next(iter(rigid.values()))
+    if len(rigid) > 1 and all(np.array_equal(first, pose) for pose in rigid.values()):
+        raise CaptureError(
+            f"{where}: all {len(rigid)} cameras have the same pose; expected different ones, estimate them again"
+        )
+    if not scaled:
+        return rigid, []
+    low, high = min(scaled), max(scaled)
+    factor = f"{low:.4g}" if high - low <= 1e-3 * high else f"{low:.4g} to {high:.4g}"
+    note = f"the rotations of {len(scaled)} of {len(rigid)} cameras were scaled by {factor}; made rigid, positions kept"
+    return rigid, [note]
+
+
+def _fault(matrix: Float64[np.ndarray, "3 4"]) -> str | None:
+    """What is wrong with a matrix; None if it is a similarity."""
+    if not np.isfinite(matrix).all():
+        return "the matrix has numbers that are not finite"
+    if np.abs(matrix).max() > GREATEST_POSITION:
+        return "the camera is more than 1e9 units away, or its rotation scaled by more"
+    left = matrix[:, :3]
+    lengths = np.linalg.norm(left, axis=0)
+    if lengths.max() < 1e-9:
+        return "the rotation is all zeros"
+    gram = left.T @ left / np.mean(lengths**2)
+    if np.abs(gram - np.eye(3)).max() > SHEAR_TOLERANCE:
+        axes = ", ".join(f"{length:.4g}" for length in lengths)
+        return f"the rotation is sheared (its axes have lengths {axes})"
+    if np.linalg.det(left) < 0:
+        return "the rotation is a mirror image (determinant below 0), so an axis has the wrong sign"
+    return None

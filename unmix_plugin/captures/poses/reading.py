@@ -1,7 +1,4 @@
-"""Poses of any program that we know, found by content.
-
-Poses of LLFF: poses_bounds.npy, (N, 17): a 3 x 5 matrix [R | t | h, w, f] (axes down, right, back), near, far.
-"""
+"""Poses of any program that we know, found by content; each has a file of its own, but LLFF, which is read here."""
 
 from __future__ import annotations
 
@@ -12,23 +9,25 @@ from pathlib import Path
 import numpy as np
 
 from unmix_plugin.captures.poses.colmap import find_models, read_colmap
-from unmix_plugin.captures.poses.files import PictureSizes, Size, load_json, load_xml
+from unmix_plugin.captures.poses.files import load_json, load_xml
 from unmix_plugin.captures.poses.lens import Lens, require_unfolded
 from unmix_plugin.captures.poses.matching import BY_ORDER
 from unmix_plugin.captures.poses.metashape import read_metashape
 from unmix_plugin.captures.poses.micmac import find_orientations, read_micmac
 from unmix_plugin.captures.poses.opensfm import is_reconstruction, read_opensfm
-from unmix_plugin.captures.poses.pose_set import PoseSet, RawCamera, make_pose_set
-from unmix_plugin.captures.poses.transforms_json import has_frames, read_transforms
+from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet, make_pose_set
+from unmix_plugin.captures.poses.transforms_json import Size, has_frames, read_transforms
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array, read_array_header
 from unmix_plugin.scenes.reading.faults import describe
 
-KNOWN = (
+_KNOWN = (
     "transforms.json, a COLMAP model (.bin or .txt), Metashape's cameras as XML, OpenSfM's reconstruction.json, "
     "MicMac's Orientation-*.xml or LLFF's poses_bounds.npy"
 )
-SPLIT_FILES = tuple(f"transforms_{split}.json" for split in ("train", "val", "eval", "test"))
+_SPLIT_FILES = tuple(f"transforms_{split}.json" for split in ("train", "val", "eval", "test"))
+_LLFF_FILE, _LLFF_PICTURES = "poses_bounds.npy", ("images", "exr")
+"""Poses, and the folders with the pictures, in the order of whose names the poses come."""
 
 
 def read_poses(path: Path, picture_sizes: Mapping[str, Size] | None = None) -> PoseSet:
@@ -41,7 +40,7 @@ def read_poses(path: Path, picture_sizes: Mapping[str, Size] | None = None) -> P
         CaptureError: nothing known is there, or what is there is damaged or can't be represented.
     """
     if not path.exists():
-        raise CaptureError(f"{path} is not there; give a file or folder with poses: {KNOWN}")
+        raise CaptureError(f"{path} is not there; give a file or folder with poses: {_KNOWN}")
     read = _read_folder if path.is_dir() else _read_file
     poses = read(path, picture_sizes or {})
     for lens in {camera.lens for camera in poses.cameras.values()} - {None}:
@@ -59,15 +58,15 @@ def _read_file(path: Path, given: Mapping[str, Size]) -> PoseSet:
     if start[:1] == b"<":
         return _read_xml(path)
     if start.startswith(b"\x93NUMPY"):
-        return read_llff(path)
+        return _read_llff(path)
     hint = ": export the cameras as XML" if path.suffix in (".psx", ".psz") else ""
-    raise CaptureError(f"{path} holds no poses that we know; expected {KNOWN}{hint}")
+    raise CaptureError(f"{path} holds no poses that we know; expected {_KNOWN}{hint}")
 
 
 def _read_json(path: Path, given: Mapping[str, Size]) -> PoseSet:
     content = load_json(path)
     if has_frames(content):
-        return read_transforms({path: content}, PictureSizes(given, path.parent))
+        return read_transforms({path: content}, given)
     if is_reconstruction(content):
         return read_opensfm(path, content)
     raise CaptureError(
@@ -92,34 +91,26 @@ def _read_folder(folder: Path, given: Mapping[str, Size]) -> PoseSet:
     found: list[tuple[str, Callable[[], PoseSet]]] = []
     if (folder / "transforms.json").is_file():
         found.append(("transforms.json", lambda: _read_json(folder / "transforms.json", given)))
-    splits = [folder / name for name in SPLIT_FILES if (folder / name).is_file()]
+    splits = [folder / name for name in _SPLIT_FILES if (folder / name).is_file()]
     if splits:
-        found.append((", ".join(path.name for path in splits), lambda: _read_splits(folder, splits, given)))
+        names = ", ".join(path.name for path in splits)
+        found.append((names, lambda: read_transforms({path: load_json(path) for path in splits}, given)))
     if models := find_models(folder):
         found.append(("a COLMAP model", lambda: _greatest_model(models)))
-    plain = [name for name in ("reconstruction.json", LLFF_FILE) if (folder / name).is_file()]
+    plain = [name for name in ("reconstruction.json", _LLFF_FILE) if (folder / name).is_file()]
     found += [(name, lambda name=name: _read_file(folder / name, given)) for name in plain]
     if orientations := find_orientations(folder):
         found.append(("MicMac's orientations", lambda: read_micmac(orientations)))
-    elif sheets := _documents(folder):
+    elif sheets := [path for path in sorted(folder.glob("*.xml")) if b"<document" in _first_bytes(path)]:
         found.append((sheets[0].name, lambda: _read_xml(sheets[0])))
     if not found:
-        raise CaptureError(f"{folder} holds no poses that we know; expected {KNOWN}")
+        raise CaptureError(f"{folder} holds no poses that we know; expected {_KNOWN}")
     (name, read), *others = found
     poses = read()
     if not others:
         return poses
     ignored = " and ".join(other for other, _ in others)
     return replace(poses, notes=(*poses.notes, f"{folder} has {ignored} too; {name} was read"))
-
-
-def _read_splits(folder: Path, paths: list[Path], given: Mapping[str, Size]) -> PoseSet:
-    return read_transforms({path: load_json(path) for path in paths}, PictureSizes(given, folder))
-
-
-def _documents(folder: Path) -> list[Path]:
-    """XML files that may be Metashape's."""
-    return [path for path in sorted(folder.glob("*.xml")) if b"<document" in _first_bytes(path)]
 
 
 def _greatest_model(models: list[Path]) -> PoseSet:
@@ -139,16 +130,10 @@ def _first_bytes(path: Path) -> bytes:
         raise CaptureError(f"{path} can't be read ({error.strerror or error})") from error
 
 
-LLFF_FILE = "poses_bounds.npy"
-PICTURE_FOLDERS = ("images", "exr")
-"""Where the pictures are, in the order of whose names the poses come."""
+def _read_llff(path: Path) -> PoseSet:
+    """poses_bounds.npy, (N, 17): a 3 x 5 matrix [R | t | h, w, f] (axes down, right, back), near, far.
 
-
-def read_llff(path: Path) -> PoseSet:
-    """Poses in the order of the file, with the names of the pictures beside it where there are as many.
-
-    Raises:
-        CaptureError: it is not an array of the right shape, or a size or focal length makes no sense.
+    Cameras have the names of the pictures beside it, where there are as many.
     """
     try:
         shape = read_array_header(path).shape
@@ -160,7 +145,13 @@ def read_llff(path: Path) -> PoseSet:
         raise CaptureError(f"{path} can't be read ({error.strerror or error})") from error
     if table is None:
         raise CaptureError(f"{path} has the shape {shape}; expected (views, 17) numbers, as LLFF writes them")
-    names, note = _names(path.parent, len(table))
+    names = [f"{BY_ORDER}{index:04d}" for index in range(len(table))]
+    note = "poses have no names: they go by the order of views"
+    for place in [path.parent / name for name in reversed(_LLFF_PICTURES) if (path.parent / name).is_dir()]:
+        there = sorted(entry.name for entry in place.iterdir() if not entry.name.startswith("."))
+        if len(there) == len(table):
+            names = [f"{place.name}/{name}" for name in there]
+            note = f"poses are those of {place.name}/ in the order of names"
     cameras = []
     for name, row in zip(names, table[:, :15].reshape(-1, 3, 5), strict=True):
         down, right, back, position, (height, width, focal) = row.T
@@ -169,23 +160,7 @@ def read_llff(path: Path) -> PoseSet:
                 f"{path}: the camera of {name} has height, width, focal length {height:g}, {width:g}, {focal:g}; "
                 "expected pixels above 0"
             )
-        lens = Lens(
-            round(width), round(height), (float(focal), float(focal)), (float(width) / 2, float(height) / 2)
-        )
-        cameras.append(RawCamera(name, np.column_stack([right, -down, back, position]), lens))
+        center = (float(width) / 2, float(height) / 2)
+        lens = Lens(round(width), round(height), (float(focal), float(focal)), center)
+        cameras.append((name, PosedCamera(np.column_stack([right, -down, back, position]), lens)))
     return make_pose_set(cameras, f"LLFF's {path.name}", str(path), notes=[note])
-
-
-def _names(folder: Path, count: int) -> tuple[list[str], str]:
-    for place in PICTURE_FOLDERS:
-        if (folder / place).is_dir():
-            found = sorted(
-                entry.name for entry in (folder / place).iterdir() if not entry.name.startswith(".")
-            )
-            if len(found) == count:
-                return [
-                    f"{place}/{name}" for name in found
-                ], f"poses are those of {place}/ in the order of names"
-    return [
-        f"{BY_ORDER}{index:04d}" for index in range(count)
-    ], "poses have no names: they go by the order of views"

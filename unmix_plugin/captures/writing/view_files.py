@@ -1,16 +1,11 @@
 """The files of one view: cube, picture, mask. Rows stream through; only pictures of one view are in memory.
 
-Notation: `H x W` pixels and `B` bands of the scene; `h` some rows.
-
-Pictures of views for people, and how sharp they are.
-
-Notation: `H x W` pixels, `B` bands; values in [0, 1].
+Notation: `H x W` pixels and `B` bands of the scene; `h` some rows; values in [0, 1].
 """
 
 from __future__ import annotations
 
-import io
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -34,10 +29,35 @@ from unmix_plugin.spectral.bands import Bands
 
 FULL_SCALE = 65535
 """Stored number that stands for 1; saturated values have it too."""
-GREYS = np.arange(256)[:, None] / 255.0
-"""Palette of pictures of labels."""
 BLOCK_VALUES = 1 << 22
 """Values of a file that are calibrated together: 16 MiB as float32."""
+BRIGHT_PERCENTILE = 99.0
+"""Of sampled pixels; shown as white."""
+
+
+@dataclass(frozen=True)
+class Colours:
+    """How spectra become sRGB, the same for all views of a sensor."""
+
+    matrix: Float32[np.ndarray, "B 3"]
+    """To linear red, green and blue."""
+    gain: float
+    """Brings bright pixels to white."""
+    description: str
+    """True colour, or which bands are shown as red, green and blue."""
+
+    @staticmethod
+    def of(bands: Bands, sample: Float32[np.ndarray, "N B"]) -> Colours:
+        """Colours for spectra like those of the sample."""
+        from unmix_plugin.spectral.colour.conversion import describe_colour, rgb_matrix
+
+        matrix = rgb_matrix(bands).numpy()
+        brightest = np.percentile((sample @ matrix).max(axis=1), BRIGHT_PERCENTILE) if len(sample) else 0.0
+        return Colours(matrix, 1.0 / float(brightest) if brightest > 0 else 1.0, describe_colour(bands))
+
+    def linear_rgb(self, values: Float32[np.ndarray, "*pixels B"]) -> Float32[np.ndarray, "*pixels 3"]:
+        """Linear light, 1 is white; not clipped."""
+        return np.asarray((values @ self.matrix) * np.float32(self.gain), dtype=np.float32)
 
 
 @dataclass(frozen=True)
@@ -71,10 +91,6 @@ class ViewRecord:
     sources: list[dict[str, Any]] = field(default_factory=list)
     """Files it was made of: path, bytes, SHA-256."""
 
-    def to_json(self) -> dict[str, Any]:
-        """Numbers, texts and lists."""
-        return asdict(self)
-
 
 @dataclass(frozen=True)
 class ViewRecipe:
@@ -103,7 +119,9 @@ def write_view(view: CaptureView, recipe: ViewRecipe, folder: Path) -> ViewRecor
     path = folder / paths["hyperspectral_file_path"]
     with whole_file(path) as temporary:
         with write_errors_as(path), temporary.open("wb") as file:
-            file.write(_npy_header((raster.height, raster.width, recipe.calibration.num_bands)))
+            shape = (raster.height, raster.width, recipe.calibration.num_bands)
+            described = {"descr": "<u2", "fortran_order": False, "shape": shape}
+            np.lib.format.write_array_header_1_0(file, described)
             start = file.tell()
             file_bands = len(recipe.calibration.bands)
             for first, last in raster.blocks(file_bands, BLOCK_VALUES):
@@ -113,7 +131,12 @@ def write_view(view: CaptureView, recipe: ViewRecipe, folder: Path) -> ViewRecor
         if not is_shown.all():
             with write_errors_as(path):
                 _blacken(temporary, start, is_shown, recipe.calibration.num_bands)
-    _write_picture(folder / paths["file_path"], tally, recipe)
+    light = np.clip(tally.rgb, 0.0, 1.0)
+    srgb = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)  # IEC 61966-2-1
+    pixels = np.rint(srgb * 255).astype(np.uint8)
+    if recipe.background is not None or recipe.use_opacity:
+        pixels = np.dstack([pixels, tally.opacity])
+    write_file(folder / paths["file_path"], rgba_png_bytes(pixels))
     if tally.missing.any():
         paths["mask_path"] = f"masks/{view.name}.png"
         grey = np.where(tally.missing, 0, 255).astype(np.uint8)
@@ -121,7 +144,8 @@ def write_view(view: CaptureView, recipe: ViewRecipe, folder: Path) -> ViewRecor
     labels = read_labels(view, raster)
     if labels is not None:
         paths["seg_file_path"] = f"labels/{view.name}.png"
-        write_file(folder / paths["seg_file_path"], indexed_png_bytes(labels, np.repeat(GREYS, 3, axis=1)))
+        greys = np.repeat(np.arange(256)[:, None] / 255.0, 3, axis=1)
+        write_file(folder / paths["seg_file_path"], indexed_png_bytes(labels, greys))
     return tally.record(view, paths)
 
 
@@ -163,9 +187,8 @@ class _Tally:
     def finish_masks(self, recipe: ViewRecipe) -> UInt8[np.ndarray, "H W"]:
         """Opacity without specks and holes; full for pixels without a measurement, as nothing is known there."""
         if recipe.background is not None:
-            done = clean(self.opacity > 0)
-            self.opacity = np.where(done.matter, OPAQUE, 0).astype(np.uint8)
-            self.specks, self.holes = done.specks, done.holes
+            matter, self.specks, self.holes = clean(self.opacity > 0)
+            self.opacity = np.where(matter, OPAQUE, 0).astype(np.uint8)
         self.opacity[self.missing] = OPAQUE
         return self.opacity
 
@@ -198,12 +221,6 @@ def _stored(values: Float32[np.ndarray, "h W B"], part: CalibratedRows) -> UInt1
     return stored
 
 
-def _npy_header(shape: tuple[int, int, int]) -> bytes:
-    header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(header, {"descr": "<u2", "fortran_order": False, "shape": shape})
-    return header.getvalue()
-
-
 def _blacken(path: Path, start: int, is_shown: Bool[np.ndarray, "H W"], bands: int) -> None:
     """Set background to 0 in a cube that is written, row by row: cubes are as seen over black."""
     row_bytes = is_shown.shape[1] * bands * 2
@@ -216,81 +233,25 @@ def _blacken(path: Path, start: int, is_shown: Bool[np.ndarray, "H W"], bands: i
             file.write(values.data)
 
 
-def _write_picture(path: Path, tally: _Tally, recipe: ViewRecipe) -> None:
-    srgb = recipe.colours.srgb(tally.rgb)
-    if recipe.background is not None or recipe.use_opacity:
-        srgb = np.dstack([srgb, tally.opacity])
-    write_file(path, rgba_png_bytes(srgb))
-
-
-BRIGHT_PERCENTILE = 99.0
-"""Of sampled pixels; shown as white."""
-
-
-@dataclass(frozen=True)
-class Colours:
-    """How spectra become sRGB, the same for all views of a sensor."""
-
-    matrix: Float32[np.ndarray, "B 3"]
-    """To linear red, green and blue."""
-    gain: float
-    """Brings bright pixels to white."""
-    description: str
-    """True colour, or which bands are shown as red, green and blue."""
-
-    @staticmethod
-    def of(bands: Bands, sample: Float32[np.ndarray, "N B"]) -> Colours:
-        """Colours for spectra like those of the sample."""
-        from unmix_plugin.spectral.colour.conversion import describe_colour, rgb_matrix
-
-        matrix = rgb_matrix(bands).numpy()
-        brightest = np.percentile((sample @ matrix).max(axis=1), BRIGHT_PERCENTILE) if len(sample) else 0.0
-        return Colours(matrix, 1.0 / float(brightest) if brightest > 0 else 1.0, describe_colour(bands))
-
-    def linear_rgb(self, values: Float32[np.ndarray, "*pixels B"]) -> Float32[np.ndarray, "*pixels 3"]:
-        """Linear light, 1 is white; not clipped."""
-        return np.asarray((values @ self.matrix) * np.float32(self.gain), dtype=np.float32)
-
-    def srgb(self, linear_rgb: Float32[np.ndarray, "*pixels 3"]) -> UInt8[np.ndarray, "*pixels 3"]:
-        """Encoded for a display (IEC 61966-2-1:1999)."""
-        light = np.clip(linear_rgb, 0.0, 1.0)
-        encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-        return np.rint(encoded * 255).astype(np.uint8)
-
-
 def detail(brightness: Float32[np.ndarray, "H W"], seen: Bool[np.ndarray, "H W"]) -> float:
     """Contrast of the finest structures against those twice as large; falls when a picture is blurred.
 
     Both are root mean squares of differences between a pixel and the mean of its neighbours, at full and at half
     resolution, over pixels of matter; 0 where there is too little of it.
     """
-    fine, fine_inside = _residual(brightness, seen)
     height, width = (length // 2 * 2 for length in brightness.shape)
     halved = brightness[:height, :width].reshape(height // 2, 2, width // 2, 2).mean(axis=(1, 3))
     inside = np.all(seen[:height, :width].reshape(height // 2, 2, width // 2, 2), axis=(1, 3))
-    coarse, coarse_inside = _residual(halved, inside)
-    if not fine_inside.any() or not coarse_inside.any():
-        return 0.0
-    size = _root_mean_square(coarse[coarse_inside])
-    return _root_mean_square(fine[fine_inside]) / size if size > 0 else 0.0
+    coarse = _finest_contrast(halved, inside)
+    return _finest_contrast(brightness, seen) / coarse if coarse > 0 else 0.0
 
 
-def _residual(
-    picture: Float32[np.ndarray, "H W"], seen: Bool[np.ndarray, "H W"]
-) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Pixels less the mean of their four neighbours, without the border; and where all five are matter."""
+def _finest_contrast(picture: Float32[np.ndarray, "H W"], seen: Bool[np.ndarray, "H W"]) -> float:
+    """Root mean square of pixels less the mean of their four neighbours, where all five are matter."""
     around = [(slice(0, -2), slice(1, -1)), (slice(2, None), slice(1, -1))]
     around += [(columns, rows) for rows, columns in around]
     middle = (slice(1, -1), slice(1, -1))
     inside = np.logical_and.reduce([seen[middle], *(seen[place] for place in around)])
     mean = sum((picture[place] for place in around), np.zeros_like(picture[middle])) / 4
-    return picture[middle] - mean, inside
-
-
-def _root_mean_square(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(values, dtype=np.float64))))
-
-
-def mean_spectrum(spectra: list[list[float]], weights: list[float]) -> Float64[np.ndarray, " B"]:
-    """Weighted mean of spectra with the same bands."""
-    return np.average(np.array(spectra), axis=0, weights=np.array(weights) + 1e-12)
+    differences = (picture[middle] - mean)[inside]
+    return float(np.sqrt(np.mean(np.square(differences, dtype=np.float64)))) if inside.any() else 0.0

@@ -1,7 +1,7 @@
-"""The folder beside the output in which a scene is made: views that are done survive a kill, and nothing takes it for a
-scene, as it has no transforms.json and is called unfinished.
+"""The folder beside the output in which a scene is made, and the files that it is made of.
 
-The files that a scene is made of: which they are, and their hashes.
+Views that are done survive a kill, and nothing takes the folder for a scene, as it has no transforms.json and is called
+unfinished.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import os
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,8 @@ from unmix_plugin.engine.runs.atomic_files import (
 from unmix_plugin.errors import CaptureError, ConfigError
 from unmix_plugin.scenes.reading.faults import sha256_of
 
-PLAN_NAME, RECORD_NAME, SCENE_NAME = "plan.json", "process.json", "transforms.json"
-_VIEWS, POSES_NAME = "views", "poses"
+RECORD_NAME = "process.json"
+_PLAN, _VIEWS, _POSES = "plan.json", "views", "poses"
 
 
 class WorkFolder:
@@ -35,7 +36,7 @@ class WorkFolder:
         self.output = output.resolve()
         self.path = self.output.with_name(f"{self.output.name}.unfinished")
         """Where files are written until the scene is complete."""
-        self.poses = self.path / POSES_NAME
+        self.poses = self.path / _POSES
         """Where files of the estimation of poses lie while it runs, or after it failed."""
 
     def begin(self, plan: dict[str, Any]) -> bool:
@@ -49,7 +50,7 @@ class WorkFolder:
             ConfigError: there is a folder of this name that is not ours.
             RunError: it can't be written.
         """
-        plan_file, text = self.path / PLAN_NAME, _json(plan)
+        plan_file, text = self.path / _PLAN, _json(plan)
         if self.path.exists():
             if not plan_file.is_file() and any(self.path.iterdir()):
                 raise ConfigError(
@@ -75,7 +76,7 @@ class WorkFolder:
 
     def note(self, record: ViewRecord) -> None:
         """Record that a view is written."""
-        write_file(self._record(record.name), _json(record.to_json()))
+        write_file(self._record(record.name), _json(asdict(record)))
 
     def finish(self, overwrite: bool) -> None:
         """Give the scene its name; the record of how it was made stays in it.
@@ -91,9 +92,9 @@ class WorkFolder:
                 self.output.rmdir()  # empty, see refuse_output
             self.path.rename(self.output)
             # After a kill here, the scene is whole and has some files too many.
-            for name in (_VIEWS, POSES_NAME):
+            for name in (_VIEWS, _POSES):
                 shutil.rmtree(self.output / name, ignore_errors=True)
-            (self.output / PLAN_NAME).unlink()
+            (self.output / _PLAN).unlink()
             shutil.rmtree(old, ignore_errors=True)
 
     def _record(self, name: str) -> Path:
@@ -131,11 +132,10 @@ def stamps(paths: Iterable[Path]) -> list[list[Any]]:
         CaptureError: a file is gone.
     """
     found = []
-    for path in paths:
-        for file in _files_of(path):
-            with _reading(file):
-                facts = file.stat()
-            found.append([os.fspath(file.absolute()), facts.st_size, facts.st_mtime_ns])
+    for file in _files_of(paths):
+        with _reading(file):
+            facts = file.stat()
+        found.append([os.fspath(file.absolute()), facts.st_size, facts.st_mtime_ns])
     return found
 
 
@@ -146,18 +146,16 @@ def hashes(paths: Iterable[Path]) -> list[dict[str, Any]]:
         CaptureError: a file can't be read.
     """
     found = []
-    for path in paths:
-        for file in _files_of(path):
-            with _reading(file):
-                found.append(
-                    {"path": os.fspath(file), "bytes": file.stat().st_size, "sha256": sha256_of(file)}
-                )
+    for file in _files_of(paths):
+        with _reading(file):
+            found.append({"path": os.fspath(file), "bytes": file.stat().st_size, "sha256": sha256_of(file)})
     return found
 
 
-def _files_of(path: Path) -> list[Path]:
-    """The file, or those of a folder that a reader takes as one."""
-    return sorted(child for child in path.iterdir() if child.is_file()) if path.is_dir() else [path]
+def _files_of(paths: Iterable[Path]) -> Iterator[Path]:
+    """Files, and those of a folder that a reader takes as one."""
+    for path in paths:
+        yield from sorted(child for child in path.iterdir() if child.is_file()) if path.is_dir() else [path]
 
 
 @contextmanager
