@@ -101,7 +101,7 @@ def _read_transforms(path: Path) -> None:
         split_frames(entry, method, 2, faults)
     for frame in entry.frames:
         if frame.intrinsics is not None:
-            focal = np.array(frame.intrinsics.focal_at(20), dtype=np.float32)
+            focal = np.array(frame.intrinsics.focal_at(20, 30), dtype=np.float32)
             assert np.isfinite(focal).all()
             assert focal.min() > 0
     faults.raise_if_any()

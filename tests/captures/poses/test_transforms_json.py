@@ -142,7 +142,7 @@ def test_matrices_that_are_no_poses_are_refused_by_name(tmp_path, spoil, message
         ({"frames": [{"file_path": "a.png"}]}, "'transform_matrix' is absent"),
         ({"fl_x": "long"}, "'fl_x' is \"long\""),
         ({"fl_x": -5}, "'fl_x' is -5"),
-        ({"w": 0.5}, "'w' and 'h' are 0.5"),
+        ({"w": 0.5}, "'w' is 0.5; expected a whole number"),
         ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR.*undistort"),
         (
             {"applied_transform": [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]},

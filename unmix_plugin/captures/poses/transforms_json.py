@@ -16,7 +16,7 @@ from unmix_plugin.errors import CaptureError, SceneError
 from unmix_plugin.formats.meshes import read_ply_points
 from unmix_plugin.scenes.placement import Placement, read_placement
 from unmix_plugin.scenes.reading.faults import Faults, describe, read_number
-from unmix_plugin.scenes.reading.transforms_json import Intrinsics, read_lens
+from unmix_plugin.scenes.reading.transforms_json import FILE_NAME, Intrinsics, read_lens
 
 Size: TypeAlias = tuple[int, int]
 """Width, height in pixels."""
@@ -49,7 +49,7 @@ def read_transforms(contents: Mapping[Path, Any], sizes: Mapping[str, Size]) -> 
     up = np.array([0.0, 0.0, 1.0])
     for path, content in contents.items():
         top = content if isinstance(content, dict) else {}
-        faults = Faults(path)
+        faults = Faults(path.parent if path.name == FILE_NAME else path)
         placement = read_placement(top, faults, path.name)
         found = _read_frames(path, content, sizes, faults, notes)
         try:
@@ -90,8 +90,9 @@ def _read_frames(
         given = read_lens(top, frame, f"frames[{index}]", faults)
         lens = None
         if given is not None:
-            size = (given.width, given.height)
-            if size[0] is None or size[1] is None:
+            if given.width is not None and given.height is not None:
+                size = (given.width, given.height)
+            else:
                 size = _size_of(path.parent, names[0], sizes)
             key = repr((given, size))  # many frames share a lens, which takes long to fit
             if key not in lenses:
