@@ -1,13 +1,24 @@
-"""Writing results: whole or not at all, and nothing lost by accident."""
+"""Files whole or not at all, nothing lost by accident; arrays row after row; PNG by imageio and Pillow."""
 
 import errno
 import os
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
+from PIL import Image
 
+from tests.formats.cubes import full_disk, random_cube
 from unmix_plugin.errors import ConfigError, RunError
-from unmix_plugin.formats.files import array_bytes, make_folder, refuse_to_overwrite, write_file
+from unmix_plugin.formats.files import (
+    array_bytes,
+    indexed_png_bytes,
+    make_folder,
+    npy_rows,
+    refuse_to_overwrite,
+    rgba_png_bytes,
+    write_file,
+)
 
 
 def test_a_file_is_written_into_a_folder_made_for_it(tmp_path):
@@ -46,3 +57,73 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(RunError, match="can't make the folder"):
         make_folder(tmp_path / "file" / "folder")
+
+
+def test_rows_in_blocks_are_the_array_that_numpy_loads(tmp_path):
+    cube = random_cube()
+    with npy_rows(tmp_path / "a" / "x.npy", cube.shape, np.float32) as add:
+        add(cube[:6])
+        add(cube[6:].astype(np.float64))
+    read = np.load(tmp_path / "a" / "x.npy", allow_pickle=False)
+    assert read.dtype == np.float32
+    np.testing.assert_array_equal(read, cube)
+
+
+def test_ids_without_channels_are_written_too(tmp_path):
+    ids = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    with npy_rows(tmp_path / "x.npy", (3, 4), np.uint8) as add:
+        add(ids)
+    np.testing.assert_array_equal(np.load(tmp_path / "x.npy"), ids)
+
+
+def test_a_disk_that_fills_up_half_way_leaves_nothing(tmp_path, monkeypatch):
+    cube = random_cube()
+    full_disk(monkeypatch, after=128 + cube[:3].nbytes)
+
+    def write():
+        with npy_rows(tmp_path / "x.npy", cube.shape, np.float32) as add:
+            add(cube[:3])
+            add(cube[3:])
+
+    with pytest.raises(RunError, match=r"can't write .*x\.npy: No space left on device"):
+        write()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_error_between_rows_leaves_nothing_and_passes_through(tmp_path):
+    def write():
+        with npy_rows(tmp_path / "x.npy", (7, 5, 5), np.float32) as add:
+            add(random_cube()[:3])
+            raise OSError("of something else")
+
+    with pytest.raises(OSError, match="of something else"):
+        write()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_rows_of_another_width_are_refused(tmp_path):
+    with (
+        pytest.raises(ValueError, match=r"rows of x.npy have shape \(5, 5\); got \(4, 5\)"),
+        npy_rows(tmp_path / "x.npy", (7, 5, 5), np.float32) as add,
+    ):
+        add(random_cube(width=4))
+
+
+def test_colours_and_opacity_are_read_back_as_they_were(tmp_path):
+    rgba = np.random.default_rng(0).integers(0, 256, (6, 9, 4), dtype=np.uint8)
+    (tmp_path / "x.png").write_bytes(rgba_png_bytes(rgba, "what it is"))
+    np.testing.assert_array_equal(iio.imread(tmp_path / "x.png"), rgba)
+    with Image.open(tmp_path / "x.png") as picture:
+        assert picture.info["Description"] == "what it is"
+
+
+def test_a_picture_of_ids_is_ids_and_colours_in_one(tmp_path):
+    ids = np.array([[0, 1, 2], [255, 7, 1]], dtype=np.uint8)
+    palette = np.random.default_rng(0).random((256, 3))
+    (tmp_path / "x.png").write_bytes(indexed_png_bytes(ids, palette, transparent=255))
+    with Image.open(tmp_path / "x.png") as picture:
+        assert picture.mode == "P"
+        np.testing.assert_array_equal(np.asarray(picture), ids)
+        rgba = np.asarray(picture.convert("RGBA"))
+    np.testing.assert_array_equal(rgba[..., :3], np.round(palette[ids] * 255))
+    np.testing.assert_array_equal(rgba[..., 3] == 0, ids == 255)

@@ -16,7 +16,7 @@ import tifffile
 import torch
 from PIL import Image
 
-from tests.captures.readers.envi_factory import header_text
+from tests.captures.file_factory import header_text
 from unmix_plugin.captures.readers.opening import open_spectral_file
 
 CUBE = np.random.default_rng(0).integers(0, 200, (5, 4, 3)).astype(np.uint16)

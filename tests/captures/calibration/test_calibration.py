@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.captures.files_in_memory import file_of
+from tests.captures.file_factory import file_of
 from unmix_plugin.captures.calibration.calibration import Calibration, Raster, WhiteReference, find_missing
 from unmix_plugin.captures.calibration.references import open_reference
 from unmix_plugin.captures.poses.lens import Lens

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.captures.files_in_memory import file_of
+from tests.captures.file_factory import file_of
 from unmix_plugin.captures.calibration.references import open_reference, panel_reference
 from unmix_plugin.errors import ConfigError
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.captures.band_files import write_band_file
+from tests.captures.file_factory import write_band_file
 
 WIDTH, HEIGHT = 64, 48
 PX_A_MM = 20.0

@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 
-from tests.captures.band_files import write_band_file
+from tests.captures.file_factory import write_band_file
 from tests.captures.layouts.data_sets import PLAIN
 from tests.captures.layouts.rig_flight import (
     HEIGHT,

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import spectral.io.envi as spy
 
-from tests.captures.readers.bands import centres_nm, widths_nm
-from tests.captures.readers.envi_factory import header_text, write_envi
+from tests.captures.file_factory import centres_nm, header_text, widths_nm, write_envi
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.errors import CaptureError
 

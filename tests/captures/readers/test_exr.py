@@ -4,7 +4,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from tests.captures.readers.bands import centres_nm, widths_nm
+from tests.captures.file_factory import centres_nm, widths_nm
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import ReadOptions
 from unmix_plugin.errors import CaptureError

@@ -6,7 +6,7 @@ import pytest
 import tifffile
 from PIL import Image
 
-from tests.captures.readers.bands import centres_nm
+from tests.captures.file_factory import centres_nm
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.errors import CaptureError
 

@@ -9,7 +9,7 @@ import tifffile
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational, ImageFileDirectory_v2
 
-from tests.captures.readers.bands import centres_nm, widths_nm
+from tests.captures.file_factory import centres_nm, widths_nm
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import ReadOptions
 from unmix_plugin.errors import CaptureError

@@ -1,6 +1,4 @@
-import contextlib
 import math
-import time
 
 import numpy as np
 import pytest
@@ -9,7 +7,6 @@ from colour.quality.datasets import SDS_TCS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
-from spectral.io.envi import SpectralLibrary
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.formats.envi import read_library_table
@@ -177,95 +174,3 @@ def test_own_files_extend_the_measured_library(tmp_path):
     assert library.find("moss").source == "mine.csv"
     with pytest.raises(SpectrumError, match=r"a library is a \.csv, or an ENVI spectral library"):
         read_library_table(tmp_path / "mine.txt")
-
-
-def written_by_spectral(folder, **changed):
-    """A library of two spectra in three bands, written by Spectral Python; then lines of its header replaced."""
-    values = np.array([[0.1, 0.25, 0.5], [0.3, 0.2, 0.7]], dtype=np.float32)
-    header = {
-        "wavelength": [400.5, 500, 700],
-        "wavelength units": "Nanometers",
-        "spectra names": ["oak", "fir tree"],
-    }
-    SpectralLibrary(values, header).save(str(folder / "trees"))
-    path = folder / "trees.hdr"
-    lines = path.read_text().splitlines()
-    for key, value in changed.items():
-        name = key.replace("_", " ")
-        lines = [line for line in lines if not line.startswith(name)] + (
-            [] if value is None else [f"{name} = {value}"]
-        )
-    path.write_text("\n".join(lines))
-    return path, values
-
-
-@pytest.mark.parametrize("suffix", [".hdr", ".sli"])
-def test_libraries_that_spectral_python_wrote_are_read_exactly(tmp_path, suffix):
-    path, values = written_by_spectral(tmp_path)
-    table = read_library_table(path.with_suffix(suffix))
-    assert table.names == ("oak", "fir tree")
-    np.testing.assert_array_equal(table.bands.centers_nm, [400.5, 500, 700])
-    np.testing.assert_array_equal(table.spectra, values.astype(np.float64))
-
-
-def test_envi_scale_units_and_byte_order_are_followed(tmp_path):
-    changed = {"wavelength": "{ 0.4, 0.5,\n 0.7 }", "wavelength_units": "Micrometers", "byte_order": 1}
-    path, values = written_by_spectral(tmp_path, **changed, reflectance_scale_factor=100)
-    path.with_suffix(".sli").write_bytes((100 * values).astype(">f4").tobytes())
-    table = read_library_table(path)
-    np.testing.assert_allclose(table.bands.centers_nm, [400, 500, 700])
-    np.testing.assert_allclose(table.spectra, values, rtol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("changed", "said"),
-    [
-        ({"wavelength": None}, "'wavelength' is missing or no list of numbers"),
-        ({"wavelength": "{400, 500}"}, "'wavelength' has 2 values for 3 bands"),
-        ({"wavelength_units": "Wavenumber"}, "'wavelength units' is 'Wavenumber'"),
-        ({"data_type": 6}, "'data type' is 6, complex"),
-        ({"lines": 20}, "has 24 bytes; 20 spectra of 3 values need 240"),
-        ({"lines": "two"}, "'lines' is two; expected a whole number"),
-        ({"lines": -1}, "'lines' is -1; expected a whole number of at least 1"),
-        ({"lines": "inf"}, "'lines' is inf; expected a whole number"),
-        ({"samples": "1e400"}, "'samples' is 1e400; expected a whole number"),
-        ({"header_offset": "nan"}, "'header offset' is nan; expected a whole number"),
-        ({"reflectance_scale_factor": 0}, "'reflectance scale factor' is 0"),
-        ({"wavelength": "{0.4, 0.5, 0.7}"}, "look like micrometres"),
-        ({"spectra_names": "{oak}"}, "1 'spectra names' for 2 spectra"),
-        ({"data_ignore_value": 0.25}, "must be finite; found nan in 'oak' at 500 nm"),
-    ],
-)
-def test_a_spoilt_envi_library_is_refused_with_its_name_and_the_fault(tmp_path, changed, said):
-    path, _ = written_by_spectral(tmp_path, **changed)
-    with pytest.raises(SpectrumError, match=said) as caught:
-        read_library_table(path)
-    assert str(path) in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    "filling",
-    [
-        *(" " * 200_000 + "\n", "\n" * 200_000, "a" * 200_000, "=" * 200_000, "{\n" * 100_000),
-        *("\n" + " " * 200_000 + "x\n", "\na =" + "\n" * 200_000, "\n" + "description = {{}\n" * 20_000),
-    ],
-)
-def test_a_long_envi_header_takes_time_in_proportion(tmp_path, filling):
-    path, _ = written_by_spectral(tmp_path)
-    path.write_text(path.read_text() + filling)
-    started = time.process_time()
-    with contextlib.suppress(SpectrumError):
-        read_library_table(path)
-    assert time.process_time() - started < 2.0
-
-
-def test_missing_parts_of_an_envi_library_are_named(tmp_path):
-    path, _ = written_by_spectral(tmp_path)
-    path.with_suffix(".sli").unlink()
-    with pytest.raises(SpectrumError, match=r"no file of numbers beside this header; expected trees\.sli"):
-        read_library_table(path)
-    with pytest.raises(SpectrumError, match=r"none\.hdr: can't read"):
-        read_library_table(tmp_path / "none.sli")
-    path.write_text("something else")
-    with pytest.raises(SpectrumError, match="its first line is not 'ENVI'"):
-        read_library_table(path)

@@ -1,7 +1,10 @@
-"""Band files as multispectral cameras write them, by Pillow: TIFF of 16 bits with XMP and EXIF."""
+"""Files of instruments for tests: in memory, as multispectral cameras write them, and small ENVI images."""
+
+from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tifffile
@@ -10,6 +13,22 @@ from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from unmix_plugin.captures.camera_tags import band_of, camera_tags
 from unmix_plugin.captures.spectral_file import BandTable, SpectralFile
+
+
+def file_of(values: np.ndarray, wavelengths_nm: np.ndarray | None = None, **facts: Any) -> SpectralFile:
+    """A file with these numbers (H, W, B); more facts by the names of `SpectralFile`'s fields."""
+    table = BandTable(wavelengths_nm)
+    height, width, bands = values.shape
+    return SpectralFile(
+        Path("memory.npy"),
+        "npy",
+        (height, width, bands),
+        values.dtype,
+        lambda rows, wanted: values[rows][..., wanted],
+        table,
+        **facts,
+    )
+
 
 EXIF_CODES = {"ExposureTime": 33434, "FNumber": 33437, "ISOSpeedRatings": 34855, "ISOSpeed": 34867}
 FOCAL_PLANE_CODES = {"FocalLength": 37386, "FocalPlaneXResolution": 41486, "FocalPlaneYResolution": 41487}
@@ -74,3 +93,41 @@ def open_band_file(path: Path) -> SpectralFile:
         band_of(metadata["xmp"]) or BandTable(),
         metadata=metadata,
     )
+
+
+CODES = {"u1": 1, "i2": 2, "i4": 3, "f4": 4, "f8": 5, "u2": 12, "u4": 13, "i8": 14, "u8": 15}
+AXES = {"bsq": (2, 0, 1), "bil": (0, 2, 1), "bip": (0, 1, 2)}
+
+
+def write_envi(header: Path, cube: np.ndarray, interleave: str, more: str = "") -> Path:
+    """Write a cube (H, W, B) as a header and a file of its name without suffix."""
+    header.write_text(header_text(cube, interleave, {}) + more + "\n")
+    header.with_suffix("").write_bytes(cube.transpose(AXES[interleave]).tobytes())
+    return header
+
+
+def header_text(cube: np.ndarray, interleave: str, change: dict[str, str | None]) -> str:
+    """Header of a cube; entries in `change` replace others, or take them away."""
+    lines, samples, bands = cube.shape
+    entries = {
+        "samples": samples,
+        "lines": lines,
+        "bands": bands,
+        "data type": CODES[cube.dtype.str[1:]],
+        "interleave": interleave,
+        "byte order": int(cube.dtype.str[0] == ">"),
+        **change,
+    }
+    return "ENVI\n" + "".join(f"{key} = {value}\n" for key, value in entries.items() if value is not None)
+
+
+def centres_nm(file: SpectralFile) -> np.ndarray:
+    """Its wavelengths, which must be there."""
+    assert file.bands.wavelengths_nm is not None, file.notes
+    return file.bands.wavelengths_nm
+
+
+def widths_nm(file: SpectralFile) -> np.ndarray:
+    """Its widths of bands, which must be there."""
+    assert file.bands.fwhm_nm is not None, file.notes
+    return file.bands.fwhm_nm
