@@ -1,6 +1,12 @@
-"""What a camera writes beside its pixels: XMP and EXIF of a TIFF, and the band that they describe.
+"""What a camera writes beside its pixels: XMP and EXIF, the band that they describe, and how numbers become radiance.
 
 Tags are called `prefix:Name` as in the file, such as `Camera:BandName` or `drone-dji:SensorGain`.
+
+Notation: `H` rows, `W` columns, `p` stored number, `x` column, `y` row, both counted from 0. All makers' formulas are
+
+    L(x, y) = (p(x, y) - black level) * factor(x, y)
+
+with a factor for exposure, gain, vignetting and, where rows are read one after the other, the row.
 """
 
 from __future__ import annotations
@@ -8,25 +14,35 @@ from __future__ import annotations
 import io
 import math
 import re
-from collections.abc import Mapping
-from typing import Any, TypeAlias
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeAlias
 from xml.etree import ElementTree
 
 import numpy as np
+from jaxtyping import Float, Float32, Float64, Int
 
-from unmix_plugin.captures.spectral_file import BandTable
+from unmix_plugin.captures.spectral_file import BandTable, SpectralFile
+from unmix_plugin.errors import CaptureError
 
+FactorOf: TypeAlias = Callable[[Int[np.ndarray, "h 1"], Int[np.ndarray, "1 W"]], Float64[np.ndarray, "h W"]]
+"""Factor at rows y and columns x."""
 XmpTags: TypeAlias = dict[str, str | list[str]]
 """Text of each tag, or the texts of a list."""
-RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
-EXIF_CODE, BLACK_LEVEL_CODE, XMP_CODE = 34665, 50714, 700
-EXIF_OF_PAGE = ("Make", "Model", "Software", "Orientation", "BitsPerSample", "BlackLevel", "DateTime")
-EXPOSURE_OF_PAGE = ("ExposureTime", "FNumber", "ISOSpeedRatings")
-FOCAL_PLANE_OF_PAGE = tuple(f"FocalPlane{what}" for what in ("XResolution", "YResolution", "ResolutionUnit"))
+_RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
+_EXIF_CODE, _BLACK_LEVEL_CODE, _XMP_CODE = 34665, 50714, 700
+_EXIF_OF_PAGE = ("Make", "Model", "Software", "Orientation", "BitsPerSample", "BlackLevel", "DateTime")
+_EXPOSURE_OF_PAGE = ("ExposureTime", "FNumber", "ISOSpeedRatings")
+_FOCAL_PLANE_OF_PAGE = tuple(f"FocalPlane{what}" for what in ("XResolution", "YResolution", "ResolutionUnit"))
 """Where a program moved them out of EXIF's own directory."""
-RATIONAL_TYPES = (5, 10)
+_RATIONAL_TYPES = (5, 10)
 """Of TIFF, unsigned and signed."""
-NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_SATURATED_12_BITS, _SATURATED_10_BITS_OF_16, _SATURATED_10_BITS = 65520.0, 65472.0, 1023.0
+"""Sensors of 12 or 10 bits fill the upper ones of 16, or 10 bits alone."""
+_FAULTY_EXPOSURE_S, _TRUE_EXPOSURE_S = 1.0 / 6329.0, 0.000274
+"""What old firmware of the RedEdge wrote, and what it meant."""
+_GREATEST_POWER = 20
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
 
 def parse_xmp(packet: bytes | str) -> XmpTags:
@@ -47,7 +63,7 @@ def parse_xmp(packet: bytes | str) -> XmpTags:
         for event, item in ElementTree.iterparse(io.BytesIO(body.encode()), events=("start-ns", "end")):
             if event == "start-ns":
                 prefixes[item[1]] = item[0]
-            elif item.tag == f"{RDF}Description":
+            elif item.tag == f"{_RDF}Description":
                 tags.update(_tags_of(item, prefixes))
     except ElementTree.ParseError:
         return {}
@@ -61,7 +77,7 @@ def _tags_of(description: ElementTree.Element, prefixes: dict[str, str]) -> XmpT
 
     tags: XmpTags = {name_of(key): value.strip() for key, value in description.attrib.items()}
     for child in description:
-        items = [(item.text or "").strip() for item in child.iter(f"{RDF}li")]
+        items = [(item.text or "").strip() for item in child.iter(f"{_RDF}li")]
         tags[name_of(child.tag)] = items if items else (child.text or "").strip()
     return tags
 
@@ -74,13 +90,13 @@ def camera_tags(page_tags: Any) -> dict[str, Any]:
     Returns:
         `xmp`, see `parse_xmp`, and `exif`: tags by tifffile's names, rationals as floats.
     """
-    exif = {name: page_tags.valueof(name) for name in EXIF_OF_PAGE}
-    exif |= {name: _rational(page_tags.valueof(name)) for name in (*EXPOSURE_OF_PAGE, *FOCAL_PLANE_OF_PAGE)}
-    exif |= {name: _rational(value) for name, value in (page_tags.valueof(EXIF_CODE) or {}).items()}
-    exif["BlackLevel"] = _black_levels(page_tags.get(BLACK_LEVEL_CODE))
+    exif = {name: page_tags.valueof(name) for name in _EXIF_OF_PAGE}
+    exif |= {name: _rational(page_tags.valueof(name)) for name in (*_EXPOSURE_OF_PAGE, *_FOCAL_PLANE_OF_PAGE)}
+    exif |= {name: _rational(value) for name, value in (page_tags.valueof(_EXIF_CODE) or {}).items()}
+    exif["BlackLevel"] = _black_levels(page_tags.get(_BLACK_LEVEL_CODE))
     known = {name: value for name, value in exif.items() if isinstance(value, (str, int, float, list))}
     plain = {name: int(value) if isinstance(value, int) else value for name, value in known.items()}
-    return {"xmp": parse_xmp(page_tags.valueof(XMP_CODE) or b""), "exif": plain}
+    return {"xmp": parse_xmp(page_tags.valueof(_XMP_CODE) or b""), "exif": plain}
 
 
 def _rational(value: Any) -> Any:
@@ -96,7 +112,7 @@ def _black_levels(tag: Any) -> list[float] | None:
     if tag is None:
         return None
     numbers = [float(part) for part in np.atleast_1d(np.asarray(tag.value, dtype=np.float64))]
-    if tag.dtype not in RATIONAL_TYPES:
+    if tag.dtype not in _RATIONAL_TYPES:
         return numbers
     return [above / below for above, below in zip(numbers[::2], numbers[1::2], strict=True) if below]
 
@@ -119,7 +135,7 @@ def tag_numbers(tags: XmpTags, *names: str) -> list[float] | None:
     """Numbers of the first of some tags that has any: one, a list, or many separated by commas."""
     for name in names:
         value = tag_value(tags, name) or ""
-        found = re.findall(NUMBER, value if isinstance(value, str) else " ".join(value))
+        found = re.findall(_NUMBER, value if isinstance(value, str) else " ".join(value))
         if found:
             return [float(number) for number in found]
     return None
@@ -143,10 +159,10 @@ def band_of(tags: XmpTags) -> BandTable | None:
     for name in ("Camera:CentralWavelength", "BandFreq"):
         value = tag_value(tags, name) or []
         items = [value] if isinstance(value, str) else value
-        centres = [number_in(item) for item in items]
+        centres = [_first_number(item) for item in items]
         if not centres or any(centre is None or not 100.0 < centre < 20_000.0 for centre in centres):
             continue
-        halves = [re.search(rf"\+\s*/?\s*-\s*({NUMBER})", item) for item in items]
+        halves = [re.search(rf"\+\s*/?\s*-\s*({_NUMBER})", item) for item in items]
         widths = tag_numbers(tags, "Camera:WavelengthFWHM") or []
         if all(halves):
             widths = [2.0 * float(half[1]) for half in halves if half]
@@ -155,7 +171,204 @@ def band_of(tags: XmpTags) -> BandTable | None:
     return None
 
 
-def number_in(text: str) -> float | None:
+def _first_number(text: str) -> float | None:
     """The first number of a text."""
-    found = re.search(NUMBER, text)
+    found = re.search(_NUMBER, text)
     return float(found[0]) if found else None
+
+
+@dataclass(frozen=True)
+class RadiometricModel:
+    """How the stored numbers of one file become radiance."""
+
+    maker: str
+    """`MicaSense`, `Parrot Sequoia`, `DJI`."""
+    unit: Literal["W/m2/sr/nm", "relative"]
+    """Relative radiance is comparable between the bands and exposures of one camera."""
+    black_level: float
+    """Stored number of no light."""
+    saturated: float
+    """Stored numbers from here on are saturated."""
+    factor_of: FactorOf = field(repr=False)
+    irradiance: float | None = None
+    """What the sunshine sensor measured, as the file gives it; not used."""
+
+    @property
+    def description(self) -> str:
+        """What was done, in one line, for the record."""
+        unit = "relative radiance" if self.unit == "relative" else f"radiance in {self.unit}"
+        return f"{unit} by {self.maker}'s calibration in the file, black level {self.black_level:g}"
+
+    def apply(
+        self,
+        values: Float[np.ndarray, "h W b"],
+        rows: slice = slice(None),
+        columns: slice = slice(None),
+    ) -> Float32[np.ndarray, "h W b"]:
+        """Radiance of some rows; a little below 0 where noise goes below the black level.
+
+        Args:
+            values: Stored numbers of these rows and columns; every band is treated alike.
+            rows, columns: Which ones of the file they are.
+        """
+        y, x = (
+            (part.start or 0) + (part.step or 1) * np.arange(count)
+            for part, count in zip((rows, columns), values.shape, strict=False)
+        )
+        factor = self.factor_of(y[:, None], x[None, :])
+        return ((values - self.black_level) * factor[..., None]).astype(np.float32)
+
+
+def radiometric_model(file: SpectralFile) -> RadiometricModel | None:
+    """The calibration that a file carries in `metadata["xmp"]` and `metadata["exif"]`; None where there is none.
+
+    Raises:
+        CaptureError: the file has a calibration that lacks a number, or one that can't be.
+    """
+    tags, exif = file.metadata.get("xmp") or {}, file.metadata.get("exif") or {}
+    read = next((read for mark, read in _MAKERS.items() if tag_numbers(tags, mark) is not None), None)
+    if read is None:
+        return None
+    model = read(file, tags, exif)
+    probe = model.factor_of(np.array([[0], [file.shape[0] - 1]]), np.arange(file.shape[1])[None, :])
+    if not (np.isfinite(probe).all() and (probe > 0.0).all()):
+        raise CaptureError(
+            f"{file.path}: the calibration in its XMP gives factors from {probe.min():g} to {probe.max():g} in the "
+            "first and last row; expected positive numbers: the tags of exposure, gain or vignetting are damaged"
+        )
+    return model
+
+
+def _micasense(file: SpectralFile, tags: XmpTags, exif: Mapping[str, Any]) -> RadiometricModel:
+    """MicaSense RedEdge and Altum: radiance in W/m2/sr/nm.
+
+        L = 1 / V(r) * a1 / (gain * exposure) * (p - pBL) / 2^bits / (1 + a2 y / exposure - a3 y)
+
+    with V a polynomial of the distance to the vignetting centre, gain = ISO speed / 100, and pBL the mean black level.
+    Source: MicaSense, RedEdge camera radiometric calibration model.
+    """
+    a1, a2, a3 = _xmp(file, tags, 3, "RadiometricCalibration")
+    exposure = _exif(file, exif, "ExposureTime")
+    if exif.get("Model") == "RedEdge" and abs(exposure - _FAULTY_EXPOSURE_S) < 1e-6:
+        exposure = _TRUE_EXPOSURE_S
+    iso = _exif(file, exif, "ISOSpeed", "ISOSpeedRatings", "PhotographicSensitivity")
+    levels = exif.get("BlackLevel") or tag_numbers(tags, "DarkRowValue") or [0.0]
+    centre = _xmp(file, tags, 2, "VignettingCenter")
+    polynomial = _xmp(file, tags, 6, "VignettingPolynomial")
+    gain = a1 / (0.01 * iso * exposure) / _stored_range(exif)
+
+    def factor_of(y: np.ndarray, x: np.ndarray) -> np.ndarray:
+        rows = 1.0 + a2 * y / exposure - a3 * y
+        return gain / (_radial_polynomial(polynomial, centre, y, x) * rows)
+
+    irradiance = tag_numbers(tags, "HorizontalIrradiance", "SpectralIrradiance")
+    to_si = tag_numbers(tags, "IrradianceScaleToSIUnits")
+    default = [0.01 if tag_numbers(tags, "HorizontalIrradiance") else 1.0]
+    measured = None if irradiance is None else irradiance[0] * (to_si or default)[0]
+    black = float(np.mean(levels))
+    return RadiometricModel("MicaSense", "W/m2/sr/nm", black, _SATURATED_12_BITS, factor_of, measured)
+
+
+def _sequoia(file: SpectralFile, tags: XmpTags, exif: Mapping[str, Any]) -> RadiometricModel:
+    """Parrot Sequoia: radiance in a unit of its own, the same for its four bands.
+
+        I = f^2 (p - B) / (A * exposure * iso + C) / V(x / W, y / H)
+
+    with the sensor model A, B, C and V a polynomial in two variables whose powers the file lists.
+    Source: Parrot, SEQ-AN-01 (pixel value to irradiance) and SEQ-AN-02 (vignetting).
+    """
+    a, b, c = _xmp(file, tags, 3, "SensorModel")
+    exposure, f_number = _exif(file, exif, "ExposureTime"), _exif(file, exif, "FNumber")
+    iso = _exif(file, exif, "ISOSpeedRatings", "PhotographicSensitivity", "ISOSpeed")
+    height, width = file.shape[:2]
+    gain = f_number**2 / (a * exposure * iso + c)
+    powers = [int(power) for power in tag_numbers(tags, "VignettingPolynomial2DName") or ()]
+    if len(powers) % 2 or not all(0 <= power <= _GREATEST_POWER for power in powers):
+        raise CaptureError(
+            f"{file.path}: the tag XMP VignettingPolynomial2DName holds {powers}; expected pairs of powers from 0 to "
+            f"{_GREATEST_POWER}"
+        )
+    vignetting = np.ones((1, 1))  # coefficients of x^n y^m
+    if powers:
+        vignetting = np.zeros((max(powers[::2]) + 1, max(powers[1::2]) + 1))
+        numbers = _xmp(file, tags, len(powers) // 2, "VignettingPolynomial2D")
+        np.add.at(vignetting, (powers[::2], powers[1::2]), numbers)
+
+    def factor_of(y: np.ndarray, x: np.ndarray) -> np.ndarray:
+        across = np.vander(x[0] / width, vignetting.shape[0], increasing=True)
+        down = np.vander(y[:, 0] / height, vignetting.shape[1], increasing=True)
+        return gain / (down @ vignetting.T @ across.T)
+
+    saturated = _SATURATED_10_BITS if _stored_range(exif) == 2.0**10 else _SATURATED_10_BITS_OF_16
+    return RadiometricModel("Parrot Sequoia", "relative", b, saturated, factor_of)
+
+
+def _dji(file: SpectralFile, tags: XmpTags, exif: Mapping[str, Any]) -> RadiometricModel:
+    """DJI P4 Multispectral and Mavic 3 Multispectral: radiance in a unit of its own, the same for all bands.
+
+        L = V(r) * (p - black level) / 2^bits / (gain * exposure) * gain adjustment
+
+    with V a polynomial of the distance to the calibrated optical centre, which multiplies here; exposure in seconds.
+    Source: DJI, P4 Multispectral and Mavic 3M image processing guides.
+    """
+    (gain,) = _xmp(file, tags, 1, "drone-dji:SensorGain", positive=True)
+    (microseconds,) = _xmp(file, tags, 1, "drone-dji:ExposureTime", positive=True)
+    adjustment = tag_numbers(tags, "drone-dji:SensorGainAdjustment") or [1.0]
+    levels = exif.get("BlackLevel") or _xmp(
+        file, tags, 1, "drone-dji:BlackLevel", "BlackLevel", "BlackCurrent"
+    )
+    polynomial = tag_numbers(tags, "VignettingData", "VignettingPolynomial") or []
+    centre = [0.0, 0.0]
+    if polynomial:
+        x, y = (tag_numbers(tags, f"drone-dji:CalibratedOpticalCenter{axis}") or [] for axis in "XY")
+        middle = tag_numbers(tags, "VignettingCenter") or [*x, *y]
+        centre = _required(file, "XMP drone-dji:CalibratedOpticalCenterX, Y", middle or None, 2)
+    scale = adjustment[0] / (gain * 1e-6 * microseconds) / _stored_range(exif)
+
+    def factor_of(y: np.ndarray, x: np.ndarray) -> np.ndarray:
+        return scale * _radial_polynomial(polynomial, centre, y, x)
+
+    irradiance = tag_numbers(tags, "drone-dji:Irradiance")
+    measured, black = irradiance[0] if irradiance else None, float(np.mean(levels))
+    return RadiometricModel("DJI", "relative", black, _SATURATED_12_BITS, factor_of, measured)
+
+
+_MAKERS = {"RadiometricCalibration": _micasense, "SensorModel": _sequoia, "drone-dji:SensorGain": _dji}
+"""How a calibration is read, by the XMP tag that it is known by."""
+
+
+def _required(
+    file: SpectralFile, name: str, numbers: list[float] | None, count: int, positive: bool = False
+) -> list[float]:
+    if numbers is None or len(numbers) != count or (positive and min(numbers) <= 0.0):
+        kind = "positive number" if positive else "number"
+        found = "it is absent" if numbers is None else f"found {numbers}"
+        raise CaptureError(
+            f"{file.path}: the tag {name} should hold {count} {kind}{'s' if count > 1 else ''}; {found}. "
+            "Without it the stored numbers can't become radiance: export the image with its metadata"
+        )
+    return numbers
+
+
+def _xmp(file: SpectralFile, tags: XmpTags, count: int, *names: str, positive: bool = False) -> list[float]:
+    """The numbers of the first of some XMP tags that is there."""
+    return _required(file, f"XMP {names[0]}", tag_numbers(tags, *names), count, positive)
+
+
+def _exif(file: SpectralFile, exif: Mapping[str, Any], *names: str) -> float:
+    """The first of some EXIF tags, a number above 0."""
+    number = exif_number(exif, *names)
+    return _required(file, f"EXIF {names[0]}", None if number is None else [number], 1, positive=True)[0]
+
+
+def _stored_range(exif: Mapping[str, Any]) -> float:
+    """Stored numbers go up to this, less one."""
+    return 2.0 ** min(32.0, exif_number(exif, "BitsPerSample") or 16.0)
+
+
+def _radial_polynomial(
+    coefficients: list[float], centre: list[float], y: np.ndarray, x: np.ndarray
+) -> Float64[np.ndarray, "h W"]:
+    """1 + k0 r + k1 r^2 + ... at a distance of r pixels from a centre (x, y)."""
+    radius = np.hypot(x - centre[0], y - centre[1])
+    return np.polynomial.polynomial.polyval(radius, np.array([1.0, *coefficients]))

@@ -16,9 +16,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from unmix_plugin.captures.calibration.bands import sampled_rows
 from unmix_plugin.captures.calibration.calibration import Raster
-from unmix_plugin.captures.calibration.sensor import Sensor
+from unmix_plugin.captures.calibration.sensor import Sensor, sampled_rows
 from unmix_plugin.captures.capture import CaptureView
 from unmix_plugin.captures.options import MaskKind
 from unmix_plugin.captures.poses.pose_set import name_some

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from unmix_plugin import __version__
-from unmix_plugin.captures.calibration.references import is_srgb
+from unmix_plugin.captures.calibration.calibration import is_srgb
 from unmix_plugin.captures.calibration.sensor import References, Sensor, choose_scale, prepare_sensor
 from unmix_plugin.captures.capture import Capture, CaptureView
 from unmix_plugin.captures.masks import background_rule, choose_mask, has_opacity, white_background_note

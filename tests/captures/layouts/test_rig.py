@@ -18,11 +18,11 @@ from tests.captures.layouts.rig_flight import (
     write_panel,
     write_poses,
 )
+from unmix_plugin.captures.camera_tags import radiometric_model
 from unmix_plugin.captures.layouts.registry import LayoutOptions
 from unmix_plugin.captures.layouts.rig import find_rig, splits_of
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.process import process_capture
-from unmix_plugin.captures.radiometry import radiometric_model
 from unmix_plugin.errors import CaptureError
 
 

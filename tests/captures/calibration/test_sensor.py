@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.captures.file_factory import file_of
-from unmix_plugin.captures.calibration.bands import (
+from unmix_plugin.captures.calibration.sensor import (
     BandChoice,
     Sample,
     drop_found,

@@ -7,8 +7,15 @@ import pytest
 import tifffile
 
 from tests.captures.file_factory import open_band_file, write_band_file, xmp_packet
-from unmix_plugin.captures.camera_tags import XmpTags, band_of, camera_tags, parse_xmp, tag_numbers, tag_text
-from unmix_plugin.captures.radiometry import radiometric_model
+from unmix_plugin.captures.camera_tags import (
+    XmpTags,
+    band_of,
+    camera_tags,
+    parse_xmp,
+    radiometric_model,
+    tag_numbers,
+    tag_text,
+)
 from unmix_plugin.captures.spectral_file import SpectralFile
 from unmix_plugin.errors import CaptureError
 
