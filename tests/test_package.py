@@ -38,6 +38,7 @@ def metadata_file(wheel, name):
     return wheel.read(path).decode()
 
 
+@pytest.mark.slow
 def test_a_wheel_holds_every_file_of_the_package_and_nothing_else(wheel):
     expected = {
         path.relative_to(ROOT).as_posix()
@@ -47,6 +48,7 @@ def test_a_wheel_holds_every_file_of_the_package_and_nothing_else(wheel):
     assert {name for name in wheel.namelist() if ".dist-info/" not in name} == expected
 
 
+@pytest.mark.slow
 def test_a_wheel_declares_commands_and_methods(wheel):
     entry_points = configparser.ConfigParser()
     entry_points.read_string(metadata_file(wheel, "entry_points.txt"))
@@ -66,6 +68,7 @@ def test_a_wheel_declares_commands_and_methods(wheel):
     }
 
 
+@pytest.mark.slow
 def test_a_wheel_carries_licence_readme_and_dependency_ranges(wheel):
     metadata = Parser().parsestr(metadata_file(wheel, "METADATA"))
     assert metadata["License-Expression"] == "Apache-2.0"

@@ -24,6 +24,7 @@ def test_valid_samples_are_read_or_refused_as_promised(name, tmp_path):
             assert name in WITH_REFUSED_SAMPLES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", READERS)
 def test_damaged_files_raise_only_what_the_reader_promises(name, tmp_path):
     outcome = fuzz(name, tmp_path, seed=0, cases=range(CASES))

@@ -21,6 +21,7 @@ from unmix_plugin.commands.render import render
 from unmix_plugin.commands.train import train
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 
+pytestmark = pytest.mark.slow
 DEVICES = ["standin", "cuda"] if torch.cuda.is_available() else ["standin"]
 STEPS = 33
 """Enough for updates of the occupancy grid, more rays a pixel, and the specular part."""

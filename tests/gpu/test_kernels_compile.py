@@ -9,6 +9,9 @@ from unmix_plugin.operators import compositing, hash_encoding, marching, merging
 from unmix_plugin.operators.launching import warp
 
 
+pytestmark = pytest.mark.slow
+
+
 @pytest.fixture(scope="module")
 def _specialised() -> None:
     """Generic kernels exist for the types that they were launched with."""

@@ -92,6 +92,7 @@ def test_the_gradient_of_a_batch_is_that_of_one_process(run, tmp_path: Path):
         torch.testing.assert_close(first[name], parameter.grad, rtol=0, atol=1e-6 * scale)
 
 
+@pytest.mark.slow
 def test_two_processes_go_on_where_one_stopped_and_end_with_the_same_model(run, tmp_path: Path):
     Trainer(config_for(tmp_path)).train()
     (training,) = (tmp_path / "outputs").glob("*/*/*/training.json")
@@ -102,6 +103,7 @@ def test_two_processes_go_on_where_one_stopped_and_end_with_the_same_model(run, 
     assert json.loads(training.read_text())["steps"] == STEPS + 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("action", "message"),
     [
@@ -118,6 +120,7 @@ def test_a_failure_anywhere_ends_all_with_one_message(run, action: str, message:
     assert message in lines[0]
 
 
+@pytest.mark.slow
 def test_ctrl_c_reaches_all_processes_and_what_was_learned_is_saved(run, tmp_path: Path):
     code, errors, _ = run("interrupted")
     assert code != 2, errors

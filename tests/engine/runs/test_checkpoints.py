@@ -152,6 +152,7 @@ def test_a_full_disk_at_any_system_call_is_said_and_changes_nothing(tmp_path: Pa
         assert found.damaged == ()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="forks")
 def test_twenty_real_kills_during_saving_leave_complete_checkpoints(tmp_path: Path):
     done = subprocess.run(

@@ -148,7 +148,7 @@ def test_parameters_without_gradient_do_not_matter():
 
 
 def test_only_refusals_in_a_row_end_training(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(guards, "MAX_IN_A_ROW", 2)
+    monkeypatch.setattr(guards, "_MAX_IN_A_ROW", 2)
     guard, _ = make_guard()
     for loss in (math.nan, 1.0, math.nan, 1.0):
         guard.check(torch.tensor(loss))
@@ -188,7 +188,7 @@ def test_a_poisoned_step_changes_no_parameter_and_is_counted_and_logged(short_co
 def test_training_that_stays_poisoned_ends_with_the_last_checkpoint_whole(
     short_config: TrainerConfig, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(guards, "MAX_IN_A_ROW", 3)
+    monkeypatch.setattr(guards, "_MAX_IN_A_ROW", 3)
     trainer = poisoned_trainer(short_config, set(range(6, 100)))
     with pytest.raises(RunError, match="3 training steps in a row"):
         trainer.train()

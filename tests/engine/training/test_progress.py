@@ -12,6 +12,7 @@ import io
 import json
 import math
 import re
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -74,7 +75,7 @@ def fake_time(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
         fake.now += fake.tick
         return fake.now
 
-    monkeypatch.setattr(limits_module, "time", SimpleNamespace(perf_counter=read))
+    monkeypatch.setattr(limits_module, "time", SimpleNamespace(perf_counter=read, monotonic=time.monotonic))
     return fake
 
 
