@@ -17,11 +17,10 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
-from unmix_plugin.engine.data_manager import DataManager
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.engine.machine import step_generator
-from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
+from unmix_plugin.engine.model import DataManager, TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.light.search import find_lamp
 from unmix_plugin.poses.knots import Knots
 from unmix_plugin.presets import choose, preset_for

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from unmix_plugin.engine.configs import DataManagerConfig, Target
-from unmix_plugin.engine.data_manager import DataManager
+from unmix_plugin.engine.model import DataManager
 from unmix_plugin.errors import require
 from unmix_plugin.presets import Auto
 from unmix_plugin.scenes.pixel_table import Components

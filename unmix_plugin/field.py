@@ -19,8 +19,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from unmix_plugin.engine.configs import InstantiateConfig, Target
-from unmix_plugin.engine.field import Field
 from unmix_plugin.engine.geometry.space import SceneBox, contracted_unit
+from unmix_plugin.engine.model import Field
 from unmix_plugin.errors import require
 from unmix_plugin.light.directions import (
     NUM_DIRECTION_FEATURES,

@@ -1,18 +1,26 @@
-"""What the package registers: the methods `unmix-nerf` and `unmix-nerf-published`, with all their settings."""
+"""What the package registers: the methods `unmix-nerf` and `unmix-nerf-published`, with all their settings.
+
+What takes long to import is imported where a method is used.
+"""
 
 from pathlib import Path
+from typing import Any
 
-from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
 from unmix_plugin.engine.configs import OptimizerConfig, PipelineConfig, TrainerConfig
 from unmix_plugin.engine.registry import MethodSpecification
-from unmix_plugin.losses.training_losses import LossConfig
-from unmix_plugin.model_settings import UnmixModelConfig
-from unmix_plugin.rendering.published_field import PublishedFieldConfig
-from unmix_plugin.rendering.settings import RendererConfig
-from unmix_plugin.trained.snapshot import unmix_scene
 
-unmix_nerf = MethodSpecification(
-    config=TrainerConfig(
+
+def _scene(*arguments: Any) -> Any:
+    from unmix_plugin.trained.snapshot import unmix_scene
+
+    return unmix_scene(*arguments)
+
+
+def _unmix_nerf() -> TrainerConfig:
+    from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
+    from unmix_plugin.model_settings import UnmixModelConfig
+
+    return TrainerConfig(
         method_name="unmix-nerf",
         output_dir=Path("outputs"),
         max_num_iterations=10_000,
@@ -30,15 +38,27 @@ unmix_nerf = MethodSpecification(
             "spectra": OptimizerConfig(lr=2e-3, final_factor=0.03),
             "poses": OptimizerConfig(lr=5e-3, final_factor=0.08),
         },
-    ),
+    )
+
+
+unmix_nerf = MethodSpecification(
+    _unmix_nerf,
+    name="unmix-nerf",
     description="radiance field of spectral images whose every point is a mixture of a few materials",
-    scene=unmix_scene,
+    scene=_scene,
 )
 
 _AS_PUBLISHED = OptimizerConfig(lr=2e-2, final_factor=5e-4)
 
-unmix_nerf_published = MethodSpecification(
-    config=TrainerConfig(
+
+def _unmix_nerf_published() -> TrainerConfig:
+    from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
+    from unmix_plugin.losses.training_losses import LossConfig
+    from unmix_plugin.model_settings import UnmixModelConfig
+    from unmix_plugin.rendering.published_field import PublishedFieldConfig
+    from unmix_plugin.rendering.settings import RendererConfig
+
+    return TrainerConfig(
         method_name="unmix-nerf-published",
         output_dir=Path("outputs"),
         max_num_iterations=30_000,
@@ -67,7 +87,12 @@ unmix_nerf_published = MethodSpecification(
             ),
         ),
         optimizers=dict.fromkeys(("grid", "networks", "spectra"), _AS_PUBLISHED),
-    ),
+    )
+
+
+unmix_nerf_published = MethodSpecification(
+    _unmix_nerf_published,
+    name="unmix-nerf-published",
     description="UnMix-NeRF as its authors publish it, for comparison; docs/background/method.md says what differs",
-    scene=unmix_scene,
+    scene=_scene,
 )

@@ -19,11 +19,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from unmix_plugin.engine.data_manager import DataManager
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle
-from unmix_plugin.engine.model import Model
-from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
+from unmix_plugin.engine.model import DataManager, Model, TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.field import CoefficientField, UnmixField
 from unmix_plugin.light.shadows import ShadowDetail
 from unmix_plugin.losses.abundance_guide import AbundanceGuide

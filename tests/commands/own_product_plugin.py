@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from tests.engine.rgb_nerf_plugin import rgb_nerf
+from unmix_plugin.engine import MethodSpecification
 from unmix_plugin.formats.files import write_file
 from unmix_plugin.products.product import Job, RunProduct
 
@@ -33,8 +34,12 @@ def _broken():
     raise ImportError("no module named scissors")
 
 
-with_product = replace(rgb_nerf, products=lambda: (ViewNames(),))
-clashing = replace(
-    rgb_nerf, config=replace(rgb_nerf.config, method_name="rgb-2"), products=lambda: (Clashing(),)
-)
-broken = replace(rgb_nerf, config=replace(rgb_nerf.config, method_name="rgb-3"), products=_broken)
+def _with(products, name: str = "rgb-nerf") -> MethodSpecification:
+    return MethodSpecification(
+        replace(rgb_nerf.config, method_name=name), rgb_nerf.description, products=products
+    )
+
+
+with_product = _with(lambda: (ViewNames(),))
+clashing = _with(lambda: (Clashing(),), "rgb-2")
+broken = _with(_broken, "rgb-3")

@@ -180,7 +180,7 @@ def test_an_interrupt_while_a_command_is_imported_is_no_traceback(script):
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "class Interrupting:\n"
         "    def find_spec(self, name, path=None, target=None):\n"
-        "        if name == 'torch':\n"
+        "        if name == 'tyro':\n"
         "            signal.raise_signal(signal.SIGINT)\n"
         "sys.meta_path.insert(0, Interrupting())\n"
         f"from unmix_plugin.commands import scripts; scripts.{script}()"

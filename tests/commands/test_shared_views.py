@@ -7,7 +7,7 @@ from tests.commands.running import run
 from tests.formats.video_reading import read_video
 from unmix_plugin.commands.export import PRODUCTS, _write, export
 from unmix_plugin.commands.render import render
-from unmix_plugin.engine.processes.processes import Processes
+from unmix_plugin.engine.processes import Processes
 from unmix_plugin.errors import ConfigError
 
 pytestmark = pytest.mark.usefixtures("no_wait_for_the_disk")

@@ -10,8 +10,8 @@ import pytest
 from rich.console import Console
 
 from unmix_plugin.engine.configs import TrainerConfig
+from unmix_plugin.engine.model import TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.engine.runs.checkpoints import Checkpoint, newest_complete_checkpoint
-from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.engine.training.training_control import Interrupted
 

@@ -9,9 +9,9 @@ import torch
 from rich.console import Console
 
 from unmix_plugin.engine.configs import TrainerConfig
+from unmix_plugin.engine.model import TrainingCallback, TrainingCallbackLocation, run_callbacks
 from unmix_plugin.engine.pipeline import Pipeline, evaluating
 from unmix_plugin.engine.runs.load_run import load_pipeline
-from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation, run_callbacks
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.errors import ConfigError
 

@@ -8,7 +8,6 @@ from tests.method_factory import CAMERA, make_model
 from unmix_plugin.operators import compositing, hash_encoding, marching, merging
 from unmix_plugin.operators.launching import warp
 
-
 pytestmark = pytest.mark.slow
 
 

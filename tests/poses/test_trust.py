@@ -7,7 +7,7 @@ from torch.testing import assert_close
 
 from tests.method_factory import make_model
 from tests.pose_factory import cameras, refinement, some_pixels
-from unmix_plugin.engine.processes.processes import Processes
+from unmix_plugin.engine.processes import Processes
 from unmix_plugin.poses.trust import LARGEST_RATIO, PoseTrust
 
 KNOTS = 10

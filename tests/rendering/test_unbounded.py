@@ -12,7 +12,7 @@ from tests.method_factory import BOX as SMALL_BOX
 from tests.method_factory import CONFIG, initial_data, make_model, make_rays
 from unmix_plugin.editing.edited_field import EditedField
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
-from unmix_plugin.engine.processes.processes import Processes
+from unmix_plugin.engine.processes import Processes
 from unmix_plugin.field import UnmixField, UnmixFieldConfig
 from unmix_plugin.operators.compositing import scale_gradient
 from unmix_plugin.operators.occupancy import OccupancyGrid, skip_distances

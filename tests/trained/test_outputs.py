@@ -12,7 +12,7 @@ from tests.engine.rgb_nerf_plugin import RgbNerf, RgbNerfConfig
 from tests.method_factory import CAMERA, NUM_BANDS, make_scene
 from tests.products.ball_model import RADIUS, ball_scene, cameras_around
 from tests.trained.camera_files.camera_scenes import BOX, FRAME, around, record
-from unmix_plugin.engine.outputs import Output
+from unmix_plugin.engine.registry import Output
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.products.render.survey import needs_survey, take_survey
 from unmix_plugin.trained.material_view import MaterialView

@@ -14,7 +14,7 @@ from tests.method_factory import make_model
 from tests.viewer.pages import decoded, has_control, opened, serving, show_layer
 from tests.viewer.view_factory import BOX, ring, source_of_model
 from unmix_plugin.editing import Light, Recipe, Retint
-from unmix_plugin.engine.outputs import Output
+from unmix_plugin.engine.registry import Output
 from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.training.training_control import DeviceShare

@@ -16,7 +16,7 @@ from unmix_plugin.errors import counted
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from unmix_plugin.engine.processes.processes import Processes
+    from unmix_plugin.engine.processes import Processes
     from unmix_plugin.engine.runs.load_run import LoadedPipeline
     from unmix_plugin.trained.trained_scene import TrainedScene
 
@@ -57,8 +57,7 @@ def evaluate(argv: list[str]) -> None:
     """
     options = tyro.cli(EvalOptions, prog="unmix-eval", args=argv)
 
-    from unmix_plugin.engine.processes.launching import start_together
-    from unmix_plugin.engine.processes.processes import joined
+    from unmix_plugin.engine.processes import joined, start_together
 
     start_together("unmix_plugin.commands.eval", argv, options.num_devices)
     with joined(options.device) as processes:

@@ -30,7 +30,7 @@ from unmix_plugin.products.spectrum import Spectrum
 from unmix_plugin.products.volume import Volume
 
 if TYPE_CHECKING:
-    from unmix_plugin.engine.processes.processes import Processes
+    from unmix_plugin.engine.processes import Processes
     from unmix_plugin.trained.open_run import LoadedRun
 
 PRODUCTS: tuple[Product, ...] = (
@@ -74,8 +74,7 @@ def export(argv: list[str]) -> None:
     product: RunProduct = tyro.cli(
         choices, prog="unmix-export", description="Write products of a run as files.", args=argv
     )
-    from unmix_plugin.engine.processes.launching import start_together
-    from unmix_plugin.engine.processes.processes import joined
+    from unmix_plugin.engine.processes import joined, start_together
 
     count = product.num_devices if isinstance(product, ViewProduct) else 1
     start_together("unmix_plugin.commands.export", argv, count)

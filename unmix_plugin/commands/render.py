@@ -17,8 +17,8 @@ from unmix_plugin.errors import counted
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from unmix_plugin.engine.outputs import Output
-    from unmix_plugin.engine.processes.processes import Processes
+    from unmix_plugin.engine.processes import Processes
+    from unmix_plugin.engine.registry import Output
     from unmix_plugin.products.render.cameras import CameraRequest, RenderCameras
     from unmix_plugin.products.render.formats import FormattedOutput
     from unmix_plugin.products.render.pictures import Palette
@@ -94,8 +94,7 @@ def render(argv: list[str]) -> None:
     options = tyro.cli(RenderOptions, prog="unmix-render", args=argv)
     request = _camera_request(options)
 
-    from unmix_plugin.engine.processes.launching import start_together
-    from unmix_plugin.engine.processes.processes import joined
+    from unmix_plugin.engine.processes import joined, start_together
 
     start_together("unmix_plugin.commands.render", argv, options.num_devices)
     with joined(options.device) as processes:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from unmix_plugin.engine.data_manager import DataManager
+    from unmix_plugin.engine.model import DataManager
     from unmix_plugin.scenes.scene import Scene
 
 from unmix_plugin.engine.runs.run_folder import newest_run

@@ -18,7 +18,7 @@ from unmix_plugin.viewer.access import TrainingViewerOptions
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from unmix_plugin.engine.processes.processes import Processes
+    from unmix_plugin.engine.processes import Processes
     from unmix_plugin.engine.training.trainer import Trainer
     from unmix_plugin.scenes.scene import Scene
 
@@ -38,7 +38,7 @@ def train(argv: list[str]) -> None:
         return
     config, viewing = parse_all(argv)
 
-    from unmix_plugin.engine.processes.launching import start_together
+    from unmix_plugin.engine.processes import start_together
     from unmix_plugin.engine.training.progress import ProgressConsole
     from unmix_plugin.engine.training.training_steps import follow_training, joined_training
 

@@ -19,17 +19,19 @@ if TYPE_CHECKING:
         Target,
         TrainerConfig,
     )
-    from unmix_plugin.engine.data_manager import DataManager
-    from unmix_plugin.engine.field import Field
     from unmix_plugin.engine.geometry.cameras import Cameras
     from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
     from unmix_plugin.engine.machine import step_generator
-    from unmix_plugin.engine.model import Model
-    from unmix_plugin.engine.outputs import Output
+    from unmix_plugin.engine.model import (
+        DataManager,
+        Field,
+        Model,
+        TrainingCallback,
+        TrainingCallbackLocation,
+    )
     from unmix_plugin.engine.pipeline import Pipeline
-    from unmix_plugin.engine.registry import MethodSpecification, discover_methods, find_method
+    from unmix_plugin.engine.registry import MethodSpecification, Output, discover_methods, find_method
     from unmix_plugin.engine.runs.load_run import LoadedModel, load_config, load_model, load_pipeline
-    from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
     from unmix_plugin.engine.training.trainer import Trainer
 
 _MODULES = {
@@ -42,17 +44,13 @@ _MODULES = {
         "Target",
         "TrainerConfig",
     ),
-    "data_manager": ("DataManager",),
-    "field": ("Field",),
     "geometry.cameras": ("Cameras",),
     "geometry.space": ("RayBundle", "SceneBox"),
     "machine": ("step_generator",),
-    "model": ("Model",),
-    "outputs": ("Output",),
+    "model": ("DataManager", "Field", "Model", "TrainingCallback", "TrainingCallbackLocation"),
     "pipeline": ("Pipeline",),
-    "registry": ("MethodSpecification", "discover_methods", "find_method"),
+    "registry": ("MethodSpecification", "Output", "discover_methods", "find_method"),
     "runs.load_run": ("LoadedModel", "load_config", "load_model", "load_pipeline"),
-    "training.callbacks": ("TrainingCallback", "TrainingCallbackLocation"),
     "training.trainer": ("Trainer",),
 }
 

@@ -102,7 +102,7 @@ class OptimizerConfig:
 class DataManagerConfig(InstantiateConfig):
     """Settings that every data manager has."""
 
-    _target: Target = "unmix_plugin.engine.data_manager:DataManager"
+    _target: Target = "unmix_plugin.engine.model:DataManager"
     train_num_rays_per_batch: int = 4096
     """Rays of the first training step; a model may adapt the number later."""
 

@@ -10,10 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from unmix_plugin.engine.configs import PipelineConfig
-from unmix_plugin.engine.data_manager import DataManager
 from unmix_plugin.engine.machine import step_generator, step_seed
-from unmix_plugin.engine.model import Model, TrainOutputs
-from unmix_plugin.engine.training.callbacks import TrainingCallback
+from unmix_plugin.engine.model import DataManager, Model, TrainingCallback, TrainOutputs
 
 MODEL_STREAM = 1
 """Stream of randomness of the model's own draws in a step; data managers draw from stream 0."""

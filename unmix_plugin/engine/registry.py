@@ -1,9 +1,12 @@
-"""Finding methods: ours and any third party's, through entry points."""
+"""Methods: what a package registers for one, what it can show, and finding ours and any third party's."""
 
-from collections.abc import Callable, Sequence
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from typing import Any, Literal, TypeVar
 
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.errors import ConfigError, did_you_mean
@@ -12,20 +15,36 @@ METHOD_GROUP = "unmix_plugin.method_configs"
 """Entry-point group; each entry names a `MethodSpecification`."""
 
 
-@dataclass(frozen=True)
 class MethodSpecification:
     """What a package registers for one method."""
 
-    config: TrainerConfig
-    """Defaults of everything; `config.method_name` is the method's name on the command line."""
-    description: str
-    """One line for the list of methods."""
-    scene: Callable[..., Any] | None = None
-    """From a model, the record of its scene and averaged parameters (None: the model's own) to what commands and the
-    viewer show, as `trained.protocol.RenderableScene`; None: the model's `outputs`."""
-    products: Callable[[], Sequence[Any]] | None = None
-    """What `unmix-export` can make of this method's runs and of no other's, as `products.product.RunProduct` with
-    defaults; called when the command is. None: nothing of its own."""
+    def __init__(
+        self,
+        config: TrainerConfig | Callable[[], TrainerConfig],
+        description: str,
+        scene: Callable[..., Any] | None = None,
+        products: Callable[[], Sequence[Any]] | None = None,
+        name: str | None = None,
+    ) -> None:
+        """
+        Args:
+            config: Defaults of everything, or what makes them when they are first asked for: settings may take seconds
+                to import.
+            description: One line for the list of methods.
+            scene: From a model, the record of its scene and averaged parameters (None: the model's own) to what
+                commands and the viewer show, as `trained.protocol.RenderableScene`; None: the model's `outputs`.
+            products: What `unmix-export` can make of this method's runs and of no other's, as
+                `products.product.RunProduct` with defaults; called when the command is. None: nothing of its own.
+            name: On the command line, as `config.method_name`; needed where `config` is made later.
+        """
+        self._config = config
+        self.description, self.scene, self.products = description, scene, products
+        self.name = self.config.method_name if name is None else name
+
+    @cached_property
+    def config(self) -> TrainerConfig:
+        """Defaults of everything."""
+        return self._config() if callable(self._config) else self._config
 
 
 @dataclass(frozen=True)
@@ -47,14 +66,12 @@ def discover_methods() -> tuple[dict[str, MethodSpecification], list[BrokenPlugi
     broken: list[BrokenPlugin] = []
     for entry_point in sorted(entry_points(group=METHOD_GROUP), key=lambda entry: (entry.name, entry.value)):
         found = _load(entry_point)
-        if isinstance(found, MethodSpecification) and found.config.method_name in methods:
-            found = BrokenPlugin(
-                entry_point.name, f"a method {found.config.method_name} is registered already"
-            )
+        if isinstance(found, MethodSpecification) and found.name in methods:
+            found = BrokenPlugin(entry_point.name, f"a method {found.name} is registered already")
         if isinstance(found, BrokenPlugin):
             broken.append(found)
         else:
-            methods[found.config.method_name] = found
+            methods[found.name] = found
     return methods, broken
 
 
@@ -84,3 +101,52 @@ def _load(entry_point: EntryPoint) -> MethodSpecification | BrokenPlugin:
             entry_point.name, f"{entry_point.value} is a {type(found).__name__}, not a MethodSpecification"
         )
     return found
+
+
+OutputKind = Literal["channels", "shares", "srgb", "linear", "picture", "grey", "map", "labels", "vectors"]
+"""What an output's numbers are, (height, width, ...): any channels, on black; a share or score of each class; sRGB on
+black (3); linear light on black (3); a picture not multiplied by opacity (3); one channel of light on black; any other
+number a pixel; uint8 ids, 255 where nothing is; unit vectors (3)."""
+
+
+@dataclass(frozen=True)
+class Output:
+    """One thing that can be shown of a trained scene."""
+
+    name: str
+    """In commands, files and the viewer."""
+    kind: OutputKind
+    title: str
+    """What a menu says."""
+    what: str
+    """What its numbers are, with their unit."""
+    value_range: tuple[float, float] | None = None
+    """Values at the ends of a colour map; None where only the views tell."""
+    colour_map: str = "viridis"
+    """As matplotlib names it."""
+
+
+AnyOutput = TypeVar("AnyOutput", bound=Output)
+
+
+def named_output(outputs: Iterable[AnyOutput], name: str) -> AnyOutput:
+    """The output of that name.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    named = {output.name: output for output in outputs}
+    if name in named:
+        return named[name]
+    raise no_output(name, named, named)
+
+
+def no_output(name: str, similar: Iterable[str], known: Collection[str]) -> ConfigError:
+    """The error that there is no output of that name; an argument after a colon is not part of what is looked for.
+
+    Args:
+        similar: Names of which some may have been meant.
+        known: What the message lists.
+    """
+    hint = did_you_mean(name.partition(":")[0], similar, likeness=0.5, form=" ({})")
+    return ConfigError(f"there is no output named {name!r}{hint}; known are {', '.join(known)}")

@@ -5,8 +5,6 @@ from pathlib import Path
 from typing import Any
 
 from unmix_plugin.engine import MethodSpecification, OptimizerConfig, PipelineConfig, TrainerConfig
-from unmix_plugin.neumatex.fit.data_manager import ObjectDataManagerConfig
-from unmix_plugin.neumatex.fit.settings import NeumatexModelConfig
 
 
 def _scene(*arguments: Any) -> Any:
@@ -23,8 +21,12 @@ def _products() -> Sequence[Any]:
     return (MaterialProduct(),)
 
 
-neumatex = MethodSpecification(
-    config=TrainerConfig(
+def _neumatex() -> TrainerConfig:
+    """The settings; imported when the method is used."""
+    from unmix_plugin.neumatex.fit.data_manager import ObjectDataManagerConfig
+    from unmix_plugin.neumatex.fit.settings import NeumatexModelConfig
+
+    return TrainerConfig(
         method_name="neumatex",
         output_dir=Path("outputs"),
         max_num_iterations=300,
@@ -39,7 +41,12 @@ neumatex = MethodSpecification(
             "endmembers": OptimizerConfig(lr=1e-3, final_factor=0.1),
             "gains": OptimizerConfig(lr=6e-3, final_factor=0.1),
         },
-    ),
+    )
+
+
+neumatex = MethodSpecification(
+    _neumatex,
+    name="neumatex",
     description="relightable materials on a known mesh, from posed pictures under a known environment",
     scene=_scene,
     products=_products,

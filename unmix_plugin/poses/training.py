@@ -18,7 +18,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
-from unmix_plugin.engine.processes.processes import Processes
+from unmix_plugin.engine.processes import Processes
 from unmix_plugin.field import CoefficientField, UnmixField
 from unmix_plugin.losses.batch_comparison import BatchComparison
 from unmix_plugin.poses.refinement import PoseRefinement

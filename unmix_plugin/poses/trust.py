@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from unmix_plugin.engine.processes.processes import Processes
+from unmix_plugin.engine.processes import Processes
 
 LARGEST_RATIO = 4.0
 """Mean squared error of a knot's pixels over the median, up to which its pose is believed: it varies as much with what

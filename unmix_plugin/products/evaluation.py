@@ -23,7 +23,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from unmix_plugin.engine.pipeline import Pipeline, average_metrics
-from unmix_plugin.engine.processes.processes import Processes
+from unmix_plugin.engine.processes import Processes
 from unmix_plugin.figures.pictures import (
     NEUTRAL,
     ColourScale,

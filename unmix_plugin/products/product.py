@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import tyro
 
 from unmix_plugin.engine.configs import DeviceName
-from unmix_plugin.engine.processes.processes import ALONE, Processes
+from unmix_plugin.engine.processes import ALONE, Processes
 from unmix_plugin.formats.files import refuse_to_overwrite
 from unmix_plugin.trained.run_views import RunView, ViewChoice, resized_views, views_of
 

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from unmix_plugin.engine.processes.processes import Processes
+from unmix_plugin.engine.processes import Processes
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.operators.occupancy import OccupancyGrid
 from unmix_plugin.rendering.renderer import VolumeRenderer

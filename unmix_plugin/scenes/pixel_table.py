@@ -24,7 +24,7 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.engine.machine import step_generator
-from unmix_plugin.engine.processes.processes import processes_here
+from unmix_plugin.engine.processes import processes_here
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.pixel_block import FEWEST_CHANNELS, DrawnPixels, PixelBlock, Projection
 from unmix_plugin.scenes.scene import Scene

@@ -17,10 +17,10 @@ from rich.console import Console
 from torch import nn
 
 from unmix_plugin.engine.configs import OptimizerConfig, TrainerConfig
+from unmix_plugin.engine.model import TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.engine.runs.checkpoints import newest_complete_checkpoint
 from unmix_plugin.engine.runs.load_run import load_model
 from unmix_plugin.engine.training import optimizers as guards
-from unmix_plugin.engine.training.callbacks import TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.engine.training.optimizers import (
     GradientGuard,
     ParameterAverage,

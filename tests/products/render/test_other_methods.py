@@ -10,7 +10,7 @@ import torch
 from tests.formats.video_reading import read_video
 from tests.products.render.render_factory import read_envi, read_exr, views
 from unmix_plugin.engine.geometry.space import SceneBox
-from unmix_plugin.engine.outputs import Output
+from unmix_plugin.engine.registry import Output
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.products.render.files import still_paths
 from unmix_plugin.products.render.formats import choose_formats

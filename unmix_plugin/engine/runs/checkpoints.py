@@ -18,7 +18,7 @@ from safetensors import SafetensorError
 from torch import Tensor, nn
 
 from unmix_plugin.engine.configs import require_in_range
-from unmix_plugin.engine.data_manager import DataManager
+from unmix_plugin.engine.model import DataManager
 from unmix_plugin.engine.runs.atomic_files import (
     OtherFormatError,
     read_run_json,

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from unmix_plugin.engine.data_manager import DataManager
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
+from unmix_plugin.engine.model import DataManager
 from unmix_plugin.engine.runs.atomic_files import read_run_json
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.errors import ConfigError, RunError

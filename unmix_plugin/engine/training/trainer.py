@@ -11,7 +11,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.machine import keep_freed_memory
-from unmix_plugin.engine.processes.processes import ALONE, Processes
+from unmix_plugin.engine.processes import ALONE, Processes
 from unmix_plugin.engine.runs.atomic_files import write_run_json
 from unmix_plugin.engine.runs.checkpoints import (
     AVERAGE,

@@ -12,13 +12,13 @@ from torch import Tensor
 
 from unmix_plugin.engine.configs import OptimizerConfig, TrainerConfig
 from unmix_plugin.engine.machine import resolve_device, seed_everything
+from unmix_plugin.engine.model import TrainingCallbackLocation, run_callbacks
 from unmix_plugin.engine.pipeline import Pipeline
-from unmix_plugin.engine.processes.processes import ALONE, Follower, Processes, joined, require_equal_settings
+from unmix_plugin.engine.processes import ALONE, Follower, Processes, joined, require_equal_settings
 from unmix_plugin.engine.runs.checkpoints import Checkpoint, TrainingRecord, restore_training
 from unmix_plugin.engine.runs.config_json import config_to_json
 from unmix_plugin.engine.runs.load_run import require_checkpoint, require_data
 from unmix_plugin.engine.runs.run_folder import open_run_folder
-from unmix_plugin.engine.training.callbacks import TrainingCallbackLocation, run_callbacks
 from unmix_plugin.engine.training.optimizers import (
     GradientGuard,
     build_optimizer,

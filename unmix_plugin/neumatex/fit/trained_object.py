@@ -24,7 +24,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
-from unmix_plugin.engine.outputs import Output, named_output
+from unmix_plugin.engine.registry import Output, named_output
 from unmix_plugin.engine.runs.scene_record import SceneRecord
 from unmix_plugin.errors import ConfigError, did_you_mean
 from unmix_plugin.neumatex.fit.tone import SpectralDisplay

@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from unmix_plugin.engine.outputs import Output
+from unmix_plugin.engine.registry import Output
 from unmix_plugin.figures.pictures import Canvas, CanvasLayout
 from unmix_plugin.formats.envi import envi_cube_paths, envi_cube_rows
 from unmix_plugin.formats.exr import layer_names, write_exr, write_spectral_exr

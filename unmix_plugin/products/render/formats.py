@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
-from unmix_plugin.engine.outputs import Output, OutputKind
+from unmix_plugin.engine.registry import Output, OutputKind
 from unmix_plugin.errors import ConfigError, did_you_mean
 from unmix_plugin.trained.protocol import RenderableScene
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from unmix_plugin.engine.processes.processes import Processes
+from unmix_plugin.engine.processes import Processes
 from unmix_plugin.formats.video import FrameSink
 
 

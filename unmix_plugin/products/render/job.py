@@ -17,8 +17,8 @@ from types import TracebackType
 import numpy as np
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.outputs import Output
-from unmix_plugin.engine.processes.processes import ALONE, Processes
+from unmix_plugin.engine.processes import ALONE, Processes
+from unmix_plugin.engine.registry import Output
 from unmix_plugin.products.render.cameras import RenderCameras
 from unmix_plugin.products.render.files import (
     COVERAGE,

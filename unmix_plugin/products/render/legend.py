@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from unmix_plugin.engine.outputs import Output
+from unmix_plugin.engine.registry import Output
 from unmix_plugin.figures.pictures import ColourScale
 from unmix_plugin.figures.plotting import draw_colour_bar, draw_swatch, figure_bytes
 from unmix_plugin.products.render.formats import FormattedOutput

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float64, UInt8
 
-from unmix_plugin.engine.outputs import Output
+from unmix_plugin.engine.registry import Output
 from unmix_plugin.figures.pictures import (
     NEUTRAL,
     ColourScale,

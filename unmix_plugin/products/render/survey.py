@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from unmix_plugin.engine.outputs import Output
+from unmix_plugin.engine.registry import Output
 from unmix_plugin.figures.pictures import ColourScale
 from unmix_plugin.products.render.pictures import scale_of
 from unmix_plugin.spectral.maps.reflectance_maps import Score, is_reflectance_map, parse_reflectance_map

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from unmix_plugin.engine.outputs import OutputKind
+from unmix_plugin.engine.registry import OutputKind
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.colour.conversion import band_composite_matrix
 from unmix_plugin.spectral.maps.reflectance_maps import parse_reflectance_map

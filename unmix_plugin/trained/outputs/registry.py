@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from unmix_plugin.engine.outputs import Output, no_output
+from unmix_plugin.engine.registry import Output, no_output
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.materials import Materials

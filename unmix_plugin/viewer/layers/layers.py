@@ -19,7 +19,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
-from unmix_plugin.engine.outputs import Output, OutputKind
+from unmix_plugin.engine.registry import Output, OutputKind
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import (

@@ -1,28 +1,33 @@
 """The processes that train one model together, each on its own rays; usually there is one.
 
 The first process decides, writes and shows; the others follow it. Gradients are averaged in every step, so that all
-take the same step from the same parameters.
+take the same step from the same parameters. `start_together` starts them on one machine, as `torchrun
+--nproc-per-node` does; they find each other by the environment that it, `torchrun` and Slurm scripts set.
 
 Notation: `P` processes.
-
-How a process finds the others: by the environment that `torchrun`, Slurm scripts and `launching` set.
 """
 
 from __future__ import annotations
 
 import importlib
 import os
+import signal
+import socket
+import subprocess
+import sys
+import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import timedelta
+from types import FrameType
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, distributed, nn
 
-from unmix_plugin.engine.processes.launching import are_started
+from unmix_plugin.engine.configs import MOST_PROCESSES, require_in_range
 from unmix_plugin.errors import ConfigError, RunError, UnmixError
 
 _T = TypeVar("_T")
@@ -127,11 +132,14 @@ class Processes:
             yield
             return
         failure: Exception | None = None
+        described: str | None = None
         try:
             yield
         except Exception as error:  # noqa: BLE001 - raised again below, by the first process
             failure = error
-        said = self.gather(None if failure is None else _described(failure))
+            is_ours = isinstance(error, UnmixError)
+            described = str(error) if is_ours else traceback.format_exception_only(error)[-1].strip()
+        said = self.gather(described)
         failed = [rank for rank, text in enumerate(said) if text is not None]
         if not failed:
             return
@@ -170,21 +178,18 @@ ALONE = Processes()
 """One process, which has nobody to talk to."""
 
 
-def _described(error: Exception) -> str:
-    return str(error) if isinstance(error, UnmixError) else traceback.format_exception_only(error)[-1].strip()
-
-
 _PATIENCE = timedelta(days=7)
 """How long processes wait for the first, which may be paused; one that ends is noticed at once."""
 
 
 def processes_here() -> int:
     """Processes of this training on this machine, which share its memory."""
-    return max(1, int(os.environ.get("LOCAL_WORLD_SIZE", "1"))) if are_started() else 1
+    return max(1, int(os.environ.get("LOCAL_WORLD_SIZE", "1"))) if _are_started() else 1
 
 
-def join(device: str) -> Processes:
-    """This process among the others, all of which call this; alone where it was not started as one of several.
+@contextmanager
+def joined(device: str) -> Iterator[Processes]:
+    """Context in which this process works with those that were started with it, if it was not started alone.
 
     Args:
         device: `auto`, `cpu` or `cuda`. On CUDA each process of a machine takes a device of its own.
@@ -192,51 +197,49 @@ def join(device: str) -> Processes:
         ConfigError: fewer devices than processes, or PyTorch lacks what they talk through; the first process of each
             machine says so.
     """
-    if not are_started():
-        return ALONE
-    rank, count = int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
+    processes = _join(device) if _are_started() else ALONE
+    try:
+        yield processes
+    except BaseException as error:
+        # Clear the local variables an error keeps: the group is among them, and its threads end with it alone.
+        chained: BaseException | None = error if processes.count > 1 else None
+        while chained is not None:
+            traceback.clear_frames(chained.__traceback__)
+            chained = chained.__cause__ or chained.__context__
+        raise
+    finally:
+        if processes.count > 1 and distributed.is_initialized():
+            distributed.destroy_process_group()
+
+
+def _are_started() -> bool:
+    """Whether this process was started as one of several."""
+    return int(os.environ.get("WORLD_SIZE", "1")) > 1 and "RANK" in os.environ
+
+
+def _join(device: str) -> Processes:
     local_rank = int(os.environ.get("LOCAL_RANK", "0"))
     is_cuda = device == "cuda" or (device == "auto" and torch.cuda.is_available())
     backend = "nccl" if is_cuda else "gloo"
-    try:
-        if is_cuda:
-            _take_device(local_rank, processes_here())
-        _require_backend(backend)
-    except ConfigError:
-        if local_rank > 0:
-            raise Follower(2) from None
-        raise
+    has_it = {"nccl": distributed.is_nccl_available, "gloo": distributed.is_gloo_available}[backend]
+    found = torch.cuda.device_count()
+    fault = None
+    if is_cuda and processes_here() > found:
+        fault = f"{processes_here()} processes on this machine, which has {found} CUDA devices"
+    elif not distributed.is_available() or not has_it():
+        fault = (
+            f"this PyTorch is built without {backend}, through which processes talk: install another build, or train "
+            "with one process"
+        )
+    if fault is not None:
+        raise Follower(2) if local_rank > 0 else ConfigError(fault)
+    if is_cuda:
+        torch.cuda.set_device(local_rank)
     # Imported later it would keep the group in defaults of its functions, and the group's threads would live on when
     # Python ends, which aborts the process where one of them then lets go of a tensor.
     importlib.import_module("torch.distributed.nn")
     distributed.init_process_group(backend, timeout=_PATIENCE)
-    return Processes(rank, count)
-
-
-def _leave(processes: Processes) -> None:
-    """End what `join` began."""
-    if processes.count > 1 and distributed.is_initialized():
-        distributed.destroy_process_group()
-
-
-@contextmanager
-def joined(device: str) -> Iterator[Processes]:
-    """Context in which this process works with those that were started with it.
-
-    Args:
-        device: As `join` takes it.
-    Raises:
-        ConfigError: as `join`.
-    """
-    processes = join(device)
-    try:
-        yield processes
-    except BaseException as error:
-        if processes.count > 1:
-            _let_go(error)
-        raise
-    finally:
-        _leave(processes)
+    return Processes(int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"]))
 
 
 def require_equal_settings(processes: Processes, settings: Mapping[str, Any]) -> None:
@@ -265,30 +268,95 @@ def require_equal_settings(processes: Processes, settings: Mapping[str, Any]) ->
 def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name, value in settings.items():
-        found.update(
-            _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
-        )
+        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
     return found
 
 
-def _let_go(error: BaseException | None) -> None:
-    """Clear the local variables an error keeps: the group is among them, and its threads end with it alone."""
-    while error is not None:
-        traceback.clear_frames(error.__traceback__)
-        error = error.__cause__ or error.__context__
+_GRACE_SECONDS = 10.0
+"""For the processes that are left to say what is wrong and to save, once one has ended."""
 
 
-def _take_device(local_rank: int, processes: int) -> None:
-    found = torch.cuda.device_count()
-    if processes > found:
-        raise ConfigError(f"{processes} processes on this machine, which has {found} CUDA devices")
-    torch.cuda.set_device(local_rank)
+def start_together(module: str, argv: Sequence[str], count: int) -> None:
+    """Run a command in several processes and end this one, unless it is one of them or one is enough.
+
+    Args:
+        module, argv: As `run_processes` takes them.
+        count: Processes asked for.
+    Raises:
+        ConfigError: fewer than one.
+        SystemExit: the processes have ended; their exit code.
+    """
+    require_in_range("num-devices", count, 1, MOST_PROCESSES)
+    if count > 1 and not _are_started():
+        sys.exit(run_processes(module, argv, count))
 
 
-def _require_backend(backend: str) -> None:
-    has_it = {"nccl": distributed.is_nccl_available, "gloo": distributed.is_gloo_available}[backend]
-    if not distributed.is_available() or not has_it():
-        raise ConfigError(
-            f"this PyTorch is built without {backend}, through which processes talk: install another build, or train "
-            "with one process"
+def run_processes(module: str, argv: Sequence[str], count: int) -> int:
+    """Run `python -m module argv` in `count` processes that find each other; only the first one's output is shown.
+
+    Returns:
+        Exit code of the first process, which has said what went wrong if anything did.
+    Raises:
+        RunError: a process was killed; by then all have ended.
+    """
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = int(probe.getsockname()[1])
+    shared = {
+        "OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // count)),
+        **os.environ,
+        "WORLD_SIZE": str(count),
+        "LOCAL_WORLD_SIZE": str(count),
+        "MASTER_ADDR": "127.0.0.1",
+        "MASTER_PORT": str(port),
+    }
+    workers = [
+        subprocess.Popen(
+            [sys.executable, "-m", module, *argv],
+            env={**shared, "RANK": str(rank), "LOCAL_RANK": str(rank)},
+            stdout=None if rank == 0 else subprocess.DEVNULL,
         )
+        for rank in range(count)
+    ]
+    codes: list[int | None] = [None] * count
+    try:
+        with _forwarded_signals(workers[0]):
+            while workers[0].poll() is None and not any(worker.poll() for worker in workers):
+                time.sleep(0.05)
+            deadline = time.monotonic() + _GRACE_SECONDS
+            for rank, worker in enumerate(workers):
+                with suppress(subprocess.TimeoutExpired):
+                    codes[rank] = worker.wait(max(0.0, deadline - time.monotonic()))
+    finally:
+        for worker in workers:
+            with suppress(OSError):
+                worker.kill()
+    first = codes[0]
+    if first is not None and (first > 0 or not any(codes)):
+        return first
+    rank = next(rank for rank, code in enumerate(codes) if code)
+    raise RunError(
+        f"process {rank + 1} of {count} ended with exit code {codes[rank]}, and with it all others. Checkpoints saved "
+        "before are whole: go on with --load-run"
+    )
+
+
+@contextmanager
+def _forwarded_signals(first: subprocess.Popen[bytes]) -> Iterator[None]:
+    """Context in which the first process gets the signals of this one; Ctrl-C reaches all of a terminal by itself."""
+
+    def forward(number: int, _frame: FrameType | None) -> None:
+        with suppress(OSError):
+            first.send_signal(number)
+
+    def ignore(_number: int, _frame: FrameType | None) -> None:
+        return
+
+    handlers = {"SIGTERM": forward, "SIGHUP": forward, "SIGINT": ignore}
+    known = {getattr(signal, name): handler for name, handler in handlers.items() if hasattr(signal, name)}
+    before = {number: signal.signal(number, handler) for number, handler in known.items()}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

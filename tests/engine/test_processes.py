@@ -1,7 +1,4 @@
-"""What keeps processes from working together is said once, by the first of a machine.
-
-What several processes that train one model owe each other.
-"""
+"""What several processes that train one model owe each other; what keeps them from it is said once, by the first."""
 
 import json
 from pathlib import Path
@@ -10,9 +7,8 @@ import pytest
 import torch
 from torch import distributed
 
-from tests.engine.processes.worker import STEPS, config_for, fixed_batch
-from unmix_plugin.engine.processes.launching import run_processes
-from unmix_plugin.engine.processes.processes import ALONE, Follower, Processes, join
+from tests.engine.process_worker import STEPS, config_for, fixed_batch
+from unmix_plugin.engine.processes import ALONE, Follower, Processes, joined, run_processes
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.engine.training.training_steps import prepare_steps
 from unmix_plugin.errors import ConfigError
@@ -30,12 +26,15 @@ def second_of_two(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
 
 def test_too_few_devices_are_told_by_the_first_process_alone(second_of_two):
     second_of_two.setattr(torch.cuda, "device_count", lambda: 1)
-    with pytest.raises(Follower) as ended:
-        join("cuda")
+    with pytest.raises(Follower) as ended, joined("cuda"):
+        pass
     assert ended.value.code == 2
     second_of_two.setenv("LOCAL_RANK", "0")
-    with pytest.raises(ConfigError, match="2 processes on this machine, which has 1 CUDA devices"):
-        join("cuda")
+    with (
+        pytest.raises(ConfigError, match="2 processes on this machine, which has 1 CUDA devices"),
+        joined("cuda"),
+    ):
+        pass
 
 
 @pytest.mark.parametrize(("device", "backend"), [("cuda", "nccl"), ("cpu", "gloo")])
@@ -43,19 +42,20 @@ def test_a_pytorch_that_lacks_what_processes_talk_through_is_told_by_the_first(
     second_of_two, device, backend
 ):
     second_of_two.setattr(distributed, f"is_{backend}_available", lambda: False)
-    with pytest.raises(Follower):
-        join(device)
+    with pytest.raises(Follower), joined(device):
+        pass
     second_of_two.setenv("LOCAL_RANK", "0")
-    with pytest.raises(ConfigError, match=f"built without {backend}"):
-        join(device)
+    with pytest.raises(ConfigError, match=f"built without {backend}"), joined(device):
+        pass
 
 
 def test_a_process_that_was_started_alone_has_nothing_to_join(monkeypatch):
     monkeypatch.delenv("WORLD_SIZE", raising=False)
-    assert join("cuda") is ALONE
+    with joined("cuda") as found:
+        assert found is ALONE
 
 
-MODULE = "tests.engine.processes.worker"
+MODULE = "tests.engine.process_worker"
 
 
 @pytest.fixture
