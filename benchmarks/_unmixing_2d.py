@@ -18,8 +18,14 @@ from torch import Tensor
 from unmix_plugin.spectral.segmentation import material_scores
 from unmix_plugin.spectral.unmixing.endmembers import drop_uninformative_pixels
 from unmix_plugin.spectral.unmixing.num_materials import propose_num_materials
-from unmix_plugin.trained.evaluation import Evaluation, SceneTruth, ViewTruth, scene_truth, view_truth
-from unmix_plugin.trained.view_rendering import RenderedView
+from unmix_plugin.trained.evaluation import (
+    Evaluation,
+    PredictedView,
+    SceneTruth,
+    ViewTruth,
+    scene_truth,
+    view_truth,
+)
 
 if TYPE_CHECKING:
     from unmix_plugin.scenes.scene import Scene
@@ -74,13 +80,13 @@ class PixelBaselines:
         return find_endmembers(self._training, self.truth.num_materials, find, generator)
 
 
-def explain_view(view: ViewTruth, endmembers: Tensor, explain: Explain) -> RenderedView:
+def explain_view(view: ViewTruth, endmembers: Tensor, explain: Explain) -> PredictedView:
     """What a method says of a view's true pixels, in the form of a model's prediction."""
     height, width, _ = view.spectra.shape
     pixels = view.spectra.flatten(0, 1)
     amounts = explain(pixels, endmembers)
     shares = amounts / amounts.sum(dim=1, keepdim=True).clamp(min=1e-12)
-    return RenderedView(
+    return PredictedView(
         spectra=(amounts @ endmembers).unflatten(0, (height, width)),
         accumulation=view.opacity,
         abundances=shares.unflatten(0, (height, width)) * view.opacity[..., None],

@@ -55,10 +55,8 @@ def measure(path: Path, device: str) -> tuple[str, dict[str, Any]]:
     """Scene name and figures of a run."""
     from unmix_plugin.engine.runs.load_run import load_pipeline
     from unmix_plugin.spectral.segmentation import NOTHING_ID
-    from unmix_plugin.trained.evaluation import Evaluation, scene_truth, view_truth
-    from unmix_plugin.trained.open_run import require_materials
-    from unmix_plugin.trained.snapshot import snapshot
-    from unmix_plugin.trained.view_rendering import render_view
+    from unmix_plugin.trained.evaluation import Evaluation, render_view, scene_truth, view_truth
+    from unmix_plugin.trained.open_run import require_materials, snapshot
 
     loaded = load_pipeline(path, device)
     scene, name = loaded.pipeline.datamanager.scene, loaded.config.method_name  # type: ignore[attr-defined]

@@ -79,9 +79,8 @@ def train(data: Path, output_dir: Path, steps: int, device: str) -> Path:
 def measure(run: Path, device: str) -> np.ndarray:
     """PSNR of each band in dB, mean over the evaluation views."""
     from unmix_plugin.engine.runs.load_run import load_pipeline
-    from unmix_plugin.trained.open_run import require_materials
-    from unmix_plugin.trained.snapshot import snapshot
-    from unmix_plugin.trained.view_rendering import render_view
+    from unmix_plugin.trained.evaluation import render_view
+    from unmix_plugin.trained.open_run import require_materials, snapshot
 
     loaded = load_pipeline(run, device)
     scene, name = loaded.pipeline.datamanager.scene, loaded.config.method_name  # type: ignore[attr-defined]

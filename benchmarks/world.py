@@ -98,7 +98,7 @@ def look(run: Path, name: str, place: Path) -> tuple[float, float]:
     from unmix_plugin.scenes.demo.scene import PLACES
     from unmix_plugin.scenes.demo.shading import THINGS
     from unmix_plugin.scenes.demo.shapes import first_hits
-    from unmix_plugin.trained.view_rendering import render_view
+    from unmix_plugin.trained.evaluation import render_view
 
     scene: Any = open_run(run)
     truth = load_scene(place / name)

@@ -15,7 +15,7 @@ from unmix_plugin.field import UnmixFieldConfig
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.model_settings import UnmixModelConfig
 from unmix_plugin.rendering.settings import RendererConfig
-from unmix_plugin.trained.snapshot import unmix_scene
+from unmix_plugin.trained.open_run import unmix_scene
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 NUM_BANDS = 5

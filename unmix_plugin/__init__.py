@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from unmix_plugin.editing.apply import edit_scene
     from unmix_plugin.editing.recipe import Light, Recipe
-    from unmix_plugin.editing.yaml_reading import read_recipe
+    from unmix_plugin.editing.recipe_files import read_recipe
     from unmix_plugin.engine.geometry.cameras import Cameras
     from unmix_plugin.products.save import save
-    from unmix_plugin.trained.material_view import MaterialView
     from unmix_plugin.trained.open_run import open_run
+    from unmix_plugin.trained.outputs import MaterialView
     from unmix_plugin.trained.protocol import Probe
     from unmix_plugin.trained.trained_scene import TrainedScene
 
@@ -35,13 +35,13 @@ __all__ = [
 _MODULES = {
     "Cameras": "engine.geometry.cameras",
     "Light": "editing.recipe",
-    "MaterialView": "trained.material_view",
+    "MaterialView": "trained.outputs",
     "Probe": "trained.protocol",
     "Recipe": "editing.recipe",
     "TrainedScene": "trained.trained_scene",
     "edit_scene": "editing.apply",
     "open_run": "trained.open_run",
-    "read_recipe": "editing.yaml_reading",
+    "read_recipe": "editing.recipe_files",
     "save": "products.save",
 }
 

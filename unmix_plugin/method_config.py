@@ -11,7 +11,7 @@ from unmix_plugin.engine.registry import MethodSpecification
 
 
 def _scene(*arguments: Any) -> Any:
-    from unmix_plugin.trained.snapshot import unmix_scene
+    from unmix_plugin.trained.open_run import unmix_scene
 
     return unmix_scene(*arguments)
 

@@ -9,8 +9,7 @@ from tests.commands.running import run
 from tests.docs.pages import ROOT, text_of
 from unmix_plugin.commands.demo_scene import write_demo_scene
 from unmix_plugin.commands.eval import evaluate
-from unmix_plugin.commands.export import PRODUCTS, export
-from unmix_plugin.commands.method_products import own_products
+from unmix_plugin.commands.export import PRODUCTS, export, own_products
 from unmix_plugin.commands.process import process
 from unmix_plugin.commands.process_inspect import inspect_command
 from unmix_plugin.commands.render import render

@@ -5,7 +5,7 @@ import pytest
 
 from tests.editing.scenes import CAMERAS, lit_scene
 from unmix_plugin.editing import Light, relight
-from unmix_plugin.editing.light import relighting_factors
+from unmix_plugin.editing.apply import relighting_factors
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_power, xyz_matrix

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unmix_plugin.editing.retint import LitReflectance, retinted
+from unmix_plugin.editing.apply import LitReflectance, retinted
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_power, linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.library.material_library import measured_library

@@ -9,8 +9,7 @@ from torch.testing import assert_close
 
 from tests.editing.scenes import CAMERAS, LIGHT, edited, lit_scene
 from unmix_plugin.editing import sample_seen
-from unmix_plugin.editing.material_state import MaterialState
-from unmix_plugin.editing.seen import Appearance, appearance_of
+from unmix_plugin.editing.edited_field import Appearance, MaterialState, appearance_of
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.materials import Coefficients

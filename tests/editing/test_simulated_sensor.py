@@ -9,7 +9,7 @@ from torch.testing import assert_close
 
 from tests.editing.scenes import CAMERAS, LIGHT, edited, lit_scene, rendered, tensors_of
 from tests.method_factory import WAVELENGTHS_NM, make_scene
-from unmix_plugin.editing.simulated_sensor import with_sensor
+from unmix_plugin.editing.apply import with_sensor
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix

@@ -27,8 +27,7 @@ from unmix_plugin.engine.runs.scene_record import read_scene_record
 from unmix_plugin.engine.training.progress import _keep_until
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.scenes.scene import Normalisation, SceneOptions
-from unmix_plugin.trained.run_views import recorded_views
-from unmix_plugin.trained.world_frame import world_frame
+from unmix_plugin.trained.run_views import recorded_views, world_frame
 
 
 def config_reader() -> Reader:

@@ -26,7 +26,7 @@ from unmix_plugin.scenes.reading.transforms_json import read_transforms
 from unmix_plugin.scenes.scene import Normalisation, SceneOptions
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 from unmix_plugin.spectral.maps.indices import parse_formula
-from unmix_plugin.trained.camera_files.camera_files import read_camera_file
+from unmix_plugin.trained.camera_files import read_camera_file
 
 _SIZE = (16, 20)
 

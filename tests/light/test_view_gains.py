@@ -20,9 +20,8 @@ from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.light.view_gains import ViewGains, smooth_terms
 from unmix_plugin.losses.training_losses import LossConfig
 from unmix_plugin.model import UnmixModel
-from unmix_plugin.trained.evaluation import ViewTruth
-from unmix_plugin.trained.view_alignment import align_gain
-from unmix_plugin.trained.view_rendering import RenderedView
+from unmix_plugin.trained.alignment import align_gain
+from unmix_plugin.trained.evaluation import PredictedView, ViewTruth
 
 WAVELENGTHS = torch.tensor(WAVELENGTHS_NM)
 
@@ -86,7 +85,7 @@ def test_a_view_is_aligned_by_exposure_and_smooth_white_balance():
     gain = (torch.tensor([0.2, -0.1, 0.05]) @ smooth_terms(WAVELENGTHS)).exp()
     truth = ViewTruth("view", shown * gain, torch.ones(8, 9, dtype=torch.bool))
     ones = torch.ones(8, 9)
-    predicted = RenderedView(shown, ones, ones[..., None], ones.to(torch.uint8), ones[..., None])
+    predicted = PredictedView(shown, ones, ones[..., None], ones.to(torch.uint8), ones[..., None])
     assert_close(align_gain(predicted, truth, WAVELENGTHS).spectra, truth.spectra, atol=1e-4, rtol=0)
 
 
@@ -94,7 +93,7 @@ def test_a_view_without_matter_stays_as_it_is():
     spectra = torch.zeros(4, 4, NUM_BANDS)
     truth = ViewTruth("void", spectra, torch.ones(4, 4, dtype=torch.bool), torch.zeros(4, 4))
     ones = torch.ones(4, 4)
-    predicted = RenderedView(spectra, ones, ones[..., None], ones.to(torch.uint8), ones[..., None])
+    predicted = PredictedView(spectra, ones, ones[..., None], ones.to(torch.uint8), ones[..., None])
     assert align_gain(predicted, truth, WAVELENGTHS) is predicted
 
 

@@ -14,8 +14,7 @@ from unmix_plugin.commands.train import train
 from unmix_plugin.engine import load_model
 from unmix_plugin.neumatex.export.product import material_paths
 from unmix_plugin.neumatex.fit.trained_object import TrainedObject
-from unmix_plugin.trained.open_run import load_run
-from unmix_plugin.trained.snapshot import snapshot
+from unmix_plugin.trained.open_run import load_run, snapshot
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,7 @@ from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.training.training_control import DeviceShare
 from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.formats.exr import write_exr
-from unmix_plugin.trained.model_scene import ModelView
-from unmix_plugin.trained.relighting import LightChoice, relit
+from unmix_plugin.trained.model_scene import LightChoice, ModelView, relit
 from unmix_plugin.viewer.rendering.scene import SceneSource
 from unmix_plugin.viewer.session import Services
 

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
-from unmix_plugin.products.cloud import is_outlier, plane_normals, thinned
+from unmix_plugin.products.point_cloud import is_outlier, plane_normals, thinned
 
 
 def sphere(count: int, seed: int = 0) -> np.ndarray:

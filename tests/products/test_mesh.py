@@ -17,17 +17,18 @@ from tests.products.ball_model import (
 from tests.products.mesh_reading import loaded_mesh
 from tests.trained.camera_files.camera_scenes import FRAME
 from unmix_plugin.errors import ConfigError, RunError
-from unmix_plugin.products.mesh import mesh_paths, require_sound, write_mesh
-from unmix_plugin.products.mesh_extraction import (
+from unmix_plugin.products.mesh import (
     TriangleMesh,
     extract_mesh,
     filled,
+    mesh_paths,
+    require_sound,
     surface_density,
     trim_unseen,
     without_stray_pieces,
+    write_mesh,
 )
-from unmix_plugin.trained.density_grid import GridPoints, sample_slice
-from unmix_plugin.trained.surface import SeenSurface
+from unmix_plugin.trained.surface import GridPoints, SeenSurface, sample_slice
 
 SCENE = ball_scene()
 PIXEL = SCENE.pixel_size

@@ -8,7 +8,7 @@ from PIL import Image
 from tests.method_factory import make_scene
 from tests.trained.camera_files.camera_scenes import around
 from unmix_plugin.products.pca import find_components, survey_view, write_components, write_pca
-from unmix_plugin.trained.view_rendering import render_view
+from unmix_plugin.trained.evaluation import render_view
 
 SCENE = make_scene()
 CAMERA = around()[1]

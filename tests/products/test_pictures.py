@@ -30,9 +30,8 @@ from unmix_plugin.products.evaluation import (
 from unmix_plugin.products.segmentation import draw_segmentation, paint_ids, scores_of
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.materials import Materials
-from unmix_plugin.trained.evaluation import Evaluation, SceneTruth, ViewTruth
+from unmix_plugin.trained.evaluation import Evaluation, PredictedView, SceneTruth, ViewTruth
 from unmix_plugin.trained.run_materials import endmember_colours
-from unmix_plugin.trained.view_rendering import RenderedView
 
 SCALE = ColourScale("viridis", 0.0, 1.0, "abundance")
 
@@ -56,14 +55,14 @@ def materials(count: int, num_bands: int = 8) -> Materials:
     return Materials(Bands.of(np.linspace(400, 700, num_bands)), spectra, torch.zeros(0, num_bands))
 
 
-def rendered(given: Materials, height: int = 12, width: int = 16) -> RenderedView:
+def rendered(given: Materials, height: int = 12, width: int = 16) -> PredictedView:
     """Random abundances; nothing in the left quarter."""
     generator = torch.Generator().manual_seed(1)
     shares = torch.softmax(9 * torch.rand(height, width, len(given.endmembers), generator=generator), dim=-1)
     shares[:, : width // 4] = 0
     ids = shares.argmax(dim=-1).to(torch.uint8)
     ids[:, : width // 4] = 255
-    return RenderedView(shares @ given.endmembers, shares.sum(dim=-1), shares, ids, shares)
+    return PredictedView(shares @ given.endmembers, shares.sum(dim=-1), shares, ids, shares)
 
 
 @pytest.mark.parametrize("count", [1, 3, 26])

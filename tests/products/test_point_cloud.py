@@ -6,8 +6,7 @@ from plyfile import PlyData
 from tests.products.ball_model import ALL_ROUND, RADIUS, ball_scene, cameras_around
 from tests.trained.camera_files.camera_scenes import FRAME
 from unmix_plugin.errors import ConfigError, RunError
-from unmix_plugin.products.point_cloud import require_count, write_point_cloud
-from unmix_plugin.products.point_scores import require_point_scores
+from unmix_plugin.products.point_cloud import require_count, require_point_scores, write_point_cloud
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.trained.surface import SeenSurface

@@ -6,7 +6,7 @@ import torch
 
 from tests.method_factory import WAVELENGTHS_NM, make_model
 from unmix_plugin.errors import ConfigError, SpectrumError
-from unmix_plugin.products.point_scores import require_point_scores
+from unmix_plugin.products.point_cloud import require_point_scores
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 

@@ -10,7 +10,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.products.poses import poses_json
 from unmix_plugin.scenes.scene import Normalisation
-from unmix_plugin.trained.camera_files.camera_files import read_camera_file
+from unmix_plugin.trained.camera_files import read_camera_file
 from unmix_plugin.trained.run_views import RunView
 
 FRAME = Normalisation(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([0.3, 0.2, -1.0]), 0.5)

@@ -17,8 +17,8 @@ from unmix_plugin.products.abundances import Abundances
 from unmix_plugin.products.cubes import Cubes
 from unmix_plugin.products.endmembers import endmember_paths, write_endmembers
 from unmix_plugin.products.segmentation import Segmentation, legend_bytes
+from unmix_plugin.trained.evaluation import render_view
 from unmix_plugin.trained.run_materials import endmember_colours
-from unmix_plugin.trained.view_rendering import render_view
 
 SCENE = make_scene()
 MATERIALS = SCENE.materials

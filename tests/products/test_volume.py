@@ -9,7 +9,7 @@ from tests.products.ball_model import INNER_RADIUS, RADIUS, ball_scene
 from tests.trained.camera_files.camera_scenes import FRAME
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.products.volume import volume_path, write_volume
-from unmix_plugin.trained.density_grid import GridPoints, sample_densities, sample_slice
+from unmix_plugin.trained.surface import GridPoints, sample_densities, sample_slice
 
 SCENE = ball_scene()
 GRID = GridPoints.over(SCENE.scene_box.aabb, 16)

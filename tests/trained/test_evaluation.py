@@ -17,13 +17,13 @@ from unmix_plugin.spectral.sensor import SceneSensor
 from unmix_plugin.trained.evaluation import (
     VIEW_FIGURES,
     Evaluation,
+    PredictedView,
     SceneTruth,
     ViewTruth,
     finite_or_none,
     scene_truth,
     view_truth,
 )
-from unmix_plugin.trained.view_rendering import RenderedView
 
 SHUFFLED = [2, 0, 1]
 
@@ -51,7 +51,7 @@ def view(scene: SceneTruth) -> ViewTruth:
     return ViewTruth("view", spectra.float(), torch.ones(10, 12, dtype=torch.bool), alpha, labels, abundances)
 
 
-def perfect(view: ViewTruth, order: list[int]) -> RenderedView:
+def perfect(view: ViewTruth, order: list[int]) -> PredictedView:
     """What a model renders that knows the truth, its endmembers numbered in another order."""
     assert view.labels is not None
     assert view.abundances is not None
@@ -59,10 +59,10 @@ def perfect(view: ViewTruth, order: list[int]) -> RenderedView:
     position[order] = torch.arange(len(order), dtype=torch.uint8)
     position[255] = 255
     composited = (view.abundances * view.opacity[..., None])[..., order]
-    return RenderedView(view.spectra, view.opacity, composited, position[view.labels.long()], composited)
+    return PredictedView(view.spectra, view.opacity, composited, position[view.labels.long()], composited)
 
 
-def evaluated(scene: SceneTruth, view: ViewTruth, predicted: RenderedView, order: list[int]) -> Evaluation:
+def evaluated(scene: SceneTruth, view: ViewTruth, predicted: PredictedView, order: list[int]) -> Evaluation:
     """An evaluation of one view."""
     assert scene.endmembers is not None
     evaluation = Evaluation(scene, scene.endmembers[order])
@@ -201,7 +201,7 @@ def test_images_too_small_for_its_window_have_no_ssim(scene):
     spectra = torch.rand(6, 9, 5)
     view = ViewTruth("small", spectra, torch.ones(6, 9, dtype=torch.bool))
     blank = torch.zeros(6, 9)
-    predicted = RenderedView(
+    predicted = PredictedView(
         spectra, blank, torch.zeros(6, 9, 3), blank.to(torch.uint8), torch.zeros(6, 9, 3)
     )
     evaluation = Evaluation(scene, scene.endmembers)
@@ -276,7 +276,7 @@ def test_a_view_is_measured_as_its_sensor_sees_it():
     valid = torch.ones(10, 12, dtype=torch.bool)
     evaluation = Evaluation(SceneTruth(Bands.of([450, 500, 550, 600, 650]), 0), torch.rand(3, 5))
     flat = torch.zeros(10, 12)
-    predicted = RenderedView(spectra, flat, torch.zeros(10, 12, 3), flat.byte(), torch.zeros(10, 12, 3))
+    predicted = PredictedView(spectra, flat, torch.zeros(10, 12, 3), flat.byte(), torch.zeros(10, 12, 3))
     figures = evaluation.add(ViewTruth("a", measured, valid, sensor=sensor), predicted)
     assert figures["psnr"] > 100
     assert math.isnan(figures["rgb_psnr"])

@@ -8,7 +8,7 @@ import pytest
 from tests.scenes.scene_factory import make_scene
 from unmix_plugin.errors import RunError, SceneError
 from unmix_plugin.scenes import SceneOptions, load_scene
-from unmix_plugin.trained.find_scene import find_scene
+from unmix_plugin.trained.open_run import find_scene
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ import pytest
 from tests.method_factory import make_scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.material_library import LibraryMaterial, MaterialLibrary, measured_library
-from unmix_plugin.trained.library_matches import match_json, relit, shown_matches
+from unmix_plugin.trained.run_materials import match_json, relit, shown_matches
 
 BANDS = Bands.of([450, 500, 550, 600, 650])
 LIGHT = np.array([0.2, 0.4, 0.6, 0.8, 1.0])

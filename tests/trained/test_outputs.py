@@ -14,10 +14,9 @@ from tests.products.ball_model import RADIUS, ball_scene, cameras_around
 from tests.trained.camera_files.camera_scenes import BOX, FRAME, around, record
 from unmix_plugin.engine.registry import Output
 from unmix_plugin.errors import ConfigError, SpectrumError
-from unmix_plugin.products.render.survey import needs_survey, take_survey
-from unmix_plugin.trained.material_view import MaterialView
+from unmix_plugin.products.render.job import needs_survey, take_survey
 from unmix_plugin.trained.model_scene import model_scene
-from unmix_plugin.trained.outputs import FAMILIES, OUTPUTS, output_names
+from unmix_plugin.trained.outputs import FAMILIES, OUTPUTS, MaterialView, output_names
 from unmix_plugin.trained.protocol import RenderableScene, RenderedView
 
 SCENE = make_scene(light=[0.5, 0.7, 1.0, 0.9, 0.6])

@@ -8,9 +8,9 @@ from tests.method_factory import make_scene
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.poses.refinement import LARGEST_STEP
-from unmix_plugin.trained import pose_alignment
+from unmix_plugin.trained import alignment as pose_alignment
+from unmix_plugin.trained.alignment import align_pose, moved
 from unmix_plugin.trained.evaluation import ViewTruth
-from unmix_plugin.trained.pose_alignment import align_pose, moved
 
 POSE = torch.tensor([[[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4.0]]])
 CAMERA = Cameras(POSE, torch.full((1, 2), 60.0), torch.full((1, 2), 16.0), torch.zeros(1, 4), 32, 32)

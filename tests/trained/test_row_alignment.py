@@ -8,7 +8,7 @@ from tests.method_factory import make_scene
 from tests.trained.test_pose_alignment import CAMERA, moved, points_seen, truth_of
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
-from unmix_plugin.trained.row_alignment import align_rows
+from unmix_plugin.trained.alignment import align_rows
 
 
 def swept(wobble: float) -> Cameras:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from tests.trained.camera_files.camera_scenes import FRAME, around, record
 from unmix_plugin.errors import RunError
-from unmix_plugin.trained.world_frame import affine_to_world, directions_to_world, world_frame
+from unmix_plugin.trained.run_views import affine_to_world, directions_to_world, world_frame
 
 SCENE = record(around(), around())
 points = st.lists(st.floats(-9, 9), min_size=3, max_size=3).map(np.array)

@@ -23,8 +23,7 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_names
 from unmix_plugin.spectral.maps.indices import available_indices
 from unmix_plugin.trained.model_scene import ModelScene
-from unmix_plugin.trained.run_views import recorded_views
-from unmix_plugin.trained.world_frame import world_frame
+from unmix_plugin.trained.run_views import recorded_views, world_frame
 from unmix_plugin.viewer.layers.painting import BACKGROUNDS
 from unmix_plugin.viewer.rendering.scene import Edit, SceneSource
 
@@ -365,8 +364,8 @@ def test_a_size_out_of_bounds_is_refused_with_its_name(viewer, label, value):
 
 
 def test_a_path_through_key_frames_is_a_camera_file(viewer):
-    from unmix_plugin.trained.camera_files.camera_files import read_camera_file
-    from unmix_plugin.trained.world_frame import world_frame
+    from unmix_plugin.trained.camera_files import read_camera_file
+    from unmix_plugin.trained.run_views import world_frame
 
     with opened(viewer) as page:
         for number, angle in enumerate((0.3, 0.8, 1.3), start=1):

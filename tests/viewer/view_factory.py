@@ -20,8 +20,8 @@ from unmix_plugin.engine.training.training_control import DeviceShare, TrainingC
 from unmix_plugin.errors import SceneError
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.scenes.scene import Scene
-from unmix_plugin.trained.material_view import MaterialView
-from unmix_plugin.trained.snapshot import unmix_scene
+from unmix_plugin.trained.open_run import unmix_scene
+from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.layers.layers import LAYERS, LayerAids, layer_named, render_reference
 from unmix_plugin.viewer.layers.painting import LayerSettings, Legend, Picture

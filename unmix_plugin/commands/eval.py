@@ -71,7 +71,7 @@ def _evaluate(options: EvalOptions, processes: Processes) -> None:
     from unmix_plugin.commands.run_choice import chosen_run, spectral_scene
     from unmix_plugin.editing.apply import edit_scene, light_factors
     from unmix_plugin.editing.edited_run import requested_recipe
-    from unmix_plugin.editing.yaml_writing import recipe_to_yaml
+    from unmix_plugin.editing.recipe_files import recipe_to_yaml
     from unmix_plugin.engine.runs.load_run import load_pipeline
     from unmix_plugin.products.evaluation import evaluate_images, evaluate_scene
 

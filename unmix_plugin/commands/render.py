@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from unmix_plugin.engine.processes import Processes
     from unmix_plugin.engine.registry import Output
     from unmix_plugin.products.render.cameras import CameraRequest, RenderCameras
-    from unmix_plugin.products.render.formats import FormattedOutput
+    from unmix_plugin.products.render.files import FormattedOutput
+    from unmix_plugin.products.render.job import Survey
     from unmix_plugin.products.render.pictures import Palette
-    from unmix_plugin.products.render.survey import Survey
     from unmix_plugin.trained.open_run import LoadedRun
     from unmix_plugin.trained.protocol import RenderableScene
 
@@ -106,7 +106,7 @@ def _render_run(options: RenderOptions, request: CameraRequest, processes: Proce
     from unmix_plugin.commands.run_choice import chosen_run
     from unmix_plugin.editing.edited_run import load_edited_run
     from unmix_plugin.products.render.cameras import choose_cameras
-    from unmix_plugin.products.render.formats import choose_formats
+    from unmix_plugin.products.render.files import choose_formats
 
     console = CommandConsole(quiet=not processes.is_first)
     with processes.together():
@@ -139,7 +139,7 @@ def _relit(loaded: LoadedRun, options: RenderOptions) -> LoadedRun:
     from dataclasses import replace
 
     from unmix_plugin.errors import ConfigError
-    from unmix_plugin.trained.relighting import LightChoice, relit
+    from unmix_plugin.trained.model_scene import LightChoice, relit
 
     choice = LightChoice(options.environment, options.environment_rotation, options.environment_exposure)
     if choice == LightChoice():
@@ -163,7 +163,7 @@ def _render(
     from unmix_plugin.commands.reporting import follow, say
     from unmix_plugin.formats.files import refuse_to_overwrite, write_file
     from unmix_plugin.products.render.job import RenderJob, output_paths
-    from unmix_plugin.products.render.legend import draw_legend
+    from unmix_plugin.products.render.pictures import draw_legend
 
     folder = (options.output or loaded.folder.exports / "render").resolve()
     legends = _legends(folder, outputs, loaded.scene)
@@ -198,7 +198,7 @@ def _survey(
     loaded: LoadedRun, cameras: RenderCameras, outputs: tuple[FormattedOutput, ...], console: Console
 ) -> Survey:
     from unmix_plugin.commands.reporting import working
-    from unmix_plugin.products.render.survey import Survey, needs_survey, take_survey
+    from unmix_plugin.products.render.job import Survey, needs_survey, take_survey
 
     asked = dict.fromkeys(one.output for one in outputs)
     if not needs_survey(asked):
@@ -211,8 +211,7 @@ def _legends(
     folder: Path, outputs: tuple[FormattedOutput, ...], scene: RenderableScene
 ) -> dict[Path, Output]:
     """Files of legends, each with the output that it explains."""
-    from unmix_plugin.products.render.formats import file_name
-    from unmix_plugin.products.render.legend import needs_legend
+    from unmix_plugin.products.render.files import file_name, needs_legend
 
     return {
         folder / f"{file_name(one.output)}_legend.png": one.output
@@ -223,7 +222,7 @@ def _legends(
 
 def _camera_file(folder: Path, source: str, loaded: LoadedRun, cameras: RenderCameras) -> tuple[Path, bytes]:
     """Where the cameras are written down, and as what."""
-    from unmix_plugin.trained.camera_files.camera_files import camera_file_bytes
+    from unmix_plugin.trained.camera_files import camera_file_bytes
 
     frames_per_second = (cameras.frames_per_second or 24.0) if cameras.is_path else None
     content = camera_file_bytes(cameras.views, frames_per_second, loaded.scene.frame)

@@ -102,7 +102,7 @@ def _scene_of(source: SceneSource, data: Path | None) -> Scene:
         RunError: it is another one.
     """
     from unmix_plugin.errors import SceneError
-    from unmix_plugin.trained.find_scene import find_scene
+    from unmix_plugin.trained.open_run import find_scene
 
     summary = source.record.summary
     scene = find_scene(summary, source.run.path, data)

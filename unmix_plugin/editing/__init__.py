@@ -4,14 +4,17 @@ They act on endmembers, densities and gloss, never on pixels, so they look the s
 """
 
 from unmix_plugin.editing.apply import assumption_of_light, changes_geometry, edit_scene, relight
-from unmix_plugin.editing.operations import (
+from unmix_plugin.editing.edited_field import sample_seen
+from unmix_plugin.editing.recipe import (
     Colour,
     Endmember,
     FileSpectrum,
     Gloss,
     Isolate,
     LibrarySpectrum,
+    Light,
     Operation,
+    Recipe,
     Remove,
     Rename,
     Replace,
@@ -19,10 +22,7 @@ from unmix_plugin.editing.operations import (
     Scale,
     Swap,
 )
-from unmix_plugin.editing.recipe import Light, Recipe
-from unmix_plugin.editing.seen import sample_seen
-from unmix_plugin.editing.yaml_reading import read_recipe, recipe_from_yaml
-from unmix_plugin.editing.yaml_writing import recipe_to_yaml
+from unmix_plugin.editing.recipe_files import read_recipe, recipe_from_yaml, recipe_to_yaml
 
 __all__ = [
     "Colour",

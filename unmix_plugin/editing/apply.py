@@ -1,27 +1,399 @@
-"""Recipes applied to a trained scene: another scene that shares its weights.
+"""Materials while a recipe changes them, and what has been done to which of them, so that no edit undoes another.
+
+Notation: `B` bands, `K` endmembers, `J` specular spectra.
+
+Another light: what it multiplies every spectrum of a scene with.
+
+A spectrum in the new light is the one seen, divided by the light that the scene was recorded in, times the new one.
+That is right if the recorded light has one spectrum everywhere; shadows, shading and gloss stay as they are. Bands
+that either light does not reach become 0: nothing is known of them.
+
+Brightness. The power of a new light is chosen so that a perfect white is as bright as before: as luminous if the bands
+see colours (CIE Y), otherwise of the same mean radiance. So single bands may exceed 1, the full scale of the sensor.
+
+Notation: `B` bands.
+
+The smoothest change of a spectrum that gives it a wanted colour, or the nearest colour that a surface can have.
+
+Notation: `B` bands; `r` a reflectance, `L` the light, M (B, 3) the matrix from radiance to linear RGB. The changed
+reflectance is r + (r + f) d with a floor f, so that d is a relative change that still reaches where r is 0. Of all d
+with M^T L (r + (r + f) d) = colour and bounds on the result, the one is taken whose
+
+    integral of d'^2 + (d / reach)^2 over wavelength
+
+is least: it changes with wavelength as little as the colour allows, and fades far from where colour is seen. Asking
+for the colour that a surface has leaves its spectrum as it is. The equation is solved in least squares, with a large
+weight: exactly if the bounds allow it, otherwise as nearly as they do. Channels count by the slope of the sRGB curve at
+the wanted colour, so that "near" is near on a display.
+
+A scene seen through another camera: its spectra have a value for each channel of a sensor.
+
+A rendered spectrum is linear in endmembers and specular spectra, and so is what a sensor makes of it: both are seen
+through the sensor once. Radiance and light become the channels' means of them, neither of them rescaled, so that their
+ratio stays reflectance: the mean of the reflectance, weighted with response and light.
+
+Notation: `B` bands, `S` channels, `K` endmembers, `J` specular spectra.
+
+What each kind of edit does to the materials: one function of the state for each kind.
+
+Recipes applied to a trained scene: another scene that shares its weights.
 
 Notation: `B` bands, `K` endmembers, `J` specular spectra, `G` mirrors.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from unmix_plugin.editing.edited_field import EditedField
-from unmix_plugin.editing.handlers import carry_out
-from unmix_plugin.editing.light import relighting_factors
-from unmix_plugin.editing.material_state import MaterialState
-from unmix_plugin.editing.operations import Gloss, Replace, Retint
-from unmix_plugin.editing.recipe import Light, Recipe
-from unmix_plugin.editing.seen import sample_seen
-from unmix_plugin.errors import ConfigError, SpectrumError
+from unmix_plugin.editing.edited_field import EditedField, MaterialState, appearance_of, sample_seen
+from unmix_plugin.editing.recipe import (
+    Colour,
+    FileSpectrum,
+    Gloss,
+    Isolate,
+    LibrarySpectrum,
+    Light,
+    Operation,
+    Recipe,
+    Remove,
+    Rename,
+    Replace,
+    Retint,
+    Scale,
+    Swap,
+)
+from unmix_plugin.errors import ConfigError, SpectrumError, UnmixError
+from unmix_plugin.figures.plotting import css_colour
+from unmix_plugin.formats.envi import read_library_table
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.colour.conversion import (
+    brightness,
+    covered_bands,
+    illuminant_power,
+    linear_to_srgb,
+    rgb_matrix,
+    srgb_to_linear,
+)
+from unmix_plugin.spectral.library.material_library import (
+    DARK_LIGHT,
+    MaterialLibrary,
+    measured_library,
+)
 from unmix_plugin.spectral.materials import Coefficients
+from unmix_plugin.spectral.sensor import Sensor
 from unmix_plugin.trained.trained_scene import TrainedScene
+
+
+def relighting_factors(
+    bands: Bands, recorded: Float64[np.ndarray, " B"] | None, light: Light
+) -> tuple[Float64[np.ndarray, " B"], list[str]]:
+    """What radiance is multiplied with, band by band, to be seen in another light; and what a user has to be told.
+
+    Args:
+        bands: Of the scene.
+        recorded: Light that the scene was recorded in, relative power; None if unknown: taken as flat, CIE E.
+        light: The new one.
+    Raises:
+        SpectrumError: the new light is unknown or invisible in all bands that the recorded one reaches.
+    """
+    before = np.ones(len(bands)) if recorded is None else recorded
+    is_lit = before > DARK_LIGHT * before.max()
+    is_covered = covered_bands(light.light, bands) | light.extrapolate
+    notes = []
+    if not is_lit.all():
+        notes.append(
+            f"the scene's own light does not reach {_listed(bands, ~is_lit)}: black in any other light"
+        )
+    if not is_covered.all():
+        dark = _listed(bands, ~is_covered)
+        notes.append(f"light {light.light} is not known at {dark}: black there; in a recipe, {_hold(light)}")
+    is_known = is_lit & is_covered
+    if not is_known.any():
+        raise SpectrumError(f"light {light.light} is not known in {bands}; in a recipe, {_hold(light)}")
+    after = np.where(is_known, illuminant_power(light.light, bands, "hold"), 0.0)
+    new_brightness = brightness(after, bands)
+    if not new_brightness > 0:
+        raise SpectrumError(f"light {light.light} is invisible in {bands}; choose one with visible power")
+    scale = brightness(np.where(is_known, before, 0.0), bands) / new_brightness
+    return np.divide(after * scale, before, out=np.zeros(len(bands)), where=is_known), notes
+
+
+def _listed(bands: Bands, chosen: Bool[np.ndarray, " B"]) -> str:
+    found = bands.centers_nm[chosen]
+    return f"{len(found)} of {bands} ({found[0]:g} to {found[-1]:g} nm)"
+
+
+def _hold(light: Light) -> str:
+    return f"illuminant: {{light: {light.light}, extrapolate: true}} holds its outermost values"
+
+
+_FLOOR = 0.05
+"""f: reflectance below which a change counts as absolute rather than relative."""
+
+_REACH_NM = 300.0
+"""Distance over which the change fades outside the wavelengths that make the colour."""
+
+_EXACTNESS = 1e5
+"""Weight of the colour against smoothness; the error of the colour falls with its square."""
+
+
+@dataclass(frozen=True)
+class LitReflectance:
+    """A spectrum to change, and the light that it is seen in."""
+
+    bands: Bands
+    reflectance: Float64[np.ndarray, " B"]
+    light: Float64[np.ndarray, " B"]
+    """Relative power."""
+
+    @property
+    def to_linear_rgb(self) -> Float64[np.ndarray, "B 3"]:
+        """Matrix from reflectance to linear RGB of the light that the surface sends."""
+        return self.light[:, None] * rgb_matrix(self.bands, torch.float64).numpy()
+
+
+def retinted(
+    surface: LitReflectance, linear_rgb: Float64[np.ndarray, "3"], greatest: float = 1.0
+) -> Float64[np.ndarray, " B"]:
+    """The reflectance most like a surface's own that has the wanted colour in its light, or comes nearest to it.
+
+    Args:
+        surface: What is changed.
+        linear_rgb: The wanted colour, as `spectral.colour.rgb_matrix` makes it of the light that the surface sends.
+        greatest: Upper bound of the reflectance; the lower one is 0.
+    """
+    from scipy.optimize import lsq_linear
+
+    reflectance, to_rgb = surface.reflectance, surface.to_linear_rgb
+    base = reflectance + _FLOOR
+    weights = (_EXACTNESS * _srgb_slope(linear_rgb))[:, None]
+    smoothness = _smoothness(surface.bands)
+    lower, upper = -reflectance / base, np.maximum(greatest - reflectance, 0.0) / base
+    solution = lsq_linear(
+        np.concatenate([smoothness, weights * (to_rgb * base[:, None]).T]),
+        np.concatenate([np.zeros(len(smoothness)), weights[:, 0] * (linear_rgb - reflectance @ to_rgb)]),
+        (lower, np.maximum(upper, lower + 1e-12)),
+        method="bvls",
+    )
+    return np.clip(reflectance + base * solution.x, 0.0, max(greatest, float(reflectance.max())))
+
+
+def _srgb_slope(linear_rgb: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
+    """Slope of the sRGB curve at each channel: 12.92 in the dark, 0.44 at white."""
+    linear = np.clip(linear_rgb, 0.0031308, 1.0)
+    return np.where(linear_rgb <= 0.0031308, 12.92, 1.055 / 2.4 * linear ** (1 / 2.4 - 1))
+
+
+def _smoothness(bands: Bands) -> Float64[np.ndarray, "rows B"]:
+    """Rows whose squares sum to the integral that is minimised, wavelengths in units of the reach."""
+    centers, widths = bands.centers_nm / _REACH_NM, bands.widths_nm / _REACH_NM
+    slopes = np.diff(np.eye(len(bands)), axis=0) / np.sqrt(np.diff(centers))[:, None]
+    return np.concatenate([slopes, np.diag(np.sqrt(widths))])
+
+
+def with_sensor(scene: TrainedScene, sensor: Sensor) -> TrainedScene:
+    """The scene as the sensor sees it; its `notes` say what of the sensor the bands do not cover.
+
+    The result can't be edited any more: edits and lights need the bands.
+
+    Raises:
+        SpectrumError: no channel of the sensor lies in what the scene's bands cover.
+    """
+    seen, materials = sensor.seen_by(scene.bands), scene.materials
+    through = replace(
+        materials,
+        bands=seen.bands,
+        endmembers=_through(materials.endmembers, seen.matrix),
+        specular_spectra=_through(materials.specular_spectra, seen.matrix),
+        light=None if materials.light is None else _through(materials.light, seen.matrix),
+    )
+    return replace(scene, materials=through, notes=(*scene.notes, seen.description, *seen.notes))
+
+
+def _through(spectra: Float[Tensor, "*n B"], matrix: Float64[np.ndarray, "B S"]) -> Float[Tensor, "*n S"]:
+    return (spectra.detach().cpu().double() @ torch.from_numpy(matrix)).to(spectra)
+
+
+_GREATEST_REFLECTANCE = 2.0
+"""Of a table of reflectances; more is a sign of per cent. Fluorescent ones exceed 1."""
+
+_VISIBLE_DIFFERENCE = 2.5 / 255
+"""Of sRGB channels, above which the user gets a note."""
+
+_REPLACED, _RETINTED, _NAMED, _COLOURED = "replaced", "retinted", "renamed", "given a colour of gloss"
+_REMOVED, _ISOLATED = "removed", "isolated"
+
+
+def carry_out(recipe: Recipe, state: MaterialState) -> None:
+    """Make all edits of a recipe, in order.
+
+    Raises:
+        ConfigError: an edit can't be made, or contradicts another; the message says where it is.
+    """
+    for position, operation in enumerate(recipe.operations):
+        where = recipe.where(position)
+        try:
+            _HANDLERS[type(operation)](state, operation, where)
+        except UnmixError as error:
+            raise ConfigError(f"{where}: {error}") from error
+
+
+def _swap(state: MaterialState, edit: Swap, _: str) -> None:
+    first, second = state.index_of(edit.first), state.index_of(edit.second)
+    if first == second:
+        raise ConfigError(
+            f"an endmember can't be swapped with itself; found {edit.first!r} and {edit.second!r}"
+        )
+    state.spectra[[first, second]] = state.spectra[[second, first]]
+    state.swap_notes((_REPLACED, _RETINTED), first, second)
+
+
+def _replace(state: MaterialState, edit: Replace, where: str) -> None:
+    index = state.index_of(edit.endmember)
+    state.note(_REPLACED, index, where)
+    library, name = _library_of(edit.spectrum)
+    library.find(name)
+    try:
+        reflectance = library.reflectance(name, state.bands, "hold" if edit.extrapolate else "refuse")
+    except SpectrumError as error:
+        raise SpectrumError(f"{error}; extrapolate: true holds the outermost values instead") from error
+    if reflectance.max() > _GREATEST_REFLECTANCE:
+        raise SpectrumError(
+            f"{name} has reflectances of up to {reflectance.max():g}; give values from 0 to 1, not per cent"
+        )
+    state.spectra[index] = reflectance * state.light
+
+
+def _library_of(spectrum: LibrarySpectrum | FileSpectrum) -> tuple[MaterialLibrary, str]:
+    """Where a reflectance is looked up, and its name there."""
+    if isinstance(spectrum, LibrarySpectrum):
+        return measured_library(), spectrum.library
+    table = read_library_table(spectrum.file)
+    names = list(table.names)
+    if spectrum.spectrum is None and len(names) > 1:
+        raise SpectrumError(
+            f"{spectrum.file} has {len(names)} spectra ({', '.join(names[:5])}, ...); choose one with spectrum"
+        )
+    library = MaterialLibrary(()).extended(table, spectrum.file.name)
+    return library, spectrum.spectrum or names[0]
+
+
+def _retint(state: MaterialState, edit: Retint, where: str) -> None:
+    index = state.index_of(edit.endmember)
+    state.note(_RETINTED, index, where)
+    seen = appearance_of(state, index) if edit.match == "picture" else None
+    is_lit = state.light > DARK_LIGHT * state.light.max()
+    light = np.where(is_lit, state.light, 0.0)
+    reflectance = np.where(is_lit, state.spectra[index] / np.where(is_lit, light, 1.0), 0.0)
+    surface = LitReflectance(state.bands, reflectance, light)
+    if seen is None:
+        changed = retinted(surface, _linear(edit.colour))
+        reached = _srgb(changed @ surface.to_linear_rgb)
+    else:
+        changed = retinted(surface, seen.full_colour(edit.colour), seen.greatest_reflectance)
+        reached = seen.mean_srgb(changed @ surface.to_linear_rgb)
+    state.spectra[index] = changed * light
+    what = state.names[index] if seen is None else f"pictures of {state.names[index]}"
+    _note_nearest(state, f"{where}: {what}", edit.colour, reached)
+
+
+def _note_nearest(state: MaterialState, what: str, asked: Colour, reached: np.ndarray) -> None:
+    """Note if a colour visibly differs from the one asked for."""
+    if np.abs(reached - asked).max() > _VISIBLE_DIFFERENCE:
+        state.notes.append(
+            f"{what} can't be {css_colour(asked)} in this light; took the nearest colour, {css_colour(reached)}"
+        )
+
+
+def _scale(state: MaterialState, edit: Scale, _: str) -> None:
+    state.spectra[state.index_of(edit.endmember)] *= edit.factor
+
+
+def _remove(state: MaterialState, edit: Remove, where: str) -> None:
+    for index in [state.index_of(endmember) for endmember in edit.endmembers]:
+        _refuse_both(state, index, _ISOLATED, _REMOVED)
+        state.done[_REMOVED, index] = where
+        state.is_kept[index] = False
+    _require_something(state)
+
+
+def _isolate(state: MaterialState, edit: Isolate, where: str) -> None:
+    earlier = [before for (what, _), before in state.done.items() if what == _ISOLATED]
+    if earlier:
+        raise ConfigError(f"{earlier[0]} isolates already; name all that are to stay in one edit")
+    kept = [state.index_of(endmember) for endmember in edit.endmembers]
+    for index in kept:
+        _refuse_both(state, index, _REMOVED, _ISOLATED)
+        state.done[_ISOLATED, index] = where
+    state.is_kept &= np.isin(np.arange(len(state.names)), kept)
+
+
+def _rename(state: MaterialState, edit: Rename, where: str) -> None:
+    index = state.index_of(edit.endmember)
+    state.note(_NAMED, index, where)
+    if edit.name in state.names and state.names.index(edit.name) != index:
+        other = state.names.index(edit.name)
+        raise ConfigError(f"endmember {other} is called {edit.name!r} already; names must differ")
+    state.names[index] = edit.name
+
+
+def _gloss(state: MaterialState, edit: Gloss, where: str) -> None:
+    if len(state.specular_spectra) == 0:
+        raise ConfigError(
+            "this run has no view-dependent part (--pipeline.model.specular none), hence no gloss"
+        )
+    chosen = range(len(state.names)) if edit.endmember is None else [state.index_of(edit.endmember)]
+    if edit.colour is not None and edit.colour not in state.mirror_reflectances:
+        flat = np.ones(len(state.bands))
+        white = LitReflectance(state.bands, flat, flat)
+        mirror = retinted(white, _linear(edit.colour))
+        state.mirror_reflectances[edit.colour] = mirror
+        _note_nearest(state, f"{where}: highlights", edit.colour, _srgb(mirror @ white.to_linear_rgb))
+    for index in chosen:
+        state.gloss[index] *= edit.scale
+        if edit.colour is not None:
+            state.note(_COLOURED, index, where)
+            state.mirrors[index] = edit.colour
+
+
+_HANDLERS: dict[type[Operation], Callable[[MaterialState, Any, str], None]] = {
+    Swap: _swap,
+    Replace: _replace,
+    Retint: _retint,
+    Scale: _scale,
+    Remove: _remove,
+    Isolate: _isolate,
+    Rename: _rename,
+    Gloss: _gloss,
+}
+
+
+def _linear(srgb: tuple[float, float, float]) -> np.ndarray:
+    return srgb_to_linear(torch.tensor(srgb, dtype=torch.float64)).numpy()
+
+
+def _srgb(linear_rgb: np.ndarray) -> np.ndarray:
+    return linear_to_srgb(torch.from_numpy(np.clip(linear_rgb, 0, 1))).numpy()
+
+
+def _refuse_both(state: MaterialState, index: int, before: str, now: str) -> None:
+    edit = state.done.get((before, index))
+    if edit is not None:
+        raise ConfigError(
+            f"{state.names[index]!r} can't be {now}: {edit} has it {before}; keep one of the two"
+        )
+
+
+def _require_something(state: MaterialState) -> None:
+    if not state.is_kept.any():
+        raise ConfigError("nothing is left: every endmember is removed; keep at least one")
 
 
 def edit_scene(scene: TrainedScene, recipe: Recipe, seen: Coefficients | None = None) -> TrainedScene:

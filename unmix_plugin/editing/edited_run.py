@@ -8,10 +8,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from unmix_plugin.editing.apply import edit_scene
+from unmix_plugin.editing.apply import edit_scene, with_sensor
 from unmix_plugin.editing.recipe import Light, Recipe
-from unmix_plugin.editing.simulated_sensor import with_sensor
-from unmix_plugin.editing.yaml_reading import read_recipe
+from unmix_plugin.editing.recipe_files import read_recipe
 from unmix_plugin.spectral.colour.conversion import parse_light
 from unmix_plugin.spectral.sensor import read_sensor
 from unmix_plugin.trained.open_run import LoadedRun, load_run

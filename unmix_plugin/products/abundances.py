@@ -26,8 +26,8 @@ from unmix_plugin.products.product import ViewProduct
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import colour_mode
 from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.trained.evaluation import PredictedView, as_numpy, picture
 from unmix_plugin.trained.run_materials import endmember_colours
-from unmix_plugin.trained.view_rendering import RenderedView, as_numpy, picture
 
 SHARE_SCALE = ColourScale("viridis", 0.0, 1.0, "abundance")
 """Colours of abundances, the same in every figure."""
@@ -49,7 +49,9 @@ class Abundances(ViewProduct):
         """Files of a view."""
         return [path for kind in self.formats for path in view_paths(folder, view, kind)]
 
-    def write_view(self, folder: Path, view: str, rendered: RenderedView, materials: Materials) -> list[Path]:
+    def write_view(
+        self, folder: Path, view: str, rendered: PredictedView, materials: Materials
+    ) -> list[Path]:
         """Write the abundances of a view: npy, envi and exr hold the same float32 numbers, png is the figure."""
         shares = rendered.abundances.numpy().astype(np.float32)
         about = f"{view}: {_WHAT}"
@@ -73,13 +75,13 @@ def view_paths(folder: Path, view: str, kind: str) -> list[Path]:
     return envi_cube_paths(folder / view) if kind == "envi" else [folder / f"{view}.{kind}"]
 
 
-def colour_panel(view: RenderedView, bands: Bands) -> TitledPicture:
+def colour_panel(view: PredictedView, bands: Bands) -> TitledPicture:
     """A view as an eye, or a camera with these bands, sees it."""
     title = "colour" if colour_mode(bands) == "true-colour" else "false colour"
     return TitledPicture(picture(view.spectra, view.coverage, bands), title)
 
 
-def draw_abundances(name: str, view: RenderedView, materials: Materials) -> bytes:
+def draw_abundances(name: str, view: PredictedView, materials: Materials) -> bytes:
     """A figure of a view in colour and of the abundances of what is seen, fading where nothing is."""
     panels = [colour_panel(view, materials.bands)]
     panels += share_panels(view.shares, view.accumulation, materials.names, endmember_colours(materials))

@@ -15,7 +15,7 @@ from unmix_plugin.products.abundances import view_paths
 from unmix_plugin.products.product import ViewProduct
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
 from unmix_plugin.spectral.materials import Materials
-from unmix_plugin.trained.view_rendering import RenderedView
+from unmix_plugin.trained.evaluation import PredictedView
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,9 @@ class Cubes(ViewProduct):
         """Files of a view."""
         return [path for kind in self.formats for path in view_paths(folder, view, kind)]
 
-    def write_view(self, folder: Path, view: str, rendered: RenderedView, materials: Materials) -> list[Path]:
+    def write_view(
+        self, folder: Path, view: str, rendered: PredictedView, materials: Materials
+    ) -> list[Path]:
         """Write the spectra of a view."""
         spectra, bands = rendered.spectra.numpy().astype(np.float32), materials.bands
         about = f"{view}: radiance on black, 1 = full scale"

@@ -41,26 +41,22 @@ from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import describe_colour, linear_to_srgb
 from unmix_plugin.spectral.segmentation import NOTHING_ID
+from unmix_plugin.trained.alignment import align_gain, align_pose, align_rows
 from unmix_plugin.trained.evaluation import (
     DEFINITIONS,
     Evaluation,
+    PredictedView,
     ViewTruth,
-    finite_or_none,
-    scene_truth,
-    view_truth,
-)
-from unmix_plugin.trained.pose_alignment import align_pose
-from unmix_plugin.trained.row_alignment import align_rows
-from unmix_plugin.trained.run_views import views_of
-from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.trained.view_alignment import align_gain
-from unmix_plugin.trained.view_rendering import (
-    RenderedView,
     as_numpy,
     coloured_picture,
+    finite_or_none,
     render_view,
+    scene_truth,
     subpixels_for,
+    view_truth,
 )
+from unmix_plugin.trained.run_views import views_of
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 _ERROR_SCALE = ColourScale("magma", 0.0, 0.2, "error of sRGB")
 _COLUMNS = 7
@@ -225,7 +221,7 @@ def material_look(evaluation: Evaluation) -> MaterialLook:
     )
 
 
-def draw_colour(view: ViewTruth, predicted: RenderedView, bands: Bands, psnr_db: float) -> bytes:
+def draw_colour(view: ViewTruth, predicted: PredictedView, bands: Bands, psnr_db: float) -> bytes:
     """True colour, predicted colour, and their difference; in false colours for sensors without all bands."""
     weights, spectra = view.colour_weights(bands), view.seen(predicted.spectra)
     error = np.abs(_srgb_on_black(spectra, weights) - _srgb_on_black(view.spectra, weights)).mean(axis=-1)
@@ -271,7 +267,7 @@ def draw_matched_segmentation(
 
 
 def draw_matched_abundances(
-    view: ViewTruth, predicted: RenderedView, evaluation: Evaluation, look: MaterialLook
+    view: ViewTruth, predicted: PredictedView, evaluation: Evaluation, look: MaterialLook
 ) -> bytes:
     """Each true material's abundance above that of the endmember matched to it; surplus endmembers at the end."""
     swatches = own_colours(evaluation.endmembers, evaluation.truth.bands)

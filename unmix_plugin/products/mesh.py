@@ -1,4 +1,12 @@
-"""The scene's surface as a mesh: PLY, glTF and OBJ.
+"""The scene's surface as triangles: marching cubes through the density, trimmed to what the run's cameras see.
+
+The surface is where the density is that rays end at, softened a little since the field is trained on images and not
+on surfaces. What no camera sees (insides, undersides) was never learnt: it is taken for solid and its surfaces are cut
+away unless asked for, and so are stray pieces.
+
+Notation: `V` vertices, `F` faces.
+
+The scene's surface as a mesh: PLY, glTF and OBJ.
 
 Notation: `V` vertices, `F` faces.
 """
@@ -12,19 +20,175 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Int
+from jaxtyping import Bool, Float, Float32, Int
 
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.formats.meshes import obj_paths, write_glb, write_obj, write_ply
 from unmix_plugin.products.product import Job, Product
+from unmix_plugin.trained.surface import (
+    GridPoints,
+    SeenSurface,
+    SurfacePoints,
+    may_be_solid,
+    sample_densities,
+)
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 if TYPE_CHECKING:
-    from unmix_plugin.products.mesh_extraction import TriangleMesh
     from unmix_plugin.scenes.scene import Normalisation
-    from unmix_plugin.trained.density_grid import GridPoints
-    from unmix_plugin.trained.surface import SeenSurface
-    from unmix_plugin.trained.surface_appearance import SurfaceAppearance
-    from unmix_plugin.trained.trained_scene import TrainedScene
+    from unmix_plugin.trained.surface import GridPoints, SeenSurface, SurfaceAppearance
+
+
+_END_QUANTILE = 0.07
+"""Rays end inside what they hit: this part of them where the density is still lower than at the surface."""
+
+_HEALED_RINGS = 3
+"""Gaps of this many vertices between what is seen are not cut: two cameras rarely agree at an edge."""
+
+_SMALLEST_PART = 0.01
+"""Pieces with fewer faces than this, relative to the largest, are stray."""
+
+_LEAST_FACES = 8
+"""So are pieces of fewer than these, where there is a larger one."""
+
+
+@dataclass(frozen=True)
+class TriangleMesh:
+    """Triangles that are seen from the side on which their corners go round counter-clockwise."""
+
+    vertices: Float[np.ndarray, "V 3"]
+    faces: Int[np.ndarray, "F 3"]
+
+    def select(self, chosen: Bool[np.ndarray, " F"]) -> TriangleMesh:
+        """Some of the faces, and the vertices that they have."""
+        faces = self.faces[chosen]
+        used, renumbered = np.unique(faces, return_inverse=True)
+        return TriangleMesh(self.vertices[used], renumbered.reshape(faces.shape))
+
+    @property
+    def normals(self) -> Float[np.ndarray, "V 3"]:
+        """Unit normals of the vertices: means over their faces, weighted by area."""
+        a, b, c = self.vertices[self.faces].swapaxes(0, 1)
+        across = np.cross(b - a, c - a)
+        sums = np.zeros_like(self.vertices)
+        for corner in self.faces.T:
+            np.add.at(sums, corner, across)
+        lengths = np.linalg.norm(sums, axis=1, keepdims=True)
+        return np.where(lengths > 0, sums / np.where(lengths > 0, lengths, 1.0), [0.0, 0.0, 1.0])
+
+
+def surface_density(scene: TrainedScene, ends: SurfacePoints) -> float:
+    """Density per model unit at which the surface lies, from the densities where rays end.
+
+    Raises:
+        RunError: no ray ends anywhere.
+    """
+    densities = sample_densities(scene, ends.positions)
+    densities = densities[densities > 0]
+    if len(densities) == 0:
+        raise RunError(
+            "no ray of the run's cameras ends on a surface: train longer, or there is nothing to export"
+        )
+    return float(np.quantile(densities.double().numpy(), _END_QUANTILE))
+
+
+def extract_mesh(
+    densities: Float32[np.ndarray, "X Y Z"],
+    grid: GridPoints,
+    threshold: float,
+    softness: float,
+    pixel_size: float,
+) -> TriangleMesh:
+    """Marching cubes where the density passes a threshold.
+
+    The cubes go through the opacity of a pixel's length rather than the density itself, which differs by many orders
+    of magnitude between neighbours.
+
+    Args:
+        densities: At the grid's points, per model unit.
+        grid: Of the densities, model space.
+        threshold: Density of the surface, > 0.
+        softness: Standard deviation, in cells, of a blur applied first; 0 for none.
+        pixel_size: Edge of a pixel in the middle of the scene, model units.
+    Raises:
+        ConfigError: no density passes the threshold.
+    Source:
+        Lewiner et al. 2003, as in scikit-image.
+    """
+    from scipy.ndimage import gaussian_filter
+    from skimage.measure import marching_cubes
+
+    opacities = np.pad(-np.expm1(-densities.astype(np.float64) * pixel_size), 1)
+    if softness > 0:
+        opacities = gaussian_filter(opacities, softness, mode="constant")
+    level = -math.expm1(-threshold * pixel_size)
+    if not opacities.min() < level < opacities.max():
+        raise ConfigError(
+            f"no surface: the greatest density on the grid is {densities.max() / threshold:.3g} times "
+            "the density asked for; choose a lower --density or a finer --resolution"
+        )
+    vertices, faces, _, _ = marching_cubes(opacities, level, gradient_direction="ascent")
+    # The padding put the grid's first point at index 1.
+    return TriangleMesh((vertices.astype(np.float64) - 1) * grid.cell + grid.origin, faces.astype(np.int64))
+
+
+def filled(
+    densities: Float32[np.ndarray, "X Y Z"], grid: GridPoints, scene: TrainedScene, surface: SeenSurface
+) -> Float32[np.ndarray, "X Y Z"]:
+    """Densities with what no camera sees into as solid as the densest point, so that surfaces have no inner side.
+
+    Args:
+        densities: At the grid's points, 0 where nothing is rendered.
+        grid: Of the densities, model space.
+        surface: What the cameras see.
+    """
+    result, solid = densities.copy(), densities.max()
+    for index in range(len(result)):
+        points = grid.slice_points(index)
+        unknown = torch.from_numpy(result[index] == 0)
+        unknown[unknown.clone()] = may_be_solid(scene, points[unknown])
+        unknown[unknown.clone()] = surface.hides(points[unknown])
+        result[index][unknown.numpy()] = solid
+    return result
+
+
+def trim_unseen(mesh: TriangleMesh, surface: SeenSurface) -> TriangleMesh:
+    """The parts of a mesh that the cameras see, with small gaps left whole."""
+    seen = surface.shows(torch.from_numpy(mesh.vertices).float()).numpy()
+    links = _links(mesh)
+    for _ in range(_HEALED_RINGS):
+        seen = seen | np.asarray(links @ seen.astype(np.float64) > 0)
+    return mesh.select(np.all(seen[mesh.faces], axis=1, keepdims=False))
+
+
+def without_stray_pieces(mesh: TriangleMesh) -> TriangleMesh:
+    """The pieces of a mesh, each joined by common edges, that have a hundredth of the faces of the largest or more."""
+    if len(mesh.faces) == 0:
+        return mesh
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    count = len(mesh.faces)
+    ends = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    _, edges = np.unique(ends[:, 0] * len(mesh.vertices) + ends[:, 1], return_inverse=True)
+    # Each face is joined to its edges, which are numbered after the faces.
+    sides = (np.ones(len(edges)), (np.repeat(np.arange(count), 3), count + edges))
+    size = count + int(edges.max()) + 1
+    _, piece = connected_components(coo_matrix(sides, shape=(size, size)), directed=False)
+    sizes = np.bincount(piece[:count])
+    smallest = max(_SMALLEST_PART * float(sizes.max()), min(_LEAST_FACES, sizes.max()))
+    return mesh.select(np.asarray(sizes[piece[:count]] >= smallest))
+
+
+def _links(mesh: TriangleMesh):  # noqa: ANN202 - a sparse matrix of scipy, which is imported here only
+    """Symmetric matrix (V, V) that is not 0 where an edge joins two vertices."""
+    from scipy.sparse import coo_matrix
+
+    edges = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    both = np.concatenate([edges, edges[:, ::-1]])
+    count = len(mesh.vertices)
+    return coo_matrix((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count)).tocsr()
+
 
 MeshFormat = Literal["ply", "glb", "obj"]
 
@@ -54,7 +218,6 @@ class Mesh(Product):
 
     def write(self, job: Job) -> list[Path]:
         """Sample the density, march through it, trim and colour the surface."""
-        from unmix_plugin.products.mesh_extraction import surface_density
 
         require_sound(self.density, self.smoothing)
         job.claim(mesh_paths(job.folder, self.formats))
@@ -73,7 +236,7 @@ class Mesh(Product):
         return written
 
     def _sample(self, job: Job) -> tuple[Float32[np.ndarray, "X Y Z"], GridPoints]:
-        from unmix_plugin.trained.density_grid import GridPoints, sample_slice
+        from unmix_plugin.trained.surface import GridPoints, sample_slice
 
         scene = job.scene
         grid = GridPoints.over(scene.scene_box.aabb, self.resolution)
@@ -89,12 +252,6 @@ class Mesh(Product):
         surface: SeenSurface,
     ) -> TriangleMesh:
         """The surface, model space."""
-        from unmix_plugin.products.mesh_extraction import (
-            extract_mesh,
-            filled,
-            trim_unseen,
-            without_stray_pieces,
-        )
 
         pixel_size = job.scene.pixel_size
         if self.unseen == "keep":
@@ -143,10 +300,8 @@ def write_mesh(
     Raises:
         RunError: there is no face, or the disk is full or refuses.
     """
-    from unmix_plugin.products.mesh_extraction import TriangleMesh
-    from unmix_plugin.trained.surface import look_from_above
-    from unmix_plugin.trained.surface_appearance import SurfaceAppearance
-    from unmix_plugin.trained.world_frame import directions_to_world, positions_for_files
+    from unmix_plugin.trained.run_views import directions_to_world, positions_for_files
+    from unmix_plugin.trained.surface import SurfaceAppearance, look_from_above
 
     if len(mesh.faces) == 0:
         raise RunError(

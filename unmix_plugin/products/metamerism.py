@@ -56,7 +56,7 @@ class Metamerism(Product):
 
     def write(self, job: Job) -> list[Path]:
         """Compare all pairs in all lights."""
-        from unmix_plugin.trained.library_matches import library_with
+        from unmix_plugin.trained.run_materials import library_with
 
         job.claim(metamerism_paths(job.folder))
         with job.working("comparing colours"):

@@ -23,8 +23,8 @@ from unmix_plugin.formats.files import rgba_png_bytes, write_file
 from unmix_plugin.products.product import Job, Product
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Materials
 from unmix_plugin.spectral.subspace import PcaColours
+from unmix_plugin.trained.evaluation import PredictedView, as_numpy
 from unmix_plugin.trained.run_views import ViewChoice, resized_views
-from unmix_plugin.trained.view_rendering import RenderedView, as_numpy
 
 if TYPE_CHECKING:
     from unmix_plugin.trained.trained_scene import TrainedScene
@@ -112,7 +112,7 @@ def components_path(folder: Path) -> Path:
     return folder / "components.csv"
 
 
-def write_pca(folder: Path, name: str, view: RenderedView, components: Components) -> Path:
+def write_pca(folder: Path, name: str, view: PredictedView, components: Components) -> Path:
     """Write a view's components as red, green and blue, fading into grey where nothing is; a pixel a pixel.
 
     Raises:

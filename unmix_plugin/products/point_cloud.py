@@ -1,4 +1,12 @@
-"""The scene's surface as a cloud of points with their spectra's mixture: PLY.
+"""Clouds of points: outliers, normals, and fewer points that still cover everything evenly.
+
+Notation: `P` points. Any units.
+
+Spectral indices and scores of targets for every point of a surface.
+
+Notation: `P` points, `B` bands.
+
+The scene's surface as a cloud of points with their spectra's mixture: PLY.
 
 Points are the ends of rays of the run's own cameras where nearly all of a ray ends, and where the cameras agree on it;
 lone points are left out, and the rest is thinned evenly. Normals are those of planes through the neighbours.
@@ -15,17 +23,189 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Float32, Int64
+from torch import Tensor
 
 from unmix_plugin.errors import ConfigError, RunError, counted
 from unmix_plugin.formats.meshes import write_ply
-from unmix_plugin.products.cloud import is_outlier, plane_normals, thinned
 from unmix_plugin.products.product import Job, Product
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.maps.indices import NAMED_INDICES
+from unmix_plugin.spectral.maps.reflectance_maps import (
+    ReflectanceMap,
+    is_reflectance_map,
+    parse_reflectance_map,
+    seen_reflectance,
+)
+from unmix_plugin.spectral.materials import Materials
 
 if TYPE_CHECKING:
-    from unmix_plugin.products.point_scores import PointScore
     from unmix_plugin.scenes.scene import Normalisation
-    from unmix_plugin.spectral.materials import Materials
     from unmix_plugin.trained.surface import SurfacePoints
+
+
+_OUTLIER_NEIGHBOURS = 8
+_OUTLIER_FACTOR = 4.0
+"""Points whose neighbours are, on average, farther by this factor than those of the median point, are outliers."""
+
+_PLANE_NEIGHBOURS = 24
+_CHUNK = 50_000
+_BISECTIONS = 20
+
+
+def is_outlier(positions: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
+    """Which points lie far from all others, by the mean distance to their nearest eight."""
+    if len(positions) <= _OUTLIER_NEIGHBOURS:
+        return np.zeros(len(positions), dtype=bool)
+    from scipy.spatial import KDTree
+
+    distances, _ = KDTree(positions).query(positions, k=_OUTLIER_NEIGHBOURS + 1)
+    to_others = distances[:, 1:].mean(axis=1)
+    return to_others > _OUTLIER_FACTOR * np.median(to_others)
+
+
+def thinned(positions: Float[np.ndarray, "P 3"], count: int) -> Int64[np.ndarray, " kept"]:
+    """Indices of at most `count` points, evenly spread: of each cube of a grid, the point nearest to their mean.
+
+    The grid is the finest that has not more than `count` cubes with points in them.
+    """
+    if len(positions) <= count:
+        return np.arange(len(positions))
+    low = positions.min(axis=0)
+    extent = float((positions - low).max())
+    fine, coarse = 0.0, 2.0 * max(extent, 1e-12)
+    for _ in range(_BISECTIONS):
+        edge = (fine + coarse) / 2
+        cubes = len(np.unique(_cube_numbers(positions - low, edge)))
+        fine, coarse = (fine, edge) if cubes <= count else (edge, coarse)
+    return np.sort(_nearest_to_means(positions, _cube_numbers(positions - low, coarse)))
+
+
+def plane_normals(
+    positions: Float[np.ndarray, "P 3"],
+    towards: Float[np.ndarray, "P 3"],
+    wanted: Int64[np.ndarray, " chosen"],
+) -> Float[np.ndarray, "chosen 3"]:
+    """Unit normals of the planes through the neighbours of some points.
+
+    Args:
+        positions: All points.
+        towards: Directions, of which a point's normal makes an acute angle with its own.
+        wanted: Points to have normals of.
+    """
+    if len(positions) < 3:
+        return _unit(towards[wanted])
+    from scipy.spatial import KDTree
+
+    tree = KDTree(positions)
+    count = min(_PLANE_NEIGHBOURS, len(positions))
+    normals = np.empty((len(wanted), 3))
+    for start in range(0, len(wanted), _CHUNK):
+        chosen = wanted[start : start + _CHUNK]
+        _, neighbours = tree.query(positions[chosen], k=count)
+        around = positions[neighbours]
+        around = around - around.mean(axis=1, keepdims=True)
+        _, axes = np.linalg.eigh(around.swapaxes(1, 2) @ around)
+        normals[start : start + _CHUNK] = axes[:, :, 0]
+    flipped = (normals * towards[wanted]).sum(axis=1) < 0
+    normals[flipped] *= -1
+    return normals
+
+
+def _cube_numbers(offsets: Float[np.ndarray, "P 3"], edge: float) -> Int64[np.ndarray, " P"]:
+    cells = (offsets / edge).astype(np.int64)
+    sizes = cells.max(axis=0) + 1
+    return (cells[:, 0] * sizes[1] + cells[:, 1]) * sizes[2] + cells[:, 2]
+
+
+def _nearest_to_means(
+    positions: Float[np.ndarray, "P 3"], cubes: Int64[np.ndarray, " P"]
+) -> Int64[np.ndarray, " kept"]:
+    _, group, counts = np.unique(cubes, return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(group, weights=column) for column in positions.T], axis=1)
+    off = np.linalg.norm(positions - (sums / counts[:, None])[group], axis=1)
+    order = np.lexsort((off, group))
+    firsts = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    return order[firsts]
+
+
+def _unit(vectors: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True).clip(min=1e-12)
+
+
+_LONGEST_COMMENT = 300
+
+
+@dataclass(frozen=True)
+class PointScore:
+    """A number to add to every point."""
+
+    output: str
+    """As asked for, such as `index:ndvi`."""
+    property: str
+    """What files call it, such as `index_ndvi`."""
+    map: ReflectanceMap
+
+    def values(
+        self, diffuse: Float[Tensor, "P B"], light: Float[Tensor, "B"] | None
+    ) -> Float32[np.ndarray, " P"]:
+        """The numbers, relative to all the points given where a target needs a background; NaN where undefined.
+
+        Args:
+            diffuse: Spectra of points without the view-dependent part.
+            light: Relative power of the light that they are seen in; None where it is unknown.
+        Raises:
+            SpectrumError: too few points to judge a target against, or all are alike.
+        """
+        opaque = torch.ones(len(diffuse), dtype=diffuse.dtype)
+        reflectance = seen_reflectance(diffuse, opaque, light, 0.5)
+        return self.map.fit(reflectance)(reflectance).numpy().astype(np.float32)
+
+    def comment(self, materials: Materials) -> str:
+        """What a file says of it."""
+        caveat = "" if materials.light is not None else "; of radiance, since the scene's light is unknown"
+        return f"{self.property}: {self.output}, {self.map.what}"[:_LONGEST_COMMENT] + caveat
+
+
+def require_point_scores(outputs: Sequence[str], bands: Bands) -> list[PointScore]:
+    """Numbers to add to points; an output asked for twice is given once.
+
+    Args:
+        outputs: Such as `index:ndvi`, `index:r800/r670`, `target:ace:paint.csv`.
+        bands: The run's bands.
+    Raises:
+        ConfigError: another output, an unknown index, a formula that can't be read.
+        SpectrumError: the bands do not cover what one needs, or a target that can't be read.
+    """
+    scores: list[PointScore] = []
+    for output in dict.fromkeys(_plain(output) for output in outputs):
+        if not is_reflectance_map(output) or not output.partition(":")[2]:
+            raise ConfigError(
+                f"--outputs {output}: points take spectral indices, index:NAME or index:FORMULA such as "
+                "index:ndvi, and targets, target:FILE.csv or target:ace:FILE.csv; colour, material and abundances "
+                "are in every cloud"
+            )
+        name = _property_name(output, [score.property for score in scores])
+        scores.append(PointScore(output, name, parse_reflectance_map(output, bands)))
+    return scores
+
+
+def _plain(output: str) -> str:
+    """Named indices in the one way that their table has them."""
+    kind, colon, argument = output.partition(":")
+    name = argument.strip().lower()
+    return f"{kind}{colon}{name if kind == 'index' and name in NAMED_INDICES else argument}"
+
+
+def _property_name(output: str, taken: Sequence[str]) -> str:
+    """`index_ndvi` of a named index; otherwise the kind and the least number that is free: formats know few
+    characters."""
+    kind, _, argument = output.partition(":")
+    if kind == "index" and argument in NAMED_INDICES:
+        return f"index_{argument.replace('-', '_')}"
+    number = next(count for count in range(1, len(taken) + 2) if f"{kind}_{count}" not in taken)
+    return f"{kind}_{number}"
+
 
 _RAYS_PER_POINT = 5
 """Rays cast for each point asked for: many miss, and an even cover needs a choice."""
@@ -47,7 +227,6 @@ class PointCloud(Product):
 
     def write(self, job: Job) -> list[Path]:
         """Look through all cameras of the run, clean and thin what they see."""
-        from unmix_plugin.products.point_scores import require_point_scores
 
         count, materials = require_count(self.num_points), job.materials
         scores = require_point_scores(self.outputs, materials.bands)
@@ -104,8 +283,8 @@ def write_point_cloud(
         RunError: there is no point, or the disk is full or refuses.
         SpectrumError: too few points to judge a target against, or all are alike.
     """
-    from unmix_plugin.trained.surface_appearance import SurfaceAppearance
-    from unmix_plugin.trained.world_frame import directions_to_world, positions_for_files
+    from unmix_plugin.trained.run_views import directions_to_world, positions_for_files
+    from unmix_plugin.trained.surface import SurfaceAppearance
 
     points = points.select(torch.from_numpy(~is_outlier(points.positions.numpy())))
     if len(points) == 0:

@@ -19,10 +19,10 @@ from unmix_plugin.trained.run_views import RunView, ViewChoice, resized_views, v
 if TYPE_CHECKING:
     from unmix_plugin.scenes.scene import Normalisation
     from unmix_plugin.spectral.materials import Materials
+    from unmix_plugin.trained.evaluation import PredictedView
     from unmix_plugin.trained.open_run import LoadedRun
     from unmix_plugin.trained.surface import SeenSurface
     from unmix_plugin.trained.trained_scene import TrainedScene
-    from unmix_plugin.trained.view_rendering import RenderedView
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,9 @@ class ViewProduct(Product):
         """Files of a view."""
 
     @abstractmethod
-    def write_view(self, folder: Path, view: str, rendered: RenderedView, materials: Materials) -> list[Path]:
+    def write_view(
+        self, folder: Path, view: str, rendered: PredictedView, materials: Materials
+    ) -> list[Path]:
         """Write the files of a view, in a folder that is made.
 
         Raises:
@@ -151,9 +153,9 @@ class Job:
         """Views of the run."""
         return views_of(self.loaded.scene.views, choice)
 
-    def render(self, view: RunView) -> RenderedView:
+    def render(self, view: RunView) -> PredictedView:
         """A view of the run."""
-        from unmix_plugin.trained.view_rendering import render_view
+        from unmix_plugin.trained.evaluation import render_view
 
         return render_view(self.scene, view.camera)
 

@@ -7,12 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.products.render.files import COVERAGE, RenderSetting, Rows, still_at
-from unmix_plugin.products.render.formats import choose_formats
-from unmix_plugin.products.render.job import channel_names
+from unmix_plugin.products.render.files import COVERAGE, RenderSetting, Rows, choose_formats, still_at
+from unmix_plugin.products.render.job import channel_names, take_survey
 from unmix_plugin.products.render.pictures import Palette
-from unmix_plugin.products.render.survey import take_survey
-from unmix_plugin.trained.material_view import MaterialView
+from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.run_views import RunView
 
 _FORMATS = {".npy": "npy", ".png": "png", ".exr": "exr", ".hdr": "envi"}

@@ -19,8 +19,8 @@ from unmix_plugin.products.abundances import colour_panel
 from unmix_plugin.products.product import Job, ViewProduct
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.segmentation import NOTHING_ID
+from unmix_plugin.trained.evaluation import PredictedView
 from unmix_plugin.trained.run_materials import endmember_colours
-from unmix_plugin.trained.view_rendering import RenderedView
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,9 @@ class Segmentation(ViewProduct):
         """Files of a view: scores, figure, ids."""
         return [folder / f"{view}.npy", folder / f"{view}.png", folder / "labels" / f"{view}.png"]
 
-    def write_view(self, folder: Path, view: str, rendered: RenderedView, materials: Materials) -> list[Path]:
+    def write_view(
+        self, folder: Path, view: str, rendered: PredictedView, materials: Materials
+    ) -> list[Path]:
         """Write a view's scores, a figure, and its ids; the id of a pixel is the index of its largest score."""
         scores_path, figure_path, labels_path = self.paths(folder, view)
         write_file(scores_path, array_bytes(scores_of(rendered, materials).numpy().astype(np.float32)))
@@ -66,14 +68,14 @@ def legend_bytes(materials: Materials) -> bytes:
     return text.getvalue().encode()
 
 
-def scores_of(view: RenderedView, materials: Materials) -> Float[Tensor, "H W K"]:
+def scores_of(view: PredictedView, materials: Materials) -> Float[Tensor, "H W K"]:
     """What the ids are chosen by: abundances, or cosines to the endmembers (0 where nothing is)."""
     if materials.segmentation == "abundances":
         return view.abundances
     return view.material_scores * (view.segmentation != NOTHING_ID)[..., None]
 
 
-def draw_segmentation(name: str, view: RenderedView, materials: Materials) -> bytes:
+def draw_segmentation(name: str, view: PredictedView, materials: Materials) -> bytes:
     """A figure of a view in colour and of its materials, with a legend of those that occur."""
     colours = endmember_colours(materials)
     ids = view.segmentation.numpy()

@@ -26,8 +26,8 @@ from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.run_views import RunView, find_view
 
 if TYPE_CHECKING:
-    from unmix_plugin.trained.library_matches import ShownMatch
     from unmix_plugin.trained.protocol import Probe
+    from unmix_plugin.trained.run_materials import ShownMatch
 
 _MOST_BARS = 12
 
@@ -85,7 +85,7 @@ class Spectrum(Product):
     def _place(
         self, job: Job, title: str, facts: dict[str, object], probe: Probe, measured: np.ndarray | None
     ) -> ProbedPlace:
-        from unmix_plugin.trained.library_matches import LIGHT_UNKNOWN, library_with, shown_matches
+        from unmix_plugin.trained.run_materials import LIGHT_UNKNOWN, library_with, shown_matches
 
         light = job.scene.light_power
         if light is None:
@@ -100,8 +100,8 @@ class Spectrum(Product):
 
     def _measured(self, job: Job, view: RunView, pixel: tuple[int, int]) -> np.ndarray | None:
         """What the scene has in a pixel, in the light asked for."""
-        from unmix_plugin.trained.find_scene import find_scene
-        from unmix_plugin.trained.library_matches import relit
+        from unmix_plugin.trained.open_run import find_scene
+        from unmix_plugin.trained.run_materials import relit
 
         with job.working("looking for the scene"):
             scene = find_scene(job.loaded.record.summary, job.loaded.folder.path, self.data)
@@ -200,7 +200,7 @@ def _facts(place: ProbedPlace, materials: Materials) -> dict[str, Any]:
     is_something = probe.opacity >= OCCUPIED_ACCUMULATION
     shares = dict(zip(materials.names, probe.abundances.tolist(), strict=True))
     position = probe.world_position
-    from unmix_plugin.trained.library_matches import match_json
+    from unmix_plugin.trained.run_materials import match_json
 
     return {
         **place.facts,

@@ -18,7 +18,7 @@ from unmix_plugin.products.product import Job, Product
 
 if TYPE_CHECKING:
     from unmix_plugin.scenes.scene import Normalisation
-    from unmix_plugin.trained.density_grid import GridPoints
+    from unmix_plugin.trained.surface import GridPoints
     from unmix_plugin.trained.trained_scene import TrainedScene
 
 _FASTEST = 1
@@ -37,7 +37,7 @@ class Volume(Product):
 
     def write(self, job: Job) -> list[Path]:
         """Sample the field, slice by slice."""
-        from unmix_plugin.trained.density_grid import GridPoints
+        from unmix_plugin.trained.surface import GridPoints
 
         scene = job.scene
         grid = GridPoints.over(scene.scene_box.aabb, self.resolution)
@@ -69,8 +69,8 @@ def write_volume(
     Raises:
         RunError: the disk is full or refuses.
     """
-    from unmix_plugin.trained.density_grid import sample_slice
-    from unmix_plugin.trained.world_frame import affine_to_world
+    from unmix_plugin.trained.run_views import affine_to_world
+    from unmix_plugin.trained.surface import sample_slice
 
     path, materials = volume_path(folder), scene.materials
     density = np.zeros(grid.shape, dtype=np.float32)

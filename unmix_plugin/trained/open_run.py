@@ -1,20 +1,124 @@
-"""Opening a run: from its folder to the trained scene in it."""
+"""From a model, trained or in training, to the scene that it holds at this moment.
+
+The scene that a run was trained on, where it can still be found: measurements to put beside predictions.
+
+Opening a run: from its folder to the trained scene in it.
+"""
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
+
+from torch import Tensor
 
 from unmix_plugin.engine.configs import TrainerConfig
-from unmix_plugin.engine.registry import discover_methods
+from unmix_plugin.engine.model import Model
+from unmix_plugin.engine.registry import discover_methods, find_method
 from unmix_plugin.engine.runs.checkpoints import TrainingRecord
 from unmix_plugin.engine.runs.load_run import SceneRecord, load_model
 from unmix_plugin.engine.runs.run_folder import RunFolder
-from unmix_plugin.errors import ConfigError
+from unmix_plugin.engine.runs.scene_record import differences, name_differences
+from unmix_plugin.errors import ConfigError, RunError, SceneError
+from unmix_plugin.model import UnmixModel
+from unmix_plugin.scenes.reading.loader import load_scene
+from unmix_plugin.scenes.scene import Scene, SceneOptions, scene_identity
+from unmix_plugin.trained.model_scene import frozen_parameters, model_scene
 from unmix_plugin.trained.protocol import RenderableScene
-from unmix_plugin.trained.snapshot import snapshot
+from unmix_plugin.trained.run_views import recorded_views, world_frame
 from unmix_plugin.trained.trained_scene import TrainedScene
+
+
+def unmix_scene(
+    model: UnmixModel, record: SceneRecord, averages: Mapping[str, Tensor] | None = None
+) -> TrainedScene:
+    """The scene of a model as it is now; training that goes on does not change it.
+
+    Args:
+        model, averages: As `frozen_parameters` takes them.
+        record: Cameras and frame of its run; they are shown as they were corrected, those of evaluation views with the
+            corrected lens.
+    Raises:
+        RunError: the record is damaged.
+    """
+    frozen = frozen_parameters(model, averages)
+    materials, renderer = model.materials, model.renderer
+    specular = frozen.get(id(materials.specular_spectra), materials.specular_spectra)
+    if model.poses is not None:
+        own = copy.deepcopy(model.poses, frozen)  # type: ignore[arg-type]
+        record = replace(
+            record,
+            train_cameras=own.refined(record.train_cameras),
+            eval_cameras=own.lens.of(record.eval_cameras),
+        )
+    materials = replace(materials, endmembers=frozen[id(model.endmembers)], specular_spectra=specular)
+    opaque = renderer.opaque_skips
+    renderer = replace(
+        renderer,
+        skips=renderer.skips.clone(),
+        reachable=renderer.reachable.clone(),
+        opaque_skips=None if opaque is None else opaque.clone(),
+    )
+    return TrainedScene(
+        copy.deepcopy(model.field, frozen).eval(),  # type: ignore[arg-type]
+        renderer,
+        materials.to(model.device),
+        world_frame(record),
+        recorded_views(record),
+        model.metadata["pixel_size"],
+        model.metadata["subpixels"],
+        fitted=(
+            *(["pose"] if model.poses is not None else []),
+            *(["gain"] if model.view_gains is not None else []),
+        ),
+    )
+
+
+def snapshot(
+    model: Model, method_name: str, record: SceneRecord, averages: Mapping[str, Tensor] | None = None
+) -> RenderableScene:
+    """The scene of a model of any method, as its registration makes it.
+
+    Raises:
+        RunError: the record is damaged.
+        ConfigError: the method offers no scene.
+    """
+    make = find_method(method_name).scene or model_scene
+    return make(model, record, averages)
+
+
+def find_scene(summary: Mapping[str, Any], run: Path, data: Path | None) -> Scene | None:
+    """The scene of a run, if it is where it was and has not changed.
+
+    Args:
+        summary: What the run recorded of its scene.
+        run: Its folder.
+        data: Where the scene is now; then it has to be there. None: where it was.
+    Raises:
+        SceneError: it is not at `data`, or malformed there.
+        RunError: `data` is another scene than the run's.
+    """
+    root = data or Path(str(summary.get("root", "")))
+    if data is None and not (root.is_absolute() and root.is_dir()):
+        return None
+    try:
+        scene = load_scene(root, SceneOptions(**summary.get("options", {})))
+    except (SceneError, TypeError):
+        if data is None:
+            return None
+        raise
+    differing = differences(scene_identity(summary), scene_identity(scene.summary()))
+    if not differing:
+        return scene
+    if data is None:
+        return None
+    raise RunError(
+        f"the scene at {root} is not the one that {run} was trained on: {name_differences(differing)}"
+    )
 
 
 @dataclass(frozen=True)

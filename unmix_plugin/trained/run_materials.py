@@ -1,14 +1,31 @@
-"""The materials of a trained scene: their spectra, names and colours."""
+"""The materials of a trained scene: their spectra, names and colours.
+
+Which known materials a run's spectra resemble: radiance is divided by the light it was seen in, if that is known.
+
+Notation: `N` spectra, `B` bands.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 
 from unmix_plugin.figures.plotting import distinct_colours, own_colours
+from unmix_plugin.formats.envi import read_library_table
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.library.material_library import (
+    DARK_LIGHT,
+    Comparison,
+    LibraryMatch,
+    MaterialLibrary,
+    measured_library,
+)
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.spectral.materials import Materials
 
@@ -32,3 +49,85 @@ def write_endmembers_csv(path: Path, materials: Materials) -> Path:
     """
     write_spectra_csv(path, endmember_table(materials))
     return path
+
+
+LIGHT_UNKNOWN = (
+    "the light of the scene is unknown and taken as flat: matches are of radiance rather than of reflectance"
+)
+"""What has to be said of matches where the scene's light is unknown."""
+
+
+def relit(
+    measured: Float[np.ndarray, "*pixels B"],
+    recorded: Sequence[float] | None,
+    light: Float64[np.ndarray, " B"] | None,
+) -> Float64[np.ndarray, "*pixels B"]:
+    """Radiance measured in one light as it is in another; 0 in bands that the first left dark.
+
+    Args:
+        measured, recorded: Radiance, and the light (relative power, None: flat) that it was measured in.
+        light: The other one; None for the same.
+    """
+    if light is None:
+        return measured.astype(np.float64)
+    before = np.ones(len(light)) if recorded is None else np.asarray(recorded, dtype=np.float64)
+    lit = before > DARK_LIGHT * before.max()
+    return measured * np.divide(light, before, out=np.zeros_like(light), where=lit)
+
+
+def library_with(paths: Iterable[Path]) -> MaterialLibrary:
+    """The measured library with one's own files before it, the last one first.
+
+    Raises:
+        SpectrumError: as `read_library_table`.
+    """
+    library = measured_library()
+    for path in paths:
+        library = library.extended(read_library_table(path), path.name)
+    return library
+
+
+@dataclass(frozen=True)
+class ShownMatch:
+    """A known material beside the spectrum that it resembles."""
+
+    match: LibraryMatch
+    spectrum: Float64[np.ndarray, " B"]
+    """The material in the light of the scene, as bright as the spectrum (least squares); NaN where it is unknown."""
+
+
+def shown_matches(
+    spectra: Float[np.ndarray, "N B"],
+    bands: Bands,
+    light: Float64[np.ndarray, " B"] | None,
+    library: MaterialLibrary,
+    comparison: Comparison = "scale",
+) -> list[list[ShownMatch]]:
+    """The three nearest materials of each spectrum, nearest first, in the light and brightness of the spectrum."""
+    found = library.nearest(spectra, bands, light, 3, comparison)
+    return [
+        [ShownMatch(match, _as_seen(match, library, spectrum, bands, light)) for match in matches]
+        for spectrum, matches in zip(spectra, found, strict=True)
+    ]
+
+
+def match_json(match: LibraryMatch) -> dict[str, Any]:
+    """A match as JSON has it."""
+    given = {"name": match.name, "angle_rad": match.angle_rad}
+    return {**given, "bands_compared": match.num_bands, "source": match.source}
+
+
+def _as_seen(
+    match: LibraryMatch,
+    library: MaterialLibrary,
+    spectrum: Float[np.ndarray, " B"],
+    bands: Bands,
+    light: Float64[np.ndarray, " B"] | None,
+) -> Float64[np.ndarray, " B"]:
+    material, unknown = library.find(match.name), np.nan
+    centers = material.bands.centers_nm
+    known = np.interp(bands.centers_nm, centers, material.reflectance, left=unknown, right=unknown)
+    lit = known if light is None else known * light
+    shared = np.isfinite(lit)
+    power = float(lit[shared] @ lit[shared])
+    return lit * (float(lit[shared] @ spectrum[shared]) / power if power > 0 else 0.0)

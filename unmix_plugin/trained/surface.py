@@ -5,20 +5,36 @@ sees was never learnt. Both are found by comparing with the other cameras: a poi
 something at its distance, and few see through it.
 
 Notation: `P` points, `K` endmembers. Model space.
+
+The field of a trained scene on a regular grid, slice by slice: density, and what there is of each endmember.
+
+Only cells that are rendered are asked: elsewhere the field was never trained, and what it says there is nothing.
+
+Notation: `X x Y x Z` grid points, `P` points, `K` endmembers. Model space.
+
+What every point of a surface carries: its colour, its material, its abundances; the same in all formats.
+
+Notation: `P` points, `K` endmembers.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.spectral.colour.conversion import describe_colour, linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials
+from unmix_plugin.spectral.segmentation import material_ids, material_scores
+from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 SOLID_ACCUMULATION = 0.9
@@ -182,3 +198,136 @@ def _shares(
         for values in (found.abundances, found.scaled_abundances)
     )
     return abundances, scaled_abundances
+
+
+_RESOLUTIONS = (8, 1024)
+_CHUNK = 1 << 16
+
+
+@dataclass(frozen=True)
+class GridPoints:
+    """Points of a regular grid over a scene box; the outermost lie on its faces, but for a fraction of a cell."""
+
+    origin: Float32[np.ndarray, "3"]
+    """First point."""
+    cell: float
+    """Distance of neighbours along each axis."""
+    shape: tuple[int, int, int]
+    """Points along x, y and z."""
+
+    @staticmethod
+    def over(aabb: Float[Tensor, "2 3"], resolution: int) -> GridPoints:
+        """A grid with `resolution` cells along the longest edge of a box.
+
+        Raises:
+            ConfigError: fewer than 8 cells, or more than 1024.
+        """
+        low, high = _RESOLUTIONS
+        if not low <= resolution <= high:
+            raise ConfigError(
+                f"--resolution is {resolution}; choose {low} to {high} cells along the longest edge"
+            )
+        corners = aabb.detach().cpu().double().numpy()
+        size = corners[1] - corners[0]
+        cell = float(size.max()) / resolution
+        x, y, z = (int(np.floor(edge / cell + 1e-6)) + 1 for edge in size)
+        return GridPoints(corners[0].astype(np.float32), cell, (x, y, z))
+
+    def slice_points(self, index: int) -> Float[Tensor, "Y Z 3"]:
+        """Points of the slice at `index` along x."""
+        _, num_y, num_z = self.shape
+        cells = torch.cartesian_prod(torch.tensor([index]), torch.arange(num_y), torch.arange(num_z))
+        points = torch.from_numpy(self.origin).double() + self.cell * cells
+        return points.float().view(num_y, num_z, 3)
+
+
+@torch.no_grad()
+def sample_slice(
+    scene: TrainedScene, points: Float[Tensor, "Y Z 3"]
+) -> tuple[Float32[np.ndarray, "Y Z"], Float32[np.ndarray, "Y Z K"]]:
+    """Densities per model unit, and abundances, which sum to 1; both 0 in cells that are never rendered."""
+    flat = points.flatten(0, 1).to(scene.device)
+    densities = torch.zeros(len(flat), device=scene.device)
+    abundances = torch.zeros(len(flat), len(scene.materials.names), device=scene.device)
+    for chosen in scene.renderer.is_occupied(flat).nonzero()[:, 0].split(_CHUNK):
+        densities[chosen], features = scene.field.get_density(flat[chosen])
+        abundances[chosen] = scene.field.abundances_of(features)
+    shape = points.shape[:2]
+    return densities.cpu().unflatten(0, shape).numpy(), abundances.cpu().unflatten(0, shape).numpy()
+
+
+@torch.no_grad()
+def sample_densities(scene: TrainedScene, positions: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
+    """Densities per model unit of any points of the box, 0 in cells that are never rendered; on the CPU."""
+    flat = positions.to(scene.device)
+    densities = torch.zeros(len(flat), device=scene.device)
+    for chosen in scene.renderer.is_occupied(flat).nonzero()[:, 0].split(_CHUNK):
+        densities[chosen] = scene.field.get_density(flat[chosen])[0]
+    return densities.cpu()
+
+
+def may_be_solid(scene: TrainedScene, points: Float[Tensor, "*grid 3"]) -> Bool[Tensor, "*grid"]:
+    """Which points lie where anything may be: not in the space that was found to be empty before training; CPU."""
+    return scene.renderer.is_reachable(points.to(scene.device)).cpu()
+
+
+@dataclass(frozen=True)
+class SurfaceAppearance:
+    """Colour, material and abundances of points."""
+
+    materials: Materials
+    abundances: Float[Tensor, "P K"]
+    """Summing to 1."""
+    diffuse: Float[Tensor, "P B"]
+    """Spectra without the view-dependent part."""
+
+    @property
+    def linear_rgb(self) -> Float32[np.ndarray, "P 3"]:
+        """Linear light in sRGB primaries, [0, 1]."""
+        matrix = rgb_matrix(self.materials.bands, torch.float64)
+        return (self.diffuse.double().clamp(0, 1) @ matrix).clamp(0, 1).float().numpy()
+
+    @property
+    def srgb(self) -> Float64[np.ndarray, "P 3"]:
+        """Colours for displays, [0, 1]."""
+        return linear_to_srgb(torch.from_numpy(self.linear_rgb).double()).numpy()
+
+    @property
+    def material_ids(self) -> UInt8[np.ndarray, " P"]:
+        """Material of each point, chosen as in segmentations."""
+        by_angle = self.materials.segmentation == "probe"
+        endmembers = self.materials.endmembers.detach().cpu()
+        scores = material_scores(self.diffuse, endmembers) if by_angle else self.abundances
+        return material_ids(scores, torch.ones(len(scores))).numpy()
+
+    @property
+    def palette(self) -> Float64[np.ndarray, "K 3"]:
+        """sRGB colours that stand for the materials."""
+        return endmember_colours(self.materials)
+
+    def properties(self) -> dict[str, np.ndarray]:
+        """red, green, blue (uint8), material (uint8) and `abundance_NAME` (float32) of each point."""
+        colours = np.round(255 * self.srgb).astype(np.uint8)
+        named = {name: colours[:, axis] for axis, name in enumerate(("red", "green", "blue"))}
+        shares = self.abundances.numpy().astype(np.float32)
+        columns = {name: shares[:, index] for index, name in enumerate(property_names(self.materials.names))}
+        return {**named, "material": self.material_ids, **columns}
+
+    def comments(self, what: str) -> list[str]:
+        """What a file says of itself."""
+        colours = describe_colour(self.materials.bands)
+        materials = [f"material {index}: {name}" for index, name in enumerate(self.materials.names)]
+        return [what, f"coordinates: world of the scene's transforms.json; {colours}", *materials]
+
+
+def property_names(names: tuple[str, ...]) -> list[str]:
+    """Names of abundances as formats without spaces take them, all different.
+
+    >>> property_names(("red clay", "red-clay", "leaf"))
+    ['abundance_red_clay', 'abundance_red_clay_1', 'abundance_leaf']
+    """
+    plain: list[str] = []
+    for index, name in enumerate(names):
+        short = "abundance_" + (re.sub(r"[^0-9A-Za-z]+", "_", name).strip("_") or str(index))
+        plain.append(f"{short}_{index}" if short in plain else short)
+    return plain

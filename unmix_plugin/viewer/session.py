@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from unmix_plugin.editing import Light, Recipe
-from unmix_plugin.editing.light import relighting_factors
+from unmix_plugin.editing.apply import relighting_factors
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.training.progress import TrainingStatus
 from unmix_plugin.errors import SpectrumError
@@ -23,7 +23,7 @@ from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_names
 from unmix_plugin.spectral.materials import Materials
-from unmix_plugin.trained.relighting import LightChoice, RelightableScene, relit
+from unmix_plugin.trained.model_scene import LightChoice, RelightableScene, relit
 from unmix_plugin.trained.run_views import recorded_views
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.layers.layers import layers_of

@@ -36,8 +36,8 @@ from unmix_plugin.neumatex.fit.trained_object import TrainedObject
 from unmix_plugin.neumatex.tracing.families import SpectralFamily
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
+from unmix_plugin.trained.model_scene import LightChoice
 from unmix_plugin.trained.open_run import load_run
-from unmix_plugin.trained.relighting import LightChoice
 from unmix_plugin.viewer.layers.layers import layers_of
 from unmix_plugin.viewer.layers.painting import LayerSettings, SwatchLegend
 

@@ -8,8 +8,8 @@ from tests.neumatex.surfaces import CAMERAS, FRAME, PBR, TURN, make_object, unev
 from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.formats.exr import write_exr
 from unmix_plugin.neumatex.fit.trained_object import OWN_LIGHT
+from unmix_plugin.trained.model_scene import EstimatedScene, LightChoice, RelightableScene
 from unmix_plugin.trained.protocol import RenderableScene
-from unmix_plugin.trained.relighting import EstimatedScene, LightChoice, RelightableScene
 
 
 @pytest.fixture(scope="module")

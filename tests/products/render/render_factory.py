@@ -14,9 +14,8 @@ from tests.method_factory import make_scene
 from tests.scenes.scene_factory import ring_poses
 from tests.trained.camera_files.camera_scenes import cameras_at
 from unmix_plugin.products.render.cameras import RenderCameras
-from unmix_plugin.products.render.formats import FormattedOutput, choose_formats
-from unmix_plugin.products.render.job import RenderJob
-from unmix_plugin.products.render.survey import Survey, take_survey
+from unmix_plugin.products.render.files import FormattedOutput, choose_formats
+from unmix_plugin.products.render.job import RenderJob, Survey, take_survey
 from unmix_plugin.trained.run_views import RunView
 
 SCENE = make_scene()

@@ -11,9 +11,8 @@ from tests.scenes.scene_factory import ring_poses
 from tests.trained.camera_files.camera_scenes import around, cameras_at, record
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.products.render.cameras import CameraRequest, choose_cameras
-from unmix_plugin.trained.camera_files.camera_files import camera_file_bytes
-from unmix_plugin.trained.run_views import recorded_views
-from unmix_plugin.trained.world_frame import world_frame
+from unmix_plugin.trained.camera_files import camera_file_bytes
+from unmix_plugin.trained.run_views import recorded_views, world_frame
 
 RECORD = record(around(6), cameras_at(ring_poses(3)))
 SCENE = replace(make_scene(), views=recorded_views(RECORD), frame=world_frame(RECORD))

@@ -4,7 +4,7 @@ import pytest
 
 from tests.method_factory import make_scene
 from unmix_plugin.errors import ConfigError, UnmixError
-from unmix_plugin.products.render.formats import choose_formats, file_name
+from unmix_plugin.products.render.files import choose_formats, file_name
 from unmix_plugin.trained.outputs import OUTPUTS
 
 SCENE = make_scene()

@@ -14,8 +14,7 @@ from tests.products.render.render_factory import SCENE, read_envi, read_exr, ren
 from unmix_plugin.errors import RunError
 from unmix_plugin.figures.pictures import CanvasLayout
 from unmix_plugin.products.render.files import still_paths
-from unmix_plugin.products.render.job import RenderJob, output_paths
-from unmix_plugin.products.render.survey import Survey
+from unmix_plugin.products.render.job import RenderJob, Survey, output_paths
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 pytestmark = pytest.mark.usefixtures("no_wait_for_the_disk")
@@ -314,7 +313,8 @@ def test_indices_and_targets_are_those_of_the_rendered_spectra_in_every_block(tm
 
 
 def test_pictures_of_an_index_are_transparent_where_it_is_undefined_and_have_a_legend(tmp_path):
-    from unmix_plugin.products.render.legend import draw_legend, needs_legend
+    from unmix_plugin.products.render.files import needs_legend
+    from unmix_plugin.products.render.pictures import draw_legend
 
     cameras = views()
     products, survey, job = render(tmp_path, [INDEX], ["png"], cameras)

@@ -12,12 +12,9 @@ from tests.products.render.render_factory import read_envi, read_exr, views
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.registry import Output
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.products.render.files import still_paths
-from unmix_plugin.products.render.formats import choose_formats
-from unmix_plugin.products.render.job import RenderJob, output_paths
-from unmix_plugin.products.render.legend import draw_legend, needs_legend
-from unmix_plugin.products.render.pictures import Palette
-from unmix_plugin.products.render.survey import take_survey
+from unmix_plugin.products.render.files import choose_formats, needs_legend, still_paths
+from unmix_plugin.products.render.job import RenderJob, output_paths, take_survey
+from unmix_plugin.products.render.pictures import Palette, draw_legend
 from unmix_plugin.trained.protocol import RenderableScene
 
 pytestmark = pytest.mark.usefixtures("no_wait_for_the_disk")

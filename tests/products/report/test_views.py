@@ -8,16 +8,13 @@ import pytest
 import torch
 
 from tests.products.report.page_outline import Outline, assert_self_contained
-from unmix_plugin.products.report.layout import view_values
-from unmix_plugin.products.report.materials import TrueMaterials, material_cards
-from unmix_plugin.products.report.page import render_page
-from unmix_plugin.products.report.run import figure_rows, read_metrics, training_charts
-from unmix_plugin.products.report.views import ReportViews, evenly
+from unmix_plugin.products.report.page import render_page, view_values
+from unmix_plugin.products.report.pictures import ReportViews, TrueMaterials, evenly, material_cards
+from unmix_plugin.products.report.report import figure_rows, read_metrics, training_charts
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.material_library import measured_library
 from unmix_plugin.spectral.materials import Materials
-from unmix_plugin.trained.evaluation import Evaluation, SceneTruth, ViewTruth
-from unmix_plugin.trained.view_rendering import RenderedView
+from unmix_plugin.trained.evaluation import Evaluation, PredictedView, SceneTruth, ViewTruth
 
 BANDS = Bands.of([450, 500, 550, 600, 650])
 SPECTRA = torch.tensor([[0.9, 0.1, 0.1, 0.2, 0.3], [0.1, 0.8, 0.3, 0.1, 0.1], [0.2, 0.2, 0.2, 0.9, 0.6]])
@@ -35,7 +32,7 @@ def striped(name, offset=0.0):
     truth = ViewTruth(name, spectra, torch.ones(10, 12, dtype=torch.bool), alpha, labels, shares)
     wrong = spectra.clone()
     wrong[1:, :, 0] -= offset
-    return RenderedView(wrong, alpha, shares, labels, shares), truth
+    return PredictedView(wrong, alpha, shares, labels, shares), truth
 
 
 def gathered(offsets, with_truth=True, materials=MATERIALS):
@@ -125,7 +122,7 @@ def test_there_is_a_map_for_each_endmember_in_the_views_chosen(count):
     materials = Materials(bands, torch.rand(count, 31), torch.zeros(0, 31))
     views = ReportViews(materials, None, {"second"})
     shares = torch.full((4, 5, count), 1 / count)
-    view = RenderedView(
+    view = PredictedView(
         shares @ materials.endmembers, torch.ones(4, 5), shares, torch.zeros(4, 5, dtype=torch.uint8), shares
     )
     views.add("first", view, None)

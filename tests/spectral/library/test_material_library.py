@@ -18,7 +18,7 @@ from unmix_plugin.spectral.library.material_library import (
     measured_library,
 )
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
-from unmix_plugin.trained.library_matches import library_with
+from unmix_plugin.trained.run_materials import library_with
 
 VISIBLE = Bands.of(np.linspace(400, 700, 31))
 NUM_MEASURED = 183 if "CIE 2024" in SDS_TCS else 182

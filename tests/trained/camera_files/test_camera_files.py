@@ -10,7 +10,7 @@ import torch
 from tests.scenes.scene_factory import look_at
 from tests.trained.camera_files.camera_scenes import FRAME, around
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.trained.camera_files.camera_files import camera_file_bytes, read_camera_file
+from unmix_plugin.trained.camera_files import camera_file_bytes, read_camera_file
 from unmix_plugin.trained.run_views import RunView
 
 POSE = look_at(np.array([1.0, -3.0, 2.0]), np.zeros(3))

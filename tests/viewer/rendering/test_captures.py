@@ -10,8 +10,8 @@ import tyro
 from tests.viewer.view_factory import make_frame, make_services, some_pose
 from unmix_plugin.commands.render import RenderOptions
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.products.render.formats import choose_formats
-from unmix_plugin.trained.relighting import LightChoice
+from unmix_plugin.products.render.files import choose_formats
+from unmix_plugin.trained.model_scene import LightChoice
 from unmix_plugin.viewer.layers.layers import LAYERS
 from unmix_plugin.viewer.layers.painting import LayerSettings
 from unmix_plugin.viewer.rendering import captures

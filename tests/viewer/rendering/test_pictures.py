@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from tests.viewer.view_factory import make_frame, make_source
-from unmix_plugin.trained.material_view import MaterialView
+from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.rendering.pictures import (
     _BLOCK_S,

@@ -15,7 +15,7 @@ from unmix_plugin.scenes import load_scene
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.materials import Coefficients, Materials
-from unmix_plugin.trained.material_view import MaterialView
+from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.panels.probe import take_probe
 from unmix_plugin.viewer.rendering import scene as scene_module

@@ -38,7 +38,7 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.spectral.materials import default_names
-from unmix_plugin.trained.world_frame import directions_to_world, positions_for_files
+from unmix_plugin.trained.run_views import directions_to_world, positions_for_files
 
 
 @dataclass(frozen=True)

@@ -44,12 +44,10 @@ from unmix_plugin.neumatex.tracing.surface import Surface
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.segmentation import material_ids
-from unmix_plugin.trained.model_scene import ModelView, frozen_parameters
-from unmix_plugin.trained.probe import one_pixel
+from unmix_plugin.trained.model_scene import LightChoice, ModelView, frozen_parameters
 from unmix_plugin.trained.protocol import Probe
-from unmix_plugin.trained.relighting import LightChoice
-from unmix_plugin.trained.run_views import RunView, recorded_views
-from unmix_plugin.trained.world_frame import world_frame
+from unmix_plugin.trained.run_views import RunView, recorded_views, world_frame
+from unmix_plugin.trained.trained_scene import one_pixel
 
 if TYPE_CHECKING:
     from unmix_plugin.neumatex.fit.model import NeumatexModel

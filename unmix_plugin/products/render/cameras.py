@@ -9,8 +9,7 @@ from pathlib import Path
 from unmix_plugin.engine.geometry.camera_paths import interpolated, orbit
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError, did_you_mean
-from unmix_plugin.trained.camera_files.camera_files import read_camera_file
-from unmix_plugin.trained.camera_files.camera_json import check_frames_per_second, check_size
+from unmix_plugin.trained.camera_files import check_frames_per_second, check_size, read_camera_file
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.run_views import RunView, cameras_of, find_view, resized_views, views_of
 

@@ -4,12 +4,15 @@ A picture has tiles side by side, one for most outputs and one for each endmembe
 come with opacity, by which they are not multiplied; for a video, they are laid over the neutral grey.
 
 Notation: `h x W` pixels, some rows of an image; `T` tiles, `K` endmembers.
+
+What the colours of an output's pictures mean: a figure with its scale and a swatch for each material.
 """
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,6 +26,7 @@ from unmix_plugin.figures.pictures import (
     paint,
     premultiplied_over_neutral,
 )
+from unmix_plugin.figures.plotting import draw_colour_bar, draw_swatch, figure_bytes
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, srgb_to_linear
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.run_materials import endmember_colours
@@ -156,3 +160,41 @@ def _encoded(linear: Float64[np.ndarray, "h W 3"]) -> Float64[np.ndarray, "h W 3
 
 def _eight_bits(values: np.ndarray) -> np.ndarray:
     return np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)
+
+
+_WIDTH, _BAR_ROW, _NAME_ROW, _MARGIN = 5.2, 0.66, 0.26, 0.16
+"""Inches."""
+_NAMES_A_ROW = 3
+_LONGEST_NAME = 24
+_FONT_PT = 9
+
+
+def draw_legend(output: Output, palette: Palette) -> bytes:
+    """The legend of an output as a PNG."""
+    from matplotlib.figure import Figure
+
+    scale = palette.scale(output)
+    has_names = output.kind in ("labels", "shares")
+    names = list(zip(palette.names, palette.colours, strict=False)) if has_names else []
+    bar = 0.0 if scale is None else _BAR_ROW
+    height = 2 * _MARGIN + bar + -(-len(names) // _NAMES_A_ROW) * _NAME_ROW
+    figure = Figure(figsize=(_WIDTH, height), facecolor="white")
+    top = height - _MARGIN - bar
+    if scale is not None:
+        _draw_bar(figure, f"{output.name}: {scale.label}", scale, top, height)
+    for index, (name, colour) in enumerate(names):
+        row, column = divmod(index, _NAMES_A_ROW)
+        left = _MARGIN + column * (_WIDTH - 2 * _MARGIN) / _NAMES_A_ROW
+        bottom = top - (row + 1) * _NAME_ROW
+        draw_swatch(figure, colour, (left, bottom + 0.05))
+        place = ((left + 0.22) / _WIDTH, (bottom + 0.06) / height)
+        figure.text(*place, name[:_LONGEST_NAME], fontsize=_FONT_PT, va="bottom")
+    return figure_bytes(figure)
+
+
+def _draw_bar(figure: Any, title: str, scale: ColourScale, bottom: float, height: float) -> None:
+    box = (_MARGIN / _WIDTH, (bottom + 0.3) / height, 1 - 2 * _MARGIN / _WIDTH, 0.14 / height)
+    bounds = (scale.low, scale.high)
+    bar = draw_colour_bar(figure, figure.add_axes(box), scale.colour_map, bounds, "horizontal")
+    bar.ax.tick_params(labelsize=_FONT_PT - 1, length=2, pad=2)
+    bar.ax.set_title(title, fontsize=_FONT_PT, loc="left", pad=3)

@@ -32,9 +32,7 @@ from unmix_plugin.spectral.maps.indices import parse_index
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials
 from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.spectral.subspace import PcaColours
-from unmix_plugin.trained.material_view import MaterialView
-from unmix_plugin.trained.outputs.families import FAMILIES
-from unmix_plugin.trained.outputs.registry import OUTPUTS
+from unmix_plugin.trained.outputs import FAMILIES, OUTPUTS, MaterialView
 from unmix_plugin.trained.protocol import RenderableScene, RenderedView
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.trained_scene import TrainedScene

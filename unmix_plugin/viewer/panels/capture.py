@@ -14,10 +14,9 @@ from unmix_plugin.editing import recipe_to_yaml
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.formats.files import rgba_png_bytes, write_file
-from unmix_plugin.trained.camera_files.camera_files import camera_file_bytes
+from unmix_plugin.trained.camera_files import camera_file_bytes
 from unmix_plugin.trained.protocol import RenderedView
-from unmix_plugin.trained.run_views import RunView
-from unmix_plugin.trained.world_frame import world_frame
+from unmix_plugin.trained.run_views import RunView, world_frame
 from unmix_plugin.viewer.page import new_file, number
 from unmix_plugin.viewer.rendering.captures import (
     SIDE_BOUNDS,

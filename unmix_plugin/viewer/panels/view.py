@@ -15,7 +15,7 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.maps.indices import available_indices
 from unmix_plugin.spectral.materials import Materials
-from unmix_plugin.trained.relighting import LightChoice
+from unmix_plugin.trained.model_scene import LightChoice
 from unmix_plugin.viewer.layers.layers import covered, layer_named
 from unmix_plugin.viewer.layers.painting import (
     BACKGROUNDS,

@@ -24,9 +24,9 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.formats.exr import write_spectral_exr
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
-from unmix_plugin.trained.material_view import MaterialView
+from unmix_plugin.trained.model_scene import LightChoice
+from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.protocol import RenderedView
-from unmix_plugin.trained.relighting import LightChoice
 from unmix_plugin.viewer.layers.painting import LayerSettings
 from unmix_plugin.viewer.rendering.pictures import FrameRender
 from unmix_plugin.viewer.rendering.render_loop import Capture, RenderLoop

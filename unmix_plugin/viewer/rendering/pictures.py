@@ -23,11 +23,10 @@ from torch import Tensor
 from unmix_plugin.editing.edited_field import EditedField
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials
-from unmix_plugin.trained.material_view import MaterialView
-from unmix_plugin.trained.model_scene import ModelView
+from unmix_plugin.trained.model_scene import EstimatedScene, ModelView
 from unmix_plugin.trained.open_run import require_materials
+from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.protocol import RenderableScene, RenderedView
-from unmix_plugin.trained.relighting import EstimatedScene
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.layers.layers import LAYERS, Layer, layer_named
 from unmix_plugin.viewer.layers.painting import LayerSettings, Legend, as_bytes

@@ -25,12 +25,11 @@ from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.engine.training.training_control import DeviceShare, TrainingControl
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients
-from unmix_plugin.trained.library_matches import relit as relit_measurement
-from unmix_plugin.trained.material_view import MaterialView
-from unmix_plugin.trained.open_run import LoadedRun, require_materials
+from unmix_plugin.trained.model_scene import LightChoice, relit
+from unmix_plugin.trained.open_run import LoadedRun, require_materials, snapshot
+from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.protocol import RenderableScene
-from unmix_plugin.trained.relighting import LightChoice, relit
-from unmix_plugin.trained.snapshot import snapshot
+from unmix_plugin.trained.run_materials import relit as relit_measurement
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.layers.layers import LayerAids, render_reference
 

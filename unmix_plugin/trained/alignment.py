@@ -1,4 +1,11 @@
-"""The pose of an evaluation view, fitted to its picture with the field as it is, where training corrected poses.
+"""The gain of an evaluation view, fitted to what was measured of it, where each training view had a gain of its own.
+
+A trained gain says nothing of views that were not trained on, so each is aligned first, with the same few numbers as in
+training: exposure and a smooth white balance. Figures after it say how well a view is predicted but for these.
+
+Notation: `B` bands, `T` terms.
+
+The pose of an evaluation view, fitted to its picture with the field as it is, where training corrected poses.
 
 Corrected poses and field move together, so a given pose no longer says exactly from where a view was taken. As is usual
 for fields that refine poses, each evaluation view is aligned before it is measured: one turn and one shift are found
@@ -13,6 +20,11 @@ Notation: `P` pixels of a coarse picture, `C` spectral channels compared, `D` th
 
 Source: Lin et al. 2021, BARF (alignment of views at test time); here by Levenberg-Marquardt steps with central
 differences of renders, since one-sided ones stop early.
+
+Poses of an evaluation view's rows, fitted to its picture with the field as it is, where training corrected poses.
+
+A line camera's rows wobble, so no single turn and shift aligns such a view. Once these are found (pose_alignment.py),
+its rows are fitted one by one.
 """
 
 from __future__ import annotations
@@ -28,13 +40,51 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import rotation_matrix
 from unmix_plugin.engine.geometry.space import RayBundle
+from unmix_plugin.light.view_gains import smooth_terms
 from unmix_plugin.poses.refinement import LARGEST_STEP
-from unmix_plugin.poses.row_fitting import main_axes
-from unmix_plugin.trained.material_view import MaterialView
+from unmix_plugin.poses.row_fitting import fit_rows, main_axes
+from unmix_plugin.spectral.evidence import is_blown_out
+from unmix_plugin.trained.evaluation import PredictedView, ViewTruth
+from unmix_plugin.trained.outputs import MaterialView
 
 if TYPE_CHECKING:
     from unmix_plugin.trained.evaluation import ViewTruth
     from unmix_plugin.trained.trained_scene import TrainedScene
+
+
+_NUM_STEPS = 20
+
+
+def align_gain(
+    predicted: PredictedView, truth: ViewTruth, wavelengths_nm: Float[Tensor, "B"]
+) -> PredictedView:
+    """The prediction times the smooth gain with which it comes nearest to the measured view."""
+    counts = truth.shows_matter & ~is_blown_out(truth.spectra)
+    if not bool(counts.any()):
+        return predicted
+    shown, measured = predicted.spectra[counts].double(), truth.spectra[counts].double()
+    gain = fitted_gain((shown * shown).sum(dim=0), (shown * measured).sum(dim=0), wavelengths_nm.double())
+    return replace(predicted, spectra=predicted.spectra * gain.to(predicted.spectra))
+
+
+def fitted_gain(
+    power: Float[Tensor, "B"], agreement: Float[Tensor, "B"], wavelengths_nm: Float[Tensor, "B"]
+) -> Float[Tensor, "B"]:
+    """Smooth gain g of least squared error, by Gauss-Newton steps.
+
+    Args:
+        power, agreement: Sums over pixels of p p and p m, where p is predicted and m measured.
+    """
+    terms = smooth_terms(wavelengths_nm)
+    logs = torch.zeros(len(terms), dtype=terms.dtype)
+    ridge = 1e-9 * power.sum() * torch.eye(len(terms), dtype=terms.dtype)
+    for _ in range(_NUM_STEPS):
+        gain = (logs @ terms).exp()
+        slopes = (terms * (power * gain * gain)) @ terms.T + ridge
+        step = torch.linalg.solve(slopes, terms @ (agreement * gain - power * gain * gain))
+        logs = logs + step.clamp(-0.5, 0.5)
+    return (logs @ terms).exp()
+
 
 SIDES_PX = (24, 48, 96, 192)
 """Longest sides of the pictures compared, one after the other; none larger than the view."""
@@ -228,3 +278,17 @@ def _shown(
     seen = truth.seen(view["spectral"]).float() @ axes.to(view.opacity)
     values = torch.cat([seen, opacity[..., None]], dim=-1).unflatten(0, (len(cameras), height))
     return torch.nn.functional.avg_pool2d(values.permute(0, 3, 1, 2), subpixels).flatten(2).mT.cpu()
+
+
+@torch.no_grad()
+def align_rows(scene: TrainedScene, camera: Cameras, truth: ViewTruth) -> Cameras:
+    """A line camera, its rows moved to where the scene looks most like what was measured."""
+
+    def look(rays: RayBundle, axes: Float[Tensor, "b C"]) -> Float[Tensor, "R D"]:
+        matrix = axes if truth.sensor is None else torch.from_numpy(truth.sensor.matrix).to(axes).T @ axes
+        found = scene.renderer.composite(scene.field, rays)
+        seen = scene.materials.through(found, matrix)
+        return seen if truth.alpha is None else torch.cat([seen, found.accumulation[:, None]], dim=1)
+
+    turned = align_pose(scene, camera, truth).to(scene.device)
+    return fit_rows(turned, truth.spectra, truth.valid, truth.alpha, scene.scene_box, look)

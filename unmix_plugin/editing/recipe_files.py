@@ -1,0 +1,403 @@
+"""Recipes as YAML: plain data, checked line by line, and written so that it reads as the same recipe.
+
+    illuminant: A
+    edits:
+      - rename: {endmember: 0, name: wood}
+      - swap: [wood, 3]
+      - replace: {endmember: 2, library: checker/red}
+      - retint: {endmember: 4, colour: '#3366cc'}
+      - remove: [5, 6]
+
+The fields of each edit's dataclass say what can be written, of what type, and what may be left out. A field whose type
+is a union of dataclasses stands for the fields of one of them: those of `Replace.spectrum` are written as `library`, or
+as `file` and `spectrum`. Of YAML only single plain values are ever constructed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection
+from dataclasses import MISSING, Field, fields, is_dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import yaml
+
+from unmix_plugin.editing.recipe import OPERATIONS, Colour, Endmember, Light, LightName, Operation, Recipe
+from unmix_plugin.errors import ConfigError, UnmixError, did_you_mean
+from unmix_plugin.figures.plotting import css_colour
+from unmix_plugin.spectral.colour.conversion import parse_light
+
+_MOST_CHARACTERS = 100_000
+"""PyYAML reads about 60,000 characters a second."""
+_MOST_EDITS = 1000
+_MOST_ENDMEMBERS = 255
+"""That one edit may name; no run has more."""
+_LONGEST_NUMBER, _LONGEST_QUOTE = 40, 60
+_PLAIN_TAGS = frozenset(
+    f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "timestamp")
+)
+_NUMBER_TAGS = frozenset(f"tag:yaml.org,2002:{kind}" for kind in ("int", "float"))
+_KINDS = {kind.kind: kind for kind in OPERATIONS}
+_T = TypeVar("_T")
+
+
+def read_recipe(path: str | Path) -> Recipe:
+    """Read a recipe; relative paths in it start from its folder.
+
+    Raises:
+        ConfigError: it can't be read, or anything in it is wrong; one message names every fault with its line.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise ConfigError(f"can't read the recipe {path}: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"can't read the recipe {path}: it is not text in UTF-8") from error
+    return recipe_from_yaml(text, str(path), path.parent)
+
+
+def recipe_from_yaml(text: str, source: str = "recipe", folder: Path = Path()) -> Recipe:
+    """A recipe from its text.
+
+    Args:
+        text: YAML.
+        source: What messages call it.
+        folder: Where relative paths start.
+    Raises:
+        ConfigError: anything in it is wrong; one message names every fault with its line.
+    """
+    faults: list[_NodeError] = []
+    operations, light = [], None
+    try:
+        document = _compose(text)
+        parts = _mapping(document, "a recipe", (), ("edits", "illuminant"))
+        if not parts:
+            raise _NodeError(document, "a recipe needs edits or an illuminant")
+        if "illuminant" in parts:
+            light = _read_light(parts["illuminant"], folder.absolute())
+        for node in _sequence(parts["edits"], "edits", _MOST_EDITS) if "edits" in parts else []:
+            try:
+                operations.append(_read_edit(node, folder.absolute()))
+            except _NodeError as error:  # noqa: PERF203 - one message names every fault
+                faults.append(error)
+    except _NodeError as error:
+        faults.append(error)
+    if faults:
+        places = [source if one.line is None else f"{source}, line {one.line}" for one in faults]
+        raise ConfigError("\n".join(f"{place}: {one}" for place, one in zip(places, faults, strict=True)))
+    return Recipe(tuple(operations), light, source)
+
+
+def recipe_to_yaml(recipe: Recipe) -> str:
+    """The text of a recipe, without comments."""
+    content: dict[str, Any] = {}
+    if recipe.illuminant is not None:
+        light = _written(recipe.illuminant)
+        content["illuminant"] = light if recipe.illuminant.extrapolate else light["light"]
+    edits = []
+    for one in recipe.operations:
+        found: Any = _written(one)
+        if one.is_list:
+            found = next(iter(found.values())) if len(found) == 1 else list(found.values())
+        edits.append({one.kind: found})
+    content["edits"] = edits
+    return yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True, width=110)
+
+
+class _NodeError(Exception):
+    """Something in a YAML text is not what it should be."""
+
+    def __init__(self, where: yaml.Node | int | None, message: str) -> None:
+        """`where`: a node, a line from 1, or None if the text as a whole is meant."""
+        super().__init__(message)
+        self.line = where.start_mark.line + 1 if isinstance(where, yaml.Node) else where
+
+
+# Edits from nodes.
+
+
+def _read_edit(node: yaml.Node, folder: Path) -> Operation:
+    if not isinstance(node, yaml.MappingNode) or len(node.value) != 1:
+        known = ", ".join(_KINDS)
+        raise _NodeError(node, f"an edit is one of {known} and what it takes, as in 'swap: [0, 1]'")
+    [(key, value)] = node.value
+    name = _text(key, "an edit")
+    if name not in _KINDS:
+        raise _NodeError(key, f"there is no edit {_describe(key)}; {_nearest(name, _KINDS)}")
+    kind = _KINDS[name]
+    try:
+        found = _read_list(value, kind, folder) if kind.is_list else _read_fields(value, kind, name, folder)
+    except UnmixError as error:
+        raise _NodeError(value, f"{name}: {error}") from error
+    if kind.needs_one_of and not any(key.value in kind.needs_one_of for key, _ in value.value):
+        raise _NodeError(value, f"{name} needs {' or '.join(kind.needs_one_of)}")
+    return replace(found, line=node.start_mark.line + 1)
+
+
+def _read_light(node: yaml.Node, folder: Path) -> Light:
+    """A light by name or file alone, or as a mapping."""
+    if not isinstance(node, yaml.MappingNode):
+        node = yaml.MappingNode(node.tag, [(yaml.ScalarNode("tag:yaml.org,2002:str", "light"), node)])
+    return _read_fields(node, Light, "illuminant", folder)
+
+
+def _read_list(node: yaml.Node, kind: type[Operation], folder: Path) -> Operation:
+    """An edit whose fields are a list, or its only field."""
+    hints = _types(kind)
+    items = [node] if len(hints) == 1 else _sequence(node, kind.kind, _MOST_ENDMEMBERS)
+    if len(items) != len(hints):
+        raise _NodeError(node, f"{kind.kind} takes a list of {len(hints)}; found {len(items)}")
+    return kind(
+        *(
+            _read_value(hint, item, kind.kind, folder)
+            for hint, item in zip(hints.values(), items, strict=True)
+        )
+    )
+
+
+def _read_fields(node: yaml.Node, kind: type[_T], what: str, folder: Path) -> _T:
+    """A dataclass from a mapping of its fields."""
+    own = {one.name: one for one in _fields(kind) if not _options(kind, one.name)}
+    unions = {one.name: _options(kind, one.name) for one in _fields(kind) if one.name not in own}
+    optional = [name for name, one in own.items() if one.default is not MISSING]
+    other = [one.name for options in unions.values() for option in options for one in _fields(option)]
+    parts = _mapping(node, what, [name for name in own if name not in optional], [*other, *optional])
+    values: dict[str, Any] = {
+        name: _read_value(_types(kind)[name], parts[name], name, folder) for name in own if name in parts
+    }
+    for name, options in unions.items():
+        values[name] = _read_option(node, parts, options, what, folder)
+    return kind(**values)
+
+
+def _read_option(
+    node: yaml.Node, parts: dict[str, yaml.Node], options: list[type], what: str, folder: Path
+) -> Any:
+    """The one of several dataclasses whose first field is there."""
+    keys = {option: [one.name for one in _fields(option)] for option in options}
+    chosen = [option for option in options if keys[option][0] in parts]
+    if len(chosen) != 1:
+        raise _NodeError(node, f"{what} takes either {' or '.join(names[0] for names in keys.values())}")
+    [kind] = chosen
+    for option in options:
+        for name in [one for one in keys[option] if one in parts and one not in keys[kind]]:
+            first, other = keys[option][0], keys[kind][0]
+            raise _NodeError(parts[name], f"{what}: {name} goes with {first}, not with {other}")
+    types = _types(kind)
+    return kind(
+        **{key: _read_value(types[key], parts[key], key, folder) for key in keys[kind] if key in parts}
+    )
+
+
+def _read_value(hint: Any, node: yaml.Node, what: str, folder: Path) -> Any:
+    """A value of a field's type."""
+    if get_origin(hint) is Literal:
+        word, allowed = _text(node, what), get_args(hint)
+        if word not in allowed:
+            raise _NodeError(node, f"{what} must be {' or '.join(allowed)}; found {_describe(node)}")
+        return word
+    return _READERS[hint](node, what, folder)
+
+
+def _fields(kind: type) -> list[Field[Any]]:
+    return [one for one in fields(kind) if not one.kw_only]
+
+
+@lru_cache
+def _types(kind: type) -> dict[str, Any]:
+    """The types of a dataclass's fields, None taken out: what may be left out is not written as null."""
+    found = {}
+    for name, hint in get_type_hints(kind).items():
+        if get_origin(hint) in (Union, UnionType):
+            hint = Union[tuple(part for part in get_args(hint) if part is not NoneType)]  # noqa: UP007
+        found[name] = hint
+    return {one.name: found[one.name] for one in _fields(kind)}
+
+
+def _options(kind: type, name: str) -> list[Any]:
+    """The dataclasses that a field may hold; none for a plain value."""
+    return [option for option in get_args(_types(kind)[name]) if is_dataclass(option)]
+
+
+def _written(value: Any) -> dict[str, Any]:
+    """A dataclass as a mapping that reads as the same; what has its default is left out."""
+    found: dict[str, Any] = {}
+    always = value.needs_one_of[:1] if isinstance(value, Operation) else ()
+    for one in _fields(type(value)):
+        part = getattr(value, one.name)
+        if _options(type(value), one.name):
+            found |= _written(part)
+        elif part == one.default and one.name not in always:
+            continue
+        elif _types(type(value))[one.name] == Colour and all(round(255 * x) / 255 == x for x in part):
+            found[one.name] = css_colour(part)  # which is exact
+        else:
+            found[one.name] = (
+                str(part) if isinstance(part, Path) else list(part) if isinstance(part, tuple) else part
+            )
+    return found
+
+
+# Values from nodes; each raises a `_NodeError` where it is something else.
+
+
+def _compose(text: str) -> yaml.Node:
+    """The text's only document."""
+    if len(text) > _MOST_CHARACTERS:
+        raise _NodeError(None, f"{len(text)} characters are too many; at most {_MOST_CHARACTERS}")
+    try:
+        document = yaml.compose(text, Loader=yaml.SafeLoader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = mark.line + 1 if mark else None
+        raise _NodeError(line, f"not YAML: {error.problem or error.context}") from error
+    except (yaml.YAMLError, RecursionError, ValueError, OverflowError) as error:
+        # The last two are PyYAML's own, of version numbers and escapes that no program can hold.
+        raise _NodeError(None, f"not YAML: {str(error).partition(chr(10))[0]}") from error
+    if document is None:
+        raise _NodeError(None, "the recipe is empty; it needs edits or an illuminant")
+    return document
+
+
+def _mapping(
+    node: yaml.Node, what: str, required: Collection[str], optional: Collection[str]
+) -> dict[str, yaml.Node]:
+    """The values of a mapping by key, none of them unknown, repeated or missing."""
+    known = [*required, *optional]
+    if not isinstance(node, yaml.MappingNode):
+        raise _NodeError(node, f"{what} takes {', '.join(known)}; found {_describe(node)}")
+    found: dict[str, yaml.Node] = {}
+    for key_node, value in node.value:
+        key = _text(key_node, "a key")
+        if key not in known:
+            raise _NodeError(key_node, f"{what} has no {_describe(key_node)}; {_nearest(key, known)}")
+        if key in found:
+            raise _NodeError(key_node, f"{what} has {key!r} twice")
+        found[key] = value
+    missing = [key for key in required if key not in found]
+    if missing:
+        raise _NodeError(node, f"{what} needs {' and '.join(missing)}")
+    return found
+
+
+def _sequence(node: yaml.Node, what: str, longest: int) -> list[yaml.Node]:
+    if not isinstance(node, yaml.SequenceNode):
+        raise _NodeError(node, f"{what} must be a list; found {_describe(node)}")
+    if len(node.value) > longest:
+        raise _NodeError(node, f"{what} has {len(node.value)} items; at most {longest}")
+    return list(node.value)
+
+
+def _scalar(node: yaml.Node) -> Any:
+    """A word, number, true, false, date or None; None, too, for lists and mappings."""
+    if not isinstance(node, yaml.ScalarNode):
+        return None
+    if node.tag not in _PLAIN_TAGS:
+        tag = node.tag[:_LONGEST_QUOTE]
+        raise _NodeError(node, f"only plain data is read; found a value with the tag {tag}")
+    # YAML 1.1 takes 1:30 for a number in base 60, which nobody means.
+    if node.tag in _NUMBER_TAGS and (len(node.value) > _LONGEST_NUMBER or ":" in node.value):
+        raise _NodeError(node, f"can't read {_describe(node)} as a number; put it in quotes if it is text")
+    try:
+        return yaml.constructor.SafeConstructor().construct_object(node)
+    except (yaml.YAMLError, ValueError, KeyError, IndexError, OverflowError) as error:
+        raise _NodeError(node, f"can't read {_describe(node)} as {node.tag.rpartition(':')[2]}") from error
+
+
+def _text(node: yaml.Node, what: str, _: Path = Path()) -> str:
+    value = _scalar(node)
+    if not isinstance(value, str):
+        raise _NodeError(
+            node, f"{what} must be text; found {_describe(node)}; put it in quotes if it is text"
+        )
+    if any(letter == "\0" or "\ud800" <= letter <= "\udfff" for letter in value):
+        raise _NodeError(
+            node, f"{what} has a character that no name or path can have; found {_describe(node)}"
+        )
+    return value
+
+
+def _number(node: yaml.Node, what: str, _: Path = Path()) -> float:
+    value = _scalar(node)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise _NodeError(node, f"{what} must be a number; found {_describe(node)}")
+    return float(value)
+
+
+def _boolean(node: yaml.Node, what: str, _: Path) -> bool:
+    value = _scalar(node)
+    if not isinstance(value, bool):
+        raise _NodeError(node, f"{what} must be true or false; found {_describe(node)}")
+    return value
+
+
+def _colour(node: yaml.Node, what: str, _: Path) -> Colour:
+    """An sRGB colour in [0, 1], from '#rrggbb' or three numbers in [0, 1]."""
+    expected = f"{what} must be '#rrggbb' in quotes, or three numbers in [0, 1]"
+    if isinstance(node, yaml.SequenceNode):
+        if len(node.value) != 3:
+            raise _NodeError(node, f"{expected}; found {len(node.value)} numbers")
+        red, green, blue = (_number(item, what) for item in node.value)
+        return red, green, blue
+    value = _scalar(node)
+    if value is None:
+        raise _NodeError(node, f"{expected}; found nothing (without quotes, # begins a comment)")
+    digits = re.fullmatch(r"#?([0-9a-fA-F]{6})", value) if isinstance(value, str) else None
+    if digits is None:
+        raise _NodeError(node, f"{expected}; found {_describe(node)}")
+    red, green, blue = (int(digits[1][i : i + 2], 16) / 255 for i in (0, 2, 4))
+    return red, green, blue
+
+
+def _endmember(node: yaml.Node, _: str, __: Path) -> Endmember:
+    value = _scalar(node)
+    if isinstance(value, bool) or not isinstance(value, str | int):
+        raise _NodeError(node, f"an endmember is given by its name or number; found {_describe(node)}")
+    return value
+
+
+def _endmembers(node: yaml.Node, what: str, folder: Path) -> tuple[Endmember, ...]:
+    """A list of them, or one alone."""
+    is_list = isinstance(node, yaml.SequenceNode)
+    items = _sequence(node, what, _MOST_ENDMEMBERS) if is_list else [node]
+    return tuple(_endmember(item, what, folder) for item in items)
+
+
+def _light(node: yaml.Node, _: str, folder: Path) -> LightName:
+    try:
+        light = parse_light(_text(node, "illuminant"))
+    except UnmixError as error:
+        raise _NodeError(node, f"illuminant: {error}") from error
+    return folder / light if isinstance(light, Path) else light
+
+
+_READERS: dict[Any, Callable[[yaml.Node, str, Path], Any]] = {
+    str: _text,
+    float: _number,
+    bool: _boolean,
+    Path: lambda node, what, folder: folder / _text(node, what),
+    Colour: _colour,
+    Endmember: _endmember,
+    tuple[Endmember, ...]: _endmembers,
+    LightName: _light,
+}
+"""How a value of each type of field is read: node, what messages call it, folder of relative paths."""
+
+
+def _describe(node: yaml.Node) -> str:
+    """What a message says that it found."""
+    if isinstance(node, yaml.MappingNode):
+        return "a mapping"
+    if isinstance(node, yaml.SequenceNode):
+        return f"a list of {len(node.value)}"
+    shortened = node.value[:_LONGEST_QUOTE] + "..." if len(node.value) > _LONGEST_QUOTE else node.value
+    return repr(shortened) if shortened else "nothing"
+
+
+def _nearest(word: str, known: Collection[str]) -> str:
+    """Words that a reader may have meant, for the end of a message."""
+    return did_you_mean(word[:_LONGEST_QUOTE], known) or f"known: {', '.join(known)}"

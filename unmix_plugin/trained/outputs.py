@@ -1,0 +1,294 @@
+"""A rendered view of a scene of mixed materials, and the table of everything that can be shown of it.
+
+Notation: `H x W` pixels, `B` bands, `K` endmembers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.registry import Output, OutputKind, no_output
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.spectral.colour.conversion import band_composite_matrix, linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.maps.reflectance_maps import parse_reflectance_map
+from unmix_plugin.spectral.materials import Coefficients, Materials
+from unmix_plugin.spectral.segmentation import material_scores
+from unmix_plugin.spectral.subspace import PcaColours
+
+if TYPE_CHECKING:
+    from unmix_plugin.trained.trained_scene import TrainedScene
+
+
+@dataclass(frozen=True)
+class MaterialView:
+    """What one camera sees of a scene."""
+
+    scene: TrainedScene
+    """With the materials to show; the coefficients may be rendered with others on the same shapes."""
+    camera: Cameras
+    coefficients: Coefficients
+    """(H, W, ...)."""
+
+    @property
+    def materials(self) -> Materials:
+        """The spectra that the coefficients are multiplied with."""
+        return self.scene.materials
+
+    @property
+    def opacity(self) -> Float[Tensor, "H W"]:
+        """[0, 1]."""
+        return self.coefficients.accumulation
+
+    @property
+    def coverage(self) -> Float[Tensor, "H W"]:
+        """How much of a pixel shows something, [0, 1]: where the world has no end, the sky is behind all."""
+        return torch.ones_like(self.opacity) if self.scene.renderer.is_unbounded else self.opacity
+
+    @property
+    def spectra(self) -> Float[Tensor, "H W B"]:
+        """Radiance on black."""
+        return self.materials.spectra(self.coefficients)
+
+    @property
+    def ray_distance(self) -> Float[Tensor, "H W"]:
+        """Along the ray, world units; 0 where nothing is."""
+        return self.coefficients.ray_distance / self.scene.frame.scale
+
+    @property
+    def depth(self) -> Float[Tensor, "H W"]:
+        """Along the viewing axis, world units; 0 where nothing is."""
+        camera = self.camera.to(self.coefficients.packed.device)
+        rays = camera.image_rays(0)
+        assert rays.axes is not None
+        along_axis = (rays.directions * rays.axes).sum(dim=-1)
+        return self.ray_distance * along_axis.view_as(self.opacity)
+
+    @property
+    def normals(self) -> Float[Tensor, "H W 3"]:
+        """Unit vectors in world axes; 0 where nothing is."""
+        scene, seen = self.scene, self.coefficients
+        rays = self.camera.to(scene.device).image_rays(0)
+        normals = scene.renderer.normals(scene.field, rays, seen.ray_distance.flatten())
+        turned = normals @ torch.as_tensor(scene.frame.rotation, dtype=normals.dtype).to(normals)
+        return turned.view(*seen.accumulation.shape, 3) * seen.is_occupied[..., None]
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> MaterialView:
+        """The same view with its coefficients on another device, or of some rows."""
+        return MaterialView(self.scene, self.camera, self.coefficients.map(function))
+
+    @torch.no_grad()
+    def __getitem__(self, name: str) -> Tensor:
+        """An output by its name.
+
+        Raises:
+            ConfigError: there is none, or its argument can't be read.
+            SpectrumError: the bands don't cover what it needs.
+        """
+        return self.scene.output(name).compute(self)
+
+
+@dataclass(frozen=True)
+class FamilyMember:
+    """One output of a family."""
+
+    what: str
+    """What its numbers are."""
+    compute: Callable[[MaterialView], Tensor]
+    value_range: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class OutputFamily:
+    """Outputs of one kind that differ by an argument."""
+
+    kind: OutputKind
+    title: str
+    needs: str
+    """What the argument is."""
+    example: str
+    make: Callable[[str, str, Materials], FamilyMember]
+    """From name, argument and materials to the output.
+
+    Raises:
+        ConfigError: the argument can't be read.
+        SpectrumError: the bands don't cover it.
+    """
+
+
+def _band(name: str, argument: str, materials: Materials) -> FamilyMember:
+    band = materials.bands.nearest(_wavelength_nm(argument, name))
+    column = torch.eye(len(materials.bands))[:, band : band + 1]
+    return FamilyMember(
+        f"radiance of one band on black, 1 = full scale: {argument}",
+        lambda view: view.materials.through(view.coefficients, column)[..., 0],
+    )
+
+
+def _false_colour(name: str, argument: str, materials: Materials) -> FamilyMember:
+    wavelengths = [_wavelength_nm(part, name) for part in argument.split(",")]
+    if len(wavelengths) != 3:
+        raise ConfigError(
+            f"false-colour takes three wavelengths, as in {FAMILIES['false-colour'].example}; got {name}"
+        )
+    matrix = band_composite_matrix(materials.bands, (wavelengths[0], wavelengths[1], wavelengths[2]))
+    return FamilyMember(
+        f"three bands as red, green and blue, radiance on black: {argument}",
+        lambda view: view.materials.through(view.coefficients, matrix).clamp(0, 1),
+    )
+
+
+def _reflectance_map(name: str, _: str, materials: Materials) -> FamilyMember:
+    asked = parse_reflectance_map(name, materials.bands)
+    caveat = "" if materials.light is not None else "; of radiance, since the scene's light is unknown"
+
+    def compute(view: MaterialView) -> Tensor:
+        reflectance = view.materials.reflectance(view.coefficients)
+        return asked.fit(reflectance[view.coefficients.is_occupied])(reflectance)
+
+    return FamilyMember(f"{asked.what}{caveat}; NaN where undefined", compute, asked.usual_range)
+
+
+def _wavelength_nm(text: str, name: str) -> float:
+    try:
+        return float(text.strip().removesuffix("nm"))
+    except ValueError:
+        raise ConfigError(f"{text!r} in the output {name} is not a wavelength in nm, such as 650nm") from None
+
+
+FAMILIES: dict[str, OutputFamily] = {
+    "band": OutputFamily("grey", "one band", "a wavelength", "band:650nm", _band),
+    "false-colour": OutputFamily(
+        "linear", "false colour", "wavelengths", "false-colour:860,650,550", _false_colour
+    ),
+    "index": OutputFamily("map", "spectral index", "to know which", "index:ndvi", _reflectance_map),
+    "target": OutputFamily(
+        "map", "likeness to a target", "to know which", "target:paint.csv", _reflectance_map
+    ),
+}
+"""By the part of the name before the colon."""
+
+
+@dataclass(frozen=True)
+class MaterialOutput(Output):
+    """An output with its function."""
+
+    compute: Callable[[MaterialView], Tensor] = field(kw_only=True)
+    """From a rendered view to (H, W, ...)."""
+
+
+def _linear_rgb(view: MaterialView) -> Tensor:
+    # Clamped after the colours are made: in another light a band may exceed the sensor's full scale.
+    return view.materials.through(view.coefficients, rgb_matrix(view.materials.bands)).clamp(0, 1)
+
+
+def _pca(view: MaterialView) -> Tensor:
+    spectra, seen = view.spectra, view.coefficients.is_occupied
+    return PcaColours.fit(spectra[seen])(spectra) * seen[..., None]
+
+
+def _material_scores(view: MaterialView) -> Tensor:
+    return material_scores(view.spectra, view.materials.endmembers)
+
+
+_UNIT = (0.0, 1.0)
+
+
+_DESCRIBED = (
+    Output("rgb", "srgb", "colour", "sRGB on black, 0 to 1"),
+    Output("linear_rgb", "linear", "linear colour", "linear light in sRGB primaries on black, 0 to 1"),
+    Output("spectral", "channels", "spectra", "radiance on black, 1 = full scale"),
+    Output("diffuse", "channels", "diffuse part", "radiance without the view-dependent part, 1 = full scale"),
+    Output("specular", "channels", "specular part", "view-dependent part of the radiance, 1 = full scale"),
+    Output("abundances", "shares", "all abundances", "abundances, summing to the opacity", _UNIT),
+    Output("segmentation", "labels", "segmentation", "index of the material, 255 where nothing is"),
+    Output(
+        "confidence",
+        "map",
+        "segmentation confidence",
+        "estimated probability that the material is right",
+        _UNIT,
+    ),
+    Output(
+        "material_scores",
+        "shares",
+        "similarity to each endmember",
+        "cosine of the spectrum to each endmember",
+        _UNIT,
+    ),
+    Output(
+        "probe_probabilities",
+        "shares",
+        "probabilities of the probe",
+        "softmax over the endmembers of the cosine of the spectrum to each, as published",
+        _UNIT,
+    ),
+    Output(
+        "pca",
+        "picture",
+        "principal components",
+        "three principal components of the spectra, each stretched from its 1st to its 99th percentile",
+    ),
+    Output("depth", "map", "depth", "distance along the viewing axis in world units, 0 where nothing is"),
+    Output(
+        "ray_distance",
+        "map",
+        "distance along the ray",
+        "distance along the ray in world units, 0 where nothing is",
+    ),
+    Output("accumulation", "map", "opacity", "opacity, 0 to 1", _UNIT, "gray"),
+    Output("normals", "vectors", "normals", "unit normals in world axes, 0 where nothing is"),
+)
+
+_COMPUTED: dict[str, Callable[[MaterialView], Tensor]] = {
+    "rgb": lambda view: linear_to_srgb(_linear_rgb(view)),
+    "linear_rgb": _linear_rgb,
+    "spectral": lambda view: view.spectra,
+    "diffuse": lambda view: view.materials.diffuse(view.coefficients),
+    "specular": lambda view: view.materials.specular(view.coefficients),
+    "abundances": lambda view: view.coefficients.abundances,
+    "segmentation": lambda view: view.materials.ids(view.coefficients),
+    "confidence": lambda view: view.materials.confidence(view.coefficients),
+    "material_scores": _material_scores,
+    "probe_probabilities": lambda view: torch.softmax(_material_scores(view), dim=-1),
+    "pca": _pca,
+    "depth": lambda view: view.depth,
+    "ray_distance": lambda view: view.ray_distance,
+    "accumulation": lambda view: view.opacity,
+    "normals": lambda view: view.normals,
+}
+
+OUTPUTS = {
+    output.name: MaterialOutput(**vars(output), compute=_COMPUTED[output.name]) for output in _DESCRIBED
+}
+"""All outputs that take no argument, in the order in which they are offered."""
+
+
+def output_names() -> tuple[str, ...]:
+    """Every name, with an example of each output that takes an argument."""
+    return (*OUTPUTS, *(family.example for family in FAMILIES.values()))
+
+
+def find_output(name: str, materials: Materials) -> MaterialOutput:
+    """An output by its name, such as `rgb`, `band:650nm` or `index:ndvi`.
+
+    Raises:
+        ConfigError: there is none, or its argument can't be read.
+        SpectrumError: the bands don't cover what it needs.
+    """
+    if name in OUTPUTS:
+        return OUTPUTS[name]
+    prefix, _, argument = name.partition(":")
+    family = FAMILIES.get(prefix)
+    if family is None:
+        raise no_output(name, [*OUTPUTS, *FAMILIES], output_names())
+    if not argument:
+        raise ConfigError(f"the output {prefix} needs {family.needs}, as in {family.example}")
+    made = family.make(name, argument, materials)
+    return MaterialOutput(name, family.kind, family.title, made.what, made.value_range, compute=made.compute)
