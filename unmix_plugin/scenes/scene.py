@@ -3,10 +3,6 @@
 Notation: `N` frames, `B` bands, `K` materials, `H x W` pixels. World space is that of the source of the poses:
 that of transforms.json before its `applied_transform`, `applied_scale` and `offset`. Model space is the one that
 `Scene.normalisation` maps it to and in which `Scene.cameras` and `Scene.scene_box` are given.
-
-What makes a scene the one that a run was trained on.
-
-What a run folder says of its spectral scene, checked before anything relies on it.
 """
 
 from __future__ import annotations

@@ -3,8 +3,6 @@
 Notation: `B` bands, index `i` rising with wavelength; wavelengths in nm. Each band stands for an interval of the
 spectrum; the intervals tile the covered range without gaps: inner edges lie halfway between neighbouring centres, and
 the outermost bands are symmetric about their centres.
-
-Integrals over wavelength of spectra that are linear between their samples, exactly.
 """
 
 from __future__ import annotations

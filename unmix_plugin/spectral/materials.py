@@ -1,13 +1,10 @@
-"""What is composited along rays: one packed tensor, from which every picture of a view follows.
+"""What is composited along rays, the spectra that it is multiplied with, and every picture that follows from both.
 
 A ray's diffuse spectrum is linear in the endmembers, sum_i w_i E^T S_i a_i = E^T sum_i w_i S_i a_i. So a renderer
-composites 2 + 2 K + J numbers a ray, and the B bands are made once a ray, by `materials.Materials`.
+composites 2 + 2 K + J numbers a ray, one packed tensor, and the B bands are made once a ray.
 
-Notation: `K` endmembers, `J` spectra of the specular dictionary, `*rays` any leading axes.
-
-The spectra that composited coefficients are multiplied with, and what follows from both.
-
-Notation: `B` bands, `K` endmembers, `J` spectra of the specular dictionary, `C` columns of a matrix on spectra.
+Notation: `B` bands, `K` endmembers, `J` spectra of the specular dictionary, `C` columns of a matrix on spectra, `*rays`
+any leading axes.
 """
 
 from __future__ import annotations

@@ -1,14 +1,10 @@
-"""Another camera, simulated from its spectral response: what its channels would have measured of a spectrum.
+"""What a camera makes of spectra: a linear operator, of the scene's own cameras or of one simulated from its response.
 
-A channel measures the mean of the radiance weighted with its response, so a flat spectrum 1 is 1 in every channel. That
-is linear in the spectrum: one matrix for each sampling of it.
+A channel measures the mean of the radiance weighted with its response, so a flat spectrum 1 is 1 in every channel: one
+matrix for each sampling of the spectrum.
 
-Notation: `B` bands of the spectrum, `S` channels of the sensor, `N` wavelengths of its table. A response is relative,
-piecewise linear between the wavelengths of its table, and 0 outside.
-
-What a camera makes of spectra: a linear operator from the scene's bands to the channels of its cubes.
-
-Notation: `B` bands of the scene, `b` channels of a sensor.
+Notation: `B` bands of the spectrum, `b` or `S` channels of the sensor, `N` wavelengths of its table. A response is
+relative, piecewise linear between the wavelengths of its table, and 0 outside.
 """
 
 from __future__ import annotations

@@ -1,14 +1,10 @@
-"""Principal components of spectra as colours, with one basis and one stretch for all pictures that are compared.
-
-Notation: `B` bands, `N` spectra, `*rays` any leading axes.
-
-A few spectra of which all spectra of a scene are sums but for noise, so that pixels can be kept as few numbers.
+"""Spectra as few numbers: the subspace that all of a scene lie in but for noise, and principal components as colours.
 
 Bands are weighted so that noise is alike in all of them; then the leading eigenvectors of the weighted spectra's second
 moments are an orthonormal basis of which no other of its size misses less. There is no mean spectrum: black stays
 black, and a pixel half as bright has half the numbers.
 
-Notation: `N` pixels, `B` bands, `P` components.
+Notation: `N` spectra, `B` bands, `P` components, `*rays` any leading axes.
 """
 
 from __future__ import annotations

@@ -1,20 +1,10 @@
-"""Where a demo scene or a demo capture goes: what is asked of the folder, and how files get there whole.
+"""The built-in demo scene as a folder: a ray-traced picnic table with true labels, abundances and endmembers.
 
-The demo scene's views: where its cameras are, and pixels from the coefficients that rays gathered.
+It stands in front of nothing, on a ground that runs to the horizon under a sky, or in a room. The layout is that of any
+scene of ours: transforms.json, cubes (radiance in [0, 1], black where nothing is), sRGB images with alpha, labels (255 =
+unlabelled) and, for evaluation views, abundances. Writing it twice gives the same bytes.
 
-Notation: `B` bands, `K` materials, `H`, `W` rows and columns.
-
-Where the demo scene is: in front of nothing, on a ground that runs to the horizon under a sky, or in a room.
-
-Notation: `R` rays, `P` points, `K` materials.
-
-The built-in demo scene as a folder: a ray-traced picnic table with true labels, abundances and endmembers.
-
-The layout is that of any scene of ours: transforms.json, cubes (radiance in [0, 1], black where nothing is), sRGB
-images with alpha, labels (255 = unlabelled) and, for evaluation views, abundances. Writing it twice gives the same
-bytes.
-
-Notation: `B` bands, `K` materials, `H`, `W` rows and columns, `N` views.
+Notation: `B` bands, `K` materials, `H`, `W` rows and columns, `N` views, `R` rays, `P` points.
 """
 
 from __future__ import annotations

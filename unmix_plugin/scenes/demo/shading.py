@@ -1,22 +1,12 @@
-"""What the demo scene is made of: measured reflectances, the lamp's spectrum, and how two materials blend on a surface.
+"""The demo scene's materials, objects and light: what a camera ray gathers, as coefficients that no band enters.
 
-Notation: `B` bands, `K` materials, `P` points. Reflectances are in [0, 1]; the lamp's power is relative, largest
-band 1. Abundances of a point are fractions of its area, >= 0, summing to 1.
-
-The demo scene's objects and light: what a camera ray gathers, as coefficients that no band enters.
-
-Notation: `R` rays, `P` points, `K` materials, `H`, `W` rows and columns. The radiance of a point is
-lamp * (diffuse @ reflectances + specular): `diffuse` (K) is abundance times irradiance, `specular` a number, since a
-clear coat mirrors the lamp in the lamp's own colour. Both are linear, so pixels average coefficients and the spectrum
-is applied once a pixel. Nothing is random: every subpixel sees the lamp's disc at a fixed point of it, and the sky's
-occlusion has a closed form.
-
-Speckled surfaces for the demo scene: two materials mixed at random in space, as in terrazzo or printed paper.
-
-Structure from motion finds nothing on plain surfaces. Speckles change abundances only: light, forms and gloss stay,
-and every point is still a mixture of two of the scene's materials.
-
-Notation: `P` points.
+Notation: `R` rays, `P` points, `B` bands, `K` materials, `H`, `W` rows and columns. Reflectances are in [0, 1], the
+lamp's power is relative, largest band 1. Abundances of a point are fractions of its area, >= 0, summing to 1. The
+radiance of a point is lamp * (diffuse @ reflectances + specular): `diffuse` (K) is abundance times irradiance,
+`specular` a number, since a clear coat mirrors the lamp in the lamp's own colour. Both are linear, so pixels average
+coefficients and the spectrum is applied once a pixel. Nothing is random: every subpixel sees the lamp's disc at a fixed
+point of it, and the sky's occlusion has a closed form. Surfaces may be speckled with a second material, as in terrazzo
+or printed paper: structure from motion finds nothing on plain ones.
 """
 
 from __future__ import annotations

@@ -1,14 +1,10 @@
-"""Lights: relative power over wavelength, by the name of a standard illuminant or from a CSV file.
-
-Notation: `B` bands. Power is relative, greatest band 1. A band sees the mean of the light over its interval, so that
-narrow lines of a lamp count wherever they lie between band centres; in the outer halves of the outermost bands a light
-that is known only up to the band centre is taken to continue at its last value.
-
-From spectra to colour, as one matrix for each sampling of the spectrum.
+"""From spectra to colour: lights, one matrix for each sampling of the spectrum, and curves for a display.
 
 Notation: `B` bands; a spectrum is radiance in [0, 1], bands last. `xyz` is CIE 1931 2 degree; `linear_rgb` is linear
 light in sRGB primaries; `srgb` is encoded for a display. A matrix has shape (B, 3) and is applied as
-`spectra @ matrix`, so colour commutes with mixing and with compositing along a ray.
+`spectra @ matrix`, so colour commutes with mixing and with compositing along a ray. The power of a light is relative,
+greatest band 1; a band sees its mean over the band's interval, so that narrow lines of a lamp count wherever they lie,
+and a light that is known only up to the outermost band centres is taken to continue at its last value.
 
 White. The flat spectrum 1 (illuminant E at the sensor's full scale) is rendered as the display's white: linear RGB
 (1, 1, 1), hence Y = 1. Each colour matching function is integrated over each band's interval, and the three linear RGB
@@ -18,10 +14,6 @@ stays yellow. Of the conventions tried (no adaptation, Bradford from E or from t
 reproduces the sRGB images that come with path-traced cubes, to within their 8 bits.
 
 Sensors whose bands cannot tell colours get a false-colour composite instead: see `colour_mode`.
-
-AgX in its basic look: a tone curve that compresses 16.5 stops as film does, and lets bright colours fade to white.
-
-Source: Sobotka 2022; the polynomial fit of its contrast curve is Wrensch's, 2023.
 """
 
 from __future__ import annotations

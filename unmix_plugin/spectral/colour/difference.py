@@ -1,11 +1,8 @@
-"""How different colours look: CIE L*a*b* under a light, and CIEDE2000.
+"""How different colours look, and pairs of surfaces that look alike in one light and differ in another (metamerism).
 
-Notation: `B` bands, `*shape` any leading axes. A difference of 1 is just noticeable side by side, 2 to 3 at a glance.
-
-Pairs of surfaces that look alike in one light and differ in another: what spectra tell apart and colours do not.
-
-Notation: `N` surfaces, `B` bands, `L` lights, `P` pairs. Colours are those that an eye adapted to each light sees;
-their differences are CIEDE2000.
+Notation: `B` bands, `N` surfaces, `L` lights, `P` pairs, `*shape` any leading axes. Colours are CIE L*a*b* as an eye
+adapted to each light sees them; their differences are CIEDE2000: 1 is just noticeable side by side, 2 to 3 at a
+glance.
 """
 
 from __future__ import annotations

@@ -1,22 +1,17 @@
-"""Abundances of pixels whose endmembers are known: one convex problem a pixel, all pixels at once.
+"""Abundances of pixels whose endmembers are known: one convex problem a pixel, all pixels at once, in float64.
 
-Notation: `N` pixels, `B` bands, `K` endmembers (rows of `endmembers`, the paper's M is the transpose). A pixel x is
-explained as E^T a; `gram` is E E^T, so that half the squared error is a . gram a / 2 - (E x) . a plus a constant.
-Everything is computed in float64 and returned in the pixels' type.
-
-Abundances of single spectra that are mixtures of few materials.
-
-With all endmembers free to take part, a spectrum that is a little off is explained by a mixture of many: white by a
-bit of every colour. A spectrum here shows at most three materials, and each beyond the first must bring it nearer by
-a fixed angle. Brightness takes no part. Up to twelve endmembers every choice of three is tried, which is exact; of
-more, the best sets found are extended one endmember at a time.
+A pixel x is explained as E^T a (the paper's M is the transpose of E); `gram` is E E^T, so that half the squared error is
+a . gram a / 2 - (E x) . a plus a constant. With all endmembers free to take part, a spectrum that is a little off is
+explained by a mixture of many: white by a bit of every colour. In `sparse_abundances` a spectrum shows at most three
+materials, and each beyond the first must bring it nearer by a fixed angle; brightness takes no part. Up to twelve
+endmembers every choice of three is tried, which is exact; of more, the best sets found are extended one endmember at a
+time.
 
 Source: least squares with an l0 penalty, as in sparse unmixing (Iordache, Bioucas-Dias and Plaza 2011), whose l1
 relaxation is needed only for libraries of hundreds. The extension is that of optimised orthogonal matching pursuit
 (L. Rebollo-Neira and D. Lowe, IEEE Signal Processing Letters 9(4), 2002), with several sets kept.
 
-Notation: `N` spectra, `B` bands, `K` endmembers, `C` choices of `m` endmembers, `S` sets kept a spectrum. Computed in
-float64: between endmembers of nearly one shape, the shares are small differences.
+Notation: `N` pixels, `B` bands, `K` endmembers, `C` choices of `m` endmembers, `S` sets kept a pixel.
 """
 
 from __future__ import annotations

@@ -1,28 +1,12 @@
-"""Minimum volume: the smallest simplex that holds nearly all pixels, where pure pixels may be missing.
+"""First guess of a scene's endmembers from the pixels of all its training views, from a file, or from partial bands.
 
-Source: J. M. Bioucas-Dias, "A variable splitting augmented Lagrangian approach to linear spectral unmixing" (SISAL),
-WHISPERS 2009: least -log|det Q| plus a hinge on negative abundances, so that a few outliers may stay outside. The
-objective is that of the paper, with the hinge rounded near zero, which lets a quasi-Newton method minimise it.
+`minimum_volume_simplex` finds the smallest simplex that holds nearly all pixels, where pure pixels may be missing. There
+pixels are scaled to sum 1, which removes shading, and lie near a plane of K - 1 dimensions; `lifted` are their
+coordinates on it, a 1 in front. Abundances are `lifted @ Q`, the corners of the simplex are the rows of the inverse of
+Q. Abundances sum to 1 if the columns of Q sum to (1, 0, ..., 0).
 
-Notation: `N` pixels, `B` bands, `K` endmembers. Pixels are scaled to sum 1, which removes shading, and lie near a plane
-of K - 1 dimensions; `lifted` are their coordinates on it, a 1 in front. Abundances are `lifted @ Q`, the corners of the
-simplex are the rows of the inverse of Q. Abundances sum to 1 if the columns of Q sum to (1, 0, ..., 0).
-
-First guess of a scene's endmembers from the pixels of all its training views.
-
-Notation: `N` pixels pooled over views, `B` bands, `K` endmembers; spectra in [0, 1], bands last.
-
-Spectra on all bands of a scene from what sensors saw of some of them: a start, which training completes.
-
-Notation: `K` spectra, `b` channels of a sensor, `B` bands of the scene.
-
-Endmembers from a file, brought to the brightness of a scene.
-
-Notation: `N` pixels, `B` bands, `K` endmembers.
-
-Endmembers and abundances of pixels taken one by one: an image without its scene.
-
-Notation: `N` pixels, `B` bands, `K` endmembers.
+Notation: `N` pixels pooled over views, `B` bands, `b` channels of a sensor, `K` endmembers, `D` = K - 1; spectra in
+[0, 1], bands last.
 """
 
 from __future__ import annotations
@@ -31,7 +15,7 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from unmix_plugin.errors import ConfigError, SpectrumError
@@ -62,6 +46,10 @@ def minimum_volume_simplex(
 ) -> Float[Tensor, "K B"]:
     """Corners of the smallest simplex around the shapes of the pixels, each with a sum over bands of 1.
 
+    Source: J. M. Bioucas-Dias, "A variable splitting augmented Lagrangian approach to linear spectral unmixing"
+    (SISAL), WHISPERS 2009: least -log|det Q| plus a hinge on negative abundances, so that a few outliers may stay
+    outside; here the hinge is rounded near zero, which lets a quasi-Newton method minimise it.
+
     Args:
         pixels: Spectra of positive sum, in any unit. Drop dark ones first: noise is all the shape they have.
         generator: On the CPU; seeds the start, the only source of randomness.
@@ -77,31 +65,19 @@ def minimum_volume_simplex(
         )
     shapes = pixels.double() / sums
     first = nfindr(shapes, num_endmembers, generator)
-    mean, axes = _plane(shapes, num_endmembers - 1)
-    lifted = _lift((shapes - mean) @ torch.linalg.pinv(axes))
-    corners = _minimise(lifted, _enlarged(lifted[first]), outlier_penalty, max_iterations)
-    spectra = (mean + corners[:, 1:] @ axes).clamp(min=0)
-    return (spectra / spectra.sum(dim=1, keepdim=True)).to(pixels.dtype)
-
-
-def _plane(
-    shapes: Float[Tensor, "N B"], num_dimensions: int
-) -> tuple[Float[Tensor, " B"], Float[Tensor, "D B"]]:
-    """Mean, and principal axes as long as the spread along them."""
     mean = shapes.mean(dim=0)
     centred = shapes - mean
     eigen = torch.linalg.eigh(centred.T @ centred / len(shapes))
-    spreads = eigen.eigenvalues.flip(0)[:num_dimensions].clamp(min=0).sqrt()
-    return mean, (eigen.eigenvectors.flip(1)[:, :num_dimensions] * spreads).T
-
-
-def _lift(coordinates: Float[Tensor, "N D"]) -> Float[Tensor, "N K"]:
-    return torch.cat([torch.ones_like(coordinates[:, :1]), coordinates], dim=1)
-
-
-def _enlarged(corners: Float[Tensor, "K K"]) -> Float[Tensor, "K K"]:
-    centre = corners.mean(dim=0)
-    return centre + _HEAD_START * (corners - centre)
+    spreads = eigen.eigenvalues.flip(0)[: num_endmembers - 1].clamp(min=0).sqrt()
+    axes = (
+        eigen.eigenvectors.flip(1)[:, : num_endmembers - 1] * spreads
+    ).T  # principal, as long as the spread
+    lifted = torch.cat([torch.ones_like(sums), centred @ torch.linalg.pinv(axes)], dim=1)
+    centre = lifted[first].mean(dim=0)
+    start = centre + _HEAD_START * (lifted[first] - centre)
+    corners = _minimise(lifted, start, outlier_penalty, max_iterations)
+    spectra = (mean + corners[:, 1:] @ axes).clamp(min=0)
+    return (spectra / spectra.sum(dim=1, keepdim=True)).to(pixels.dtype)
 
 
 def _minimise(
@@ -171,7 +147,8 @@ def initialise_endmembers(
     if method == "kmeans" or num_endmembers == 1:
         return normalised_kmeans(usable, num_endmembers, generator).endmembers.clamp(0, 1)
     spectra = _shapes(usable, num_endmembers, method, generator)
-    return scale_to_lit_pixels(spectra, usable, _most_similar(usable, spectra)).clamp(0, 1)
+    most_similar = (usable @ torch.nn.functional.normalize(spectra, dim=1).T).argmax(dim=1)
+    return scale_to_lit_pixels(spectra, usable, most_similar).clamp(0, 1)
 
 
 def drop_uninformative_pixels(pixels: Float[Tensor, "N B"]) -> Float[Tensor, "kept B"]:
@@ -255,10 +232,6 @@ def _count_distinct(pixels: Tensor, enough: int) -> int:
         pixels = pixels[(pixels != pixels[0]).any(dim=1)]
         count += 1
     return count
-
-
-def _most_similar(pixels: Float[Tensor, "N B"], spectra: Float[Tensor, "K B"]) -> Int[Tensor, " N"]:
-    return (pixels @ torch.nn.functional.normalize(spectra, dim=1).T).argmax(dim=1)
 
 
 _SMOOTHNESS = 1e-3

@@ -7,19 +7,13 @@ frequent mixture, which k-means takes for a material, is none.
 
 The model is that of two-endmember MESMA (D. A. Roberts et al., Remote Sensing of Environment 65, 1998); the search
 grows the set one by one and swaps members while that helps, as in partitioning around medoids (Kaufman and Rousseeuw
-1990).
+1990). `pooled_pair_endmembers` leaves less to chance, for images on their own: five sets of candidates are searched one
+by one, and their winners once more together; members that several searches agree on are averaged, and the distance of
+a dark pixel, whose shape is mostly noise, counts by the root of its length. Trainings start from the plain search: in a
+room whose walls colour the light the other costs them 1 to 3 dB (docs/background/unmixing.md).
 
 Notation: `N` pixels that judge, `B` bands, `M` candidates, `K` endmembers. All spectra have length 1, which removes
 shading; the distance of a pixel to a cone is then the sine of the angle between them.
-
-Endmembers as `two_material_mixtures` finds them, with less left to chance: for images on their own.
-
-Five sets of candidates are searched one by one, and their winners once more together; members that several searches
-agree on are averaged. The shape of a dark pixel is mostly noise, so its distance counts by the root of its length.
-Trainings start from the plain search: in a room whose walls colour the light this one costs them 1 to 3 dB (docs/
-unmixing.md).
-
-Notation: `N` pixels, `B` bands, `K` endmembers, `M` candidates.
 """
 
 from __future__ import annotations
@@ -192,7 +186,7 @@ _DRAWS = 5
 _NUM_SEEDS = 10_000
 """Pixels of which the candidates of a draw are the cluster means."""
 _ITERATIONS = 10
-_NUM_JUDGES_POOLED_PAIRS = 1500
+_NUM_POOLED_JUDGES = 1500
 _DARK = 0.3
 """Length below which a distance counts less, as a share of that of bright pixels (95th percentile)."""
 _POWER = 1.2
@@ -217,7 +211,7 @@ def pooled_pair_endmembers(
     num_candidates = _count_shapes(pixels, _NUM_CANDIDATES)
     if num_candidates < _NUM_CANDIDATES or num_endmembers > _NUM_CANDIDATES:
         return two_material_endmembers(pixels, num_endmembers, generator)
-    judges = _some(pixels, _NUM_JUDGES_POOLED_PAIRS, generator).double()
+    judges = _some(pixels, _NUM_POOLED_JUDGES, generator).double()
     pool, draws = [], []
     for _ in range(_DRAWS):
         candidates = _candidates(pixels, num_candidates, generator)
