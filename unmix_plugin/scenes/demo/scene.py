@@ -1,7 +1,7 @@
 """The built-in demo scene as a folder: a ray-traced picnic table with true labels, abundances and endmembers.
 
 It stands in front of nothing, on a ground that runs to the horizon under a sky, or in a room. The layout is that of any
-scene of ours: transforms.json, cubes (radiance in [0, 1], black where nothing is), sRGB images with alpha, labels (255 =
+scene of ours: transforms.json, cubes (radiance in [0, 1], black where nothing is), sRGB images with alpha, labels (255
 unlabelled) and, for evaluation views, abundances. Writing it twice gives the same bytes.
 
 Notation: `B` bands, `K` materials, `H`, `W` rows and columns, `N` views, `R` rays, `P` points.

@@ -1,7 +1,7 @@
 """Abundances of pixels whose endmembers are known: one convex problem a pixel, all pixels at once, in float64.
 
-A pixel x is explained as E^T a (the paper's M is the transpose of E); `gram` is E E^T, so that half the squared error is
-a . gram a / 2 - (E x) . a plus a constant. With all endmembers free to take part, a spectrum that is a little off is
+A pixel x is explained as E^T a (the paper's M is the transpose of E); `gram` is E E^T, so that half the squared error
+is a . gram a / 2 - (E x) . a plus a constant. With all endmembers free to take part, a spectrum that is a little off is
 explained by a mixture of many: white by a bit of every colour. In `sparse_abundances` a spectrum shows at most three
 materials, and each beyond the first must bring it nearer by a fixed angle; brightness takes no part. Up to twelve
 endmembers every choice of three is tried, which is exact; of more, the best sets found are extended one endmember at a

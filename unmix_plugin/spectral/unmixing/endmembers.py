@@ -1,7 +1,7 @@
 """First guess of a scene's endmembers from the pixels of all its training views, from a file, or from partial bands.
 
-`minimum_volume_simplex` finds the smallest simplex that holds nearly all pixels, where pure pixels may be missing. There
-pixels are scaled to sum 1, which removes shading, and lie near a plane of K - 1 dimensions; `lifted` are their
+`minimum_volume_simplex` finds the smallest simplex that holds nearly all pixels, where pure pixels may be missing.
+There pixels are scaled to sum 1, which removes shading, and lie near a plane of K - 1 dimensions; `lifted` are their
 coordinates on it, a 1 in front. Abundances are `lifted @ Q`, the corners of the simplex are the rows of the inverse of
 Q. Abundances sum to 1 if the columns of Q sum to (1, 0, ..., 0).
 
