@@ -61,8 +61,8 @@ def test_the_rays_of_a_pixel_lie_within_it_one_in_each_cell(scene_folder):
 
 
 def test_batches_from_disk_depend_on_seed_and_step_and_hold_what_was_measured(scene_folder, monkeypatch):
-    monkeypatch.setattr(pixel_block, "CHUNK_BYTES", 12 * 40)
-    monkeypatch.setattr(pixel_block, "PIXELS_PER_STEP", 8)
+    monkeypatch.setattr(pixel_block, "_CHUNK_BYTES", 12 * 40)
+    monkeypatch.setattr(pixel_block, "_PIXELS_PER_STEP", 8)
     monkeypatch.setattr(pixel_table, "available_bytes", lambda _: 4000)
     going_on, resumed = make(scene_folder), make(scene_folder)
     assert any("stay on disk" in warning for warning in going_on.warnings())

@@ -12,8 +12,8 @@ PIXELS = 1000
 @pytest.fixture(autouse=True)
 def small_chunks(monkeypatch):
     """Chunks of 40 pixels of 4 bytes, each of two steps."""
-    monkeypatch.setattr(pixel_block, "CHUNK_BYTES", 160)
-    monkeypatch.setattr(pixel_block, "PIXELS_PER_STEP", 20)
+    monkeypatch.setattr(pixel_block, "_CHUNK_BYTES", 160)
+    monkeypatch.setattr(pixel_block, "_PIXELS_PER_STEP", 20)
 
 
 def make_pool(valid=None, num_bytes=800, reads=None) -> PixelPool:

@@ -70,7 +70,7 @@ def test_opaque_pixels_are_sampled_of_one_sensor(rig):
 
 def test_of_large_blocks_some_opaque_pixels_are_sampled_from(rig, monkeypatch):
     everything = PixelTable(rig, CPU, (3, 4)).sample_opaque(1, 1000, seed=0)
-    monkeypatch.setattr(pixel_table, "MOST_LISTED", 100)
+    monkeypatch.setattr(pixel_table, "_MOST_LISTED", 100)
     table = PixelTable(rig, CPU, (3, 4))
     found = table.sample_opaque(1, 1000, seed=0)
     assert 0 < len(found) < 13

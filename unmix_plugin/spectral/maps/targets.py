@@ -1,8 +1,8 @@
 """Targets by name, `ace:paint.csv#gold>0.5`: how much each pixel looks like a given spectrum.
 
 Notation: `B` bands, `N` pixels of the background, `*rays` any leading axes; spectra x and target t are reflectances.
-The background has mean m and covariance S = C + d trace(C) / B, C the sample covariance, d `LOADING`. A score is NaN where
-a pixel has a value that is not finite, where it is zero in all bands, and where the score is undefined.
+The background has mean m and covariance S = C + d trace(C) / B, C the sample covariance, d `LOADING`. A score is NaN
+where a pixel has a value that is not finite, is zero in all bands, or has no defined score.
 """
 
 from __future__ import annotations
