@@ -1,8 +1,12 @@
-"""Stripes and spikes are found and replaced; edges, thin things and spectra with features are not."""
+"""Stripes and spikes are found and replaced; edges, thin things and spectra with features are not.
 
+Bands are told apart by their noise, and count alike where none is much noisier.
+"""
+
+import pytest
 import torch
 
-from unmix_plugin.spectral.bad_values import deviation_limits, repaired
+from unmix_plugin.spectral.bad_values import BandNoise, deviation_limits, judge_bands, repaired
 
 SIDE, NUM_BANDS = 24, 16
 
@@ -54,3 +58,68 @@ def test_a_feature_that_the_pixels_around_share_is_real():
     seen = image()
     seen[10:14, 18:22, 9] += 0.5
     assert not mend(seen)[0].any()
+
+
+NOISY_BANDS, NUM_PIXELS = 20, 4000
+
+
+def mixtures(noise: float = 0.005) -> torch.Tensor:
+    """Pixels of three smooth materials, with noise."""
+    generator = torch.Generator().manual_seed(0)
+    x = torch.linspace(0, 1, NOISY_BANDS)
+    materials = torch.stack([0.2 + 0.6 * x, 0.7 - 0.5 * x, 0.5 + 0.3 * torch.sin(6 * x)])
+    shares = torch.rand(NUM_PIXELS, 3, generator=generator)
+    clean = 0.7 * shares / shares.sum(dim=1, keepdim=True) @ materials
+    return clean + noise * torch.randn(clean.shape, generator=generator)
+
+
+def noisier(band: int, noise: float) -> torch.Tensor:
+    pixels = mixtures()
+    pixels[:, band] += noise * torch.randn(NUM_PIXELS, generator=torch.Generator().manual_seed(1))
+    return pixels
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.005, 0.05])
+def test_even_noise_leaves_all_weights_exactly_1(noise):
+    found = judge_bands(mixtures(noise))
+    assert torch.equal(found.weights, torch.ones(NOISY_BANDS))
+    assert not found.mostly_noise.any()
+    assert not found.dead.any()
+
+
+def test_noise_is_measured_and_weighs_a_band_down_by_its_variance():
+    weak, strong = judge_bands(noisier(7, 0.05)), judge_bands(noisier(7, 0.1))
+    assert float(weak.sigmas[7]) == pytest.approx(0.05, rel=0.1)
+    assert float(weak.weights.mean()) == pytest.approx(1, abs=1e-5)
+    assert int(weak.weights.argmin()) == 7
+    assert len(weak.weights.unique()) == 2
+    ratio = [float(found.weights[7] / found.weights[0]) for found in (weak, strong)]
+    assert ratio[0] / ratio[1] == pytest.approx(4, rel=0.1)
+
+
+def test_spikes_do_not_make_a_band_noisy():
+    pixels = mixtures()
+    pixels[::50, 4] += 0.5
+    assert torch.equal(judge_bands(pixels).weights, torch.ones(NOISY_BANDS))
+
+
+def test_a_band_of_noise_alone_and_a_dead_one_are_named():
+    pixels = mixtures()
+    pixels[:, 3] = 0.2 + 0.1 * torch.randn(NUM_PIXELS, generator=torch.Generator().manual_seed(1))
+    pixels[:, 12] = 0.4
+    found = judge_bands(pixels)
+    assert found.mostly_noise.nonzero().flatten().tolist() == [3]
+    assert found.dead.nonzero().flatten().tolist() == [12]
+    assert float(found.weights[12] / found.weights[0]) == pytest.approx(1e-4, rel=1e-3)
+
+
+@pytest.mark.parametrize("pixels", [mixtures()[:, :3], mixtures()[:50]])
+def test_too_little_data_tells_nothing(pixels):
+    found = judge_bands(pixels)
+    assert torch.equal(found.weights, BandNoise.unknown(pixels.shape[1]).weights)
+
+
+def test_a_scene_of_dead_bands_counts_all_alike():
+    found = judge_bands(torch.full((500, NOISY_BANDS), 0.3))
+    assert found.dead.all()
+    assert torch.equal(found.weights, torch.ones(NOISY_BANDS))

@@ -1,12 +1,103 @@
+"""Spectra on all bands from sensors that see some of them."""
+
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch.testing import assert_close
 
 from tests.spectral.mixtures import mixed_pixels, seeded, smooth_endmembers
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.metrics import spectral_angle
-from unmix_plugin.spectral.unmixing.endmembers import drop_uninformative_pixels, initialise_endmembers
+from unmix_plugin.spectral.unmixing.endmembers import (
+    comparable_brightness,
+    distinct_spectra,
+    drop_uninformative_pixels,
+    fill_bands,
+    initialise_endmembers,
+    minimum_volume_simplex,
+    typical_spectrum,
+    unmix_pixels,
+)
+from unmix_plugin.spectral.unmixing.nfindr_winter1999 import nfindr
+
+
+def worst_angle(found, materials):
+    """Largest angle of a material to the nearest found spectrum."""
+    return float(spectral_angle(materials[:, None], found[None]).amin(1).max())
+
+
+@settings(max_examples=15)
+@given(st.integers(3, 5), st.integers(0, 100))
+def test_materials_of_which_no_pixel_is_pure_are_found(num_endmembers, seed):
+    materials = smooth_endmembers(num_endmembers)
+    pixels = mixed_pixels(materials, 2000, seed=seed, max_abundance=0.85)
+    found = minimum_volume_simplex(pixels, num_endmembers, seeded(seed))
+    assert worst_angle(found, materials) < 0.12
+
+
+def test_it_reaches_further_than_the_purest_pixels():
+    materials = smooth_endmembers(4)
+    pixels = mixed_pixels(materials, 2000, seed=1, max_abundance=0.8)
+    purest = pixels[nfindr(pixels / pixels.sum(1, keepdim=True), 4, seeded())]
+    assert worst_angle(minimum_volume_simplex(pixels, 4, seeded()), materials) < 0.4 * worst_angle(
+        purest, materials
+    )
+
+
+def test_shading_changes_nothing():
+    pixels = mixed_pixels(smooth_endmembers(4), 1000, seed=2)
+    gains = 0.1 + torch.rand(1000, 1, dtype=torch.float64, generator=seeded())
+    plain, shaded = (minimum_volume_simplex(p, 4, seeded()) for p in (pixels, gains * pixels))
+    assert_close(plain, shaded, atol=1e-4, rtol=0)
+
+
+def test_a_few_outliers_may_stay_outside():
+    materials = smooth_endmembers(3)
+    pixels = mixed_pixels(materials, 3000, seed=3, max_abundance=0.95)
+    stray = torch.rand(9, pixels.shape[1], dtype=torch.float64, generator=seeded(4)) + 0.02
+    found = minimum_volume_simplex(torch.cat([pixels, stray]), 3, seeded())
+    assert worst_angle(found, materials) < 0.12
+
+
+def test_a_higher_price_of_outliers_gives_a_larger_simplex():
+    pixels = mixed_pixels(smooth_endmembers(3), 2000, seed=5)
+    pixels = pixels * (1 + 0.05 * torch.randn(pixels.shape, dtype=torch.float64, generator=seeded()))
+    spreads = []
+    for penalty in (5.0, 50.0, 500.0):
+        corners = minimum_volume_simplex(pixels, 3, seeded(), outlier_penalty=penalty)
+        spreads.append(float(spectral_angle(corners[[0, 0, 1]], corners[[1, 2, 2]]).sum()))
+    assert spreads[0] < spreads[1] < spreads[2]
+
+
+def test_corners_are_spectra_of_sum_one_in_the_type_of_the_pixels():
+    pixels = mixed_pixels(smooth_endmembers(3), 500, seed=6).float()
+    found = minimum_volume_simplex(pixels, 3, seeded())
+    assert found.dtype == torch.float32
+    assert float(found.min()) >= 0
+    assert_close(found.sum(1), torch.ones(3))
+
+
+def test_the_same_generator_gives_the_same_corners():
+    pixels = mixed_pixels(smooth_endmembers(4), 800, seed=7)
+    assert torch.equal(
+        minimum_volume_simplex(pixels, 4, seeded(3)), minimum_volume_simplex(pixels, 4, seeded(3))
+    )
+
+
+def test_pixels_without_light_are_refused():
+    pixels = mixed_pixels(smooth_endmembers(3), 50, seed=8)
+    pixels[[4, 9]] = 0
+    with pytest.raises(SpectrumError, match="positive sum; found 2 others"):
+        minimum_volume_simplex(pixels, 3, seeded())
+
+
+def test_a_flat_simplex_is_refused():
+    first, second = smooth_endmembers(2)
+    weights = torch.rand(50, 1, dtype=torch.float64, generator=seeded())
+    with pytest.raises(SpectrumError, match="3 endmembers were asked for; ask for at most 2"):
+        minimum_volume_simplex(weights * first + (1 - weights) * second, 3, seeded())
+
 
 METHODS = ["kmeans", "vca", "nfindr", "minimum-volume", "pairs", "pooled-pairs"]
 
@@ -121,3 +212,104 @@ def test_pixels_that_are_not_finite_are_refused_with_their_number():
 def test_below_a_root_mean_square_of_0005_even_the_brightest_pixels_are_dark():
     pixels = torch.tensor([[0.0049, 0.0049], [0.0051, 0.0051]])
     assert torch.equal(drop_uninformative_pixels(pixels), pixels[1:])
+
+
+TYPICAL = torch.tensor([0.1, 0.2, 0.4, 0.3, 0.2, 0.1])
+
+
+def test_bands_that_were_seen_stay_and_others_follow_the_typical_spectrum():
+    brightness = torch.tensor([[0.5], [2.0]])
+    matrix = torch.eye(6)[[3, 1, 2]]
+    filled = fill_bands((brightness * TYPICAL) @ matrix.T, matrix, TYPICAL)
+    assert_close(filled, brightness * TYPICAL, rtol=2e-2, atol=1e-3)
+
+
+def test_a_spectrum_of_another_shape_is_kept_where_it_was_seen():
+    matrix = torch.eye(6)[:4]
+    seen = torch.tensor([[0.4, 0.3, 0.2, 0.1]])
+    filled = fill_bands(seen, matrix, TYPICAL)
+    assert_close(filled[:, :4], seen, rtol=0.1, atol=0.02)
+    ratios = filled / TYPICAL
+    assert_close(ratios[:, 4:], ratios[:, 3:4].expand(-1, 2), rtol=1e-3, atol=1e-3)
+
+
+def test_broad_channels_are_seen_again_as_they_were():
+    matrix = torch.tensor([[0.5, 0.5, 0, 0, 0, 0], [0, 0, 0.5, 0.5, 0, 0], [0, 0, 0, 0, 0.5, 0.5]])
+    seen = torch.tensor([[0.2, 0.3, 0.4]])
+    assert_close(fill_bands(seen, matrix, TYPICAL) @ matrix.T, seen, rtol=0.03, atol=5e-3)
+
+
+def test_a_typical_spectrum_agrees_with_all_sensors():
+    first, second = torch.eye(6)[:3], torch.eye(6)[2:]
+    found = typical_spectrum([TYPICAL[:3], TYPICAL[2:]], [first, second])
+    assert_close(found, TYPICAL, rtol=0.02, atol=2e-3)
+    assert (typical_spectrum([torch.zeros(3)], [first]) > 0).all()
+
+
+def test_distinct_spectra_are_independent_and_in_range():
+    spectra = distinct_spectra(TYPICAL, 6)
+    assert int(torch.linalg.matrix_rank(spectra, rtol=1e-3)) == 6
+    assert (spectra > 0).all()
+    assert (spectra < 1).all()
+    assert_close(spectra.mean(dim=0) / TYPICAL, torch.ones(6), rtol=0.3, atol=0)
+
+
+def landscape(dark, seed=0):
+    """Shaded mixtures of three materials, the last of them dimmed; and the materials."""
+    materials = smooth_endmembers(3, 24)
+    generator = seeded(seed)
+    shares = torch.rand(1500, 3, dtype=torch.float64, generator=generator) ** 6 + 1e-3
+    shares = shares / shares.sum(dim=1, keepdim=True)
+    dimmed = materials * torch.tensor([[1.0], [0.8], [dark]], dtype=torch.float64)
+    shading = 0.5 + 0.4 * torch.rand(1500, 1, dtype=torch.float64, generator=generator)
+    noise = 0.001 * torch.randn(1500, 24, dtype=torch.float64, generator=generator)
+
+    return (shading * (shares @ dimmed) + noise).clamp(min=0).float(), dimmed
+
+
+def matched(found, materials):
+    angles = spectral_angle(materials[:, None].double(), found[None].double())
+    order = angles.argmin(dim=1)
+    assert sorted(order.tolist()) == [0, 1, 2]
+    return order, angles.amin(dim=1)
+
+
+def test_abundances_of_shaded_mixtures_are_found_whatever_the_seed():
+    pixels, materials = landscape(dark=0.6)
+    truth = torch.linalg.lstsq(materials.T, pixels.double().T).solution.T.clamp(min=0)
+    truth = truth / truth.sum(dim=1, keepdim=True)
+    found = []
+    for seed in range(2):
+        endmembers, abundances = unmix_pixels(pixels, 3, seeded(seed))
+        order, angles = matched(endmembers, materials)
+        assert float(angles.max()) < 0.06
+        assert float((abundances[:, order].double() - truth).square().mean().sqrt()) < 0.08
+        found.append(abundances[:, order])
+    assert float((found[0] - found[1]).square().mean().sqrt()) < 0.02
+
+
+def test_a_nearly_black_material_is_counted_between_spectra_of_one_peak():
+    pixels, materials = landscape(dark=0.05)
+    endmembers, abundances = unmix_pixels(pixels, 3, seeded())
+    order, _ = matched(endmembers, materials)
+    assert_close(endmembers.amax(dim=1), endmembers.amax().expand(3))
+    of_one_peak = materials / materials.amax(dim=1, keepdim=True)
+    truth = torch.linalg.lstsq(of_one_peak.T, pixels.double().T).solution.T.clamp(min=0)
+    truth = truth / truth.sum(dim=1, keepdim=True)
+    assert float((abundances[:, order].double() - truth).square().mean().sqrt()) < 0.06
+
+
+def test_brightness_stays_unless_one_endmember_is_nearly_black():
+    materials = smooth_endmembers(3).float()
+    moderate = materials * torch.tensor([[1.0], [0.5], [0.3]])
+    assert torch.equal(comparable_brightness(moderate), moderate)
+    dark = comparable_brightness(materials * torch.tensor([[1.0], [0.5], [0.1]]))
+    assert_close(dark.amax(dim=1), materials[0].amax().expand(3))
+
+
+def test_abundances_sum_to_one_and_black_pixels_show_nothing():
+    pixels, _ = landscape(dark=0.6)
+    pixels = torch.cat([pixels, torch.zeros(2, 24)])
+    _, abundances = unmix_pixels(pixels, 3, seeded())
+    assert_close(abundances[:-2].sum(dim=1), torch.ones(1500))
+    assert not abundances[-2:].any()

@@ -1,13 +1,17 @@
+""""""
+
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from tests.spectral.mixtures import seeded, smooth_endmembers
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.spectral.unmixing.abundances import fcls, nnls, sunsal
+from unmix_plugin.spectral.unmixing import abundances as sparse_unmixing
+from unmix_plugin.spectral.unmixing.abundances import fcls, nnls, sparse_abundances, sunsal
 
 
 def random_problem(num_endmembers, num_pixels=40, num_bands=9, seed=0):
@@ -145,3 +149,121 @@ def test_more_pixels_than_are_solved_at_a_time_are_all_solved():
     pixels, endmembers = random_problem(2, num_pixels=7)
     many = pixels.repeat(10_000, 1)
     assert_close(nnls(many, endmembers)[-7:], nnls(pixels, endmembers))
+
+
+def endmembers_of(num_endmembers):
+    return smooth_endmembers(num_endmembers).float()
+
+
+@pytest.mark.parametrize("num_endmembers", [1, 2, 3, 5, 25])
+def test_pure_spectra_are_pure_under_any_shading(num_endmembers):
+    endmembers = endmembers_of(num_endmembers) if num_endmembers < 10 else torch.eye(num_endmembers)
+    shading = torch.linspace(0.1, 1.5, num_endmembers)[:, None]
+    found = sparse_abundances(shading * endmembers, endmembers, 0.02)
+    assert_close(found, torch.eye(num_endmembers), atol=1e-3, rtol=0)
+
+
+@given(st.integers(0, 50), st.floats(0.2, 0.8))
+@settings(max_examples=20)
+def test_abundances_of_mixtures_of_two_are_found_whatever_the_brightness_of_endmembers(seed, share):
+    endmembers = endmembers_of(5) * torch.rand(5, 1, generator=seeded(seed)).clamp(min=0.2)
+    mixture = 0.4 * (share * endmembers[1] + (1 - share) * endmembers[3])
+    found = sparse_abundances(mixture[None], endmembers, 1e-4)
+    assert_close(found, torch.tensor([[0.0, share, 0.0, 1 - share, 0.0]]), atol=5e-3, rtol=0)
+
+
+def test_without_a_penalty_mixtures_of_three_are_those_of_non_negative_least_squares():
+    endmembers = endmembers_of(3)
+    shares = torch.rand(40, 3, generator=seeded(3)) + 0.05
+    mixtures = shares @ endmembers
+    expected = nnls(mixtures.double(), endmembers.double())
+    expected = expected / expected.sum(dim=1, keepdim=True)
+    assert_close(sparse_abundances(mixtures, endmembers, 0.0).double(), expected, atol=5e-3, rtol=0)
+
+
+def test_a_material_that_explains_less_than_the_penalty_is_left_out():
+    endmembers = endmembers_of(4)
+    nearly_pure = endmembers[:1] + 0.02 * endmembers[2:3]
+    assert int((sparse_abundances(nearly_pure, endmembers, 0.3) > 0).sum()) == 1
+    assert int((sparse_abundances(nearly_pure, endmembers, 0.0) > 0).sum()) > 1
+
+
+def test_no_spectrum_shows_more_than_three_materials_and_shares_sum_to_one():
+    endmembers = endmembers_of(7)
+    mixtures = torch.rand(200, 7, generator=seeded(1)) @ endmembers
+    found = sparse_abundances(mixtures, endmembers, 0.001)
+    assert_close(found.sum(dim=1), torch.ones(200))
+    assert bool((found >= 0).all())
+    assert int((found > 0).sum(dim=1).max()) <= 3
+
+
+def test_black_spectra_show_nothing():
+    found = sparse_abundances(torch.zeros(2, 12), torch.rand(3, 12, generator=seeded(0)), 0.02)
+    assert_close(found, torch.zeros(2, 3))
+
+
+def test_endmembers_of_one_shape_are_no_error():
+    endmembers = endmembers_of(3)
+    twins = torch.cat([endmembers, endmembers[:1]])
+    found = sparse_abundances(endmembers, twins, 0.02)
+    assert bool(torch.isfinite(found).all())
+    assert_close(found.sum(dim=1), torch.ones(3))
+
+
+def test_nearly_collinear_greys_are_told_apart_as_far_as_float32_spectra_allow():
+    generator = seeded(0)
+    first = 0.2 + 0.6 * torch.rand(31, generator=generator, dtype=torch.float64)
+    second = first * (1 + 1e-4 * torch.randn(31, generator=generator, dtype=torch.float64))
+    shares = torch.rand(400, 1, generator=generator, dtype=torch.float64)
+    mixtures = (shares * first + (1 - shares) * second).float()
+    greys = torch.stack([first, second]).float()
+    expected = nnls(mixtures.double(), greys.double())
+    expected = expected / expected.sum(dim=1, keepdim=True)
+    assert float((sparse_abundances(mixtures, greys, 0.0).double() - expected).abs().max()) < 0.01
+
+
+def _cost(found, mixtures, endmembers, penalty):
+    """What the search minimises, of each spectrum."""
+    fitted = normalize(found.double() @ endmembers.double(), dim=1)
+    cosines = (fitted * normalize(mixtures.double(), dim=1)).sum(dim=1)
+    return (1 - cosines.square()).clamp(min=0).sqrt() + penalty * ((found > 0).sum(dim=1) - 1)
+
+
+def _noisy_mixtures(endmembers, count=300):
+    """Of one to three endmembers."""
+    generator = seeded(4)
+    places = torch.rand(count, len(endmembers), generator=generator).argsort(dim=1)[:, :3]
+    amounts = torch.rand(count, 3, generator=generator) * (
+        torch.arange(count)[:, None] % 3 >= torch.arange(3)
+    )
+    clean = torch.zeros(count, len(endmembers)).scatter(1, places, amounts + 0.0) @ endmembers
+    return clean + 0.002 * torch.randn(clean.shape, generator=generator)
+
+
+def test_few_endmembers_are_searched_wholly_and_extending_sets_finds_the_same(monkeypatch):
+    endmembers = endmembers_of(5)
+    mixtures = _noisy_mixtures(endmembers)
+    whole = sparse_abundances(mixtures, endmembers, 0.01)
+    monkeypatch.setattr(sparse_unmixing, "_MOST_SEARCHED", 0)
+    monkeypatch.setattr(sparse_unmixing, "_SETS_KEPT", 5)
+    assert_close(sparse_abundances(mixtures, endmembers, 0.01), whole, atol=1e-5, rtol=0)
+
+
+def test_of_many_endmembers_nearly_every_spectrum_gets_the_mixture_of_the_whole_search(monkeypatch):
+    endmembers = endmembers_of(16)
+    mixtures = _noisy_mixtures(endmembers)
+    screened = _cost(sparse_abundances(mixtures, endmembers, 0.01), mixtures, endmembers, 0.01)
+    monkeypatch.setattr(sparse_unmixing, "_MOST_SEARCHED", 16)
+    whole = _cost(sparse_abundances(mixtures, endmembers, 0.01), mixtures, endmembers, 0.01)
+    assert bool((screened >= whole - 1e-6).all())
+    assert float((screened < whole + 1e-6).double().mean()) > 0.95
+    assert float(screened.mean()) < 1.02 * float(whole.mean())
+
+
+def test_hundreds_of_endmembers_are_searched_in_bounded_parts(monkeypatch):
+    endmembers = torch.rand(255, 40, generator=seeded(2)).square()
+    mixtures = 0.7 * endmembers[:20] + 0.3 * endmembers[100:120]
+    found = sparse_abundances(mixtures, endmembers, 0.001)
+    assert_close(found.gather(1, torch.arange(20)[:, None])[:, 0], torch.full((20,), 0.7), atol=1e-3, rtol=0)
+    monkeypatch.setattr(sparse_unmixing, "_NUMBERS_AT_A_TIME", 255 * 8 * 3)
+    assert_close(sparse_abundances(mixtures, endmembers, 0.001), found)

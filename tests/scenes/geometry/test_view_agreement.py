@@ -1,15 +1,26 @@
-"""Poses of a wrong convention are found, and the right convention is named."""
+"""Poses of a wrong convention are found, and the right convention is named.
+
+Cameras at one place are told before a training.
+"""
 
 import json
 import shutil
 
 import numpy as np
 import pytest
+import torch
 
+from tests.scenes.scene_factory import look_at, make_scene
+from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
+from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes import load_scene
 from unmix_plugin.scenes.demo.scene import make_demo_scene
-from unmix_plugin.scenes.geometry.view_agreement import check_scene_poses, compare_conventions
+from unmix_plugin.scenes.geometry.view_agreement import (
+    check_scene_poses,
+    compare_conventions,
+    parallax_warning,
+)
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 WRONG = {
@@ -98,3 +109,21 @@ def test_views_that_show_nothing_give_no_verdict(demo):
     grey = np.full((64, 64, 8), 0.5, np.float32)
     assert compare_conventions(poses, scene.cameras, lambda _, part: grey[part]) == {}
     assert compare_conventions(poses[:3], scene.cameras[[0, 1, 2]], scene.cube) == {}
+
+
+BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
+
+
+def test_cameras_at_one_place_are_told_from_those_that_are_apart():
+    for base, is_said in ((0.0, True), (0.005, True), (0.05, False)):
+        positions = np.array([[0.0, 0.0, 4.0], [0.0, 0.0, 4.0], [base, 0.0, 4.0]])
+        assert (parallax_warning(positions, BOX) is not None) == is_said, base
+
+
+def test_a_camera_that_only_turns_is_said_before_a_training(tmp_path):
+    turned = [look_at(np.array([0.0, 3.0, 0.5]), np.array([x, 0.0, 0.0])) for x in np.linspace(-0.4, 0.4, 6)]
+    for name, poses, is_said in (("turned", turned, True), ("moved", None, False)):
+        folder = make_scene(tmp_path / name, alpha=False, poses=poses)
+        config = HyperspectralDataManagerConfig(grid_resolution=8)
+        warnings = config.setup(data=folder.root, device=torch.device("cpu"), seed=0).warnings()
+        assert any("all training cameras stand at one place" in warning for warning in warnings) == is_said
