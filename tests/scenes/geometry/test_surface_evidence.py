@@ -90,7 +90,7 @@ def share_right(scene, cameras, views, depths):
     return float(torch.cat(known).float().mean()), float(torch.cat(right).float().mean())
 
 
-@pytest.mark.parametrize(("edge", "spread"), [(1, 0.2), (5, 0.0)])
+@pytest.mark.parametrize(("edge", "spread"), [(1, 0.2), pytest.param(5, 0.0, marks=pytest.mark.slow)])
 def test_views_of_differing_exposure_and_large_noisy_views_are_swept_too(scene, edge, spread):
     """`edge`: by how many times larger the pictures are, with noise in each pixel that means over pixels remove."""
     train = list(scene.train_indices)
