@@ -230,6 +230,11 @@ class Scene:
 
     def summary(self) -> dict[str, Any]:
         """What a run has to record of the scene, as JSON-able values."""
+        rig = {
+            "sensors": [sensor.to_json() for sensor in self.sensors],
+            "frame_sensors": [frame.sensor for frame in self.frames],
+        }
+        rig = rig if self.is_rig else {}
         return {
             "root": str(self.root),
             "wavelengths_nm": self.wavelengths_nm.tolist(),
@@ -242,7 +247,7 @@ class Scene:
             "material_names": None if self.material_names is None else list(self.material_names),
             "illuminant": None if self.illuminant is None else self.illuminant.tolist(),
             "endmembers": None if self.endmembers is None else self.endmembers.tolist(),
-            **self._rig_summary(),
+            **rig,  # nothing for the scenes of one ordinary camera, so that their records stay as they are
             "has_alpha": self.has_alpha,
             "is_unbounded": self.is_unbounded,
             "has_labels": self.has_labels,
@@ -250,15 +255,6 @@ class Scene:
             "input_hashes": dict(self.input_hashes),
             "truth_hashes": dict(self.truth_hashes),
             "options": asdict(self.options),
-        }
-
-    def _rig_summary(self) -> dict[str, Any]:
-        """Nothing for the scenes of one ordinary camera, so that their records stay as they are."""
-        if not self.is_rig:
-            return {}
-        return {
-            "sensors": [sensor.to_json() for sensor in self.sensors],
-            "frame_sensors": [frame.sensor for frame in self.frames],
         }
 
     def _size(self, index: int) -> tuple[int, int]:

@@ -21,13 +21,12 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from unmix_plugin.scenes.reading.faults import Faults
-from unmix_plugin.scenes.reading.transforms_json import FrameEntry, SceneEntry
+from unmix_plugin.scenes.reading.transforms_json import SceneEntry, Size
 
 READ_HEADER = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
 }
-
 _ONE_PARSER = Lock()
 """NumPy parses headers as Python literals, which fails in CPython 3.11 if several threads do so at the same moment."""
 
@@ -154,14 +153,14 @@ class _CubeValues:
 
 
 def measure_cube(path: Path, value_scale: float | None, invalid_pixels: InvalidPixels) -> _CubeValues:
-    """Read a checked (H, W, B) cube once."""
+    """What a checked (H, W, B) cube holds, read once; whatever `read_cube` would make of it."""
     cube = map_array(path)
     height, width, bands = cube.shape
     rows = max(1, _BLOCK_VALUES // max(1, width * bands))
     digest, is_in_file_order = hashlib.sha256(), cube.flags.c_contiguous
     head, end = (cube.offset, cube.offset + cube.nbytes) if is_in_file_order else (-1, 0)  # type: ignore[attr-defined]
     digest.update(_read_bytes(path, 0, head))
-    totals = np.zeros(5, dtype=np.int64)
+    totals = np.zeros(5, dtype=np.int64)  # NaN, infinite, negative, further below 0 than noise, above 1
     greatest, least = 0.0, 0.0
     invalid = np.zeros((height, width), bool)
     for first in range(0, height, rows):
@@ -176,7 +175,13 @@ def measure_cube(path: Path, value_scale: float | None, invalid_pixels: InvalidP
             greatest = max(greatest, float(stored.max()))
             continue
         finite = np.isfinite(block)
-        totals += _odd_values(block, finite)
+        totals += (
+            np.isnan(block).sum(),
+            np.isinf(block).sum(),
+            ((block < 0.0) & finite).sum(),
+            ((block < -_NOISE) & finite).sum(),
+            ((block > 1.0) & finite).sum(),
+        )
         invalid[first : first + rows] = _find_invalid(block, invalid_pixels)
         greatest = max(greatest, float(stored.max(where=finite, initial=0.0)))
         least = min(least, float(block.min(where=finite, initial=0.0)))
@@ -200,19 +205,6 @@ def _read_bytes(path: Path, start: int, count: int = -1) -> bytes:
         return file.read(count)
 
 
-def _odd_values(
-    block: Float32[np.ndarray, "h W B"], finite: Bool[np.ndarray, "h W B"]
-) -> tuple[np.int64, ...]:
-    """Values that are NaN, infinite, negative, further below 0 than noise, and above 1."""
-    return (
-        np.isnan(block).sum(),
-        np.isinf(block).sum(),
-        ((block < 0.0) & finite).sum(),
-        ((block < -_NOISE) & finite).sum(),
-        ((block > 1.0) & finite).sum(),
-    )
-
-
 def read_cube(
     path: Path,
     value_scale: float | None,
@@ -233,7 +225,7 @@ def read_cube(
 def read_invalid(
     path: Path, value_scale: float | None, invalid_pixels: InvalidPixels
 ) -> Bool[np.ndarray, "H W"]:
-    """`_find_invalid` of a file."""
+    """Pixels that `read_cube` sets to 0."""
     return _find_invalid(_read_scaled(path, value_scale), invalid_pixels)
 
 
@@ -255,11 +247,7 @@ def _find_invalid(values: np.ndarray, invalid_pixels: InvalidPixels) -> Bool[np.
 
 
 def _is_far_out_of_range(values: _CubeValues, value_scale: float | None) -> bool:
-    """Whether a cube's values cannot be meant as [0, 1].
-
-    Saturated highlights above 1 are common and are clipped; a cube that is above 1 in more than a few places, or by
-    far, was stored in other units.
-    """
+    """Whether values can't be meant as [0, 1]; saturated highlights in a few places can."""
     share = values.num_above_one / values.num_values
     if value_scale is None:
         return share > _EXCESS_SHARE or values.greatest > _EXCESS_VALUE
@@ -274,7 +262,8 @@ def _propose_scale(greatest: float, is_integer: bool) -> float:
     >>> _propose_scale(87.0, False), propose_scale(3.14, False)
     (100.0, 3.2)
     """
-    for scale in _integer_scales() if is_integer else _FLOAT_SCALES:
+    bits = sorted([float(2**bits - 1) for bits in _SENSOR_BITS] + [_REFLECTANCE_SCALE])
+    for scale in bits if is_integer else _FLOAT_SCALES:
         if greatest <= scale and (is_integer or greatest > _EXCESS_VALUE):
             return scale
     digits = int(np.floor(np.log10(max(greatest, 1e-30)))) - 1
@@ -293,14 +282,8 @@ def _describe_scale(scale: float) -> str:
     return f" ({bits} bits{'; reflectances times 10000 need 10000' if 8 < bits < 16 else ''})"
 
 
-def _integer_scales() -> list[float]:
-    return sorted([float(2**bits - 1) for bits in _SENSOR_BITS] + [_REFLECTANCE_SCALE])
-
-
 _MOST_READERS = 8
 """Cubes read at once: hashing and comparing take longer than a disk, and don't hold each other up."""
-_Size = tuple[int, int]
-"""Height and width in pixels."""
 
 
 def check_cube_headers(
@@ -308,7 +291,7 @@ def check_cube_headers(
     located: tuple[dict[str, Path], ...],
     operators: Sequence[np.ndarray | None],
     faults: Faults,
-) -> tuple[list[_Size | None], list[_ArrayHeader | None]]:
+) -> tuple[list[Size | None], list[_ArrayHeader | None]]:
     """Check shapes and types against sizes and sensors.
 
     Args:
@@ -316,25 +299,33 @@ def check_cube_headers(
     Returns:
         Sizes of the frames' images, None where nothing tells one, and the sound headers.
     """
-    shared: tuple[_Size, str] | None = None
+    shared: tuple[Size, str] | None = None
     bands: tuple[int, str] | None = None
-    sizes: list[_Size | None] = []
+    sizes: list[Size | None] = []
     headers: list[_ArrayHeader | None] = []
     for frame, paths, operator in zip(entry.frames, located, operators, strict=True):
         path = paths.get("hyperspectral_file_path")
         where = frame.name_of("hyperspectral_file_path")
         header = None if path is None else _read_header(path, "(H, W, B)", where, faults)
-        expected = _stated_size(frame) or shared
+        lens, expected = frame.intrinsics, shared
+        if lens is not None and lens.width is not None and lens.height is not None:
+            expected = (lens.height, lens.width), "as 'w' and 'h' say"
         headers.append(header)
         if header is not None:
             found = header.shape[0], header.shape[1]
             if expected is None:
                 expected = shared = found, f"as {where} has"
             if found != expected[0]:
-                message = f"expected {_describe_size(expected[0])}, {expected[1]}"
-                faults.add(where, f"the cube has {_describe_size(found)} pixels (width x height); {message}")
+                wide = f"{found[1]} x {found[0]} pixels (width x height)"
+                message = f"expected {expected[0][1]} x {expected[0][0]}, {expected[1]}"
+                faults.add(where, f"the cube has {wide}; {message}")
                 headers[-1] = None
-            wanted = bands if operator is None else (len(operator), _bands_from(frame))
+            wanted = bands
+            if operator is not None and "responses_path" in frame.paths:
+                wanted = len(operator), "as its responses have"
+            elif operator is not None:
+                listed = "'wavelengths' lists" if frame.sensor.bands is None else "its 'bands' list"
+                wanted = len(operator), f"as {listed}"
             if wanted is None:
                 wanted = bands = header.shape[2], f"as {where} has"
             if header.shape[2] != wanted[0]:
@@ -388,7 +379,7 @@ def _read_header(path: Path, layout: str, where: str, faults: Faults) -> _ArrayH
 
 
 def check_abundances(
-    path: Path, size: _Size | None, num_materials: int | None, where: str, faults: Faults
+    path: Path, size: Size | None, num_materials: int | None, where: str, faults: Faults
 ) -> None:
     """Check one frame's true abundances."""
     header = _read_header(path, "(H, W, K)", where, faults)
@@ -396,10 +387,8 @@ def check_abundances(
         return
     found = header.shape[0], header.shape[1]
     if size is not None and found != size:
-        faults.add(
-            where,
-            f"has {_describe_size(found)} pixels (width x height); expected {_describe_size(size)} as the cubes have",
-        )
+        expected = f"{size[1]} x {size[0]} as the cubes have"
+        faults.add(where, f"has {found[1]} x {found[0]} pixels (width x height); expected {expected}")
     if num_materials is not None and header.shape[2] != num_materials:
         faults.add(
             where, f"has {header.shape[2]} abundances a pixel; expected {num_materials}, one a material"
@@ -407,11 +396,6 @@ def check_abundances(
     values = map_array(path)
     if not (values.min() >= -0.01 and values.max() <= 1.01):  # false with any NaN
         faults.add(where, "has abundances outside [0, 1] or NaN; expected fractions")
-
-
-def _describe_size(size: _Size) -> str:
-    """Width x height."""
-    return f"{size[1]} x {size[0]}"
 
 
 def _note_invalid(
@@ -474,16 +458,3 @@ def _note_scales(measured: list[tuple[str, _CubeValues]], scale: float | None, f
             where,
             f"the cube's values are far outside [0, 1]{given} (up to {greatest:g} as stored in this scene); {advice}",
         )
-
-
-def _stated_size(frame: FrameEntry) -> tuple[_Size, str] | None:
-    lens = frame.intrinsics
-    if lens is None or lens.width is None or lens.height is None:
-        return None
-    return (lens.height, lens.width), "as 'w' and 'h' say"
-
-
-def _bands_from(frame: FrameEntry) -> str:
-    if "responses_path" in frame.paths:
-        return "as its responses have"
-    return "as 'wavelengths' lists" if frame.sensor.bands is None else "as its 'bands' list"

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from unmix_plugin.scenes.reading.faults import Faults
-from unmix_plugin.scenes.reading.transforms_json import FrameEntry, SceneEntry
+from unmix_plugin.scenes.reading.transforms_json import FrameEntry, SceneEntry, Size
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -26,8 +26,6 @@ _COLOUR_MODES = {"RGB": "RGB", "RGBA": "RGBA", "L": "RGB", "LA": "RGBA", "1": "R
 
 UNLABELLED = 255
 """Label of a pixel whose material is unknown."""
-Size = tuple[int, int]
-"""Height and width in pixels."""
 
 
 class UnreadableImageError(ValueError):
@@ -113,7 +111,7 @@ def check_colours(
     example = None
     for frame, paths, size in zip(entry.frames, located, sizes, strict=True):
         noted = faults.noted
-        pixels = _read_picture_checks(frame, paths, "file_path", read_colour, size, faults)
+        pixels = _checked(frame, paths, "file_path", read_colour, size, faults)
         is_readable.append(faults.noted == noted and ("file_path" in paths) == ("file_path" in frame.paths))
         alpha = pixels[..., 3] if pixels is not None and pixels.shape[2] == 4 else None
         seen.append(None if alpha is None else alpha > 0)
@@ -134,7 +132,7 @@ def check_masks(
     """Check all masks; returns which pixels they keep."""
     masks: _Pictures = []
     for frame, paths, size in zip(entry.frames, located, sizes, strict=True):
-        masks.append(_read_picture_checks(frame, paths, "mask_path", read_mask, size, faults))
+        masks.append(_checked(frame, paths, "mask_path", read_mask, size, faults))
         if masks[-1] is not None and not masks[-1].any():
             faults.add(
                 frame.name_of("mask_path"),
@@ -152,7 +150,7 @@ def check_labels(
 ) -> None:
     """Check the true materials of all frames."""
     for frame, paths, size in zip(entry.frames, located, sizes, strict=True):
-        labels = _read_picture_checks(frame, paths, "seg_file_path", read_labels, size, faults)
+        labels = _checked(frame, paths, "seg_file_path", read_labels, size, faults)
         greatest = 0 if labels is None else int(labels.max(where=labels != UNLABELLED, initial=0))
         if num_materials is not None and greatest >= num_materials:
             faults.add(
@@ -161,7 +159,7 @@ def check_labels(
             )
 
 
-def _read_picture_checks(
+def _checked(
     frame: FrameEntry,
     paths: dict[str, Path],
     key: str,

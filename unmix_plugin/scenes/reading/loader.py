@@ -33,10 +33,10 @@ from unmix_plugin.scenes.reading.cubes import (
     read_cube,
 )
 from unmix_plugin.scenes.reading.faults import Faults, resolve_path, sha256_of
-from unmix_plugin.scenes.reading.images import Size, check_colours, check_labels, check_masks
+from unmix_plugin.scenes.reading.images import check_colours, check_labels, check_masks
 from unmix_plugin.scenes.reading.sensors import check_coverage, group_by_sensor, read_operators
 from unmix_plugin.scenes.reading.splits import Split, split_frames
-from unmix_plugin.scenes.reading.transforms_json import FILE_NAME, SceneEntry, read_transforms
+from unmix_plugin.scenes.reading.transforms_json import FILE_NAME, SceneEntry, Size, read_transforms
 from unmix_plugin.scenes.scene import Frame, Normalisation, Scene, SceneOptions
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, read_illuminant_csv, read_spectra_csv

@@ -12,8 +12,7 @@ from jaxtyping import Float64
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.scenes.reading.faults import Faults
-from unmix_plugin.scenes.reading.images import Size
-from unmix_plugin.scenes.reading.transforms_json import SensorEntry
+from unmix_plugin.scenes.reading.transforms_json import SensorEntry, Size
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.sensor import SceneSensor, read_sensor
 

@@ -28,6 +28,8 @@ from unmix_plugin.scenes.reading.faults import (
 from unmix_plugin.spectral.bands import require_nanometres
 
 FILE_NAME = "transforms.json"
+Size = tuple[int, int]
+"""Height and width in pixels."""
 _FILE_KEYS = (
     "file_path",
     "hyperspectral_file_path",
