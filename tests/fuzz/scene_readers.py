@@ -17,7 +17,7 @@ from tests.fuzz.reader import Reader
 from tests.scenes.scene_factory import look_at
 from unmix_plugin.errors import ConfigError, SceneError, SpectrumError
 from unmix_plugin.formats.envi import read_envi_library
-from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, measure_cube, read_array_header
+from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, _measure_cube, read_array_header
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.images import UnreadableImageError, read_colour, read_labels, read_mask
 from unmix_plugin.scenes.reading.loader import _locate_files
@@ -124,7 +124,7 @@ def _npy(array: np.ndarray) -> bytes:
 def _read_cube(path: Path) -> None:
     header = read_array_header(path)
     if len(header.shape) == 3 and 0 not in header.shape:
-        values = measure_cube(path, None, "refuse")
+        values = _measure_cube(path, None, "refuse")
         assert 0 <= values.num_invalid_pixels <= values.num_pixels
 
 

@@ -13,7 +13,7 @@ from tests.method_factory import (
 )
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.losses.training_losses import LossConfig
-from unmix_plugin.spectral.evidence import FAINT, relative_weights
+from unmix_plugin.spectral.evidence import _FAINT, relative_weights
 
 
 def test_a_last_colour_background_closes_every_ray_that_meets_something():
@@ -83,7 +83,7 @@ def test_relative_errors_count_the_more_the_darker_the_rendered_pixel_is(power):
         batch = {"spectra": torch.full((1, NUM_BANDS), 0.9 * rendered), "alpha": torch.ones(1)}
         return float(model.get_loss_dict(outputs, batch)["spectral"])
 
-    faint = (0.2 + FAINT) / (0.1 + FAINT)
+    faint = (0.2 + _FAINT) / (0.1 + _FAINT)
     assert loss(0.2) == pytest.approx(0.02**2, rel=1e-4)
     assert loss(0.1) == pytest.approx(0.01**2 * faint**power, rel=1e-4)
 

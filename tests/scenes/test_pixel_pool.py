@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from unmix_plugin.scenes import pixel_block
-from unmix_plugin.scenes.pixel_block import PixelPool
+from unmix_plugin.scenes.pixel_block import _PixelPool
 
 PIXELS = 1000
 
@@ -16,7 +16,7 @@ def small_chunks(monkeypatch):
     monkeypatch.setattr(pixel_block, "_PIXELS_PER_STEP", 20)
 
 
-def make_pool(valid=None, num_bytes=800, reads=None) -> PixelPool:
+def make_pool(valid=None, num_bytes=800, reads=None) -> _PixelPool:
     values = torch.arange(PIXELS, dtype=torch.int32)[:, None]
 
     def read(first: int, last: int) -> torch.Tensor:
@@ -24,10 +24,10 @@ def make_pool(valid=None, num_bytes=800, reads=None) -> PixelPool:
             reads.append((first, last))
         return values[first:last]
 
-    return PixelPool(torch.ones(PIXELS, dtype=torch.bool) if valid is None else valid, 4, num_bytes, read)
+    return _PixelPool(torch.ones(PIXELS, dtype=torch.bool) if valid is None else valid, 4, num_bytes, read)
 
 
-def draw(pool: PixelPool, step: int, count: int = 20) -> torch.Tensor:
+def draw(pool: _PixelPool, step: int, count: int = 20) -> torch.Tensor:
     pixels, values = pool.draw(count, step, torch.Generator().manual_seed(step))
     assert torch.equal(values[:, 0].long(), pixels)
     return pixels
@@ -75,6 +75,6 @@ def test_an_error_of_the_disk_is_said_where_pixels_are_drawn():
     def fail(first: int, last: int) -> torch.Tensor:
         raise OSError(f"the disk is gone: {first} to {last}")
 
-    pool = PixelPool(torch.ones(PIXELS, dtype=torch.bool), 4, 800, fail)
+    pool = _PixelPool(torch.ones(PIXELS, dtype=torch.bool), 4, 800, fail)
     with pytest.raises(OSError, match="the disk is gone"):
         draw(pool, 0)

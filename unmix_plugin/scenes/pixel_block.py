@@ -39,7 +39,7 @@ _CHUNKS_AHEAD = 4
 _ORDER_SEED = 23
 
 
-class PixelPool:
+class _PixelPool:
     """Values of some of a block's pixels at each step."""
 
     def __init__(
@@ -174,7 +174,7 @@ class Projection:
         )
 
 
-class ProjectedPixels:
+class _ProjectedPixels:
     """Spectra of a block's pixels by the components that they have in a subspace."""
 
     def __init__(
@@ -265,8 +265,8 @@ class PixelBlock:
         self._kept = np.dtype("i2" if self._is_unsigned else kind if self._is_compact else "f4")
         self.num_channels = scene.sensors[self.sensor].num_channels
         self.num_bad = 0
-        self.pool: PixelPool | None = None
-        self._projected: ProjectedPixels | None = None
+        self.pool: _PixelPool | None = None
+        self._projected: _ProjectedPixels | None = None
         self._values: Tensor | None = None
 
     def __len__(self) -> int:
@@ -328,7 +328,7 @@ class PixelBlock:
         """Leave the values on disk, and hold so much of them for draws."""
         if self.valid.any():
             pixel_bytes = self.num_channels * self.value_bytes
-            self.pool = PixelPool(self.valid, pixel_bytes, num_bytes, self._read_range)
+            self.pool = _PixelPool(self.valid, pixel_bytes, num_bytes, self._read_range)
 
     def hold_projected(self, subspace: SpectralSubspace, limits: Float[Tensor, " b"] | None) -> None:
         """Read all values, and hold of each pixel its components in a subspace.
@@ -337,7 +337,7 @@ class PixelBlock:
             limits: As `mend` takes them; None replaces nothing.
         """
         num_pixels = self._width * self._height
-        projected = ProjectedPixels(subspace, len(self), self.num_channels, self._camera_of.device)
+        projected = _ProjectedPixels(subspace, len(self), self.num_channels, self._camera_of.device)
         for row, view in enumerate(self._views):
             spectra = self._scaled(self._stored(view, ()))
             if limits is not None:

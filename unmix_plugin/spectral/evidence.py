@@ -152,7 +152,7 @@ def bounded_square(errors: Float[Tensor, "R C"], outliers: Float[Tensor, "R 1"])
     return torch.where(size <= outliers, errors.square(), outliers * (2 * size - outliers))
 
 
-FAINT = 0.02
+_FAINT = 0.02
 """Brightness below which weights hardly grow: there is noise."""
 
 
@@ -163,7 +163,7 @@ def relative_weights(pred_spectra: Float[Tensor, "R B"], power: float) -> Float[
 
     Source: Mildenhall et al. 2022, NeRF in the Dark, for a power of 2.
     """
-    return ((_PLAIN_BRIGHTNESS + FAINT) / (brightness(pred_spectra.detach()) + FAINT)) ** power
+    return ((_PLAIN_BRIGHTNESS + _FAINT) / (brightness(pred_spectra.detach()) + _FAINT)) ** power
 
 
 _SURELY_LIT = 0.05

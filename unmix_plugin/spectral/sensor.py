@@ -164,7 +164,7 @@ class SceneSensor:
     """A channel's value is its row times the spectrum. Rows are not negative and sum to 1."""
 
     @staticmethod
-    def of_bands(name: str, bands: tuple[int, ...], num_bands: int) -> SceneSensor:
+    def _of_bands(name: str, bands: tuple[int, ...], num_bands: int) -> SceneSensor:
         """A sensor whose channels are some bands of the scene, in any order."""
         return SceneSensor(name, np.eye(num_bands)[list(bands)])
 
@@ -214,7 +214,7 @@ class SceneSensor:
             KeyError, IndexError, TypeError, ValueError: no sensor of a scene with so many bands.
         """
         if "bands" in values:
-            return SceneSensor.of_bands(str(values["name"]), tuple(values["bands"]), num_bands)
+            return SceneSensor._of_bands(str(values["name"]), tuple(values["bands"]), num_bands)
         matrix = np.array(values["responses"], dtype=np.float64)
         if matrix.ndim != 2 or matrix.shape[1] != num_bands or not matrix.min(initial=0.0) >= 0:
             raise ValueError(

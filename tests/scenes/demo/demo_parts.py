@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from unmix_plugin.scenes.demo.shading import LAMP_POSITION, THINGS
+from unmix_plugin.scenes.demo.shading import _LAMP_POSITION, THINGS
 
 PLACEMENTS = tuple(thing.placement for thing in THINGS)
 TABLE, APPLE, *_ = THINGS
-LAMP = np.array(LAMP_POSITION, dtype=np.float32)
+LAMP = np.array(_LAMP_POSITION, dtype=np.float32)
 
 
 def row(*values):

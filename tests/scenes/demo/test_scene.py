@@ -15,22 +15,22 @@ from tests.scenes.demo.demo_parts import LAMP, PLACEMENTS
 from unmix_plugin.errors import ConfigError, SceneError, SpectrumError
 from unmix_plugin.scenes.demo import scene as demo_scene
 from unmix_plugin.scenes.demo.scene import (
-    CAMERA_DISTANCE,
+    _CAMERA_DISTANCE,
+    _frame_name,
+    _radiance_cube,
     demo_cameras,
     demo_scene_path,
-    frame_name,
     is_complete,
     label_image,
     make_demo_scene,
-    radiance_cube,
 )
 from unmix_plugin.scenes.demo.shading import (
     MATERIALS,
+    _trace,
     band_centers_nm,
     lamp_power,
     reflectances,
     render_view,
-    trace,
 )
 from unmix_plugin.scenes.demo.shapes import first_hits
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
@@ -53,7 +53,7 @@ def spectra_of(bands):
 
 def test_a_lit_matt_pixel_of_one_material_is_reflectance_times_lamp_times_shading(view):
     spectra, lamp = spectra_of(31)
-    cube = radiance_cube(view, spectra, lamp)
+    cube = _radiance_cube(view, spectra, lamp)
     for k in range(len(MATERIALS)):
         pure = (view.alpha == 1) & (view.abundances[..., k] > 0.9999) & (view.specular == 0)
         if MATERIALS[k] == "green":  # the glossy apple only: no pixel of it is without a trace of highlight
@@ -68,12 +68,12 @@ def test_what_a_highlight_adds_to_the_same_point_has_the_lamps_colour():
     spectra, lamp = spectra_of(31)
     rays = demo_cameras(64, 8).image_rays(2)
     origins, directions = rays.origins.numpy(), rays.directions.numpy()
-    brightest = trace(origins, directions, LAMP[None]).specular.argmax()
+    brightest = _trace(origins, directions, LAMP[None]).specular.argmax()
     distances, _ = first_hits(PLACEMENTS, origins, directions)
     point = origins[brightest] + distances[brightest] * directions[brightest]
     eyes = np.stack([origins[brightest], point + 2 * np.array([0, 0.3, 1], dtype=np.float32)])
     towards = (point - eyes) / np.linalg.norm(point - eyes, axis=1, keepdims=True)
-    seen = trace(eyes, towards.astype(np.float32), LAMP[None])
+    seen = _trace(eyes, towards.astype(np.float32), LAMP[None])
     assert seen.specular[0] > 0.5
     assert seen.specular[1] < 0.1
     radiances = (seen.diffuse @ spectra + seen.specular[:, None]) * lamp
@@ -87,14 +87,14 @@ def test_two_cameras_see_the_same_diffuse_light_at_the_same_point():
     origins, directions = rays.origins.numpy(), rays.directions.numpy()
     distances, _ = first_hits(PLACEMENTS, origins, directions)
     points = (origins + distances[:, None] * directions)[np.isfinite(distances)]
-    seen = trace(origins, directions, LAMP[None])
+    seen = _trace(origins, directions, LAMP[None])
     eye = cameras.camera_to_world[5, :, 3].numpy()
     lengths = np.linalg.norm(points - eye, axis=1)
     towards = (points - eye) / lengths[:, None]
     others, _ = first_hits(PLACEMENTS, np.broadcast_to(eye, points.shape), towards)
     common = np.abs(others - lengths) < 1e-4
     assert common.sum() > 50
-    again = trace(np.broadcast_to(eye, points.shape)[common], towards[common], LAMP[None])
+    again = _trace(np.broadcast_to(eye, points.shape)[common], towards[common], LAMP[None])
     first = seen.diffuse[seen.is_hit][common]
     # A shadow's border can fall to either side by rounding.
     assert np.mean(np.abs(again.diffuse - first).max(axis=1) < 2e-3) > 0.98
@@ -189,7 +189,7 @@ def test_an_unknown_light_is_refused_before_anything_is_written(tmp_path):
 
 def test_every_fourth_view_is_for_evaluation_and_has_abundances(folder):
     transforms = json.loads((folder / "transforms.json").read_text())
-    evaluation = [f"images/{frame_name(i)}.png" for i in (2, 6)]
+    evaluation = [f"images/{_frame_name(i)}.png" for i in (2, 6)]
     assert transforms["val_filenames"] == transforms["test_filenames"] == evaluation
     frames = {frame["file_path"]: frame for frame in transforms["frames"]}
     assert set(transforms["train_filenames"]) == set(frames) - set(evaluation)
@@ -210,7 +210,7 @@ def test_cameras_look_at_the_table_from_all_sides_with_rigid_poses(folder):
     )
     assert_allclose(np.linalg.det(rotations), 1, atol=1e-6)
     assert_allclose(poses[:, 3], np.broadcast_to([0, 0, 0, 1], (7, 4)))
-    looking_at = poses[:, :3, 3] - CAMERA_DISTANCE * rotations[:, :, 2]
+    looking_at = poses[:, :3, 3] - _CAMERA_DISTANCE * rotations[:, :, 2]
     assert_allclose(looking_at, np.broadcast_to([0, 0, 0.22], (7, 3)), atol=1e-5)
     azimuths = np.sort(np.arctan2(poses[:, 1, 3], poses[:, 0, 3]))
     assert np.diff(azimuths, append=azimuths[0] + 2 * np.pi).max() < np.pi / 2

@@ -10,24 +10,24 @@ from numpy.testing import assert_allclose
 from tests.scenes.demo.demo_parts import APPLE, LAMP, TABLE, row
 from unmix_plugin.scenes.demo.scene import demo_cameras
 from unmix_plugin.scenes.demo.shading import (
-    COAT_REFLECTANCE,
-    LAMP_IRRADIANCE,
+    _COAT_REFLECTANCE,
+    _LAMP_IRRADIANCE,
     THINGS,
-    coat_highlight,
-    direct_light,
-    lamp_point,
-    sky_light,
-    solid_noise,
+    _coat_highlight,
+    _direct_light,
+    _lamp_point,
+    _sky_light,
+    _solid_noise,
+    _trace,
     speckled_things,
-    trace,
 )
 
 
 def test_direct_light_follows_the_cosine_where_nothing_is_in_the_way():
     point = row(1.1, -0.3, 0)
     towards = LAMP - point[0]
-    expected = LAMP_IRRADIANCE * towards[2] / np.linalg.norm(towards)
-    assert_allclose(direct_light(point, row(0, 0, 1), LAMP[None]), expected, rtol=1e-5)
+    expected = _LAMP_IRRADIANCE * towards[2] / np.linalg.norm(towards)
+    assert_allclose(_direct_light(point, row(0, 0, 1), LAMP[None]), expected, rtol=1e-5)
 
 
 def test_a_point_behind_the_apple_lies_in_its_shadow():
@@ -35,25 +35,25 @@ def test_a_point_behind_the_apple_lies_in_its_shadow():
     along = center - LAMP
     shadow = (LAMP + along * (LAMP[2] / -along[2])).astype(np.float32)
     assert np.hypot(shadow[0], shadow[1]) < 1.3, "the shadow's middle falls on the table"
-    assert direct_light(shadow[None], row(0, 0, 1), LAMP[None]) == 0
+    assert _direct_light(shadow[None], row(0, 0, 1), LAMP[None]) == 0
 
 
 def test_the_sky_is_darker_beside_a_thing_than_in_the_open():
     beside, away = row(-0.5, -0.3, 0), row(0.0, -1.2, 0)
     up = row(0, 0, 1)
-    near, far = sky_light(beside, up, TABLE)[0], sky_light(away, up, TABLE)[0]
+    near, far = _sky_light(beside, up, TABLE)[0], _sky_light(away, up, TABLE)[0]
     assert 0 <= near < 0.3 * far
 
 
 def test_a_highlight_seen_head_on_is_the_fresnel_reflectance_over_four_squared_roughness():
     # Eye, lamp and normal coincide: D = 1 / (pi a^2), both Smith terms 1, cosines 1.
     normal = LAMP[None] / np.linalg.norm(LAMP)
-    got = coat_highlight(np.zeros((1, 3), np.float32), normal, normal, roughness=0.2)
-    assert_allclose(got, COAT_REFLECTANCE / (4 * 0.2**2), rtol=1e-4)
+    got = _coat_highlight(np.zeros((1, 3), np.float32), normal, normal, roughness=0.2)
+    assert_allclose(got, _COAT_REFLECTANCE / (4 * 0.2**2), rtol=1e-4)
 
 
 def test_the_lamps_points_fill_its_disc_evenly():
-    offsets = np.array([lamp_point(i, 9) for i in range(9)]) - LAMP
+    offsets = np.array([_lamp_point(i, 9) for i in range(9)]) - LAMP
     assert len(np.unique(offsets.round(4), axis=0)) == 9
     assert_allclose(offsets.mean(axis=0), 0, atol=0.06)
 
@@ -63,7 +63,7 @@ def hits():
     """The same rays at the plain and at the speckled scene."""
     rays = demo_cameras(96, 4).image_rays(1)
     origins, directions = rays.origins.numpy(), rays.directions.numpy()
-    return trace(origins, directions, LAMP[None]), trace(origins, directions, LAMP[None], speckled_things())
+    return _trace(origins, directions, LAMP[None]), _trace(origins, directions, LAMP[None], speckled_things())
 
 
 def test_speckles_change_abundances_and_nothing_else(hits):
@@ -86,8 +86,8 @@ def test_every_thing_shows_both_of_its_materials(hits):
 
 def test_noise_is_smooth_and_differs_between_things():
     points = np.random.default_rng(0).uniform(-1, 1, (500, 3)).astype(np.float32)
-    values = solid_noise(points, 0)
+    values = _solid_noise(points, 0)
     assert 0 <= values.min() < 0.35
     assert 0.65 < values.max() <= 1
-    assert np.abs(solid_noise(points + np.float32(1e-4), 0) - values).max() < 0.02
-    assert np.corrcoef(solid_noise(points, 1), values)[0, 1] < 0.2
+    assert np.abs(_solid_noise(points + np.float32(1e-4), 0) - values).max() < 0.02
+    assert np.corrcoef(_solid_noise(points, 1), values)[0, 1] < 0.2

@@ -24,11 +24,11 @@ from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.scenes.geometry.bounds import find_bounds
 from unmix_plugin.scenes.geometry.carving import (
     MIN_EXPLAINED,
+    _foreground_mask,
+    _needed_witnesses,
     carve_box,
-    foreground_mask,
     foreground_rays,
     mask_warning,
-    needed_witnesses,
     share_explained,
     share_through,
 )
@@ -162,9 +162,9 @@ def test_pixels_that_a_mask_ignores_count_as_matter(tmp_path):
     before = load_scene(folder.root)
     folder.edit(lambda c: c["frames"][1].update(mask_path="mask.png"))
     after = load_scene(folder.root)
-    assert foreground_mask(after, 1)[:, 10:].all()
-    assert np.array_equal(foreground_mask(after, 1)[:, :10], foreground_mask(before, 1)[:, :10])
-    assert np.array_equal(foreground_mask(after, 2), foreground_mask(before, 2))
+    assert _foreground_mask(after, 1)[:, 10:].all()
+    assert np.array_equal(_foreground_mask(after, 1)[:, :10], _foreground_mask(before, 1)[:, :10])
+    assert np.array_equal(_foreground_mask(after, 2), _foreground_mask(before, 2))
 
 
 def test_the_box_of_a_ball_is_tight_around_it(tmp_path):
@@ -273,8 +273,8 @@ def test_a_hole_in_one_mask_does_not_carve_what_all_other_views_see():
     foreground[3] = foreground[3].copy()
     foreground[3][14:26, 14:26] = False
     rays = foreground_rays(cameras, foreground)
-    assert needed_witnesses(cameras, ball_matter(poses, 0.5), BOX, rays) == 1
-    witnesses = needed_witnesses(cameras, foreground, BOX, rays)
+    assert _needed_witnesses(cameras, ball_matter(poses, 0.5), BOX, rays) == 1
+    witnesses = _needed_witnesses(cameras, foreground, BOX, rays)
     assert witnesses == 2
     spoilt, kept = (carve_box(cameras, foreground, BOX, 32, witnesses=count) for count in (1, witnesses))
     assert (true & ~spoilt).sum() > 0.1 * true.sum()
@@ -294,11 +294,11 @@ def test_where_many_views_look_through_what_the_others_see_more_must_agree():
             mask[14:26, 14:26] = False
         return masks
 
-    witnesses = needed_witnesses(cameras, spoilt(5), BOX, rays)
+    witnesses = _needed_witnesses(cameras, spoilt(5), BOX, rays)
     assert witnesses == 4
     few, enough = (carve_box(cameras, spoilt(5), BOX, 64, witnesses=count) for count in (3, witnesses))
     assert share_through(rays, BOX, few) < MIN_EXPLAINED <= share_through(rays, BOX, enough)
-    assert needed_witnesses(cameras, spoilt(20), BOX, rays) == 6
+    assert _needed_witnesses(cameras, spoilt(20), BOX, rays) == 6
 
 
 @pytest.fixture(scope="module")
@@ -309,7 +309,7 @@ def demo(tmp_path_factory) -> Scene:
 
 
 def masks(scene: Scene) -> list[np.ndarray]:
-    return [foreground_mask(scene, index) for index in scene.train_indices]
+    return [_foreground_mask(scene, index) for index in scene.train_indices]
 
 
 def turned(scene: Scene, size: float) -> Scene:

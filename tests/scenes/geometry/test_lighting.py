@@ -8,20 +8,20 @@ from tests.scenes.geometry.ball_views import BOX, RADIUS, SIDE, ball_matter, bal
 from tests.scenes.scene_factory import ring_poses
 from unmix_plugin.scenes.geometry.carving import carve_box
 from unmix_plugin.scenes.geometry.lighting import (
-    foretold_share,
-    gain_spread,
-    hull_places,
+    _foretold_share,
+    _gain_spread,
+    _hull_places,
+    _view_gains,
     judge_light,
     seen_places,
-    view_gains,
 )
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.5])
 def test_a_light_that_moves_with_the_camera_is_told_from_a_fixed_one(noise):
     moving, fixed = ball_views(True, noise), ball_views(False, noise)
-    assert foretold_share(moving[0], *seen_places(*moving)) > 0.1
-    assert foretold_share(fixed[0], *seen_places(*fixed)) < 0.0
+    assert _foretold_share(moving[0], *seen_places(*moving)) > 0.1
+    assert _foretold_share(fixed[0], *seen_places(*fixed)) < 0.0
     assert (judge_light(*moving), judge_light(*fixed)) == ("camera", "fixed")
 
 
@@ -29,7 +29,7 @@ def test_a_light_that_moves_with_the_camera_is_told_from_a_fixed_one(noise):
 def test_views_of_different_exposure_are_told_from_views_of_one(noise):
     log_gains = np.log(np.random.default_rng(1).uniform(0.8, 1.2, 16))
     views = ball_views(False, noise, log_gains)
-    assert gain_spread(views[0], *seen_places(*views)) == pytest.approx(log_gains.std(), rel=0.5)
+    assert _gain_spread(views[0], *seen_places(*views)) == pytest.approx(log_gains.std(), rel=0.5)
     assert judge_light(*views) == "per-view"
 
 
@@ -38,10 +38,10 @@ def test_gains_are_found_exactly_where_places_differ_by_nothing_else():
     log_gains = torch.from_numpy(generator.normal(size=8) * 0.2).float()
     seen = torch.from_numpy(generator.normal(size=(100, 1))).float() + log_gains
     seen[torch.from_numpy(generator.random((100, 8)) < 0.6)] = torch.nan
-    found = view_gains(seen)
+    found = _view_gains(seen)
     torch.testing.assert_close(found, log_gains - log_gains.mean(), atol=1e-4, rtol=0)
     seen[:, 3] = torch.nan
-    assert view_gains(seen).isnan().tolist() == [index == 3 for index in range(8)]
+    assert _view_gains(seen).isnan().tolist() == [index == 3 for index in range(8)]
 
 
 def test_few_views_of_different_exposure_are_left_alone():
@@ -52,13 +52,13 @@ def test_few_views_of_different_exposure_are_left_alone():
 
 def test_a_light_that_moves_is_no_difference_of_exposure():
     views = ball_views(True)
-    assert gain_spread(views[0], *seen_places(*views)) < 0.03
+    assert _gain_spread(views[0], *seen_places(*views)) < 0.03
 
 
 def test_normals_of_a_hull_point_outwards():
     poses = ring_poses(12)
     hull = carve_box(make_cameras(poses), ball_matter(poses, RADIUS), BOX, 32)
-    places = hull_places(hull, BOX)
+    places = _hull_places(hull, BOX)
     outwards = torch.nn.functional.normalize(places.positions, dim=-1)
     assert float((outwards * places.normals).sum(dim=-1).median()) > 0.9
 

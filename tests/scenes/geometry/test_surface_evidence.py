@@ -12,14 +12,14 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox, UnitSpace
 from unmix_plugin.scenes import SceneOptions, carve, load_scene
 from unmix_plugin.scenes.demo import scene as demo_scene
-from unmix_plugin.scenes.demo.scene import WORLD, make_demo_scene
+from unmix_plugin.scenes.demo.scene import _WORLD, make_demo_scene
 from unmix_plugin.scenes.demo.shading import render_view
 from unmix_plugin.scenes.demo.shapes import first_hits
 from unmix_plugin.scenes.geometry.surface_evidence import (
     SurfaceEvidence,
-    SweptDepths,
-    seen_through,
-    sweep_depths,
+    _seen_through,
+    _sweep_depths,
+    _SweptDepths,
 )
 from unmix_plugin.scenes.pixel_table import PixelTable
 
@@ -33,7 +33,7 @@ def folder(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(demo_scene, "render_view", partial(render_view, subpixels=1))
         folder = tmp_path_factory.mktemp("world") / "scene"
-        make_demo_scene(folder, 64, 3, 24, place=WORLD)
+        make_demo_scene(folder, 64, 3, 24, place=_WORLD)
     return folder
 
 
@@ -53,7 +53,7 @@ def true_distances(scene, rays):
     """To the first surface, model units; inf where there is the sky."""
     origins = scene.normalisation.to_world(rays.origins.double().numpy()).astype(np.float32)
     directions = (rays.directions.numpy() @ scene.normalisation.rotation).astype(np.float32)
-    found, _ = first_hits([thing.placement for thing in WORLD.things], origins, directions)
+    found, _ = first_hits([thing.placement for thing in _WORLD.things], origins, directions)
     return torch.from_numpy(found) * scene.normalisation.scale
 
 
@@ -113,7 +113,7 @@ def test_views_of_differing_exposure_and_large_noisy_views_are_swept_too(scene, 
         )
         return (gains[view] * cube + noise)[part]
 
-    depths = sweep_depths(large, scene.scene_box, read_view)
+    depths = _sweep_depths(large, scene.scene_box, read_view)
     assert depths is not None
     assert depths.stride == 2 * (1 if edge == 1 else 3)
     share, right = share_right(scene, large, [0, 5, 10], depths)
@@ -153,9 +153,9 @@ def test_nothing_is_known_of_views_that_show_one_colour_or_are_too_few():
     def noisy(view, part):
         return np.random.default_rng(view).random(size, np.float32)[part]
 
-    assert sweep_depths(cameras, BOX, plain) is None
-    assert sweep_depths(cameras[[0, 1, 2]], BOX, noisy) is None
-    unrelated = sweep_depths(cameras, BOX, noisy)
+    assert _sweep_depths(cameras, BOX, plain) is None
+    assert _sweep_depths(cameras[[0, 1, 2]], BOX, noisy) is None
+    unrelated = _sweep_depths(cameras, BOX, noisy)
     assert unrelated is not None
     assert torch.isfinite(unrelated.distances).float().mean() < 0.05
 
@@ -168,7 +168,7 @@ def test_views_of_a_pixel_or_a_row_are_too_small_to_be_swept(scene, size):
         cameras.camera_to_world, cameras.focal_px, cameras.center_px, cameras.distortion, width, height
     )
     pixels = np.random.default_rng(0).random((*size, 3), np.float32)
-    assert sweep_depths(small, BOX, lambda view, part: (pixels + 0.01 * view)[part]) is None
+    assert _sweep_depths(small, BOX, lambda view, part: (pixels + 0.01 * view)[part]) is None
 
 
 @pytest.mark.parametrize("num_views", [2, 3])
@@ -176,8 +176,8 @@ def test_three_views_must_look_through_a_cell(num_views):
     positions = [np.array([2.5, side, 0.3]) for side in (-0.4, 0.0, 0.4)]
     cameras = make_cameras([look_at(position, np.array([-20.0, 0.0, 0.0])) for position in positions])
     shape = (num_views, cameras.height, cameras.width)
-    depths = SweptDepths(tuple(range(num_views)), torch.full(shape, 3.0), 1)
-    empty = seen_through(depths, cameras, BOX, 32)
+    depths = _SweptDepths(tuple(range(num_views)), torch.full(shape, 3.0), 1)
+    empty = _seen_through(depths, cameras, BOX, 32)
     space = UnitSpace(BOX, is_unbounded=True)
 
     def is_empty(*point: float) -> bool:

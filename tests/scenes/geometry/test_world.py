@@ -13,10 +13,10 @@ from unmix_plugin.engine.geometry.space import SceneBox, UnitSpace
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes import SceneOptions, carve, load_scene
 from unmix_plugin.scenes.demo import scene as demo_scene
-from unmix_plugin.scenes.demo.scene import ROOM, TABLE, WORLD, make_demo_scene
+from unmix_plugin.scenes.demo.scene import _ROOM, _TABLE, _WORLD, make_demo_scene
 from unmix_plugin.scenes.demo.shading import render_view
-from unmix_plugin.scenes.geometry.carving import carve_world
-from unmix_plugin.scenes.geometry.view_agreement import WorldEvidence
+from unmix_plugin.scenes.geometry.carving import _carve_world
+from unmix_plugin.scenes.geometry.view_agreement import _WorldEvidence
 
 BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 
@@ -27,7 +27,7 @@ def folders(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(demo_scene, "render_view", partial(render_view, subpixels=1))
         root = tmp_path_factory.mktemp("places")
-        for name, place, size in (("table", TABLE, 48), ("world", WORLD, 48), ("room", ROOM, 72)):
+        for name, place, size in (("table", _TABLE, 48), ("world", _WORLD, 48), ("room", _ROOM, 72)):
             make_demo_scene(root / name, size, 3, 16, place=place)
     return root
 
@@ -41,10 +41,10 @@ def test_what_goes_on_behind_the_box_is_found_from_the_views(folders, name, is_u
 
 
 def test_a_room_whose_inside_explains_all_pixels_is_bounded():
-    assert not WorldEvidence(num_pixels=1000, num_inside=900, num_behind=20, num_explained=850).goes_on
-    assert WorldEvidence(num_pixels=1000, num_inside=600, num_behind=300, num_explained=850).goes_on
-    assert WorldEvidence(num_pixels=1000, num_inside=300, num_behind=10, num_explained=350).goes_on
-    assert not WorldEvidence(0, 0, 0, 0).goes_on
+    assert not _WorldEvidence(num_pixels=1000, num_inside=900, num_behind=20, num_explained=850).goes_on
+    assert _WorldEvidence(num_pixels=1000, num_inside=600, num_behind=300, num_explained=850).goes_on
+    assert _WorldEvidence(num_pixels=1000, num_inside=300, num_behind=10, num_explained=350).goes_on
+    assert not _WorldEvidence(0, 0, 0, 0).goes_on
 
 
 def test_a_world_behind_what_is_transparent_is_refused(folders):
@@ -71,7 +71,7 @@ def test_cells_that_one_view_alone_sees_are_carved_and_those_that_many_see_are_n
     """Two cameras side by side see the same far places, and each what is right before it alone."""
     positions = [np.array([3.0, side, 0.3]) for side in (-1.0, 1.0)]
     cameras = make_cameras([look_at(position, np.array([-20.0, 0.0, 0.0])) for position in positions])
-    kept = torch.from_numpy(carve_world(cameras, BOX, 32))
+    kept = torch.from_numpy(_carve_world(cameras, BOX, 32))
     space = UnitSpace(BOX, is_unbounded=True)
 
     def is_kept(*point: float) -> bool:

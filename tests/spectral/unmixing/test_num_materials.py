@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from tests.spectral.mixtures import mixed_pixels, seeded, smooth_endmembers
 from tests.spectral.unmixing.surface_pixels import surface_pixels
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.spectral.unmixing.num_materials import elbow, estimate_noise, hysime, propose_num_materials
+from unmix_plugin.spectral.unmixing.num_materials import _elbow, estimate_noise, hysime, propose_num_materials
 
 
 def gaussian(shape, deviation, seed=0):
@@ -78,7 +78,7 @@ def test_few_pixels_of_many_bands_get_a_proposal_without_hysime():
     ],
 )
 def test_the_elbow_is_where_a_further_material_helps_little(distances, number):
-    assert elbow(distances) == number
+    assert _elbow(distances) == number
 
 
 @settings(max_examples=15)

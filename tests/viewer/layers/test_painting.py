@@ -11,7 +11,7 @@ from torch.testing import assert_close
 
 from tests.viewer.view_factory import make_aids
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb
-from unmix_plugin.spectral.maps.indices import MAX_LENGTH
+from unmix_plugin.spectral.maps.indices import _MAX_LENGTH
 from unmix_plugin.viewer.layers.painting import (
     BACKGROUNDS,
     COLOUR_MAPS,
@@ -73,7 +73,7 @@ def test_a_range_that_is_none_leaves_the_one_before():
 
 def test_a_formula_that_is_too_long_stays_too_long_rather_than_becoming_another_one():
     cut = LayerSettings().changed("index", "r600" + " " * 900 + "+r650" * 400)
-    assert len(cut.index) == 1000 > MAX_LENGTH
+    assert len(cut.index) == 1000 > _MAX_LENGTH
     kept = LayerSettings().changed("index", "r600" + " " * 2000 + "/ r650")
     assert kept.index == "r600 / r650"
     assert kept.changed("index", 3.0).index == "r600 / r650"

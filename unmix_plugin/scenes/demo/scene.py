@@ -133,8 +133,8 @@ def written_once(
 
 
 _VIEW_ANGLE_DEG = 38.0
-CAMERA_DISTANCE = 4.1
-LOOK_AT = (0.0, 0.0, 0.22)
+_CAMERA_DISTANCE = 4.1
+_LOOK_AT = (0.0, 0.0, 0.22)
 _ELEVATIONS_DEG = (16.0, 68.0)
 
 
@@ -148,7 +148,7 @@ def demo_cameras(size: int, views: int) -> Cameras:
     heights = low + (high - low) * shares
     flat = np.sqrt(1 - heights**2)
     backward = np.stack([flat * np.cos(azimuths), flat * np.sin(azimuths), heights], axis=1)
-    positions = np.asarray(LOOK_AT) + CAMERA_DISTANCE * backward
+    positions = np.asarray(_LOOK_AT) + _CAMERA_DISTANCE * backward
     return upright_cameras(positions, backward, size, np.deg2rad(_VIEW_ANGLE_DEG))
 
 
@@ -172,12 +172,12 @@ def transform_matrix(cameras: Cameras, index: int) -> list[list[float]]:
     return [*cameras.camera_to_world[index].double().tolist(), [0.0, 0.0, 0.0, 1.0]]
 
 
-def frame_name(index: int) -> str:
+def _frame_name(index: int) -> str:
     """`train_000`, `train_001`, `eval_002`, ...: every 4th view is for evaluation."""
     return f"{'eval' if index % 4 == 2 else 'train'}_{index:03d}"
 
 
-def radiance_cube(
+def _radiance_cube(
     view: ViewCoefficients, spectra: Float[np.ndarray, "K B"], lamp: Float[np.ndarray, " B"]
 ) -> Float[np.ndarray, "H W B"]:
     """Spectral radiance of every pixel in [0, 1]: what exceeds 1 saturates, as in a sensor."""
@@ -305,13 +305,13 @@ def _room_cameras(size: int, views: int, seed: int = 11) -> Cameras:
     return upright_cameras(positions, backward, size, np.deg2rad(_PHONE_ANGLE_DEG))
 
 
-TABLE = _Place(THINGS, demo_cameras)
+_TABLE = _Place(THINGS, demo_cameras)
 """The table before nothing."""
-WORLD = _Place((*THINGS, _ground(), *_far_things()), demo_cameras, _open_sky)
+_WORLD = _Place((*THINGS, _ground(), *_far_things()), demo_cameras, _open_sky)
 """The table on a ground that runs to the horizon, with huts and trees, under a sky."""
-ROOM = _Place((*THINGS, *_room(), _ground(), *_far_things(20, seed=8)), _room_cameras, _open_sky)
+_ROOM = _Place((*THINGS, *_room(), _ground(), *_far_things(20, seed=8)), _room_cameras, _open_sky)
 """The table in a room with windows onto the same world."""
-PLACES: Mapping[str, _Place] = {"table": TABLE, "world": WORLD, "room": ROOM}
+PLACES: Mapping[str, _Place] = {"table": _TABLE, "world": _WORLD, "room": _ROOM}
 
 
 DEFAULT_SIZE, DEFAULT_BANDS, DEFAULT_VIEWS = 96, 31, 32
@@ -348,7 +348,7 @@ def make_demo_scene(
     views: int = DEFAULT_VIEWS,
     overwrite: bool = False,
     illuminant: str | Path = LAMP,
-    place: _Place = TABLE,
+    place: _Place = _TABLE,
 ) -> None:
     """Write a demo scene. It is built beside the folder and moved in when complete.
 
@@ -386,7 +386,7 @@ def is_complete(directory: Path) -> bool:
 
 
 def _write_scene(
-    folder: Path, size: int, bands: int, views: int, illuminant: str | Path = LAMP, place: _Place = TABLE
+    folder: Path, size: int, bands: int, views: int, illuminant: str | Path = LAMP, place: _Place = _TABLE
 ) -> None:
     sampling = Bands.of(band_centers_nm(bands))
     spectra, lamp = reflectances(sampling.centers_nm), lamp_power(sampling.centers_nm, illuminant)
@@ -399,8 +399,8 @@ def _write_scene(
     frames = []
     for index in range(views):
         view = render_view(cameras, index, things=place.things, sky=place.sky)
-        cube = radiance_cube(view, spectra, lamp)
-        frames.append(_write_view(folder, frame_name(index), view, cube, to_rgb, place.sky is None))
+        cube = _radiance_cube(view, spectra, lamp)
+        frames.append(_write_view(folder, _frame_name(index), view, cube, to_rgb, place.sky is None))
         frames[-1]["transform_matrix"] = transform_matrix(cameras, index)
     content = _header(cameras, sampling) | _splits(views) | {"frames": frames}
     (folder / _TRANSFORMS).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
@@ -444,7 +444,7 @@ def _header(cameras: Cameras, bands: Bands) -> dict[str, Any]:
 
 
 def _splits(views: int) -> dict[str, list[str]]:
-    names = [frame_name(index) for index in range(views)]
+    names = [_frame_name(index) for index in range(views)]
     train, evaluation = (
         [f"images/{name}.png" for name in names if name.startswith(s)] for s in ("train", "eval")
     )

@@ -127,14 +127,14 @@ def plain(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
     return np.zeros(len(points), dtype=points.dtype)
 
 
-LAMP_POSITION = (2.6, -2.2, 4.2)
+_LAMP_POSITION = (2.6, -2.2, 4.2)
 _LAMP_RADIUS = 0.55
-LAMP_IRRADIANCE = 0.7
+_LAMP_IRRADIANCE = 0.7
 """On a surface that faces the lamp; with the sky it keeps a white wall just below 1."""
 _SKY_IRRADIANCE = 0.34
 _BOUNCE_SHARE = 0.35
 """What a surface that faces down receives, as a share of the open sky."""
-COAT_REFLECTANCE = 0.05
+_COAT_REFLECTANCE = 0.05
 """Fresnel reflectance of the clear coats at normal incidence."""
 
 _SUBPIXELS = 3
@@ -210,7 +210,7 @@ def render_view(
     index: int,
     subpixels: int = _SUBPIXELS,
     things: Sequence[Thing] = THINGS,
-    lamp: tuple[float, float, float] = LAMP_POSITION,
+    lamp: tuple[float, float, float] = _LAMP_POSITION,
     sky: Sky | None = None,
 ) -> ViewCoefficients:
     """Look at the scene through one camera with `subpixels`^2 rays a pixel.
@@ -232,8 +232,8 @@ def render_view(
         origins, directions = (
             np.concatenate([getattr(one, name).numpy() for one in rays]) for name in ("origins", "directions")
         )
-        lamps = np.stack([lamp_point(i, count, lamp) for i in numbers]).repeat(pixels, axis=0)
-        hits = trace(origins, directions, lamps, things, lamp)
+        lamps = np.stack([_lamp_point(i, count, lamp) for i in numbers]).repeat(pixels, axis=0)
+        hits = _trace(origins, directions, lamps, things, lamp)
         if sky is not None:
             hits.diffuse[~hits.is_hit] = sky(directions[~hits.is_hit])
         for total, values in (
@@ -257,12 +257,12 @@ def _offset(i: int, subpixels: int) -> tuple[float, float]:
     return (i % subpixels + 0.5) / subpixels, (i // subpixels + 0.5) / subpixels
 
 
-def trace(
+def _trace(
     origins: Float[np.ndarray, "R 3"],
     directions: Float[np.ndarray, "R 3"],
     lamps: Float[np.ndarray, "#R 3"],
     things: Sequence[Thing] = THINGS,
-    lamp_middle: tuple[float, float, float] = LAMP_POSITION,
+    lamp_middle: tuple[float, float, float] = _LAMP_POSITION,
 ) -> _Hits:
     """What each ray sees first, lit by one point of the lamp and by the sky. Directions have length 1.
 
@@ -282,19 +282,19 @@ def trace(
         points = origins[rows] + distances[rows, None] * directions[rows]
         local_points = thing.placement.to_local(points)
         normals = thing.placement.normals_at(local_points)
-        lamplight = direct_light(points, normals, lamps[rows], placements)
+        lamplight = _direct_light(points, normals, lamps[rows], placements)
         abundances[rows] = thing.surface.abundances(local_points)
-        diffuse[rows] = abundances[rows] * (lamplight + sky_light(points, normals, thing, things))[:, None]
+        diffuse[rows] = abundances[rows] * (lamplight + _sky_light(points, normals, thing, things))[:, None]
         if thing.surface.roughness is not None:
-            highlight = coat_highlight(
+            highlight = _coat_highlight(
                 points, normals, -directions[rows], thing.surface.roughness, lamp_middle
             )
             specular[rows] = lamplight * highlight
     return _Hits(is_hit, abundances, diffuse, specular)
 
 
-def lamp_point(
-    i: int, count: int, middle: tuple[float, float, float] = LAMP_POSITION
+def _lamp_point(
+    i: int, count: int, middle: tuple[float, float, float] = _LAMP_POSITION
 ) -> Float[np.ndarray, "3"]:
     """The i-th of `count` points that are spread evenly over the lamp's horizontal disc.
 
@@ -308,7 +308,7 @@ def lamp_point(
     return (np.array(middle) + offset).astype(np.float32)
 
 
-def direct_light(
+def _direct_light(
     points: Float[np.ndarray, "P 3"],
     normals: Float[np.ndarray, "P 3"],
     lamps: Float[np.ndarray, "#P 3"],
@@ -319,10 +319,10 @@ def direct_light(
     cosines = (dot(towards_lamp, normals) / np.sqrt(dot(towards_lamp, towards_lamp))).clip(0)
     # The segment to the lamp has length 1 here: nothing of the scene lies beyond the lamp.
     blocked, _ = first_hits(placements, points + 1e-3 * normals, towards_lamp)
-    return np.where(np.isfinite(blocked), 0, LAMP_IRRADIANCE * cosines).astype(np.float32)
+    return np.where(np.isfinite(blocked), 0, _LAMP_IRRADIANCE * cosines).astype(np.float32)
 
 
-def sky_light(
+def _sky_light(
     points: Float[np.ndarray, "P 3"],
     normals: Float[np.ndarray, "P 3"],
     thing: Thing,
@@ -349,12 +349,12 @@ def sky_light(
     return _SKY_IRRADIANCE * (_BOUNCE_SHARE + (1 - _BOUNCE_SHARE) * facing_up) * open_share
 
 
-def coat_highlight(
+def _coat_highlight(
     points: Float[np.ndarray, "P 3"],
     normals: Float[np.ndarray, "P 3"],
     towards_eye: Float[np.ndarray, "P 3"],
     roughness: float,
-    lamp_middle: tuple[float, float, float] = LAMP_POSITION,
+    lamp_middle: tuple[float, float, float] = _LAMP_POSITION,
 ) -> Float[np.ndarray, " P"]:
     """Mirrored radiance for irradiance 1 from the lamp's centre, in units of a white matt surface's.
 
@@ -375,7 +375,7 @@ def coat_highlight(
     shadowing = 1.0
     for cosine in (cos_eye, cos_lamp):
         shadowing = shadowing / (cosine + np.sqrt(a2 + (1 - a2) * cosine**2))
-    fresnel = COAT_REFLECTANCE + (1 - COAT_REFLECTANCE) * (1 - dot(halfway, towards_eye).clip(0, 1)) ** 5
+    fresnel = _COAT_REFLECTANCE + (1 - _COAT_REFLECTANCE) * (1 - dot(halfway, towards_eye).clip(0, 1)) ** 5
     return np.pi * distribution * shadowing * fresnel
 
 
@@ -404,7 +404,7 @@ _STRENGTH = (1.0, 0.8, 0.8, 0.8, 0.9)
 """How far speckles replace the pattern of each thing, in [0, 1]."""
 
 
-def solid_noise(points: Float[np.ndarray, "P 3"], seed: int) -> Float32[np.ndarray, " P"]:
+def _solid_noise(points: Float[np.ndarray, "P 3"], seed: int) -> Float32[np.ndarray, " P"]:
     """Smooth random values in [0, 1], the same for the same place.
 
     Args:
@@ -428,7 +428,7 @@ def _speckled(thing: Thing, strength: float, seed: int) -> Blend:
     sizes = np.asarray(thing.placement.half_sizes, np.float32)
 
     def blend(local_points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
-        speckles = smooth_step(solid_noise(local_points * sizes, seed), *_CONTRAST)
+        speckles = smooth_step(_solid_noise(local_points * sizes, seed), *_CONTRAST)
         return (1 - strength) * thing.surface.blend(local_points) + strength * speckles
 
     return blend

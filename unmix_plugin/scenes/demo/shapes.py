@@ -43,13 +43,13 @@ class Placement:
     def to_local(self, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
         """World points in own coordinates."""
         center = np.asarray(self.center, dtype=points.dtype)
-        return self.directions_to_local(points - center)
+        return self._directions_to_local(points - center)
 
-    def directions_to_local(self, directions: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
+    def _directions_to_local(self, directions: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
         """World directions in own coordinates, lengths scaled."""
         return directions @ (self.axes / self.half_sizes).astype(directions.dtype)
 
-    def normals_to_world(self, normals: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
+    def _normals_to_world(self, normals: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
         """Own normals as unit normals in the world."""
         world = normals @ (self.axes / self.half_sizes).T.astype(normals.dtype)
         return world / np.sqrt(dot(world, world))[:, None]
@@ -58,14 +58,14 @@ class Placement:
         self, origins: Float[np.ndarray, "R 3"], directions: Float[np.ndarray, "R 3"]
     ) -> Float[np.ndarray, " R"]:
         """Distances, in lengths of the direction, at which rays enter from outside; inf where they never do."""
-        local_origins, local_directions = self.to_local(origins), self.directions_to_local(directions)
+        local_origins, local_directions = self.to_local(origins), self._directions_to_local(directions)
         near, far = _INTERVALS[self.primitive](local_origins, local_directions)
         return np.where((near < far) & (near > _SELF_HIT_DISTANCE), near, np.inf).astype(origins.dtype)
 
     def normals_at(self, local_points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
         """Unit normals in the world at points of the surface given in own coordinates."""
         if self.primitive == "sphere":
-            return self.normals_to_world(local_points)
+            return self._normals_to_world(local_points)
         normals = np.zeros_like(local_points)
         if self.primitive == "cylinder":
             on_cap = np.abs(local_points[:, 2]) > np.hypot(local_points[:, 0], local_points[:, 1])
@@ -75,7 +75,7 @@ class Placement:
             face = np.abs(local_points).argmax(axis=1)
             rows = np.arange(len(local_points))
             normals[rows, face] = np.sign(local_points[rows, face])
-        return self.normals_to_world(normals)
+        return self._normals_to_world(normals)
 
 
 def dot(a: Float[np.ndarray, "P C"], b: Float[np.ndarray, "P C"]) -> Float[np.ndarray, " P"]:

@@ -87,22 +87,22 @@ def carve(
     indices = list(scene.train_indices)
     cameras, box = scene.cameras[indices] if cameras is None else cameras, scene.scene_box
     if scene.is_unbounded:
-        return carve_world(cameras, box, resolution)
+        return _carve_world(cameras, box, resolution)
     if not scene.has_alpha:
         fewest_views = max(1, math.ceil(_FAIR_SHARE_OPEN * len(indices)))
         return carve_box(cameras, None, box, resolution, fewest_views)
     if foreground is None:
-        foreground = [foreground_mask(scene, index) for index in indices]
+        foreground = [_foreground_mask(scene, index) for index in indices]
     fair = max(1, math.ceil(_FAIR_SHARE * len(indices)))
     rays = foreground_rays(cameras, [_without_specks(mask) for mask in foreground])
-    witnesses = needed_witnesses(cameras, foreground, box, rays)
+    witnesses = _needed_witnesses(cameras, foreground, box, rays)
     kept = carve_box(cameras, foreground, box, resolution, fair, witnesses)
     if share_through(rays, box, kept) >= MIN_EXPLAINED:
         return kept
     return carve_box(cameras, foreground, box, resolution, witnesses=witnesses)
 
 
-def needed_witnesses(
+def _needed_witnesses(
     cameras: Cameras, foreground: list[Bool[np.ndarray, "_ _"]], box: SceneBox, rays: RayBundle
 ) -> int:
     """Views that must agree that a cell is empty, so that the hull explains what single views show.
@@ -120,7 +120,7 @@ def needed_witnesses(
     return _WITNESSES[int(np.argmax(shares))]
 
 
-def foreground_mask(scene: Scene, index: int) -> Bool[np.ndarray, "H W"]:
+def _foreground_mask(scene: Scene, index: int) -> Bool[np.ndarray, "H W"]:
     """Pixels of a view that may show something: not fully transparent, or not to be trusted."""
     alpha = scene.alpha(index)
     valid = scene.valid_mask(index)
@@ -361,7 +361,7 @@ def _without_specks(foreground: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H 
     return binary_opening(foreground, np.ones((2, 2), dtype=bool))
 
 
-def carve_world(cameras: Cameras, box: SceneBox, resolution: int) -> Bool[np.ndarray, "R R R"]:
+def _carve_world(cameras: Cameras, box: SceneBox, resolution: int) -> Bool[np.ndarray, "R R R"]:
     """Cells of the world contracted around a box that enough training cameras see; arguments as `carve_box` has."""
     cells = min(resolution, _WORLD_CELLS)
     unit = (torch.cartesian_prod(*[torch.arange(cells)] * 3) + 0.5) / cells

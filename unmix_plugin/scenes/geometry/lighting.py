@@ -50,7 +50,7 @@ class Places:
     """Unit vectors, outwards."""
 
 
-def hull_places(hull: Bool[np.ndarray, "R R R"], box: SceneBox) -> Places:
+def _hull_places(hull: Bool[np.ndarray, "R R R"], box: SceneBox) -> Places:
     """Evenly thinned-out cells on the surface of a hull, with their normals."""
     from scipy import ndimage  # slow to import
 
@@ -81,7 +81,7 @@ def seen_places(
         hull: Cells that may be occupied, of the box.
     """
     hull = coarse_hull(hull)
-    places = hull_places(hull, box)
+    places = _hull_places(hull, box)
     seen = [
         _looked_up(cameras, index, image, places, hull, box) for index, image in enumerate(log_brightness)
     ]
@@ -168,12 +168,12 @@ def judge_light(
 ) -> _FoundLight:
     """Which light the views were taken in; fixed where too little is seen to tell. Arguments as of `seen_places`."""
     places, seen = seen_places(cameras, log_brightness, hull, box)
-    if foretold_share(cameras, places, seen) > _MOVING_SHARE:
+    if _foretold_share(cameras, places, seen) > _MOVING_SHARE:
         return "camera"
-    return "per-view" if gain_spread(cameras, places, seen) > _LEAST_GAIN_SPREAD else "fixed"
+    return "per-view" if _gain_spread(cameras, places, seen) > _LEAST_GAIN_SPREAD else "fixed"
 
 
-def foretold_share(cameras: Cameras, places: Places, seen: Float[Tensor, "P N"]) -> float:
+def _foretold_share(cameras: Cameras, places: Places, seen: Float[Tensor, "P N"]) -> float:
     """Least share of the changes of brightness that the other half of the views predicts; 0 if too little is seen.
 
     Args:
@@ -191,7 +191,7 @@ def foretold_share(cameras: Cameras, places: Places, seen: Float[Tensor, "P N"])
     return _least_share(seen, turned, (along > along.median(dim=0).values).T)
 
 
-def gain_spread(cameras: Cameras, places: Places, seen: Float[Tensor, "P N"]) -> float:
+def _gain_spread(cameras: Cameras, places: Places, seen: Float[Tensor, "P N"]) -> float:
     """Standard deviation of the views' log gains, as far as two halves of the places agree on them.
 
     The least of the three ways to halve the places, along the axes; 0 if too little is seen. Gains that are a smooth
@@ -209,7 +209,7 @@ def gain_spread(cameras: Cameras, places: Places, seen: Float[Tensor, "P N"]) ->
     smooth = torch.stack([torch.ones_like(x), x, y, z, x * y, y * z, z * x, x * x - y * y, z * z], dim=-1)
     shared = []
     for half in (positions > positions.median(dim=0).values).T:
-        one, other = view_gains(seen[half]), view_gains(seen[~half])
+        one, other = _view_gains(seen[half]), _view_gains(seen[~half])
         both = one.isfinite() & other.isfinite()
         left = int(both.sum()) - smooth.shape[1]
         if left < _FEWEST_VIEWS:
@@ -220,7 +220,7 @@ def gain_spread(cameras: Cameras, places: Places, seen: Float[Tensor, "P N"]) ->
     return max(min(shared), 0.0) ** 0.5
 
 
-def view_gains(seen: Float[Tensor, "P N"]) -> Float[Tensor, " N"]:
+def _view_gains(seen: Float[Tensor, "P N"]) -> Float[Tensor, " N"]:
     """Logarithms of the views' gains, of mean 0, by which places look most alike; NaN where a view sees none.
 
     Least absolute differences of what a place looks like, gains taken off, from its mean over views; by repeated least

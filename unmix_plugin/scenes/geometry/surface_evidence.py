@@ -59,7 +59,7 @@ _CHANCE_PIXELS = 4000
 
 
 @dataclass(frozen=True)
-class SweptDepths:
+class _SweptDepths:
     """Distances of some pixels of some views."""
 
     views: tuple[int, ...]
@@ -70,7 +70,7 @@ class SweptDepths:
     """Pixels of the whole view from one that is asked to the next; the first stands at `stride` / 2."""
 
 
-def sweep_depths(cameras: Cameras, box: SceneBox, read_view: ReadView) -> SweptDepths | None:
+def _sweep_depths(cameras: Cameras, box: SceneBox, read_view: ReadView) -> _SweptDepths | None:
     """Distances of the pixels of all views, or of `_MOST_VIEWS`; None if views are too few, too small or too plain.
 
     Args:
@@ -93,7 +93,7 @@ def sweep_depths(cameras: Cameras, box: SceneBox, read_view: ReadView) -> SweptD
     if torch.isfinite(found).float().mean() < _LEAST_KNOWN:
         relative = _sweep_all([_over_surroundings(image) for image in images], lenses, box)
         found = found if relative is None else torch.where(torch.isfinite(found), found, relative)
-    return SweptDepths(tuple(views), found, thinning.stride * _PIXEL_STRIDE)
+    return _SweptDepths(tuple(views), found, thinning.stride * _PIXEL_STRIDE)
 
 
 def _over_surroundings(image: Float[Tensor, "H W B"]) -> Float[Tensor, "H W B"]:
@@ -181,7 +181,7 @@ _MARGIN = 1.5
 """Between a cell's centre and a surface behind it, in edges of the cell."""
 
 
-def seen_through(depths: SweptDepths, cameras: Cameras, box: SceneBox, cells: int) -> Bool[Tensor, "C C C"]:
+def _seen_through(depths: _SweptDepths, cameras: Cameras, box: SceneBox, cells: int) -> Bool[Tensor, "C C C"]:
     """Cells of the contracted world that are empty.
 
     Args:
@@ -230,11 +230,11 @@ class SurfaceEvidence:
         """Compare the training views; of rigs and line cameras, and of bounded scenes, nothing is known."""
         self._cameras = scene.cameras[list(scene.train_indices)]
         self._box = scene.scene_box
-        self._depths: SweptDepths | None = None
+        self._depths: _SweptDepths | None = None
         self._placed: tuple[Cameras, Tensor, Tensor] | None = None
         if scene.is_unbounded and not scene.is_rig and self._cameras.key_poses is None:
             train = scene.train_indices
-            self._depths = sweep_depths(
+            self._depths = _sweep_depths(
                 self._cameras, self._box, lambda view, part: scene.cube(train[view], part)
             )
 
@@ -249,7 +249,7 @@ class SurfaceEvidence:
             return reachable
         cells = min(len(reachable), _CELLS)
         index = torch.arange(len(reachable)) * cells // len(reachable)
-        empty = seen_through(self._depths, self._cameras, self._box, cells)
+        empty = _seen_through(self._depths, self._cameras, self._box, cells)
         return reachable & ~empty[index][:, index][:, :, index].numpy()
 
     def points(self, pixels: DrawnPixels) -> Float[Tensor, "R 3"]:

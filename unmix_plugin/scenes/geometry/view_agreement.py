@@ -354,7 +354,7 @@ def parallax_warning(positions: Float[np.ndarray, "N 3"], box: SceneBox) -> str 
 
 
 @dataclass(frozen=True)
-class WorldEvidence:
+class _WorldEvidence:
     """What pixels of the training views say."""
 
     num_pixels: int
@@ -373,7 +373,7 @@ class WorldEvidence:
         return shows_more or self.num_explained < _LEAST_EXPLAINED * self.num_pixels
 
 
-def find_world_evidence(box: SceneBox, cameras: Cameras, read_view: ReadView) -> WorldEvidence:
+def find_world_evidence(box: SceneBox, cameras: Cameras, read_view: ReadView) -> _WorldEvidence:
     """Ask where the views agree.
 
     Args:
@@ -383,7 +383,7 @@ def find_world_evidence(box: SceneBox, cameras: Cameras, read_view: ReadView) ->
     """
     found = _compare(cameras.camera_to_world.double().numpy(), cameras, read_view, _spread_pixels)
     if found is None:
-        return WorldEvidence(0, 0, 0, 0)
+        return _WorldEvidence(0, 0, 0, 0)
     nearest, farthest = _WORLD_DEPTHS
     depths = float(box.size.max()) / 2 / torch.linspace(1 / nearest, 1 / farthest, _NUM_DEPTHS)
     sides = []
@@ -395,7 +395,7 @@ def find_world_evidence(box: SceneBox, cameras: Cameras, read_view: ReadView) ->
         )
     behind, inside = (torch.cat(parts) / found.chance for parts in zip(*sides, strict=True))
     is_clear = torch.minimum(behind, inside) < _MOST_UNEXPLAINED
-    return WorldEvidence(
+    return _WorldEvidence(
         len(inside),
         int((is_clear & (inside < _CLEARLY * behind)).sum()),
         int((is_clear & (behind < _CLEARLY * inside)).sum()),

@@ -152,7 +152,7 @@ class _CubeValues:
         return 0 if self.invalid is None else int(self.invalid.sum())
 
 
-def measure_cube(path: Path, value_scale: float | None, invalid_pixels: InvalidPixels) -> _CubeValues:
+def _measure_cube(path: Path, value_scale: float | None, invalid_pixels: InvalidPixels) -> _CubeValues:
     """What a checked (H, W, B) cube holds, read once; whatever `read_cube` would make of it."""
     cube = map_array(path)
     height, width, bands = cube.shape
@@ -347,7 +347,7 @@ def check_cube_values(
     def measure(paths: dict[str, Path], header: _ArrayHeader | None) -> _CubeValues | None:
         if header is None:
             return None
-        return measure_cube(paths["hyperspectral_file_path"], value_scale, invalid_pixels)
+        return _measure_cube(paths["hyperspectral_file_path"], value_scale, invalid_pixels)
 
     with ThreadPoolExecutor(min(_MOST_READERS, os.cpu_count() or 1)) as readers:
         measured = list(readers.map(measure, located, headers))

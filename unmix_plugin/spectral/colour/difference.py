@@ -36,7 +36,7 @@ def reflectance_to_lab(
     return _xyz_to_lab(reflectance @ lit, lit.sum(axis=0))
 
 
-def srgb_to_lab(srgb: Float[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape 3"]:
+def _srgb_to_lab(srgb: Float[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape 3"]:
     """L*a*b* of sRGB colours in [0, 1] on a display whose white is D65."""
     to_xyz = np.linalg.inv(XYZ_TO_LINEAR_SRGB)
     linear = srgb_to_linear(torch.from_numpy(np.asarray(srgb, dtype=np.float64))).numpy()
@@ -128,7 +128,7 @@ def metameric_pairs(
             f"found {alike:g} and {different:g}"
         )
     first, second = np.triu_indices(len(reflectance), k=1)
-    differences = pair_differences(reflectance, lights, bands)
+    differences = _pair_differences(reflectance, lights, bands)
     chosen = (differences.min(axis=1) <= alike) & (differences.max(axis=1) >= different)
     order = np.flatnonzero(chosen)[np.argsort(-differences[chosen].max(axis=1), kind="stable")]
     return [
@@ -136,7 +136,7 @@ def metameric_pairs(
     ]
 
 
-def pair_differences(
+def _pair_differences(
     reflectance: Float64[np.ndarray, "N B"], lights: Float64[np.ndarray, "L B"], bands: Bands
 ) -> Float64[np.ndarray, "P L"]:
     """CIEDE2000 of every pair of surfaces in every light; pairs in the order of `numpy.triu_indices(N, 1)`."""

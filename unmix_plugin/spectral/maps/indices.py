@@ -28,7 +28,7 @@ from torch import Tensor
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.spectral.bands import Bands
 
-MAX_LENGTH = 500
+_MAX_LENGTH = 500
 """Characters of a formula."""
 _MAX_NESTING = 50
 """Parentheses, minus signs and exponents within one another."""
@@ -125,8 +125,8 @@ def parse_formula(text: str) -> _Formula:
     (670.0, 800.0)
     """
     text = text.strip()
-    if len(text) > MAX_LENGTH:
-        raise ConfigError(f"an index formula has at most {MAX_LENGTH} characters; this one has {len(text)}")
+    if len(text) > _MAX_LENGTH:
+        raise ConfigError(f"an index formula has at most {_MAX_LENGTH} characters; this one has {len(text)}")
     reader = _Reader(text)
     for match in _TOKEN.finditer(text):
         reader.take(match)

@@ -65,7 +65,7 @@ class Background:
         factor = torch.linalg.cholesky(covariance + LOADING * variance * identity)
         return Background(mean, torch.linalg.solve_triangular(factor, identity, upper=False))
 
-    def whiten(self, spectra: Float[Tensor, "*rays B"]) -> Float[Tensor, "*rays B"]:
+    def _whiten(self, spectra: Float[Tensor, "*rays B"]) -> Float[Tensor, "*rays B"]:
         """W (x - m), float64: lengths and angles in these coordinates are those of S^-1."""
         return (spectra.double() - self.mean) @ self.whitening.T
 
@@ -82,8 +82,8 @@ def matched_filter(
 
     Source: Manolakis, Marden and Shaw 2003, Lincoln Laboratory Journal 14(1), as normalised by Eismann 2012.
     """
-    wanted = background.whiten(target)
-    return background.whiten(spectra) @ (wanted / wanted.square().sum())
+    wanted = background._whiten(target)
+    return background._whiten(spectra) @ (wanted / wanted.square().sum())
 
 
 def adaptive_coherence(
@@ -97,7 +97,7 @@ def adaptive_coherence(
         Scharf and McWhorter 1996, Adaptive matched subspace detectors and adaptive coherence estimators; Kraut, Scharf
         and Butler 2005, IEEE Trans. Signal Processing 53(2).
     """
-    wanted, found = background.whiten(target), background.whiten(spectra)
+    wanted, found = background._whiten(target), background._whiten(spectra)
     lengths = wanted.norm() * found.norm(dim=-1)
     return (found @ wanted / lengths).clamp(0, 1).square()
 
@@ -172,7 +172,7 @@ class _Target:
             return _TargetScore(self, None)
         found = Background.fit(background)
         target = self.reflectance.to(found.mean)
-        if not found.whiten(target).norm() > _LEAST_DISTANCE:
+        if not found._whiten(target).norm() > _LEAST_DISTANCE:
             raise SpectrumError(
                 f"the target '{self.name}' ({self.file}) is the mean of the background, so nothing tells them apart; "
                 "choose views that show more than the target, or the spectral angle"

@@ -81,16 +81,16 @@ def propose_num_materials(
     noise = _noise_distance(pixels) if is_enough else 0.0
     # Distances in independent directions add as squares.
     distances = tuple(math.sqrt(max(fit.mean_distance**2 - noise**2, 0.0)) for fit in fits)
-    return _MaterialCount(elbow(distances), distances, noise, hysime(pixels) if is_enough else None)
+    return _MaterialCount(_elbow(distances), distances, noise, hysime(pixels) if is_enough else None)
 
 
-def elbow(mean_distances: tuple[float, ...]) -> int:
+def _elbow(mean_distances: tuple[float, ...]) -> int:
     """The number of materials after which a further one helps little.
 
     Args:
         mean_distances: With 1, 2, ... materials; at least one.
 
-    >>> elbow((0.20, 0.08, 0.03, 0.027, 0.026))
+    >>> _elbow((0.20, 0.08, 0.03, 0.027, 0.026))
     3
     """
     number = 1

@@ -72,7 +72,7 @@ def two_material_fits(
     candidates = normalised_kmeans(pixels, num_candidates, generator, restarts=1).endmembers
     judges = pixels[torch.randperm(len(pixels), generator=generator)[:_NUM_JUDGES].to(pixels.device)]
     candidates = normalize(candidates.double(), dim=1)
-    search = _PairSearch(distances_to_pairs(normalize(judges.double(), dim=1), candidates))
+    search = _PairSearch(_distances_to_pairs(normalize(judges.double(), dim=1), candidates))
     fits, chosen = [], []
     for _ in range(min(most_endmembers, num_candidates)):
         chosen = search.improved(search.grown(chosen))
@@ -98,7 +98,7 @@ def two_material_endmembers(
     return fits[-1].endmembers
 
 
-def distances_to_pairs(
+def _distances_to_pairs(
     shapes: Float[Tensor, "N B"], candidates: Float[Tensor, "M B"]
 ) -> Float[Tensor, "M M N"]:
     """Distance of unit spectra to the non-negative mixtures of every two candidates; on the diagonal, of one alone.
@@ -124,7 +124,7 @@ def mean_pair_distance(pixels: Float[Tensor, "N B"], endmembers: Float[Tensor, "
     """Mean distance of pixels to the nearest mixture of two endmembers, all taken as unit spectra; 0 without pixels."""
     corners = normalize(endmembers.double(), dim=1)
     nearest = [
-        distances_to_pairs(normalize(part.double(), dim=1), corners).flatten(0, 1).amin(dim=0)
+        _distances_to_pairs(normalize(part.double(), dim=1), corners).flatten(0, 1).amin(dim=0)
         for part in pixels.split(_NUM_JUDGES)
     ]
     return float(torch.cat(nearest).mean()) if len(pixels) else 0.0
@@ -239,7 +239,7 @@ def _grown_sets(judges: Float[Tensor, "N B"], candidates: Float[Tensor, "M B"], 
     """The best sets found of 1, 2, ... candidates."""
     lengths = judges.norm(dim=1)
     weights = (lengths / (_DARK * lengths.quantile(0.95))).clamp(max=1).sqrt()
-    search = _PairSearch(distances_to_pairs(normalize(judges, dim=1), candidates).pow_(_POWER).mul_(weights))
+    search = _PairSearch(_distances_to_pairs(normalize(judges, dim=1), candidates).pow_(_POWER).mul_(weights))
     sets: list[list[int]] = [[]]
     for _ in range(min(most, len(candidates))):
         sets.append(search.improved(search.grown(sets[-1])))
