@@ -1,12 +1,7 @@
-"""Materials for the training of priors: layered ones of all kinds, and how they are spread over an object.
+"""Objects with known materials, and what some views of them show at surface points, for the training of the prior.
 
-Notation: `N` points, `M` materials of an object or noises, `P` parameters of `LayeredFamily`, `W` waves of all noises.
-
-Shapes for the training of priors: blobs, rings, boxes, bars and groups of them.
-
-Objects with known materials, and what some views of them show at surface points, for the training of priors.
-
-Notation: `B` objects, `N` points, `V` views, `K` lobes of light, `P` parameters of `LayeredFamily`.
+Notation: `B` objects, `N` points, `V` views, `K` lobes of light, `M` materials of an object or noises, `P` parameters
+of `LayeredFamily`, `W` waves of all noises.
 """
 
 from __future__ import annotations
@@ -23,7 +18,7 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 from torch.nn import functional
 
-from unmix_plugin.engine.runs.atomic_files import write_file
+from unmix_plugin.formats.files import write_file
 from unmix_plugin.neumatex.demo.shapes import demo_mesh
 from unmix_plugin.neumatex.demo.surfaces import LayeredSurface
 from unmix_plugin.neumatex.prior.observations import KnownLight, known_light, sample_surface

@@ -1,30 +1,33 @@
-"""What layered materials are drawn from, to train the decoder and to measure it.
+"""How the shipped decoder of neural materials was trained: python -m tools.train_decoder
 
-Training of decoder and encoder together, on layered materials under lights of every size.
+Decoder and encoder are trained together, on layered materials under lights of every size. What is compared is what a
+camera would see: reflected light after a tone curve. A light of some extent widens every lobe, so lights of all sizes
+come down to lobes of more width.
 
-Notation as in `microfacet`. What is compared is what a camera would see: reflected light after a tone curve. A light of
-some extent widens every lobe, so lights of all sizes come down to lobes of more width.
-
-`python -m tools.train_decoder` trains the decoder of neural materials.
+Notation as in `microfacet`.
 """
 
+import hashlib
+import json
 import math
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
+import safetensors.torch
 import torch
 import tyro
 from jaxtyping import Float
 from rich.console import Console
-from torch import Tensor
+from torch import Tensor, nn
 
 from unmix_plugin.neumatex.tracing.families import LayeredFamily
 from unmix_plugin.neumatex.tracing.layers import LayerStack
 from unmix_plugin.neumatex.tracing.microfacet import alpha_of, roughness_of
-from unmix_plugin.neumatex.tracing.neural import SHIPPED, Decoder, Encoder, write_weights
+from unmix_plugin.neumatex.tracing.neural import SHIPPED, Decoder, Encoder
 
 
 def draw_materials(number: int, generator: torch.Generator) -> Float[Tensor, "N 14"]:
@@ -143,6 +146,16 @@ def _eyes(number: int, generator: torch.Generator) -> Tensor:
     z = torch.where(u[2] < 0.7, torch.sqrt(u[0]), u[0]).clamp_min(0.02)
     sine, angle = torch.sqrt(1.0 - z * z), 2.0 * math.pi * u[1]
     return torch.stack([sine * torch.cos(angle), sine * torch.sin(angle), z])
+
+
+def write_weights(path: Path, decoder: Decoder, encoder: Encoder, record: Mapping[str, Any]) -> None:
+    """Write the weights, and beside them `record` with their SHA-256 as JSON."""
+    tensors = nn.ModuleDict({"decoder": decoder, "encoder": encoder}).state_dict()
+    data = safetensors.torch.save({name: tensor.contiguous() for name, tensor in tensors.items()})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)
+    full = {**record, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    path.with_suffix(".json").write_text(json.dumps(full, indent=1) + "\n", encoding="utf-8")
 
 
 @dataclass(frozen=True)

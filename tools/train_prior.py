@@ -1,24 +1,17 @@
-"""The loss that teaches a network how wrong it is.
+"""How the shipped prior was trained: true materials at surface points against what it says of them.
 
-Source:
-    Seitzer et al. 2022, On the Pitfalls of Heteroscedastic Uncertainty Estimation with Probabilistic Neural Networks.
+python -m tools.train_prior objects --folder FOLDER    renders training objects into a folder
+python -m tools.train_prior prior --folder FOLDER      trains on them
 
-Training of the small prior: true materials at surface points against what it says of them.
+The networks that read planes are trained apart: they learn to be fitted fast, to the truth and to what the prior says.
 
 Notation: `B` objects, `N` points, `P` parameters of a material.
-
-Training of the networks that read planes: they learn to be fitted fast, to the truth and to what the prior says.
-
-Groups of objects get planes of 0; planes and readers are then moved together for some steps, and the next group comes.
-
-Make the small prior: `objects` renders training objects into a folder, `prior` trains on them.
-
-python -m tools.train_prior objects --folder FOLDER
-python -m tools.train_prior prior --folder FOLDER
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import platform
 import time
@@ -27,6 +20,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Union
 
+import safetensors.torch
 import torch
 import tyro
 from jaxtyping import Float
@@ -34,9 +28,12 @@ from rich.console import Console
 from torch import Tensor
 
 from tools.prior_objects import TrainingObjects, read_objects, training_object, write_objects
+from unmix_plugin.formats.files import write_file
 from unmix_plugin.neumatex.prior.small import (
+    RECORD,
     RESOLUTION,
     SHIPPED,
+    WEIGHTS,
     Estimates,
     MaterialName,
     Observations,
@@ -46,7 +43,6 @@ from unmix_plugin.neumatex.prior.small import (
     read_record,
     read_small_prior,
     shipped_decoder_sha256,
-    write_small_prior,
 )
 from unmix_plugin.neumatex.tracing.neural import NeuralFamily
 from unmix_plugin.neumatex.tracing.surface import NUM_CHANNELS
@@ -62,6 +58,10 @@ def beta_nll(
 
     The weight carries no gradient. With beta 0 it is the plain likelihood, with beta 1 the mean's gradient is that of
     half the squared error.
+
+    Source:
+        Seitzer et al. 2022, On the Pitfalls of Heteroscedastic Uncertainty Estimation with Probabilistic Neural
+        Networks.
     """
     likelihood = 0.5 * ((predicted - target).square() * torch.exp(-log_variance) + log_variance)
     return (likelihood * torch.exp(beta * log_variance.detach())).mean()
@@ -261,6 +261,18 @@ def what_is_said(
 
 
 _OBJECTS_A_FILE = 50
+
+
+def write_small_prior(folder: Path, prior: SmallPrior, record: dict[str, Any]) -> None:
+    """Put a prior and its record into a folder.
+
+    Args:
+        record: How it was made, JSON; `decoder_sha256` is the decoder of its latents.
+    """
+    data = safetensors.torch.save({name: part.contiguous() for name, part in prior.state_dict().items()})
+    record = {**record, "sha256": hashlib.sha256(data).hexdigest()}
+    write_file(folder / WEIGHTS, data)
+    write_file(folder / RECORD, (json.dumps(record, indent=1) + "\n").encode())
 
 
 @dataclass(frozen=True)

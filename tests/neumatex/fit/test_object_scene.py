@@ -29,7 +29,7 @@ from tests.neumatex.factory import (
 )
 from unmix_plugin.errors import SceneError, UnmixError
 from unmix_plugin.formats.exr import write_exr
-from unmix_plugin.neumatex.fit.data_manager import PixelList
+from unmix_plugin.neumatex.fit.data_manager import _PixelList
 from unmix_plugin.neumatex.fit.object_scene import load_object
 from unmix_plugin.neumatex.tracing.rays import RayMesh
 from unmix_plugin.scenes.placement import Placement
@@ -330,7 +330,7 @@ def test_pixels_that_a_mask_leaves_out_are_not_trained_on(made_spectral, spectra
     frames[view]["mask_path"] = "mask.png"
     change(spectral_folder, frames=frames)
     pixels, all_pixels = (
-        PixelList.of(object_, 10**6, 0) for object_ in (load_object(spectral_folder), scene)
+        _PixelList.of(object_, 10**6, 0) for object_ in (load_object(spectral_folder), scene)
     )
     masked = (all_pixels.views == 0) & (all_pixels.corners[:, 0] < width // 2)
     assert masked.any()

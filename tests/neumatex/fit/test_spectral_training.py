@@ -30,8 +30,8 @@ from unmix_plugin.commands.export import export
 from unmix_plugin.commands.train import train
 from unmix_plugin.engine import load_model
 from unmix_plugin.neumatex.fit import start as run_start
-from unmix_plugin.neumatex.fit.model import NeumatexModel, settle
-from unmix_plugin.neumatex.fit.start import as_bright
+from unmix_plugin.neumatex.fit.model import NeumatexModel, _settle
+from unmix_plugin.neumatex.fit.start import _as_bright
 from unmix_plugin.neumatex.fit.trained_object import TrainedObject
 from unmix_plugin.neumatex.tracing.families import SpectralFamily
 from unmix_plugin.scenes.scene import Normalisation
@@ -197,11 +197,11 @@ def test_mixed_pixels_do_not_make_dark_endmembers_brighter_nor_bright_ones_darke
     share[:200], share[200:400] = 0.0, 1.0  # few show one material alone
     pixels = torch.cat([share, 1 - share], dim=1) @ DARK_AND_BRIGHT
     purity = unit(pixels, dim=1) @ unit(DARK_AND_BRIGHT, dim=1).T
-    assert_close(as_bright(unit(DARK_AND_BRIGHT, dim=1), pixels, purity), DARK_AND_BRIGHT, rtol=1e-3, atol=0)
+    assert_close(_as_bright(unit(DARK_AND_BRIGHT, dim=1), pixels, purity), DARK_AND_BRIGHT, rtol=1e-3, atol=0)
 
 
 def test_no_band_of_a_first_endmember_is_above_1_and_its_shape_stays():
-    found = as_bright(DARK_AND_BRIGHT, 5 * DARK_AND_BRIGHT, torch.eye(2))
+    found = _as_bright(DARK_AND_BRIGHT, 5 * DARK_AND_BRIGHT, torch.eye(2))
     assert float(found.max()) <= 1
     assert_close(unit(found, dim=1), unit(DARK_AND_BRIGHT, dim=1))
 
@@ -209,7 +209,7 @@ def test_no_band_of_a_first_endmember_is_above_1_and_its_shape_stays():
 @pytest.mark.parametrize("gains", [(0.5, 1.05), (3.0, 2.0)])
 def test_gains_leave_spectral_angles_as_they_are_and_reflectances_at_most_1(gains):
     endmembers, factors = DARK_AND_BRIGHT.clone(), torch.tensor(gains)
-    settle(endmembers, factors)
+    _settle(endmembers, factors)
     assert_close(unit(endmembers, dim=1), unit(DARK_AND_BRIGHT, dim=1))
     assert float(endmembers.max()) <= 1
     assert factors.tolist() == [1.0, 1.0]
@@ -221,7 +221,7 @@ def test_a_material_reflects_the_same_before_and_after_its_gains_are_settled():
     parameters = torch.tensor([[0.4, 0.6, 0.5, 0.2]])
     before = family.base_colour(parameters)
     assert_close(before, torch.tensor([[0.6, 0.42]]) @ DARK_AND_BRIGHT)
-    settle(endmembers, gains)
+    _settle(endmembers, gains)
     assert_close(family.base_colour(parameters), before)
 
 

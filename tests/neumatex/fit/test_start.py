@@ -16,12 +16,12 @@ from tests.neumatex.factory import write_object
 from tests.products.ball_model import RADIUS, ball_scene
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.fit import data_manager
-from unmix_plugin.neumatex.fit.data_manager import view_arrays
+from unmix_plugin.neumatex.fit.data_manager import _view_arrays
 from unmix_plugin.neumatex.fit.object_scene import load_object
 from unmix_plugin.neumatex.fit.start import (
     PriorAnchor,
-    RunMaterials,
     TriplaneSurface,
+    _RunMaterials,
     material_family,
     start_plain,
     views_of,
@@ -51,7 +51,7 @@ def test_the_distance_counts_each_parameter_by_its_expected_error():
 def test_views_for_a_prior_are_the_training_views_thinned_out(tmp_path, monkeypatch):
     scene = load_object(write_object(tmp_path / "ball"))
     monkeypatch.setattr(data_manager, "LONGEST_EDGE_PX", 12)
-    views = views_of(view_arrays(scene))
+    views = views_of(_view_arrays(scene))
     assert len(views.pictures) == len(scene.split.train) == 5
     assert views.pictures[0].shape == (12, 12, 3)
     whole, thin = scene.pictures.cameras[list(scene.split.train)], views.cameras
@@ -62,7 +62,7 @@ def test_views_for_a_prior_are_the_training_views_thinned_out(tmp_path, monkeypa
     torch.testing.assert_close(middle, torch.tensor([0.5, 0.3, 0.1]))
 
 
-RUN = RunMaterials(Path("run"), ball_scene())
+RUN = _RunMaterials(Path("run"), ball_scene())
 COUNT = len(RUN.scene.materials.endmembers)
 TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 SCALE, SHIFT = 0.5, np.array([0.3, -0.1, 0.2])

@@ -13,9 +13,9 @@ from torch.testing import assert_close
 
 from unmix_plugin.neumatex.fit.tone import (
     NUM_COEFFICIENTS,
-    CameraResponse,
     LampRatio,
     SpectralDisplay,
+    _CameraResponse,
     psnr_db,
     tone_curve,
 )
@@ -47,7 +47,7 @@ def test_psnr_of_a_known_error():
 @settings(deadline=None, max_examples=30)
 @given(st.lists(st.floats(-5, 5), min_size=NUM_COEFFICIENTS, max_size=NUM_COEFFICIENTS))
 def test_any_coefficients_give_a_curve_that_increases_from_0_to_1(coefficients):
-    response = CameraResponse()
+    response = _CameraResponse()
     response.coefficients.data = torch.tensor(coefficients)
     light = torch.linspace(0, 1, 500)[:, None]
     numbers = response(light)[:, 0].detach()
@@ -70,7 +70,7 @@ def test_an_unknown_curve_and_exposure_are_found_from_light_and_numbers(name, cu
     generator = torch.Generator().manual_seed(3)
     light = torch.rand(2000, 3, generator=generator) ** 2
     measured = curve(light)
-    response = CameraResponse()
+    response = _CameraResponse()
     optimizer = torch.optim.Adam(response.parameters(), lr=0.05)
     for _ in range(400):
         optimizer.zero_grad()
@@ -82,7 +82,7 @@ def test_an_unknown_curve_and_exposure_are_found_from_light_and_numbers(name, cu
 
 
 def test_its_slope_by_light_is_that_of_differences():
-    response = CameraResponse().double()
+    response = _CameraResponse().double()
     light = torch.tensor([[0.013, 0.2, 0.71]], dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(response(light).sum(), light)
     step = 1e-7

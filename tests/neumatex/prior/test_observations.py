@@ -18,10 +18,10 @@ from tests.neumatex.surfaces import ring_cameras
 from unmix_plugin.neumatex.prior.observations import (
     NUM_LOBES,
     PosedViews,
-    compressed,
+    _compressed,
+    _light_lobes,
+    _lobe_fits,
     known_light,
-    light_lobes,
-    lobe_fits,
     sample_surface,
     well_spread,
 )
@@ -59,7 +59,7 @@ UP = torch.tensor([[0.0, 0.0, 1.0]])
 
 
 def test_an_even_light_is_the_same_in_every_lobe():
-    lobes = light_lobes(Environment(torch.full((64, 128, 3), 2.0), exposure_stops=1.0))
+    lobes = _light_lobes(Environment(torch.full((64, 128, 3), 2.0), exposure_stops=1.0))
     directions = torch.nn.functional.normalize(
         torch.randn(50, 3, generator=torch.Generator().manual_seed(0)), dim=-1
     )
@@ -69,7 +69,7 @@ def test_an_even_light_is_the_same_in_every_lobe():
 
 def test_the_irradiance_of_a_bright_half_follows_the_cosine():
     image = (directions_of_pixels(64, 128)[..., 2:] > 0).float().expand(64, 128, 3)
-    lobes = light_lobes(Environment(image))
+    lobes = _light_lobes(Environment(image))
     tilts = torch.tensor([0.0, 60.0, 90.0, 180.0]).deg2rad()
     normals = torch.stack([tilts.sin(), torch.zeros(4), tilts.cos()], dim=-1)
     # The irradiance under a hemisphere of radiance 1 is pi (1 + cos tilt) / 2.
@@ -83,7 +83,7 @@ def test_a_spot_is_widened_more_by_blunter_lobes_and_turns_with_the_light(turn):
     spot = torch.tensor([math.cos(angle), math.sin(angle), 0.0])
     away = Environment(environment.image, turn).image.clone()
     away[31:33, 63:65] = 100.0  # the picture's centre is +x before the turn
-    found = light_lobes(Environment(away, turn)).about(torch.stack([spot, -spot]))
+    found = _light_lobes(Environment(away, turn)).about(torch.stack([spot, -spot]))
     at_spot, opposite = found[0, :, 0], found[1, :, 0]
     assert (at_spot[:-1] > 2 * at_spot[1:]).all()
     assert (opposite[:-1] < 1e-6).all()
@@ -170,7 +170,7 @@ def made_of(lobe: int):
 
 def test_a_fit_finds_albedo_and_share_and_leaves_nothing_only_for_the_right_lobe():
     colours, mirrored, reaching, albedo, share = made_of(lobe=2)
-    fits = lobe_fits(colours, mirrored, torch.ones(30, 12), reaching).unflatten(-1, (NUM_LOBES, 7))
+    fits = _lobe_fits(colours, mirrored, torch.ones(30, 12), reaching).unflatten(-1, (NUM_LOBES, 7))
     found_share, found_albedo, left = fits[:, 2].split((3, 3, 1), dim=-1)
     # The ridge of the fit makes shares a little small, most where the light happens to vary little.
     assert_close(found_share, share, atol=0.15, rtol=0)
@@ -185,18 +185,18 @@ def test_views_without_weight_change_nothing():
     weights[:, 8:] = 0
     spoiled = colours.clone()
     spoiled[:, 8:] = 7.0
-    expected = lobe_fits(colours[:, :8], mirrored[:, :8], weights[:, :8], reaching)
-    assert_close(lobe_fits(spoiled, mirrored, weights, reaching), expected)
+    expected = _lobe_fits(colours[:, :8], mirrored[:, :8], weights[:, :8], reaching)
+    assert_close(_lobe_fits(spoiled, mirrored, weights, reaching), expected)
 
 
 def test_a_point_that_nothing_sees_has_finite_numbers():
     colours, mirrored, reaching, _, _ = made_of(lobe=0)
-    assert torch.isfinite(lobe_fits(colours, mirrored, torch.zeros(30, 12), reaching)).all()
+    assert torch.isfinite(_lobe_fits(colours, mirrored, torch.zeros(30, 12), reaching)).all()
 
 
 def test_light_is_compressed_between_0_and_1_in_order():
     light = torch.tensor([0.0, 0.1, 1.0, 8.0, 100.0])
-    values = compressed(light)
+    values = _compressed(light)
     assert values[0] == 0
     assert_close(values[3], torch.tensor(1.0))
     assert (values[1:4] > values[:3]).all()

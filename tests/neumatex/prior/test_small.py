@@ -33,6 +33,7 @@ from tools.train_prior import (
     training_loss,
     true_layers,
     true_pbr,
+    write_small_prior,
 )
 from unmix_plugin.errors import RunError, SceneError
 from unmix_plugin.neumatex.prior.observations import PosedViews
@@ -42,13 +43,12 @@ from unmix_plugin.neumatex.prior.small import (
     SHIPPED,
     Estimates,
     SmallPrior,
-    filled_triplane,
+    _filled_triplane,
+    _read_colours,
     fit_loss,
     fit_planes,
     predict,
-    read_colours,
     read_small_prior,
-    write_small_prior,
 )
 from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.neumatex.tracing.rays import RayMesh
@@ -293,7 +293,7 @@ def scene():
 def test_colours_are_read_where_a_point_is_seen(scene):
     views = scene.views
     positions = 0.3 * torch.randn(40, 3, generator=generator())
-    colours, shown = read_colours(views, positions)
+    colours, shown = _read_colours(views, positions)
     for index in range(5):
         pixels, _ = views.cameras.project(positions, index)
         inside = ((pixels > 1) & (pixels < 31)).all(dim=-1)
@@ -319,7 +319,7 @@ def test_a_prediction_is_a_triplane_of_the_resolution_asked_for(scene, material)
 def test_planes_in_a_resolution_that_subdivides_theirs_are_the_same_material():
     planes = torch.randn(3, 12, 32, 32, generator=generator())
     positions = 2 * torch.rand(50, 3, generator=generator()) - 1
-    own, finer = (filled_triplane(make_prior(), planes, "pbr", resolution) for resolution in (32, 63))
+    own, finer = (_filled_triplane(make_prior(), planes, "pbr", resolution) for resolution in (32, 63))
     assert_close(finer.parameters_at(positions), own.parameters_at(positions), atol=1e-4, rtol=0)
 
 

@@ -250,7 +250,7 @@ def test_albedo_of_the_tables_is_that_of_the_lobes():
         stack = FAMILY.stack(parameters.expand(len(grid), -1))
         _, specular = stack.reflectance(grid.T, eyes)
         reflected = float((specular[0] * grid[:, 2].clamp_min(0) * solid_angles).sum())
-        surface = FAMILY.stack(parameters[None]).passing(wo[2:]).surface
+        surface = FAMILY.stack(parameters[None])._passing(wo[2:]).surface
         assert 1.0 - float(surface) == pytest.approx(reflected, abs=0.003)
 
 

@@ -14,7 +14,7 @@ import torch
 from torch.testing import assert_close
 
 from tests.neumatex.surfaces import eye_directions, numbers
-from tools.train_decoder import DecoderTraining, draw_materials, response_error, train
+from tools.train_decoder import DecoderTraining, draw_materials, response_error, train, write_weights
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.tracing.families import LayeredFamily
 from unmix_plugin.neumatex.tracing.neural import (
@@ -23,7 +23,6 @@ from unmix_plugin.neumatex.tracing.neural import (
     Encoder,
     NeuralFamily,
     read_weights,
-    write_weights,
 )
 
 FAMILY = NeuralFamily()

@@ -17,7 +17,7 @@ from unmix_plugin.neumatex.tracing.built_in_lights import built_in_environment
 from unmix_plugin.neumatex.tracing.environment import Environment, directions_of_pixels
 from unmix_plugin.neumatex.tracing.mesh import mesh_of
 from unmix_plugin.neumatex.tracing.microfacet import frames
-from unmix_plugin.neumatex.tracing.path_tracer import SamplePoints, reflected_radiance, render_view
+from unmix_plugin.neumatex.tracing.path_tracer import _SamplePoints, reflected_radiance, render_view
 from unmix_plugin.neumatex.tracing.rays import RayMesh, pixel_hits
 
 GLOSSY = [0.4, 0.3, 0.2, 0.3, 0.5]
@@ -267,7 +267,7 @@ def test_colours_must_agree():
 
 
 def test_numbers_are_uniform_and_even():
-    numbers = SamplePoints.draw(3, 64, 2, _generator(), torch.device("cpu"))
+    numbers = _SamplePoints.draw(3, 64, 2, _generator(), torch.device("cpu"))
     drawn = numbers.of(torch.arange(3 * 64), 1)
     assert drawn.shape == (192, 5)
     for point in range(3):

@@ -109,7 +109,7 @@ Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Subject:
+class _Subject:
     """What pictures are taken of."""
 
     ray_mesh: RayMesh
@@ -195,14 +195,14 @@ def demo_object_path(cache_dir: Path | None = None, say: Say | None = None) -> P
     Raises:
         SceneError: the cache can't be written.
     """
-    return cached_object(
+    return _cached_object(
         "demo-object",
         lambda folder: _write_object(folder, 0, DEFAULT_SIZE, DEFAULT_VIEWS, DEFAULT_LIGHTS, say),
         cache_dir,
     )
 
 
-def cached_object(name: str, write: Callable[[Path], None], cache_dir: Path | None) -> Path:
+def _cached_object(name: str, write: Callable[[Path], None], cache_dir: Path | None) -> Path:
     """The folder of an object that is written once for each version of the generator; see `demo_object_path`.
 
     Args:
@@ -214,11 +214,11 @@ def cached_object(name: str, write: Callable[[Path], None], cache_dir: Path | No
 
 
 def _write_object(folder: Path, seed: int, size: int, views: int, lights: int, say: Say | None) -> None:
-    names = light_names(seed, lights)
+    names = _light_names(seed, lights)
     surface = LayeredSurface(seed)
-    subject = Subject(RayMesh(demo_mesh(seed)), surface, torch.Generator().manual_seed(seed), size)
+    subject = _Subject(RayMesh(demo_mesh(seed)), surface, torch.Generator().manual_seed(seed), size)
     colours = surface.family.base_colour(surface.parameters(subject.ray_mesh.mesh.vertices))
-    write_mesh(folder / "mesh.glb", subject.ray_mesh.mesh, colours, surface.kinds)
+    _write_mesh(folder / "mesh.glb", subject.ray_mesh.mesh, colours, surface.kinds)
     for number, name in enumerate(names):
         if say is not None:
             say(f"demo object: rendering light {number + 1} of {len(names)} ({name})")
@@ -232,7 +232,7 @@ def _write_object(folder: Path, seed: int, size: int, views: int, lights: int, s
             _write_pictures(folder / "relit" / name, subject, light, cameras, 1)
 
 
-def light_names(seed: int, lights: int) -> list[str]:
+def _light_names(seed: int, lights: int) -> list[str]:
     """The light of training, one of `_TRAINING_LIGHTS`, and others after it."""
     rng = np.random.default_rng([3, seed])
     chosen = str(rng.choice(_TRAINING_LIGHTS))
@@ -240,7 +240,7 @@ def light_names(seed: int, lights: int) -> list[str]:
 
 
 def _write_pictures(
-    folder: Path, subject: Subject, light: Environment, cameras: Cameras, evaluation_interval: int
+    folder: Path, subject: _Subject, light: Environment, cameras: Cameras, evaluation_interval: int
 ) -> None:
     """Pictures under one light with transforms.json and the light itself."""
     frames: list[dict[str, Any]] = []
@@ -250,7 +250,7 @@ def _write_pictures(
         radiance, alpha = subject.picture(light, cameras, index, samples)
         _write_straight(folder / path, radiance, alpha)
         frames.append({"file_path": path, "transform_matrix": transform_matrix(cameras, index)})
-    write_channels(folder / "environment.exr", light.image)
+    _write_channels(folder / "environment.exr", light.image)
     content = {
         **lens_entries(cameras),
         "environment_path": "environment.exr",
@@ -260,7 +260,7 @@ def _write_pictures(
     (folder / "transforms.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
-def _write_base_colours(folder: Path, subject: Subject, cameras: Cameras) -> None:
+def _write_base_colours(folder: Path, subject: _Subject, cameras: Cameras) -> None:
     """Base colours of evaluation views."""
     for index in range(0, len(cameras), EVALUATION_INTERVAL):
         hits = pixel_hits(subject.ray_mesh, cameras, index, _SUBPIXELS)
@@ -272,16 +272,16 @@ def _write_base_colours(folder: Path, subject: Subject, cameras: Cameras) -> Non
 def _write_straight(path: Path, premultiplied: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W"]) -> None:
     """RGBA whose colours are not multiplied by alpha; 0 where it is 0."""
     straight = premultiplied / alpha.clamp(min=1e-6)[..., None]
-    write_channels(path, torch.cat([straight, alpha[..., None]], dim=-1))
+    _write_channels(path, torch.cat([straight, alpha[..., None]], dim=-1))
 
 
-def write_channels(path: Path, image: Float[Tensor, "H W c"]) -> None:
+def _write_channels(path: Path, image: Float[Tensor, "H W c"]) -> None:
     """Channels R, G, B, A as far as there are."""
     names = "RGBA"[: image.shape[-1]]
     write_exr(path, {name: image[..., index].numpy() for index, name in enumerate(names)}, {})
 
 
-def write_mesh(path: Path, mesh: Mesh, colours: Float[Tensor, "V 3"], kinds: Sequence[str]) -> None:
+def _write_mesh(path: Path, mesh: Mesh, colours: Float[Tensor, "V 3"], kinds: Sequence[str]) -> None:
     """A glTF mesh with linear colours at its vertices, and the names of its materials."""
     parts = (mesh.vertices.numpy(), mesh.normals.numpy(), colours.numpy(), mesh.faces.numpy())
     write_glb(path, *parts, {}, {"materials": list(kinds)})
@@ -371,21 +371,21 @@ def demo_spectral_object_path(cache_dir: Path | None = None, say: Say | None = N
         numbers = (DEFAULT_SIZE, DEFAULT_VIEWS, DEFAULT_BANDS, DEFAULT_SPECTRAL_LIGHTS)
         _write_object_spectral_object(folder, 0, numbers, TRAINING_LIGHT, say)
 
-    return cached_object("demo-spectral-object", write, cache_dir)
+    return _cached_object("demo-spectral-object", write, cache_dir)
 
 
 def _write_object_spectral_object(
     folder: Path, seed: int, numbers: tuple[int, int, int, int], light_name: str, say: Say | None
 ) -> None:
     size, views, num_bands, lights = numbers
-    others = [name for name in light_names(seed, len(NAMES) - 1) if name != light_name]
+    others = [name for name in _light_names(seed, len(NAMES) - 1) if name != light_name]
     bands, names = Bands.of(band_centers_nm(num_bands)), [light_name, *others[:lights]]
     ray_mesh = RayMesh(demo_mesh(seed))
     surface = SpectralSurface(seed, bands.centers_nm, ray_mesh.mesh.vertices)
-    subject = Subject(ray_mesh, surface, torch.Generator().manual_seed(seed), size)
+    subject = _Subject(ray_mesh, surface, torch.Generator().manual_seed(seed), size)
     mesh, to_rgb = ray_mesh.mesh, rgb_matrix(bands)
     colours = surface.family.base_colour(surface.parameters(mesh.vertices)) @ to_rgb
-    write_mesh(folder / "mesh.glb", mesh, colours.clamp(0, 1), surface.names)
+    _write_mesh(folder / "mesh.glb", mesh, colours.clamp(0, 1), surface.names)
     table = SpectraTable(bands, surface.names, surface.family.endmembers.double().numpy())
     write_spectra_csv(folder / "endmembers.csv", table)
     for number, name in enumerate(names):
@@ -404,7 +404,7 @@ def _write_object_spectral_object(
 
 def _write_pictures_spectral_object(
     folder: Path,
-    subject: Subject,
+    subject: _Subject,
     colours: Environment,
     cameras: Cameras,
     bands: Bands,
@@ -427,7 +427,7 @@ def _write_pictures_spectral_object(
             frame["abundance_file_path"] = f"abundances/{index:03d}.npy"
             _save(folder / frame["abundance_file_path"], _abundances(subject, cameras, index))
         frames.append({**frame, "transform_matrix": transform_matrix(cameras, index)})
-    write_channels(folder / "environment.exr", colours.image * factor)
+    _write_channels(folder / "environment.exr", colours.image * factor)
     write_spectra_csv(folder / "illuminant.csv", SpectraTable(bands, ("power",), lamp[None]))
     content = {
         **lens_entries(cameras),
@@ -468,7 +468,7 @@ def _write_view(
     return frame
 
 
-def _abundances(subject: Subject, cameras: Cameras, index: int) -> Float[Tensor, "H W K"]:
+def _abundances(subject: _Subject, cameras: Cameras, index: int) -> Float[Tensor, "H W K"]:
     """Means of what is seen in each pixel; 0 where nothing is."""
     surface = subject.surface
     assert isinstance(surface, SpectralSurface)

@@ -45,7 +45,7 @@ _SMALL = 24
 """Triangles of a chart that had better join another one."""
 
 
-def chart_labels(
+def _chart_labels(
     positions: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> tuple[np.ndarray, np.ndarray]:
     """The chart of each triangle, counted from 0, and the axis (0 to 5) that each triangle is seen along."""
@@ -67,7 +67,7 @@ def chart_labels(
     return _components(axes, links)[0], axes
 
 
-def chart_uv(positions: Float[np.ndarray, "N 3"], axes: Int[np.ndarray, " N"]) -> Float[np.ndarray, "N 2"]:
+def _chart_uv(positions: Float[np.ndarray, "N 3"], axes: Int[np.ndarray, " N"]) -> Float[np.ndarray, "N 2"]:
     """Points as they are seen along an axis each, in the positions' unit, not mirrored."""
     right = np.roll(np.abs(_AXES), 1, axis=1)
     up = np.cross(_AXES, right)
@@ -124,7 +124,7 @@ _TRIES = 6
 
 
 @dataclass(frozen=True)
-class Atlas:
+class _Atlas:
     """A mesh cut open."""
 
     vertices: Int64[np.ndarray, " U"]
@@ -135,7 +135,7 @@ class Atlas:
     """Texture coordinates as glTF has them: u to the right, v downwards, [0, 1]."""
 
 
-def unwrap(mesh: Mesh, texture_size: int) -> Atlas:
+def _unwrap(mesh: Mesh, texture_size: int) -> _Atlas:
     """Cut a mesh into charts and pack them.
 
     Args:
@@ -151,16 +151,16 @@ def unwrap(mesh: Mesh, texture_size: int) -> Atlas:
             "texture coordinates need the package xatlas, which is not installed: pip install xatlas"
         )
     positions, faces = mesh.vertices.cpu().double().numpy(), mesh.faces.cpu().long().numpy()
-    charts, axes = chart_labels(positions, faces)
+    charts, axes = _chart_labels(positions, faces)
     # A vertex is there once for each chart that it has a part in.
     keys, corners = np.unique(charts[:, None].astype(np.int64) * len(positions) + faces, return_inverse=True)
     cut, vertices = corners.reshape(faces.shape), keys % len(positions)
     axis_of_chart = np.zeros(charts.max() + 1, dtype=np.int64)
     axis_of_chart[charts] = axes
-    flat = chart_uv(positions[vertices], axis_of_chart[keys // len(positions)]).astype(np.float32)
+    flat = _chart_uv(positions[vertices], axis_of_chart[keys // len(positions)]).astype(np.float32)
     packer = _packed(flat, cut, charts, texture_size)
     order, packed, uv = packer[0]
-    return Atlas(vertices[order.astype(np.int64)], packed.astype(np.int64), uv.astype(np.float32))
+    return _Atlas(vertices[order.astype(np.int64)], packed.astype(np.int64), uv.astype(np.float32))
 
 
 def _packed(flat: np.ndarray, cut: np.ndarray, charts: np.ndarray, texture_size: int) -> Any:
@@ -226,7 +226,7 @@ class Texels:
         return picture.reshape(self.size, self.size, -1)[nearest[0], nearest[1]]
 
 
-def texels_of(atlas: Atlas, size: int) -> Texels:
+def _texels_of(atlas: _Atlas, size: int) -> Texels:
     """The texels of S x S whose centres lie in a triangle; where triangles meet, in the first of them."""
     corners = atlas.uv.astype(np.float64)[atlas.faces] * size - 0.5
     parts = list(_inside(corners, size))
@@ -281,7 +281,7 @@ _CHUNK_BAKING = 1 << 17
 class BakedMaterial:
     """A surface's parameters at the texels of an atlas."""
 
-    atlas: Atlas
+    atlas: _Atlas
     texels: Texels
     parameters: Float[Tensor, "T P"]
     """[0, 1], on the CPU."""
@@ -302,8 +302,8 @@ def bake(mesh: Mesh, surface: Surface, texture_size: int) -> BakedMaterial:
     Raises:
         ConfigError: xatlas is not installed, or the mesh does not fit into the texture.
     """
-    atlas = unwrap(mesh, texture_size)
-    texels = texels_of(atlas, texture_size)
+    atlas = _unwrap(mesh, texture_size)
+    texels = _texels_of(atlas, texture_size)
     faces = atlas.vertices[atlas.faces]
     positions = texels.of_corners(mesh.vertices.cpu().double().numpy(), faces)
     points = torch.from_numpy(positions).float().to(mesh.vertices.device)

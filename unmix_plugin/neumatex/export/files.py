@@ -162,16 +162,16 @@ def write_shader(folder: Path, family: NeuralFamily) -> list[Path]:
     Raises:
         RunError: the disk is full or refuses.
     """
-    constants = decoder_constants(family)
+    constants = _decoder_constants(family)
     text, numbers = shader_paths(make_folder(folder))
-    write_file(text, shader_text(constants).encode())
+    write_file(text, _shader_text(constants).encode())
     about = (
         "numbers of decoder.glsl, by the same names; matrices row after row, tables a row for each roughness"
     )
     return [text, write_file(numbers, json.dumps({"about": about, **constants}).encode())]
 
 
-def decoder_constants(family: NeuralFamily) -> dict[str, Any]:
+def _decoder_constants(family: NeuralFamily) -> dict[str, Any]:
     """Every number that the shader needs, by its name there: ints, floats, and lists of floats."""
     linear = [*family.decoder.hidden, family.decoder.last]
     constants: dict[str, Any] = {
@@ -184,7 +184,7 @@ def decoder_constants(family: NeuralFamily) -> dict[str, Any]:
         constants[f"BIAS_{index}"] = _floats(layer.bias)
     ggx, white = ggx_table(), sheen_table()
     means = mean_ggx_albedo(torch.linspace(0, 1, ggx.shape[0])[None])
-    nodes = tuple(layers._NODES), tuple(layers._WEIGHTS)
+    nodes = tuple(layers.DUST_NODES), tuple(layers.DUST_WEIGHTS)
     return {
         **constants,
         "LARGEST_COVER": layers.LARGEST_COVER,
@@ -192,7 +192,7 @@ def decoder_constants(family: NeuralFamily) -> dict[str, Any]:
         "LARGEST_COAT_ROUGHNESS": layers.LARGEST_COAT_ROUGHNESS,
         "LARGEST_HAZE": layers.LARGEST_HAZE,
         "LARGEST_DIELECTRIC_F0": layers.LARGEST_DIELECTRIC_F0,
-        "SMALLEST_SHEEN_WIDTH": layers._SMALLEST_WIDTH,
+        "SMALLEST_SHEEN_WIDTH": layers.SMALLEST_SHEEN_WIDTH,
         "DUST_COLOUR": list(layers.DUST_COLOUR),
         "NODES": len(nodes[0]),
         "NODE_PLACES": list(nodes[0]),
@@ -207,7 +207,7 @@ def decoder_constants(family: NeuralFamily) -> dict[str, Any]:
     }
 
 
-def shader_text(constants: dict[str, Any]) -> str:
+def _shader_text(constants: dict[str, Any]) -> str:
     """The shader with its constants."""
     template = files("unmix_plugin.neumatex.export").joinpath("decoder.glsl").read_text(encoding="utf-8")
     assert _PLACE in template

@@ -42,7 +42,7 @@ class MaterialProduct(RunProduct):
 
         scene = job.loaded.scene
         assert isinstance(scene, TrainedObject)  # what else has another method and is refused before
-        require_texture_size(self.texture_size)
+        _require_texture_size(self.texture_size)
         job.claim(material_paths(job.folder, scene.surface.family))
         with job.working("unwrapping the mesh and baking its material"):
             written, error = write_material(
@@ -54,7 +54,7 @@ class MaterialProduct(RunProduct):
         return written
 
 
-def require_texture_size(texture_size: int) -> None:
+def _require_texture_size(texture_size: int) -> None:
     """Refuse impossible sizes.
 
     Raises:
@@ -123,12 +123,12 @@ def write_material(
         family = SpectralFamily(family.endmembers.detach().cpu())  # where the baked parameters are
         seen = InColours(family, bands)
     fit = fit_pbr(seen, baked.parameters, torch.Generator().manual_seed(seed))
-    textures = textures_of(seen, baked.parameters, fit.parameters)
+    textures = _textures_of(seen, baked.parameters, fit.parameters)
     written, pictures = [], {}
     for texture in textures:
         paths, pictures[texture.name] = files.write_texture(folder, baked, texture)
         written += paths
-    names = parameter_names(family)
+    names = _parameter_names(family)
     written.append(files.write_parameters(folder / "parameters.exr", baked, names))
     shown = (pictures["gltf_base_colour"], pictures["gltf_metallic_roughness"])
     written.append(files.write_material_glb(folder / "material.glb", mesh, baked, frame, shown))
@@ -141,13 +141,13 @@ def write_material(
     return written, fit.mean_error
 
 
-def parameter_names(family: MaterialFamily) -> tuple[str, ...]:
+def _parameter_names(family: MaterialFamily) -> tuple[str, ...]:
     """What each parameter of a family is."""
     numbers = tuple(f"parameter {index}" for index in range(family.num_parameters))
     return tuple(getattr(family, "PARAMETERS", numbers))
 
 
-def textures_of(
+def _textures_of(
     family: MaterialFamily, parameters: Float[Tensor, "T P"], fitted: Float[Tensor, "T 5"]
 ) -> list[Texture]:
     """The textures of a material and of its glTF approximation."""

@@ -37,7 +37,7 @@ _OPAQUE = 0.5
 
 
 @dataclass(frozen=True)
-class MeshFit:
+class _MeshFit:
     """How well the silhouettes of a mesh agree with alpha."""
 
     overlaps: list[float]
@@ -63,7 +63,7 @@ def mesh_fit(
     alphas: Sequence[Float[np.ndarray, "_ _"] | None],
     frame: Normalisation,
     where: str,
-) -> MeshFit:
+) -> _MeshFit:
     """Compare a mesh with what pictures show of it.
 
     Args:
@@ -84,7 +84,7 @@ def mesh_fit(
     overlaps = [_overlap(ray_mesh, cameras[view], alphas[view]) for view in range(0, len(cameras), step)]
     wrong = sum(overlap < LEAST_OVERLAP for overlap in overlaps)
     if 2 * wrong <= len(overlaps):
-        return MeshFit(overlaps, None)
+        return _MeshFit(overlaps, None)
     edge = 2 / frame.scale
     message = (
         f"{where} is not where the pictures show the object: in {wrong} of {len(overlaps)} views it covers less than "
@@ -92,7 +92,7 @@ def mesh_fit(
         f"{edge:.4g} long; {_places(cameras, frame)}. Bring it into the world of the poses: the same origin, unit and "
         "axes. With y upwards it does not fit either"
     )
-    return MeshFit(overlaps, message)
+    return _MeshFit(overlaps, message)
 
 
 def _places(cameras: Cameras, frame: Normalisation) -> str:

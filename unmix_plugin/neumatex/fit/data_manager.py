@@ -42,14 +42,15 @@ from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.neumatex.tracing.rays import RayMesh
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.colour.conversion import srgb_to_linear
-from unmix_plugin.spectral.evidence import OPAQUE_ALPHA
 
+OPAQUE = 0.99
+"""Alpha from which a pixel shows the object alone."""
 _CORNERS = ((0.02, 0.02), (0.98, 0.02), (0.02, 0.98), (0.98, 0.98), (0.5, 0.5))
 """Where in a pixel the mesh has to be seen, so that every place in it sees it."""
 
 
 @dataclass(frozen=True)
-class DrawnPixels:
+class _DrawnPixels:
     """Pixels of a batch."""
 
     views: Int[Tensor, " R"]
@@ -61,7 +62,7 @@ class DrawnPixels:
 
 
 @dataclass(frozen=True)
-class PixelList:
+class _PixelList:
     """Pixels by view and place."""
 
     views: Int[Tensor, " M"]
@@ -70,7 +71,7 @@ class PixelList:
     numbers: Float[Tensor, "M C"]
 
     @staticmethod
-    def of(scene: ObjectScene, most: int, seed: int) -> PixelList:
+    def of(scene: ObjectScene, most: int, seed: int) -> _PixelList:
         """Read the training views; of more pixels than `most`, so many are drawn.
 
         Raises:
@@ -81,26 +82,26 @@ class PixelList:
         share = most // len(scene.split.train) + 1
         for row, view in enumerate(scene.split.train):
             picture = scene.pictures.read(view)
-            shown = torch.from_numpy(opacity(picture) >= OPAQUE_ALPHA) & sees_mesh(ray_mesh, scene, view)
+            shown = torch.from_numpy(opacity(picture) >= OPAQUE) & _sees_mesh(ray_mesh, scene, view)
             rows, columns = shown.nonzero(as_tuple=True)
             if len(rows) > share:
                 kept = torch.randperm(len(rows), generator=generator)[:share]
                 rows, columns = rows[kept], columns[kept]
             numbers = torch.from_numpy(picture.numbers)[rows, columns]
             parts.append((torch.full_like(rows, row), torch.stack([columns, rows], dim=-1), numbers))
-        found = PixelList(*(torch.cat(values) for values in zip(*parts, strict=True)))
+        found = _PixelList(*(torch.cat(values) for values in zip(*parts, strict=True)))
         if not len(found.views):
             raise SceneError(f"{scene.root}: no training view shows the mesh and opaque alpha in one pixel")
         return found
 
-    def draw(self, count: int, generator: torch.Generator) -> DrawnPixels:
+    def draw(self, count: int, generator: torch.Generator) -> _DrawnPixels:
         """Random pixels, each as likely as any other."""
         chosen = torch.randint(len(self.views), (count,), generator=generator)
         places = self.corners[chosen] + torch.rand(count, 2, generator=generator)
-        return DrawnPixels(self.views[chosen], places, self.numbers[chosen])
+        return _DrawnPixels(self.views[chosen], places, self.numbers[chosen])
 
 
-def sees_mesh(ray_mesh: RayMesh, scene: ObjectScene, view: int) -> Bool[Tensor, "H W"]:
+def _sees_mesh(ray_mesh: RayMesh, scene: ObjectScene, view: int) -> Bool[Tensor, "H W"]:
     """Pixels of a view that the mesh covers."""
     camera = scene.pictures.cameras[view].to(ray_mesh.device)
     seen = torch.ones(camera.height * camera.width, dtype=torch.bool)
@@ -224,8 +225,8 @@ class ObjectDataManager(DataManager):
         arrays["light_map"] = light.image
         buffers = {name: array.numpy() for name, array in arrays.items() if array is not None}
         if self.object.bands is not None:
-            return {**buffers, **pixel_arrays(self.object, self.train_cameras, self._pixels, self.seed)}
-        return {**buffers, **view_arrays(self.object)}
+            return {**buffers, **_pixel_arrays(self.object, self.train_cameras, self._pixels, self.seed)}
+        return {**buffers, **_view_arrays(self.object)}
 
     def summary(self) -> dict[str, Any]:
         """Files, splits, normalisation, hashes."""
@@ -246,9 +247,9 @@ class ObjectDataManager(DataManager):
         return list(self.object.notes)
 
     @cached_property
-    def _pixels(self) -> PixelList:
+    def _pixels(self) -> _PixelList:
         """Read when training begins: evaluation needs none of it."""
-        return PixelList.of(self.object, self.options.max_pixels, self.seed)
+        return _PixelList.of(self.object, self.options.max_pixels, self.seed)
 
     def _find_image(self, index: int) -> int | tuple[int, int]:
         """A view of the object's own pictures, or a light and a view of its pictures."""
@@ -323,7 +324,7 @@ LONGEST_EDGE_PX = 512
 """Of the views that a prior sees; larger ones are thinned out."""
 
 
-def view_arrays(scene: ObjectScene) -> dict[str, np.ndarray]:
+def _view_arrays(scene: ObjectScene) -> dict[str, np.ndarray]:
     """Training views that a prior may look at, as arrays by name; `views_of` puts them together again."""
     train = list(scene.split.train)
     cameras = scene.pictures.cameras[train]
@@ -351,7 +352,9 @@ NUM_PIXELS = 20_000
 _STREAM = 7
 
 
-def pixel_arrays(scene: ObjectScene, cameras: Cameras, pixels: PixelList, seed: int) -> dict[str, np.ndarray]:
+def _pixel_arrays(
+    scene: ObjectScene, cameras: Cameras, pixels: _PixelList, seed: int
+) -> dict[str, np.ndarray]:
     """Rays and spectra of some pixels of the training views, the lamp, and where the world is, as arrays by name."""
     assert scene.lamp is not None
     drawn = pixels.draw(NUM_PIXELS, step_generator(seed, 0, stream=_STREAM))

@@ -48,7 +48,7 @@ from unmix_plugin.neumatex.tracing.path_tracer import SeenPoints, TracedObject, 
 from unmix_plugin.neumatex.tracing.surface import Triplane
 
 
-def empty_endmembers(config: NeumatexModelConfig, record: ObjectRecord) -> nn.Parameter | None:
+def _empty_endmembers(config: NeumatexModelConfig, record: ObjectRecord) -> nn.Parameter | None:
     """Endmembers (K, B) of a spectral material, not yet filled; None for materials in colours.
 
     Raises:
@@ -71,7 +71,7 @@ def empty_endmembers(config: NeumatexModelConfig, record: ObjectRecord) -> nn.Pa
 
 
 @torch.no_grad()
-def settle(endmembers: Float[Tensor, "K B"], gains: Float[Tensor, " K"]) -> None:
+def _settle(endmembers: Float[Tensor, "K B"], gains: Float[Tensor, " K"]) -> None:
     """Make endmembers as bright as their gains say, as far as reflectances can be, and the gains 1; in place."""
     bright = endmembers.clamp(0, 1) * gains.clamp(min=0)[:, None]
     endmembers.copy_(bright / bright.amax(dim=1, keepdim=True).clamp(min=1))
@@ -96,7 +96,7 @@ class NeumatexModel(Model):
         """Modules and buffers in the shapes that config and object ask for."""
         record = ObjectRecord.from_json(self.metadata)
         self.record = record
-        self.endmembers: nn.Parameter | None = empty_endmembers(self.config, record)
+        self.endmembers: nn.Parameter | None = _empty_endmembers(self.config, record)
         self.gains = None if self.endmembers is None else nn.Parameter(torch.ones(len(self.endmembers)))
         self.family = material_family(self.config.material, self.endmembers, self.gains)
         # A run keeps the decoder that it was fitted with.
@@ -290,7 +290,7 @@ class NeumatexModel(Model):
     def _settle_endmembers(self, step: int, progress: float) -> None:
         assert self.endmembers is not None
         assert self.gains is not None
-        settle(self.endmembers, self.gains)
+        _settle(self.endmembers, self.gains)
 
     def _random(self) -> torch.Generator:
         """The step's source of random numbers; outside training always the same."""

@@ -61,18 +61,18 @@ _NUM_COLOURS = 3
 
 
 @dataclass(frozen=True)
-class SpectralLight:
+class _SpectralLight:
     """Bands and lamp of spectral pictures."""
 
     bands: Bands
     lamp: Float64[np.ndarray, " B"] | None
     """Relative power, greatest 1; None where it is not given."""
 
-    def lamp_of(self, environment: Environment) -> Float64[np.ndarray, " B"]:
+    def _lamp_of(self, environment: Environment) -> Float64[np.ndarray, " B"]:
         """The lamp; the environment's mean spectrum where none is given."""
         return mean_spectrum(environment).double().numpy() if self.lamp is None else self.lamp
 
-    def of_held_out(self, folder: Path, entry: SceneEntry, pictures: PosedPictures) -> SpectralLight:
+    def _of_held_out(self, folder: Path, entry: SceneEntry, pictures: PosedPictures) -> _SpectralLight:
         """The same bands, lit by the held-out light's own lamp where it has one.
 
         Raises:
@@ -89,9 +89,9 @@ class SpectralLight:
         return self if lamp is None else replace(self, lamp=lamp)
 
 
-def spectral_light(
+def _spectral_light(
     root: Path, entry: SceneEntry, pictures: PosedPictures, lamp: str | None
-) -> SpectralLight | None:
+) -> _SpectralLight | None:
     """Bands and lamp of an object's pictures; None for pictures in colours.
 
     Args:
@@ -119,7 +119,7 @@ def spectral_light(
             f"{root / FILE_NAME}: pictures of {count} bands with 'tone_mapping' {pictures.tone}; expected linear light"
         )
     bands = Bands(found)
-    return SpectralLight(bands, _own_lamp(root, entry, bands) if lamp is None else read_lamp(lamp, bands))
+    return _SpectralLight(bands, _own_lamp(root, entry, bands) if lamp is None else read_lamp(lamp, bands))
 
 
 def _own_lamp(root: Path, entry: SceneEntry, bands: Bands) -> Float64[np.ndarray, " B"] | None:
@@ -133,7 +133,7 @@ def _own_lamp(root: Path, entry: SceneEntry, bands: Bands) -> Float64[np.ndarray
 
 
 @dataclass(frozen=True)
-class TrueMaterials:
+class _TrueMaterials:
     """What an object is really made of."""
 
     names: tuple[str, ...]
@@ -162,9 +162,9 @@ class TrueMaterials:
         return found
 
 
-def read_true_materials(
-    root: Path, entry: SceneEntry, spectral: SpectralLight | None
-) -> TrueMaterials | None:
+def _read_true_materials(
+    root: Path, entry: SceneEntry, spectral: _SpectralLight | None
+) -> _TrueMaterials | None:
     """What 'endmembers_path' and each frame's 'abundance_file_path' name; None without spectra or endmembers.
 
     Raises:
@@ -186,11 +186,11 @@ def read_true_materials(
     )
     faults.raise_if_any()
     assert table is not None
-    return TrueMaterials(table.names, table.spectra, files)
+    return _TrueMaterials(table.names, table.spectra, files)
 
 
 @dataclass(frozen=True)
-class HeldOutLight:
+class _HeldOutLight:
     """The object under a light that training never sees."""
 
     name: str
@@ -215,14 +215,14 @@ class ObjectScene:
     """All views."""
     split: Split
     """Views to train on and views to evaluate, at least one each."""
-    lights: tuple[HeldOutLight, ...]
+    lights: tuple[_HeldOutLight, ...]
     bands: Bands | None
     """Of spectral pictures; None for RGB."""
     lamp: Float64[np.ndarray, " B"] | None
     """Relative power of the light of spectral pictures, greatest band 1."""
     truth: Path | None
     """Folder of true base colours; None where there is none."""
-    true_materials: TrueMaterials | None
+    true_materials: _TrueMaterials | None
     """Of spectral pictures, where they are known."""
     input_hashes: dict[str, str]
     """SHA-256 of mesh, environment and pictures."""
@@ -281,7 +281,7 @@ def load_object(root: Path, lamp: str | None = None) -> ObjectScene:
     frame, mesh, pictures = _placed(
         read_mesh(mesh_path, notes), mesh_path.name, root, entry, light, notes, faults
     )
-    spectral = spectral_light(root, entry, pictures, lamp)
+    spectral = _spectral_light(root, entry, pictures, lamp)
     environment = light.environment(spectral)
     doubt = light_doubt(pictures, environment)
     notes += [] if doubt is None else [doubt]
@@ -296,9 +296,9 @@ def load_object(root: Path, lamp: str | None = None) -> ObjectScene:
         split=split,
         lights=tuple(_read_held_out(path, frame, spectral) for path in _held_out_folders(root)),
         bands=None if spectral is None else spectral.bands,
-        lamp=None if spectral is None else spectral.lamp_of(environment),
+        lamp=None if spectral is None else spectral._lamp_of(environment),
         truth=truth if truth.is_dir() else None,
-        true_materials=read_true_materials(root, entry, spectral),
+        true_materials=_read_true_materials(root, entry, spectral),
         input_hashes={**{name: sha256_of(path) for name, path in files.items()}, **pictures.hashes},
         notes=tuple(notes),
     )
@@ -313,7 +313,7 @@ class _Light:
     exposure_stops: float
     tone: ToneMapping | None
 
-    def environment(self, spectral: SpectralLight | None) -> Environment:
+    def environment(self, spectral: _SpectralLight | None) -> Environment:
         """In the bands of spectral pictures, otherwise in colours."""
         placement = (self.rotation_deg, self.exposure_stops)
         if spectral is None:
@@ -417,7 +417,7 @@ def _held_out_folders(root: Path) -> list[Path]:
     return sorted(path for path in relit.iterdir() if path.is_dir()) if relit.is_dir() else []
 
 
-def _read_held_out(folder: Path, frame: Normalisation, spectral: SpectralLight | None) -> HeldOutLight:
+def _read_held_out(folder: Path, frame: Normalisation, spectral: _SpectralLight | None) -> _HeldOutLight:
     faults = Faults(folder)
     entry: SceneEntry = read_transforms(folder, faults, needs_cubes=False)
     light = _read_light(folder, faults)
@@ -426,5 +426,5 @@ def _read_held_out(folder: Path, frame: Normalisation, spectral: SpectralLight |
         raise SceneError(f"{folder} has no environment map")
     pictures = read_posed_pictures(folder, entry, _from_poses(frame, entry.placement), light.tone, faults)
     if spectral is not None:
-        spectral = spectral.of_held_out(folder, entry, pictures)
-    return HeldOutLight(folder.name, light.environment(spectral), pictures)
+        spectral = spectral._of_held_out(folder, entry, pictures)
+    return _HeldOutLight(folder.name, light.environment(spectral), pictures)

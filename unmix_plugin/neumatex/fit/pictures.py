@@ -115,7 +115,7 @@ def _read_npy(path: Path, value_scale: float | None) -> Picture:
 
 
 @dataclass(frozen=True)
-class PictureFiles:
+class _PictureFiles:
     """The files of one picture."""
 
     name: str
@@ -134,7 +134,7 @@ class PictureFiles:
 class PosedPictures:
     """Pictures and their cameras, read when asked for."""
 
-    files: tuple[PictureFiles, ...]
+    files: tuple[_PictureFiles, ...]
     cameras: Cameras
     """Model space, one a picture."""
     tone: ToneMapping
@@ -157,7 +157,7 @@ class PosedPictures:
             SceneError: it can't be read, or its size has changed.
         """
         files = self.files[index]
-        picture = read_files(files)
+        picture = _read_files(files)
         width, height = self.cameras.size(index)
         if picture.numbers.shape[:2] != (height, width):
             raise SceneError(f"{files.colours} has changed since it was first read; start again")
@@ -169,7 +169,7 @@ class PosedPictures:
         return {files.name: sha256_of(files.colours) for files in self.files}
 
 
-def read_files(files: PictureFiles) -> Picture:
+def _read_files(files: _PictureFiles) -> Picture:
     """A picture from its one or two files.
 
     Raises:
@@ -227,7 +227,7 @@ def read_posed_pictures(
     return PosedPictures(tuple(named), make_cameras(entry, sizes, frame), tone or usual, colours.pop())
 
 
-def _locate(root: Path, frame: FrameEntry, value_scale: float | None, faults: Faults) -> PictureFiles | None:
+def _locate(root: Path, frame: FrameEntry, value_scale: float | None, faults: Faults) -> _PictureFiles | None:
     """The files of a frame; None with noted faults where one is missing."""
     keys = [key for key in ("hyperspectral_file_path", "file_path", "mask_path") if key in frame.paths]
     found = {key: resolve_path(root, frame.paths[key], None, frame.where, faults) for key in keys}
@@ -235,15 +235,15 @@ def _locate(root: Path, frame: FrameEntry, value_scale: float | None, faults: Fa
     pictures = [path for path in found.values() if path is not None]
     if len(pictures) < len(found) or not pictures or (mask is None and "mask_path" in keys):
         return None
-    return PictureFiles("", *pictures, mask=mask, value_scale=value_scale)
+    return _PictureFiles("", *pictures, mask=mask, value_scale=value_scale)
 
 
-def _check(root: Path, named: list[PictureFiles], faults: Faults) -> tuple[list[tuple[int, int]], set[int]]:
+def _check(root: Path, named: list[_PictureFiles], faults: Faults) -> tuple[list[tuple[int, int]], set[int]]:
     """Sizes of all pictures, and the numbers of colours that they have."""
     sizes, colours = [], set()
     for files in named:
         try:
-            shape = read_files(files).numbers.shape
+            shape = _read_files(files).numbers.shape
         except SceneError as error:
             faults.add(str(root), str(error).replace(f"{root}/", ""))
             continue

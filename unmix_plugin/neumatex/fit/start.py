@@ -95,7 +95,7 @@ def material_family(
     return families[name]()
 
 
-def plain_parameters(family: MaterialFamily) -> Float[Tensor, "P"]:
+def _plain_parameters(family: MaterialFamily) -> Float[Tensor, "P"]:
     """Parameters of a rough grey surface that is not metal and has no layers: where a fit without a prior starts.
 
     From the middle of all parameters, which is half a metal, a fit puts the colours of what is diffuse into what the
@@ -119,7 +119,7 @@ def start_plain(triplane: Triplane, family: MaterialFamily) -> None:
     with torch.no_grad():
         triplane.planes.mul_(_START_PLANES)
         last.weight.mul_(_START_SPREAD)
-        plain = plain_parameters(family)
+        plain = _plain_parameters(family)
         raw = plain.logit()
         if triplane.num_shares:
             raw[: triplane.num_shares] = plain[: triplane.num_shares].log()
@@ -179,21 +179,21 @@ _LEAST_FOUND = 0.5
 
 
 @dataclass(frozen=True)
-class RunMaterials:
+class _RunMaterials:
     """What a run says of materials."""
 
     path: Path
     scene: TrainedScene
 
     @staticmethod
-    def open(path: Path) -> RunMaterials:
+    def open(path: Path) -> _RunMaterials:
         """Of a run folder; it is read once.
 
         Raises:
             RunError: the run is missing or damaged.
             ConfigError: its method does not unmix spectra.
         """
-        return RunMaterials(path, _scene(path))
+        return _RunMaterials(path, _scene(path))
 
     @property
     def num_endmembers(self) -> int:
@@ -285,7 +285,7 @@ def resolved_num_endmembers(
     if "lamp" not in arrays:  # pictures in colours, which the model refuses
         return _USUAL_ENDMEMBERS, ""
     if config.from_run is not None:
-        return RunMaterials.open(config.from_run).num_endmembers, ""
+        return _RunMaterials.open(config.from_run).num_endmembers, ""
     if config.num_endmembers is None:
         return min(_USUAL_ENDMEMBERS, len(arrays["lamp"])), ""
     pixels = drop_uninformative_pixels(torch.from_numpy(arrays["pixels"] / arrays["lamp"]).float())
@@ -294,7 +294,7 @@ def resolved_num_endmembers(
 
 
 @dataclass(frozen=True)
-class SeenPixels:
+class _SeenPixels:
     """Pixels that are lit well enough to tell reflectance."""
 
     positions: Float[Tensor, "N 3"]
@@ -317,34 +317,34 @@ def start_spectral(
     endmembers, shares = start(model, found, arrays, generator)
     model.endmembers.copy_(endmembers)
     start_plain(model.triplane, model.family)
-    fit_shares(model.triplane, found.positions, shares, generator)
+    _fit_shares(model.triplane, found.positions, shares, generator)
 
 
 def _from_pixels(
-    model: NeumatexModel, found: SeenPixels, _: Mapping[str, np.ndarray], generator: torch.Generator
+    model: NeumatexModel, found: _SeenPixels, _: Mapping[str, np.ndarray], generator: torch.Generator
 ) -> tuple[Float[Tensor, "K B"], Float[Tensor, "N K"]]:
     """Endmembers and abundances by unmixing the pixels' reflectances."""
     pixels = found.reflectance
     count = model.family.num_parameters - NUM_GLOSS
     first = initialise_endmembers(pixels, count, model.config.endmember_init, generator)
     unit = torch.nn.functional.normalize
-    endmembers = as_bright(first, pixels, unit(pixels, dim=1) @ unit(first, dim=1).T)
+    endmembers = _as_bright(first, pixels, unit(pixels, dim=1) @ unit(first, dim=1).T)
     return endmembers, fcls(pixels, endmembers)
 
 
 def _from_run(
-    model: NeumatexModel, found: SeenPixels, arrays: Mapping[str, np.ndarray], _: torch.Generator
+    model: NeumatexModel, found: _SeenPixels, arrays: Mapping[str, np.ndarray], _: torch.Generator
 ) -> tuple[Float[Tensor, "K B"], Float[Tensor, "N K"]]:
     """Endmembers and abundances of a run of unmix-nerf."""
     assert model.config.from_run is not None
-    run = RunMaterials.open(model.config.from_run)
+    run = _RunMaterials.open(model.config.from_run)
     count = model.family.num_parameters - NUM_GLOSS
     first = run.reflectances(model.record.bands, arrays["lamp"], count).to(found.reflectance)
     shares = run.abundances(found.positions, found.normals, arrays["world_corners"])
-    return as_bright(first, found.reflectance, shares), shares
+    return _as_bright(first, found.reflectance, shares), shares
 
 
-def as_bright(
+def _as_bright(
     spectra: Float[Tensor, "K B"], pixels: Float[Tensor, "N B"], purity: Float[Tensor, "N K"]
 ) -> Float[Tensor, "K B"]:
     """Spectra of the same shape, each as bright as the purest of its pixels: in known light a pixel is as bright as its
@@ -360,20 +360,20 @@ def as_bright(
     return bright / bright.amax(dim=1, keepdim=True).clamp(min=1)
 
 
-def _seen_pixels(model: NeumatexModel, arrays: Mapping[str, np.ndarray]) -> SeenPixels:
+def _seen_pixels(model: NeumatexModel, arrays: Mapping[str, np.ndarray]) -> _SeenPixels:
     device = model.device
     pixels, origins, directions = (
         torch.from_numpy(arrays[name]).to(device) for name in ("pixels", "pixel_origins", "pixel_directions")
     )
     seen = model.traced.seen(origins, directions)
-    reflectance, is_lit = apparent_reflectance(model.traced, seen, pixels[seen.found])
-    return SeenPixels(
+    reflectance, is_lit = _apparent_reflectance(model.traced, seen, pixels[seen.found])
+    return _SeenPixels(
         seen.points.positions[is_lit], seen.points.geometric_normals[is_lit], reflectance[is_lit]
     )
 
 
 @torch.no_grad()
-def apparent_reflectance(
+def _apparent_reflectance(
     traced: TracedObject, seen: SeenPoints, radiance: Float[Tensor, "N B"]
 ) -> tuple[Float[Tensor, "N B"], Bool[Tensor, " N"]]:
     """Reflectance of a diffuse base under the plain gloss that would look so bright in direct light; and where enough
@@ -403,7 +403,7 @@ def _plain_light(traced: TracedObject, seen: SeenPoints, base: float) -> Float[T
     return plain.light(seen, _SAMPLES, 0, generator)
 
 
-def fit_shares(
+def _fit_shares(
     triplane: Triplane,
     positions: Float[Tensor, "N 3"],
     shares: Float[Tensor, "N K"],

@@ -35,7 +35,7 @@ MAX_STOPS = 8.0
 """Exposure that can be learnt, either way."""
 
 
-class CameraResponse(nn.Module):
+class _CameraResponse(nn.Module):
     """One increasing curve for all colours, and the exposure before it."""
 
     mean: Tensor
@@ -43,7 +43,7 @@ class CameraResponse(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        mean, components = response_basis()
+        mean, components = _response_basis()
         self.register_buffer("mean", mean.clone())
         self.register_buffer("components", components.clone())
         self.coefficients = nn.Parameter(torch.zeros(NUM_COEFFICIENTS))
@@ -67,19 +67,19 @@ class CameraResponse(nn.Module):
 
 
 @lru_cache(maxsize=1)
-def response_basis() -> tuple[Float[Tensor, " S"], Float[Tensor, "K S"]]:
+def _response_basis() -> tuple[Float[Tensor, " S"], Float[Tensor, "K S"]]:
     """Mean and principal components of the logarithm of the steps of all curves of the family.
 
     A component is scaled by its spread, so that coefficients of about 1 are usual.
     """
-    logs = curve_family().diff(dim=1).clamp(min=1e-12).log()
+    logs = _curve_family().diff(dim=1).clamp(min=1e-12).log()
     mean = logs.mean(dim=0)
     _, spreads, axes = torch.linalg.svd(logs - mean, full_matrices=False)
     scale = spreads[:NUM_COEFFICIENTS, None] / len(logs) ** 0.5
     return mean.float(), (scale * axes[:NUM_COEFFICIENTS]).float()
 
 
-def curve_family() -> Float[Tensor, "F S_plus_1"]:
+def _curve_family() -> Float[Tensor, "F S_plus_1"]:
     """Responses at (i / S)^2 of full exposure, float64: powers, logarithms, S-shaped ones, and powers of these."""
     light = torch.linspace(0, 1, NUM_STEPS + 1, dtype=torch.float64).square()
     gammas = torch.linspace(0.3, 1.4, 12, dtype=torch.float64)
@@ -101,7 +101,7 @@ LightCurve = Literal["agx", "srgb", "linear"]
 """Through which pictures of light can be compared."""
 
 
-class Linear(nn.Module):
+class _Linear(nn.Module):
     """Numbers that are light; more than 1 is allowed."""
 
     def forward(self, light: Float[Tensor, "*pixels C"]) -> Float[Tensor, "*pixels C"]:
@@ -109,7 +109,7 @@ class Linear(nn.Module):
         return light
 
 
-class Srgb(nn.Module):
+class _Srgb(nn.Module):
     """Light encoded for an sRGB display, clipped at white."""
 
     def forward(self, light: Float[Tensor, "*pixels C"]) -> Float[Tensor, "*pixels C"]:
@@ -117,7 +117,7 @@ class Srgb(nn.Module):
         return linear_to_srgb(light.clamp(0, 1))
 
 
-class Agx(nn.Module):
+class _Agx(nn.Module):
     """Light as AgX encodes it: see `unmix_plugin.spectral.colour.conversion`; RGB only."""
 
     def forward(self, light: Float[Tensor, "*pixels 3"]) -> Float[Tensor, "*pixels 3"]:
@@ -126,10 +126,10 @@ class Agx(nn.Module):
 
 
 _CURVES: dict[str, type[nn.Module]] = {
-    "linear": Linear,
-    "srgb": Srgb,
-    "agx": Agx,
-    "camera": CameraResponse,
+    "linear": _Linear,
+    "srgb": _Srgb,
+    "agx": _Agx,
+    "camera": _CameraResponse,
 }
 
 
@@ -193,7 +193,7 @@ class SpectralDisplay(nn.Module):
         self.register_buffer("matrix", rgb_matrix(bands), persistent=False)
 
     def rgb(self, spectra: Float[Tensor, "*pixels B"]) -> Float[Tensor, "*pixels 3"]:
-        """Linear colour, at least 0."""
+        """_Linear colour, at least 0."""
         return (spectra @ self.matrix).clamp(min=0)
 
     def forward(self, light: Float[Tensor, "*pixels B"]) -> Float[Tensor, "*pixels 3"]:

@@ -91,22 +91,22 @@ _GEOMETRY = (
 )
 
 
-def has_latents(family: MaterialFamily) -> bool:
+def _has_latents(family: MaterialFamily) -> bool:
     """Whether parameters 3 to 8 are latents of a decoder."""
     return getattr(family, "decoder", None) is not None
 
 
-def object_outputs(family: MaterialFamily, has_variance: bool) -> tuple[Output, ...]:
+def _object_outputs(family: MaterialFamily, has_variance: bool) -> tuple[Output, ...]:
     """The outputs of objects with materials of a family, in the order in which they are offered."""
     own: tuple[Output, ...] = ()
     if isinstance(family, SpectralFamily):
         own = _SPECTRAL
-    elif has_latents(family) or isinstance(family, PbrFamily):
-        own = _LATENTS if has_latents(family) else _PBR
+    elif _has_latents(family) or isinstance(family, PbrFamily):
+        own = _LATENTS if _has_latents(family) else _PBR
     return (*_COMMON, *own, *((_UNCERTAINTY,) if has_variance else ()), *_GEOMETRY)
 
 
-def view_outputs(
+def _view_outputs(
     scene: TrainedObject, camera: Cameras, hits: PixelHits, light: Float[Tensor, "K C"]
 ) -> dict[str, Tensor]:
     """All outputs of a view, (H, W, ...); colours are on black, everything else is a mean over what is seen in a
@@ -140,7 +140,7 @@ def view_outputs(
         found["segmentation"] = material_ids(shares, alpha)
         gloss = mean(parameters[:, family.num_endmembers :])
         found["roughness"], found["specular_level"] = gloss.unbind(dim=-1)
-    elif has_latents(family):
+    elif _has_latents(family):
         found["latents_a"], found["latents_b"] = mean(parameters[:, 3:6]), mean(parameters[:, 6:9])
     elif isinstance(family, PbrFamily):
         found["roughness"], found["metallicity"] = mean(parameters[:, 3:5]).unbind(dim=-1)
@@ -219,7 +219,7 @@ class TrainedObject:
     @property
     def outputs(self) -> tuple[Output, ...]:
         """All that can be shown of the materials and of the light that they reflect."""
-        return object_outputs(self.surface.family, self.log_variance is not None)
+        return _object_outputs(self.surface.family, self.log_variance is not None)
 
     def output(self, name: str) -> Output:
         """An output by its name.
@@ -317,7 +317,7 @@ class TrainedObject:
             bounces=self.bounces,
             generator=generator,
         )
-        return ModelView(camera, view_outputs(self, camera, hits, light))
+        return ModelView(camera, _view_outputs(self, camera, hits, light))
 
 
 @lru_cache(maxsize=2)

@@ -1,20 +1,10 @@
-"""Posed pictures of an object, as a prior wants them.
+"""What the prior looks at: posed views, points of the mesh, the light that reaches them, and numbers made of all that.
 
-Notation: `V` views of `H` x `W` pixels. Cameras are in model space, where the mesh lies in [-1, 1]^3.
+A known light is sent into lobes: a cosine-weighted one for the diffuse part, narrower ones about a mirrored direction.
+All light is divided by the environment's mean, so that exposure does not matter.
 
-What a known light sends into lobes: cosine-weighted for the diffuse part, narrower ones about a mirrored direction.
-
-Notation: `N` directions, `K` lobes, `C` colours, `H x W` pixels of a latitude-longitude picture,
-`P` of a coarse one.
-
-Points on a mesh, and what is known of them before any picture is read: who sees them, and what light reaches them.
-
-Notation: `N` points in model space, `V` views, `K` lobes of light. All light is divided by the environment's mean.
-
-Numbers that a network can learn from: what views show of points, beside the light that was there.
-
-Notation: leading axes are objects and `N` points; `V` views, `K` lobes of light, `F` features. Colours and light are
-divided by the environment's mean radiance, so that exposure does not matter.
+Notation: `V` views of `H` x `W` pixels, `N` points in model space, where the mesh lies in [-1, 1]^3, `K` lobes,
+`C` colours, `F` features. Leading axes of features are objects and points.
 """
 
 from __future__ import annotations
@@ -89,7 +79,7 @@ _BLURRED_ROWS = 32
 
 
 @dataclass(frozen=True)
-class LightLobes:
+class _LightLobes:
     """A light that was blurred once, so that lobes of it are look-ups."""
 
     diffuse: Environment
@@ -102,17 +92,13 @@ class LightLobes:
         return torch.stack([lobe.radiance(directions) for lobe in self.mirrored], dim=1)
 
 
-def light_lobes(environment: Environment) -> LightLobes:
+def _light_lobes(environment: Environment) -> _LightLobes:
     """Blur an environment's picture into lobes."""
     coarse = _shrunk(environment, _BLURRED_ROWS)
-
-    def blurred(kernel: Tensor) -> Environment:
-        image = kernel.to(coarse) @ coarse.flatten(0, 1)
-        return Environment(image.reshape(coarse.shape), environment.rotation_deg)
-
-    diffuse, *lobes = [blurred(kernel) for kernel in _kernels()]
-    mirror = Environment(_shrunk(environment, _MIRROR_ROWS), environment.rotation_deg)
-    return LightLobes(diffuse, (mirror, *lobes))
+    blurred = [(kernel.to(coarse) @ coarse.flatten(0, 1)).reshape(coarse.shape) for kernel in _kernels()]
+    images = [blurred[0], _shrunk(environment, _MIRROR_ROWS), *blurred[1:]]
+    diffuse, *mirrored = [Environment(image, environment.rotation_deg) for image in images]
+    return _LightLobes(diffuse, tuple(mirrored))
 
 
 @functools.cache
@@ -141,7 +127,7 @@ _SHADOW_RAYS = 32
 
 @dataclass(frozen=True)
 class KnownLight:
-    """Views and light at points of a surface."""
+    """Who sees points of a surface, and what light reaches them, before any picture is read."""
 
     visible: Bool[Tensor, "N V"]
     """Whether a view's camera sees a point."""
@@ -182,13 +168,13 @@ def known_light(
     environment: Environment,
     generator: torch.Generator,
 ) -> KnownLight:
-    """What is known of points before pictures are read.
+    """What is known of points.
 
     Args:
         eyes: Positions of the cameras, model space, outside the mesh.
         generator: Draws the directions of shadow rays.
     """
-    lobes = light_lobes(environment)
+    lobes = _light_lobes(environment)
     mean = environment.mean_radiance().mean().clamp(min=1e-12)
     to_eye = functional.normalize(eyes - points.positions[:, None], dim=-1)
     cosines = (to_eye * points.normals[:, None]).sum(dim=-1)
@@ -251,9 +237,9 @@ def view_features(
     """
     apparent = colours / (reaching[..., None, :] + 0.02)
     single = torch.stack([cosines, (1 - cosines) ** 5, mirror_open], dim=-1)
-    light = compressed(reaching)[..., None, :].expand_as(colours)
-    lobes = compressed(mirrored).flatten(-2)
-    return torch.cat([compressed(colours), lobes, light, compressed(apparent), single], dim=-1)
+    light = _compressed(reaching)[..., None, :].expand_as(colours)
+    lobes = _compressed(mirrored).flatten(-2)
+    return torch.cat([_compressed(colours), lobes, light, _compressed(apparent), single], dim=-1)
 
 
 def point_features(
@@ -267,12 +253,12 @@ def point_features(
 ) -> Float[Tensor, "*n F"]:
     """What all views together show of a point: fits of its colours by each lobe of light, and where it is."""
     weights = visible * (0.2 + 0.8 * mirror_open)
-    fits = lobe_fits(colours, mirrored, weights, irradiance * unshadowed)
+    fits = _lobe_fits(colours, mirrored, weights, irradiance * unshadowed)
     seen = visible.sum(dim=-1, keepdim=True) / 8
-    return torch.cat([compressed(irradiance), unshadowed, seen, positions, encode(positions), fits], dim=-1)
+    return torch.cat([_compressed(irradiance), unshadowed, seen, positions, encode(positions), fits], dim=-1)
 
 
-def lobe_fits(
+def _lobe_fits(
     colours: Float[Tensor, "*n V 3"],
     mirrored: Float[Tensor, "*n V K 3"],
     weights: Float[Tensor, "*n V"],
@@ -289,19 +275,19 @@ def lobe_fits(
     weights = weights[..., None, None]
     total = weights.sum(dim=-3).clamp(min=1e-6)
 
-    def mean(values: Tensor) -> Tensor:
+    def _mean(values: Tensor) -> Tensor:
         return (values * weights).sum(dim=-3) / total
 
-    mean_colour, mean_light = mean(colours), mean(light)
+    mean_colour, mean_light = _mean(colours), _mean(light)
     spread = light - mean_light[..., None, :, :]
     difference = colours - mean_colour[..., None, :, :]
-    share = mean(spread * difference) / (mean(spread.square()) + _RIDGE)
+    share = _mean(spread * difference) / (_mean(spread.square()) + _RIDGE)
     constant = (mean_colour - share * mean_light) / (reaching[..., None, :] + 0.02)
-    left = mean((difference - share[..., None, :, :] * spread).square()).sum(dim=-1, keepdim=True)
-    left = left / (mean(difference.square()).sum(dim=-1, keepdim=True) + 1e-3)
+    left = _mean((difference - share[..., None, :, :] * spread).square()).sum(dim=-1, keepdim=True)
+    left = left / (_mean(difference.square()).sum(dim=-1, keepdim=True) + 1e-3)
     return torch.cat([share.clamp(-1, 2), constant.clamp(-1, 2), left.clamp(0, 2)], dim=-1).flatten(-2)
 
 
-def compressed(light: Tensor) -> Tensor:
+def _compressed(light: Tensor) -> Tensor:
     """Light from 0 to `_BRIGHTEST` on a logarithmic scale from 0 to 1."""
     return torch.log1p(8 * light.clamp(0, _BRIGHTEST)) / torch.log1p(torch.tensor(8 * _BRIGHTEST))

@@ -1,19 +1,11 @@
-"""The small prior: from what views show of surface points to the material at each of them.
+"""The shipped prior: from what views show of surface points to the material there, and to planes that hold it.
 
-Notation: `B` objects, `N` points, `V` views, `P` parameters of a material, `W` numbers of an embedding.
+It was trained on procedural objects (tools/train_prior.py) and is small enough to run on a processor in a second or
+two. Its interface is that of the published one (views in; planes, and networks that read them, out), but it knows the
+mesh and the light, which the published one has to guess from the pictures. It works on the CPU.
 
-The small prior's weights: one safetensors file and a JSON record of how it was made.
-
-Latents mean something only beside the decoder that they were made for, so the record has that decoder's SHA-256.
-
-From materials at points to planes: the planes that the readers read back best.
-
-Notation: `B` objects, `N` points, `P` parameters, `C` channels and `R` texels of a plane.
-
-The prior that is shipped: trained on procedural objects, small enough to run on a processor in a second or two.
-
-It has the interface of the published one (views in; planes, and networks that read them, out), but knows the mesh and
-the light, which the published one has to guess from the pictures. It works on the CPU.
+Notation: `B` objects, `N` points, `V` views, `P` parameters of a material, `W` numbers of an embedding, `C` channels
+and `R` texels of a plane.
 """
 
 from __future__ import annotations
@@ -31,7 +23,6 @@ from safetensors import SafetensorError
 from torch import Tensor, nn
 from torch.nn import functional
 
-from unmix_plugin.engine.runs.atomic_files import write_file
 from unmix_plugin.errors import RunError, SceneError
 from unmix_plugin.neumatex.prior.observations import (
     NUM_POINT_FEATURES,
@@ -59,10 +50,19 @@ MaterialName = Literal["neural", "pbr"]
 TaskName = Literal["neural", "pbr", "layers"]
 """What the embeddings are trained to tell; the layers are there for the training alone."""
 NUM_PARAMETERS: dict[TaskName, int] = {"neural": 9, "pbr": 5, "layers": 14}
-_VIEW_WIDTH, _POINT_WIDTH, _NUM_HEADS = 64, 128, 4
-_NUM_EXCHANGES = 3
-MOST_ASKED = 640
+SHIPPED = Path(__file__).parent.parent / "weights"
+"""Folder of a safetensors file and of a JSON record of how it was made."""
+WEIGHTS, RECORD = "small.safetensors", "small.json"
+RESOLUTION = 32
+"""R of fitted planes: cells that hold several points each, whose errors average out."""
+_VIEW_WIDTH, _POINT_WIDTH, _NUM_HEADS, _NUM_EXCHANGES = 64, 128, 4, 3
+_MOST_ASKED = 640
 """Points of an object that the others learn from: the first ones, which are as random as all."""
+_RATE, _SHRINKAGE = 0.05, 1e-4
+"""Of the fit of planes; shrinkage pulls texels that hardly a point reads to 0."""
+_MOST_VIEWS = 12
+"""Views that are looked at; of more, those whose directions are farthest apart."""
+_NUM_POINTS, _LEAST_ALPHA = 3072, 0.9
 
 
 @dataclass(frozen=True)
@@ -80,19 +80,10 @@ class Observations:
 
     def selected(self, points: Int[Tensor, " n"], views: Int[Tensor, " v"]) -> Observations:
         """Some of the points and some of the views, in the order asked for."""
-
-        def both(values: Tensor) -> Tensor:
-            return values[:, points][:, :, views]
-
+        per_view = ("colours", "visible", "cosines", "mirrored", "mirror_open")
+        some = {name: values[:, points] for name, values in vars(self).items()}
         return Observations(
-            positions=self.positions[:, points],
-            colours=both(self.colours),
-            visible=both(self.visible),
-            cosines=both(self.cosines),
-            mirrored=both(self.mirrored),
-            mirror_open=both(self.mirror_open),
-            irradiance=self.irradiance[:, points],
-            unshadowed=self.unshadowed[:, points],
+            **{name: part[:, :, views] if name in per_view else part for name, part in some.items()}
         )
 
 
@@ -101,13 +92,12 @@ class SmallPrior(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.view_encoder = _perceptron(NUM_VIEW_FEATURES, _VIEW_WIDTH, _VIEW_WIDTH)
-        self.point_encoder = _perceptron(3 * _VIEW_WIDTH + NUM_POINT_FEATURES, _POINT_WIDTH, _POINT_WIDTH)
-        self.exchanges = nn.ModuleList([PointExchange(_POINT_WIDTH) for _ in range(_NUM_EXCHANGES)])
+        self.view_encoder = _perceptron(NUM_VIEW_FEATURES, _VIEW_WIDTH)
+        self.point_encoder = _perceptron(3 * _VIEW_WIDTH + NUM_POINT_FEATURES, _POINT_WIDTH)
+        self.exchanges = nn.ModuleList([_PointExchange(_POINT_WIDTH) for _ in range(_NUM_EXCHANGES)])
         self.last_norm = nn.LayerNorm(_POINT_WIDTH)
-        self.heads = nn.ModuleDict(
-            {name: nn.Linear(_POINT_WIDTH, 2 * p) for name, p in NUM_PARAMETERS.items()}
-        )
+        heads = {name: nn.Linear(_POINT_WIDTH, 2 * p) for name, p in NUM_PARAMETERS.items()}
+        self.heads = nn.ModuleDict(heads)
         self.neural_readers = Readers(NUM_PARAMETERS["neural"])
         self.pbr_readers = Readers(NUM_PARAMETERS["pbr"])
 
@@ -115,10 +105,21 @@ class SmallPrior(nn.Module):
         """The networks that read a material from planes."""
         return self.neural_readers if material == "neural" else self.pbr_readers
 
-    def forward(self, observations: Observations) -> Float[Tensor, "B N W"]:
-        """Embeddings of points: what their views show, and what other points of the object are like."""
-        seen = observations.visible.any(dim=-1)
-        points = self._points(observations)
+    def forward(self, o: Observations) -> Float[Tensor, "B N W"]:
+        """Embeddings of points: what their views show, in any order, and what other points of the object are like."""
+        reaching = o.irradiance * o.unshadowed
+        encoded = self.view_encoder(view_features(o.colours, o.cosines, o.mirrored, o.mirror_open, reaching))
+        seen = o.visible.any(dim=-1)
+        mask = o.visible[..., None].float()
+        total = mask.sum(dim=-2).clamp(min=1)
+        mean = (encoded * mask).sum(dim=-2) / total
+        spread = ((encoded - mean[..., None, :]).square() * mask).sum(dim=-2) / total
+        largest = torch.where(o.visible[..., None], encoded, -1e4).amax(dim=-2)
+        largest = torch.where(seen[..., None], largest, 0.0)
+        known = point_features(
+            o.positions, o.colours, o.visible, o.mirrored, o.mirror_open, o.irradiance, o.unshadowed
+        )
+        points = self.point_encoder(torch.cat([mean, (spread + 1e-6).sqrt(), largest, known], dim=-1))
         for exchange in self.exchanges:
             points = exchange(points, seen)
         return self.last_norm(points)
@@ -130,24 +131,8 @@ class SmallPrior(nn.Module):
         raw, raw_variance = self.heads[task](embeddings).chunk(2, dim=-1)
         return torch.sigmoid(raw), bounded_log_variance(raw_variance)
 
-    def _points(self, o: Observations) -> Float[Tensor, "B N W"]:
-        """Embeddings of points from all their views; the order of the views does not matter."""
-        reaching = o.irradiance * o.unshadowed
-        views = view_features(o.colours, o.cosines, o.mirrored, o.mirror_open, reaching)
-        encoded = self.view_encoder(views)
-        mask = o.visible[..., None].float()
-        total = mask.sum(dim=-2).clamp(min=1)
-        mean = (encoded * mask).sum(dim=-2) / total
-        spread = ((encoded - mean[..., None, :]).square() * mask).sum(dim=-2) / total
-        largest = torch.where(o.visible[..., None], encoded, -1e4).amax(dim=-2)
-        largest = torch.where(o.visible.any(dim=-1, keepdim=True), largest, 0.0)
-        known = point_features(
-            o.positions, o.colours, o.visible, o.mirrored, o.mirror_open, o.irradiance, o.unshadowed
-        )
-        return self.point_encoder(torch.cat([mean, (spread + 1e-6).sqrt(), largest, known], dim=-1))
 
-
-class PointExchange(nn.Module):
+class _PointExchange(nn.Module):
     """Attention of points to others of the same object, then a perceptron for each.
 
     One point is seen under one light from a few sides; others of the same material show it under more.
@@ -163,107 +148,20 @@ class PointExchange(nn.Module):
     def forward(self, points: Float[Tensor, "B N W"], seen: Bool[Tensor, "B N"]) -> Float[Tensor, "B N W"]:
         """Points after one exchange; those that no view sees ask, but are not asked."""
         normed = self.first_norm(points)
-        asked, known = normed[:, :MOST_ASKED], seen[:, :MOST_ASKED]
+        asked, known = normed[:, :_MOST_ASKED], seen[:, :_MOST_ASKED]
         known = known | ~known.any(dim=-1, keepdim=True)
         keys, values = self.keys_and_values(asked).chunk(2, dim=-1)
-        heads = [_in_heads(part) for part in (self.queries(normed), keys, values)]
+        heads = [
+            part.unflatten(-1, (_NUM_HEADS, -1)).transpose(1, 2)
+            for part in (self.queries(normed), keys, values)
+        ]
         found = functional.scaled_dot_product_attention(*heads, attn_mask=known[:, None, None])
         points = points + self.joined(found.transpose(1, 2).flatten(2))
         return points + self.perceptron(self.second_norm(points))
 
 
-def _in_heads(values: Float[Tensor, "B N W"]) -> Float[Tensor, "B H N w"]:
-    return values.unflatten(-1, (_NUM_HEADS, -1)).transpose(1, 2)
-
-
-def _perceptron(*sizes: int) -> nn.Sequential:
-    inputs, hidden, outputs = sizes
-    return nn.Sequential(nn.Linear(inputs, hidden), nn.SiLU(), nn.Linear(hidden, outputs), nn.SiLU())
-
-
-SHIPPED = Path(__file__).parent.parent / "weights"
-_WEIGHTS, _RECORD = "small.safetensors", "small.json"
-
-
-def write_small_prior(folder: Path, prior: SmallPrior, record: dict[str, Any]) -> None:
-    """Put a prior and its record into a folder.
-
-    Args:
-        record: How it was made, JSON; `decoder_sha256` is the decoder of its latents.
-    """
-    data = safetensors.torch.save({name: part.contiguous() for name, part in prior.state_dict().items()})
-    record = {**record, "sha256": hashlib.sha256(data).hexdigest()}
-    write_file(folder / _WEIGHTS, data)
-    write_file(folder / _RECORD, (json.dumps(record, indent=1) + "\n").encode())
-
-
-def read_small_prior(
-    material: MaterialName, folder: Path = SHIPPED, decoder_sha256: str | None = None
-) -> SmallPrior:
-    """The prior in a folder, ready to predict.
-
-    Args:
-        material: What it is to predict; only the neural one depends on the decoder.
-        decoder_sha256: Of the decoder in use; the shipped one's by default.
-    Raises:
-        RunError: a file is missing or damaged, or the latents belong to another decoder.
-    """
-    record = read_record(folder)
-    if material == "neural":
-        expected = shipped_decoder_sha256() if decoder_sha256 is None else decoder_sha256
-        _require_decoder(folder, record, expected)
-    path = folder / _WEIGHTS
-    try:
-        data = path.read_bytes()
-        if hashlib.sha256(data).hexdigest() != record.get("sha256"):
-            raise RunError(f"{path} is not the file that {_RECORD} describes; install the package again")
-        prior = SmallPrior()
-        prior.load_state_dict(safetensors.torch.load(data))
-    except (OSError, SafetensorError, RuntimeError) as error:
-        raise RunError(f"{path} can't be read as weights of the prior: {error}") from error
-    return prior.eval().requires_grad_(requires_grad=False)
-
-
-def read_record(folder: Path = SHIPPED) -> dict[str, Any]:
-    """How a prior was made.
-
-    Raises:
-        RunError: the record is missing or no JSON.
-    """
-    path = folder / _RECORD
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise RunError(f"{path} can't be read: {error}") from error
-
-
-def shipped_decoder_sha256() -> str:
-    """Of the weights of the neural material that come with the package.
-
-    Raises:
-        RunError: they are missing.
-    """
-    try:
-        return hashlib.sha256(neural.SHIPPED.read_bytes()).hexdigest()
-    except OSError as error:
-        raise RunError(f"{neural.SHIPPED} can't be read: {error}; install the package again") from error
-
-
-def _require_decoder(folder: Path, record: dict[str, Any], expected: str) -> None:
-    found = record.get("decoder_sha256")
-    if found != expected:
-        raise RunError(
-            f"the prior in {folder} was trained for the material decoder {str(found)[:12]}, but the decoder in use is "
-            f"{expected[:12]}: its latents would mean something else; train it again (python -m "
-            "tools.train_prior) or use --pipeline.model.material pbr"
-        )
-
-
-RESOLUTION = 32
-"""R of fitted planes: cells that hold several points each, whose errors average out."""
-_RATE = 0.05
-_SHRINKAGE = 1e-4
-"""Pulls texels that hardly a point reads to 0."""
+def _perceptron(inputs: int, width: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(inputs, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU())
 
 
 @dataclass(frozen=True)
@@ -283,15 +181,12 @@ def fit_loss(readers: Readers, planes: Float[Tensor, "B 3 C R R"], estimates: Es
     # Parameters that are known to 0.02 or better count the same: beyond that a few points would decide all.
     certain = torch.exp(-0.5 * said.clamp(min=-8.0))
     unsure = readers.log_variance(features) - said
-    return (
-        (error.square() * certain).mean()
-        + 0.02 * unsure.square().mean()
-        + _SHRINKAGE * planes.square().mean()
-    )
+    loss = (error.square() * certain).mean() + 0.02 * unsure.square().mean()
+    return loss + _SHRINKAGE * planes.square().mean()
 
 
 def fit_planes(readers: Readers, estimates: Estimates, steps: int = 120) -> Float[Tensor, "B 3 C R R"]:
-    """Planes of objects, fitted from 0; the readers stay as they are."""
+    """Planes of objects that the readers read back best, fitted from 0; the readers stay as they are."""
     with torch.enable_grad():
         count = len(estimates.positions)
         planes = torch.zeros(count, 3, NUM_CHANNELS, RESOLUTION, RESOLUTION, requires_grad=True)
@@ -301,12 +196,6 @@ def fit_planes(readers: Readers, estimates: Estimates, steps: int = 120) -> Floa
             planes.grad = gradient
             optimiser.step()
     return planes.detach()
-
-
-MOST_VIEWS = 12
-"""Views that are looked at; of more, those whose directions are farthest apart."""
-_NUM_POINTS = 3072
-_LEAST_ALPHA = 0.9
 
 
 def predict(
@@ -336,31 +225,22 @@ def predict(
     prior = read_small_prior(material) if prior is None else prior
     if ray_mesh.device.type != "cpu":
         ray_mesh = RayMesh(ray_mesh.mesh.to("cpu"))
-    environment = environment.to("cpu")
-    chosen = views[well_spread(views.cameras.camera_to_world[:, :, 3], MOST_VIEWS)]
+    chosen = views[well_spread(views.cameras.camera_to_world[:, :, 3], _MOST_VIEWS)]
     with torch.no_grad():
-        observations = observe(chosen, ray_mesh, environment, _NUM_POINTS, generator)
+        observations = _observe(chosen, ray_mesh, environment.to("cpu"), generator)
         said = prior.estimate(prior(observations), material)
     planes = fit_planes(prior.readers_of(material), Estimates(observations.positions, *said))[0]
-    return filled_triplane(prior, planes, material, resolution)
+    return _filled_triplane(prior, planes, material, resolution)
 
 
-def observe(
-    views: PosedViews,
-    ray_mesh: RayMesh,
-    environment: Environment,
-    num_points: int,
-    generator: torch.Generator,
+def _observe(
+    views: PosedViews, ray_mesh: RayMesh, environment: Environment, generator: torch.Generator
 ) -> Observations:
-    """What views show of points of the mesh; B is 1.
-
-    Raises:
-        SceneError: no view shows any of the points.
-    """
-    points = sample_surface(ray_mesh.mesh, num_points, generator)
+    """What views show of points of the mesh; B is 1."""
+    points = sample_surface(ray_mesh.mesh, _NUM_POINTS, generator)
     eyes = views.cameras.camera_to_world[:, :, 3]
     known = known_light(points, eyes, ray_mesh, environment, generator)
-    colours, shown = read_colours(views, points.positions)
+    colours, shown = _read_colours(views, points.positions)
     visible = known.visible & shown
     if not bool(visible.any()):
         raise SceneError(
@@ -369,19 +249,12 @@ def observe(
             "right?"
         )
     mean = environment.mean_radiance().mean().clamp(min=1e-12)
-    return Observations(
-        positions=points.positions[None],
-        colours=torch.where(visible[..., None], colours / mean, 0.0)[None],
-        visible=visible[None],
-        cosines=known.cosines[None],
-        mirrored=known.mirrored[None],
-        mirror_open=known.mirror_open[None],
-        irradiance=known.irradiance[None],
-        unshadowed=known.unshadowed[None],
-    )
+    colours = torch.where(visible[..., None], colours / mean, 0.0)
+    parts = {**vars(known), "positions": points.positions, "colours": colours, "visible": visible}
+    return Observations(**{name: part[None] for name, part in parts.items()})
 
 
-def read_colours(
+def _read_colours(
     views: PosedViews, positions: Float[Tensor, "N 3"]
 ) -> tuple[Float[Tensor, "N V 3"], Bool[Tensor, "N V"]]:
     """Colours of points in each picture, bilinear, and whether the object is there."""
@@ -397,16 +270,72 @@ def read_colours(
     return torch.stack(colours, dim=1), torch.stack(shown, dim=1)
 
 
-def filled_triplane(
+def _filled_triplane(
     prior: SmallPrior, planes: Float[Tensor, "3 C R R"], material: MaterialName, resolution: int
 ) -> Triplane:
     """Planes in another resolution with copies of the prior's networks for a material."""
-    readers = prior.readers_of(material)
+    readers, size = prior.readers_of(material), (resolution, resolution)
     triplane = Triplane(readers.num_parameters, resolution, planes.shape[1])
     triplane.readers.load_state_dict(readers.state_dict())
-    enlarged = functional.interpolate(
-        planes, size=(resolution, resolution), mode="bilinear", align_corners=True
-    )
     with torch.no_grad():
-        triplane.planes.copy_(enlarged)
+        triplane.planes.copy_(functional.interpolate(planes, size, mode="bilinear", align_corners=True))
     return triplane
+
+
+def read_small_prior(
+    material: MaterialName, folder: Path = SHIPPED, decoder_sha256: str | None = None
+) -> SmallPrior:
+    """The prior in a folder, ready to predict.
+
+    Args:
+        material: What it is to predict. Only `neural` depends on the decoder: latents mean something only beside the
+            one that they were made for, so the record has its SHA-256.
+        decoder_sha256: Of the decoder in use; the shipped one's by default.
+    Raises:
+        RunError: a file is missing or damaged, or the latents belong to another decoder.
+    """
+    record = read_record(folder)
+    if material == "neural":
+        expected = shipped_decoder_sha256() if decoder_sha256 is None else decoder_sha256
+        if record.get("decoder_sha256") != expected:
+            raise RunError(
+                f"the prior in {folder} was trained for the material decoder "
+                f"{str(record.get('decoder_sha256'))[:12]}, but the decoder in use is {expected[:12]}: its latents "
+                "would mean something else; train it again (python -m tools.train_prior) or use "
+                "--pipeline.model.material pbr"
+            )
+    path = folder / WEIGHTS
+    try:
+        data = path.read_bytes()
+        if hashlib.sha256(data).hexdigest() != record.get("sha256"):
+            raise RunError(f"{path} is not the file that {RECORD} describes; install the package again")
+        prior = SmallPrior()
+        prior.load_state_dict(safetensors.torch.load(data))
+    except (OSError, SafetensorError, RuntimeError) as error:
+        raise RunError(f"{path} can't be read as weights of the prior: {error}") from error
+    return prior.eval().requires_grad_(requires_grad=False)
+
+
+def read_record(folder: Path = SHIPPED) -> dict[str, Any]:
+    """How a prior was made.
+
+    Raises:
+        RunError: the record is missing or no JSON.
+    """
+    path = folder / RECORD
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise RunError(f"{path} can't be read: {error}") from error
+
+
+def shipped_decoder_sha256() -> str:
+    """Of the weights of the neural material that come with the package.
+
+    Raises:
+        RunError: they are missing.
+    """
+    try:
+        return hashlib.sha256(neural.SHIPPED.read_bytes()).hexdigest()
+    except OSError as error:
+        raise RunError(f"{neural.SHIPPED} can't be read: {error}; install the package again") from error

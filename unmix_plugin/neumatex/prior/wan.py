@@ -1,17 +1,16 @@
 """The published prior's shape: Wan2.1's video transformer and its autoencoder, from 23 views to three planes.
 
+Its published weights are not public, and neither is how eleven frames become three planes. Here a linear layer mixes
+the frames of each place. Weights of Wan2.1 itself are what training starts from: with them alone the planes mean
+nothing. The prior that is trained and shipped is `small`.
+
+Weights are read from a folder in diffusers' layout, that of Wan-AI/Wan2.1-T2V-1.3B-Diffusers: transformer/ and vae/,
+each config.json and safetensors; the text encoder is not needed. A file `null_text.safetensors` with one tensor
+`embedding` (512 x 4096), the text encoder's output for an empty prompt, is used where there is one.
+
 Notation: `B` objects, `S` pixels along an edge of a view and texels along an edge of a plane (512 as published), `L`
 the same in latents (S / 8), `Z` channels of latents, `F` their frames (11 as published), `T` tokens of `D` numbers for
 a text. Needs the extra `lmrm` (diffusers).
-
-The published weights of this prior are not public, and neither is how eleven frames become three planes. Here a linear
-layer mixes the frames of each place. Weights of Wan2.1 itself are what training starts from: with them alone the planes
-mean nothing. The prior that is trained and shipped is `prior.small`.
-
-Weights of Wan2.1 from a folder in diffusers' layout: transformer/ and vae/, each config.json and safetensors.
-
-The folder is that of Wan-AI/Wan2.1-T2V-1.3B-Diffusers; its text encoder is not needed. A file `null_text.safetensors`
-with one tensor `embedding` (512 x 4096), the text encoder's output for an empty prompt, is used where there is one.
 """
 
 from __future__ import annotations
@@ -195,12 +194,13 @@ def _read_model(model_class: Any, folder: Path) -> Any:
     config = _read_config(folder / "config.json", model_class)
     with torch.device("meta"):
         expected = model_class.from_config(config)
-    _compare(folder, expected, _shapes(folder))
+    paths = sorted(folder.glob("*.safetensors"))
+    if not paths:
+        raise ConfigError(f"{folder} has no *.safetensors; weights in other formats are not read")
+    _compare(folder, expected, paths)
     model = model_class.from_config(config)
-    for path in _files(folder):
-        model.load_state_dict(
-            load_file(path), strict=False
-        )  # every tensor was found to be in one of the files
+    for path in paths:  # every tensor was found to be in one of them
+        model.load_state_dict(load_file(path), strict=False)
     return model
 
 
@@ -219,27 +219,15 @@ def _read_config(path: Path, model_class: type) -> dict[str, Any]:
     return config
 
 
-def _files(folder: Path) -> list[Path]:
-    paths = sorted(folder.glob("*.safetensors"))
-    if not paths:
-        raise ConfigError(f"{folder} has no *.safetensors; weights in other formats are not read")
-    return paths
-
-
-def _shapes(folder: Path) -> dict[str, tuple[int, ...]]:
-    """Shape of every tensor in a folder's weights, without reading them."""
-    return {name: shape for path in _files(folder) for name, shape in _file_shapes(path).items()}
-
-
-def _file_shapes(path: Path) -> dict[str, tuple[int, ...]]:
-    try:
-        with safe_open(path, framework="pt") as file:
-            return {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118
-    except (OSError, SafetensorError) as error:
-        raise ConfigError(f"{path} can't be read: {error}; fetch it again") from error
-
-
-def _compare(folder: Path, expected: ModelMixin, found: dict[str, tuple[int, ...]]) -> None:
+def _compare(folder: Path, expected: ModelMixin, paths: list[Path]) -> None:
+    """Refuse files without a tensor, or with one of another shape; no tensor is read for that."""
+    found: dict[str, tuple[int, ...]] = {}
+    for path in paths:
+        try:
+            with safe_open(path, framework="pt") as file:
+                found |= {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118
+        except (OSError, SafetensorError) as error:  # noqa: PERF203 - the file is named
+            raise ConfigError(f"{path} can't be read: {error}; fetch it again") from error
     wanted = {name: tuple(tensor.shape) for name, tensor in expected.state_dict().items()}
     missing = sorted(wanted.keys() - found.keys())
     if missing:

@@ -127,8 +127,8 @@ class Environment:
         return self._weights / self._weights.sum() / self._solid_angles[:, None]
 
     @cached_property
-    def _inversion(self) -> PictureInversion:
-        return PictureInversion.of(self._weights)
+    def _inversion(self) -> _PictureInversion:
+        return _PictureInversion.of(self._weights)
 
 
 def directions_of_pixels(height: int, width: int) -> Float[Tensor, "H W 3"]:
@@ -144,7 +144,7 @@ def directions_of_pixels(height: int, width: int) -> Float[Tensor, "H W 3"]:
 
 
 @dataclass(frozen=True)
-class PictureInversion:
+class _PictureInversion:
     """Cumulative shares of a picture's pixels."""
 
     rows: Float64[Tensor, " row_edges"]
@@ -155,12 +155,12 @@ class PictureInversion:
     """Share up to and with each pixel of its row, plus the row's index: one increasing list."""
 
     @staticmethod
-    def of(weights: Float[Tensor, "H W"]) -> PictureInversion:
+    def of(weights: Float[Tensor, "H W"]) -> _PictureInversion:
         """For weights of at least 0, not all of them 0."""
         weights = weights.double()
         rows, columns = _cumulative(weights.sum(dim=1)), _cumulative(weights)
         indices = torch.arange(len(weights), dtype=torch.float64, device=weights.device)
-        return PictureInversion(rows, columns, (columns[:, 1:] + indices[:, None]).reshape(-1))
+        return _PictureInversion(rows, columns, (columns[:, 1:] + indices[:, None]).reshape(-1))
 
     def draw(
         self, uniforms: Float[Tensor, "N 2"]

@@ -1,33 +1,7 @@
-"""What a family of materials offers: evaluation and importance sampling of its reflectances.
+"""Families of materials: reflectances with a common set of parameters, and the sampling of their directions.
 
-Notation: `N` surface points, `P` parameters of a material, `C` colours or bands. Directions are unit vectors in the
-local frame of a point, whose z axis is the shading normal; `wi` points to the light, `wo` to the eye.
-
-What families share whose directions to the light are drawn from a cosine lobe and visible GGX normals.
-
-Materials that are a stack of layers over a diffuse base.
-
-Notation as in `family`.
-
-Analytic layered materials: the truth that the neural decoder learns, and procedural objects are made of.
-
-Notation as in `family`.
-
-The metallic-roughness materials of glTF 2.0: five numbers a point.
-
-Notation as in `family`; inside, as in `microfacet`. As published these materials may reflect up to twice the light at
-grazing angles, where the diffuse part does not know how much the surface reflects. That is kept: files of this kind
-mean just this.
-
-Spectral materials: a diffuse base that is a mixture of endmember reflectances, and a grey gloss above it.
-
-Notation as in `family`, with `B` bands for its colours and `K` endmembers. With abundances a, endmembers E and the
-albedo A of the gloss for light from one direction,
-
-    f = (1 - A(wi)) (1 - A(wo)) / (1 - mean A) (a E) / pi + gloss(wi, wo)
-
-The gloss is one GGX lobe, the same in all bands. What it reflects does not reach the base, so a white base under it
-reflects all light, and no material more than it gets.
+Notation: `N` points, `P` parameters of a material, `C` colours or bands `B`, `K` endmembers. Directions are unit
+vectors in the local frame of a point, whose z axis is the shading normal; `wi` points to the light, `wo` to the eye.
 """
 
 from __future__ import annotations
@@ -59,6 +33,10 @@ from unmix_plugin.neumatex.tracing.microfacet import (
     schlick,
     visibility,
 )
+
+NUM_GLOSS = 2
+"""Parameters of the gloss of `SpectralFamily`."""
+_DIELECTRIC_F0 = 0.04
 
 
 @runtime_checkable
@@ -116,14 +94,13 @@ class DecodableFamily(MaterialFamily, Protocol):
         ...
 
 
-class LobeFamily(ABC):
-    """Sampling by a mixture of lobes; notation as in `family`."""
+class _LobeFamily(ABC):
+    """A `MaterialFamily` whose directions are drawn from a cosine lobe and visible GGX normals."""
 
     @torch.no_grad()
     def sample(
         self, parameters: Float[Tensor, "N P"], wo: Float[Tensor, "N 3"], uniforms: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N 3"]:
-        """Directions to the light, drawn from a cosine lobe and visible GGX normals."""
         wo = wo.T.contiguous()
         return self._mixture(parameters, wo).sample(wo, uniforms.T.contiguous()).T.contiguous()
 
@@ -131,7 +108,6 @@ class LobeFamily(ABC):
     def density(
         self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
     ) -> Float[Tensor, " N"]:
-        """Probability density of `sample`, 1/sr."""
         wo = wo.T.contiguous()
         return self._mixture(parameters, wo).density(wi.T.contiguous(), wo)
 
@@ -140,8 +116,8 @@ class LobeFamily(ABC):
         """The lobes of each point, seen along a direction."""
 
 
-class StackFamily(ABC):
-    """Parameters of a material; the first three are its diffuse colour, linear, and all of them give its layers."""
+class StackFamily(_LobeFamily):
+    """Layers over a diffuse base: the first three parameters are its linear colour, and all of them give the layers."""
 
     num_colours = 3
 
@@ -152,43 +128,25 @@ class StackFamily(ABC):
     def evaluate(
         self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N C"]:
-        """Reflectance, 1/sr, without the cosine: what passes the layers times the base over pi, and what they
-        reflect; 0 where a direction is below the surface."""
         passed, specular = self.stack(parameters).reflectance(wi.T.contiguous(), wo.T.contiguous())
         return ((passed / math.pi) * self.diffuse_colour(parameters).T + specular).T
-
-    @torch.no_grad()
-    def sample(
-        self, parameters: Float[Tensor, "N P"], wo: Float[Tensor, "N 3"], uniforms: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, "N 3"]:
-        """Directions to the light, drawn from a cosine lobe and three GGX lobes."""
-        wo = wo.T.contiguous()
-        mixture = self.stack(parameters).mixture(wo, self.diffuse_colour(parameters).T)
-        return mixture.sample(wo, uniforms.T.contiguous()).T.contiguous()
-
-    @torch.no_grad()
-    def density(
-        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, " N"]:
-        """Probability density of `sample`, 1/sr."""
-        wo = wo.T.contiguous()
-        mixture = self.stack(parameters).mixture(wo, self.diffuse_colour(parameters).T)
-        return mixture.density(wi.T.contiguous(), wo)
 
     def diffuse_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
         """Linear albedo of what is below the layers; a metal has nothing there, and the colour says nothing."""
         return parameters[:, :3]
 
     def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
-        """Linear base colour: what a metal reflects, and the diffuse albedo of everything else."""
         layers = self.stack(parameters)
         return torch.lerp(self.diffuse_colour(parameters), layers.metal_colour.T, layers.metallicity[:, None])
 
+    def _mixture(self, parameters: Tensor, wo: Tensor) -> LobeMixture:
+        return self.stack(parameters).mixture(wo, self.diffuse_colour(parameters).T)
+
 
 class LayeredFamily(StackFamily):
-    """Dust over sheen over clear coat over a surface with haze over a base that is diffuse or metal.
+    """Analytic layered materials: the truth that the neural decoder learns, and procedural objects are made of.
 
-    Parameters, each in [0, 1]:
+    Dust over sheen over clear coat over a surface with haze over a base that is diffuse or metal. Parameters in [0, 1]:
 
     | index | name | meaning |
     | --- | --- | --- |
@@ -213,7 +171,6 @@ class LayeredFamily(StackFamily):
     num_parameters = len(PARAMETERS)
 
     def stack(self, parameters: Float[Tensor, "N P"]) -> LayerStack:
-        """The layers that the parameters stand for."""
         base, scalars = parameters.T.contiguous().split([3, parameters.shape[1] - 3])
         metallicity, roughness, level, coat, coat_roughness, *others = scalars.unbind(0)
         sheen, sheen_roughness, tint, haze, spread, dust = others
@@ -232,11 +189,11 @@ class LayeredFamily(StackFamily):
         )
 
 
-_DIELECTRIC_F0 = 0.04
+class PbrFamily(_LobeFamily):
+    """Metallic-roughness materials. Parameters: base colour (0 to 2, linear), roughness (3), metallicity (4).
 
-
-class PbrFamily(LobeFamily):
-    """Parameters: base colour (0 to 2, linear), roughness (3), metallicity (4).
+    As published they may reflect up to twice the light at grazing angles, where the diffuse part does not know how much
+    the surface reflects. That is kept: files of this kind mean just this.
 
     Source:
         glTF 2.0 specification, appendix B.
@@ -249,8 +206,7 @@ class PbrFamily(LobeFamily):
     def evaluate(
         self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N C"]:
-        """Reflectance, 1/sr, without the cosine; 0 where a direction is below the surface."""
-        base, roughness, metallicity = _columns(parameters)
+        base, roughness, metallicity = parameters.T.contiguous().split([3, 1, 1])
         wi, wo = wi.T.contiguous(), wo.T.contiguous()
         half = half_vectors(wi, wo)
         f0 = _DIELECTRIC_F0 + metallicity * (base - _DIELECTRIC_F0)
@@ -261,31 +217,27 @@ class PbrFamily(LobeFamily):
         return ((diffuse + fresnel * lobe) * ((wi[2] > 0) & (wo[2] > 0))).T
 
     def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
-        """Linear base colour; of metals, the colour of what they reflect."""
         return parameters[:, :3]
 
     def _mixture(self, parameters: Tensor, wo: Tensor) -> LobeMixture:
-        base, roughness, metallicity = _columns(parameters)
+        base, roughness, metallicity = parameters.T.contiguous().split([3, 1, 1])
         f0 = _DIELECTRIC_F0 + metallicity * (base.mean(0) - _DIELECTRIC_F0)
         specular = f0 + (1.0 - f0) * schlick(wo[2])
         diffuse = (1.0 - metallicity) * base.mean(0) * (1.0 - f0)
         return LobeMixture.of_albedos(alpha_of(roughness), diffuse[0], specular)
 
 
-def _columns(parameters: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Base colour (3 N), roughness (1 N) and metallicity (1 N)."""
-    base, roughness, metallicity = parameters.T.contiguous().split([3, 1, 1])
-    return base, roughness, metallicity
+class SpectralFamily(_LobeFamily):
+    """A diffuse base that is a mixture of endmember reflectances, and a grey gloss above it.
 
+    Parameters: abundances (0 to K - 1, at least 0, sum 1), roughness (K), specular level (K + 1). With abundances a,
+    endmembers E and the albedo A of the gloss for light from one direction,
 
-NUM_GLOSS = 2
-"""Parameters of the gloss."""
+        f = (1 - A(wi)) (1 - A(wo)) / (1 - mean A) (a E) / pi + gloss(wi, wo)
 
-
-class SpectralFamily(LobeFamily):
-    """Parameters: abundances (0 to K - 1, at least 0, sum 1), roughness (K), specular level (K + 1).
-
-    The gloss reflects the square of the specular level at normal incidence: 0.2 is a common dielectric's 4 %.
+    The gloss is one GGX lobe, the same in all bands. It reflects the square of the specular level at normal incidence:
+    0.2 is a common dielectric's 4 %. What it reflects does not reach the base, so a white base under it reflects all
+    light, and no material more than it gets.
     """
 
     def __init__(self, endmembers: Float[Tensor, "K B"], gains: Float[Tensor, " K"] | None = None) -> None:
@@ -326,7 +278,6 @@ class SpectralFamily(LobeFamily):
     def evaluate(
         self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N C"]:
-        """Reflectance, 1/sr, without the cosine; 0 where a direction is below the surface."""
         roughness, f0 = self._gloss(parameters)
         wi, wo = wi.T.contiguous(), wo.T.contiguous()
         half = half_vectors(wi, wo)
@@ -355,9 +306,7 @@ class SpectralFamily(LobeFamily):
         return LobeMixture.of_albedos(alpha_of(roughness), diffuse, 1.0 - passed)
 
 
-def _passing(
-    roughness: Float[Tensor, "1 N"], f0: Float[Tensor, "1 N"], cosine: Float[Tensor, " N"]
-) -> Float[Tensor, "1 N"]:
+def _passing(roughness: Tensor, f0: Tensor, cosine: Float[Tensor, " N"]) -> Float[Tensor, "1 N"]:
     """Share of light from a direction that the gloss does not reflect."""
     a, b = ggx_albedo(roughness, cosine.clamp_min(0.0))
     return 1.0 - (f0 * a + b)

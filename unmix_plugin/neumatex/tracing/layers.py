@@ -1,22 +1,13 @@
-"""A thin coat of dust: grey-brown, thicker to see along it than through it.
+"""Layers over a diffuse or metallic base: dust, sheen of cloth, clear coat, a glossy surface with haze.
 
-What a direction passes through falls with its cosine mu as `(1 - cover)^(1 / mu)`; the rest is scattered such that a
-white dust would lose no light.
+From the top, each layer reflects its share and lets `1 - albedo` of each direction through to what is below, on the way
+in and on the way out. So the stack is reciprocal and never reflects more than it gets. All of it is
+`passed * base / pi + specular`, where only `passed` is the part that meets the diffuse base colour.
 
-Sheen of cloth: the distribution called Charlie.
+Albedos of the lobes are integrated once and looked up afterwards. A table's rows are perceptual roughness from 0 to 1,
+its columns the square root of the cosine from 0 to 1: albedos change fastest near the horizon.
 
 Notation as in `microfacet`.
-
-Directional albedos of the lobes, integrated once and looked up afterwards.
-
-A table's rows are perceptual roughness from 0 to 1, its columns the square root of the cosine from 0 to 1: albedos
-change fastest near the horizon.
-
-Layers over a diffuse or metallic base: dust, sheen, clear coat, a glossy surface with haze.
-
-Notation as in `microfacet`. From the top, each layer reflects its share and lets `1 - albedo` of each direction through
-to what is below, on the way in and on the way out. So the stack is reciprocal and never reflects more than it gets.
-All of it is `passed * base / pi + specular`, where only `passed` is the part that meets the diffuse base colour.
 """
 
 import math
@@ -41,39 +32,41 @@ from unmix_plugin.neumatex.tracing.microfacet import (
 
 LARGEST_COVER = 0.7
 DUST_COLOUR = (0.52, 0.46, 0.38)
-"""Linear RGB."""
+"""Linear RGB, grey-brown."""
+DUST_NODES = (0.03376524, 0.16939531, 0.38069041, 0.61930959, 0.83060469, 0.96623476)
+DUST_WEIGHTS = (0.08566225, 0.18038079, 0.23395697, 0.23395697, 0.18038079, 0.08566225)
+"""Of Gauss and Legendre on [0, 1]."""
+SMALLEST_SHEEN_WIDTH = 0.22
+"""Narrower sheen would reflect more than all light near the horizon."""
+LARGEST_DIELECTRIC_F0 = 0.08
+LARGEST_COAT_ROUGHNESS = 0.6
+LARGEST_SHEEN = 0.6
+LARGEST_HAZE = 0.7
+_COAT_F0 = 0.04
+_ROWS, _COLUMNS, _STRATA = 32, 48, 32
 
 
-def dust_passed(cover: Float[Tensor, " N"], cosine: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
+def _dust_passed(cover: Float[Tensor, " N"], cosine: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
     """Share of light along a direction that passes the dust.
 
-    >>> dust_passed(torch.tensor([0.5]), torch.tensor([0.5]))
+    >>> _dust_passed(torch.tensor([0.5]), torch.tensor([0.5]))
     tensor([0.2500])
     """
     return torch.exp(torch.log1p(-cover) / cosine.clamp_min(SMALLEST_COSINE))
 
 
-def mean_held(cover: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
+def _mean_held(cover: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
     """Share of cosine-weighted light of the whole hemisphere that the dust holds back.
 
     With tau = -log(1 - cover) it is 1 - 2 E3(tau); the exponential integral is summed at Gauss-Legendre nodes.
     """
     log_passed = torch.log1p(-cover)
-    nodes = zip(_NODES, _WEIGHTS, strict=True)
+    nodes = zip(DUST_NODES, DUST_WEIGHTS, strict=True)
     passed = [2.0 * weight * mu * torch.exp(log_passed * (1.0 / mu)) for mu, weight in nodes]
     return 1.0 - torch.stack(passed).sum(0)
 
 
-# Six nodes of Gauss and Legendre on [0, 1].
-_NODES = (0.03376524, 0.16939531, 0.38069041, 0.61930959, 0.83060469, 0.96623476)
-_WEIGHTS = (0.08566225, 0.18038079, 0.23395697, 0.23395697, 0.18038079, 0.08566225)
-
-
-_SMALLEST_WIDTH = 0.22
-"""Narrower ones would reflect more than all light near the horizon."""
-
-
-def sheen_reflection(
+def _sheen_reflection(
     roughness: Float[Tensor, " N"],
     half: Float[Tensor, "3 N"],
     n_i: Float[Tensor, " N"],
@@ -84,14 +77,11 @@ def sheen_reflection(
     Source:
         Estevez and Kulla 2017, Production friendly microfacet sheen BRDF; visibility of Ashikhmin and Premoze.
     """
-    exponent = 1.0 / (_SMALLEST_WIDTH + (1.0 - _SMALLEST_WIDTH) * roughness)
+    exponent = 1.0 / (SMALLEST_SHEEN_WIDTH + (1.0 - SMALLEST_SHEEN_WIDTH) * roughness)
     log_sine2 = torch.log((half[0] * half[0] + half[1] * half[1]).clamp_min(1e-12))
     density = (2.0 + exponent) / (2.0 * math.pi) * torch.exp(exponent * (0.5 * log_sine2))
     n_i, n_o = n_i.clamp_min(SMALLEST_COSINE), n_o.clamp_min(SMALLEST_COSINE)
     return density / (4.0 * (n_i + n_o - n_i * n_o))
-
-
-_ROWS, _COLUMNS, _STRATA = 32, 48, 32
 
 
 def ggx_albedo(
@@ -102,7 +92,7 @@ def ggx_albedo(
     return a, b
 
 
-def sheen_albedo(roughness: Float[Tensor, " N"], cosine: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
+def _sheen_albedo(roughness: Float[Tensor, " N"], cosine: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
     """Directional albedo of white sheen, [0, 1]."""
     return _look_up(_sheen_cells(roughness.device), roughness[None], cosine)[0, 0]
 
@@ -120,7 +110,7 @@ def mean_ggx_albedo(roughness: Float[Tensor, "K N"]) -> tuple[Float[Tensor, "K N
 @lru_cache(maxsize=1)
 def ggx_table() -> Float[Tensor, "R M 2"]:
     """Quasi Monte Carlo over visible normals, on a grid of strata."""
-    roughness, cosine = _nodes(_COLUMNS, alpha_of(torch.linspace(0.0, 1.0, _ROWS)))
+    roughness, cosine = _nodes(alpha_of(torch.linspace(0.0, 1.0, _ROWS)))
     table = torch.empty(_ROWS * _COLUMNS, 2)
     steps = (torch.arange(_STRATA) + 0.5) / _STRATA
     uniforms = torch.cartesian_prod(steps, steps).T
@@ -140,7 +130,7 @@ def ggx_table() -> Float[Tensor, "R M 2"]:
 @lru_cache(maxsize=1)
 def sheen_table() -> Float[Tensor, "R M 1"]:
     """A product rule over the hemisphere."""
-    roughness, cosine = _nodes(_COLUMNS, torch.linspace(0.0, 1.0, _ROWS))
+    roughness, cosine = _nodes(torch.linspace(0.0, 1.0, _ROWS))
     steps = (torch.arange(2 * _STRATA) + 0.5) / (2 * _STRATA)
     u, v = torch.cartesian_prod(steps, steps).unbind(-1)
     # Squared steps crowd at the horizon; du of the cosine is 2 u.
@@ -150,24 +140,18 @@ def sheen_table() -> Float[Tensor, "R M 1"]:
     table = torch.empty(_ROWS * _COLUMNS, 1)
     for node in range(_ROWS * _COLUMNS):
         wo = _direction(cosine[node])[:, None].expand_as(wi)
-        value = sheen_reflection(roughness[node].expand_as(wi_z), half_vectors(wi, wo), wi_z, wo[2])
+        value = _sheen_reflection(roughness[node].expand_as(wi_z), half_vectors(wi, wo), wi_z, wo[2])
         table[node] = (value * wi_z * weight).mean() * 2.0 * math.pi
     return table.reshape(_ROWS, _COLUMNS, 1)
 
 
-def _nodes(columns: int, rows: Tensor) -> tuple[Tensor, Tensor]:
-    cosine = torch.linspace(0.0, 1.0, columns).square().clamp_min(SMALLEST_COSINE)
-    return rows.repeat_interleave(columns), cosine.repeat(len(rows))
+def _nodes(rows: Tensor) -> tuple[Tensor, Tensor]:
+    cosine = torch.linspace(0.0, 1.0, _COLUMNS).square().clamp_min(SMALLEST_COSINE)
+    return rows.repeat_interleave(_COLUMNS), cosine.repeat(len(rows))
 
 
 def _direction(cosine: Tensor) -> Tensor:
     return torch.stack([torch.sqrt(1.0 - cosine * cosine), torch.zeros_like(cosine), cosine])
-
-
-def _mean(table: Tensor) -> Tensor:
-    """Average over directions, row by row: the integral of 2 mu E(mu), with mu the square of the column."""
-    s = torch.linspace(0.0, 1.0, table.shape[1])
-    return torch.trapezoid(4.0 * s[:, None] ** 3 * table, s, dim=1)
 
 
 @lru_cache(maxsize=4)
@@ -178,7 +162,9 @@ def _ggx_cells(device: torch.device) -> Tensor:
 @lru_cache(maxsize=4)
 def _ggx_means(device: torch.device) -> tuple[Tensor, Tensor]:
     """Means of each row, (2, rows), and their rise to the next row."""
-    means = _mean(ggx_table()).T.contiguous().to(device)
+    # The integral of 2 mu E(mu), with mu the square of the column.
+    s = torch.linspace(0.0, 1.0, _COLUMNS)
+    means = torch.trapezoid(4.0 * s[:, None] ** 3 * ggx_table(), s, dim=1).T.contiguous().to(device)
     return means, means.diff(dim=1)
 
 
@@ -206,13 +192,6 @@ def _look_up(cells: Tensor, roughness: Tensor, cosine: Tensor) -> Tensor:
     )
     x = at - column
     return (corner + x * right) + (roughness * (_ROWS - 1) - row) * (below + x * twist)
-
-
-_COAT_F0 = 0.04
-LARGEST_DIELECTRIC_F0 = 0.08
-LARGEST_COAT_ROUGHNESS = 0.6
-LARGEST_SHEEN = 0.6
-LARGEST_HAZE = 0.7
 
 
 @dataclass(frozen=True)
@@ -245,7 +224,7 @@ class LayerStack:
 
         Both are 0 where a direction is below the surface.
         """
-        light, eye = self.passing(wi[2]), self.passing(wo[2])
+        light, eye = self._passing(wi[2]), self._passing(wo[2])
         dust = light.dust * eye.dust
         sheen = dust * light.sheen * eye.sheen
         coat = sheen * light.coat * eye.coat
@@ -256,7 +235,7 @@ class LayerStack:
         coat_lobe, sharp, hazy = lobes.unbind(0)
         of_coat = self.coat_weight * (_COAT_F0 + (1.0 - _COAT_F0) * edge) * coat_lobe
         surface = coat * self._mixed(sharp, hazy)
-        of_sheen = dust * sheen_reflection(self.sheen_roughness, half, wi[2], wo[2])
+        of_sheen = dust * _sheen_reflection(self.sheen_roughness, half, wi[2], wo[2])
         # f0 + (1 - f0) edge, of three colours, with what has none apart.
         specular = self.f0 * (surface * (1.0 - edge)) + (surface * edge + sheen * of_coat)
         specular = specular + of_sheen * self.sheen_colour + self._dust(light.dust, eye.dust)
@@ -267,7 +246,7 @@ class LayerStack:
     def mixture(self, wo: Float[Tensor, "3 N"], base: Float[Tensor, "C N"]) -> LobeMixture:
         """A density about like the reflectance times the cosine; without gradient."""
         with torch.no_grad():
-            eye = self.passing(wo[2])
+            eye = self._passing(wo[2])
             f0 = self.f0.mean(0)
             edge = schlick(wo[2]) * (1.0 - self.roughness[1])
             surface = eye.dust * eye.sheen * eye.coat * (f0 + (1.0 - f0) * edge)
@@ -283,17 +262,17 @@ class LayerStack:
         return self.dielectric_f0 + self.metallicity * (self.metal_colour - self.dielectric_f0)
 
     def _dust(self, passed_light: Tensor, passed_eye: Tensor) -> Tensor:
-        held = (1.0 - passed_light) * (1.0 - passed_eye) / mean_held(self.dust_cover).clamp_min(1e-6)
+        held = (1.0 - passed_light) * (1.0 - passed_eye) / _mean_held(self.dust_cover).clamp_min(1e-6)
         return held * (torch.tensor(DUST_COLOUR, device=held.device)[:, None] / math.pi)
 
-    def passing(self, cosine: Float[Tensor, " N"]) -> "Passing":
+    def _passing(self, cosine: Float[Tensor, " N"]) -> "_Passing":
         """What each layer lets through from one direction to what is below."""
         cosine = cosine.clamp_min(0.0)
         (coat_a, *surface_a), (coat_b, *surface_b) = (x.unbind(0) for x in ggx_albedo(self.roughness, cosine))
         coat = 1.0 - self.coat_weight * (_COAT_F0 * coat_a + coat_b)
         surface = 1.0 - (self.dielectric_f0 * self._mixed(*surface_a) + self._mixed(*surface_b))
-        sheen = 1.0 - self.sheen_colour.amax(0) * sheen_albedo(self.sheen_roughness, cosine)
-        return Passing(dust_passed(self.dust_cover, cosine), sheen, coat, surface)
+        sheen = 1.0 - self.sheen_colour.amax(0) * _sheen_albedo(self.sheen_roughness, cosine)
+        return _Passing(_dust_passed(self.dust_cover, cosine), sheen, coat, surface)
 
     def _surface_mean(self) -> Tensor:
         """Mean of `surface` over directions, which makes a white base under it lose no light."""
@@ -305,7 +284,7 @@ class LayerStack:
 
 
 @dataclass(frozen=True)
-class Passing:
+class _Passing:
     """Shares of light along one direction that pass each layer, (N)."""
 
     dust: Tensor

@@ -52,14 +52,14 @@ def read_environment(path: Path, rotation_deg: float = 0.0, exposure_stops: floa
     """
     if not path.is_file():
         raise SceneError(f"{path}: there is no such environment map")
-    readers = {".exr": _read_exr, ".hdr": read_hdr}
+    readers = {".exr": _read_exr, ".hdr": _read_hdr}
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise SceneError(
             f"{path}: is not an environment map; convert it to one of {', '.join(ENVIRONMENT_SUFFIXES)}"
         )
     image = reader(path)
-    check_environment(path, image)
+    _check_environment(path, image)
     return Environment(torch.from_numpy(np.ascontiguousarray(image)), rotation_deg, exposure_stops)
 
 
@@ -77,7 +77,7 @@ def _read_exr(path: Path) -> np.ndarray:
     return np.stack([channels[name].astype(np.float32) for name in names], axis=-1)
 
 
-def check_environment(path: Path, image: np.ndarray) -> None:
+def _check_environment(path: Path, image: np.ndarray) -> None:
     height, width = image.shape[:2]
     if width != 2 * height:
         raise SceneError(
@@ -105,7 +105,7 @@ _NEW_RUNS = (8, 0x7FFF)
 """Widths, in pixels, that may have the newer run-length code."""
 
 
-def read_hdr(path: Path) -> Float32[np.ndarray, "H W 3"]:
+def _read_hdr(path: Path) -> Float32[np.ndarray, "H W 3"]:
     """Linear radiance of a picture whose rows run from the top, each from the left.
 
     Raises:
@@ -225,7 +225,7 @@ def read_environment_of_bands(
     """
     spectral = _read_wavelengths(path, bands) if path.suffix.lower() == ".exr" and path.is_file() else None
     if spectral is not None:
-        check_environment(path, spectral)
+        _check_environment(path, spectral)
         return Environment(torch.from_numpy(spectral), rotation_deg, exposure_stops)
     colours = read_environment(path, rotation_deg, exposure_stops)
     if lamp is None:

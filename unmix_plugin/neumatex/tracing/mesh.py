@@ -72,11 +72,11 @@ def mesh_of(
     """A mesh of float32 vertices, with area-weighted normals where none are given."""
     vertices, faces = vertices.float().contiguous(), faces.int().contiguous()
     if normals is None:
-        normals = area_weighted_normals(vertices, faces)
+        normals = _area_weighted_normals(vertices, faces)
     return Mesh(vertices, faces, torch.nn.functional.normalize(normals.float(), dim=-1), uv)
 
 
-def area_weighted_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "V 3"]:
+def _area_weighted_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "V 3"]:
     """Unit normals of vertices: means over their triangles, weighted by area; +z where they cancel."""
     a, b, c = vertices.double()[faces.long()].unbind(dim=1)
     doubled_areas = torch.linalg.cross(b - a, c - a)

@@ -1,14 +1,8 @@
-"""Local frames of shading: an orthonormal basis whose z axis is a normal, and directions in it.
-
-GGX microfacets: distribution, masking, reflection at the half vector, sampling of visible normals.
+"""GGX microfacets: shading frames, distribution, masking, sampling of visible normals, and mixtures of such lobes.
 
 Notation: `N` points, `K` lobes of a point. `alpha` is the width of a lobe, about the square of its roughness.
 Directions are local, z along the normal; `n_i` and `n_o` are the cosines of `wi` (light) and `wo` (eye). Components and
 lobes come first, `3 N` and `K N`: numbers that meet are then side by side in memory, which is several times faster.
-
-Importance sampling shared by the families: a cosine lobe and GGX lobes, each with its share.
-
-Notation as in `microfacet`.
 """
 
 import math
@@ -160,7 +154,7 @@ class LobeMixture:
         lobe = (uniforms[2] >= self.shares.cumsum(0)).sum(0).clamp_max(len(self.alphas))
         alpha = self.alphas.gather(0, (lobe - 1).clamp_min(0)[None])[0]
         reflected = sample_reflections(alpha, wo, uniforms[:2])
-        return torch.where(lobe == 0, cosine_directions(uniforms[:2]), reflected)
+        return torch.where(lobe == 0, _cosine_directions(uniforms[:2]), reflected)
 
     def density(self, wi: Float[Tensor, "3 N"], wo: Float[Tensor, "3 N"]) -> Float[Tensor, " N"]:
         """Of `sample`, 1/sr, on the whole sphere."""
@@ -168,7 +162,7 @@ class LobeMixture:
         return self.shares[0] * (wi[2].clamp_min(0.0) / math.pi) + lobes
 
 
-def cosine_directions(uniforms: Float[Tensor, "2 N"]) -> Float[Tensor, "3 N"]:
+def _cosine_directions(uniforms: Float[Tensor, "2 N"]) -> Float[Tensor, "3 N"]:
     """Directions above the surface whose density is their cosine over pi."""
     radius, angle = torch.sqrt(uniforms[1]), 2.0 * math.pi * uniforms[0]
     z = torch.sqrt((1.0 - uniforms[1]).clamp_min(0.0))

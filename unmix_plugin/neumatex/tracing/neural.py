@@ -1,30 +1,23 @@
-"""D_neu: the one decoder that all objects share, from six latents to reflection; and its encoder.
+"""Neural materials: a base colour, and six latents that one shared decoder, D_neu, turns into reflection.
 
-The last layer of the network names a stack of analytic layers: widths, colours and weights of lobes. Sharp highlights
-then cost no more than soft ones, and the stack is reciprocal, never brighter than its light, and can be sampled
-exactly. Chosen by measurement: a network that gives reflectances themselves (three layers of width 64, from latents and
-features of the half vector) reached a mean error of 31.8 dB after 1200 steps, given latents that were learnt already;
-this one reached 36.0 dB in as many, learning its encoder too.
-
-The shipped weights of decoder and encoder, and the record of how they were made.
-
-Neural materials: a base colour, and six latents that the shared decoder D_neu turns into reflection.
-
-Notation as in `family`. With `passed` and `specular` decoded from the latents l,
+With `passed` and `specular` decoded from the latents l,
 
     f = passed(l, wi, wo) base / pi + specular(l, wi, wo)
 
 as in NeuMatEx, whose `T_neu` depends on `wi` alone; here it is a product of the same function of either direction, so
 that light and eye can change places. The colour of a metal is in its latents: `base_colour` reads it from there.
+
+The last layer of the decoder names a stack of analytic layers: widths, colours and weights of lobes. Sharp highlights
+then cost no more than soft ones, and the stack is reciprocal, never brighter than its light, and can be sampled
+exactly. A network that gives reflectances themselves was worse: 31.8 dB after 1200 steps with latents that were learnt
+already, against 36.0 dB of this one, which learnt its encoder too.
+
+Notation as in `families`.
 """
 
-import hashlib
-import json
-from collections.abc import Mapping
 from copy import deepcopy
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import safetensors.torch
 import torch
@@ -44,9 +37,10 @@ from unmix_plugin.neumatex.tracing.layers import (
 )
 
 NUM_LATENTS = 6
-NUM_NUMBERS = 15
+_NUM_NUMBERS = 15
 """That name the layers: L."""
 _NUM_FEATURES = 23
+SHIPPED = Path(__file__).parent.parent / "weights" / "decoder.safetensors"
 
 
 class Decoder(nn.Module):
@@ -55,35 +49,33 @@ class Decoder(nn.Module):
     def __init__(self, width: int = 48) -> None:
         super().__init__()
         self.hidden = nn.ModuleList([nn.Linear(NUM_LATENTS, width), nn.Linear(width, width)])
-        self.last = nn.Linear(width, NUM_NUMBERS)
+        self.last = nn.Linear(width, _NUM_NUMBERS)
 
     def forward(self, latents: Float[Tensor, "N 6"]) -> LayerStack:
         """The layers of latents in [0, 1]."""
-        return layers_of(self.numbers(latents))
+        return _layers_of(self.numbers(latents))
 
     def numbers(self, latents: Float[Tensor, "N 6"]) -> Float[Tensor, "L N"]:
-        """Numbers in [0, 1] that name the layers of latents; `layers_of` reads them."""
+        """Numbers in [0, 1] that name the layers of latents."""
         x = 2.0 * latents - 1.0
         for layer in self.hidden:
             x = nn.functional.silu(layer(x))
         return torch.sigmoid(torch.addmm(self.last.bias[:, None], self.last.weight, x.T))
 
 
-def layers_of(numbers: Float[Tensor, "L N"]) -> LayerStack:
-    """The layers that a decoder's numbers name."""
+def _layers_of(numbers: Float[Tensor, "L N"]) -> LayerStack:
     # Gradients of a split are joined once; each index into `numbers` would fill zeros for all of them.
     dust, sheen, sheen_roughness, coat, roughness, haze, metallicity, metal, level = numbers.split(
         [1, 3, 1, 1, 3, 1, 1, 3, 1]
     )
     of_coat, surface, beyond = roughness.unbind(0)
+    hazy = surface + (1.0 - surface) * beyond
     return LayerStack(
         dust_cover=LARGEST_COVER * dust[0],
         sheen_colour=LARGEST_SHEEN * sheen,
         sheen_roughness=sheen_roughness[0],
         coat_weight=coat[0],
-        roughness=torch.stack(
-            [LARGEST_COAT_ROUGHNESS * of_coat, surface, surface + (1.0 - surface) * beyond]
-        ),
+        roughness=torch.stack([LARGEST_COAT_ROUGHNESS * of_coat, surface, hazy]),
         haze_weight=LARGEST_HAZE * haze[0],
         metallicity=metallicity[0],
         metal_colour=metal,
@@ -121,9 +113,6 @@ def _features(stack: LayerStack) -> Tensor:
     return 2.0 * torch.cat([torch.stack(scalars), sheen, metal, torch.sqrt(metal + 1e-4)]).T - 1.0
 
 
-SHIPPED = Path(__file__).parent.parent / "weights" / "decoder.safetensors"
-
-
 def read_weights(path: Path = SHIPPED) -> tuple[Decoder, Encoder]:
     """Decoder and encoder, frozen.
 
@@ -134,49 +123,32 @@ def read_weights(path: Path = SHIPPED) -> tuple[Decoder, Encoder]:
         tensors = safetensors.torch.load(path.read_bytes())
     except (OSError, SafetensorError) as error:
         raise ConfigError(f"can't read the material decoder's weights in {path}: {error}") from error
-    both = _both()
-    found = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-    expected = {name: tuple(tensor.shape) for name, tensor in both.state_dict().items()}
+    decoder, encoder = Decoder(), Encoder()
+    both = nn.ModuleDict({"decoder": decoder, "encoder": encoder})
+    found, expected = (
+        {name: tuple(tensor.shape) for name, tensor in one.items()} for one in (tensors, both.state_dict())
+    )
     for name in sorted(expected | found):
         if found.get(name) != expected.get(name):
             raise ConfigError(
-                f"weights of another shape in {path}: {name} is {found.get(name, 'missing')}, "
-                f"expected {expected.get(name, 'no such tensor')}; train them with "
-                "python -m tools.train_decoder"
+                f"weights of another shape in {path}: {name} is {found.get(name, 'missing')}, expected "
+                f"{expected.get(name, 'no such tensor')}; train them with python -m tools.train_decoder"
             )
     both.load_state_dict(tensors)
     both.requires_grad_(False)
-    return both["decoder"], both["encoder"]  # pyright: ignore[reportReturnType]
+    return decoder, encoder
 
 
-@lru_cache(maxsize=1)
-def shipped_weights() -> tuple[Decoder, Encoder]:
-    """Those of the package, read once."""
-    return read_weights()
+_shipped_weights = lru_cache(maxsize=1)(read_weights)
 
 
-def write_weights(path: Path, decoder: Decoder, encoder: Encoder, record: Mapping[str, Any]) -> None:
-    """Write the weights, and beside them `record` with their SHA-256 as JSON."""
-    tensors = nn.ModuleDict({"decoder": decoder, "encoder": encoder}).state_dict()
-    data = safetensors.torch.save({name: tensor.contiguous() for name, tensor in tensors.items()})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(data)
-    full = {**record, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
-    path.with_suffix(".json").write_text(json.dumps(full, indent=1) + "\n", encoding="utf-8")
-
-
-def _both() -> nn.ModuleDict:
-    return nn.ModuleDict({"decoder": Decoder(), "encoder": Encoder()})
-
-
-class DecodedFamily(StackFamily):
+class _DecodedFamily(StackFamily):
     """Parameters: diffuse colour (0 to 2, linear), then the numbers that a decoder made of latents."""
 
-    num_parameters = 3 + NUM_NUMBERS
+    num_parameters = 3 + _NUM_NUMBERS
 
     def stack(self, parameters: Float[Tensor, "N P"]) -> LayerStack:
-        """The layers that the numbers name."""
-        return layers_of(parameters[:, 3:].T.contiguous())
+        return _layers_of(parameters[:, 3:].T.contiguous())
 
 
 class NeuralFamily(StackFamily):
@@ -196,17 +168,16 @@ class NeuralFamily(StackFamily):
         Raises:
             ConfigError: the package's weights can't be read, or have another shape.
         """
-        decoder, encoder = weights if weights is not None else shipped_weights()
+        decoder, encoder = weights if weights is not None else _shipped_weights()
         self.decoder, self.encoder = deepcopy(decoder).to(device), deepcopy(encoder).to(device)
 
     def stack(self, parameters: Float[Tensor, "N P"]) -> LayerStack:
-        """The layers that the latents are decoded to."""
         return self.decoder(parameters[:, 3:])
 
     @property
-    def decoded_family(self) -> DecodedFamily:
+    def decoded_family(self) -> _DecodedFamily:
         """The family of what `decoded` gives: the same reflectances, without a network for each direction."""
-        return DecodedFamily()
+        return _DecodedFamily()
 
     def decoded(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N D"]:
         """Parameters of `decoded_family`; differentiable."""
@@ -215,5 +186,4 @@ class NeuralFamily(StackFamily):
     @torch.no_grad()
     def from_layered(self, parameters: Float[Tensor, "N L"]) -> Float[Tensor, "N P"]:
         """The neural material that the encoder finds for each of `LayeredFamily`; the base colours are the same."""
-        latents = self.encoder(LayeredFamily().stack(parameters))
-        return torch.cat([parameters[:, :3], latents], -1)
+        return torch.cat([parameters[:, :3], self.encoder(LayeredFamily().stack(parameters))], -1)

@@ -211,7 +211,7 @@ def reflected_radiance(
         )
     world = _World(decoded_once(surface), ray_mesh, environment)
     device, num_points = to_eye.device, len(to_eye)
-    numbers = SamplePoints.draw(num_points, samples, bounces + 1, generator, device)
+    numbers = _SamplePoints.draw(num_points, samples, bounces + 1, generator, device)
     vertices = _first_vertices(world, points, to_eye, samples)
     radiance = torch.zeros(num_points, environment.num_colours, device=device)
     for depth in range(bounces + 1):
@@ -327,7 +327,7 @@ NUMBERS_A_VERTEX = 5
 
 
 @dataclass(frozen=True)
-class SamplePoints:
+class _SamplePoints:
     """Numbers in [0, 1) of N points, S samples each."""
 
     sequence: Float64[Tensor, "S D"]
@@ -342,7 +342,7 @@ class SamplePoints:
         vertices: int,
         generator: torch.Generator | None,
         device: torch.device,
-    ) -> SamplePoints:
+    ) -> _SamplePoints:
         """Numbers for paths of so many vertices.
 
         Raises:
@@ -353,7 +353,7 @@ class SamplePoints:
         dimensions = NUMBERS_A_VERTEX * vertices
         sequence = torch.quasirandom.SobolEngine(dimensions).draw(samples, dtype=torch.float64)
         shifts = torch.rand(num_points, dimensions, generator=generator, dtype=torch.float64, device=device)
-        return SamplePoints(sequence.to(device), shifts)
+        return _SamplePoints(sequence.to(device), shifts)
 
     def of(self, paths: Int[Tensor, " M"], vertex: int) -> Float[Tensor, "M 5"]:
         """Numbers of a vertex of paths; path p is sample p % S of point p // S."""

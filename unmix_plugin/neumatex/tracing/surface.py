@@ -41,7 +41,7 @@ class Surface(Protocol):
 
 
 @dataclass(frozen=True)
-class DecodedSurface:
+class _DecodedSurface:
     """The same materials, their parameters decoded where they are looked up; see `Surface`."""
 
     encoded: Surface
@@ -62,7 +62,7 @@ def decoded_once(surface: Surface) -> Surface:
     """The same materials so that a network, where the family has one, is evaluated once a point, not once a
     direction."""
     family = surface.family
-    return DecodedSurface(surface, family) if isinstance(family, DecodableFamily) else surface
+    return _DecodedSurface(surface, family) if isinstance(family, DecodableFamily) else surface
 
 
 PLANE_AXES = ((0, 1), (1, 2), (0, 2))
