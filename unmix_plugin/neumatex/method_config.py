@@ -37,7 +37,7 @@ def _neumatex() -> TrainerConfig:
             "planes": OptimizerConfig(lr=5e-3, final_factor=0.2),
             "networks": OptimizerConfig(lr=5e-3, final_factor=0.2),
             "response": OptimizerConfig(lr=2e-2, final_factor=0.1),
-            # Brightness soon comes right; shapes of spectra drift where they may move as fast (see endmember_gains).
+            # Brightness soon comes right; shapes of spectra drift where they may move as fast (see fit.model).
             "endmembers": OptimizerConfig(lr=1e-3, final_factor=0.1),
             "gains": OptimizerConfig(lr=6e-3, final_factor=0.1),
         },

@@ -29,7 +29,7 @@ from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.train import train
 from unmix_plugin.engine import load_model
-from unmix_plugin.neumatex.fit import start as run_start
+from unmix_plugin.neumatex.fit import start
 from unmix_plugin.neumatex.fit.model import NeumatexModel, _settle
 from unmix_plugin.neumatex.fit.start import _as_bright
 from unmix_plugin.neumatex.fit.trained_object import TrainedObject
@@ -151,7 +151,7 @@ def test_the_number_of_materials_is_proposed_where_it_is_asked_for(tmp_path):
 def test_a_fit_starts_from_the_endmembers_and_abundances_of_a_run(tmp_path, monkeypatch):
     there = Normalisation(np.eye(3), -CENTRE, RUN_RADIUS / RADIUS)
     of_run = replace(ball_scene(), frame=there)
-    monkeypatch.setattr(run_start, "_scene", lambda _: of_run)
+    monkeypatch.setattr(start, "_opened", lambda _: of_run)
     folder = write_spectral_object(tmp_path / "ball")
     words = ["--data", folder, "--output-dir", tmp_path / "out", "--max-num-iterations", 1]
     settings = ["--pipeline.model.material=spectral", "--pipeline.model.from-run=run"]

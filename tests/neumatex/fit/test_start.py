@@ -20,20 +20,19 @@ from unmix_plugin.neumatex.fit.data_manager import _view_arrays
 from unmix_plugin.neumatex.fit.object_scene import load_object
 from unmix_plugin.neumatex.fit.start import (
     PriorAnchor,
-    TriplaneSurface,
     _RunMaterials,
     material_family,
     start_plain,
     views_of,
 )
-from unmix_plugin.neumatex.tracing.surface import Triplane
+from unmix_plugin.neumatex.tracing.surface import Triplane, TriplaneSurface
 from unmix_plugin.spectral.bands import Bands
 
 
 def test_the_distance_counts_each_parameter_by_its_expected_error():
     generator = torch.Generator().manual_seed(1)
     said, anchor = Triplane(5, 8, generator=generator), PriorAnchor(Triplane(5, 8, generator=generator))
-    anchor.adopt(said)
+    anchor.triplane.load_state_dict(said.state_dict())
     positions = 2 * torch.rand(7, 3, generator=generator) - 1
     parameters = torch.rand(7, 5, generator=generator, requires_grad=True)
     expected = torch.zeros(())

@@ -104,7 +104,7 @@ _SUBPIXELS = 2
 _MEAN_RADIANCE = 0.3
 """Of the object, which its environments are scaled to."""
 
-Say = Callable[[str], None]
+Say = Callable[[str], object]
 """What to do with a line about the progress."""
 
 

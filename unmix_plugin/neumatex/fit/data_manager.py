@@ -1,10 +1,6 @@
-"""Pixels of training views that show the mesh and nothing else, to be drawn evenly.
+"""Training batches of an object's pixels, and its evaluation images under its own light and others.
 
-Notation: `M` pixels, `R` of them drawn, `C` colours or bands.
-
-Training batches of an object's pixels, and its evaluation images under its own light and others.
-
-Notation: `R` pixels of a batch, `C` colours or bands, `H x W` pixels of a view.
+Notation: `M` pixels of training views, `R` of them in a batch, `C` colours or bands, `H x W` pixels of a view.
 """
 
 from __future__ import annotations
@@ -23,6 +19,7 @@ from torch import Tensor
 
 from unmix_plugin.engine import (
     Cameras,
+    Common,
     DataManager,
     DataManagerConfig,
     RayBundle,
@@ -31,7 +28,6 @@ from unmix_plugin.engine import (
     TrainingCallback,
     step_generator,
 )
-from unmix_plugin.engine.configs import Common
 from unmix_plugin.errors import SceneError, require
 from unmix_plugin.neumatex.fit.object_scene import ObjectScene, load_object
 from unmix_plugin.neumatex.fit.pictures import PosedPictures, opacity
@@ -43,80 +39,21 @@ from unmix_plugin.neumatex.tracing.rays import RayMesh
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.colour.conversion import srgb_to_linear
 
-OPAQUE = 0.99
-"""Alpha from which a pixel shows the object alone."""
-_CORNERS = ((0.02, 0.02), (0.98, 0.02), (0.02, 0.98), (0.98, 0.98), (0.5, 0.5))
-"""Where in a pixel the mesh has to be seen, so that every place in it sees it."""
-
-
-@dataclass(frozen=True)
-class _DrawnPixels:
-    """Pixels of a batch."""
-
-    views: Int[Tensor, " R"]
-    """Which training view."""
-    places: Float[Tensor, "R 2"]
-    """A random place in each pixel, x and y in pixels of the view."""
-    numbers: Float[Tensor, "R C"]
-    """As the picture holds them."""
-
-
-@dataclass(frozen=True)
-class _PixelList:
-    """Pixels by view and place."""
-
-    views: Int[Tensor, " M"]
-    corners: Int[Tensor, "M 2"]
-    """Column and row."""
-    numbers: Float[Tensor, "M C"]
-
-    @staticmethod
-    def of(scene: ObjectScene, most: int, seed: int) -> _PixelList:
-        """Read the training views; of more pixels than `most`, so many are drawn.
-
-        Raises:
-            SceneError: no view shows the mesh.
-        """
-        ray_mesh, parts = RayMesh(scene.mesh), []
-        generator = torch.Generator().manual_seed(seed)
-        share = most // len(scene.split.train) + 1
-        for row, view in enumerate(scene.split.train):
-            picture = scene.pictures.read(view)
-            shown = torch.from_numpy(opacity(picture) >= OPAQUE) & _sees_mesh(ray_mesh, scene, view)
-            rows, columns = shown.nonzero(as_tuple=True)
-            if len(rows) > share:
-                kept = torch.randperm(len(rows), generator=generator)[:share]
-                rows, columns = rows[kept], columns[kept]
-            numbers = torch.from_numpy(picture.numbers)[rows, columns]
-            parts.append((torch.full_like(rows, row), torch.stack([columns, rows], dim=-1), numbers))
-        found = _PixelList(*(torch.cat(values) for values in zip(*parts, strict=True)))
-        if not len(found.views):
-            raise SceneError(f"{scene.root}: no training view shows the mesh and opaque alpha in one pixel")
-        return found
-
-    def draw(self, count: int, generator: torch.Generator) -> _DrawnPixels:
-        """Random pixels, each as likely as any other."""
-        chosen = torch.randint(len(self.views), (count,), generator=generator)
-        places = self.corners[chosen] + torch.rand(count, 2, generator=generator)
-        return _DrawnPixels(self.views[chosen], places, self.numbers[chosen])
-
-
-def _sees_mesh(ray_mesh: RayMesh, scene: ObjectScene, view: int) -> Bool[Tensor, "H W"]:
-    """Pixels of a view that the mesh covers."""
-    camera = scene.pictures.cameras[view].to(ray_mesh.device)
-    seen = torch.ones(camera.height * camera.width, dtype=torch.bool)
-    for place in _CORNERS:
-        rays = camera.image_rays(0, place)
-        seen &= ray_mesh.closest(rays.origins, rays.directions).found.cpu()
-    return seen.reshape(camera.height, camera.width)
-
-
 DEMO_OBJECT = Path("demo-object")
 """`--data demo-object` stands for the built-in object."""
 DEMO_SPECTRAL_OBJECT = Path("demo-spectral-object")
 """And this for the one with spectral pictures."""
+OPAQUE = 0.99
+"""Alpha from which a pixel shows the object alone."""
+_CORNERS = ((0.02, 0.02), (0.98, 0.02), (0.02, 0.98), (0.98, 0.98), (0.5, 0.5))
+"""Where in a pixel the mesh has to be seen, so that every place in it sees it."""
 _THINNEST = 1e-3
 """Least half edge of the scene box: a mesh may be flat."""
+_MOST_VIEWS = 12
+LONGEST_EDGE_PX = 512
+"""Of the views that a prior sees; larger ones are thinned out."""
+_NUM_PIXELS, _STREAM = 20_000, 7
+"""Pixels that a spectral material starts from, and the stream of random numbers that draws them."""
 
 
 @dataclass(frozen=True)
@@ -168,36 +105,40 @@ class ObjectDataManager(DataManager):
         reach = self.object.mesh.vertices.abs().amax(dim=0).clamp(min=_THINNEST)
         self.scene_box = SceneBox(torch.stack([-reach, reach]))
         self._num_rays = config.train_num_rays_per_batch
+        lights = [(light, view) for light in self.object.lights for view in range(len(light.pictures))]
+        self._images = [*split.evaluation, *lights]
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
         """Random object pixels of the training views; the draw depends on (seed, step) only."""
-        drawn = self._pixels.draw(self._num_rays, step_generator(self.seed, step))
-        rays = self.train_cameras.generate_rays(drawn.views, drawn.places)
-        return rays.to(self.device), {"numbers": drawn.numbers.to(self.device)}
+        views, places, numbers = self._pixels.draw(self._num_rays, step_generator(self.seed, step))
+        rays = self.train_cameras.generate_rays(views, places)
+        return rays.to(self.device), {"numbers": numbers.to(self.device)}
 
     @property
     def num_eval_images(self) -> int:
         """Evaluation views, and every picture under a held-out light."""
-        return len(self.eval_cameras) + sum(len(light.pictures) for light in self.object.lights)
+        return len(self._images)
 
     def eval_image(self, index: int) -> tuple[Cameras, dict[str, Tensor]]:
         """Camera and whole image; those under held-out lights come after the evaluation views."""
-        place = self._find_image(index)
+        place = self._images[index]
         if isinstance(place, int):
-            camera, batch = self._image(self.object.pictures, place)
-            return camera, {**batch, **self._truth(place)}
+            return self._image(self.object.pictures, place, self._truth(place))
         light, view = place
-        held_out = self.object.lights[light]
-        camera, batch = self._image(held_out.pictures, view)
-        return camera, {**batch, **_environment_entries(held_out.environment.to(self.device))}
+        environment = light.environment
+        placement = torch.tensor([environment.rotation_deg, environment.exposure_stops], device=self.device)
+        entries = {
+            "environment": environment.image.to(self.device),
+            "environment_placement": placement,
+        }
+        return self._image(light.pictures, view, entries)
 
     def eval_name(self, index: int) -> str:
         """The picture's name, after its light's where that is held out."""
-        place = self._find_image(index)
+        place = self._images[index]
         if isinstance(place, int):
             return self.object.pictures.names[place]
-        held_out = self.object.lights[place[0]]
-        return f"{held_out.name}-{held_out.pictures.names[place[1]]}"
+        return f"{place[0].name}-{place[0].pictures.names[place[1]]}"
 
     def get_train_rays_per_batch(self) -> int:
         """Pixels of the next training batch."""
@@ -218,15 +159,16 @@ class ObjectDataManager(DataManager):
 
     def initial_data(self) -> Mapping[str, np.ndarray]:
         """Mesh and environment, which become buffers of the model, so that a run renders without its data; and some
-        training views for a prior, as `prior_anchor.views_of` puts them together, or of spectral pictures some pixels
-        to start from."""
+        training views for a prior, which `views_of` puts together again, or of spectral pictures some pixels to start
+        from."""
         mesh, light = self.object.mesh, self.object.environment
         arrays = {"vertices": mesh.vertices, "faces": mesh.faces, "normals": mesh.normals, "uv": mesh.uv}
         arrays["light_map"] = light.image
         buffers = {name: array.numpy() for name, array in arrays.items() if array is not None}
-        if self.object.bands is not None:
-            return {**buffers, **_pixel_arrays(self.object, self.train_cameras, self._pixels, self.seed)}
-        return {**buffers, **_view_arrays(self.object)}
+        return {
+            **buffers,
+            **(_view_arrays(self.object) if self.object.lamp is None else self._pixel_arrays()),
+        }
 
     def summary(self) -> dict[str, Any]:
         """Files, splits, normalisation, hashes."""
@@ -251,25 +193,17 @@ class ObjectDataManager(DataManager):
         """Read when training begins: evaluation needs none of it."""
         return _PixelList.of(self.object, self.options.max_pixels, self.seed)
 
-    def _find_image(self, index: int) -> int | tuple[int, int]:
-        """A view of the object's own pictures, or a light and a view of its pictures."""
-        if index < len(self.eval_cameras):
-            return self.object.split.evaluation[index]
-        index -= len(self.eval_cameras)
-        for light, held_out in enumerate(self.object.lights):
-            if index < len(held_out.pictures):
-                return light, index
-            index -= len(held_out.pictures)
-        raise IndexError(f"{self.num_eval_images} evaluation images; asked for one beyond")
-
-    def _image(self, pictures: PosedPictures, view: int) -> tuple[Cameras, dict[str, Tensor]]:
+    def _image(
+        self, pictures: PosedPictures, view: int, others: dict[str, Tensor]
+    ) -> tuple[Cameras, dict[str, Tensor]]:
         picture = pictures.read(view)
-        return pictures.cameras[view], {
+        batch = {
             "numbers": self._tensor(picture.numbers),
             "alpha": self._tensor(opacity(picture)),
             "tone": torch.tensor(TONE_MAPPINGS.index(pictures.tone)),
             "lights": torch.tensor(len(self.object.lights)),
         }
+        return pictures.cameras[view], {**batch, **others}
 
     def _truth(self, view: int) -> dict[str, Tensor]:
         """What is known of a view's materials."""
@@ -286,54 +220,87 @@ class ObjectDataManager(DataManager):
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(self.device)
 
-
-def _environment_entries(environment: Environment) -> dict[str, Tensor]:
-    placement = torch.tensor([environment.rotation_deg, environment.exposure_stops])
-    return {"environment": environment.image, "environment_placement": placement}
+    def _pixel_arrays(self) -> dict[str, np.ndarray]:
+        """Rays and spectra of some training pixels, the lamp, and where the model's axes are in the world."""
+        assert self.object.lamp is not None
+        generator = step_generator(self.seed, 0, stream=_STREAM)
+        views, places, numbers = self._pixels.draw(_NUM_PIXELS, generator)
+        rays = self.train_cameras.generate_rays(views, places)
+        return {
+            "pixels": numbers.numpy(),
+            "pixel_origins": rays.origins.numpy(),
+            "pixel_directions": rays.directions.numpy(),
+            "lamp": self.object.lamp,
+            "world_corners": self.object.frame.to_world(np.concatenate([np.zeros((1, 3)), np.eye(3)])),
+        }
 
 
 def batch_environment(batch: Mapping[str, Tensor]) -> Environment | None:
     """The held-out light of an image batch; None where it has the object's own."""
     if "environment" not in batch:
         return None
-    rotation_deg, exposure_stops = batch["environment_placement"].tolist()
-    return Environment(batch["environment"], rotation_deg, exposure_stops)
+    return Environment(batch["environment"], *batch["environment_placement"].tolist())
 
 
-def _tell(line: str) -> None:
-    """A line about the progress, beside the command's own output."""
-    sys.stderr.write(f"{line}\n")
+@dataclass(frozen=True)
+class _PixelList:
+    """Pixels of training views that show the mesh and nothing else, by view and place."""
+
+    views: Int[Tensor, " M"]
+    corners: Int[Tensor, "M 2"]
+    """Column and row."""
+    numbers: Float[Tensor, "M C"]
+
+    @staticmethod
+    def of(scene: ObjectScene, most: int, seed: int) -> _PixelList:
+        """Read the training views; of more pixels than `most`, so many are drawn.
+
+        Raises:
+            SceneError: no view shows the mesh.
+        """
+        ray_mesh, parts = RayMesh(scene.mesh), []
+        generator = torch.Generator().manual_seed(seed)
+        share = most // len(scene.split.train) + 1
+        for row, view in enumerate(scene.split.train):
+            picture = scene.pictures.read(view)
+            sees_mesh = _sees_mesh(ray_mesh, scene.pictures.cameras[view])
+            rows, columns = (torch.from_numpy(opacity(picture) >= OPAQUE) & sees_mesh).nonzero(as_tuple=True)
+            if len(rows) > share:
+                kept = torch.randperm(len(rows), generator=generator)[:share]
+                rows, columns = rows[kept], columns[kept]
+            numbers = torch.from_numpy(picture.numbers)[rows, columns]
+            parts.append((torch.full_like(rows, row), torch.stack([columns, rows], dim=-1), numbers))
+        found = _PixelList(*(torch.cat(values) for values in zip(*parts, strict=True)))
+        if not len(found.views):
+            raise SceneError(f"{scene.root}: no training view shows the mesh and opaque alpha in one pixel")
+        return found
+
+    def draw(
+        self, count: int, generator: torch.Generator
+    ) -> tuple[Int[Tensor, " R"], Float[Tensor, "R 2"], Float[Tensor, "R C"]]:
+        """Training view, a random place (x and y in pixels) and numbers of random pixels, all equally likely."""
+        chosen = torch.randint(len(self.views), (count,), generator=generator)
+        places = self.corners[chosen] + torch.rand(count, 2, generator=generator)
+        return self.views[chosen], places, self.numbers[chosen]
 
 
-def _object_folder(data: Path) -> Path:
-    if data == DEMO_SPECTRAL_OBJECT:
-        from unmix_plugin.neumatex.demo.objects import demo_spectral_object_path
-
-        return demo_spectral_object_path()
-    if data == DEMO_OBJECT:
-        from unmix_plugin.neumatex.demo.objects import demo_object_path
-
-        return demo_object_path(say=_tell)
-    return data
-
-
-MOST_VIEWS = 12
-
-
-LONGEST_EDGE_PX = 512
-"""Of the views that a prior sees; larger ones are thinned out."""
+def _sees_mesh(ray_mesh: RayMesh, camera: Cameras) -> Bool[Tensor, "H W"]:
+    """Pixels of a view that the mesh covers."""
+    seen = torch.ones(camera.height * camera.width, dtype=torch.bool)
+    for place in _CORNERS:
+        rays = camera.to(ray_mesh.device).image_rays(0, place)
+        seen &= ray_mesh.closest(rays.origins, rays.directions).found.cpu()
+    return seen.reshape(camera.height, camera.width)
 
 
 def _view_arrays(scene: ObjectScene) -> dict[str, np.ndarray]:
-    """Training views that a prior may look at, as arrays by name; `views_of` puts them together again."""
+    """Training views that a prior may look at, as arrays by name."""
     train = list(scene.split.train)
     cameras = scene.pictures.cameras[train]
     arrays: dict[str, np.ndarray] = {}
-    chosen = well_spread(cameras.camera_to_world[:, :, 3], MOST_VIEWS)
-    for number, row in enumerate(chosen):
+    for number, row in enumerate(well_spread(cameras.camera_to_world[:, :, 3], _MOST_VIEWS)):
         picture = scene.pictures.read(train[row])
-        height, width = picture.numbers.shape[:2]
-        step = max(1, -(-max(height, width) // LONGEST_EDGE_PX))
+        step = max(1, -(-max(picture.numbers.shape[:2]) // LONGEST_EDGE_PX))
         # Pixel c of a thinned-out view is pixel c step of the whole one; centres are at + 0.5.
         lens = torch.cat([cameras.focal_px[row] / step, (cameras.center_px[row] - 0.5) / step + 0.5])
         light = torch.from_numpy(picture.numbers[::step, ::step].copy())
@@ -346,24 +313,11 @@ def _view_arrays(scene: ObjectScene) -> dict[str, np.ndarray]:
     return arrays
 
 
-NUM_PIXELS = 20_000
+def _object_folder(data: Path) -> Path:
+    from unmix_plugin.neumatex.demo.objects import demo_object_path, demo_spectral_object_path
 
-
-_STREAM = 7
-
-
-def _pixel_arrays(
-    scene: ObjectScene, cameras: Cameras, pixels: _PixelList, seed: int
-) -> dict[str, np.ndarray]:
-    """Rays and spectra of some pixels of the training views, the lamp, and where the world is, as arrays by name."""
-    assert scene.lamp is not None
-    drawn = pixels.draw(NUM_PIXELS, step_generator(seed, 0, stream=_STREAM))
-    rays = cameras.generate_rays(drawn.views, drawn.places)
-    corners = np.concatenate([np.zeros((1, 3)), np.eye(3)])
-    return {
-        "pixels": drawn.numbers.numpy(),
-        "pixel_origins": rays.origins.numpy(),
-        "pixel_directions": rays.directions.numpy(),
-        "lamp": scene.lamp,
-        "world_corners": scene.frame.to_world(corners),
-    }
+    if data == DEMO_SPECTRAL_OBJECT:
+        return demo_spectral_object_path()
+    if data == DEMO_OBJECT:
+        return demo_object_path(say=lambda line: sys.stderr.write(f"{line}\n"))
+    return data

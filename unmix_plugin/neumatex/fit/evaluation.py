@@ -83,10 +83,10 @@ def evaluate_object_image(
     metrics = {
         f"{prefix}psnr": float(psnr_db(error)),
         f"{prefix}psnr_image": float(psnr_db(error.sum() / (shown.numel() * error.shape[-1]))),
-        "lights": float(batch["lights"]),
     }
     if isinstance(display, SpectralDisplay):
         metrics[f"{prefix}sam"] = float(spectral_angle(predicted.double(), true.double()).mean())
+    metrics["lights"] = float(batch["lights"])
     pictures = {f"{prefix}rgb": _side_by_side(shown, *colours)}
     if prefix:
         return metrics, pictures

@@ -1,17 +1,15 @@
-"""Endmembers of a spectral material as they are fitted: their shapes slowly, their brightness fast.
-
-How bright a material is known light tells soon. The shape of a spectrum is less certain: where it may move as fast, it
-drifts towards mixtures. So each endmember has a gain with a rate of its own, which is folded into it after every step.
-
-Notation: `K` endmembers, `B` bands.
-
-The model neumatex: materials on a known mesh under known light, fitted to pictures through a path tracer.
-
-Notation: `R` rays, one a pixel; `N` of them meet the mesh; `C` colours; `P` parameters of a material; `H x W` pixels.
+"""The model neumatex: materials on a known mesh under known light, fitted to pictures through a path tracer.
 
 The loss is the squared error of tone-mapped light. Rendered light is a random estimate, whose square would add its
 variance to the error: each of the two factors has an estimate of its own, from independent samples. That is unbiased
 where the tone curve is linear over the spread of the estimates, and nearly so where it bends.
+
+How bright a spectral material is known light tells soon. The shape of a spectrum is less certain: where it may move as
+fast, it drifts towards mixtures. So each endmember has a gain with a rate of its own, which is folded into it after
+every step.
+
+Notation: `R` rays, one a pixel; `N` of them meet the mesh; `C` colours; `P` parameters of a material; `K` endmembers
+and `B` bands of a spectral one; `H x W` pixels.
 """
 
 from __future__ import annotations
@@ -28,14 +26,11 @@ from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.fit.data_manager import batch_environment
 from unmix_plugin.neumatex.fit.evaluation import (
     evaluate_object_image,
-    evaluate_spectral_image,
     evaluation_outputs,
 )
 from unmix_plugin.neumatex.fit.settings import NeumatexModelConfig, ObjectRecord
 from unmix_plugin.neumatex.fit.start import (
     PriorAnchor,
-    TriplaneSurface,
-    frozen_parts,
     material_family,
     start_plain,
     start_spectral,
@@ -45,38 +40,7 @@ from unmix_plugin.neumatex.fit.tone import LampRatio, SpectralDisplay, ToneMappi
 from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.neumatex.tracing.mesh import Mesh
 from unmix_plugin.neumatex.tracing.path_tracer import SeenPoints, TracedObject, TracedObjectCache
-from unmix_plugin.neumatex.tracing.surface import Triplane
-
-
-def _empty_endmembers(config: NeumatexModelConfig, record: ObjectRecord) -> nn.Parameter | None:
-    """Endmembers (K, B) of a spectral material, not yet filled; None for materials in colours.
-
-    Raises:
-        ConfigError: the material does not fit the pictures.
-    """
-    count, bands = config.num_endmembers, record.num_colours
-    if record.is_spectral != (config.material == "spectral"):
-        fitting = "spectral" if record.is_spectral else "neural or pbr"
-        raise ConfigError(
-            f"the material {config.material} does not fit pictures of {bands} "
-            f"{'bands' if record.is_spectral else 'colours'}; choose {fitting}"
-        )
-    if not record.is_spectral:
-        return None
-    if not isinstance(count, int):
-        raise ConfigError("num-endmembers is not settled: call resolve_auto first")
-    if count > bands:
-        raise ConfigError(f"num-endmembers is {count} but the pictures have {bands} bands; choose fewer")
-    return nn.Parameter(torch.zeros(count, bands))
-
-
-@torch.no_grad()
-def _settle(endmembers: Float[Tensor, "K B"], gains: Float[Tensor, " K"]) -> None:
-    """Make endmembers as bright as their gains say, as far as reflectances can be, and the gains 1; in place."""
-    bright = endmembers.clamp(0, 1) * gains.clamp(min=0)[:, None]
-    endmembers.copy_(bright / bright.amax(dim=1, keepdim=True).clamp(min=1))
-    gains.fill_(1)
-
+from unmix_plugin.neumatex.tracing.surface import Triplane, TriplaneSurface
 
 _START_SEED = 0
 """Of networks and planes before training; the run's own seed draws everything else."""
@@ -96,11 +60,13 @@ class NeumatexModel(Model):
         """Modules and buffers in the shapes that config and object ask for."""
         record = ObjectRecord.from_json(self.metadata)
         self.record = record
-        self.endmembers: nn.Parameter | None = _empty_endmembers(self.config, record)
+        self.endmembers: nn.Parameter | None = self._empty_endmembers()
         self.gains = None if self.endmembers is None else nn.Parameter(torch.ones(len(self.endmembers)))
         self.family = material_family(self.config.material, self.endmembers, self.gains)
         # A run keeps the decoder that it was fitted with.
-        self.family_parts = nn.ModuleDict(frozen_parts(self.family))
+        networks = {name: getattr(self.family, name, None) for name in ("decoder", "encoder")}
+        frozen = {name: part.requires_grad_(False) for name, part in networks.items() if part is not None}
+        self.family_parts = nn.ModuleDict(frozen)
         generator = torch.Generator().manual_seed(_START_SEED)
         parameters, resolution = self.family.num_parameters, self.config.plane_resolution
         shares = 0 if self.endmembers is None else len(self.endmembers)
@@ -132,7 +98,6 @@ class NeumatexModel(Model):
             from unmix_plugin.neumatex.prior.small import predict
 
             assert self.config.material != "spectral"  # which has no prior
-
             found = predict(
                 views_of(initial_data),
                 self.traced.ray_mesh,
@@ -142,7 +107,7 @@ class NeumatexModel(Model):
                 generator=generator,
             )
             self.triplane.load_state_dict(found.state_dict())
-            self.anchor.adopt(found)
+            self.anchor.triplane.load_state_dict(found.state_dict())
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Planes, networks unless they stay as they are, and the camera's response where there is one."""
@@ -237,9 +202,8 @@ class NeumatexModel(Model):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Figures and pictures of one view: see `image_evaluation` and `spectral_evaluation`."""
-        evaluate = evaluate_spectral_image if self.record.is_spectral else evaluate_object_image
-        return evaluate(self, outputs, batch)
+        """Figures and pictures of one view."""
+        return evaluate_object_image(self, outputs, batch)
 
     def warm_up(self) -> None:
         """Compile the kernels, forward and backward, on a few rays that meet the mesh."""
@@ -286,7 +250,23 @@ class NeumatexModel(Model):
             return LampRatio(self.record.lamp) if name == "auto" else tone_curve(name)
         return tone_curve("agx" if name == "auto" else name)
 
-    @torch.no_grad()
+    def _empty_endmembers(self) -> nn.Parameter | None:
+        """Endmembers (K, B) of a spectral material, not yet filled; None for materials in colours."""
+        is_spectral, bands = self.record.is_spectral, self.record.num_colours
+        if is_spectral != (self.config.material == "spectral"):
+            raise ConfigError(
+                f"the material {self.config.material} does not fit pictures of {bands} "
+                f"{'bands' if is_spectral else 'colours'}; choose {'spectral' if is_spectral else 'neural or pbr'}"
+            )
+        if not is_spectral:
+            return None
+        count = self.config.num_endmembers
+        if not isinstance(count, int):
+            raise ConfigError("num-endmembers is not settled: call resolve_auto first")
+        if count > bands:
+            raise ConfigError(f"num-endmembers is {count} but the pictures have {bands} bands; choose fewer")
+        return nn.Parameter(torch.zeros(count, bands))
+
     def _settle_endmembers(self, step: int, progress: float) -> None:
         assert self.endmembers is not None
         assert self.gains is not None
@@ -297,6 +277,14 @@ class NeumatexModel(Model):
         if self.generator is not None and self.training:
             return self.generator
         return torch.Generator(self.device).manual_seed(0)
+
+
+@torch.no_grad()
+def _settle(endmembers: Float[Tensor, "K B"], gains: Float[Tensor, " K"]) -> None:
+    """Make endmembers as bright as their gains say, as far as reflectances can be, and the gains 1; in place."""
+    bright = endmembers.clamp(0, 1) * gains.clamp(min=0)[:, None]
+    endmembers.copy_(bright / bright.amax(dim=1, keepdim=True).clamp(min=1))
+    gains.fill_(1)
 
 
 def _squared_error(residuals: Float[Tensor, "2 R C"], found: Tensor) -> Float[Tensor, ""]:

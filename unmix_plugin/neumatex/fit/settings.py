@@ -1,7 +1,4 @@
-"""What gives a model of an object its shape: `metadata` of its data manager, checked when a run is opened.
-
-Settings of the model neumatex, and how those that follow from the object are found.
-"""
+"""Settings of the model neumatex, and what an object adds to them: sizes, light and bands, as a run records them."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Where the path tracer gets materials from: one family, and its parameters at points of a mesh.
 
-A material on a surface: three planes of features, read by two small networks that all objects share.
+The parameters of an object lie in three planes of features, read by two small networks.
 
 Notation: `N` points in model space, where the mesh lies in [-1, 1]^3; `P` parameters of a material; `C` channels and
 `R` texels along an edge of a plane. Plane 0 is XY, plane 1 YZ, plane 2 XZ; the first letter runs along a plane's
@@ -42,7 +42,7 @@ class Surface(Protocol):
 
 @dataclass(frozen=True)
 class _DecodedSurface:
-    """The same materials, their parameters decoded where they are looked up; see `Surface`."""
+    """The same materials, their parameters decoded where they are looked up."""
 
     encoded: Surface
     decodable: DecodableFamily
@@ -50,11 +50,9 @@ class _DecodedSurface:
 
     @property
     def family(self) -> MaterialFamily:
-        """Of the decoded parameters."""
         return self.decodable.decoded_family
 
     def parameters(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N P"]:
-        """Decoded parameters at surface points."""
         return self.decodable.decoded(self.encoded.parameters(positions))
 
 
@@ -65,12 +63,23 @@ def decoded_once(surface: Surface) -> Surface:
     return _DecodedSurface(surface, family) if isinstance(family, DecodableFamily) else surface
 
 
-PLANE_AXES = ((0, 1), (1, 2), (0, 2))
-"""Axes of the model that run along the columns and the rows of XY, YZ, XZ."""
+@dataclass(frozen=True)
+class TriplaneSurface:
+    """A `Surface` of a family, its parameters looked up in a triplane."""
+
+    family: MaterialFamily
+    triplane: Triplane
+
+    def parameters(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N P"]:
+        return self.triplane.parameters_at(positions)
+
+
 NUM_CHANNELS = 12
 """Channels of a plane, as published."""
-NUM_FREQUENCIES = 3
+_NUM_FREQUENCIES = 3
 """Bands of the positional encoding, as published."""
+PLANE_AXES = ((0, 1), (1, 2), (0, 2))
+"""Axes of the model that run along the columns and the rows of XY, YZ, XZ."""
 LOG_VARIANCE_RANGE = (-9.0, 0.0)
 """Least and largest log-variance of a parameter: standard deviations of 0.011 and 1, the parameters being in [0, 1]."""
 _WIDTH = 64
@@ -94,7 +103,7 @@ class Readers(nn.Module):
             num_shares: How many of the first parameters are shares, which sum to 1.
         """
         super().__init__()
-        inputs = 3 * num_channels + 3 + 6 * NUM_FREQUENCIES
+        inputs = 3 * num_channels + 3 + 6 * _NUM_FREQUENCIES
         self.num_parameters = num_parameters
         self.num_shares = num_shares
         self.material_network = _network(inputs, num_parameters, generator)
@@ -189,7 +198,7 @@ def look_up_twin(planes: Float[Tensor, "3 C R R"], positions: Float[Tensor, "N 3
 
 def encode(positions: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n E"]:
     """Sines and cosines of the position times pi, 2 pi and 4 pi: 18 numbers."""
-    angles = torch.cat([positions * (math.pi * 2.0**band) for band in range(NUM_FREQUENCIES)], dim=-1)
+    angles = torch.cat([positions * (math.pi * 2.0**band) for band in range(_NUM_FREQUENCIES)], dim=-1)
     return torch.cat([angles.sin(), angles.cos()], dim=-1)
 
 
