@@ -196,14 +196,14 @@ def seen_pixels(
     truth: Any, scene: Any, endmembers: torch.Tensor, lamp: torch.Tensor, index: int
 ) -> tuple[torch.Tensor, ...]:
     """Of pixels that count: direct light, the true albedo, the one found, that with shading, the true abundances."""
-    from unmix_plugin.neumatex.fit.data_manager import OPAQUE
+    from unmix_plugin.spectral.evidence import OPAQUE_ALPHA
 
     light, alpha = direct_light(truth, index)
     name = truth.pictures.names[index]
     camera = next(view.camera for view in scene.views if view.name.endswith(name))
     view = scene.look(camera)
     opacity = view.opacity
-    shown = (alpha >= OPAQUE) & (opacity > 0.9) & (light > _DARKEST * light.max())
+    shown = (alpha >= OPAQUE_ALPHA) & (opacity > 0.9) & (light > _DARKEST * light.max())
     shares = view["abundances"][shown]
     found = (shares / shares.sum(dim=1, keepdim=True) @ endmembers).mean(dim=1)
     with_shading = found

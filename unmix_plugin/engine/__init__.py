@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from unmix_plugin.engine.configs import (
+        Common,
         DataManagerConfig,
         InstantiateConfig,
         ModelConfig,
@@ -18,7 +19,9 @@ if TYPE_CHECKING:
         PipelineConfig,
         Target,
         TrainerConfig,
+        short,
     )
+    from unmix_plugin.engine.geometry.camera_paths import upright_cameras
     from unmix_plugin.engine.geometry.cameras import Cameras
     from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
     from unmix_plugin.engine.machine import step_generator
@@ -30,12 +33,21 @@ if TYPE_CHECKING:
         TrainingCallbackLocation,
     )
     from unmix_plugin.engine.pipeline import Pipeline
-    from unmix_plugin.engine.registry import MethodSpecification, Output, discover_methods, find_method
+    from unmix_plugin.engine.registry import (
+        MethodSpecification,
+        Output,
+        discover_methods,
+        find_method,
+        named_output,
+    )
+    from unmix_plugin.engine.runs.config_json import config_from_json
     from unmix_plugin.engine.runs.load_run import LoadedModel, load_config, load_model, load_pipeline
+    from unmix_plugin.engine.runs.scene_record import SceneRecord
     from unmix_plugin.engine.training.trainer import Trainer
 
 _MODULES = {
     "configs": (
+        "Common",
         "DataManagerConfig",
         "InstantiateConfig",
         "ModelConfig",
@@ -43,19 +55,24 @@ _MODULES = {
         "PipelineConfig",
         "Target",
         "TrainerConfig",
+        "short",
     ),
+    "geometry.camera_paths": ("upright_cameras",),
     "geometry.cameras": ("Cameras",),
     "geometry.space": ("RayBundle", "SceneBox"),
     "machine": ("step_generator",),
     "model": ("DataManager", "Field", "Model", "TrainingCallback", "TrainingCallbackLocation"),
     "pipeline": ("Pipeline",),
-    "registry": ("MethodSpecification", "Output", "discover_methods", "find_method"),
+    "registry": ("MethodSpecification", "Output", "discover_methods", "find_method", "named_output"),
+    "runs.config_json": ("config_from_json",),
     "runs.load_run": ("LoadedModel", "load_config", "load_model", "load_pipeline"),
+    "runs.scene_record": ("SceneRecord",),
     "training.trainer": ("Trainer",),
 }
 
 __all__ = [
     "Cameras",
+    "Common",
     "DataManager",
     "DataManagerConfig",
     "Field",
@@ -70,17 +87,22 @@ __all__ = [
     "PipelineConfig",
     "RayBundle",
     "SceneBox",
+    "SceneRecord",
     "Target",
     "Trainer",
     "TrainerConfig",
     "TrainingCallback",
     "TrainingCallbackLocation",
+    "config_from_json",
     "discover_methods",
     "find_method",
     "load_config",
     "load_model",
     "load_pipeline",
+    "named_output",
+    "short",
     "step_generator",
+    "upright_cameras",
 ]
 
 

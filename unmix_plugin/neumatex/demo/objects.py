@@ -1,30 +1,22 @@
-"""Where the cameras of built-in objects are: around the object, above and below.
+"""Built-in objects as folders: pictures of a procedural mesh by our own path tracer, in colours or in many bands.
 
-Notation: `N` views.
+A folder holds transforms.json, mesh.glb, environment.exr and pictures under one light; relit/<light>/ holds the same
+under lights that training never sees. Every 8th view is for evaluation.
 
-Built-in objects as folders: pictures of a procedural mesh with layered materials, by our own path tracer.
+Objects in colours have layered materials; pictures in images/ are linear OpenEXR with straight alpha, and
+truth/base_colour/ has the base colour of evaluation views. Spectral objects are of measured materials, and a spectral
+scene like any other here, which `unmix-nerf` can be trained on, too: cubes with pictures for their alpha, wavelengths,
+the lamp's spectrum, true endmembers, and true abundances of evaluation views. Of their environment, which is in
+colours, luminance counts; elsewhere they have another lamp.
 
-The folder holds transforms.json, mesh.glb, environment.exr and images/ under one light; relit/<light>/ holds the same
-under lights that training never sees, and truth/base_colour/ the base colour of evaluation views. Pictures are linear
-OpenEXR with straight alpha. Every 8th view is for evaluation.
-
-Notation: `H x W` pixels, `N` views.
-
-Built-in objects as spectral pictures: a procedural mesh of measured materials, by our own path tracer.
-
-The folder is a spectral scene like any other here, which `unmix-nerf` can be trained on, too: cubes with pictures for
-their alpha, wavelengths, the lamp's spectrum, true endmembers, and true abundances of evaluation views. Beside that it
-has a mesh, an environment in colours, whose luminance counts, and relit/<light>/ with the same object under other
-environments and another lamp.
-
-Notation: `H x W` pixels, `B` bands.
+Notation: `H x W` pixels, `N` views, `B` bands, `K` endmembers.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,8 +26,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.camera_paths import upright_cameras
-from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine import Cameras, upright_cameras
 from unmix_plugin.formats.exr import write_exr
 from unmix_plugin.formats.meshes import write_glb
 from unmix_plugin.neumatex.demo.shapes import demo_mesh
@@ -60,10 +51,107 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 
+DEFAULT_SIZE, DEFAULT_VIEWS, DEFAULT_LIGHTS = 96, 24, 4
+DEFAULT_BANDS, DEFAULT_SPECTRAL_LIGHTS = 16, 2
+VIEWS_A_LIGHT = 3
+"""Pictures under each light that training never sees."""
+EVALUATION_INTERVAL = 8
+"""Every so many views one is for evaluation, from the first on."""
+LAMP, OTHER_LAMP = "D50", "A"
+"""That light a spectral object in training, and elsewhere."""
+TRAINING_LIGHT = "clear-sky"
+"""Environment of a spectral object in training, whose sun casts shadows."""
+_TRAINING_LIGHTS = ("studio", "softbox-strips", "clear-sky", "window-room", "overcast")
+"""Lights that show all colours of a material; an object in colours is captured under one of them."""
+_BOUNDS = {"size": (16, 1024), "views": (2, 1000), "bands": (4, 512), "lights": (0, len(NAMES) - 1)}
+_SAMPLES, _EVALUATION_SAMPLES, _SPECTRAL_EVALUATION_SAMPLES = 64, 384, 160
+"""Paths a pixel."""
+_BOUNCES = 2
+_SUBPIXELS = 2
+_MEAN_RADIANCE, _SPECTRAL_MEAN_RADIANCE = 0.3, 0.2
+"""Of the object, which its environments are scaled to; low enough for highlights of spectral pictures to stay below 1
+nearly everywhere."""
 _DISTANCE = 4.2
 _ELEVATIONS_DEG = (-40.0, 70.0)
 _MARGIN = 1.12
 """Half of a picture, as a multiple of the object's radius."""
+
+Say = Callable[[str], object]
+"""What to do with a line about the progress."""
+
+
+def demo_object(
+    folder: Path,
+    seed: int = 0,
+    size: int = DEFAULT_SIZE,
+    views: int = DEFAULT_VIEWS,
+    lights: int = DEFAULT_LIGHTS,
+    say: Say | None = None,
+) -> None:
+    """Write an object. It is built beside the folder and moved in when complete.
+
+    Args:
+        folder: Made if absent, parents too.
+        seed: Shape, materials and lights follow from it; shapes take turns.
+        size: Rows and columns of the pictures.
+        views: Pictures under the light of training.
+        lights: Other lights, each with `VIEWS_A_LIGHT` pictures.
+        say: Gets a line for each light.
+    Raises:
+        ConfigError: a number out of bounds; a folder with something in it, or no folder at all.
+        SceneError: the folder can't be written, or the disk is full.
+    """
+    numbers = {"size": size, "views": views, "lights": lights}
+    _write_into(folder, numbers, lambda place: _write_object(place, seed, size, views, lights, say))
+
+
+def demo_spectral_object(
+    folder: Path,
+    seed: int = 0,
+    size: int = DEFAULT_SIZE,
+    views: int = DEFAULT_VIEWS,
+    bands: int = DEFAULT_BANDS,
+    lights: int = DEFAULT_SPECTRAL_LIGHTS,
+    say: Say | None = None,
+    light: str = TRAINING_LIGHT,
+) -> None:
+    """Write a spectral object, as `demo_object` writes one in colours.
+
+    Args:
+        bands: Evenly spaced over 400 to 700 nm.
+        light: Built-in environment of training.
+    Raises:
+        ConfigError: a number out of bounds; no such light; a folder with something in it, or no folder at all.
+        SceneError: the folder can't be written, or the disk is full.
+    """
+    numbers = {"size": size, "views": views, "bands": bands, "lights": lights}
+    _write_into(
+        folder,
+        numbers,
+        lambda place: _write_spectral_object(place, seed, size, views, bands, lights, say, light),
+    )
+
+
+def demo_object_path(cache_dir: Path | None = None, say: Say | None = None) -> Path:
+    """The folder of the default demo object, written on first use, which takes a minute or two.
+
+    Args:
+        cache_dir: Where to keep it; None is `unmix-nerf` in XDG_CACHE_HOME or ~/.cache. A changed generator writes
+            into a new folder.
+        say: Gets a line for each light.
+    Raises:
+        SceneError: the cache can't be written.
+    """
+    numbers = DEFAULT_SIZE, DEFAULT_VIEWS, DEFAULT_LIGHTS
+    return _cached("demo-object", cache_dir, lambda place: _write_object(place, 0, *numbers, say))
+
+
+def demo_spectral_object_path(cache_dir: Path | None = None, say: Say | None = None) -> Path:
+    """The folder of the default spectral demo object, written on first use; see `demo_object_path`."""
+    numbers = DEFAULT_SIZE, DEFAULT_VIEWS, DEFAULT_BANDS, DEFAULT_SPECTRAL_LIGHTS
+    return _cached(
+        "demo-spectral-object", cache_dir, lambda place: _write_spectral_object(place, 0, *numbers, say)
+    )
 
 
 def viewpoints(views: int, size: int, radius: float, first: int = 0) -> Cameras:
@@ -85,27 +173,6 @@ def viewpoints(views: int, size: int, radius: float, first: int = 0) -> Cameras:
     backward = np.stack([flat * np.cos(azimuths), flat * np.sin(azimuths), z], axis=1)
     half_angle = np.arcsin(min(_MARGIN * radius / _DISTANCE, 0.95))
     return upright_cameras(_DISTANCE * backward, backward, size, 2 * half_angle)
-
-
-DEFAULT_SIZE, DEFAULT_VIEWS, DEFAULT_LIGHTS = 96, 24, 4
-SIZE_BOUNDS, VIEWS_BOUNDS, LIGHTS_BOUNDS = (16, 1024), (2, 1000), (0, len(NAMES) - 1)
-VIEWS_A_LIGHT = 3
-"""Pictures under each light that training never sees."""
-EVALUATION_INTERVAL = 8
-"""Every so many views one is for evaluation, from the first on."""
-
-_TRAINING_LIGHTS = ("studio", "softbox-strips", "clear-sky", "window-room", "overcast")
-"""Lights that show all colours of a material; an object is captured under one of them."""
-
-_SAMPLES, _EVALUATION_SAMPLES = 64, 384
-"""Paths a pixel."""
-_BOUNCES = 2
-_SUBPIXELS = 2
-_MEAN_RADIANCE = 0.3
-"""Of the object, which its environments are scaled to."""
-
-Say = Callable[[str], object]
-"""What to do with a line about the progress."""
 
 
 @dataclass(frozen=True)
@@ -137,10 +204,6 @@ class _Subject:
             generator=self.generator,
         )
 
-    def exposed(self, light: Environment) -> Environment:
-        """A light scaled so that the object's mean radiance is `_MEAN_RADIANCE`."""
-        return Environment(light.image * self.exposure(light, _MEAN_RADIANCE))
-
     def exposure(self, light: Environment, mean_radiance: float) -> Float[Tensor, ""]:
         """Factor of a light that gives the object a mean radiance."""
         cameras = self.cameras(4, 0).resized(24, 24)
@@ -149,80 +212,16 @@ class _Subject:
         return mean_radiance * light.num_colours * alpha / radiance
 
 
-def demo_object(
-    folder: Path,
-    seed: int = 0,
-    size: int = DEFAULT_SIZE,
-    views: int = DEFAULT_VIEWS,
-    lights: int = DEFAULT_LIGHTS,
-    say: Say | None = None,
-) -> None:
-    """Write an object. It is built beside the folder and moved in when complete.
-
-    Args:
-        folder: Made if absent, parents too.
-        seed: Shape, materials and lights follow from it; shapes take turns.
-        size: Rows and columns of the pictures.
-        views: Pictures under the light of training.
-        lights: Other lights, each with `VIEWS_A_LIGHT` pictures.
-        say: Gets a line for each light.
-    Raises:
-        ConfigError: a number out of bounds; a folder with something in it, or no folder at all.
-        SceneError: the folder can't be written, or the disk is full.
-    """
-    check_bounds(
-        "a demo object",
-        {
-            "size": (size, SIZE_BOUNDS),
-            "views": (views, VIEWS_BOUNDS),
-            "lights": (lights, LIGHTS_BOUNDS),
-        },
-    )
-    with staging_for(folder, "the demo object", overwrite=False) as staging:
-        _write_object(staging / "object", seed, size, views, lights, say)
-        if folder.exists():
-            folder.rmdir()
-        (staging / "object").rename(folder)
-
-
-def demo_object_path(cache_dir: Path | None = None, say: Say | None = None) -> Path:
-    """The folder of the default demo object, written on first use, which takes a minute or two.
-
-    Args:
-        cache_dir: Where to keep it; None is `unmix-nerf` in XDG_CACHE_HOME or ~/.cache. A changed generator writes
-            into a new folder.
-        say: Gets a line for each light.
-    Raises:
-        SceneError: the cache can't be written.
-    """
-    return _cached_object(
-        "demo-object",
-        lambda folder: _write_object(folder, 0, DEFAULT_SIZE, DEFAULT_VIEWS, DEFAULT_LIGHTS, say),
-        cache_dir,
-    )
-
-
-def _cached_object(name: str, write: Callable[[Path], None], cache_dir: Path | None) -> Path:
-    """The folder of an object that is written once for each version of the generator; see `demo_object_path`.
-
-    Args:
-        name: Of its folder in the cache.
-        write: Writes it into a folder.
-    """
-    target = (cache_dir or user_cache()) / f"{name}-{_generator_hash()}" / "object"
-    return written_once(target, f"the {name.replace('-', ' ')}", write, _is_complete)
-
-
 def _write_object(folder: Path, seed: int, size: int, views: int, lights: int, say: Say | None) -> None:
-    names = _light_names(seed, lights)
     surface = LayeredSurface(seed)
     subject = _Subject(RayMesh(demo_mesh(seed)), surface, torch.Generator().manual_seed(seed), size)
     colours = surface.family.base_colour(surface.parameters(subject.ray_mesh.mesh.vertices))
     _write_mesh(folder / "mesh.glb", subject.ray_mesh.mesh, colours, surface.kinds)
+    names = _light_names(seed)[: lights + 1]
     for number, name in enumerate(names):
-        if say is not None:
-            say(f"demo object: rendering light {number + 1} of {len(names)} ({name})")
-        light = subject.exposed(built_in_environment(name, seed))
+        _tell(say, number, names)
+        light = built_in_environment(name, seed)
+        light = Environment(light.image * subject.exposure(light, _MEAN_RADIANCE))
         if number == 0:
             cameras = subject.cameras(views, 0)
             _write_pictures(folder, subject, light, cameras, EVALUATION_INTERVAL)
@@ -232,177 +231,62 @@ def _write_object(folder: Path, seed: int, size: int, views: int, lights: int, s
             _write_pictures(folder / "relit" / name, subject, light, cameras, 1)
 
 
-def _light_names(seed: int, lights: int) -> list[str]:
-    """The light of training, one of `_TRAINING_LIGHTS`, and others after it."""
-    rng = np.random.default_rng([3, seed])
-    chosen = str(rng.choice(_TRAINING_LIGHTS))
-    return [chosen, *(str(name) for name in rng.permutation(NAMES) if name != chosen)][: lights + 1]
-
-
 def _write_pictures(
     folder: Path, subject: _Subject, light: Environment, cameras: Cameras, evaluation_interval: int
 ) -> None:
     """Pictures under one light with transforms.json and the light itself."""
     frames: list[dict[str, Any]] = []
     for index in range(len(cameras)):
-        path = f"images/{_name(index)}"
+        path = f"images/{index:03d}.exr"
         samples = _SAMPLES if index % evaluation_interval else _EVALUATION_SAMPLES
         radiance, alpha = subject.picture(light, cameras, index, samples)
         _write_straight(folder / path, radiance, alpha)
         frames.append({"file_path": path, "transform_matrix": transform_matrix(cameras, index)})
     _write_channels(folder / "environment.exr", light.image)
-    content = {
-        **lens_entries(cameras),
-        "environment_path": "environment.exr",
-        "tone_mapping": "linear",
-        "frames": frames,
-    }
-    (folder / "transforms.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    keys = {"environment_path": "environment.exr", "tone_mapping": "linear", "frames": frames}
+    _write_json(folder, {**lens_entries(cameras), **keys})
 
 
 def _write_base_colours(folder: Path, subject: _Subject, cameras: Cameras) -> None:
     """Base colours of evaluation views."""
     for index in range(0, len(cameras), EVALUATION_INTERVAL):
         hits = pixel_hits(subject.ray_mesh, cameras, index, _SUBPIXELS)
-        parameters = subject.surface.parameters(hits.points.positions)
-        colours = hits.image(subject.surface.family.base_colour(parameters))
-        _write_straight(folder / _name(index), colours, hits.alpha())
+        colours = subject.surface.family.base_colour(subject.surface.parameters(hits.points.positions))
+        _write_straight(folder / f"{index:03d}.exr", hits.image(colours), hits.alpha())
 
 
-def _write_straight(path: Path, premultiplied: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W"]) -> None:
-    """RGBA whose colours are not multiplied by alpha; 0 where it is 0."""
-    straight = premultiplied / alpha.clamp(min=1e-6)[..., None]
-    _write_channels(path, torch.cat([straight, alpha[..., None]], dim=-1))
-
-
-def _write_channels(path: Path, image: Float[Tensor, "H W c"]) -> None:
-    """Channels R, G, B, A as far as there are."""
-    names = "RGBA"[: image.shape[-1]]
-    write_exr(path, {name: image[..., index].numpy() for index, name in enumerate(names)}, {})
-
-
-def _write_mesh(path: Path, mesh: Mesh, colours: Float[Tensor, "V 3"], kinds: Sequence[str]) -> None:
-    """A glTF mesh with linear colours at its vertices, and the names of its materials."""
-    parts = (mesh.vertices.numpy(), mesh.normals.numpy(), colours.numpy(), mesh.faces.numpy())
-    write_glb(path, *parts, {}, {"materials": list(kinds)})
-
-
-def _name(index: int) -> str:
-    return f"{index:03d}.exr"
-
-
-def _is_complete(folder: Path) -> bool:
-    """Whether a folder holds an object with all pictures of the light of training."""
-    try:
-        frames = json.loads((folder / "transforms.json").read_text(encoding="utf-8"))["frames"]
-        paths = [folder / frame["file_path"] for frame in frames]
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
-    return all(path.is_file() for path in (*paths, folder / "mesh.glb", folder / "environment.exr"))
-
-
-def _generator_hash() -> str:
-    """Changes with the generator's code, so that a cached object is never one of another version."""
-    digest = hashlib.sha256()
-    rooms = Path(__file__).parent.parent
-    for room in ("demo", "geometry", "lighting", "materials", "tracing"):
-        for path in sorted((rooms / room).glob("*.py")):
-            digest.update(path.read_bytes())
-    return digest.hexdigest()[:12]
-
-
-DEFAULT_BANDS, DEFAULT_SPECTRAL_LIGHTS = 16, 2
-BANDS_BOUNDS = (4, 512)
-LAMP, OTHER_LAMP = "D50", "A"
-"""That light the object in training, and elsewhere."""
-
-TRAINING_LIGHT = "clear-sky"
-"""Environment of training, whose sun casts shadows."""
-
-_SAMPLES_SPECTRAL_OBJECT, _EVALUATION_SAMPLES_SPECTRAL_OBJECT = 64, 160
-_SUBPIXELS_SPECTRAL_OBJECT = 2
-_MEAN_RADIANCE_SPECTRAL_OBJECT = 0.2
-"""Of the object; low enough for highlights to stay below 1 nearly everywhere."""
-
-
-def demo_spectral_object(
+def _write_spectral_object(
     folder: Path,
-    seed: int = 0,
-    size: int = DEFAULT_SIZE,
-    views: int = DEFAULT_VIEWS,
-    bands: int = DEFAULT_BANDS,
-    lights: int = DEFAULT_SPECTRAL_LIGHTS,
-    say: Say | None = None,
-    light: str = TRAINING_LIGHT,
+    seed: int,
+    size: int,
+    views: int,
+    num_bands: int,
+    lights: int,
+    say: Say | None,
+    light_name: str = TRAINING_LIGHT,
 ) -> None:
-    """Write an object. It is built beside the folder and moved in when complete.
-
-    Args:
-        folder: Made if absent, parents too.
-        seed: Shape, materials and lights follow from it.
-        size: Rows and columns of the pictures.
-        views: Pictures under the light of training, every 8th for evaluation.
-        bands: Evenly spaced over 400 to 700 nm.
-        lights: Other lights, each with `VIEWS_A_LIGHT` pictures.
-        say: Gets a line for each light.
-        light: Built-in environment of training.
-    Raises:
-        ConfigError: a number out of bounds; no such light; a folder with something in it, or no folder at all.
-        SceneError: the folder can't be written, or the disk is full.
-    """
-    bounds = {
-        "size": (size, SIZE_BOUNDS),
-        "views": (views, VIEWS_BOUNDS),
-        "bands": (bands, BANDS_BOUNDS),
-        "lights": (lights, LIGHTS_BOUNDS),
-    }
-    check_bounds("a demo object", bounds)
-    with staging_for(folder, "the demo object", overwrite=False) as staging:
-        _write_object_spectral_object(staging / "object", seed, (size, views, bands, lights), light, say)
-        if folder.exists():
-            folder.rmdir()
-        (staging / "object").rename(folder)
-
-
-def demo_spectral_object_path(cache_dir: Path | None = None, say: Say | None = None) -> Path:
-    """The folder of the default spectral demo object, written on first use; see `demo_object_path`."""
-
-    def write(folder: Path) -> None:
-        numbers = (DEFAULT_SIZE, DEFAULT_VIEWS, DEFAULT_BANDS, DEFAULT_SPECTRAL_LIGHTS)
-        _write_object_spectral_object(folder, 0, numbers, TRAINING_LIGHT, say)
-
-    return _cached_object("demo-spectral-object", write, cache_dir)
-
-
-def _write_object_spectral_object(
-    folder: Path, seed: int, numbers: tuple[int, int, int, int], light_name: str, say: Say | None
-) -> None:
-    size, views, num_bands, lights = numbers
-    others = [name for name in _light_names(seed, len(NAMES) - 1) if name != light_name]
-    bands, names = Bands.of(band_centers_nm(num_bands)), [light_name, *others[:lights]]
-    ray_mesh = RayMesh(demo_mesh(seed))
+    bands, ray_mesh = Bands.of(band_centers_nm(num_bands)), RayMesh(demo_mesh(seed))
     surface = SpectralSurface(seed, bands.centers_nm, ray_mesh.mesh.vertices)
     subject = _Subject(ray_mesh, surface, torch.Generator().manual_seed(seed), size)
-    mesh, to_rgb = ray_mesh.mesh, rgb_matrix(bands)
-    colours = surface.family.base_colour(surface.parameters(mesh.vertices)) @ to_rgb
-    _write_mesh(folder / "mesh.glb", mesh, colours.clamp(0, 1), surface.names)
+    colours = surface.family.base_colour(surface.parameters(ray_mesh.mesh.vertices)) @ rgb_matrix(bands)
+    _write_mesh(folder / "mesh.glb", ray_mesh.mesh, colours.clamp(0, 1), surface.names)
     table = SpectraTable(bands, surface.names, surface.family.endmembers.double().numpy())
     write_spectra_csv(folder / "endmembers.csv", table)
+    names = [light_name, *[name for name in _light_names(seed) if name != light_name][:lights]]
     for number, name in enumerate(names):
-        if say is not None:
-            say(f"demo object: rendering light {number + 1} of {len(names)} ({name})")
+        _tell(say, number, names)
         light = built_in_environment(name, seed)
         if number == 0:
             cameras = subject.cameras(views, 0)
             truth = {"materials": list(surface.names), "endmembers_path": "endmembers.csv"}
-            _write_pictures_spectral_object(folder, subject, light, cameras, bands, LAMP, truth)
+            _write_cubes(folder, subject, light, cameras, bands, LAMP, truth)
         else:
             cameras = subject.cameras(VIEWS_A_LIGHT, 1000 + VIEWS_A_LIGHT * number)
             lamp = OTHER_LAMP if number % 2 else LAMP
-            _write_pictures_spectral_object(folder / "relit" / name, subject, light, cameras, bands, lamp, {})
+            _write_cubes(folder / "relit" / name, subject, light, cameras, bands, lamp, {})
 
 
-def _write_pictures_spectral_object(
+def _write_cubes(
     folder: Path,
     subject: _Subject,
     colours: Environment,
@@ -411,18 +295,18 @@ def _write_pictures_spectral_object(
     lamp_name: str,
     truth: dict[str, Any],
 ) -> None:
-    """Pictures under one light with transforms.json, the light and the lamp; with truth, abundances too."""
+    """Cubes under one light with transforms.json, the light and the lamp; with truth, abundances too."""
     lamp = read_lamp(lamp_name, bands)
     light = of_lamp(colours, torch.from_numpy(lamp))
-    factor = subject.exposure(light, _MEAN_RADIANCE_SPECTRAL_OBJECT)
+    factor = subject.exposure(light, _SPECTRAL_MEAN_RADIANCE)
     light, frames = Environment(light.image * factor), list[dict[str, Any]]()
+    splits: dict[str, list[str]] = {"train_filenames": [], "val_filenames": []}
     for index in range(len(cameras)):
         is_evaluation = bool(truth) and index % EVALUATION_INTERVAL == 0
-        samples = (
-            _EVALUATION_SAMPLES_SPECTRAL_OBJECT if is_evaluation or not truth else _SAMPLES_SPECTRAL_OBJECT
-        )
+        samples = _SPECTRAL_EVALUATION_SAMPLES if is_evaluation or not truth else _SAMPLES
         radiance, alpha = subject.picture(light, cameras, index, samples)
         frame = _write_view(folder, f"{index:03d}", radiance, alpha, rgb_matrix(bands))
+        splits["val_filenames" if is_evaluation else "train_filenames"].append(frame["file_path"])
         if is_evaluation:
             frame["abundance_file_path"] = f"abundances/{index:03d}.npy"
             _save(folder / frame["abundance_file_path"], _abundances(subject, cameras, index))
@@ -436,16 +320,10 @@ def _write_pictures_spectral_object(
         "environment_path": "environment.exr",
         "tone_mapping": "linear",
         "value_scale": 1.0,
-        **({"mesh_path": "mesh.glb", **truth, **_splits(frames)} if truth else {}),
-        "frames": frames,
     }
-    (folder / "transforms.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-
-
-def _splits(frames: list[dict[str, Any]]) -> dict[str, list[str]]:
-    evaluation = [frame["file_path"] for frame in frames if "abundance_file_path" in frame]
-    train = [frame["file_path"] for frame in frames if "abundance_file_path" not in frame]
-    return {"train_filenames": train, "val_filenames": evaluation, "test_filenames": evaluation}
+    if truth:
+        content |= {"mesh_path": "mesh.glb", **truth, **splits, "test_filenames": splits["val_filenames"]}
+    _write_json(folder, {**content, "frames": frames})
 
 
 def _write_view(
@@ -472,11 +350,75 @@ def _abundances(subject: _Subject, cameras: Cameras, index: int) -> Float[Tensor
     """Means of what is seen in each pixel; 0 where nothing is."""
     surface = subject.surface
     assert isinstance(surface, SpectralSurface)
-    hits = pixel_hits(subject.ray_mesh, cameras, index, _SUBPIXELS_SPECTRAL_OBJECT)
+    hits = pixel_hits(subject.ray_mesh, cameras, index, _SUBPIXELS)
     found = hits.image(surface.family.abundances(surface.parameters(hits.points.positions)))
     return found / hits.alpha().clamp(min=1e-6)[..., None]
+
+
+def _light_names(seed: int) -> list[str]:
+    """A light of training, one of `_TRAINING_LIGHTS`, and all others after it."""
+    rng = np.random.default_rng([3, seed])
+    chosen = str(rng.choice(_TRAINING_LIGHTS))
+    return [chosen, *(str(name) for name in rng.permutation(NAMES) if name != chosen)]
+
+
+def _tell(say: Say | None, number: int, names: Sequence[str]) -> None:
+    if say is not None:
+        say(f"demo object: rendering light {number + 1} of {len(names)} ({names[number]})")
+
+
+def _write_straight(path: Path, premultiplied: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W"]) -> None:
+    """RGBA whose colours are not multiplied by alpha; 0 where it is 0."""
+    straight = premultiplied / alpha.clamp(min=1e-6)[..., None]
+    _write_channels(path, torch.cat([straight, alpha[..., None]], dim=-1))
+
+
+def _write_channels(path: Path, image: Float[Tensor, "H W c"]) -> None:
+    """Channels R, G, B, A as far as there are."""
+    names = "RGBA"[: image.shape[-1]]
+    write_exr(path, {name: image[..., index].numpy() for index, name in enumerate(names)}, {})
+
+
+def _write_mesh(path: Path, mesh: Mesh, colours: Float[Tensor, "V 3"], kinds: Sequence[str]) -> None:
+    """A glTF mesh with linear colours at its vertices, and the names of its materials."""
+    parts = (mesh.vertices.numpy(), mesh.normals.numpy(), colours.numpy(), mesh.faces.numpy())
+    write_glb(path, *parts, {}, {"materials": list(kinds)})
+
+
+def _write_json(folder: Path, content: dict[str, Any]) -> None:
+    (folder / "transforms.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 def _save(path: Path, numbers: Tensor) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     np.save(path, numbers.numpy().astype(np.float16))
+
+
+def _write_into(folder: Path, numbers: Mapping[str, int], write: Callable[[Path], None]) -> None:
+    """Check the numbers, write beside the folder, and move what was written in."""
+    check_bounds("a demo object", {name: (number, _BOUNDS[name]) for name, number in numbers.items()})
+    with staging_for(folder, "the demo object", overwrite=False) as staging:
+        write(staging / "object")
+        if folder.exists():
+            folder.rmdir()
+        (staging / "object").rename(folder)
+
+
+def _cached(name: str, cache_dir: Path | None, write: Callable[[Path], None]) -> Path:
+    """The folder of an object that is written once for each version of the generator's code."""
+    digest = hashlib.sha256()
+    for room in ("demo", "tracing"):
+        for path in sorted((Path(__file__).parent.parent / room).glob("*.py")):
+            digest.update(path.read_bytes())
+    target = (cache_dir or user_cache()) / f"{name}-{digest.hexdigest()[:12]}" / "object"
+    return written_once(target, f"the {name.replace('-', ' ')}", write, _is_complete)
+
+
+def _is_complete(folder: Path) -> bool:
+    """Whether a folder holds an object with all pictures of the light of training."""
+    try:
+        frames = json.loads((folder / "transforms.json").read_text(encoding="utf-8"))["frames"]
+        paths = [folder / frame["file_path"] for frame in frames]
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+    return all(path.is_file() for path in (*paths, folder / "mesh.glb", folder / "environment.exr"))

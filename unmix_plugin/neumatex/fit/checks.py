@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine import Cameras
 from unmix_plugin.errors import SceneError
 from unmix_plugin.neumatex.fit.pictures import PosedPictures, opacity
 from unmix_plugin.neumatex.tracing.environment import Environment

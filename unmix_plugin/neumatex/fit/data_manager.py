@@ -38,13 +38,12 @@ from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.neumatex.tracing.rays import RayMesh
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.colour.conversion import srgb_to_linear
+from unmix_plugin.spectral.evidence import OPAQUE_ALPHA
 
 DEMO_OBJECT = Path("demo-object")
 """`--data demo-object` stands for the built-in object."""
 DEMO_SPECTRAL_OBJECT = Path("demo-spectral-object")
 """And this for the one with spectral pictures."""
-OPAQUE = 0.99
-"""Alpha from which a pixel shows the object alone."""
 _CORNERS = ((0.02, 0.02), (0.98, 0.02), (0.02, 0.98), (0.98, 0.98), (0.5, 0.5))
 """Where in a pixel the mesh has to be seen, so that every place in it sees it."""
 _THINNEST = 1e-3
@@ -264,7 +263,9 @@ class _PixelList:
         for row, view in enumerate(scene.split.train):
             picture = scene.pictures.read(view)
             sees_mesh = _sees_mesh(ray_mesh, scene.pictures.cameras[view])
-            rows, columns = (torch.from_numpy(opacity(picture) >= OPAQUE) & sees_mesh).nonzero(as_tuple=True)
+            rows, columns = (torch.from_numpy(opacity(picture) >= OPAQUE_ALPHA) & sees_mesh).nonzero(
+                as_tuple=True
+            )
             if len(rows) > share:
                 kept = torch.randperm(len(rows), generator=generator)[:share]
                 rows, columns = rows[kept], columns[kept]

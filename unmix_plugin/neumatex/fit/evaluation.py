@@ -15,12 +15,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from unmix_plugin.engine import Cameras
-from unmix_plugin.neumatex.fit.data_manager import OPAQUE
 from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS, SpectralDisplay, psnr_db, tone_curve
 from unmix_plugin.neumatex.tracing.families import MaterialFamily, SpectralFamily
 from unmix_plugin.neumatex.tracing.path_tracer import TracedObject, rays_radiance
 from unmix_plugin.neumatex.tracing.rays import pixel_hits
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb
+from unmix_plugin.spectral.evidence import OPAQUE_ALPHA
 from unmix_plugin.spectral.metrics import abundance_rmse, endmember_angle, match_endmembers, spectral_angle
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def evaluation_outputs(
 ) -> dict[str, Float[Tensor, "H W C"]]:
     """`light` and `base_colour`, both linear, and `parameters` of the material, where pixels count; 0 elsewhere."""
     hits = pixel_hits(traced.ray_mesh, camera, 0, SUBPIXELS)
-    hits = hits.select((batch["alpha"] >= OPAQUE).flatten()[hits.pixels])
+    hits = hits.select((batch["alpha"] >= OPAQUE_ALPHA).flatten()[hits.pixels])
     light = rays_radiance(
         traced.surface,
         traced.ray_mesh,
@@ -69,7 +69,7 @@ def evaluate_object_image(
     Args:
         outputs: Of `evaluation_outputs`.
     """
-    shown, display = batch["alpha"] >= OPAQUE, model.curve
+    shown, display = batch["alpha"] >= OPAQUE_ALPHA, model.curve
     light, numbers = outputs["light"][shown], batch["numbers"][shown]
     if isinstance(display, SpectralDisplay):
         predicted, true = light.clamp(0, 1), numbers.clamp(0, 1)

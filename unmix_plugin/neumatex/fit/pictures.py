@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine import Cameras
 from unmix_plugin.errors import CaptureError, SceneError, counted
 from unmix_plugin.neumatex.fit.tone import ToneMapping
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array, read_array_header

@@ -10,9 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import torch
 
-from unmix_plugin.engine import Model, ModelConfig, Target
-from unmix_plugin.engine.configs import Common, short
-from unmix_plugin.engine.runs.config_json import config_from_json
+from unmix_plugin.engine import Common, Model, ModelConfig, Target, config_from_json, short
 from unmix_plugin.errors import require
 from unmix_plugin.neumatex.fit.tone import LightCurve, ToneMapping
 from unmix_plugin.spectral.bands import Bands

@@ -1,12 +1,6 @@
-"""What can be shown of an object: outputs by name, from surface points and the light that they reflect.
+"""The scene of a run of neumatex: a mesh with its materials, rendered under any light, and all that can be shown of it.
 
 Notation: `H x W` pixels, `K` rays that meet the mesh, `P` parameters, `C` colours.
-
-The scene of a run of neumatex: a mesh with its materials, rendered under any light.
-
-Notation: `H x W` pixels, `K` rays that meet the mesh, `P` parameters, `C` colours.
-
-From a model of neumatex, trained or in training, to the object that it holds at this moment.
 """
 
 from __future__ import annotations
@@ -22,10 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.space import SceneBox
-from unmix_plugin.engine.registry import Output, named_output
-from unmix_plugin.engine.runs.scene_record import SceneRecord
+from unmix_plugin.engine import Cameras, Output, SceneBox, SceneRecord, named_output
 from unmix_plugin.errors import ConfigError, did_you_mean
 from unmix_plugin.neumatex.fit.tone import SpectralDisplay
 from unmix_plugin.neumatex.tracing.built_in_lights import NAMES, built_in_environment
@@ -52,7 +43,12 @@ from unmix_plugin.trained.trained_scene import one_pixel
 if TYPE_CHECKING:
     from unmix_plugin.neumatex.fit.model import NeumatexModel
 
-
+OWN_LIGHT = "of the pictures"
+"""Name of the light that the pictures were taken under."""
+_GLANCE_SAMPLES = 4
+"""Paths a pixel of one estimate."""
+_SUBPIXELS = 2
+"""Rays along a pixel's edge of a finished view."""
 _CHUNK = 1 << 17
 _DARKEST = 0.02
 """Base colour below which shading is not divided by it."""
@@ -89,95 +85,6 @@ _GEOMETRY = (
     Output("depth", "map", "depth", "distance along the viewing axis in world units, 0 where nothing is"),
     Output("accumulation", "map", "opacity", "part of the pixel that the mesh covers", (0.0, 1.0)),
 )
-
-
-def _has_latents(family: MaterialFamily) -> bool:
-    """Whether parameters 3 to 8 are latents of a decoder."""
-    return getattr(family, "decoder", None) is not None
-
-
-def _object_outputs(family: MaterialFamily, has_variance: bool) -> tuple[Output, ...]:
-    """The outputs of objects with materials of a family, in the order in which they are offered."""
-    own: tuple[Output, ...] = ()
-    if isinstance(family, SpectralFamily):
-        own = _SPECTRAL
-    elif _has_latents(family) or isinstance(family, PbrFamily):
-        own = _LATENTS if _has_latents(family) else _PBR
-    return (*_COMMON, *own, *((_UNCERTAINTY,) if has_variance else ()), *_GEOMETRY)
-
-
-def _view_outputs(
-    scene: TrainedObject, camera: Cameras, hits: PixelHits, light: Float[Tensor, "K C"]
-) -> dict[str, Tensor]:
-    """All outputs of a view, (H, W, ...); colours are on black, everything else is a mean over what is seen in a
-    pixel."""
-    alpha = hits.alpha()
-    positions = hits.points.positions
-    parameters = _in_chunks(scene.surface.parameters, positions, scene.surface.family.num_parameters)
-    base = scene.surface.family.base_colour(parameters)
-    seen = alpha[..., None].clamp(min=1e-6)
-
-    def mean(values: Tensor) -> Tensor:
-        """Of what is seen."""
-        return hits.image(values) / seen
-
-    linear = hits.image(light)
-    in_colours = scene.curve.rgb if isinstance(scene.curve, SpectralDisplay) else _as_it_is
-    rgb = torch.where(alpha[..., None] > 0, scene.curve(linear / seen), 0.0) * alpha[..., None]
-    found = {
-        "rgb": rgb,
-        "linear_rgb": in_colours(linear),
-        "base_colour": in_colours(hits.image(base)),
-        "shading": hits.image(in_colours(light) / in_colours(base).clamp(min=_DARKEST)),
-        "normals": _world_normals(scene, mean(hits.points.normals)) * (alpha > 0)[..., None],
-        "depth": mean(_depths(scene, camera, positions)[:, None])[..., 0],
-        "accumulation": alpha,
-    }
-    family = scene.surface.family
-    if isinstance(family, SpectralFamily):
-        shares = hits.image(family.abundances(parameters))
-        found |= {"spectral": linear, "reflectance": hits.image(base), "abundances": shares}
-        found["segmentation"] = material_ids(shares, alpha)
-        gloss = mean(parameters[:, family.num_endmembers :])
-        found["roughness"], found["specular_level"] = gloss.unbind(dim=-1)
-    elif _has_latents(family):
-        found["latents_a"], found["latents_b"] = mean(parameters[:, 3:6]), mean(parameters[:, 6:9])
-    elif isinstance(family, PbrFamily):
-        found["roughness"], found["metallicity"] = mean(parameters[:, 3:5]).unbind(dim=-1)
-    if scene.log_variance is not None:
-        spread = (_in_chunks(scene.log_variance, positions, family.num_parameters) / 2).exp()
-        found["uncertainty"] = mean(spread.mean(dim=1, keepdim=True))[..., 0]
-    return found
-
-
-def _as_it_is(values: Tensor) -> Tensor:
-    return values
-
-
-def _in_chunks(look_up, positions: Float[Tensor, "K 3"], width: int) -> Tensor:  # noqa: ANN001
-    parts = [look_up(part) for part in positions.split(_CHUNK)] if len(positions) else []
-    return torch.cat(parts) if parts else positions.new_zeros((0, width))
-
-
-def _world_normals(scene: TrainedObject, normals: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
-    rotation = torch.from_numpy(scene.frame.rotation).to(normals)
-    return torch.nn.functional.normalize(normals @ rotation, dim=-1)
-
-
-def _depths(scene: TrainedObject, camera: Cameras, positions: Float[Tensor, "K 3"]) -> Float[Tensor, " K"]:
-    """Along the viewing axis, world units."""
-    pose = camera.camera_to_world[0].to(positions)
-    return -((positions - pose[:, 3]) @ pose[:, 2]) / scene.frame.scale
-
-
-OWN_LIGHT = "of the pictures"
-"""Name of the light that the pictures were taken under."""
-
-_GLANCE_SAMPLES = 4
-"""Paths a pixel of one estimate."""
-
-_SUBPIXELS = 2
-"""Rays along a pixel's edge of a finished view."""
 
 
 @dataclass(frozen=True)
@@ -218,8 +125,14 @@ class TrainedObject:
 
     @property
     def outputs(self) -> tuple[Output, ...]:
-        """All that can be shown of the materials and of the light that they reflect."""
-        return _object_outputs(self.surface.family, self.log_variance is not None)
+        """All that can be shown of the materials and of the light that they reflect, in the order of offering."""
+        family = self.surface.family
+        own: tuple[Output, ...] = ()
+        if isinstance(family, SpectralFamily):
+            own = _SPECTRAL
+        elif _has_latents(family) or isinstance(family, PbrFamily):
+            own = _LATENTS if _has_latents(family) else _PBR
+        return (*_COMMON, *own, *(() if self.log_variance is None else (_UNCERTAINTY,)), *_GEOMETRY)
 
     def output(self, name: str) -> Output:
         """An output by its name.
@@ -307,7 +220,8 @@ class TrainedObject:
     @torch.no_grad()
     def _rendered(self, camera: Cameras, subpixels: int, samples: int, number: int) -> ModelView:
         hits = pixel_hits(self.ray_mesh, camera, 0, subpixels)
-        generator = torch.Generator(self.device).manual_seed(_seed(camera, number))
+        # Another seed for each strip of rows of a picture, always the same for the same one.
+        seed = 7919 * number + round(abs(float(camera.center_px[0, 1]))) % 7907
         light = rays_radiance(
             self.surface,
             self.ray_mesh,
@@ -315,9 +229,47 @@ class TrainedObject:
             hits,
             samples=samples,
             bounces=self.bounces,
-            generator=generator,
+            generator=torch.Generator(self.device).manual_seed(seed),
         )
-        return ModelView(camera, _view_outputs(self, camera, hits, light))
+        return ModelView(camera, self._view_outputs(camera, hits, light))
+
+    def _view_outputs(
+        self, camera: Cameras, hits: PixelHits, light: Float[Tensor, "K C"]
+    ) -> dict[str, Tensor]:
+        """All outputs of a view, (H, W, ...); colours are on black, everything else is a mean over what is seen in a
+        pixel."""
+        family, positions, alpha = self.surface.family, hits.points.positions, hits.alpha()
+        parameters = _in_chunks(self.surface.parameters, positions, family.num_parameters)
+        base, linear = family.base_colour(parameters), hits.image(light)
+        seen = alpha[..., None].clamp(min=1e-6)
+        in_colours = self.curve.rgb if isinstance(self.curve, SpectralDisplay) else (lambda values: values)
+        rotation = torch.from_numpy(self.frame.rotation).to(positions)
+        normals = torch.nn.functional.normalize(hits.image(hits.points.normals) / seen @ rotation, dim=-1)
+        pose = camera.camera_to_world[0].to(positions)
+        depths = -((positions - pose[:, 3]) @ pose[:, 2]) / self.frame.scale
+        found = {
+            "rgb": torch.where(alpha[..., None] > 0, self.curve(linear / seen), 0.0) * alpha[..., None],
+            "linear_rgb": in_colours(linear),
+            "base_colour": in_colours(hits.image(base)),
+            "shading": hits.image(in_colours(light) / in_colours(base).clamp(min=_DARKEST)),
+            "normals": normals * (alpha > 0)[..., None],
+            "depth": (hits.image(depths[:, None]) / seen)[..., 0],
+            "accumulation": alpha,
+        }
+        means = hits.image(parameters) / seen
+        if isinstance(family, SpectralFamily):
+            shares = hits.image(family.abundances(parameters))
+            found |= {"spectral": linear, "reflectance": hits.image(base), "abundances": shares}
+            found["segmentation"] = material_ids(shares, alpha)
+            found["roughness"], found["specular_level"] = means[..., family.num_endmembers :].unbind(dim=-1)
+        elif _has_latents(family):
+            found["latents_a"], found["latents_b"] = means[..., 3:6], means[..., 6:9]
+        elif isinstance(family, PbrFamily):
+            found["roughness"], found["metallicity"] = means[..., 3:5].unbind(dim=-1)
+        if self.log_variance is not None:
+            spread = (_in_chunks(self.log_variance, positions, family.num_parameters) / 2).exp()
+            found["uncertainty"] = (hits.image(spread.mean(dim=1, keepdim=True)) / seen)[..., 0]
+        return found
 
 
 @lru_cache(maxsize=2)
@@ -326,15 +278,22 @@ def _environment_file(path: Path, changed_ns: int) -> Environment:  # noqa: ARG0
     return read_environment(path)
 
 
-def _seed(camera: Cameras, number: int) -> int:
-    """Of the samples of one view: another one for each strip of rows of a picture, always the same for the same one."""
-    return 7919 * number + round(abs(float(camera.center_px[0, 1]))) % 7907
+def _has_latents(family: MaterialFamily) -> bool:
+    """Whether parameters 3 to 8 are latents of a decoder."""
+    return getattr(family, "decoder", None) is not None
+
+
+def _in_chunks(
+    look_up: Callable[[Tensor], Tensor], positions: Float[Tensor, "K 3"], width: int
+) -> Float[Tensor, "K P"]:
+    parts = [look_up(part) for part in positions.split(_CHUNK)] if len(positions) else []
+    return torch.cat(parts) if parts else positions.new_zeros((0, width))
 
 
 def trained_object(
     model: NeumatexModel, record: SceneRecord, averages: Mapping[str, Tensor] | None = None
 ) -> TrainedObject:
-    """The object of a model as it is now; training that goes on does not change it.
+    """The object of a model as it is now, trained or in training; training that goes on does not change it.
 
     Args:
         model, averages: As `frozen_parameters` takes them.

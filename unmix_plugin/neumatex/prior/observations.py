@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine import Cameras
 from unmix_plugin.neumatex.tracing.environment import Environment, directions_of_pixels
 from unmix_plugin.neumatex.tracing.mesh import Mesh
 from unmix_plugin.neumatex.tracing.rays import RayMesh, SurfacePoints

@@ -37,7 +37,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine import Cameras
 from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.neumatex.tracing.mesh import Mesh
 from unmix_plugin.neumatex.tracing.microfacet import frames, to_local, to_world

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine import Cameras
 from unmix_plugin.neumatex.tracing.mesh import Mesh
 from unmix_plugin.operators.launching import as_warp, launch, vector_type, warp
 
