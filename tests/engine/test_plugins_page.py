@@ -26,7 +26,10 @@ def test_the_public_names_are_those_that_the_page_lists():
     table = "".join(line for line in section.splitlines() if line.startswith("|"))
     assert sorted(re.findall(r"`(\w+)`", table)) == sorted(unmix_plugin.engine.__all__)
     for name in unmix_plugin.engine.__all__:
-        assert getattr(getattr(unmix_plugin.engine, name), "__name__", None) == name or name in ("Common", "Target")
+        assert getattr(getattr(unmix_plugin.engine, name), "__name__", None) == name or name in (
+            "Common",
+            "Target",
+        )
 
 
 def test_no_other_name_is_public():
