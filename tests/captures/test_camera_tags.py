@@ -192,17 +192,6 @@ def test_what_is_below_the_black_level_stays_below_0(tmp_path):
     assert (model.apply(file.read().astype(np.float64)) < 0.0).all()
 
 
-def test_twice_the_exposure_is_half_the_radiance(tmp_path, pixels):
-    once, twice = (
-        radiometric_model(make(tmp_path, pixels, DJI | {"drone-dji:ExposureTime": exposure}))
-        for exposure in ("1000", "2000")
-    )
-    assert once is not None
-    assert twice is not None
-    values = pixels[..., None].astype(np.float64)
-    np.testing.assert_allclose(once.apply(values), 2.0 * twice.apply(values), rtol=1e-6)
-
-
 @pytest.mark.parametrize(("tags", "irradiance"), [(MICASENSE, 1.085), (DJI, 7423.1), (SEQUOIA, None)])
 def test_the_sunshine_sensor_is_reported(tmp_path, pixels, tags, irradiance):
     model = radiometric_model(make(tmp_path, pixels, tags))

@@ -153,6 +153,8 @@ def test_names_without_wavelengths_give_none(tmp_path, names):
         ({"lines": "-5"}, "'lines' is -5"),
         ({"bands": "many"}, "'bands' is many"),
         ({"bands": "9" * 5000}, "'bands' is 9"),
+        ({"samples": "1e400"}, "'samples' is 1e400; expected a whole number"),
+        ({"header offset": "nan"}, "'header offset' is nan; expected a whole number"),
         ({"byte order": "2"}, "'byte order' is 2; expected 0"),
         ({"header offset": "1.5"}, "'header offset' is 1.5"),
         ({"file compression": "1"}, "compressed"),

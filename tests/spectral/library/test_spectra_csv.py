@@ -1,11 +1,9 @@
-import errno
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unmix_plugin.errors import RunError, SpectrumError
+from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import (
     SpectraTable,
@@ -86,26 +84,6 @@ def test_a_file_that_is_missing_a_folder_or_no_text_is_refused(tmp_path):
         read_spectra_csv(tmp_path)
     with pytest.raises(SpectrumError, match="not a CSV file in UTF-8"):
         read_spectra_csv(written(tmp_path, "wavelength,caf\xe9\n400,1\n", "latin-1"))
-
-
-def test_writing_where_nothing_can_be_written_is_a_run_error(tmp_path):
-    (tmp_path / "a file").touch()
-    with pytest.raises(RunError, match="can't make the folder"):
-        write_spectra_csv(tmp_path / "a file" / "e.csv", SMALL)
-
-
-def test_a_full_disk_leaves_the_old_file_and_no_litter(tmp_path, monkeypatch):
-    path = tmp_path / "e.csv"
-    path.write_text("old")
-
-    def fail(*_args, **_options):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr("os.write", fail)
-    with pytest.raises(RunError, match="No space left on device"):
-        write_spectra_csv(path, SMALL)
-    assert [file.name for file in tmp_path.iterdir()] == ["e.csv"]
-    assert path.read_text() == "old"
 
 
 def test_a_table_must_hold_together():
