@@ -43,21 +43,39 @@ def video_frames(path: Path, width: int, height: int, frames_per_second: float) 
         if frame.shape != (height, width, 3) or frame.dtype != np.uint8:
             raise ValueError(f"frames are ({height}, {width}, 3) uint8; got {frame.shape} {frame.dtype}")
         even = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-        assert encoder.stdin is not None
-        try:
-            encoder.stdin.write(even.tobytes())
-        except OSError as error:
-            encoder.wait()
-            raise _failure(path, log) from error
+        with _failures(encoder, path, log):
+            stdin.write(even.tobytes())
 
     with whole_file(path) as temporary, tempfile.TemporaryFile() as log:
-        size = (width + width % 2, height + height % 2)
-        encoder = _start(_command(temporary, size, frames_per_second), log)
+        command = _command(temporary, (width + width % 2, height + height % 2), frames_per_second)
+        # A session of its own: Ctrl-C is for us, and we end the encoder.
+        encoder = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=log, start_new_session=True
+        )
+        stdin = encoder.stdin
+        assert stdin is not None
         try:
             yield add
-            _finish(encoder, path, log)
+            with _failures(encoder, path, log):
+                stdin.close()
+            if encoder.wait() != 0:
+                raise _failure(path, log)
         finally:
-            _stop(encoder)
+            if encoder.poll() is None:  # still at work
+                encoder.kill()
+                encoder.wait()
+            with contextlib.suppress(OSError):  # what was not yet written has no reader any more
+                stdin.close()
+
+
+@contextmanager
+def _failures(encoder: subprocess.Popen[bytes], path: Path, log: IO[bytes]) -> Iterator[None]:
+    """Context in which an encoder that no longer reads is an error of the video."""
+    try:
+        yield
+    except OSError as error:
+        encoder.wait()
+        raise _failure(path, log) from error
 
 
 def _command(path: Path, size: tuple[int, int], frames_per_second: float) -> list[str]:
@@ -69,34 +87,6 @@ def _command(path: Path, size: tuple[int, int], frames_per_second: float) -> lis
     codec = f"-an -c:v libx264 -crf {_QUALITY} -movflags +faststart -f mp4"
     options = f"-hide_banner -loglevel error -nostdin -y {frames} {colours} {codec}"
     return [imageio_ffmpeg.get_ffmpeg_exe(), *options.split(), str(path)]
-
-
-def _start(command: list[str], log: IO[bytes]) -> subprocess.Popen[bytes]:
-    # A session of its own: Ctrl-C is for us, and we end the encoder.
-    return subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=log, start_new_session=True
-    )
-
-
-def _finish(encoder: subprocess.Popen[bytes], path: Path, log: IO[bytes]) -> None:
-    assert encoder.stdin is not None
-    try:
-        encoder.stdin.close()
-    except OSError as error:
-        encoder.wait()
-        raise _failure(path, log) from error
-    if encoder.wait() != 0:
-        raise _failure(path, log)
-
-
-def _stop(encoder: subprocess.Popen[bytes]) -> None:
-    """End an encoder that is still at work, and close what leads to it."""
-    if encoder.poll() is None:
-        encoder.kill()
-        encoder.wait()
-    if encoder.stdin is not None and not encoder.stdin.closed:
-        with contextlib.suppress(OSError):  # what was not yet written has no reader any more
-            encoder.stdin.close()
 
 
 def _failure(path: Path, log: IO[bytes]) -> RunError:

@@ -199,7 +199,7 @@ def prepare_sensor(
     # Floating-point numbers may have been brought to what stands for 1 already.
     has_one = is_srgb(first) or first.scale is not None or (first.dtype.kind == "f" and model is None)
     evidence = {"saturation": {"stored": saturation, "evidence": how}}
-    evidence |= _reference_evidence(dark, white) | _band_evidence(first, choice) | _light_evidence(views)
+    evidence |= _evidence(views, choice, dark, white)
     return Sensor(
         name,
         calibration,
@@ -281,32 +281,26 @@ def _unit(file: SpectralFile, white: WhiteReference | None) -> str:
     return "relative radiance" if file.scale is None else "values divided by the scale factor of the files"
 
 
-def _reference_evidence(dark: Reference | None, white: WhiteReference | None) -> dict[str, Any]:
+def _evidence(
+    views: Sequence[CaptureView], choice: BandChoice, dark: Reference | None, white: WhiteReference | None
+) -> dict[str, Any]:
+    """References, bands, and what sunshine sensors measured, by view."""
     used = {"dark": dark, "white": None if white is None else white.reference}
-    return {
+    found: dict[str, Any] = {
         what: {"file": str(reference.file.path), "use": reference.how}
         for what, reference in used.items()
         if reference is not None
     }
-
-
-def _band_evidence(file: SpectralFile, choice: BandChoice) -> dict[str, Any]:
-    return {
-        "wavelengths": file.bands.evidence,
-        "dropped_bands": [
-            {"band": band, "wavelength_nm": float(choice.wavelengths_nm[band]), "reason": reason}
-            for band, reason in sorted(choice.dropped.items())
-        ],
-    }
-
-
-def _light_evidence(views: Sequence[CaptureView]) -> dict[str, Any]:
-    """What sunshine sensors measured, by view."""
+    found["wavelengths"] = views[0].cube.bands.evidence
+    found["dropped_bands"] = [
+        {"band": band, "wavelength_nm": float(choice.wavelengths_nm[band]), "reason": reason}
+        for band, reason in sorted(choice.dropped.items())
+    ]
     models = {view.name: radiometric_model(view.cube) for view in views}
     light = {
         name: model.irradiance for name, model in models.items() if model and model.irradiance is not None
     }
-    return {"irradiance": light} if light else {}
+    return found | ({"irradiance": light} if light else {})
 
 
 def choose_scale(sensors: Sequence[Sensor], given: float | None) -> tuple[float, str]:
