@@ -1,4 +1,4 @@
-"""Each camera's formula against pixels computed one by one, with the numbers of the tags in plain arithmetic."""
+"""Tags of cameras, and each camera's formula against pixels computed one by one in plain arithmetic."""
 
 import math
 
@@ -8,6 +8,7 @@ import tifffile
 
 from tests.captures.file_factory import open_band_file, write_band_file, xmp_packet
 from unmix_plugin.captures.camera_tags import (
+    RadiometricModel,
     XmpTags,
     band_of,
     camera_tags,
@@ -26,13 +27,10 @@ def test_elements_and_attributes_read_alike(as_attributes):
     assert (tags["Camera:BandName"], tags["drone-dji:SensorGain"]) == ("Red", "2.5")
 
 
-def test_a_list_keeps_its_order():
-    tags = parse_xmp(xmp_packet({"Camera:VignettingPolynomial": ["-3.18e-05", "1.5e-07", "2"]}))
-    assert tag_numbers(tags, "Camera:VignettingPolynomial") == [-3.18e-05, 1.5e-07, 2.0]
-
-
-def test_numbers_in_one_text_are_split():
-    assert tag_numbers({"Camera:PrincipalPoint": "2.35363, 1.79947"}, "PrincipalPoint") == [2.35363, 1.79947]
+@pytest.mark.parametrize("value", [["-3.18e-05", "1.5e-07", "2"], "-3.18e-05, 1.5e-07, 2"])
+def test_numbers_of_a_list_or_a_text_keep_their_order(value):
+    tags = parse_xmp(xmp_packet({"Camera:VignettingPolynomial": value}))
+    assert tag_numbers(tags, "VignettingPolynomial") == [-3.18e-05, 1.5e-07, 2.0]
 
 
 def test_the_first_tag_that_is_there_counts():
@@ -54,21 +52,18 @@ def test_a_damaged_packet_has_no_tags(packet):
     assert parse_xmp(packet) == {}
 
 
-def test_a_band_has_its_centre_and_width():
-    table = band_of({"Camera:CentralWavelength": "717", "Camera:WavelengthFWHM": "10"})
+@pytest.mark.parametrize(
+    ("tags", "centre", "width"),
+    [
+        ({"Camera:CentralWavelength": "717", "Camera:WavelengthFWHM": "10"}, [717.0], [10.0]),
+        ({"drone-dji:BandFreq": "730(+/-16) nm"}, [730.0], [32.0]),  # half a width is doubled
+    ],
+)
+def test_a_band_has_its_centre_and_width(tags, centre, width):
+    table = band_of(tags)
     assert table is not None
-    assert table.wavelengths_nm is not None
-    assert table.fwhm_nm is not None
-    assert (table.wavelengths_nm.tolist(), table.fwhm_nm.tolist()) == ([717.0], [10.0])
-    assert "CentralWavelength" in table.evidence
-
-
-def test_half_a_width_is_doubled():
-    table = band_of({"drone-dji:BandFreq": "730(+/-16) nm"})
-    assert table is not None
-    assert table.wavelengths_nm is not None
-    assert table.fwhm_nm is not None
-    assert (table.wavelengths_nm.tolist(), table.fwhm_nm.tolist()) == ([730.0], [32.0])
+    np.testing.assert_array_equal((table.wavelengths_nm, table.fwhm_nm), (centre, width))
+    assert next(iter(tags)).rpartition(":")[2] in table.evidence
 
 
 @pytest.mark.parametrize("centre", ["0.717", "none", ""])
@@ -92,11 +87,8 @@ def test_exposure_that_a_program_moved_out_of_exif_is_found(tmp_path):
     tifffile.imwrite(tmp_path / "a.tif", np.zeros((2, 3), np.uint16), extratags=tags)
     with tifffile.TiffFile(tmp_path / "a.tif") as stream:
         exif = camera_tags(stream.pages.first.tags)["exif"]
-    assert (exif["ExposureTime"], exif["ISOSpeedRatings"], exif["FocalPlaneResolutionUnit"]) == (
-        0.004,
-        200,
-        4,
-    )
+    names = ("ExposureTime", "ISOSpeedRatings", "FocalPlaneResolutionUnit")
+    assert [exif[name] for name in names] == [0.004, 200, 4]
 
 
 MICASENSE = {
@@ -133,6 +125,12 @@ def make(tmp_path, pixels, tags, exif=EXIF, **options) -> SpectralFile:
     return open_band_file(write_band_file(tmp_path / "band.tif", pixels, tags, exif, **options))
 
 
+def model_of(file: SpectralFile) -> RadiometricModel:
+    model = radiometric_model(file)
+    assert model is not None
+    return model
+
+
 def micasense_by_hand(p: int, x: int, y: int) -> float:
     r = math.sqrt((x - 25.5) ** 2 + (y - 14.25) ** 2)
     v = 1 - 3e-05 * r + 1e-05 * r**2 - 3e-07 * r**3 + 1e-09 * r**4 - 1e-11 * r**5 + 7e-14 * r**6
@@ -162,8 +160,7 @@ def dji_by_hand(p: int, x: int, y: int) -> float:
 )
 def test_radiance_is_that_of_a_calculation_by_hand(tmp_path, pixels, tags, options, by_hand, unit):
     file = make(tmp_path, pixels, tags, **options)
-    model = radiometric_model(file)
-    assert model is not None
+    model = model_of(file)
     radiance = model.apply(file.read().astype(np.float64))
     expected = [[by_hand(int(pixels[y, x]), x, y) for x in range(SIZE[1])] for y in range(SIZE[0])]
     np.testing.assert_allclose(radiance[..., 0], expected, rtol=1e-5)
@@ -174,8 +171,7 @@ def test_radiance_is_that_of_a_calculation_by_hand(tmp_path, pixels, tags, optio
 @pytest.mark.parametrize("tags", [MICASENSE, SEQUOIA, DJI])
 def test_some_rows_are_those_of_the_whole(tmp_path, pixels, tags):
     file = make(tmp_path, pixels, tags)
-    model = radiometric_model(file)
-    assert model is not None
+    model = model_of(file)
     whole = model.apply(file.read().astype(np.float64))
     for rows in (slice(7, 19), slice(None, 4), slice(3, 30, 5)):
         part = model.apply(file.read(rows).astype(np.float64), rows)
@@ -187,32 +183,24 @@ def test_some_rows_are_those_of_the_whole(tmp_path, pixels, tags):
 
 def test_what_is_below_the_black_level_stays_below_0(tmp_path):
     file = make(tmp_path, np.full(SIZE, 4700), MICASENSE, black_level=[4800] * 4)
-    model = radiometric_model(file)
-    assert model is not None
-    assert (model.apply(file.read().astype(np.float64)) < 0.0).all()
+    assert (model_of(file).apply(file.read().astype(np.float64)) < 0.0).all()
 
 
 @pytest.mark.parametrize(("tags", "irradiance"), [(MICASENSE, 1.085), (DJI, 7423.1), (SEQUOIA, None)])
 def test_the_sunshine_sensor_is_reported(tmp_path, pixels, tags, irradiance):
-    model = radiometric_model(make(tmp_path, pixels, tags))
-    assert model is not None
-    assert model.irradiance == irradiance
+    assert model_of(make(tmp_path, pixels, tags)).irradiance == irradiance
 
 
 def test_irradiance_of_the_second_sensor_is_scaled_to_si(tmp_path, pixels):
     tags = MICASENSE | {"Camera:HorizontalIrradiance": "108.5", "Camera:IrradianceScaleToSIUnits": "0.01"}
-    model = radiometric_model(make(tmp_path, pixels, tags))
-    assert model is not None
-    assert model.irradiance == pytest.approx(1.085)
+    assert model_of(make(tmp_path, pixels, tags)).irradiance == pytest.approx(1.085)
 
 
 def test_the_faulty_exposure_of_old_firmware_is_mended(tmp_path, pixels):
     file = make(tmp_path, pixels, MICASENSE, EXIF | {"ExposureTime": 1.0 / 6329.0})
-    plain = radiometric_model(file)
+    plain = model_of(file)
     file.metadata["exif"]["Model"] = "RedEdge"
-    mended = radiometric_model(file)
-    assert plain is not None
-    assert mended is not None
+    mended = model_of(file)
     values = pixels[:1, :, None].astype(np.float64)
     np.testing.assert_allclose(
         mended.apply(values) / plain.apply(values), (1.0 / 6329.0) / 0.000274, rtol=1e-4
