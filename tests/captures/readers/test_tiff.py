@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from PIL.TiffImagePlugin import IFDRational, ImageFileDirectory_v2
 
 from tests.captures.file_factory import centres_nm, widths_nm
 from unmix_plugin.captures.readers.opening import open_spectral_file
-from unmix_plugin.captures.spectral_file import ReadOptions
+from unmix_plugin.captures.spectral_file import ReadOptions, SpectralFile
 from unmix_plugin.errors import CaptureError
 
 CUBE = np.random.default_rng(0).integers(0, 60000, (70, 50, 6)).astype(np.uint16)
@@ -31,6 +32,14 @@ STORAGE = {
     "big-endian": {"byteorder": ">", "rowsperstrip": 30},
     "BigTIFF": {"bigtiff": True, "tile": (16, 16)},
 }
+
+
+def written(folder: Path, image: np.ndarray, **options: Any) -> SpectralFile:
+    """An image as tifffile writes it, opened; bands beside each other in each pixel unless options say otherwise."""
+    tifffile.imwrite(
+        folder / "a.tif", image, **{"photometric": "minisblack", "planarconfig": "contig"} | options
+    )
+    return open_spectral_file(folder / "a.tif")
 
 
 def write(path: Path, arrangement: str, storage: str) -> Path:
@@ -54,8 +63,7 @@ def test_rows_and_bands_are_those_of_the_image(tmp_path, arrangement, storage):
 @pytest.mark.parametrize("dtype", ["u1", "i2", "u4", "f4", "f8"])
 def test_types_of_numbers(tmp_path, dtype):
     image = CUBE.astype(dtype)
-    tifffile.imwrite(tmp_path / "a.tif", image, photometric="minisblack", planarconfig="contig")
-    file = open_spectral_file(tmp_path / "a.tif")
+    file = written(tmp_path, image)
     assert file.dtype == np.dtype(dtype)
     np.testing.assert_array_equal(file.read(), image)
 
@@ -69,8 +77,7 @@ def test_a_picture_written_by_pillow_has_one_band_or_three(tmp_path):
 
 
 def test_stacks_of_imagej_with_one_entry_for_all_pages(tmp_path):
-    tifffile.imwrite(tmp_path / "a.tif", PLANES, imagej=True)
-    file = open_spectral_file(tmp_path / "a.tif")
+    file = written(tmp_path, PLANES, imagej=True)
     np.testing.assert_array_equal(file.read(slice(3, 9), np.array([5, 1])), CUBE[3:9][..., [5, 1]])
     tifffile.imwrite(tmp_path / "b.tif", PLANES, truncate=True)
     np.testing.assert_array_equal(open_spectral_file(tmp_path / "b.tif").read(), CUBE)
@@ -129,10 +136,7 @@ def items(name, values, more=""):
 )
 def test_wavelengths_of_gdal(tmp_path, text, nm):
     tag = (42112, "s", 0, GDAL.format(text), True)
-    tifffile.imwrite(
-        tmp_path / "a.tif", CUBE, photometric="minisblack", planarconfig="contig", extratags=[tag]
-    )
-    file = open_spectral_file(tmp_path / "a.tif")
+    file = written(tmp_path, CUBE, extratags=[tag])
     np.testing.assert_allclose(centres_nm(file), nm)
     assert file.notes == ()
 
@@ -141,10 +145,7 @@ def test_scale_width_and_no_data_of_gdal(tmp_path):
     text = items("OFFSET", [0] * 6, ' role="offset"') + items("SCALE", [0.0001] * 6, ' role="scale"')
     text += items("wavelength", [400, 410, 420, 430, 440, 450]) + items("fwhm", [5, 5, 5, 5, 5, 6])
     tags = [(42112, "s", 0, GDAL.format(text), True), (42113, "s", 0, "65535", True)]
-    tifffile.imwrite(
-        tmp_path / "a.tif", CUBE, photometric="minisblack", planarconfig="contig", extratags=tags
-    )
-    file = open_spectral_file(tmp_path / "a.tif")
+    file = written(tmp_path, CUBE, extratags=tags)
     assert file.scale == pytest.approx(10000)
     assert file.no_data == 65535
     np.testing.assert_array_equal(widths_nm(file), [5, 5, 5, 5, 5, 6])
@@ -160,15 +161,7 @@ def test_scale_width_and_no_data_of_gdal(tmp_path):
     ],
 )
 def test_wavelengths_of_the_description(tmp_path, description):
-    tifffile.imwrite(
-        tmp_path / "a.tif",
-        CUBE,
-        photometric="minisblack",
-        planarconfig="contig",
-        description=description,
-        metadata=None,
-    )
-    file = open_spectral_file(tmp_path / "a.tif")
+    file = written(tmp_path, CUBE, description=description, metadata=None)
     np.testing.assert_allclose(centres_nm(file), [400, 410, 420, 430, 440, 450])
     assert "image description" in file.bands.evidence
 
@@ -204,8 +197,7 @@ XMP = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="a
 def test_the_band_of_a_multispectral_camera(tmp_path):
     packet = XMP.encode()
     tag = (700, "B", len(packet), packet, True)
-    tifffile.imwrite(tmp_path / "a.tif", PLANES[0], extratags=[tag, (274, "H", 1, 6, True)], metadata=None)
-    file = open_spectral_file(tmp_path / "a.tif")
+    file = written(tmp_path, PLANES[0], extratags=[tag, (274, "H", 1, 6, True)], metadata=None)
     assert file.shape == (70, 50, 1)  # the orientation is not followed
     assert file.bands.names == ("Red edge",)
     np.testing.assert_array_equal(centres_nm(file), [717])
@@ -226,8 +218,7 @@ def test_previews_and_pages_of_other_sizes_are_left_out(tmp_path):
 
 def test_opacity_is_noted(tmp_path):
     image = CUBE[..., :4].copy()
-    tifffile.imwrite(tmp_path / "a.tif", image, photometric="rgb", extrasamples=["unassalpha"])
-    file = open_spectral_file(tmp_path / "a.tif")
+    file = written(tmp_path, image, photometric="rgb", extrasamples=["unassalpha"])
     np.testing.assert_array_equal(file.read(), image)
     assert "marked as opacity" in file.notes[0]
 
