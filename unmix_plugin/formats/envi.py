@@ -242,11 +242,11 @@ def read_library_table(path: Path) -> SpectraTable:
     if suffix == ".csv":
         return read_spectra_csv(path)
     if suffix in (".hdr", ".sli"):
-        return read_envi_library(path)
+        return _read_envi_library(path)
     raise SpectrumError(f"{path}: a library is a .csv, or an ENVI spectral library (.hdr and .sli)")
 
 
-def read_envi_library(path: Path) -> SpectraTable:
+def _read_envi_library(path: Path) -> SpectraTable:
     """Read and validate an ENVI spectral library.
 
     Of the header these keys count beside those of the layout: `wavelength` and `wavelength units`, `spectra names`,

@@ -43,8 +43,9 @@ def video_frames(path: Path, width: int, height: int, frames_per_second: float) 
         if frame.shape != (height, width, 3) or frame.dtype != np.uint8:
             raise ValueError(f"frames are ({height}, {width}, 3) uint8; got {frame.shape} {frame.dtype}")
         even = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+        assert encoder.stdin is not None
         with _failures(encoder, path, log):
-            stdin.write(even.tobytes())
+            encoder.stdin.write(even.tobytes())
 
     with whole_file(path) as temporary, tempfile.TemporaryFile() as log:
         command = _command(temporary, (width + width % 2, height + height % 2), frames_per_second)

@@ -8,10 +8,10 @@ import pytest
 from tests.captures.file_factory import file_of
 from unmix_plugin.captures.calibration.sensor import (
     BandChoice,
-    Sample,
-    drop_found,
-    find_saturation,
-    noise_shares,
+    _drop_found,
+    _find_saturation,
+    _noise_shares,
+    _Sample,
 )
 
 WAVELENGTHS_NM = np.linspace(400.0, 900.0, 12)
@@ -20,8 +20,8 @@ SPECTRA = GENERATOR.random((3, 12)) * 0.6 + 0.2
 MIXTURES = (GENERATOR.dirichlet(np.ones(3), 3000) @ SPECTRA).astype(np.float32)
 
 
-def _unsaturated(values: np.ndarray) -> Sample:
-    return Sample(values.astype(np.float32), np.zeros(values.shape, bool))
+def _unsaturated(values: np.ndarray) -> _Sample:
+    return _Sample(values.astype(np.float32), np.zeros(values.shape, bool))
 
 
 def test_noise_is_found_beside_what_bands_share():
@@ -29,14 +29,14 @@ def test_noise_is_found_beside_what_bands_share():
     level[7] = 0.3
     noisy = MIXTURES + level * GENERATOR.standard_normal(MIXTURES.shape)
     expected = level / np.sqrt((noisy**2).mean(axis=0))
-    found = noise_shares(noisy.astype(np.float32))
+    found = _noise_shares(noisy.astype(np.float32))
     assert found[7] == pytest.approx(expected[7], rel=0.05)
     np.testing.assert_allclose(np.delete(found, 7), np.delete(expected, 7), rtol=0.5)
 
 
 def test_noise_is_not_told_from_too_few_pixels_or_bands():
-    assert np.isnan(noise_shares(MIXTURES[:20])).all()
-    assert np.isnan(noise_shares(MIXTURES[:, :3])).all()
+    assert np.isnan(_noise_shares(MIXTURES[:20])).all()
+    assert np.isnan(_noise_shares(MIXTURES[:, :3])).all()
 
 
 def test_dead_saturated_and_noisy_bands_are_left_out_with_the_reason():
@@ -45,8 +45,8 @@ def test_dead_saturated_and_noisy_bands_are_left_out_with_the_reason():
     values[:, 7] += 3.0 * GENERATOR.standard_normal(len(values)).astype(np.float32)
     saturated = np.zeros(values.shape, bool)
     saturated[: len(values) // 3, 9] = True
-    found, _ = drop_found(
-        BandChoice(WAVELENGTHS_NM, {0: "named"}), Sample(values[:, 1:], saturated[:, 1:]), 0.5
+    found, _ = _drop_found(
+        BandChoice(WAVELENGTHS_NM, {0: "named"}), _Sample(values[:, 1:], saturated[:, 1:]), 0.5
     )
     assert {band: reason.split(":")[0].split(" is ")[0] for band, reason in found.dropped.items()} == {
         0: "named",
@@ -60,12 +60,12 @@ def test_dead_saturated_and_noisy_bands_are_left_out_with_the_reason():
 def test_a_white_background_that_saturates_every_band_drops_none():
     saturated = np.zeros(MIXTURES.shape, bool)
     saturated[:2000] = True
-    assert drop_found(BandChoice(WAVELENGTHS_NM, {}), Sample(MIXTURES, saturated), 0.5)[0].dropped == {}
+    assert _drop_found(BandChoice(WAVELENGTHS_NM, {}), _Sample(MIXTURES, saturated), 0.5)[0].dropped == {}
 
 
 def test_bands_that_have_nothing_in_common_are_not_all_noise():
     independent = GENERATOR.random((3000, 12)).astype(np.float32)
-    found, notes = drop_found(BandChoice(WAVELENGTHS_NM, {}), _unsaturated(independent), 0.3)
+    found, notes = _drop_found(BandChoice(WAVELENGTHS_NM, {}), _unsaturated(independent), 0.3)
     assert found.dropped == {}
     assert notes == ("12 of 12 bands have noise above 30% of their signal; all are kept",)
 
@@ -83,10 +83,10 @@ def test_a_wavelength_is_used_once():
 @pytest.mark.parametrize(("top", "expected"), [(4095, 4095.0), (3900, 3900.0), (None, 65535.0)])
 def test_the_end_of_the_detector_is_a_plateau(top: int | None, expected: float):
     counts = GENERATOR.normal(2000, 900, (64, 64, 6)).clip(0, top or 60000).astype(np.uint16)
-    assert find_saturation([file_of(counts)], np.arange(6))[0] == expected
+    assert _find_saturation([file_of(counts)], np.arange(6))[0] == expected
 
 
 def test_a_band_that_is_stuck_does_not_count_as_saturated():
     counts = GENERATOR.integers(0, 2000, (64, 64, 6)).astype(np.uint16)
     counts[..., 3] = 60000
-    assert find_saturation([file_of(counts)], np.arange(6))[0] == 65535.0
+    assert _find_saturation([file_of(counts)], np.arange(6))[0] == 65535.0

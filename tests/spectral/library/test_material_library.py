@@ -14,7 +14,7 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.material_library import (
     LibraryMaterial,
     MaterialLibrary,
-    continuum_removed,
+    _continuum_removed,
     measured_library,
 )
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
@@ -103,13 +103,13 @@ def test_continuum_removal_leaves_the_absorptions_alone():
     wavelengths = np.linspace(400, 700, 31)
     slope = 0.2 + 0.6 * (wavelengths - 400) / 300
     dip = 1 - 0.5 * np.exp(-(((wavelengths - 550) / 20) ** 2))
-    np.testing.assert_allclose(continuum_removed((slope * dip)[None], wavelengths)[0], dip, atol=1e-6)
+    np.testing.assert_allclose(_continuum_removed((slope * dip)[None], wavelengths)[0], dip, atol=1e-6)
 
 
 @given(st.lists(st.floats(0.01, 1.0), min_size=4, max_size=12))
 def test_the_continuum_is_the_upper_convex_hull(values):
     spectrum, wavelengths = np.array(values), np.linspace(400, 700, len(values))
-    removed = continuum_removed(spectrum[None], wavelengths)[0]
+    removed = _continuum_removed(spectrum[None], wavelengths)[0]
     assert removed.max() <= 1 + 1e-12
     scaled = (wavelengths - 400) / 300
     below = np.stack([np.append(scaled, [0.0, 1.0]), np.append(spectrum, [-9.0, -9.0])], axis=1)

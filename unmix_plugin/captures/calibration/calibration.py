@@ -24,7 +24,7 @@ from unmix_plugin.errors import CaptureError, ConfigError, SpectrumError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 
-BLOCK_VALUES = 1 << 22
+_BLOCK_VALUES = 1 << 22
 """Values read together."""
 _PATTERN_BLOCK_PX = 8
 _MOST_PATTERN = 4.0
@@ -36,7 +36,7 @@ def is_srgb(file: SpectralFile) -> bool:
     return file.metadata.get("encoding") == "sRGB"
 
 
-def linear(file: SpectralFile, stored: np.ndarray, rows: slice) -> Float32[np.ndarray, "h W b"]:
+def _linear(file: SpectralFile, stored: np.ndarray, rows: slice) -> Float32[np.ndarray, "h W b"]:
     """Numbers of some whole rows: pictures decoded, and the calibration applied that the file carries itself.
 
     Args:
@@ -72,7 +72,7 @@ class Reference:
     def rows(self, rows: slice, columns: slice, bands: np.ndarray) -> Float32[np.ndarray, "h columns b"]:
         """Values at some rows and columns of the cubes; axes of length 1 where one value stands for all."""
         if self.is_per_pixel:
-            return linear(self.file, self.file.read(rows, bands), rows)[:, columns]
+            return _linear(self.file, self.file.read(rows, bands), rows)[:, columns]
         mean = self.mean[:, :, bands]
         return mean if mean.shape[1] == 1 else mean[:, columns]
 
@@ -135,7 +135,7 @@ def panel_reference(cube: SpectralFile, rectangle: tuple[int, int, int, int], vi
             f"{rows} rows and {columns} columns"
         )
     lines = slice(top, top + height)
-    values = linear(cube, cube.read(lines), lines)[:, left : left + width].astype(np.float64)
+    values = _linear(cube, cube.read(lines), lines)[:, left : left + width].astype(np.float64)
     mean = values.mean(axis=(0, 1), keepdims=True).astype(np.float32)
     how = f"mean of {height} x {width} pixels from row {top} and column {left} of view {view}"
     return Reference(cube, "white reference", mean, False, how)
@@ -145,15 +145,15 @@ def _column_means(file: SpectralFile) -> tuple[Float32[np.ndarray, "1 W B"], flo
     """Mean over lines, and how much more than noise the rows differ, judged on a few bands."""
     height, width, bands = file.shape
     total = np.zeros((width, bands))
-    step = max(1, BLOCK_VALUES // (width * bands))
+    step = max(1, _BLOCK_VALUES // (width * bands))
     for first in range(0, height, step):
         rows = slice(first, min(first + step, height))
-        total += linear(file, file.read(rows), rows).sum(axis=0, dtype=np.float64)
+        total += _linear(file, file.read(rows), rows).sum(axis=0, dtype=np.float64)
     mean = total / height
     judged = np.unique(np.linspace(0, bands - 1, 5).astype(int))
     whole = slice(0, height)
     patterns = [
-        _pattern(linear(file, file.read(whole, judged[[index]]), whole)[..., 0] - mean[:, band])
+        _pattern(_linear(file, file.read(whole, judged[[index]]), whole)[..., 0] - mean[:, band])
         for index, band in enumerate(judged)
     ]
     return mean[None].astype(np.float32), float(np.median(patterns))
@@ -371,7 +371,7 @@ class Calibration:
         rows, columns = self.raster.file_rows(first, last), self.raster.columns
         whole = file.read(rows, self.bands)
         stored = whole[:, columns]
-        missing = find_missing(stored, file.no_data)
+        missing = _find_missing(stored, file.no_data)
         saturated = np.zeros(stored.shape, bool) if self.saturation is None else stored >= self.saturation
         values = self._values(file, whole, rows)
         sound = np.isfinite(values.sum(axis=-1)) & ~missing  # one number that is not finite makes the sum so
@@ -388,7 +388,7 @@ class Calibration:
 
     def _values(self, file: SpectralFile, whole: np.ndarray, rows: slice) -> Float32[np.ndarray, "h W b"]:
         columns, bands = self.raster.columns, self.bands
-        values = linear(file, whole, rows)[:, columns]  # a new array, free to be changed
+        values = _linear(file, whole, rows)[:, columns]  # a new array, free to be changed
         exposure = exposure_of(file)
         if exposure is None or self.exposure is None:
             factor = np.float32(self.gain)
@@ -413,7 +413,7 @@ class Calibration:
         return used.reshape(*values.shape[:-1], self.num_bands, self.bin_bands)
 
 
-def find_missing(stored: np.ndarray, no_data: float | None) -> Bool[np.ndarray, "h W"]:
+def _find_missing(stored: np.ndarray, no_data: float | None) -> Bool[np.ndarray, "h W"]:
     """Pixels without a measurement: no number in some band, or the file's no-data value.
 
     A no-data value of 0 is also what a dark pixel may read in a band, so that all bands must have it.

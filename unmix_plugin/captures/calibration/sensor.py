@@ -167,7 +167,7 @@ def prepare_sensor(
     elif model is not None:
         saturation, how = model.saturated, f"known of {model.maker}"
     else:
-        saturation, how = find_saturation(files, choice.kept)
+        saturation, how = _find_saturation(files, choice.kept)
     raster = Raster.of(first.shape[0], first.shape[1], options.crop, options.bin_pixels)
     lamp = None
     if white is not None:
@@ -187,8 +187,8 @@ def prepare_sensor(
     exposure, said = _common_exposure(files, white) if model is None else (None, [])
     gain = 1.0 if first.scale is None or is_srgb(first) else 1.0 / first.scale
     calibration = Calibration(raster, choice.kept, 1, dark, white, saturation, gain, exposure)
-    sample = draw_sample(files, calibration)
-    choice, noted = drop_found(choice, sample, options.max_noise)
+    sample = _draw_sample(files, calibration)
+    choice, noted = _drop_found(choice, sample, options.max_noise)
     notes += [*said, *noted]
     choice.require(binning, str(first.path))
     still_kept = np.isin(calibration.bands, choice.kept)
@@ -349,7 +349,7 @@ def _places(files: Sequence[SpectralFile], rows: list[int]) -> Iterator[tuple[Sp
             yield file, row
 
 
-def find_saturation(files: Sequence[SpectralFile], bands: np.ndarray) -> tuple[float | None, str]:
+def _find_saturation(files: Sequence[SpectralFile], bands: np.ndarray) -> tuple[float | None, str]:
     """The stored number at which a detector ends, from a plateau at the greatest one, and the evidence.
 
     Files of floating-point numbers have none, as they were processed.
@@ -384,14 +384,14 @@ def find_saturation(files: Sequence[SpectralFile], bands: np.ndarray) -> tuple[f
 
 
 @dataclass(frozen=True)
-class Sample:
+class _Sample:
     """Calibrated pixels of all views of a sensor, at all bands of its files."""
 
     values: Float32[np.ndarray, "N B"]
     saturated: Bool[np.ndarray, "N B"]
 
 
-def draw_sample(files: Sequence[SpectralFile], calibration: Calibration) -> Sample:
+def _draw_sample(files: Sequence[SpectralFile], calibration: Calibration) -> _Sample:
     """Pixels on the sampled rows, evenly spaced along them.
 
     Args:
@@ -411,7 +411,7 @@ def draw_sample(files: Sequence[SpectralFile], calibration: Calibration) -> Samp
         keep &= ~part.missing[0]
         values.append(part.values[0][keep])
         saturated.append(part.saturated[0][keep])
-    sample = Sample(np.concatenate(values), np.concatenate(saturated))
+    sample = _Sample(np.concatenate(values), np.concatenate(saturated))
     if not len(sample.values):
         raise CaptureError(
             f"{files[0].path}: no sampled pixel of it and of the other views has a measurement in all bands (NaN, "
@@ -420,7 +420,7 @@ def draw_sample(files: Sequence[SpectralFile], calibration: Calibration) -> Samp
     return sample
 
 
-def drop_found(choice: BandChoice, sample: Sample, max_noise: float) -> tuple[BandChoice, tuple[str, ...]]:
+def _drop_found(choice: BandChoice, sample: _Sample, max_noise: float) -> tuple[BandChoice, tuple[str, ...]]:
     """Leave out bands that are dead, saturated or noisy in the sample.
 
     Where most bands are noisy none is left out for it: bands have little in common then, or the whole capture is noisy.
@@ -437,7 +437,7 @@ def drop_found(choice: BandChoice, sample: Sample, max_noise: float) -> tuple[Ba
     is_dead = np.ptp(sample.values, axis=0) == 0
     noise = np.zeros(len(kept))
     usable = ~sample.saturated[:, ~is_dead].any(axis=1)
-    noise[~is_dead] = noise_shares(sample.values[usable][:, ~is_dead])
+    noise[~is_dead] = _noise_shares(sample.values[usable][:, ~is_dead])
     is_noisy = noise > max_noise  # false for NaN
     if is_noisy.mean() > _MOST_NOISY:
         notes = (
@@ -452,7 +452,7 @@ def drop_found(choice: BandChoice, sample: Sample, max_noise: float) -> tuple[Ba
     return BandChoice(choice.wavelengths_nm, reasons | choice.dropped), notes
 
 
-def noise_shares(values: Float32[np.ndarray, "N B"]) -> Float64[np.ndarray, " B"]:
+def _noise_shares(values: Float32[np.ndarray, "N B"]) -> Float64[np.ndarray, " B"]:
     """Noise of each band over its signal, from what the other bands can't explain; NaN with too few pixels.
 
     The residual of a band's regression on all others has variance 1 / (C^-1)_bb, with C the matrix of their second

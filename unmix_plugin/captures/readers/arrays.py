@@ -39,7 +39,7 @@ from unmix_plugin.scenes.reading.cubes import (
     read_array_header,
 )
 
-TakePart: TypeAlias = Callable[[Axes, slice, BandIndex], np.ndarray]
+_TakePart: TypeAlias = Callable[[Axes, slice, BandIndex], np.ndarray]
 """(h, W, b) numbers of a stored array whose axes are these."""
 
 _CENTRES = re.compile(
@@ -69,7 +69,7 @@ class FoundArray:
     dtype: np.dtype
     whole: Callable[[], np.ndarray]
     """All its numbers, mapped or loaded."""
-    take: TakePart | None = None
+    take: _TakePart | None = None
     """A faster way to some rows and bands than through `whole`."""
     attributes: Mapping[str, Any] = field(default_factory=dict)
     dimensions: tuple[str, ...] | None = None

@@ -174,8 +174,8 @@ class MaterialLibrary:
             known = np.interp(centers, material.bands.centers_nm, material.reflectance)
             compared = reflectance[:, shared].astype(np.float64)
             if comparison == "continuum":
-                compared = continuum_removed(compared, centers)
-                known = continuum_removed(known[None], centers)[0]
+                compared = _continuum_removed(compared, centers)
+                known = _continuum_removed(known[None], centers)[0]
             angles = spectral_angle(torch.from_numpy(compared), torch.from_numpy(known)).numpy()
             for matches, angle in zip(found, angles, strict=True):
                 matches.append(LibraryMatch(material.name, float(angle), len(centers), material.source))
@@ -246,12 +246,12 @@ def _without_flat_ends(material: LibraryMaterial) -> LibraryMaterial:
     return replace(material, bands=bands, reflectance=material.reflectance[inside])
 
 
-def continuum_removed(
+def _continuum_removed(
     spectra: Float64[np.ndarray, "N B"], wavelengths_nm: Float64[np.ndarray, " B"]
 ) -> Float64[np.ndarray, "N B"]:
     """Spectra over their continuum, the upper convex hull (Clark and Roush 1984): below 1 where something absorbs.
 
-    >>> continuum_removed(np.array([[0.2, 0.2, 0.4]]), np.array([400.0, 500.0, 600.0])).round(3)
+    >>> _continuum_removed(np.array([[0.2, 0.2, 0.4]]), np.array([400.0, 500.0, 600.0])).round(3)
     array([[1.   , 0.667, 1.   ]])
     """
     hulls = np.stack([_upper_hull(row, wavelengths_nm) for row in spectra])
