@@ -1,7 +1,7 @@
-"""How a scene was turned, moved and scaled from where its poses come from, as transforms.json records it.
+"""How a scene was turned, moved and scaled: from where its poses come from to transforms.json, and on to model space.
 
 nerfstudio's keys `applied_transform` (3 x 4) and `applied_scale`, and `offset` for coordinates that are too large for
-float32: p_scene = applied_scale * applied_transform @ (p_source - offset, 1).
+float32, record the first: p_scene = applied_scale * applied_transform @ (p_source - offset, 1).
 """
 
 from __future__ import annotations
@@ -21,28 +21,35 @@ _SCALE_RANGE = (1e-12, 1e12)
 
 
 @dataclass(frozen=True)
-class Placement:
-    """Similarity from the source's world to the scene's.
-
-    p_scene = scale * (rotation @ (p_source - offset) + translation)
-    """
+class _Similarity:
+    """p_to = scale * (rotation @ (p_from - offset) + translation)."""
 
     rotation: Float64[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
     """Orthonormal, determinant 1."""
     translation: Float64[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
-    """Units of the source, added after the rotation."""
+    """Units that it starts from, added after the rotation."""
     scale: float = 1.0
-    """Units of the scene a unit of the source, > 0."""
+    """Units that it leads to, for each that it starts from; > 0."""
     offset: Float64[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
-    """Subtracted first, in units of the source."""
+    """Subtracted first, so that geo-referenced coordinates keep their digits."""
+
+    def _apply(self, points: Float[np.ndarray, "*points 3"]) -> Float64[np.ndarray, "*points 3"]:
+        return self.scale * ((points - self.offset) @ self.rotation.T + self.translation)
+
+    def _undo(self, points: Float[np.ndarray, "*points 3"]) -> Float64[np.ndarray, "*points 3"]:
+        return (points / self.scale - self.translation) @ self.rotation + self.offset
+
+
+class Placement(_Similarity):
+    """Similarity from the source's world to that of transforms.json."""
 
     def to_scene(self, points: Float[np.ndarray, "*points 3"]) -> Float64[np.ndarray, "*points 3"]:
         """Points of the source in the scene."""
-        return self.scale * ((points - self.offset) @ self.rotation.T + self.translation)
+        return self._apply(points)
 
     def to_source(self, points: Float[np.ndarray, "*points 3"]) -> Float64[np.ndarray, "*points 3"]:
         """Points of the scene in the source, the inverse of `to_scene`."""
-        return (points / self.scale - self.translation) @ self.rotation + self.offset
+        return self._undo(points)
 
     @property
     def is_identity(self) -> bool:
@@ -57,6 +64,46 @@ class Placement:
             _SCALE_KEY: self.scale,
             _OFFSET_KEY: self.offset.tolist(),
         }
+
+
+class Normalisation(_Similarity):
+    """Similarity from world to model space."""
+
+    def to_model(self, points: Float[np.ndarray, "*points 3"]) -> Float64[np.ndarray, "*points 3"]:
+        """World points in model space."""
+        return self._apply(points)
+
+    def to_world(self, points: Float[np.ndarray, "*points 3"]) -> Float64[np.ndarray, "*points 3"]:
+        """Model points in world space, the inverse of `to_model`."""
+        return self._undo(points)
+
+    def after(self, placement: Placement) -> Normalisation:
+        """From the source's world to model space, where this one starts from the space of transforms.json."""
+        return Normalisation(
+            self.rotation @ placement.rotation,
+            self.rotation @ placement.translation + self.translation / placement.scale,
+            self.scale * placement.scale,
+            placement.offset,
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Numbers and lists; `from_json` restores the same bits."""
+        return {
+            "rotation": self.rotation.tolist(),
+            "translation": self.translation.tolist(),
+            "scale": self.scale,
+            **({"offset": self.offset.tolist()} if self.offset.any() else {}),
+        }
+
+    @staticmethod
+    def from_json(values: dict[str, Any]) -> Normalisation:
+        """The transform that `to_json` wrote."""
+        return Normalisation(
+            np.array(values["rotation"], dtype=np.float64).reshape(3, 3),
+            np.array(values["translation"], dtype=np.float64).reshape(3),
+            float(values["scale"]),
+            np.array(values.get("offset", (0.0, 0.0, 0.0)), dtype=np.float64).reshape(3),
+        )
 
 
 def read_placement(content: dict[str, Any], faults: Faults, where: str) -> Placement:

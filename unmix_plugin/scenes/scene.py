@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, Shaped, UInt8
+from jaxtyping import Bool, Float32, Float64, Shaped, UInt8
 
 from unmix_plugin.engine.configs import Common, short
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.runs.config_json import config_from_json
-from unmix_plugin.scenes.placement import Placement
+from unmix_plugin.scenes.placement import Normalisation, Placement
 from unmix_plugin.scenes.reading.cubes import InvalidPixels, map_array, read_cube, read_invalid
 from unmix_plugin.scenes.reading.images import read_colour, read_labels, read_mask
 from unmix_plugin.scenes.reading.transforms_json import FILE_NAME
@@ -65,56 +65,6 @@ class Frame:
     """(H, W, K) .npy file of true abundances."""
     sensor: int = 0
     """Which of the scene's sensors took it."""
-
-
-@dataclass(frozen=True)
-class Normalisation:
-    """Similarity from world to model space: p_model = scale * (rotation @ (p_world - offset) + translation)."""
-
-    rotation: Float64[np.ndarray, "3 3"]
-    """Orthonormal, determinant 1."""
-    translation: Float64[np.ndarray, "3"]
-    """World units, added after the rotation."""
-    scale: float
-    """Model units a world unit, > 0."""
-    offset: Float64[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
-    """Subtracted first, so that geo-referenced coordinates keep their digits; world units."""
-
-    def to_model(self, points: Float[np.ndarray, "*points 3"]) -> Float64[np.ndarray, "*points 3"]:
-        """World points in model space."""
-        return self.scale * ((points - self.offset) @ self.rotation.T + self.translation)
-
-    def to_world(self, points: Float[np.ndarray, "*points 3"]) -> Float64[np.ndarray, "*points 3"]:
-        """Model points in world space, the inverse of `to_model`."""
-        return (points / self.scale - self.translation) @ self.rotation + self.offset
-
-    def after(self, placement: Placement) -> Normalisation:
-        """From the source's world to model space, where this one starts from the space of transforms.json."""
-        return Normalisation(
-            self.rotation @ placement.rotation,
-            self.rotation @ placement.translation + self.translation / placement.scale,
-            self.scale * placement.scale,
-            placement.offset,
-        )
-
-    def to_json(self) -> dict[str, Any]:
-        """Numbers and lists; `from_json` restores the same bits."""
-        return {
-            "rotation": self.rotation.tolist(),
-            "translation": self.translation.tolist(),
-            "scale": self.scale,
-            **({"offset": self.offset.tolist()} if self.offset.any() else {}),
-        }
-
-    @staticmethod
-    def from_json(values: dict[str, Any]) -> Normalisation:
-        """The transform that `to_json` wrote."""
-        return Normalisation(
-            np.array(values["rotation"], dtype=np.float64).reshape(3, 3),
-            np.array(values["translation"], dtype=np.float64).reshape(3),
-            float(values["scale"]),
-            np.array(values.get("offset", (0.0, 0.0, 0.0)), dtype=np.float64).reshape(3),
-        )
 
 
 @dataclass(frozen=True)

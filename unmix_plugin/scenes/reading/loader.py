@@ -26,6 +26,7 @@ from unmix_plugin.scenes.geometry.view_agreement import (
     describe,
     find_world_evidence,
 )
+from unmix_plugin.scenes.placement import Normalisation
 from unmix_plugin.scenes.reading.cubes import (
     check_abundances,
     check_cube_headers,
@@ -37,7 +38,7 @@ from unmix_plugin.scenes.reading.images import check_colours, check_labels, chec
 from unmix_plugin.scenes.reading.sensors import check_coverage, group_by_sensor, read_operators
 from unmix_plugin.scenes.reading.splits import Split, split_frames
 from unmix_plugin.scenes.reading.transforms_json import FILE_NAME, SceneEntry, Size, read_transforms
-from unmix_plugin.scenes.scene import Frame, Normalisation, Scene, SceneOptions
+from unmix_plugin.scenes.scene import Frame, Scene, SceneOptions
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, read_illuminant_csv, read_spectra_csv
 from unmix_plugin.spectral.sensor import SceneSensor

@@ -38,7 +38,13 @@ def read_operators(
                 tables[path] = _read_responses(path, Bands(wavelengths_nm), where, faults)
             operators.append(tables[path])
         else:
-            operators.append(_rows_of(entry.bands, len(wavelengths_nm), where, faults))
+            rows, last = np.eye(len(wavelengths_nm)), len(wavelengths_nm) - 1
+            chosen = tuple(range(len(rows))) if entry.bands is None else entry.bands
+            outside = next((band for band in chosen if not 0 <= band <= last), None)
+            if outside is not None:
+                message = f"'bands' has {outside}; expected 0 to {last}, indices into 'wavelengths'"
+                faults.add(where, message)
+            operators.append(rows[list(chosen)] if outside is None else None)
     return operators
 
 
@@ -96,18 +102,6 @@ def lonely_sensors(sensors: tuple[SceneSensor, ...], train_sensors: set[int]) ->
             (sensors[index].seen_bands & sensors[other].seen_bands).any() for other in used if other != index
         )
     ]
-
-
-def _rows_of(
-    bands: tuple[int, ...] | None, num_bands: int, where: str, faults: Faults
-) -> Float64[np.ndarray, "_ _"] | None:
-    if bands is None:
-        return np.eye(num_bands)
-    if not all(0 <= band < num_bands for band in bands):
-        found = next(band for band in bands if not 0 <= band < num_bands)
-        faults.add(where, f"'bands' has {found}; expected 0 to {num_bands - 1}, indices into 'wavelengths'")
-        return None
-    return np.eye(num_bands)[list(bands)]
 
 
 def _read_responses(
