@@ -93,7 +93,7 @@ def share_right(scene, cameras, views, depths):
 @pytest.mark.parametrize(("edge", "spread"), [(1, 0.2), pytest.param(5, 0.0, marks=pytest.mark.slow)])
 def test_views_of_differing_exposure_and_large_noisy_views_are_swept_too(scene, edge, spread):
     """`edge`: by how many times larger the pictures are, with noise in each pixel that means over pixels remove."""
-    train = list(scene.train_indices)
+    train = list(scene.train_indices[:12])
     cameras = scene.cameras[train]
     large = Cameras(
         cameras.camera_to_world,

@@ -59,18 +59,9 @@ def rewritten(demo, folder, change=lambda pose: pose, with_alpha=True, shift=0.0
 
 
 @pytest.mark.parametrize("with_alpha", [True, False])
-@pytest.mark.parametrize("shift", [0.0, 1000.0])
-def test_right_poses_raise_no_alarm(demo, tmp_path, with_alpha, shift):
-    scene = load_scene(rewritten(demo, tmp_path / "scene", with_alpha=with_alpha, shift=shift))
+def test_right_poses_raise_no_alarm_far_from_the_origin(demo, tmp_path, with_alpha):
+    scene = load_scene(rewritten(demo, tmp_path / "scene", with_alpha=with_alpha, shift=1000.0))
     assert check_scene_poses(scene) is None
-
-
-@pytest.mark.parametrize("wrong", WRONG)
-def test_wrong_poses_without_alpha_are_called_what_they_are(demo, tmp_path, wrong):
-    scene = load_scene(rewritten(demo, tmp_path / "scene", WRONG[wrong], with_alpha=False))
-    warning = check_scene_poses(scene)
-    assert warning is not None
-    assert f"the poses look like {wrong}" in warning
 
 
 @pytest.mark.parametrize("wrong", [None, *WRONG])

@@ -18,8 +18,13 @@ def folder(tmp_path):
     return make_line_scene(tmp_path / "lines")
 
 
-def test_a_pose_a_row_and_key_poses_of_the_same_path_are_one_camera(folder):
-    expected = load_scene(folder.root)
+@pytest.fixture(scope="module")
+def lines(tmp_path_factory):
+    """The scene that is not changed."""
+    return load_scene(make_line_scene(tmp_path_factory.mktemp("lines") / "scene").root)
+
+
+def test_a_pose_a_row_and_key_poses_of_the_same_path_are_one_camera(folder, lines):
     for index in range(6):
         matrices = [matrix.tolist() for matrix in row_poses(ring_poses(6)[index])]
         ends = [{"row": row, "transform_matrix": matrices[row]} for row in (0, HEIGHT - 1)]
@@ -31,32 +36,25 @@ def test_a_pose_a_row_and_key_poses_of_the_same_path_are_one_camera(folder):
         folder.edit(set_frame(index, **given))
     found = load_scene(folder.root)
     for index in range(6):
-        mine, theirs = expected.cameras.image_rays(index), found.cameras.image_rays(index)
+        mine, theirs = lines.cameras.image_rays(index), found.cameras.image_rays(index)
         assert_close(mine.origins, theirs.origins, atol=1e-5, rtol=0)
         assert_close(mine.directions, theirs.directions, atol=1e-5, rtol=0)
 
 
-def test_rays_start_where_the_row_was_taken(folder):
-    scene = load_scene(folder.root)
+def test_rays_start_where_the_row_was_taken(lines):
     poses = np.stack([matrix[:3, 3] for matrix in row_poses(ring_poses(6)[2])])
-    rays = scene.cameras.image_rays(2)
-    assert_close(
-        rays.origins[:: scene.cameras.width].double().numpy(),
-        scene.normalisation.to_model(poses),
-        atol=1e-5,
-        rtol=0,
-    )
-    middle = scene.normalisation.to_model(ring_poses(6)[2][:3, 3])
-    assert_close(scene.cameras.camera_to_world[2, :, 3].double().numpy(), middle, atol=1e-5, rtol=0)
+    origins = lines.cameras.image_rays(2).origins[:: lines.cameras.width].double().numpy()
+    assert_close(origins, lines.normalisation.to_model(poses), atol=1e-5, rtol=0)
+    middle = lines.normalisation.to_model(ring_poses(6)[2][:3, 3])
+    assert_close(lines.cameras.camera_to_world[2, :, 3].double().numpy(), middle, atol=1e-5, rtol=0)
 
 
-def test_the_box_and_the_hull_hold_what_the_sweeps_show(folder):
-    scene = load_scene(folder.root)
-    corners = scene.normalisation.to_world(scene.scene_box.aabb.double().numpy())
+def test_the_box_and_the_hull_hold_what_the_sweeps_show(lines):
+    corners = lines.normalisation.to_world(lines.scene_box.aabb.double().numpy())
     assert (corners[0] < -0.55).all()
     assert (corners[1] > 0.55).all()
     assert (np.abs(corners) < 2.0).all()
-    hull = carve(scene, 32)
+    hull = carve(lines, 32)
     steps = (np.arange(32) + 0.5) / 32
     grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1)
     distance = np.linalg.norm(corners[0] + grid * (corners[1] - corners[0]), axis=-1)
@@ -65,7 +63,6 @@ def test_the_box_and_the_hull_hold_what_the_sweeps_show(folder):
 
 
 def test_a_scene_may_mix_frame_cameras_and_line_cameras(folder):
-    lines = load_scene(folder.root)
     pose = ring_poses(6)[4]
     folder.edit(set_frame(4, row_poses=None, transform_matrix=pose.tolist()))
     scene = load_scene(folder.root)
@@ -73,7 +70,6 @@ def test_a_scene_may_mix_frame_cameras_and_line_cameras(folder):
     assert torch.equal(
         scene.cameras.image_rays(4).origins.unique(dim=0), scene.cameras.camera_to_world[[4], :, 3]
     )
-    assert lines.cameras.is_line_camera(4)
 
 
 def turned(entries, row):

@@ -33,29 +33,41 @@ print(json.dumps(ended))
 """Runs the script once for each list of arguments, in one process, which imports everything once."""
 
 
-def run(*calls):
-    """Exit code, output and errors of the script for each tuple of arguments."""
-    words = json.dumps([[str(word) for word in arguments] for arguments in calls])
+SOUND = ("plain.mat", "turned.mat")
+WORDS = ("--endmembers", "3", "--seeds", "2", "--json", "--rows", "pairs, NNLS", "VCA, FCLS")
+BAD = {
+    ("absent.mat",): "there is no file or folder",
+    ("text.mat",): "can't be read as a .mat file",
+    ("no_truth.mat",): "has no 'A'; found Y",
+    ("short.mat",): "expected Y (bands, pixels)",
+    ("plain.mat", "--endmembers", "4"): "there are 3 true materials",
+    ("plain.mat", "--rows", "magic"): "no method is called 'magic'",
+}
+
+
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory):
+    """Exit code, output and errors for each sound file, then for each bad call."""
+    folder = tmp_path_factory.mktemp("images")
+    materials = smooth_endmembers(3, 12).numpy()
+    shares = torch.rand(300, 3, generator=seeded(), dtype=torch.float64).numpy() ** 4
+    shares = shares / shares.sum(axis=1, keepdims=True)
+    # As MATLAB users store them, in units of a thousand.
+    image = {"Y": 1000 * (shares @ materials).T, "A": shares.T, "M": materials.T}
+    savemat(folder / "plain.mat", image)
+    savemat(folder / "turned.mat", {key: image[key].T for key in image})
+    savemat(folder / "no_truth.mat", {"Y": image["Y"]})
+    savemat(folder / "short.mat", image | {"A": image["A"][:, :-1]})
+    (folder / "text.mat").write_text("no matrix")
+    calls = [(name, *WORDS) for name in SOUND] + list(BAD)
+    words = json.dumps([[str(folder / name), *more] for name, *more in calls])
     each = [sys.executable, "-c", EACH, str(SCRIPT), words]
     return json.loads(subprocess.run(each, capture_output=True, text=True, check=True).stdout)
 
 
-@pytest.fixture
-def image():
-    """Y, A and M as MATLAB users store them, in units of a thousand."""
-    materials = smooth_endmembers(3, 12).numpy()
-    shares = torch.rand(300, 3, generator=seeded(), dtype=torch.float64).numpy() ** 4
-    shares = shares / shares.sum(axis=1, keepdims=True)
-    return {"Y": 1000 * (shares @ materials).T, "A": shares.T, "M": materials.T}
-
-
-def test_medians_and_spreads_are_printed_as_json_whatever_is_transposed(tmp_path, image):
-    words = ("--endmembers", 3, "--seeds", 2, "--json", "--rows", "pairs, NNLS", "VCA, FCLS")
-    savemat(tmp_path / "plain.mat", image)
-    savemat(tmp_path / "turned.mat", {key: image[key].T for key in image})
-    ended = run((tmp_path / "plain.mat", *words), (tmp_path / "turned.mat", *words))
-    assert [code for code, _, _ in ended] == [0, 0], ended
-    reports = [json.loads(out) for _, out, _ in ended]
+def test_medians_and_spreads_are_printed_as_json_whatever_is_transposed(ended):
+    assert [code for code, _, _ in ended[:2]] == [0, 0], ended
+    reports = [json.loads(out) for _, out, _ in ended[:2]]
     assert reports[0]["methods"] == reports[1]["methods"]
     assert set(reports[0]["methods"]) == {"pairs, NNLS", "VCA, FCLS"}
     for figures in reports[0]["methods"].values():
@@ -67,20 +79,8 @@ def test_medians_and_spreads_are_printed_as_json_whatever_is_transposed(tmp_path
     assert reports[0]["methods"]["VCA, FCLS"]["abundance_rmse"]["median"] < 0.1
 
 
-def test_bad_input_is_one_message_and_exit_code_2(tmp_path, image):
-    (tmp_path / "text.mat").write_text("no matrix")
-    savemat(tmp_path / "no_truth.mat", {"Y": image["Y"]})
-    savemat(tmp_path / "short.mat", image | {"A": image["A"][:, :-1]})
-    savemat(tmp_path / "whole.mat", image)
-    cases = {
-        (tmp_path / "absent.mat",): "there is no file or folder",
-        (tmp_path / "text.mat",): "can't be read as a .mat file",
-        (tmp_path / "no_truth.mat",): "has no 'A'; found Y",
-        (tmp_path / "short.mat",): "expected Y (bands, pixels)",
-        (tmp_path / "whole.mat", "--endmembers", 4): "there are 3 true materials",
-        (tmp_path / "whole.mat", "--rows", "magic"): "no method is called 'magic'",
-    }
-    for message, (code, _, errors) in zip(cases.values(), run(*cases), strict=True):
+def test_bad_input_is_one_message_and_exit_code_2(ended):
+    for message, (code, _, errors) in zip(BAD.values(), ended[2:], strict=True):
         assert code == 2
         assert message in errors
         assert errors.count("\n") == 1
