@@ -124,7 +124,6 @@ def pose_errors(scene: Path, capture: Path, views: int) -> dict[str, float]:
 
 def reflectance_errors(scene: Path, size: int, views: int) -> dict[str, float]:
     """Mean absolute difference between the scene's cubes and what was rendered, without noise, on matter."""
-    from unmix_plugin.captures.demo import view_name
     from unmix_plugin.scenes.demo.scene import demo_cameras, reflected
     from unmix_plugin.scenes.demo.shading import reflectances, render_view, speckled_things
 
@@ -137,7 +136,7 @@ def reflectance_errors(scene: Path, size: int, views: int) -> dict[str, float]:
         view = render_view(cameras, index, things=things)
         matter = view.alpha >= 0.5
         expected = reflected(view, spectra)[matter].clip(0, record["calibrated_value_of_1"])
-        stored = np.load(scene / "cubes" / f"{view_name(index)}.npy")[matter]
+        stored = np.load(scene / "cubes" / f"view_{index:03d}.npy")[matter]
         found = stored * (record["calibrated_value_of_1"] / record["value_scale"])
         errors.append(np.abs(found - expected).mean())
         levels.append(expected.mean())

@@ -4,14 +4,10 @@ A folder with one ENVI cube a view (`view_000.hdr` and `.raw`), `white` and `dar
 form of transforms.json, and `truth/` with labels and reflectances, for whoever compares. Writing it twice gives the
 same bytes.
 
-Notation: `B` bands, `K` materials, `H`, `W` rows and columns.
+The instrument is a line camera. One row of an image is exposed at a time, so that every column and band of the detector
+has a sensitivity and a dark current of its own, and what a column gets wrong it gets wrong in every row.
 
-A line camera that is not perfect: what its detector writes for the light that comes in.
-
-One row of an image is exposed at a time, so that every column and band of the detector has a sensitivity and a dark
-current of its own, and what a column gets wrong it gets wrong in every row.
-
-Notation: `W` columns, `B` bands, `h` rows. Light is relative to a white matt panel, 1.
+Notation: `B` bands, `W` columns, `h` rows. Light is relative to a white matt panel, 1.
 """
 
 from __future__ import annotations
@@ -24,6 +20,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, UInt16
 
+from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.formats.envi import HeaderValue, beside, header_bytes, wavelength_entries
 from unmix_plugin.scenes.demo.scene import (
     SIZE_BOUNDS,
@@ -55,16 +52,24 @@ RAW_BANDS_BOUNDS = (10, 512)
 """Among fewer, a noisy band can't be told from the others."""
 REFERENCE_LINES = 100
 """Rows of the white and of the dark."""
-
+FULL_WELL = 100_000.0
+"""Electrons that a pixel of the detector can hold."""
+ELECTRONS_PER_COUNT = FULL_WELL / 64_000
+READ_NOISE = 12.0
+"""Electrons, standard deviation."""
+WHITE_SHARE = 0.95
+"""Share of the full well that the white panel fills in the best band and column: brighter highlights saturate."""
+DARK_COUNTS = 900.0
+DARK_SPREAD = 120.0
+"""Standard deviation of the dark counts of columns."""
+GAIN_SPREAD = 0.03
+"""Standard deviation of the columns' sensitivities, as a share."""
+VIGNETTING = 0.3
+"""Light that the lens loses at the ends of the line, as a share."""
+BAD_NOISE = 0.5
+"""Noise of a noisy band as a share of the full well."""
 POSES = "poses-true.json"
-_UINT16 = 12
-"""What ENVI calls this type."""
 _OURS = re.compile(r"(view_\d{3,}|white|dark)\.(hdr|raw)|view_\d{3,}\.png")
-
-
-def view_name(index: int) -> str:
-    """`view_000`, `view_001`, ..."""
-    return f"view_{index:03d}"
 
 
 def make_demo_capture(
@@ -95,46 +100,52 @@ def make_demo_capture(
     check_bounds("a demo capture", numbers)
     sampling = Bands.of(band_centers_nm(bands))
     lamp = lamp_power(sampling.centers_nm, illuminant)
+    cameras, spectra = demo_cameras(size, views), reflectances(sampling.centers_nm)
+    frames = [
+        {"file_path": f"view_{index:03d}.hdr", "transform_matrix": transform_matrix(cameras, index)}
+        for index in range(views)
+    ]
     with staging_for(directory, "the demo capture", overwrite) as staging:
-        (staging / "truth").mkdir()
-        _write_truth(staging, sampling, lamp)
-        _write_images(staging, size, views, sampling, lamp)
-        _write_poses(staging / POSES, size, views)
+        truth = staging / "truth"
+        truth.mkdir()
+        write_spectra_csv(truth / "endmembers.csv", SpectraTable(sampling, MATERIALS, spectra))
+        write_spectra_csv(truth / "illuminant.csv", SpectraTable(sampling, ("power",), lamp[None]))
+        _write_images(staging, cameras, spectra, demo_line_camera(size, sampling.centers_nm, lamp), sampling)
+        content = json.dumps(lens_entries(cameras) | {"frames": frames}, indent=1) + "\n"
+        (staging / POSES).write_text(content, encoding="utf-8")
         _move_files(staging, directory)
 
 
-def _write_images(folder: Path, size: int, views: int, bands: Bands, lamp: np.ndarray) -> None:
+def _write_images(
+    folder: Path,
+    cameras: Cameras,
+    spectra: Float[np.ndarray, "K B"],
+    camera: LineCamera,
+    bands: Bands,
+) -> None:
     """Dark, white, every view, and the labels of each."""
     from PIL import Image
 
-    camera = demo_line_camera(size, bands.centers_nm, lamp)
     generator = np.random.default_rng(1)
-    marked = camera.bad.marked
-    shape = (REFERENCE_LINES, size, len(bands))
+    shape = (REFERENCE_LINES, len(camera.dark_counts), len(bands))
     for name, light in (("dark", np.zeros(shape, np.float32)), ("white", np.ones(shape, np.float32))):
-        write_counts(folder / name, camera.expose(light, generator), bands, marked, f"{name} reference")
-    cameras, things = demo_cameras(size, views), speckled_things()
-    spectra = reflectances(bands.centers_nm)
-    for index in range(views):
-        view, name = render_view(cameras, index, things=things), view_name(index)
+        _write_counts(folder / name, camera.expose(light, generator), bands, camera, f"{name} reference")
+    things = speckled_things()
+    for index in range(len(cameras)):
+        view, name = render_view(cameras, index, things=things), f"view_{index:03d}"
         counts = camera.expose(reflected(view, spectra), generator)
-        write_counts(folder / name, counts, bands, marked, "a view of the demo scene")
+        _write_counts(folder / name, counts, bands, camera, "a view of the demo scene")
         Image.fromarray(label_image(view)).save(folder / "truth" / f"{name}.png")
 
 
-def write_counts(
+def _write_counts(
     path_without_suffix: Path,
-    counts: UInt16[np.ndarray, "H W B"],
+    counts: UInt16[np.ndarray, "h W B"],
     bands: Bands,
-    marked: tuple[int, ...],
+    camera: LineCamera,
     what: str,
 ) -> None:
-    """Write NAME.hdr and NAME.raw, band-interleaved by line.
-
-    Args:
-        marked: Bands that the header marks as bad.
-        what: Description of the image.
-    """
+    """Write NAME.hdr and NAME.raw, band-interleaved by line; the header marks some of the bad bands."""
     height, width, num_bands = counts.shape
     entries: dict[str, HeaderValue] = {
         "description": f"{what}, raw counts",
@@ -143,32 +154,14 @@ def write_counts(
         "lines": height,
         "bands": num_bands,
         "header offset": 0,
-        "data type": _UINT16,
+        "data type": 12,
         "interleave": "bil",
         "byte order": 0,
         **wavelength_entries(bands),
-        "bbl": [str(int(band not in marked)) for band in range(num_bands)],
+        "bbl": [str(int(band not in camera.marked)) for band in range(num_bands)],
     }
     beside(path_without_suffix, ".raw").write_bytes(counts.astype("<u2").transpose(0, 2, 1).tobytes())
     beside(path_without_suffix, ".hdr").write_bytes(header_bytes(entries))
-
-
-def _write_truth(folder: Path, bands: Bands, lamp: np.ndarray) -> None:
-    truth = folder / "truth"
-    write_spectra_csv(
-        truth / "endmembers.csv", SpectraTable(bands, MATERIALS, reflectances(bands.centers_nm))
-    )
-    write_spectra_csv(truth / "illuminant.csv", SpectraTable(bands, ("power",), lamp[None]))
-
-
-def _write_poses(path: Path, size: int, views: int) -> None:
-    cameras = demo_cameras(size, views)
-    frames = [
-        {"file_path": f"{view_name(index)}.hdr", "transform_matrix": transform_matrix(cameras, index)}
-        for index in range(views)
-    ]
-    content = lens_entries(cameras) | {"frames": frames}
-    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 def _move_files(built: Path, directory: Path) -> None:
@@ -183,69 +176,38 @@ def _move_files(built: Path, directory: Path) -> None:
             path.replace(directory / path.relative_to(built))
 
 
-FULL_WELL = 100_000.0
-"""Electrons that a pixel of the detector can hold."""
-ELECTRONS_PER_COUNT = FULL_WELL / 64_000
-READ_NOISE = 12.0
-"""Electrons, standard deviation."""
-WHITE_SHARE = 0.95
-"""Share of the full well that the white panel fills in the best band and column: brighter highlights saturate."""
-DARK_COUNTS = 900.0
-DARK_SPREAD = 120.0
-"""Standard deviation of the dark counts of columns."""
-GAIN_SPREAD = 0.03
-"""Standard deviation of the columns' sensitivities, as a share."""
-VIGNETTING = 0.3
-"""Light that the lens loses at the ends of the line, as a share."""
-BAD_NOISE = 0.5
-"""Noise of a noisy band as a share of the full well."""
-
-
-@dataclass(frozen=True)
-class BadBands:
-    """Bands that measure nothing usable, by index, and whether the instrument marks them."""
-
-    noisy_marked: int
-    dead_marked: int
-    noisy_unmarked: int
-
-    @classmethod
-    def of(cls, bands: int) -> BadBands:
-        """The first is noisy, one is dead after a third of the `bands`, one noisy after two thirds."""
-        return cls(0, bands // 3, 2 * bands // 3)
-
-    @property
-    def marked(self) -> tuple[int, int]:
-        """Bands that the header marks as bad."""
-        return (self.noisy_marked, self.dead_marked)
-
-    @property
-    def all(self) -> tuple[int, int, int]:
-        """Every bad band."""
-        return (*self.marked, self.noisy_unmarked)
-
-
 @dataclass(frozen=True)
 class LineCamera:
-    """One detector behind one lens."""
+    """One detector behind one lens, with three bands that measure nothing usable."""
 
     white_electrons: Float32[np.ndarray, "W B"]
     """What the white panel gives."""
     dark_counts: Float32[np.ndarray, "W B"]
-    bad: BadBands
+
+    @property
+    def bad(self) -> tuple[int, int, int]:
+        """The first band is noisy, one is dead after a third of the bands, one noisy after two thirds."""
+        bands = self.white_electrons.shape[1]
+        return 0, bands // 3, 2 * bands // 3
+
+    @property
+    def marked(self) -> tuple[int, int]:
+        """Bands that the header marks as bad: the last one is left to be found."""
+        return self.bad[:2]
 
     def expose(
         self, light: Float32[np.ndarray, "h W B"], generator: np.random.Generator
     ) -> UInt16[np.ndarray, "h W B"]:
         """Counts for light, with shot noise and read noise; 65535 where the pixel is full."""
+        noisy, dead, noisy_unmarked = self.bad
         electrons = light * self.white_electrons
         noise = generator.standard_normal(light.shape, dtype=np.float32)
         electrons += noise * np.sqrt(electrons + np.float32(READ_NOISE**2))
-        for band in (self.bad.noisy_marked, self.bad.noisy_unmarked):
+        for band in (noisy, noisy_unmarked):
             extra = generator.standard_normal(light.shape[:2], dtype=np.float32)
             electrons[..., band] += np.float32(BAD_NOISE * FULL_WELL) * extra
         counts = self.dark_counts + electrons / np.float32(ELECTRONS_PER_COUNT)
-        counts[..., self.bad.dead_marked] = 0
+        counts[..., dead] = 0
         return counts.round().clip(0, np.iinfo(np.uint16).max).astype(np.uint16)
 
 
@@ -274,5 +236,4 @@ def demo_line_camera(
     return LineCamera(
         (WHITE_SHARE * FULL_WELL * light / light.max()).astype(np.float32),
         dark.clip(0).astype(np.float32),
-        BadBands.of(bands),
     )
