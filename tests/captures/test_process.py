@@ -1,4 +1,9 @@
-"""From a folder of cubes to a scene that loads."""
+"""From a folder of cubes to a scene that loads.
+
+A start that was cut off is gone on with, and a scene is never half there.
+
+What a user is told of captures that are pictures for people.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from tests.captures.capture_factory import (
     HEIGHT,
@@ -18,10 +24,13 @@ from tests.captures.capture_factory import (
     write_cube,
     write_poses,
 )
-from tests.captures.poses.test_alignment import elsewhere
+from tests.captures.poses.alignment import elsewhere
 from unmix_plugin.captures import process as process_module
+from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.poses.reading import read_poses
-from unmix_plugin.captures.writing.view_files import FULL_SCALE
+from unmix_plugin.captures.process import process_capture
+from unmix_plugin.captures.writing.view_files import FULL_SCALE, write_view
+from unmix_plugin.errors import CaptureError, ConfigError
 from unmix_plugin.scenes.reading.loader import load_scene
 
 
@@ -195,3 +204,179 @@ def test_what_was_done_is_written_for_people(tmp_path: Path):
     assert record["what_looks_wrong"] == findings
     dropped = record["decisions"]["sensors"]["all views"]["dropped_bands"]
     assert [band["wavelength_nm"] for band in dropped] == [500.0, 550.0, 600.0]
+
+
+class _Writer:
+    """Writes views and counts them; stops at one of them in the way of a kill."""
+
+    def __init__(self, stop_at: int | None = None) -> None:
+        self.stop_at, self.written = stop_at, []
+
+    def __call__(self, view, recipe, folder):
+        if len(self.written) == self.stop_at:
+            raise KeyboardInterrupt
+        self.written.append(view.name)
+        return write_view(view, recipe, folder)
+
+
+@pytest.fixture
+def interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A capture of 4 views of which 2 are written."""
+    capture = make_capture(tmp_path / "capture")
+    monkeypatch.setattr(process_module, "write_view", _Writer(stop_at=2))
+    with pytest.raises(KeyboardInterrupt):
+        process(capture.root, tmp_path / "scene")
+    return capture
+
+
+def _write_with(monkeypatch: pytest.MonkeyPatch) -> _Writer:
+    writer = _Writer()
+    monkeypatch.setattr(process_module, "write_view", writer)
+    return writer
+
+
+@pytest.mark.usefixtures("interrupted")
+def test_what_is_half_there_is_no_scene(tmp_path: Path):
+    assert not (tmp_path / "scene").exists()
+    assert len(list((tmp_path / "scene.unfinished" / "cubes").glob("*.npy"))) == 2
+    assert not (tmp_path / "scene.unfinished" / "transforms.json").exists()
+
+
+def test_the_next_start_goes_on_with_the_next_view(interrupted, tmp_path: Path, monkeypatch):
+    writer = _write_with(monkeypatch)
+    process(interrupted.root, tmp_path / "scene")
+    assert writer.written == ["view_02", "view_03"]
+    assert not (tmp_path / "scene.unfinished").exists()
+    process(interrupted.root, tmp_path / "whole")
+    for path in sorted((tmp_path / "whole").rglob("*")):
+        if path.is_file() and path.name != "process.json":
+            assert (
+                tmp_path / "scene" / path.relative_to(tmp_path / "whole")
+            ).read_bytes() == path.read_bytes()
+    assert len(load_scene(tmp_path / "scene").frames) == 4
+
+
+def test_other_options_start_again(interrupted, tmp_path: Path, monkeypatch):
+    writer = _write_with(monkeypatch)
+    process(interrupted.root, tmp_path / "scene", bin_bands=3)
+    assert len(writer.written) == 4
+
+
+def test_changed_input_starts_again(interrupted, tmp_path: Path, monkeypatch):
+    path = interrupted.root / "view_03.raw"
+    numbers = np.fromfile(path, "<u2")
+    numbers[5] += 1
+    numbers.tofile(path)
+    writer = _write_with(monkeypatch)
+    process(interrupted.root, tmp_path / "scene")
+    assert len(writer.written) == 4
+
+
+def test_a_damaged_record_is_written_again(interrupted, tmp_path: Path, monkeypatch):
+    (tmp_path / "scene.unfinished" / "views" / "view_00.json").write_text('{"name": "view')
+    writer = _write_with(monkeypatch)
+    process(interrupted.root, tmp_path / "scene")
+    assert writer.written == ["view_00", "view_02", "view_03"]
+
+
+def test_a_scene_is_replaced_only_if_asked(tmp_path: Path):
+    capture = make_capture(tmp_path / "capture")
+    process(capture.root, tmp_path / "scene")
+    with pytest.raises(ConfigError, match=r"holds a scene already.*--overwrite"):
+        process(capture.root, tmp_path / "scene")
+    process(capture.root, tmp_path / "scene", overwrite=True, bin_bands=3)
+    assert len(load_scene(tmp_path / "scene").wavelengths_nm) == 3
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["capture", "scene"]
+
+
+def test_inputs_are_recorded_with_their_hashes(tmp_path: Path):
+    import hashlib
+
+    capture = make_capture(tmp_path / "capture")
+    process(capture.root, tmp_path / "scene")
+    record = json.loads((tmp_path / "scene" / "process.json").read_text())
+    for view in record["views"]:
+        for source in view["sources"]:
+            data = Path(source["path"]).read_bytes()
+            assert source["sha256"] == hashlib.sha256(data).hexdigest()
+            assert source["bytes"] == len(data)
+
+
+def test_a_scene_may_be_written_to_the_working_directory(tmp_path: Path, monkeypatch):
+    capture = make_capture(tmp_path / "capture")
+    (tmp_path / "scene").mkdir()
+    monkeypatch.chdir(tmp_path / "scene")
+    process(capture.root, Path())
+    assert (tmp_path / "scene" / "transforms.json").is_file()
+
+
+def test_the_root_of_the_disk_is_no_scene(tmp_path: Path):
+    with pytest.raises(ConfigError, match="can't be a scene"):
+        process(make_capture(tmp_path / "capture").root, Path("/"))
+
+
+NAMES = ["view_00", "view_01", "view_02", "view_03"]
+ORIENTATION = 0x0112
+
+
+def write_views(root: Path, ground: int, alpha: tuple[str, ...] = (), turned: tuple[str, ...] = ()) -> None:
+    """Pictures of a textured square on a noisy grey ground."""
+    generator = np.random.default_rng(0)
+    (root / "images").mkdir(parents=True)
+    for name in NAMES:
+        pixels = generator.integers(ground - 9, ground + 1, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+        pixels[8:16, 8:20] = generator.integers(40, 120, (8, 12, 3))
+        if name in alpha:
+            pixels = np.dstack([pixels, np.full((HEIGHT, WIDTH), 255, np.uint8)])
+        exif = Image.Exif()
+        exif[ORIENTATION] = 6 if name in turned else 1
+        Image.fromarray(pixels).save(root / "images" / f"{name}.png", exif=exif)
+    write_poses(root / "transforms.json", NAMES)
+
+
+def notes_of(root: Path, output: Path, wavelengths: str = "610,550,465", **options) -> str:
+    """All that is said while the pictures become a scene."""
+    told: list[str] = []
+    asked = ProcessOptions("nerfstudio", root, output, wavelengths=wavelengths, **options)
+    process_capture(asked, told.append, lambda _, views: views)
+    return "\n".join(told)
+
+
+def test_alpha_that_some_views_lack_is_not_dropped_in_silence(tmp_path: Path):
+    write_views(tmp_path / "capture", 90, alpha=("view_00", "view_01", "view_03"))
+    said = "1 of 4 views has no alpha channel (view_02), so that of the others is not used"
+    assert said in notes_of(tmp_path / "capture", tmp_path / "scene")
+    assert "alpha channel" not in notes_of(tmp_path / "capture", tmp_path / "asked", mask="none")
+
+
+def test_wavelengths_from_short_to_long_are_questioned(tmp_path: Path):
+    write_views(tmp_path / "capture", 90)
+    told = notes_of(tmp_path / "capture", tmp_path / "scene", "465,550,610")
+    assert "465 nm is taken for red, 550 nm for green, 610 nm for blue" in told
+    assert "give --wavelengths 610,550,465" in told
+    assert "taken for red" not in notes_of(tmp_path / "capture", tmp_path / "usual")
+
+
+def test_turned_pictures_are_read_as_stored_with_a_note(tmp_path: Path):
+    write_views(tmp_path / "capture", 90, turned=("view_01", "view_02"))
+    told = notes_of(tmp_path / "capture", tmp_path / "scene")
+    assert "EXIF's orientation of 2 of 4 pictures is ignored" in told
+
+
+def test_poses_of_turned_pictures_name_the_orientation(tmp_path: Path):
+    write_views(tmp_path / "capture", 90, turned=("view_01",))
+    write_poses(tmp_path / "capture" / "transforms.json", NAMES[1:3], width=HEIGHT, height=WIDTH)
+    with pytest.raises(CaptureError, match="or store them turned as EXIF's orientation says"):
+        notes_of(tmp_path / "capture", tmp_path / "scene")
+
+
+@pytest.mark.parametrize(("ground", "is_white"), [(254, True), (160, False), (20, False)])
+def test_a_white_background_suggests_its_mask(tmp_path: Path, ground: int, is_white: bool):
+    write_views(tmp_path / "capture", ground)
+    assert ("--mask white leaves it out" in notes_of(tmp_path / "capture", tmp_path / "scene")) == is_white
+
+
+def test_a_white_background_needs_no_hint_where_a_mask_is_chosen(tmp_path: Path):
+    write_views(tmp_path / "capture", 254)
+    for mask in ("white", "none"):
+        assert "leaves it out" not in notes_of(tmp_path / "capture", tmp_path / mask, mask=mask)

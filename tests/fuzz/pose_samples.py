@@ -8,11 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.captures.poses.llff_table import table
-from tests.captures.poses.metashape_document import document
-from tests.captures.poses.micmac_files import CALIBRATION, ORIENTATION, RADIAL, text_of
-from tests.captures.poses.opensfm_reconstruction import BROWN, reconstruction
-from tests.captures.poses.pose_factory import FLIP, ring, transforms
+from tests.captures.poses.pose_factory import (
+    BROWN,
+    CALIBRATION,
+    FLIP,
+    ORIENTATION,
+    RADIAL,
+    llff_table,
+    metashape_document,
+    reconstruction,
+    ring,
+    text_of,
+    transforms,
+)
 from unmix_plugin.captures.poses.matching import match_poses
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.posing import place_poses
@@ -72,7 +80,10 @@ def opensfm_samples() -> tuple[bytes, ...]:
 def metashape_samples() -> tuple[bytes, ...]:
     """With and without a place in the world and higher terms."""
     terms = "<k1>0.01</k1><k3>0.001</k3><b2>0.1</b2>"
-    return (document(ring(3)).encode(), document(ring(3), component=_SIMILARITY, terms=terms).encode())
+    return (
+        metashape_document(ring(3)).encode(),
+        metashape_document(ring(3), component=_SIMILARITY, terms=terms).encode(),
+    )
 
 
 def micmac_samples() -> tuple[bytes, ...]:
@@ -88,7 +99,7 @@ def llff_samples() -> tuple[bytes, ...]:
     samples = []
     for dtype in (np.float64, np.float32):
         buffer = io.BytesIO()
-        np.save(buffer, table(ring(3).values()).astype(dtype))
+        np.save(buffer, llff_table(ring(3).values()).astype(dtype))
         samples.append(buffer.getvalue())
     return tuple(samples)
 

@@ -19,52 +19,41 @@ from unmix_plugin.captures.layouts.registry import LayoutOptions
 from unmix_plugin.errors import CaptureError
 
 
-def test_views_have_the_first_stokes_component_of_all_wavelengths(tmp_path):
-    write_nespof(tmp_path)
-    capture = find_nespof(tmp_path, PLAIN)
-    assert [view.name for view in capture.views] == ["r_0", "r_1", "r_2", "r_3", "r_4"]
-    for index, view in enumerate(capture.views):
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """The rendered scene as its layout finds it; not to be changed."""
+    root = tmp_path_factory.mktemp("nespof")
+    write_nespof(root)
+    return find_nespof(root, PLAIN)
+
+
+def test_views_have_the_first_stokes_component_of_all_wavelengths_and_opacity(scene):
+    assert [view.name for view in scene.views] == ["r_0", "r_1", "r_2", "r_3", "r_4"]
+    for index, view in enumerate(scene.views):
         expected = np.stack([intensity(index, wavelength) for wavelength in (450, 460, 470)], axis=-1)
         np.testing.assert_array_equal(view.cube.read(), expected)
-        assert view.cube.bands.wavelengths_nm is not None
         assert view.cube.bands.wavelengths_nm.tolist() == [450.0, 460.0, 470.0]
-
-
-def test_rows_and_bands_are_read_alone(tmp_path):
-    write_nespof(tmp_path)
-    cube = find_nespof(tmp_path, PLAIN).views[2].cube
+        np.testing.assert_allclose(view.alpha.read()[..., 0], np.linspace(0, 1, 35).reshape(5, 7), atol=1e-6)
+    cube = scene.views[2].cube
     np.testing.assert_array_equal(cube.read(slice(1, 4), np.array([2, 0])), cube.read()[1:4][..., [2, 0]])
 
 
-def test_opacity_is_the_last_channel(tmp_path):
-    write_nespof(tmp_path)
-    alpha = find_nespof(tmp_path, PLAIN).views[0].alpha
-    assert alpha is not None
-    np.testing.assert_allclose(alpha.read()[..., 0], np.linspace(0, 1, 35).reshape(5, 7), atol=1e-6)
+def test_splits_are_those_of_the_files_and_repeated_frames_are_left_out(scene):
+    assert [view.split for view in scene.views] == ["eval", "train", "train", "train", "train"]
+    assert any("5 frames of transforms_test.json listed before" in note for note in scene.notes)
+
+
+def test_poses_and_field_of_view_belong_to_the_views(scene):
+    for index in range(5):
+        camera = scene.poses.cameras[f"r_{index}"]
+        np.testing.assert_allclose(camera.camera_to_world, pose(index)[:3], atol=1e-6)
+        assert (camera.lens.width, camera.lens.height) == (7, 5)
+        assert camera.lens.focal_px[0] == pytest.approx(0.5 * 7 / np.tan(0.4))
 
 
 def test_a_scene_without_alpha_has_no_opacity(tmp_path):
     write_nespof(tmp_path, alpha=False)
     assert find_nespof(tmp_path, PLAIN).views[0].alpha is None
-
-
-def test_splits_are_those_of_the_files_and_repeated_frames_are_left_out(tmp_path):
-    write_nespof(tmp_path)
-    capture = find_nespof(tmp_path, PLAIN)
-    assert [view.split for view in capture.views] == ["eval", "train", "train", "train", "train"]
-    assert any("5 frames of transforms_test.json listed before" in note for note in capture.notes)
-
-
-def test_poses_and_field_of_view_belong_to_the_views(tmp_path):
-    write_nespof(tmp_path)
-    poses = find_nespof(tmp_path, PLAIN).poses
-    assert poses is not None
-    for index in range(5):
-        camera = poses.cameras[f"r_{index}"]
-        np.testing.assert_allclose(camera.camera_to_world, pose(index)[:3], atol=1e-6)
-        assert camera.lens is not None
-        assert (camera.lens.width, camera.lens.height) == (7, 5)
-        assert camera.lens.focal_px[0] == pytest.approx(0.5 * 7 / np.tan(0.4))
 
 
 def test_labels_lie_in_seg(tmp_path):

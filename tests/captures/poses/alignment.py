@@ -6,11 +6,13 @@ Notation: `N` cameras, `P` points.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64
+from scipy.spatial.transform import Rotation
 
+from tests.captures.poses.pose_factory import LENS
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 from unmix_plugin.captures.posing import moved
 from unmix_plugin.engine.geometry.camera_paths import focus_point
@@ -134,7 +136,6 @@ def _refine(
 ) -> Placement:
     """The similarity with the least squares in pixels, from a first one."""
     from scipy.optimize import least_squares
-    from scipy.spatial.transform import Rotation
 
     wanted = np.stack([camera.pixels_of(points) for camera in theirs])
     seen = np.isfinite(wanted) & _inside(wanted, theirs)[..., None]
@@ -186,3 +187,24 @@ def _alignment(
         np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0))),
         np.linalg.norm(found[:, :, 3] - true[:, :, 3], axis=1),
     )
+
+
+SIMILARITY = Placement(
+    Rotation.from_euler("xyz", [0.3, -1.0, 2.0]).as_matrix(), np.array([1.0, 2.0, -3.0]), 2.5
+)
+
+
+def elsewhere(poses: PoseSet) -> PoseSet:
+    back = Placement(
+        SIMILARITY.rotation.T,
+        -SIMILARITY.scale * SIMILARITY.rotation.T @ SIMILARITY.translation,
+        1 / SIMILARITY.scale,
+    )
+    return replace(poses, cameras={name: moved(camera, back) for name, camera in poses.cameras.items()})
+
+
+def in_a_row() -> PoseSet:
+    cameras = {
+        str(x): PosedCamera(np.column_stack([np.eye(3), [x, 0.0, 5.0 + 0.1 * x]]), LENS) for x in range(4)
+    }
+    return PoseSet(cameras, "a row")

@@ -1,4 +1,4 @@
-"""Cameras on a ring, for tests of readers."""
+"""Cameras on a ring, and files of other programs that tell of them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from tests.scenes.scene_factory import ring_poses
 from unmix_plugin.captures.poses.lens import Lens
@@ -49,3 +50,83 @@ def assert_same_poses(found: PoseSet, expected: dict[str, np.ndarray], atol: flo
         camera_to_world = found.cameras[name].camera_to_world.copy()
         camera_to_world[:, 3] += found.offset
         np.testing.assert_allclose(camera_to_world, pose, atol=atol, err_msg=name)
+
+
+def llff_table(poses, hwf=(480.0, 640.0, 500.0)):
+    rows = []
+    for pose in poses:
+        right, up, back, position = pose.T
+        rows.append([*np.column_stack([-up, right, back, position, hwf]).ravel(), 0.5, 9.0])
+    return np.array(rows)
+
+
+METASHAPE_SENSOR = """<sensor id="0" label="lens" type="{kind}"><resolution width="640" height="480"/>
+<property name="pixel_width" value="0.004"/><property name="pixel_height" value="0.005"/>
+<property name="focal_length" value="2"/>{calibration}</sensor>"""
+METASHAPE_CALIBRATION = """<calibration type="{kind}" class="adjusted"><resolution width="640" height="480"/>
+<f>500</f><cx>3</cx><cy>-4</cy>{terms}</calibration>"""
+
+
+def text_of(matrix):
+    return " ".join(repr(float(value)) for value in np.asarray(matrix).ravel())
+
+
+def metashape_document(
+    poses, component="", chunk="", terms="", kind="frame", calibration=METASHAPE_CALIBRATION, extra=""
+):
+    """What Metashape writes for cameras at these poses of the chunk, all in a group."""
+    cameras = "".join(
+        f'<camera id="{index}" sensor_id="0" component_id="0" label="{name}"><transform>'
+        f"{text_of(np.vstack([np.column_stack([pose[:, :3] @ FLIP, pose[:, 3]]), [0, 0, 0, 1]]))}"
+        "</transform></camera>"
+        for index, (name, pose) in enumerate(poses.items())
+    )
+    sensor = METASHAPE_SENSOR.format(kind=kind, calibration=calibration.format(kind=kind, terms=terms))
+    return (
+        f'<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"><chunk label="c" enabled="true">{chunk}'
+        f'<sensors>{sensor}</sensors><components><component id="0">{component}</component></components>'
+        f'<cameras><group id="0">{cameras}</group>{extra}</cameras></chunk></document>'
+    )
+
+
+ORIENTATION = """<?xml version="1.0" ?><ExportAPERO><OrientationConique>
+<FileInterne>Ori-All/AutoCal.xml</FileInterne><TypeProj>eProjStenope</TypeProj>
+<Externe><Centre>{center}</Centre><ParamRotation><CodageMatr><L1>{l1}</L1><L2>{l2}</L2><L3>{l3}</L3>
+</CodageMatr></ParamRotation></Externe><ConvOri><KnownConv>{convention}</KnownConv></ConvOri>
+</OrientationConique></ExportAPERO>"""
+CALIBRATION = """<?xml version="1.0" ?><ExportAPERO><CalibrationInternConique>
+<KnownConv>eConvApero_DistM2C</KnownConv><PP>320.5 238.5</PP><F>500</F><SzIm>640 480</SzIm>
+<CalibDistortion>{distortion}</CalibDistortion></CalibrationInternConique></ExportAPERO>"""
+RADIAL = "<CDist>322 241</CDist><CoeffDist>{a}</CoeffDist><CoeffDist>-1e-14</CoeffDist>"
+
+
+PERSPECTIVE = {
+    "projection_type": "perspective",
+    "width": 640,
+    "height": 480,
+    "focal": 0.8,
+    "k1": 0.1,
+    "k2": -0.05,
+}
+BROWN = {
+    "projection_type": "brown", "width": 480, "height": 640, "focal_x": 0.8, "focal_y": 0.75, "c_x": 0.01, "c_y": -0.02,
+    "k1": 0.1, "k2": -0.05, "k3": 0.0, "p1": 0.001, "p2": 0.002,
+}  # fmt: skip
+
+
+def world_to_camera(pose):
+    rotation = (pose[:, :3] @ FLIP).T
+    return rotation, -rotation @ pose[:, 3]
+
+
+def as_json(rotation, translation):
+    return {
+        "rotation": Rotation.from_matrix(rotation).as_rotvec().tolist(),
+        "translation": translation.tolist(),
+    }
+
+
+def reconstruction(camera=PERSPECTIVE):
+    shots = {name: {**as_json(*world_to_camera(pose)), "camera": "c"} for name, pose in ring().items()}
+    points = {"7": {"coordinates": [1.0, 2.0, 3.0], "color": [36.0, 25.4, 300.0]}}
+    return {"cameras": {"c": camera}, "shots": shots, "points": points}

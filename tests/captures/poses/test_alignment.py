@@ -4,32 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.captures.poses.alignment import align_poses, similarity_of
-from tests.captures.poses.pose_factory import LENS, ring_set
-from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
-from unmix_plugin.captures.posing import moved
+from tests.captures.poses.alignment import SIMILARITY, align_poses, elsewhere, in_a_row, similarity_of
+from tests.captures.poses.pose_factory import ring_set
 from unmix_plugin.errors import CaptureError
-from unmix_plugin.scenes.placement import Placement
-
-SIMILARITY = Placement(
-    Rotation.from_euler("xyz", [0.3, -1.0, 2.0]).as_matrix(), np.array([1.0, 2.0, -3.0]), 2.5
-)
-
-
-def elsewhere(poses: PoseSet) -> PoseSet:
-    back = Placement(
-        SIMILARITY.rotation.T,
-        -SIMILARITY.scale * SIMILARITY.rotation.T @ SIMILARITY.translation,
-        1 / SIMILARITY.scale,
-    )
-    return replace(poses, cameras={name: moved(camera, back) for name, camera in poses.cameras.items()})
-
-
-def in_a_row() -> PoseSet:
-    cameras = {
-        str(x): PosedCamera(np.column_stack([np.eye(3), [x, 0.0, 5.0 + 0.1 * x]]), LENS) for x in range(4)
-    }
-    return PoseSet(cameras, "a row")
 
 
 @pytest.mark.parametrize("truth", [ring_set(), in_a_row()], ids=["ring", "row"])

@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.captures.poses.metashape_document import document, text_of
-from tests.captures.poses.pose_factory import assert_same_poses, ring
+from tests.captures.poses.pose_factory import assert_same_poses, metashape_document, ring, text_of
 from unmix_plugin.captures.poses.lens import project_opencv
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.errors import CaptureError
@@ -11,7 +10,7 @@ from unmix_plugin.errors import CaptureError
 
 def read(tmp_path, *args, **options):
     path = tmp_path / "cameras.xml"
-    path.write_text(document(*args, **options), encoding="utf-8")
+    path.write_text(metashape_document(*args, **options), encoding="utf-8")
     return read_poses(path)
 
 
@@ -113,6 +112,6 @@ def test_cameras_that_are_disabled_or_not_aligned_are_left_out_and_named(tmp_pat
 )
 def test_damaged_documents_are_refused(tmp_path, spoil, message):
     path = tmp_path / "cameras.xml"
-    path.write_text(spoil(document(ring())), encoding="utf-8")
+    path.write_text(spoil(metashape_document(ring())), encoding="utf-8")
     with pytest.raises(CaptureError, match=message):
         read_poses(path)

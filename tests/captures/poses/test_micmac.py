@@ -1,8 +1,15 @@
 import numpy as np
 import pytest
 
-from tests.captures.poses.micmac_files import CALIBRATION, ORIENTATION, RADIAL, text_of
-from tests.captures.poses.pose_factory import FLIP, assert_same_poses, ring
+from tests.captures.poses.pose_factory import (
+    CALIBRATION,
+    FLIP,
+    ORIENTATION,
+    RADIAL,
+    assert_same_poses,
+    ring,
+    text_of,
+)
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.errors import CaptureError
 

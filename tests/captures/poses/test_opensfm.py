@@ -2,14 +2,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.captures.poses.opensfm_reconstruction import (
+from tests.captures.poses.pose_factory import (
     BROWN,
     PERSPECTIVE,
     as_json,
+    assert_same_poses,
     reconstruction,
+    ring,
     world_to_camera,
+    write_json,
 )
-from tests.captures.poses.pose_factory import assert_same_poses, ring, write_json
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.errors import CaptureError
 

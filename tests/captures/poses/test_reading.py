@@ -1,14 +1,15 @@
+""""""
+
 import numpy as np
 import pytest
 
-from tests.captures.poses.llff_table import table
-from tests.captures.poses.pose_factory import assert_same_poses, ring
+from tests.captures.poses.pose_factory import assert_same_poses, llff_table, ring
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.errors import CaptureError
 
 
 def write(tmp_path, **options):
-    np.save(tmp_path / "poses_bounds.npy", table(ring().values(), **options))
+    np.save(tmp_path / "poses_bounds.npy", llff_table(ring().values(), **options))
     return tmp_path / "poses_bounds.npy"
 
 
