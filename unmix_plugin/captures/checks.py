@@ -26,31 +26,31 @@ from unmix_plugin.captures.writing.view_files import ViewRecord
 from unmix_plugin.engine.geometry.camera_paths import meeting_point
 from unmix_plugin.errors import counted
 
-FEW_VIEWS = 15
-NARROW_DEG = 12.0
+_FEW_VIEWS = 15
+_NARROW_DEG = 12.0
 """Cameras that are all within this range of elevation see the object from one height only."""
-WIDE_RING_DEG = 180.0
+_WIDE_RING_DEG = 180.0
 """Part of a circle from which a ring counts as one."""
-GAP_DEG = 75.0
-LEAST_OVERLAP = 0.4
+_GAP_DEG = 75.0
+_LEAST_OVERLAP = 0.4
 """Share of a view that another one should see too."""
-FAR_NEIGHBOUR_DEG = 35.0
-SATURATED_SHARE, MISSING_SHARE = 0.01, 0.05
-BLURRED = 0.6
+_FAR_NEIGHBOUR_DEG = 35.0
+_SATURATED_SHARE, _MISSING_SHARE = 0.01, 0.05
+_BLURRED = 0.6
 """Detail of a view against the median of all, below which it is blurred."""
-LEAST_VIEWS = 4
+_LEAST_VIEWS = 4
 """That blur and exposure are compared among."""
-JUMP, JUMP_DEVIATIONS = 0.15, 4.0
+_JUMP, _JUMP_DEVIATIONS = 0.15, 4.0
 """Logarithm of a gain against the others that counts as a jump, also as a multiple of the usual deviation."""
-LEAST_SHARED_POINTS = 50
-NEIGHBOURS = 6
+_LEAST_SHARED_POINTS = 50
+_NEIGHBOURS = 6
 """Views that one is compared with: the nearest."""
-PAIR_ANGLES_DEG = (4.0, 25.0)
+_PAIR_ANGLES_DEG = (4.0, 25.0)
 """Between the views of a pair in which moving light is measured."""
-LEAST_PAIR_POINTS, LEAST_PAIRS, MOST_PAIRS = 60, 6, 200
-MOST_CHANGE = 0.7
+_LEAST_PAIR_POINTS, _LEAST_PAIRS, _MOST_PAIRS = 60, 6, 200
+_MOST_CHANGE = 0.7
 """Logarithm of a ratio beyond which a pixel shows another surface."""
-LEAST_SLOPE, CERTAINTY = 0.15, 4.0
+_LEAST_SLOPE, _CERTAINTY = 0.15, 4.0
 """Slopes below, up or down, count as none; standard errors of the slope that are beyond doubt."""
 _WIDTH = 110
 
@@ -95,7 +95,7 @@ class SeenView:
         smooth = ndimage.uniform_filter(light, 3)
         return np.where(pixels[..., 3] > 127, smooth, np.nan).astype(np.float32)
 
-    def pixels_of(self, points: _Points) -> Float64[np.ndarray, "P 2"]:
+    def _pixels_of(self, points: _Points) -> Float64[np.ndarray, "P 2"]:
         """Where points are seen, x and y in pixels; NaN outside the picture or behind the camera."""
         assert self.camera.lens is not None
         found = self.camera.pixels_of(points)
@@ -104,14 +104,14 @@ class SeenView:
         found[~inside] = np.nan  # comparisons are false for NaN
         return found
 
-    def has_before_it(self, points: _Points) -> Bool[np.ndarray, " P"]:
+    def _has_before_it(self, points: _Points) -> Bool[np.ndarray, " P"]:
         """Points nearer to the camera than the middle of all: those behind it are mostly hidden."""
         distances = np.linalg.norm(points - self.position, axis=1)
         return distances < np.linalg.norm(np.median(points, axis=0) - self.position)
 
-    def log_brightness_of(self, points: _Points) -> Float64[np.ndarray, " P"]:
+    def _log_brightness_of(self, points: _Points) -> Float64[np.ndarray, " P"]:
         """Logarithm of the luminance at points; not finite where they are not seen."""
-        pixels = self.pixels_of(points)
+        pixels = self._pixels_of(points)
         found = np.full(len(pixels), np.nan)
         inside = np.isfinite(pixels).all(axis=1)
         columns, rows = np.floor(pixels[inside]).astype(int).T
@@ -121,7 +121,7 @@ class SeenView:
 
 
 @dataclass(frozen=True)
-class Checked:
+class _Checked:
     """What the checks say, one sentence each."""
 
     findings: tuple[str, ...]
@@ -130,7 +130,7 @@ class Checked:
     """What was looked at, with its numbers."""
 
 
-def check_views(views: Sequence[SeenView], points: _Points | None) -> Checked:
+def check_views(views: Sequence[SeenView], points: _Points | None) -> _Checked:
     """All checks.
 
     Args:
@@ -138,9 +138,9 @@ def check_views(views: Sequence[SeenView], points: _Points | None) -> Checked:
         points: Sparse points, if there are any.
     """
     findings, measured = [], []
-    if len(views) < FEW_VIEWS:
+    if len(views) < _FEW_VIEWS:
         findings.append(
-            f"only {len(views)} views: expect holes and fog; {FEW_VIEWS} or more all around serve better"
+            f"only {len(views)} views: expect holes and fog; {_FEW_VIEWS} or more all around serve better"
         )
     findings += _pixels(views)
     for found, said in (
@@ -152,10 +152,10 @@ def check_views(views: Sequence[SeenView], points: _Points | None) -> Checked:
     ):
         findings += found
         measured.append(said)
-    return Checked(tuple(findings), tuple(measured))
+    return _Checked(tuple(findings), tuple(measured))
 
 
-def report_text(title: str, checked: Checked, done: Sequence[str]) -> str:
+def report_text(title: str, checked: _Checked, done: Sequence[str]) -> str:
     """One page of text: what looks wrong, what was measured, what was done.
 
     Args:
@@ -192,7 +192,7 @@ def _some(names: list[str]) -> str:
 def _pixels(views: Sequence[SeenView]) -> list[str]:
     """Views with many saturated or missing pixels, or without matter."""
     findings = []
-    for what, limit in (("saturated", SATURATED_SHARE), ("missing", MISSING_SHARE)):
+    for what, limit in (("saturated", _SATURATED_SHARE), ("missing", _MISSING_SHARE)):
         shares = {
             view.name: getattr(view.record, f"{what}_pixels") / view.record.num_pixels for view in views
         }
@@ -224,12 +224,12 @@ def _ring(views: Sequence[SeenView]) -> tuple[list[str], str]:
         f"{elevation.max():.0f} degrees"
     )
     findings = []
-    if height < NARROW_DEG and around > WIDE_RING_DEG:
+    if height < _NARROW_DEG and around > _WIDE_RING_DEG:
         findings.append(
             f"a narrow ring: all cameras are within {height:.0f} degrees of elevation, so that what is seen from "
             "above or below is a guess; add a second ring 25 degrees higher"
         )
-    if around > WIDE_RING_DEG and gap > GAP_DEG:
+    if around > _WIDE_RING_DEG and gap > _GAP_DEG:
         findings.append(f"no camera looks from {gap:.0f} degrees of the circle around the object")
     return findings, said
 
@@ -255,10 +255,10 @@ def _overlap(views: Sequence[SeenView], points: _Points | None) -> tuple[list[st
         angles = np.where(np.arange(len(views)) == index, np.inf, between[index])
         nearest[index] = angles.min()
         near = np.argsort(angles)[: min(6, len(views) - 1)]
-        near = near[angles[near] <= FAR_NEIGHBOUR_DEG]
-        seen = [np.isfinite(views[other].pixels_of(points)).all(axis=1).mean() for other in near]
+        near = near[angles[near] <= _FAR_NEIGHBOUR_DEG]
+        seen = [np.isfinite(views[other]._pixels_of(points)).all(axis=1).mean() for other in near]
         shares[index] = max(seen, default=0.0)
-    alone = [index for index in range(len(views)) if shares[index] < LEAST_OVERLAP]
+    alone = [index for index in range(len(views)) if shares[index] < _LEAST_OVERLAP]
     findings = []
     if alone:
         worst = min(alone, key=lambda index: shares[index])
@@ -291,12 +291,12 @@ def _blur(views: Sequence[SeenView]) -> tuple[list[str], str]:
     """Views with less fine detail than the others."""
     details = np.array([view.record.detail for view in views])
     middle = float(np.median(details))
-    if len(views) < LEAST_VIEWS or middle <= 0:
+    if len(views) < _LEAST_VIEWS or middle <= 0:
         return [], "blur is not judged"
     blurred = [
         f"{view.name} ({detail / middle:.0%} of the usual detail)"
         for view, detail in zip(views, details, strict=True)
-        if detail < BLURRED * middle
+        if detail < _BLURRED * middle
     ]
     said = f"finest structures have {middle:.2f} times the contrast of those twice as large (median of views)"
     if not blurred:
@@ -306,21 +306,21 @@ def _blur(views: Sequence[SeenView]) -> tuple[list[str], str]:
 
 def _exposure(views: Sequence[SeenView], points: _Points | None) -> tuple[list[str], str]:
     """Views whose sparse points are brighter or darker than the same points in the views nearest to them."""
-    if points is None or len(points) < LEAST_SHARED_POINTS or len(views) < LEAST_VIEWS:
+    if points is None or len(points) < _LEAST_SHARED_POINTS or len(views) < _LEAST_VIEWS:
         missing = (
             "exposure is not compared: it takes sparse points, which come with estimated poses and COLMAP"
         )
         return [], missing
     angles = _angles_between(views) + 360.0 * np.eye(len(views))
-    before = [view.has_before_it(points) for view in views]
+    before = [view._has_before_it(points) for view in views]
     gains = np.full(len(views), np.nan)  # logarithms, against the views around
     for index, view in enumerate(views):
         ratios = []
-        for other in np.argsort(angles[index])[:NEIGHBOURS]:
+        for other in np.argsort(angles[index])[:_NEIGHBOURS]:
             shared = points[before[index] & before[other]]
-            found = view.log_brightness_of(shared) - views[other].log_brightness_of(shared)
+            found = view._log_brightness_of(shared) - views[other]._log_brightness_of(shared)
             found = found[np.isfinite(found)]
-            if len(found) >= LEAST_SHARED_POINTS // 2:
+            if len(found) >= _LEAST_SHARED_POINTS // 2:
                 ratios.append(float(np.median(found)))
         if len(ratios) >= 2:
             gains[index] = np.median(ratios)
@@ -331,7 +331,7 @@ def _exposure(views: Sequence[SeenView], points: _Points | None) -> tuple[list[s
     jumps = [
         f"{view.name} ({np.exp(gain):.2f} times as bright)"
         for view, gain in zip(views, gains, strict=True)
-        if abs(gain) > max(JUMP, JUMP_DEVIATIONS * usual)
+        if abs(gain) > max(_JUMP, _JUMP_DEVIATIONS * usual)
     ]
     if not jumps:
         return [], said
@@ -351,7 +351,7 @@ def _moving_light(views: Sequence[SeenView], points: _Points | None) -> tuple[li
         f"the brightness of sparse points has a slope of {slope:.2f} +- {error:.2f} along the movement of "
         f"the camera ({pairs} pairs of views; 0 is fixed light)"
     )
-    if abs(slope) <= max(LEAST_SLOPE, CERTAINTY * error):
+    if abs(slope) <= max(_LEAST_SLOPE, _CERTAINTY * error):
         return [], said
     finding = (
         f"light moves with the camera, as when an object is turned before fixed lamps: {said}. Shading of a point then "
@@ -362,14 +362,14 @@ def _moving_light(views: Sequence[SeenView], points: _Points | None) -> tuple[li
 
 def _slope_of_light(views: Sequence[SeenView], points: _Points | None) -> tuple[float, float, int] | None:
     """The slope over all pairs of near views, its standard error, the number of pairs; None with too few of them."""
-    if points is None or len(points) < LEAST_PAIR_POINTS:
+    if points is None or len(points) < _LEAST_PAIR_POINTS:
         return None
-    angles, (low, high) = _angles_between(views), PAIR_ANGLES_DEG
+    angles, (low, high) = _angles_between(views), _PAIR_ANGLES_DEG
     pairs = np.argwhere((angles >= low) & (angles <= high))
-    pairs = pairs[:: max(1, len(pairs) // MOST_PAIRS)]
+    pairs = pairs[:: max(1, len(pairs) // _MOST_PAIRS)]
     slopes = [_slope(views[first], views[second], points) for first, second in pairs.tolist()]
     values = np.array([slope for slope in slopes if slope is not None])
-    if len(values) < LEAST_PAIRS:
+    if len(values) < _LEAST_PAIRS:
         return None
     middle = float(np.median(values))
     deviation = 1.4826 * float(np.median(np.abs(values - middle)))
@@ -378,15 +378,15 @@ def _slope_of_light(views: Sequence[SeenView], points: _Points | None) -> tuple[
 
 def _slope(first: SeenView, second: SeenView, points: _Points) -> float | None:
     """Slope of log brightness along the direction in which the camera moves, per radius and radian."""
-    points = points[first.has_before_it(points) & second.has_before_it(points)]
-    before = first.pixels_of(points)
-    ratio = second.log_brightness_of(points) - first.log_brightness_of(points)
+    points = points[first._has_before_it(points) & second._has_before_it(points)]
+    before = first._pixels_of(points)
+    ratio = second._log_brightness_of(points) - first._log_brightness_of(points)
     rotation = first.camera.camera_to_world[:, :3]
     turned = (second.position - first.position) @ rotation
     direction = np.array([turned[0], -turned[1]])
     length = float(np.linalg.norm(direction))
-    good = np.isfinite(ratio) & (np.abs(ratio) < MOST_CHANGE)
-    if good.sum() < LEAST_PAIR_POINTS or length == 0.0:
+    good = np.isfinite(ratio) & (np.abs(ratio) < _MOST_CHANGE)
+    if good.sum() < _LEAST_PAIR_POINTS or length == 0.0:
         return None
     along = before[good] @ (direction / length)
     middle = np.median(along)

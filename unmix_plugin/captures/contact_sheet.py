@@ -17,11 +17,11 @@ from unmix_plugin.captures.checks import SeenView
 from unmix_plugin.figures.pictures import Canvas, CanvasLayout, columns_for
 from unmix_plugin.figures.plotting import FIGURE_DPI, figure_bytes, plain_axes
 
-MOST_VIEWS = 96
+_MOST_VIEWS = 96
 """Views that are shown; of more, as many evenly spaced."""
-SHEET_PX, TILE_PX = 1300, (96, 300)
+_SHEET_PX, _TILE_PX = 1300, (96, 300)
 """Width of all pictures beside each other; least and greatest longer side of one."""
-OUTLINE, IGNORED, BEHIND = (255, 0, 200), (255, 60, 60), 60
+OUTLINE, _IGNORED, _BEHIND = (255, 0, 200), (255, 60, 60), 60
 """Colours of the mask's outline and of pixels without a measurement; grey of the background."""
 _CHARTS_INCHES, _LEAST_WIDTH_INCHES = 3.6, 11.0
 _LETTERS_AN_INCH = 10
@@ -78,8 +78,8 @@ def contact_sheet(
 
 
 def _tiles(views: Sequence[SeenView]) -> UInt8[np.ndarray, "H W 3"]:
-    shown = [views[index] for index in _evenly(len(views), MOST_VIEWS)]
-    side_px = int(np.clip(SHEET_PX / columns_for(len(shown)), *TILE_PX))
+    shown = [views[index] for index in _evenly(len(views), _MOST_VIEWS)]
+    side_px = int(np.clip(_SHEET_PX / columns_for(len(shown)), *_TILE_PX))
     pictures = [_small_picture(view, side_px) for view in shown]
     size = max(picture.shape[1] for picture in pictures), max(picture.shape[0] for picture in pictures)
     captions = [view.name for view in shown]
@@ -107,14 +107,14 @@ def _small_picture(view: SeenView, side_px: int) -> UInt8[np.ndarray, "h w 3"]:
         size = max(1, round(opened.width * scale)), max(1, round(opened.height * scale))
         picture = np.asarray(opened.convert("RGBA").resize(size, Image.Resampling.BOX))
     opacity = picture[..., 3:] / 255.0
-    pixels = np.rint(picture[..., :3] * opacity + BEHIND * (1 - opacity)).astype(np.uint8)
+    pixels = np.rint(picture[..., :3] * opacity + _BEHIND * (1 - opacity)).astype(np.uint8)
     matter = picture[..., 3] > 127
     pixels[matter & ~ndimage.binary_erosion(matter, border_value=1)] = OUTLINE
     mask = view.record.paths.get("mask_path")
     if mask is not None:
         with Image.open(view.picture.parent.parent / mask) as opened:
             ignored = np.asarray(opened.convert("L").resize(size, Image.Resampling.BOX)) < 128
-        pixels[ignored] = IGNORED
+        pixels[ignored] = _IGNORED
     return pixels
 
 

@@ -48,25 +48,25 @@ RAW_SIZE, RAW_BANDS, RAW_VIEWS = 400, 31, 40
 """Defaults: as many views and pixels as structure from motion needs."""
 RAW_LAMP = "A"
 """The lamp of the laboratory: a halogen lamp, which has little blue."""
-RAW_BANDS_BOUNDS = (10, 512)
+_RAW_BANDS_BOUNDS = (10, 512)
 """Among fewer, a noisy band can't be told from the others."""
-REFERENCE_LINES = 100
+_REFERENCE_LINES = 100
 """Rows of the white and of the dark."""
 FULL_WELL = 100_000.0
 """Electrons that a pixel of the detector can hold."""
-ELECTRONS_PER_COUNT = FULL_WELL / 64_000
+_ELECTRONS_PER_COUNT = FULL_WELL / 64_000
 READ_NOISE = 12.0
 """Electrons, standard deviation."""
 WHITE_SHARE = 0.95
 """Share of the full well that the white panel fills in the best band and column: brighter highlights saturate."""
-DARK_COUNTS = 900.0
-DARK_SPREAD = 120.0
+_DARK_COUNTS = 900.0
+_DARK_SPREAD = 120.0
 """Standard deviation of the dark counts of columns."""
-GAIN_SPREAD = 0.03
+_GAIN_SPREAD = 0.03
 """Standard deviation of the columns' sensitivities, as a share."""
-VIGNETTING = 0.3
+_VIGNETTING = 0.3
 """Light that the lens loses at the ends of the line, as a share."""
-BAD_NOISE = 0.5
+_BAD_NOISE = 0.5
 """Noise of a noisy band as a share of the full well."""
 POSES = "poses-true.json"
 _OURS = re.compile(r"(view_\d{3,}|white|dark)\.(hdr|raw)|view_\d{3,}\.png")
@@ -94,7 +94,7 @@ def make_demo_capture(
     """
     numbers = {
         "size": (size, SIZE_BOUNDS),
-        "bands": (bands, RAW_BANDS_BOUNDS),
+        "bands": (bands, _RAW_BANDS_BOUNDS),
         "views": (views, VIEWS_BOUNDS),
     }
     check_bounds("a demo capture", numbers)
@@ -120,14 +120,14 @@ def _write_images(
     folder: Path,
     cameras: Cameras,
     spectra: Float[np.ndarray, "K B"],
-    camera: LineCamera,
+    camera: _LineCamera,
     bands: Bands,
 ) -> None:
     """Dark, white, every view, and the labels of each."""
     from PIL import Image
 
     generator = np.random.default_rng(1)
-    shape = (REFERENCE_LINES, len(camera.dark_counts), len(bands))
+    shape = (_REFERENCE_LINES, len(camera.dark_counts), len(bands))
     for name, light in (("dark", np.zeros(shape, np.float32)), ("white", np.ones(shape, np.float32))):
         _write_counts(folder / name, camera.expose(light, generator), bands, camera, f"{name} reference")
     things = speckled_things()
@@ -142,7 +142,7 @@ def _write_counts(
     path_without_suffix: Path,
     counts: UInt16[np.ndarray, "h W B"],
     bands: Bands,
-    camera: LineCamera,
+    camera: _LineCamera,
     what: str,
 ) -> None:
     """Write NAME.hdr and NAME.raw, band-interleaved by line; the header marks some of the bad bands."""
@@ -177,7 +177,7 @@ def _move_files(built: Path, directory: Path) -> None:
 
 
 @dataclass(frozen=True)
-class LineCamera:
+class _LineCamera:
     """One detector behind one lens, with three bands that measure nothing usable."""
 
     white_electrons: Float32[np.ndarray, "W B"]
@@ -205,15 +205,15 @@ class LineCamera:
         electrons += noise * np.sqrt(electrons + np.float32(READ_NOISE**2))
         for band in (noisy, noisy_unmarked):
             extra = generator.standard_normal(light.shape[:2], dtype=np.float32)
-            electrons[..., band] += np.float32(BAD_NOISE * FULL_WELL) * extra
-        counts = self.dark_counts + electrons / np.float32(ELECTRONS_PER_COUNT)
+            electrons[..., band] += np.float32(_BAD_NOISE * FULL_WELL) * extra
+        counts = self.dark_counts + electrons / np.float32(_ELECTRONS_PER_COUNT)
         counts[..., dead] = 0
         return counts.round().clip(0, np.iinfo(np.uint16).max).astype(np.uint16)
 
 
 def demo_line_camera(
     width: int, wavelengths_nm: Float[np.ndarray, " B"], lamp: Float[np.ndarray, " B"]
-) -> LineCamera:
+) -> _LineCamera:
     """The demo's line camera.
 
     Args:
@@ -226,14 +226,14 @@ def demo_line_camera(
     # Silicon behind a grating: most sensitive in the green, a third of that at 400 nm.
     sensitivity = np.exp(-(((wavelengths_nm - 560) / 150) ** 2))
     across = np.linspace(-1, 1, width)[:, None]
-    columns = (1 - VIGNETTING * across**2) * (1 + GAIN_SPREAD * generator.standard_normal((width, bands)))
+    columns = (1 - _VIGNETTING * across**2) * (1 + _GAIN_SPREAD * generator.standard_normal((width, bands)))
     light = columns * sensitivity * lamp
     # Columns are read through two amplifiers in turn, whose offsets differ.
-    dark = DARK_COUNTS + DARK_SPREAD * (
+    dark = _DARK_COUNTS + _DARK_SPREAD * (
         generator.standard_normal((width, 1)) + 0.3 * generator.standard_normal((width, bands))
     )
-    dark[1::2] += DARK_SPREAD
-    return LineCamera(
+    dark[1::2] += _DARK_SPREAD
+    return _LineCamera(
         (WHITE_SHARE * FULL_WELL * light / light.max()).astype(np.float32),
         dark.clip(0).astype(np.float32),
     )

@@ -23,27 +23,27 @@ from unmix_plugin.captures.options import MaskKind
 from unmix_plugin.captures.poses.pose_set import name_some
 from unmix_plugin.errors import CaptureError
 
-Background = Literal["white", "black"]
+_Background = Literal["white", "black"]
 
 HALF, OPAQUE = 127, 255
 """Grey above which a mask is white; opacity of matter that covers a pixel."""
-SMALL_SHARE = 5e-4
+_SMALL_SHARE = 5e-4
 """Specks and holes smaller than this share of the picture are removed."""
-DEVIATIONS = 6.0
+_DEVIATIONS = 6.0
 """Standard deviations of the background's noise between its level and the threshold."""
-LEAST_DISTANCE = 0.02
+_LEAST_DISTANCE = 0.02
 """Between level and threshold, as a share of the brightest pixels; JPEG and shading vary a background by about this."""
-LEAST_WHITE, MOST_BLACK = 0.5, 0.2
+_LEAST_WHITE, _MOST_BLACK = 0.5, 0.2
 """Level of a white or black background, as a share of the brightest pixels."""
-BORDER_SHARE = 0.02
+_BORDER_SHARE = 0.02
 """Width of the border that a background is judged by, as a share of the view's."""
-MOST_BORDER_PIXELS = 20000
-BRIGHT_PERCENTILE = 99.0
-LOOKED_AT = 12
+_MOST_BORDER_PIXELS = 20000
+_BRIGHT_PERCENTILE = 99.0
+_LOOKED_AT = 12
 """Views whose border is looked at for a white background that nobody has named."""
-ALMOST_WHITE = 0.9
+_ALMOST_WHITE = 0.9
 """Brightness of such a background, as a share of full reflectance or, where none is known, of the brightest pixels."""
-WHITE_BORDER = 0.75
+_WHITE_BORDER = 0.75
 """Share of the border that such a background covers."""
 
 
@@ -78,7 +78,7 @@ def choose_mask(views: Sequence[CaptureView], asked: MaskKind | None) -> tuple[M
 class BackgroundRule:
     """Which pixels are background."""
 
-    kind: Background
+    kind: _Background
     threshold: float
     """Background is at least this bright in every band (white), or at most this bright in the mean (black)."""
     level: float
@@ -92,12 +92,14 @@ class BackgroundRule:
         return brightness < self.threshold if self.kind == "white" else brightness > self.threshold
 
 
-def _brightness(kind: Background, values: Float32[np.ndarray, "*pixels B"]) -> np.ndarray:
+def _brightness(kind: _Background, values: Float32[np.ndarray, "*pixels B"]) -> np.ndarray:
     """What tells background from matter: white is bright in every band, black is dark in the mean."""
     return values.min(axis=-1) if kind == "white" else values.mean(axis=-1)
 
 
-def find_background(kind: Background, border: Float32[np.ndarray, "N B"], brightest: float) -> BackgroundRule:
+def find_background(
+    kind: _Background, border: Float32[np.ndarray, "N B"], brightest: float
+) -> BackgroundRule:
     """The rule that fits pixels at the border of the views.
 
     Args:
@@ -110,10 +112,10 @@ def find_background(kind: Background, border: Float32[np.ndarray, "N B"], bright
     brightness = _brightness(kind, border)
     level = float(np.median(brightness))
     deviation = 1.4826 * float(np.median(np.abs(brightness - level)))
-    distance = max(DEVIATIONS * deviation, LEAST_DISTANCE * brightest)
+    distance = max(_DEVIATIONS * deviation, _LEAST_DISTANCE * brightest)
     share = level / brightest if brightest > 0 else 0.0
-    if (kind == "white" and share < LEAST_WHITE) or (kind == "black" and share > MOST_BLACK):
-        expected = f"more than {LEAST_WHITE:.0%}" if kind == "white" else f"less than {MOST_BLACK:.0%}"
+    if (kind == "white" and share < _LEAST_WHITE) or (kind == "black" and share > _MOST_BLACK):
+        expected = f"more than {_LEAST_WHITE:.0%}" if kind == "white" else f"less than {_MOST_BLACK:.0%}"
         raise CaptureError(
             f"--mask {kind}: the border of the views is at {share:.0%} of the brightest pixels; expected {expected}, "
             "as the background should reach to the border: choose another --mask"
@@ -126,7 +128,7 @@ def background_rule(
     sensor: Sensor,
     views: Sequence[CaptureView],
     scale: float,
-    kind: Background,
+    kind: _Background,
     sample: Float32[np.ndarray, "N c"],
 ) -> BackgroundRule:
     """The rule that fits the border of the views.
@@ -145,10 +147,10 @@ def white_background_note(
     sensor: Sensor, views: Sequence[CaptureView], scale: float, sample: Float32[np.ndarray, "N c"]
 ) -> list[str]:
     """A hint at `--mask white` if the border of most views is almost white; arguments as `background_rule` has them."""
-    pixels = _border(sensor, views[:: max(1, -(-len(views) // LOOKED_AT))], scale)
-    least = ALMOST_WHITE * (1.0 if sensor.is_absolute else _brightest("white", sample, pixels))
+    pixels = _border(sensor, views[:: max(1, -(-len(views) // _LOOKED_AT))], scale)
+    least = _ALMOST_WHITE * (1.0 if sensor.is_absolute else _brightest("white", sample, pixels))
     share = float(np.mean(_brightness("white", pixels) >= least)) if len(pixels) else 0.0
-    if least <= 0 or share < WHITE_BORDER:
+    if least <= 0 or share < _WHITE_BORDER:
         return []
     note = (
         f"{share:.0%} of the border of the views is almost white, and no view has a mask: if this is background, "
@@ -158,19 +160,19 @@ def white_background_note(
 
 
 def _brightest(
-    kind: Background, sample: Float32[np.ndarray, "N c"], border: Float32[np.ndarray, "M c"]
+    kind: _Background, sample: Float32[np.ndarray, "N c"], border: Float32[np.ndarray, "M c"]
 ) -> float:
     everywhere = np.concatenate([_brightness(kind, sample), _brightness(kind, border)])
-    return float(np.percentile(np.clip(everywhere, 0.0, 1.0), BRIGHT_PERCENTILE)) if len(everywhere) else 0.0
+    return float(np.percentile(np.clip(everywhere, 0.0, 1.0), _BRIGHT_PERCENTILE)) if len(everywhere) else 0.0
 
 
 def _border(sensor: Sensor, views: Sequence[CaptureView], scale: float) -> Float32[np.ndarray, "M c"]:
     """Pixels at the border of the views, in [0, 1]; saturated ones are 1, missing ones are left out."""
     raster = sensor.calibration.raster
-    width = max(1, round(BORDER_SHARE * raster.width))
+    width = max(1, round(_BORDER_SHARE * raster.width))
     columns = np.r_[0:width, raster.width - width : raster.width]
     rows = sorted({0, raster.height - 1, *sampled_rows(raster.height)})
-    step = max(1, len(views) * (2 * raster.width + 2 * width * len(rows)) // MOST_BORDER_PIXELS)
+    step = max(1, len(views) * (2 * raster.width + 2 * width * len(rows)) // _MOST_BORDER_PIXELS)
     border = []
     for view in views:
         for row in rows:
@@ -183,7 +185,7 @@ def _border(sensor: Sensor, views: Sequence[CaptureView], scale: float) -> Float
 
 
 def clean(matter: Bool[np.ndarray, "H W"]) -> tuple[Bool[np.ndarray, "H W"], int, int]:
-    """Remove specks, then fill holes, each connected by edges and smaller than `SMALL_SHARE` of the picture.
+    """Remove specks, then fill holes, each connected by edges and smaller than `_SMALL_SHARE` of the picture.
 
     Returns:
         The mask, and how many specks were removed and holes filled.
@@ -196,7 +198,7 @@ def clean(matter: Bool[np.ndarray, "H W"]) -> tuple[Bool[np.ndarray, "H W"], int
     >>> int(cleaned.sum()), specks, holes
     (3600, 1, 1)
     """
-    smallest = max(4, round(SMALL_SHARE * matter.size))
+    smallest = max(4, round(_SMALL_SHARE * matter.size))
     kept, specks = _without_small(matter, smallest)
     background, holes = _without_small(~kept, smallest)
     return ~background, specks, holes

@@ -99,7 +99,7 @@ def make_plan(
         name, sensor = next(iter(sensors.items()))
         sample = sensor.sample / np.float32(scale)
         said += white_background_note(sensor, by_sensor[name], scale, sample)
-    said += notes_on_pictures([view.cube for view in views])
+    said += _notes_on_pictures([view.cube for view in views])
     said += [note for view in views[:1] for note in view.cube.notes]
     opened = [file for file in (references.dark, references.white) if file is not None]
     return Plan(
@@ -121,7 +121,7 @@ def input_files(view: CaptureView) -> list[Path]:
     return [*view.cube.files, *more]
 
 
-def notes_on_pictures(files: Sequence[SpectralFile]) -> list[str]:
+def _notes_on_pictures(files: Sequence[SpectralFile]) -> list[str]:
     """Notes on encoding, order of colours and orientation, one sentence each; none where there is no picture."""
     pictures = [file for file in files if file.reader == "picture"]
     notes = []

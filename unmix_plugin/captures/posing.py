@@ -34,13 +34,13 @@ from unmix_plugin.scenes.placement import Placement
 from unmix_plugin.scenes.reading.cubes import map_array
 
 ESTIMATE = "estimate"
-LEAST_VIEWS = 2
+_LEAST_VIEWS = 2
 """One to train on and one for evaluation."""
-MOST_STRETCH = 0.01
+_MOST_STRETCH = 0.01
 """By which the shapes of a lens's image and of a cube may differ, as a share."""
-LEAST_TURN_DEG = 10.0
+_LEAST_TURN_DEG = 10.0
 """Horizontal axes of cameras that span less than this do not tell the vertical."""
-MOST_SWAY_DEG = 30.0
+_MOST_SWAY_DEG = 30.0
 """Between the axes of cameras that look down and their mean, about."""
 
 _Pose: TypeAlias = Float64[np.ndarray, "4 4"]
@@ -62,7 +62,7 @@ class PosedViews:
 
 
 @dataclass(frozen=True)
-class PlacedPoses:
+class _PlacedPoses:
     """Poses in the world of a scene."""
 
     poses: PoseSet
@@ -153,9 +153,9 @@ def pose_views(views: Sequence[CaptureView], poses: PoseSet) -> PosedViews:
     cameras, completed = complete_rigs(views, cameras)
     matched = [note for note in said if not (completed and "without pose" in note)]
     posed = tuple(view for view in views if view.name in cameras)
-    if len(posed) < LEAST_VIEWS:
+    if len(posed) < _LEAST_VIEWS:
         raise CaptureError(
-            f"{poses.source}: {len(posed)} of {len(views)} views has a pose; a scene needs {LEAST_VIEWS} or more. "
+            f"{poses.source}: {len(posed)} of {len(views)} views has a pose; a scene needs {_LEAST_VIEWS} or more. "
             + "; ".join(said)
         )
     fitted = {
@@ -179,7 +179,7 @@ def _lens_of(lens: Lens | None, view: CaptureView) -> Lens:
     if (lens.width, lens.height) == (width, height):
         return lens
     across, down = width / lens.width, height / lens.height
-    if abs(across / down - 1.0) > MOST_STRETCH:
+    if abs(across / down - 1.0) > _MOST_STRETCH:
         turned = ", or store them turned as EXIF's orientation says"
         raise CaptureError(
             f"view {view.name} has {width} x {height} pixels (width x height), its lens is given for {lens.width} x "
@@ -290,7 +290,7 @@ def _square(pose: Float64[np.ndarray, "3 4"]) -> _Pose:
     return np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
 
 
-def place_poses(poses: PoseSet, is_flight: bool = False) -> PlacedPoses:
+def place_poses(poses: PoseSet, is_flight: bool = False) -> _PlacedPoses:
     """Settle up axis, middle and scale of a scene.
 
     The up axis is the source's where it has one, otherwise the direction across which the cameras' horizontal axes lie,
@@ -315,7 +315,7 @@ def place_poses(poses: PoseSet, is_flight: bool = False) -> PlacedPoses:
         up=np.array([0.0, 0.0, 1.0]),
     )
     how_large = [f"1 unit of the scene is {1.0 / scale:.6g} of the source"] if poses.has_world else []
-    return PlacedPoses(placed, replace(inner, offset=poses.offset), (how_up, how_middle, *how_large))
+    return _PlacedPoses(placed, replace(inner, offset=poses.offset), (how_up, how_middle, *how_large))
 
 
 def moved(camera: PosedCamera, similarity: Placement) -> PosedCamera:
@@ -331,11 +331,11 @@ def _find_up(
     if known is not None:
         return known, "up is the source's"
     back = poses[:, :, 2].mean(axis=0)
-    if is_flight and np.linalg.norm(back) > np.cos(np.radians(MOST_SWAY_DEG)):
+    if is_flight and np.linalg.norm(back) > np.cos(np.radians(_MOST_SWAY_DEG)):
         return back / np.linalg.norm(back), "up is against where the cameras look, as they would in a flight"
     mean = poses[:, :, 1].mean(axis=0)
     _, singular, vt = np.linalg.svd(poses[:, :, 0], full_matrices=True)
-    is_spread = len(singular) > 1 and singular[1] > np.sin(np.radians(LEAST_TURN_DEG)) * singular[0]
+    is_spread = len(singular) > 1 and singular[1] > np.sin(np.radians(_LEAST_TURN_DEG)) * singular[0]
     vertical = vt[2] * (1.0 if vt[2] @ mean >= 0 else -1.0)
     if is_spread and vertical @ mean > 0.5 * np.linalg.norm(mean) > 0.05:
         return vertical, "up is square to the cameras' horizontal axes"

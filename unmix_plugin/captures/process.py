@@ -21,15 +21,15 @@ from unmix_plugin.captures.writing.view_files import ViewRecord, write_view
 from unmix_plugin.captures.writing.work_folder import WorkFolder, hashes, refuse_output
 from unmix_plugin.errors import CaptureError, ConfigError, did_you_mean
 
-Say = Callable[[str], None]
+_Say = Callable[[str], None]
 """Tells the user something, one line."""
-Follow = Callable[[str, Sequence[CaptureView]], Iterable[CaptureView]]
+_Follow = Callable[[str, Sequence[CaptureView]], Iterable[CaptureView]]
 """Goes through views and shows how far it is."""
-LARGEST_DIFFERENCE_NM = 0.1
+_LARGEST_DIFFERENCE_NM = 0.1
 """Between the same bands of views of one sensor."""
 
 
-def process_capture(options: ProcessOptions, say: Say, follow: Follow) -> list[str]:
+def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list[str]:
     """Make the scene that the options ask for.
 
     A start that was interrupted is gone on with where inputs and options are the same.
@@ -134,7 +134,7 @@ def _refuse_unlike(cube: SpectralFile, first: SpectralFile) -> None:
         )
     if wavelengths is not None and expected_nm is not None:
         band = int(np.argmax(np.abs(wavelengths - expected_nm)))
-        if abs(wavelengths[band] - expected_nm[band]) > LARGEST_DIFFERENCE_NM:
+        if abs(wavelengths[band] - expected_nm[band]) > _LARGEST_DIFFERENCE_NM:
             raise CaptureError(
                 f"{cube.path} has {wavelengths[band]:g} nm at band {band}; expected {expected_nm[band]:g} nm, as "
                 f"{first.path} has: all views of a camera have the same bands"

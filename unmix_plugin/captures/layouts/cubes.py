@@ -17,11 +17,11 @@ from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import SpectralFile
 from unmix_plugin.errors import CaptureError
 
-CUBE_SUFFIXES = frozenset(
+_CUBE_SUFFIXES = frozenset(
     {".hdr", ".npy", ".npz", ".tif", ".tiff", ".exr", ".mat", ".h5", ".hdf5", ".nc", ".pt"}
 )
-PICTURE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
-REFERENCE_NAME = re.compile(
+_PICTURE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
+_REFERENCE_NAME = re.compile(
     r"(white|dark|flat)[ _-]*(ref(erence)?|frame|field|current)?[ _-]*\d*", re.IGNORECASE
 )
 """Names of files that hold no view."""
@@ -36,14 +36,14 @@ def find_cubes(root: Path, options: LayoutOptions) -> Capture:
     """
     excluded = {path.resolve() for path in options.exclude}
     files = [path for path in _visible_files(root) if path.resolve() not in excluded]
-    references = [path for path in files if REFERENCE_NAME.fullmatch(path.stem)]
+    references = [path for path in files if _REFERENCE_NAME.fullmatch(path.stem)]
     files = [path for path in files if path not in references]
-    cubes = [path for path in files if path.suffix.lower() in CUBE_SUFFIXES]
-    pictures = {path.stem: path for path in files if path.suffix.lower() in PICTURE_SUFFIXES}
+    cubes = [path for path in files if path.suffix.lower() in _CUBE_SUFFIXES]
+    pictures = {path.stem: path for path in files if path.suffix.lower() in _PICTURE_SUFFIXES}
     folders = [] if cubes else _band_folders(root, excluded)
     found = cubes or folders or list(pictures.values())
     if not found:
-        kinds = ", ".join(sorted(CUBE_SUFFIXES | PICTURE_SUFFIXES))
+        kinds = ", ".join(sorted(_CUBE_SUFFIXES | _PICTURE_SUFFIXES))
         raise CaptureError(
             f"{root} holds no cubes; expected one file a view ({kinds}), or one folder of band files a view"
         )
@@ -56,7 +56,7 @@ def find_cubes(root: Path, options: LayoutOptions) -> Capture:
         )
         for path in sorted(found, key=_name)
     )
-    unused = [path for path in references if path.suffix.lower() in CUBE_SUFFIXES]
+    unused = [path for path in references if path.suffix.lower() in _CUBE_SUFFIXES]
     notes = tuple(
         f"{path.name} was left out, as its name is that of a reference; use it with --white or --dark"
         for path in unused
@@ -67,7 +67,7 @@ def find_cubes(root: Path, options: LayoutOptions) -> Capture:
 def _open(path: Path, options: LayoutOptions) -> SpectralFile:
     file = open_spectral_file(path, options.read)
     if (
-        path.suffix.lower() in PICTURE_SUFFIXES
+        path.suffix.lower() in _PICTURE_SUFFIXES
         and file.dtype.itemsize == 1
         and "encoding" not in file.metadata
     ):
@@ -87,13 +87,13 @@ def _band_folders(root: Path, excluded: set[Path]) -> list[Path]:
         if path.is_dir()
         and not path.name.startswith(".")
         and path.resolve() not in excluded
-        and not REFERENCE_NAME.fullmatch(path.name)
+        and not _REFERENCE_NAME.fullmatch(path.name)
         and len([file for file in _visible_files(path) if _is_band(file)]) > 1
     )
 
 
 def _is_band(path: Path) -> bool:
-    return path.suffix.lower() in CUBE_SUFFIXES | PICTURE_SUFFIXES
+    return path.suffix.lower() in _CUBE_SUFFIXES | _PICTURE_SUFFIXES
 
 
 def _name(path: Path) -> str:

@@ -39,7 +39,7 @@ class LayoutOptions:
         return ReadOptions(self.dataset, self.wavelengths_nm, self.axes)
 
 
-FindViews: TypeAlias = Callable[[Path, LayoutOptions], Capture]
+_FindViews: TypeAlias = Callable[[Path, LayoutOptions], Capture]
 """Finds the views below a folder; raises CaptureError where there are none or they can't be opened."""
 
 _FUNCTIONS = {
@@ -66,11 +66,11 @@ def find_views(layout: str, root: Path, options: LayoutOptions) -> Capture:
         found = "is a file" if root.is_file() else "is not there"
         raise CaptureError(f"{root} {found}; give the folder of the capture with --data")
     module, function = _FUNCTIONS[layout].split(":")
-    find: FindViews = getattr(import_module(f"unmix_plugin.captures.layouts.{module}"), function)
+    find: _FindViews = getattr(import_module(f"unmix_plugin.captures.layouts.{module}"), function)
     return find(root, options)
 
 
-MOST_NAMED = 3
+_MOST_NAMED = 3
 
 
 class FoundFiles:
@@ -120,8 +120,8 @@ class FoundFiles:
             CaptureError: some were; the message names a few.
         """
         if self._missing:
-            shown = ", ".join(self._missing[:MOST_NAMED])
-            more = len(self._missing) - MOST_NAMED
+            shown = ", ".join(self._missing[:_MOST_NAMED])
+            more = len(self._missing) - _MOST_NAMED
             raise CaptureError(
                 f"{self._root} lacks {counted(len(self._missing), 'file')} of its views: {shown}"
                 f"{f' and {more} more' if more > 0 else ''}; {advice}"

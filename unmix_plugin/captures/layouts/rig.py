@@ -34,25 +34,25 @@ from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import BandTable, SpectralFile
 from unmix_plugin.errors import CaptureError, counted
 
-TIFF_SUFFIXES = (".tif", ".tiff")
-COLOUR_SUFFIXES = (".jpg", ".jpeg")
-THERMAL_NM = 3000.0
+_TIFF_SUFFIXES = (".tif", ".tiff")
+_COLOUR_SUFFIXES = (".jpg", ".jpeg")
+_THERMAL_NM = 3000.0
 """Bands from here on measure heat."""
-BAND_ENDING = re.compile(
+_BAND_ENDING = re.compile(
     r"(?:_MS)?[_-](\d{1,2}|GRE|GREEN|RED|REG|REDEDGE|RE|NIR|BLUE|RGB|G|R|B|D|W)$", re.IGNORECASE
 )
 """Of a file's stem."""
-DJI_NUMBER = re.compile(r"(DJI_\d+)(\d)$", re.IGNORECASE)
+_DJI_NUMBER = re.compile(r"(DJI_\d+)(\d)$", re.IGNORECASE)
 """Of a Phantom 4 Multispectral: the last digit is the band, 0 the colour picture."""
-EVAL_INTERVAL = 8
+_EVAL_INTERVAL = 8
 """Every so many releases, one is for evaluation."""
-UNIQUE_TAGS = ("MicaSense:CaptureId", "CaptureUUID", "CaptureId")
-MM_OF_UNIT: dict[float, float] = {2.0: 25.4, 3.0: 10.0, 4.0: 1.0, 5.0: 1e-3}
+_UNIQUE_TAGS = ("MicaSense:CaptureId", "CaptureUUID", "CaptureId")
+_MM_OF_UNIT: dict[float, float] = {2.0: 25.4, 3.0: 10.0, 4.0: 1.0, 5.0: 1e-3}
 """Millimetres in EXIF's FocalPlaneResolutionUnit: inch, cm, mm, micrometre."""
-TAGS = "lens in the XMP"
-LONGEST_MM = 50.0
+_TAGS = "lens in the XMP"
+_LONGEST_MM = 50.0
 """Focal length without a unit from which it is in pixels; these cameras have about 5 mm."""
-LIMIT_PX = 10.0
+_LIMIT_PX = 10.0
 """By how much the lens with k1, k2, p1, p2 may differ from the camera's; poses usually bring a better one."""
 
 
@@ -66,7 +66,7 @@ def find_rig(root: Path, options: LayoutOptions) -> Capture:
     excluded = {path.resolve() for path in options.exclude}
     paths = [path for path in sorted(root.rglob("*")) if path.is_file() and path.resolve() not in excluded]
     paths = [path for path in paths if not any(part.startswith(".") for part in path.relative_to(root).parts)]
-    opened = [_open_band_file(path, root) for path in paths if path.suffix.lower() in TIFF_SUFFIXES]
+    opened = [_open_band_file(path, root) for path in paths if path.suffix.lower() in _TIFF_SUFFIXES]
     bands = [item for item in opened if item.file.shape[2] == 1 and not _is_thermal(item.file)]
     if not bands:
         raise CaptureError(
@@ -95,7 +95,7 @@ def find_rig(root: Path, options: LayoutOptions) -> Capture:
 def _is_thermal(file: SpectralFile) -> bool:
     wavelengths = file.bands.wavelengths_nm
     name = tag_text(file.metadata.get("xmp") or {}, "BandName") or ""
-    return name.upper() == "LWIR" or (wavelengths is not None and float(wavelengths.min()) > THERMAL_NM)
+    return name.upper() == "LWIR" or (wavelengths is not None and float(wavelengths.min()) > _THERMAL_NM)
 
 
 def _check_lenses(views: Sequence[CaptureView]) -> None:
@@ -148,7 +148,7 @@ def _notes(
     notes = []
     thermal = sum(item.file.shape[2] == 1 and _is_thermal(item.file) for item in opened)
     colour = sum(item.file.shape[2] > 1 for item in opened)
-    colour += sum(path.suffix.lower() in COLOUR_SUFFIXES for path in paths)
+    colour += sum(path.suffix.lower() in _COLOUR_SUFFIXES for path in paths)
     exif = [item.file.metadata.get("exif") or {} for item in bands]
     turned = sum((exif_number(values, "Orientation") or 1) > 1 for values in exif)
     counts = Counter(releases)
@@ -186,8 +186,8 @@ class _BandFile:
 
 def _open_band_file(path: Path, root: Path) -> _BandFile:
     file = open_spectral_file(path)
-    number = DJI_NUMBER.fullmatch(path.stem)
-    found = BAND_ENDING.search(path.stem)
+    number = _DJI_NUMBER.fullmatch(path.stem)
+    found = _BAND_ENDING.search(path.stem)
     base, ending = path.stem, ""
     if number is not None:
         base, ending = number[1], number[2]
@@ -216,7 +216,7 @@ def _release_names(bands: Sequence[_BandFile], where: str) -> list[str]:
 
     Identifiers count where they join files; cameras that write another one into every file are grouped by name.
     """
-    identifiers = [tag_text(item.tags, *UNIQUE_TAGS) or "" for item in bands]
+    identifiers = [tag_text(item.tags, *_UNIQUE_TAGS) or "" for item in bands]
     counts = Counter(identifier for identifier in identifiers if identifier)
     keys = [
         identifier if counts[identifier] > 1 else f"name {item.base}"
@@ -233,7 +233,7 @@ def splits_of(releases: Iterable[str]) -> dict[str, Split]:
     """One of every eight releases is for evaluation, with all its lenses: in their middle, since what the first and
     the last of a flight show no other does."""
     names = sorted(set(releases))
-    evaluated = names[min(EVAL_INTERVAL, len(names)) // 2 :: EVAL_INTERVAL]
+    evaluated = names[min(_EVAL_INTERVAL, len(names)) // 2 :: _EVAL_INTERVAL]
     return {release: "eval" if release in evaluated else "train" for release in names}
 
 
@@ -262,7 +262,7 @@ class _NoLensError(Exception):
 
 
 def _pix4d_lens(file: SpectralFile, tags: XmpTags, exif: dict[str, Any]) -> tuple[Lens, tuple[str, ...]]:
-    unit = MM_OF_UNIT.get(exif_number(exif, "FocalPlaneResolutionUnit") or 4.0, 1.0)
+    unit = _MM_OF_UNIT.get(exif_number(exif, "FocalPlaneResolutionUnit") or 4.0, 1.0)
     across = (exif_number(exif, "FocalPlaneXResolution") or 0.0) / unit  # pixels a millimetre
     down = (exif_number(exif, "FocalPlaneYResolution") or 0.0) / unit or across
     centre_mm = tag_numbers(tags, "Camera:PrincipalPoint")
@@ -283,7 +283,7 @@ def _pix4d_lens(file: SpectralFile, tags: XmpTags, exif: dict[str, Any]) -> tupl
     focal = tag_numbers(tags, "PerspectiveFocalLength")
     if focal is None or focal[0] <= 0.0:
         raise _NoLensError("PerspectiveFocalLength is absent")
-    unit = tag_text(tags, "PerspectiveFocalLengthUnits") or ("mm" if focal[0] < LONGEST_MM else "px")
+    unit = tag_text(tags, "PerspectiveFocalLengthUnits") or ("mm" if focal[0] < _LONGEST_MM else "px")
     focal_px = (focal[0] * across, focal[0] * down) if unit == "mm" else (focal[0], focal[0])
     distortion = tag_numbers(tags, "PerspectiveDistortion") or []
     k1, k2, k3, p1, p2 = distortion if len(distortion) == 5 else [0.0] * 5
@@ -311,7 +311,7 @@ def _lens(
     height, width = file.shape[:2]
     lens = Lens(width, height, focal_px, centre, (*radial[:2], *tangential), (radial[2], 0.0))
     if lens.higher_radial[0]:
-        require_unfolded(lens, f"{file.path}, {TAGS}")
+        require_unfolded(lens, f"{file.path}, {_TAGS}")
     return lens
 
 
@@ -338,4 +338,4 @@ def _fit_fisheye(
 
     focal = 2.0 / math.pi * polynomial[1] * np.diag(affine)
     start = Lens(*size, (float(focal[0]), float(focal[1])), centre)
-    return fit_lens(project, start, "fisheye of Pix4D", TAGS, LIMIT_PX)
+    return fit_lens(project, start, "fisheye of Pix4D", _TAGS, _LIMIT_PX)

@@ -45,7 +45,7 @@ _NO_WAVELENGTHS = (
 
 
 @dataclass(frozen=True)
-class Frame:
+class _Frame:
     """One element of `frames`."""
 
     where: str
@@ -65,17 +65,17 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class FrameList:
+class _FrameList:
     """All frames of a folder, and what is given for all of them."""
 
     source: Path
     """transforms.json, or the folder that holds one for each split."""
-    frames: tuple[Frame, ...]
+    frames: tuple[_Frame, ...]
     top: dict[str, Any]
     notes: tuple[str, ...]
 
 
-def read_frames(root: Path, key: str) -> FrameList:
+def read_frames(root: Path, key: str) -> _FrameList:
     """Frames of transforms.json, or of transforms_train.json and its like; repeated ones are left out and noted.
 
     Args:
@@ -94,7 +94,7 @@ def read_frames(root: Path, key: str) -> FrameList:
             "give the folder that holds it with --data, or name another layout"
         )
     top: dict[str, Any] = {}
-    frames: dict[str, Frame] = {}
+    frames: dict[str, _Frame] = {}
     repeated: dict[str, int] = defaultdict(int)
     for path, split in files.items():
         content = load_json(path)
@@ -104,7 +104,7 @@ def read_frames(root: Path, key: str) -> FrameList:
             found = "absent" if listed is None else describe(listed)
             raise CaptureError(f"{path}: 'frames' is {found}; expected a list with one object a view")
         for index, values in enumerate(listed):
-            frame = Frame(f"{path.name}: frames[{index}]", values, split)
+            frame = _Frame(f"{path.name}: frames[{index}]", values, split)
             if frames.setdefault(frame.name or frame.where, frame) is not frame:
                 repeated[path.name] += 1
     for frame in frames.values():
@@ -116,10 +116,10 @@ def read_frames(root: Path, key: str) -> FrameList:
         f"{counted(count, 'frame')} of {name} listed before: left out" for name, count in repeated.items()
     ]
     source = whole if whole in files else root
-    return FrameList(source, _split_by_lists(tuple(frames.values()), top), top, tuple(notes))
+    return _FrameList(source, _split_by_lists(tuple(frames.values()), top), top, tuple(notes))
 
 
-def _split_by_lists(frames: tuple[Frame, ...], top: dict[str, Any]) -> tuple[Frame, ...]:
+def _split_by_lists(frames: tuple[_Frame, ...], top: dict[str, Any]) -> tuple[_Frame, ...]:
     """Splits from `train_filenames` and the like: evaluation is test if there is any, otherwise validation."""
     train, val, test = (
         {text.removeprefix("./") for text in top.get(f"{name}_filenames") or [] if isinstance(text, str)}
@@ -129,7 +129,7 @@ def _split_by_lists(frames: tuple[Frame, ...], top: dict[str, Any]) -> tuple[Fra
     if not evaluation:
         return frames
 
-    def split_of(frame: Frame) -> Split | None:
+    def split_of(frame: _Frame) -> Split | None:
         names = {frame.text(key) for key in _NAME_KEYS}
         if names & evaluation:
             return "eval"
@@ -139,7 +139,7 @@ def _split_by_lists(frames: tuple[Frame, ...], top: dict[str, Any]) -> tuple[Fra
 
 
 def make_capture(
-    layout: str, root: Path, listed: FrameList, views: Sequence[CaptureView], notes: Iterable[str] = ()
+    layout: str, root: Path, listed: _FrameList, views: Sequence[CaptureView], notes: Iterable[str] = ()
 ) -> Capture:
     """Views with the poses of their frames, in the order of their names.
 

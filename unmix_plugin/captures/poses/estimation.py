@@ -25,32 +25,32 @@ from unmix_plugin.captures.poses.colmap import read_colmap
 from unmix_plugin.captures.poses.pose_set import PoseSet, name_some
 from unmix_plugin.errors import CaptureError
 
-LEAST_VIEWS = 3
-LEAST_SHARE = 0.5
+_LEAST_VIEWS = 3
+_LEAST_SHARE = 0.5
 """Of the views; with fewer registered ones the poses are refused."""
-MOST_EXHAUSTIVE = 100
+_MOST_EXHAUSTIVE = 100
 """Views up to which all pairs are matched; beyond, neighbours in the order of names."""
-RIM_PX = 4
+_RIM_PX = 4
 """Beside the edge of a mask, where features are those of the silhouette and not of the surface."""
-PERCENTILES = (1.0, 99.5)
-GAMMA = 0.5
+_PERCENTILES = (1.0, 99.5)
+_GAMMA = 0.5
 """Values are light; shadows need the room that eyes, and detectors made for photographs, expect."""
-LOCAL_CONTRAST, TILES = 0.02, 8
+_LOCAL_CONTRAST, _TILES = 0.02, 8
 """A side is cut into so many tiles, each with a contrast of its own."""
-ENOUGH = 0.9
+_ENOUGH = 0.9
 """Share of registered images with which no other focal length is tried."""
-FOCAL_FACTORS = (1.2, 3.0, 7.0)
+_FOCAL_FACTORS = (1.2, 3.0, 7.0)
 """First focal lengths to try, over the longer side: wide, tele and far lenses."""
-PEAK_THRESHOLD = 0.003
+_PEAK_THRESHOLD = 0.003
 """Of features: half of COLMAP's, as matter in a laboratory has less texture than a street."""
-MOST_FEATURES = 8192
+_MOST_FEATURES = 8192
 """Of a picture."""
-SEED = 0
-GAIN = 0.02
+_SEED = 0
+_GAIN = 0.02
 """Part of the reprojection error that distortion has to remove to be kept."""
-GREATEST_BEND = 0.1
+_GREATEST_BEND = 0.1
 """Of half the diagonal: what distortion may move the corner of a picture by."""
-LOG = "colmap.log"
+_LOG = "colmap.log"
 _WHAT_TO_DO = (
     "take more views with smaller steps (10 degrees) and much overlap, mask a background that stands still while the "
     "object turns, put printed texture beside the object, or give poses with --poses FILE"
@@ -85,15 +85,15 @@ def estimate_poses(
             "poses can't be estimated: pycolmap is not installed; pip install 'unmix-nerf[sfm]', or give poses of "
             "another program"
         )
-    if len(pictures) < LEAST_VIEWS:
+    if len(pictures) < _LEAST_VIEWS:
         raise CaptureError(
-            f"{len(pictures)} views; expected at least {LEAST_VIEWS} to estimate poses from: {_WHAT_TO_DO}"
+            f"{len(pictures)} views; expected at least {_LEAST_VIEWS} to estimate poses from: {_WHAT_TO_DO}"
         )
     files = {name: f"{index:06d}.png" for index, name in enumerate(sorted(pictures))}
     _write_pictures(folder, {files[name]: picture for name, picture in pictures.items()}, "images")
     if masks is not None:
         shown = {
-            f"{files[name]}.png": 255 * binary_erosion(mask, iterations=RIM_PX).astype(np.uint8)
+            f"{files[name]}.png": 255 * binary_erosion(mask, iterations=_RIM_PX).astype(np.uint8)
             for name, mask in masks.items()
         }
         _write_pictures(folder, shown, "masks")
@@ -104,7 +104,7 @@ def estimate_poses(
         folder=str(folder.resolve()),
         sensors=tuple(map(tuple, sensors.values())),
         has_masks=masks is not None,
-        sequential=len(pictures) > MOST_EXHAUSTIVE,
+        sequential=len(pictures) > _MOST_EXHAUSTIVE,
         threads=threads or min(os.cpu_count() or 1, 8),
     )
     return _best(_run(settings, folder), files, folder)
@@ -125,15 +125,15 @@ def _run(settings: _Settings, folder: Path) -> list[dict]:
     result.unlink(missing_ok=True)
     asked.write_text(json.dumps(asdict(settings)), encoding="utf-8")
     command = [sys.executable, "-m", "unmix_plugin.captures.poses.estimation", str(asked)]
-    with (folder / LOG).open("wb") as log:
+    with (folder / _LOG).open("wb") as log:
         status = subprocess.run(
             command, stdout=log, stderr=log, stdin=subprocess.DEVNULL, check=False
         ).returncode
     if status != 0 or not result.is_file():
-        lines = (folder / LOG).read_text("utf-8", "replace").strip().splitlines()
+        lines = (folder / _LOG).read_text("utf-8", "replace").strip().splitlines()
         raise CaptureError(
             f"COLMAP stopped with status {status} ({lines[-1].strip() if lines else 'without a word'}); see "
-            f"{folder / LOG}"
+            f"{folder / _LOG}"
         )
     return json.loads(result.read_text(encoding="utf-8"))
 
@@ -142,10 +142,10 @@ def _best(models: list[dict], files: Mapping[str, str], folder: Path) -> PoseSet
     """The model with the most views, that with the smaller error where two have as many."""
     best = max(models, key=lambda model: (model["registered"], -model["error_px"]), default=None)
     registered = 0 if best is None else best["registered"]
-    if best is None or registered < max(LEAST_VIEWS, LEAST_SHARE * len(files)):
+    if best is None or registered < max(_LEAST_VIEWS, _LEAST_SHARE * len(files)):
         raise CaptureError(
             f"poses of only {registered} of {len(files)} views could be estimated; expected at least half: "
-            f"{_WHAT_TO_DO} (see {folder / LOG})"
+            f"{_WHAT_TO_DO} (see {folder / _LOG})"
         )
     poses = read_colmap(Path(best["folder"]))
     cameras = {name: poses.cameras[file] for name, file in files.items() if file in poses.cameras}
@@ -178,12 +178,12 @@ def contrast_picture(
     counts = valid & np.isfinite(mean)
     if not counts.any():
         return np.zeros(mean.shape, np.uint8)
-    low, high = np.percentile(mean[counts], PERCENTILES)
+    low, high = np.percentile(mean[counts], _PERCENTILES)
     if high <= low:
         return np.where(counts, np.uint8(128), np.uint8(0))
-    level = np.clip((np.where(counts, mean, low) - low) / (high - low), 0.0, 1.0) ** GAMMA
-    tile = [max(side // TILES, 1) for side in mean.shape]
-    local = equalize_adapthist(level, kernel_size=tile, clip_limit=LOCAL_CONTRAST)
+    level = np.clip((np.where(counts, mean, low) - low) / (high - low), 0.0, 1.0) ** _GAMMA
+    tile = [max(side // _TILES, 1) for side in mean.shape]
+    local = equalize_adapthist(level, kernel_size=tile, clip_limit=_LOCAL_CONTRAST)
     return np.where(counts, np.round(255.0 * local), 0.0).astype(np.uint8)
 
 
@@ -208,7 +208,7 @@ def _reconstruct(path: Path) -> None:
 
     values = json.loads(path.read_text(encoding="utf-8"))
     settings = _Settings(**{**values, "sensors": tuple(map(tuple, values["sensors"]))})
-    pycolmap.set_random_seed(SEED)
+    pycolmap.set_random_seed(_SEED)
     folder = Path(settings.folder)
     database = folder / "database.db"
     database.unlink(missing_ok=True)
@@ -216,10 +216,10 @@ def _reconstruct(path: Path) -> None:
     _match(pycolmap, settings, database)
     count = sum(map(len, settings.sensors))
     found: list[dict[str, Any]] = []
-    for factor in FOCAL_FACTORS:
+    for factor in _FOCAL_FACTORS:
         _set_focal(pycolmap, database, factor)
         found += _map(pycolmap, settings, database, folder / "models" / f"{factor:g}")
-        if max((model["registered"] for model in found), default=0) >= ENOUGH * count:
+        if max((model["registered"] for model in found), default=0) >= _ENOUGH * count:
             break
     (folder / "result.json").write_text(json.dumps(found), encoding="utf-8")
 
@@ -227,7 +227,7 @@ def _reconstruct(path: Path) -> None:
 def _extract(pycolmap: Any, settings: _Settings, database: Path) -> None:
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads, options.use_gpu = settings.threads, False
-    options.sift.max_num_features, options.sift.peak_threshold = MOST_FEATURES, PEAK_THRESHOLD
+    options.sift.max_num_features, options.sift.peak_threshold = _MOST_FEATURES, _PEAK_THRESHOLD
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = "SIMPLE_RADIAL"  # a lens with one number of distortion
     if settings.has_masks:
@@ -248,7 +248,7 @@ def _match(pycolmap: Any, settings: _Settings, database: Path) -> None:
     options = pycolmap.FeatureMatchingOptions()
     options.num_threads, options.use_gpu = settings.threads, False
     verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = SEED
+    verification.ransac.random_seed = _SEED
     match = pycolmap.match_sequential if settings.sequential else pycolmap.match_exhaustive
     match(database, matching_options=options, verification_options=verification, device=pycolmap.Device.cpu)
 
@@ -268,13 +268,13 @@ def _map(pycolmap: Any, settings: _Settings, database: Path, output: Path) -> li
     """Models from one first focal length, without distortion, which a few views of a far lens would let run away."""
     output.mkdir(parents=True, exist_ok=True)
     options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads, options.random_seed = settings.threads, SEED
-    options.min_model_size = LEAST_VIEWS
+    options.num_threads, options.random_seed = settings.threads, _SEED
+    options.min_model_size = _LEAST_VIEWS
     options.max_num_models = 5
     options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = False
     options.max_focal_length_ratio = options.mapper.max_focal_length_ratio = 50.0
     options.triangulation.max_focal_length_ratio = 50.0
-    options.mapper.random_seed = options.triangulation.random_seed = SEED
+    options.mapper.random_seed = options.triangulation.random_seed = _SEED
     options.mapper.init_min_tri_angle, options.mapper.init_min_num_inliers = 8.0, 50
     options.mapper.abs_pose_min_num_inliers, options.mapper.abs_pose_min_inlier_ratio = 15, 0.15
     models = pycolmap.incremental_mapping(database, Path(settings.folder) / "images", output, options)
@@ -294,7 +294,7 @@ def _with_distortion(pycolmap: Any, model: Any) -> Any:
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_extra_params, options.print_summary = True, False
     pycolmap.bundle_adjustment(bent, options)
-    limit = (1.0 - GAIN) * model.compute_mean_reprojection_error()
+    limit = (1.0 - _GAIN) * model.compute_mean_reprojection_error()
     is_better = bent.compute_mean_reprojection_error() < limit
     return bent if is_better and all(map(_is_plausible, bent.cameras.values())) else model
 
@@ -305,7 +305,7 @@ def _is_plausible(camera: Any) -> bool:
     away = corners - (camera.principal_point_x, camera.principal_point_y)
     ideal = away / (camera.focal_length_x, camera.focal_length_y)
     bent = camera.img_from_cam(np.column_stack([ideal, np.ones(4)]))
-    limit = GREATEST_BEND * 0.5 * np.hypot(camera.width, camera.height)
+    limit = _GREATEST_BEND * 0.5 * np.hypot(camera.width, camera.height)
     return bool(np.isfinite(bent).all() and np.linalg.norm(bent - corners, axis=1).max() < limit)
 
 

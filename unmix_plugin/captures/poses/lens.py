@@ -16,7 +16,7 @@ from jaxtyping import Float64
 from unmix_plugin.errors import CaptureError
 
 Points = Float64[np.ndarray, "P 2"]
-Project: TypeAlias = Callable[[Points], Points]
+_Project: TypeAlias = Callable[[Points], Points]
 """From ideal coordinates to pixels."""
 
 
@@ -50,7 +50,7 @@ class Lens:
         return project_opencv(ideal, self.focal_px, self.center_px, self.radial, self.tangential)
 
 
-LARGEST_ERROR_PX = 0.5
+_LARGEST_ERROR_PX = 0.5
 """Of a fitted lens anywhere in the image; beyond, the images have to be undistorted."""
 _GRID = 21
 _STEP = 1e-6
@@ -85,7 +85,7 @@ def project_fisheye(
 
 
 def fit_lens(
-    project: Project, start: Lens, model: str, where: str, limit_px: float = LARGEST_ERROR_PX
+    project: _Project, start: Lens, model: str, where: str, limit_px: float = _LARGEST_ERROR_PX
 ) -> tuple[Lens, str]:
     """The OPENCV lens that is nearest to another model.
 
@@ -164,7 +164,7 @@ def _pixel_grid(width: int, height: int) -> Points:
     return np.column_stack([columns.ravel(), rows.ravel()])
 
 
-def _invert(project: Project, pixels: Points, start: Lens) -> Points | None:
+def _invert(project: _Project, pixels: Points, start: Lens) -> Points | None:
     """Ideal points that `project` maps to the pixels, by Newton's method; None if there are none."""
     ideal = (pixels - np.array(start.center_px)) / np.array(start.focal_px)
     with np.errstate(all="ignore"):

@@ -18,17 +18,17 @@ from unmix_plugin.errors import CaptureError, counted
 
 FLIP = np.diag([1.0, -1.0, -1.0])
 """From OpenGL to OpenCV camera axes and back, from the right."""
-SHEAR_TOLERANCE = 5e-3
+_SHEAR_TOLERANCE = 5e-3
 """Largest element of R^T R - 1, after the scale is taken out, that passes as rounding of printed digits."""
-SCALE_TOLERANCE = 1e-3
+_SCALE_TOLERANCE = 1e-3
 """Scales this near to 1 are rounding too, and not mentioned."""
-GREATEST_POSITION = 1e9
+_GREATEST_POSITION = 1e9
 """Positions beyond this are damage."""
-FAR = 100.0
+_FAR = 100.0
 """Cameras further from the origin than this many times their spread are geo-referenced."""
-FAR_ALONE = 1e4
+_FAR_ALONE = 1e4
 """The same for one camera, in units of the source."""
-MAX_NAMED = 3
+_MAX_NAMED = 3
 
 SparsePoints: TypeAlias = tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"] | None]
 """Positions and sRGB of structure from motion's points."""
@@ -125,14 +125,14 @@ def find_offset(positions: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "3
     middle = positions.mean(axis=0)
     spread = float(np.linalg.norm(positions - middle, axis=1).max())
     distance = float(np.linalg.norm(middle))
-    is_far = distance > FAR * spread if spread > 0 else distance > FAR_ALONE
+    is_far = distance > _FAR * spread if spread > 0 else distance > _FAR_ALONE
     return np.round(middle) if is_far else np.zeros(3)
 
 
 def name_some(names: Sequence[str]) -> str:
     """A few names for a message, and how many more there are."""
-    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
-    return ", ".join(names[:MAX_NAMED]) + more
+    more = f" and {len(names) - _MAX_NAMED} more" if len(names) > _MAX_NAMED else ""
+    return ", ".join(names[:_MAX_NAMED]) + more
 
 
 def _unique(
@@ -175,7 +175,7 @@ def _make_rigid(
         u, _, vt = np.linalg.svd(matrix[:, :3])
         rigid[name] = np.column_stack([u @ vt, matrix[:, 3]])
         scale = float(np.cbrt(np.linalg.det(matrix[:, :3])))
-        scaled += [scale] if abs(scale - 1.0) > SCALE_TOLERANCE else []
+        scaled += [scale] if abs(scale - 1.0) > _SCALE_TOLERANCE else []
     first = next(iter(rigid.values()))
     if len(rigid) > 1 and all(np.array_equal(first, pose) for pose in rigid.values()):
         raise CaptureError(
@@ -193,14 +193,14 @@ def _fault(matrix: Float64[np.ndarray, "3 4"]) -> str | None:
     """What is wrong with a matrix; None if it is a similarity."""
     if not np.isfinite(matrix).all():
         return "the matrix has numbers that are not finite"
-    if np.abs(matrix).max() > GREATEST_POSITION:
+    if np.abs(matrix).max() > _GREATEST_POSITION:
         return "the camera is more than 1e9 units away, or its rotation scaled by more"
     left = matrix[:, :3]
     lengths = np.linalg.norm(left, axis=0)
     if lengths.max() < 1e-9:
         return "the rotation is all zeros"
     gram = left.T @ left / np.mean(lengths**2)
-    if np.abs(gram - np.eye(3)).max() > SHEAR_TOLERANCE:
+    if np.abs(gram - np.eye(3)).max() > _SHEAR_TOLERANCE:
         axes = ", ".join(f"{length:.4g}" for length in lengths)
         return f"the rotation is sheared (its axes have lengths {axes})"
     if np.linalg.det(left) < 0:

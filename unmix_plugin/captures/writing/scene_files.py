@@ -29,9 +29,9 @@ from unmix_plugin.formats.meshes import write_ply
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 
-SCENE_NAME, SHEET_NAME, REPORT_NAME = "transforms.json", "contact-sheet.png", "report.txt"
-ILLUMINANT_NAME, FLAT_LIGHT_NAME, POINTS_NAME = "illuminant.csv", "flat-light.csv", "points.ply"
-MOST_BANDS = 8
+_SCENE_NAME, _SHEET_NAME, _REPORT_NAME = "transforms.json", "contact-sheet.png", "report.txt"
+_ILLUMINANT_NAME, _FLAT_LIGHT_NAME, _POINTS_NAME = "illuminant.csv", "flat-light.csv", "points.ply"
+_MOST_BANDS = 8
 """Bands left out for one reason that are named."""
 
 
@@ -57,7 +57,7 @@ def write_scene_files(
     checked = check_views([view for view in seen if view.record.sensor == greatest], posed.poses.points)
     title = f"{plan.capture.root}: {len(seen)} views, {_sizes_in_words(plan)}"
     done = _what_was_done(plan, posed, [view.record for view in seen])
-    write_file(folder / REPORT_NAME, report_text(title, checked, done).encode())
+    write_file(folder / _REPORT_NAME, report_text(title, checked, done).encode())
     spectra = [
         Spectra(
             name,
@@ -68,7 +68,7 @@ def write_scene_files(
         for name, sensor in plan.sensors.items()
     ]
     sheet = contact_sheet(seen, spectra, posed.poses.points, posed.poses.colours, title)
-    write_file(folder / SHEET_NAME, sheet)
+    write_file(folder / _SHEET_NAME, sheet)
     views = [asdict(view.record) for view in seen]
     totals = ("num_pixels", "saturated_pixels", "missing_pixels", "clipped_values", "negative_values")
     record = {
@@ -87,7 +87,7 @@ def write_scene_files(
         "views": views,
     }
     _write_json(folder / RECORD_NAME, record)
-    _write_json(folder / SCENE_NAME, _transforms_json(plan, posed.views, seen, keys))
+    _write_json(folder / _SCENE_NAME, _transforms_json(plan, posed.views, seen, keys))
     return list(checked.findings)
 
 
@@ -103,8 +103,8 @@ def write_points(folder: Path, poses: PoseSet) -> dict[str, str]:
     if poses.colours is not None:
         columns |= {name: poses.colours[:, index] for index, name in enumerate(("red", "green", "blue"))}
     comment = "sparse points of structure from motion, scene coordinates"
-    write_ply(folder / POINTS_NAME, columns, comments=[comment])
-    return {"ply_file_path": POINTS_NAME}
+    write_ply(folder / _POINTS_NAME, columns, comments=[comment])
+    return {"ply_file_path": _POINTS_NAME}
 
 
 def _write_light(folder: Path, plan: Plan) -> dict[str, str]:
@@ -113,9 +113,9 @@ def _write_light(folder: Path, plan: Plan) -> dict[str, str]:
     if sensor.lamp is None or len(plan.sensors) > 1:
         return {}
     bands = Bands(sensor.centers_nm)
-    write_spectra_csv(folder / ILLUMINANT_NAME, SpectraTable(bands, ("power",), sensor.lamp[None]))
-    write_spectra_csv(folder / FLAT_LIGHT_NAME, SpectraTable(bands, ("power",), np.ones((1, len(bands)))))
-    return {"illuminant_path": FLAT_LIGHT_NAME}
+    write_spectra_csv(folder / _ILLUMINANT_NAME, SpectraTable(bands, ("power",), sensor.lamp[None]))
+    write_spectra_csv(folder / _FLAT_LIGHT_NAME, SpectraTable(bands, ("power",), np.ones((1, len(bands)))))
+    return {"illuminant_path": _FLAT_LIGHT_NAME}
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:
@@ -244,7 +244,7 @@ def _left_out(sensor: Sensor) -> dict[str, str]:
         wavelength = f"{sensor.bands.wavelengths_nm[band]:g} nm"
         found["noisy" if reason.startswith("noise") else reason].append(wavelength)
     return {
-        reason: ", ".join(names[:MOST_BANDS])
-        + (f" and {len(names) - MOST_BANDS} more" if len(names) > MOST_BANDS else "")
+        reason: ", ".join(names[:_MOST_BANDS])
+        + (f" and {len(names) - _MOST_BANDS} more" if len(names) > _MOST_BANDS else "")
         for reason, names in found.items()
     }

@@ -29,9 +29,9 @@ from unmix_plugin.spectral.bands import Bands
 
 FULL_SCALE = 65535
 """Stored number that stands for 1; saturated values have it too."""
-BLOCK_VALUES = 1 << 22
+_BLOCK_VALUES = 1 << 22
 """Values of a file that are calibrated together: 16 MiB as float32."""
-BRIGHT_PERCENTILE = 99.0
+_BRIGHT_PERCENTILE = 99.0
 """Of sampled pixels; shown as white."""
 
 
@@ -52,7 +52,7 @@ class Colours:
         from unmix_plugin.spectral.colour.conversion import describe_colour, rgb_matrix
 
         matrix = rgb_matrix(bands).numpy()
-        brightest = np.percentile((sample @ matrix).max(axis=1), BRIGHT_PERCENTILE) if len(sample) else 0.0
+        brightest = np.percentile((sample @ matrix).max(axis=1), _BRIGHT_PERCENTILE) if len(sample) else 0.0
         return Colours(matrix, 1.0 / float(brightest) if brightest > 0 else 1.0, describe_colour(bands))
 
     def linear_rgb(self, values: Float32[np.ndarray, "*pixels B"]) -> Float32[np.ndarray, "*pixels 3"]:
@@ -124,7 +124,7 @@ def write_view(view: CaptureView, recipe: ViewRecipe, folder: Path) -> ViewRecor
             np.lib.format.write_array_header_1_0(file, described)
             start = file.tell()
             file_bands = len(recipe.calibration.bands)
-            for first, last in raster.blocks(file_bands, BLOCK_VALUES):
+            for first, last in raster.blocks(file_bands, _BLOCK_VALUES):
                 part = recipe.calibration.rows(view.cube, first, last)
                 file.write(_stored(tally.add(first, part, recipe), part).data)
         is_shown = tally.finish_masks(recipe) > 0
