@@ -92,9 +92,7 @@ def _tiles(views: Sequence[SeenView]) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def _evenly(count: int, most: int) -> list[int]:
-    return (
-        list(range(count)) if count <= most else np.linspace(0, count - 1, most).round().astype(int).tolist()
-    )
+    return np.linspace(0, count - 1, min(count, most)).round().astype(int).tolist()
 
 
 def _small_picture(view: SeenView, side_px: int) -> UInt8[np.ndarray, "h w 3"]:
@@ -133,17 +131,8 @@ def _draw_cameras(
         kept = _evenly(len(points), _MOST_POINTS)
         tint = "0.5" if colours is None else np.clip(colours[kept] / 255.0 * 0.8, 0, 1)
         axes.scatter(points[kept, across], points[kept, up], s=1.0, c=tint, linewidths=0)
-    axes.quiver(
-        places[:, across],
-        places[:, up],
-        looks[:, across],
-        looks[:, up],
-        color="#c03060",
-        angles="xy",
-        width=0.004,
-        scale=12,
-        pivot="tail",
-    )
+    arrows = (*places[:, [across, up]].T, *looks[:, [across, up]].T)
+    axes.quiver(*arrows, color="#c03060", angles="xy", width=0.004, scale=12, pivot="tail")
     axes.scatter(places[:, across], places[:, up], s=9, c="#c03060", zorder=3)
     reach = 1.15 * float(np.abs(places[:, [across, up]]).max(initial=1e-9))
     axes.set_xlim(-reach, reach)
@@ -163,24 +152,14 @@ def _draw_spectra(axes: Any, spectra: Sequence[Spectra]) -> None:
     for index, sensor in enumerate(spectra):
         colour = colormaps["tab10"](index % 10)
         marker = "." if len(sensor.wavelengths_nm) < 12 else None
-        axes.plot(
-            sensor.wavelengths_nm, sensor.views.T, color=colour, alpha=0.15, linewidth=0.6, marker=marker
-        )
+        nm, style = sensor.wavelengths_nm, {"color": colour, "marker": marker}
+        axes.plot(nm, sensor.views.T, alpha=0.15, linewidth=0.6, **style)
         label = f"{sensor.label}: mean" if sensor.label else "mean over views"
-        axes.plot(
-            sensor.wavelengths_nm,
-            sensor.views.mean(axis=0),
-            color=colour,
-            linewidth=1.8,
-            label=label,
-            marker=marker,
-        )
+        axes.plot(nm, sensor.views.mean(axis=0), linewidth=1.8, label=label, **style)
     dropped = np.concatenate([sensor.dropped_nm for sensor in spectra])
     if len(dropped):
-        at = axes.get_xaxis_transform()
-        axes.vlines(
-            dropped, 0.0, 1.0, color="#d04040", linewidth=0.8, alpha=0.6, transform=at, label="bands left out"
-        )
+        style = {"color": "#d04040", "linewidth": 0.8, "alpha": 0.6, "label": "bands left out"}
+        axes.vlines(dropped, 0.0, 1.0, transform=axes.get_xaxis_transform(), **style)
     axes.set_ylim(bottom=0.0)
     axes.set_title("mean spectra of matter", fontsize=9)
     axes.set_xlabel("wavelength in nm", fontsize=8)

@@ -7,7 +7,6 @@ the views: three bands, gamma-encoded.
 from __future__ import annotations
 
 import re
-from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,7 +27,7 @@ _REFERENCE_NAME = re.compile(
 
 
 def find_cubes(root: Path, options: LayoutOptions) -> Capture:
-    """The views of a folder; see the module.
+    """The views of a folder.
 
     Raises:
         CaptureError: no file in it can be a view, one can't be opened, two views share a name, or the number of
@@ -47,30 +46,30 @@ def find_cubes(root: Path, options: LayoutOptions) -> Capture:
         raise CaptureError(
             f"{root} holds no cubes; expected one file a view ({kinds}), or one folder of band files a view"
         )
-    _refuse_duplicates(found)
-    views = tuple(
-        CaptureView(
-            name=_name(path),
-            cube=_open(path, options),
-            picture=None if not (cubes or folders) else pictures.get(_name(path)),
-        )
-        for path in sorted(found, key=_name)
-    )
-    unused = [path for path in references if path.suffix.lower() in _CUBE_SUFFIXES]
-    notes = tuple(
+    owners: dict[str, Path] = {}
+    for path in found:
+        other = owners.setdefault(_name(path).casefold(), path)
+        if other is not path:
+            raise CaptureError(
+                f"{other} and {path} would both be the view '{_name(other)}'; expected one file a view: rename or move "
+                "one of them"
+            )
+    views = []
+    for path in sorted(found, key=_name):
+        picture = pictures.get(_name(path)) if cubes or folders else None
+        views.append(CaptureView(_name(path), _open(path, options), picture=picture))
+    notes = (
         f"{path.name} was left out, as its name is that of a reference; use it with --white or --dark"
-        for path in unused
+        for path in references
+        if path.suffix.lower() in _CUBE_SUFFIXES
     )
-    return Capture("cubes", root, views, notes=notes)
+    return Capture("cubes", root, tuple(views), notes=tuple(notes))
 
 
 def _open(path: Path, options: LayoutOptions) -> SpectralFile:
     file = open_spectral_file(path, options.read)
-    if (
-        path.suffix.lower() in _PICTURE_SUFFIXES
-        and file.dtype.itemsize == 1
-        and "encoding" not in file.metadata
-    ):
+    is_picture = path.suffix.lower() in _PICTURE_SUFFIXES and file.dtype.itemsize == 1
+    if is_picture and "encoding" not in file.metadata:
         file = replace(file, metadata={**file.metadata, "encoding": "sRGB"})
     return file
 
@@ -81,34 +80,15 @@ def _visible_files(folder: Path) -> list[Path]:
 
 def _band_folders(root: Path, excluded: set[Path]) -> list[Path]:
     """Folders that hold more than one file, each a view of band files."""
-    return sorted(
-        path
-        for path in root.iterdir()
-        if path.is_dir()
-        and not path.name.startswith(".")
-        and path.resolve() not in excluded
-        and not _REFERENCE_NAME.fullmatch(path.name)
-        and len([file for file in _visible_files(path) if _is_band(file)]) > 1
-    )
-
-
-def _is_band(path: Path) -> bool:
-    return path.suffix.lower() in _CUBE_SUFFIXES | _PICTURE_SUFFIXES
+    folders = [path for path in root.iterdir() if path.is_dir() and not path.name.startswith(".")]
+    folders = [path for path in folders if path.resolve() not in excluded]
+    folders = [path for path in folders if not _REFERENCE_NAME.fullmatch(path.name)]
+    kinds = _CUBE_SUFFIXES | _PICTURE_SUFFIXES
+    counts = [sum(file.suffix.lower() in kinds for file in _visible_files(path)) for path in folders]
+    return sorted(path for path, count in zip(folders, counts, strict=True) if count > 1)
 
 
 def _name(path: Path) -> str:
     """The stem, with only what is fit for any file system."""
     stem = path.name if path.is_dir() else path.stem
     return re.sub(r"[^\w.+-]+", "_", stem).strip(".") or "view"
-
-
-def _refuse_duplicates(paths: list[Path]) -> None:
-    owners: dict[str, list[Path]] = defaultdict(list)
-    for path in paths:
-        owners[_name(path).casefold()].append(path)
-    for same in owners.values():
-        if len(same) > 1:
-            raise CaptureError(
-                f"{same[0]} and {same[1]} would both be the view '{_name(same[0])}'; expected one file a view: rename "
-                "or move one of them"
-            )

@@ -110,8 +110,12 @@ def fit_lens(
             f"{where}: the lens model {model} can't be followed to the corners of the image; {advice}"
         )
 
+    def lens_of(values: np.ndarray) -> Lens:
+        fx, fy, cx, cy, p1, p2, k1, k2, k3, k4 = values.tolist()
+        return Lens(start.width, start.height, (fx, fy), (cx, cy), (k1, k2, p1, p2), (k3, k4))
+
     def errors(values: np.ndarray) -> np.ndarray:
-        return (_project(values, ideal) - pixels).ravel()
+        return (lens_of(values).pixels_of(ideal) - pixels).ravel()
 
     first = np.array([*start.focal_px, *start.center_px, *start.tangential, *start.radial])
     scales = np.array([*start.focal_px, *start.focal_px, 0.01, 0.01, 0.1, 0.1, 0.1, 0.1])
@@ -122,9 +126,9 @@ def fit_lens(
             f"{where}: the lens model {model} differs from the nearest OPENCV lens by up to "
             f"{worst:.3g} px; expected at most {limit_px:g} px: {advice}"
         )
-    bends = (*_pair(found[6:8]), *_pair(found[4:6])), _pair(found[8:])
-    lens = Lens(start.width, start.height, _pair(found[:2]), _pair(found[2:4]), *bends)
-    return lens, f"lens model {model} replaced by the nearest OPENCV lens; off by at most {worst:.2g} px"
+    return lens_of(
+        found
+    ), f"lens model {model} replaced by the nearest OPENCV lens; off by at most {worst:.2g} px"
 
 
 def require_unfolded(lens: Lens, where: str) -> None:
@@ -143,20 +147,7 @@ def require_unfolded(lens: Lens, where: str) -> None:
 @lru_cache
 def _folds(lens: Lens) -> bool:
     """Remembered, since all files of one camera have the same lens."""
-
-    def project(ideal: Points) -> Points:
-        return lens.pixels_of(ideal)
-
-    return _invert(project, _pixel_grid(lens.width, lens.height), lens) is None
-
-
-def _project(values: np.ndarray, ideal: Points) -> Points:
-    radial = tuple(values[6:].tolist())
-    return project_opencv(ideal, _pair(values[:2]), _pair(values[2:4]), radial, _pair(values[4:6]))
-
-
-def _pair(values: np.ndarray) -> tuple[float, float]:
-    return float(values[0]), float(values[1])
+    return _invert(lens.pixels_of, _pixel_grid(lens.width, lens.height), lens) is None
 
 
 def _pixel_grid(width: int, height: int) -> Points:
@@ -172,9 +163,8 @@ def _invert(project: _Project, pixels: Points, start: Lens) -> Points | None:
             missing = pixels - project(ideal)
             if not np.isfinite(missing).all():
                 return None
-            along = [
-                (project(ideal + step) - project(ideal - step)) / (2 * _STEP) for step in _STEP * np.eye(2)
-            ]
+            steps = _STEP * np.eye(2)
+            along = [(project(ideal + step) - project(ideal - step)) / (2 * _STEP) for step in steps]
             jacobian = np.stack(along, axis=-1)
             determinant = np.linalg.det(jacobian)
             if not np.isfinite(determinant).all() or (determinant <= 0).any():

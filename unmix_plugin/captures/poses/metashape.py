@@ -40,25 +40,32 @@ def read_metashape(path: Path, root: ElementTree.Element) -> PoseSet:
         )
     chunk = max(chunks, key=lambda one: len(list(one.iter("camera"))))
     notes = [f"{len(chunks)} chunks; the one with the most cameras was read"] if len(chunks) > 1 else []
-    aligned = _aligned(chunk, path, notes)
-    worlds = _worlds(chunk, path)
-    aligned = _of_one_world(aligned, worlds, notes)
+    # Similarities to the world by component; None is the chunk's own, the identity without one.
+    owners = [(None, chunk), *((part.get("id"), part) for part in chunk.iterfind("components/component"))]
+    worlds: dict[str | None, Float64[np.ndarray, "4 4"]] = {None: np.eye(4)}
+    for component, owner in owners:
+        if (own := owner.find("transform")) is not None:
+            worlds[component] = _similarity(own, path)
+    aligned = _of_one_world(_aligned(chunk, path, notes), worlds, notes)
     used = {camera.get("sensor_id") for camera in aligned}
     lenses: dict[str | None, Lens | None] = {}
     for sensor in chunk.iterfind("sensors/sensor"):
         if sensor.get("id") in used:
             lenses[sensor.get("id")], said = _lens(sensor, str(path))
             notes += said
-    raw = [
-        (
-            camera.get("label") or f"camera {camera.get('id')}",
-            PosedCamera(
-                _to_world(camera, worlds.get(camera.get("component_id"), worlds[None]), path),
-                lenses.get(camera.get("sensor_id")),
-            ),
-        )
-        for camera in aligned
-    ]
+    raw = []
+    for camera in aligned:
+        world = worlds.get(camera.get("component_id"), worlds[None])
+        values = numbers_of(camera.find("transform"), 16, f"{path}: camera {camera.get('label')}")
+        if values is None:
+            raise CaptureError(
+                f"{path}: camera {camera.get('label')}: <transform> is empty; expected 16 numbers"
+            )
+        scale = np.cbrt(np.abs(np.linalg.det(world[:3, :3]))) or 1.0
+        matrix = world @ values.reshape(4, 4)
+        pose = np.column_stack([matrix[:3, :3] / scale @ FLIP, matrix[:3, 3]])
+        name = camera.get("label") or f"camera {camera.get('id')}"
+        raw.append((name, PosedCamera(pose, lenses.get(camera.get("sensor_id")))))
     middle = np.mean([camera.camera_to_world[:, 3] for _, camera in raw], axis=0)
     is_geocentric = _EARTH_RADII[0] < np.linalg.norm(middle) < _EARTH_RADII[1]
     notes += ["coordinates are geocentric; up is away from the Earth's middle"] if is_geocentric else []
@@ -84,17 +91,6 @@ def _aligned(chunk: ElementTree.Element, path: Path, notes: list[str]) -> list[E
             why = ", some of them lenses of a rig, whose places beside the first lens are not read"
         notes.append(f"{counted(len(missing), 'camera')} without transform{why}: {name_some(missing)}")
     return aligned
-
-
-def _worlds(chunk: ElementTree.Element, path: Path) -> dict[str | None, Float64[np.ndarray, "4 4"]]:
-    """Similarities to the world by component; None is the chunk's own, the identity without one."""
-    worlds: dict[str | None, Float64[np.ndarray, "4 4"]] = {None: np.eye(4)}
-    if (own := chunk.find("transform")) is not None:
-        worlds[None] = _similarity(own, path)
-    for component in chunk.iterfind("components/component"):
-        if (own := component.find("transform")) is not None:
-            worlds[component.get("id")] = _similarity(own, path)
-    return worlds
 
 
 def _similarity(element: ElementTree.Element, path: Path) -> Float64[np.ndarray, "4 4"]:
@@ -130,18 +126,6 @@ def _of_one_world(
         f"{len(by_component)} components are not aligned to each other: {len(kept)} of {len(cameras)} cameras"
     )
     return kept
-
-
-def _to_world(
-    camera: ElementTree.Element, world: Float64[np.ndarray, "4 4"], path: Path
-) -> Float64[np.ndarray, "3 4"]:
-    where = f"{path}: camera {camera.get('label')}"
-    values = numbers_of(camera.find("transform"), 16, where)
-    if values is None:
-        raise CaptureError(f"{where}: <transform> is empty; expected 16 numbers")
-    scale = np.cbrt(np.abs(np.linalg.det(world[:3, :3]))) or 1.0
-    matrix = world @ values.reshape(4, 4)
-    return np.column_stack([matrix[:3, :3] / scale @ FLIP, matrix[:3, 3]])
 
 
 def _lens(sensor: ElementTree.Element, where: str) -> tuple[Lens | None, list[str]]:
