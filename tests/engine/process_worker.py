@@ -18,8 +18,8 @@ from tests.engine.rgb_nerf_plugin import rgb_nerf
 from unmix_plugin.commands.entry import run_command
 from unmix_plugin.engine.pipeline import Pipeline
 from unmix_plugin.engine.runs import load_run
-from unmix_plugin.engine.training.trainer import Trainer
-from unmix_plugin.engine.training.training_steps import (
+from unmix_plugin.engine.training.trainer import (
+    Trainer,
     TrainingSteps,
     follow_training,
     joined_training,
@@ -45,20 +45,14 @@ def config_for(folder: Path) -> Any:
 
 def train(folder: Path, config: Any) -> None:
     """Train together; keep the parameters that each process ends with."""
-    steps: list[TrainingSteps] = []
-    made = TrainingSteps.__init__
-
-    def remember(self: TrainingSteps, *args: Any) -> None:
-        made(self, *args)
-        steps.append(self)
-
-    setattr(TrainingSteps, "__init__", remember)  # noqa: B010 - type checkers refuse the plain assignment
     with joined_training(config) as processes:
         if processes.is_first:
-            Trainer(config, processes=processes).train()
+            trainer = Trainer(config, processes=processes)
+            trainer.train()
+            model = trainer.pipeline.model
         else:
-            follow_training(config, processes)
-        torch.save(steps[0].pipeline.model.state_dict(), folder / f"rank-{processes.rank}.pt")
+            model = follow_training(config, processes).pipeline.model
+        torch.save(model.state_dict(), folder / f"rank-{processes.rank}.pt")
 
 
 def gradients(folder: Path, config: Any) -> None:

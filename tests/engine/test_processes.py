@@ -9,8 +9,7 @@ from torch import distributed
 
 from tests.engine.process_worker import STEPS, config_for, fixed_batch
 from unmix_plugin.engine.processes import ALONE, Follower, Processes, joined, run_processes
-from unmix_plugin.engine.training.trainer import Trainer
-from unmix_plugin.engine.training.training_steps import prepare_steps
+from unmix_plugin.engine.training.trainer import Trainer, prepare_steps
 from unmix_plugin.errors import ConfigError
 
 

@@ -1,8 +1,6 @@
-"""Which device to compute on.
+"""What a training has of its machine: a device, memory that stays, and random numbers.
 
-How the process keeps memory that it will need again.
-
-Randomness as a function of (seed, step), so that a resumed run draws what a straight one drew.
+Randomness is a function of (seed, step), so that a resumed run draws what a straight one drew.
 """
 
 import ctypes

@@ -1,10 +1,7 @@
-"""What a model or a data manager wants done around each training step.
+"""What a method is made of: a data manager, a model, usually a field, and what they want done around each step.
 
-The interface between data on disk and training: rays with what was measured along them.
-
-The interface of a field: what is at a position, and how it looks from a direction.
-
-The interface of a model: from rays to outputs, losses, metrics and pictures.
+A data manager joins data on disk and training: rays with what was measured along them. A field says what is at a
+position and how it looks from a direction. A model leads from rays to outputs, losses, metrics and pictures.
 """
 
 from __future__ import annotations
@@ -27,35 +24,6 @@ from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.engine.processes import ALONE, Processes
 from unmix_plugin.engine.registry import Output
 from unmix_plugin.errors import ConfigError
-
-
-class TrainingCallbackLocation(Enum):
-    """When a callback runs."""
-
-    BEFORE_TRAIN_ITERATION = "before"
-    """Before the rays of the step are drawn."""
-    AFTER_TRAIN_ITERATION = "after"
-    """After the optimiser's update, also when a step was skipped for a non-finite loss or gradient."""
-
-
-@dataclass(frozen=True)
-class TrainingCallback:
-    """One function and the place in the step at which the trainer calls it."""
-
-    where: TrainingCallbackLocation
-    """Before or after the update."""
-    func: Callable[[int, float], None]
-    """Called with the step (0 for the first) and the training progress in [0, 1]: the fraction used up of whichever
-    limit, steps or seconds, is nearer its end."""
-
-
-def run_callbacks(
-    callbacks: list[TrainingCallback], where: TrainingCallbackLocation, step: int, progress: float
-) -> None:
-    """Call those of `callbacks` that belong at `where`, in their order."""
-    for callback in callbacks:
-        if callback.where is where:
-            callback.func(step, progress)
 
 
 class DataManager(ABC):
@@ -161,30 +129,6 @@ class DataManager(ABC):
     def get_training_callbacks(self) -> list[TrainingCallback]:
         """Functions to call around each step."""
         return []
-
-
-class Field(nn.Module, ABC):
-    """A function of space with parameters."""
-
-    @abstractmethod
-    def get_density(self, positions: Float[Tensor, "*samples 3"]) -> tuple[Float[Tensor, "*samples"], Tensor]:
-        """Density (per scene unit, >= 0) at `positions` in model space, and features for `get_outputs`."""
-
-    @abstractmethod
-    def get_outputs(
-        self,
-        positions: Float[Tensor, "*samples 3"],
-        directions: Float[Tensor, "*samples 3"],
-        features: Tensor,
-    ) -> dict[str, Tensor]:
-        """What the field says at `positions` seen along unit `directions`, given the features of `get_density`."""
-
-    def forward(
-        self, positions: Float[Tensor, "*samples 3"], directions: Float[Tensor, "*samples 3"]
-    ) -> tuple[Float[Tensor, "*samples"], dict[str, Tensor]]:
-        """Densities and outputs."""
-        densities, features = self.get_density(positions)
-        return densities, self.get_outputs(positions, directions, features)
 
 
 TrainOutputs: TypeAlias = tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Tensor]]
@@ -359,3 +303,56 @@ class Model(nn.Module, ABC):
                 f"this model has no output {', '.join(unknown)}; it has {', '.join(sorted(found))}"
             )
         return {name: value for name, value in found.items() if names is None or name in names}
+
+
+class Field(nn.Module, ABC):
+    """A function of space with parameters."""
+
+    @abstractmethod
+    def get_density(self, positions: Float[Tensor, "*samples 3"]) -> tuple[Float[Tensor, "*samples"], Tensor]:
+        """Density (per scene unit, >= 0) at `positions` in model space, and features for `get_outputs`."""
+
+    @abstractmethod
+    def get_outputs(
+        self,
+        positions: Float[Tensor, "*samples 3"],
+        directions: Float[Tensor, "*samples 3"],
+        features: Tensor,
+    ) -> dict[str, Tensor]:
+        """What the field says at `positions` seen along unit `directions`, given the features of `get_density`."""
+
+    def forward(
+        self, positions: Float[Tensor, "*samples 3"], directions: Float[Tensor, "*samples 3"]
+    ) -> tuple[Float[Tensor, "*samples"], dict[str, Tensor]]:
+        """Densities and outputs."""
+        densities, features = self.get_density(positions)
+        return densities, self.get_outputs(positions, directions, features)
+
+
+class TrainingCallbackLocation(Enum):
+    """When a callback runs."""
+
+    BEFORE_TRAIN_ITERATION = "before"
+    """Before the rays of the step are drawn."""
+    AFTER_TRAIN_ITERATION = "after"
+    """After the optimiser's update, also when a step was skipped for a non-finite loss or gradient."""
+
+
+@dataclass(frozen=True)
+class TrainingCallback:
+    """One function and the place in the step at which the trainer calls it."""
+
+    where: TrainingCallbackLocation
+    """Before or after the update."""
+    func: Callable[[int, float], None]
+    """Called with the step (0 for the first) and the training progress in [0, 1]: the fraction used up of whichever
+    limit, steps or seconds, is nearer its end."""
+
+
+def run_callbacks(
+    callbacks: list[TrainingCallback], where: TrainingCallbackLocation, step: int, progress: float
+) -> None:
+    """Call those of `callbacks` that belong at `where`, in their order."""
+    for callback in callbacks:
+        if callback.where is where:
+            callback.func(step, progress)

@@ -1,7 +1,7 @@
 """A data manager and a model, joined: what one training or evaluation step computes."""
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from unmix_plugin.engine.configs import PipelineConfig
 from unmix_plugin.engine.machine import step_generator, step_seed
-from unmix_plugin.engine.model import DataManager, Model, TrainingCallback, TrainOutputs
+from unmix_plugin.engine.model import DataManager, Model, TrainOutputs
 
 MODEL_STREAM = 1
 """Stream of randomness of the model's own draws in a step; data managers draw from stream 0."""
@@ -81,19 +81,6 @@ class Pipeline(nn.Module):
             found.append(metrics)
             pictures = pictures or images
         return average_metrics(found), pictures
-
-    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
-        """The model's parameters by optimizer name."""
-        return self.model.get_param_groups()
-
-    def get_training_callbacks(self) -> list[TrainingCallback]:
-        """The data manager's callbacks, then the model's."""
-        return [*self.datamanager.get_training_callbacks(), *self.model.get_training_callbacks()]
-
-    @torch.no_grad()
-    def between_steps(self, step: int, progress: float) -> Collection[str]:
-        """What the model learns of the data between two steps; names of the parameter groups that it reset."""
-        return self.model.between_steps(step, progress, self.datamanager)
 
 
 def average_metrics(found: Sequence[Mapping[str, float]]) -> dict[str, float]:

@@ -251,7 +251,7 @@ def _shrunk(camera: Cameras, side: int) -> Cameras:
         center_px=camera.center_px * scale,
         width=width,
         height=height,
-        key_poses=None if keys is None else keys.with_heights(keys.heights * scale[1]),
+        key_poses=None if keys is None else replace(keys, heights=keys.heights * scale[1]),
     )
 
 

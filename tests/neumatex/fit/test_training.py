@@ -124,7 +124,7 @@ def test_a_fit_begins_at_the_prior_which_stays_as_it_is(tmp_path, fit_networks):
         data=folder, device=torch.device("cpu")
     )
     pipeline.initialise()
-    groups = pipeline.get_param_groups()
+    groups = pipeline.model.get_param_groups()
     assert bool(groups["networks"]) is fit_networks
     pipeline.train()
     pipeline.seed_step(0)

@@ -1,15 +1,8 @@
-"""Where cameras look: the point nearest to their optical axes, and whether these meet there.
+"""Where cameras stand and look: paths around a scene and through its cameras, the point that cameras look at, and
+upright cameras for built-in scenes.
 
-Notation: `N` cameras; poses are camera to world, OpenGL axes.
-
-Moving cameras: a circle around the scene, and a smooth path through some of its cameras.
-
-Notation: `N` cameras, `F` frames. Axes are OpenGL: the columns of a pose are right, up and back; a camera looks along
-minus back.
-
-Cameras of built-in scenes: square pictures, held upright.
-
-Notation: `N` views.
+Notation: `N` cameras, `F` frames. Poses are camera to world, OpenGL axes: their columns are right, up and back; a
+camera looks along minus back.
 """
 
 from __future__ import annotations
@@ -21,49 +14,6 @@ from jaxtyping import Float, Float64
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.errors import ConfigError
-
-_LEAST_CONVERGENCE = 1e-3
-"""Least mean squared sine between optical axes and the direction that they spread from least, (1.8 deg)^2, with which
-the nearest point is fixed at all."""
-_LEAST_SPREAD_DEG = 6.0
-"""Root mean square of that angle for cameras turned about a subject; a flight whose camera sways has less."""
-_MOST_MISSED = 0.25
-"""By how much half of the axes may miss the point, over their depth there."""
-
-
-def focus_point(poses: Float64[np.ndarray, "N 3 4"]) -> Float64[np.ndarray, "3"] | None:
-    """The point nearest to all optical axes, least squares; None if they are parallel or most point away from it."""
-    if _convergence(poses) < _LEAST_CONVERGENCE:
-        return None
-    across = _across(poses)
-    point = np.linalg.solve(across.mean(axis=0), (across @ poses[:, :, 3:]).mean(axis=0)[:, 0])
-    depths = ((point - poses[:, :, 3]) * -poses[:, :, 2]).sum(axis=-1)
-    return point if (depths > 0.0).mean() > 0.5 else None
-
-
-def meeting_point(poses: Float64[np.ndarray, "N 3 4"]) -> Float64[np.ndarray, "3"] | None:
-    """That point where the axes meet well enough to say that the subject is there, otherwise None.
-
-    They do not where cameras look down on land from an aircraft, side by side at something flat, or around themselves.
-    """
-    point = focus_point(poses)
-    if point is None or _convergence(poses) < np.sin(np.radians(_LEAST_SPREAD_DEG)) ** 2:
-        return None
-    towards, forward = point - poses[:, :, 3], -poses[:, :, 2]
-    depths = (towards * forward).sum(axis=-1)
-    missed = np.linalg.norm(towards - depths[:, None] * forward, axis=-1)
-    return point if np.median(missed / np.abs(depths).clip(min=1e-12)) <= _MOST_MISSED else None
-
-
-def _across(poses: Float64[np.ndarray, "N 3 4"]) -> Float64[np.ndarray, "N 3 3"]:
-    """Projections of space to what is square to each optical axis."""
-    axes = poses[:, :, 2]
-    return np.eye(3) - axes[:, :, None] * axes[:, None, :]
-
-
-def _convergence(poses: Float64[np.ndarray, "N 3 4"]) -> float:
-    return float(np.linalg.eigvalsh(_across(poses).mean(axis=0))[0])
-
 
 _WIDEST_GAP_DEG = 120.0
 """Directions that no camera looks from, beyond which a circle becomes an arc: behind them there may be walls."""
@@ -134,8 +84,7 @@ def _looked_at(
     poses: Float64[np.ndarray, "N 3 4"], aabb: Float64[np.ndarray, "2 3"]
 ) -> Float64[np.ndarray, "3"]:
     """The point of the box nearest to all optical axes, in the sense of least squares."""
-    backs = poses[:, :, 2]
-    across = np.eye(3) - backs[:, :, None] * backs[:, None, :]
+    across = _across(poses)
     # Parallel axes leave the depth open: a little pull towards the middle of the box decides it.
     pull = 1e-3 * len(poses)
     wanted = (across @ poses[:, :, 3:]).sum(axis=0)[:, 0] + pull * aabb.mean(axis=0)
@@ -261,6 +210,53 @@ def _with_lens(cameras: Cameras, poses: Float[np.ndarray, "F 3 4"]) -> Cameras:
         cameras.width,
         cameras.height,
     )
+
+
+_LEAST_CONVERGENCE = 1e-3
+"""Least mean squared sine between optical axes and the direction that they spread from least, (1.8 deg)^2, with which
+the nearest point is fixed at all."""
+
+
+_LEAST_SPREAD_DEG = 6.0
+"""Root mean square of that angle for cameras turned about a subject; a flight whose camera sways has less."""
+
+
+_MOST_MISSED = 0.25
+"""By how much half of the axes may miss the point, over their depth there."""
+
+
+def focus_point(poses: Float64[np.ndarray, "N 3 4"]) -> Float64[np.ndarray, "3"] | None:
+    """The point nearest to all optical axes, least squares; None if they are parallel or most point away from it."""
+    if _convergence(poses) < _LEAST_CONVERGENCE:
+        return None
+    across = _across(poses)
+    point = np.linalg.solve(across.mean(axis=0), (across @ poses[:, :, 3:]).mean(axis=0)[:, 0])
+    depths = ((point - poses[:, :, 3]) * -poses[:, :, 2]).sum(axis=-1)
+    return point if (depths > 0.0).mean() > 0.5 else None
+
+
+def meeting_point(poses: Float64[np.ndarray, "N 3 4"]) -> Float64[np.ndarray, "3"] | None:
+    """That point where the axes meet well enough to say that the subject is there, otherwise None.
+
+    They do not where cameras look down on land from an aircraft, side by side at something flat, or around themselves.
+    """
+    point = focus_point(poses)
+    if point is None or _convergence(poses) < np.sin(np.radians(_LEAST_SPREAD_DEG)) ** 2:
+        return None
+    towards, forward = point - poses[:, :, 3], -poses[:, :, 2]
+    depths = (towards * forward).sum(axis=-1)
+    missed = np.linalg.norm(towards - depths[:, None] * forward, axis=-1)
+    return point if np.median(missed / np.abs(depths).clip(min=1e-12)) <= _MOST_MISSED else None
+
+
+def _across(poses: Float64[np.ndarray, "N 3 4"]) -> Float64[np.ndarray, "N 3 3"]:
+    """Projections of space to what is square to each optical axis."""
+    axes = poses[:, :, 2]
+    return np.eye(3) - axes[:, :, None] * axes[:, None, :]
+
+
+def _convergence(poses: Float64[np.ndarray, "N 3 4"]) -> float:
+    return float(np.linalg.eigvalsh(_across(poses).mean(axis=0))[0])
 
 
 def upright_cameras(

@@ -1,14 +1,4 @@
-"""OPENCV lens distortion of normalised image coordinates, forward and inverse.
-
-Notation: `x, y` are image coordinates divided by depth, x to the right and y **down** (OpenCV); `k1` to `k4` are radial
-and `p1, p2` tangential coefficients; r2 = x^2 + y^2; `D` coefficients, 4 (k1, k2, p1, p2) or 6 (and k3, k4):
-
-    x' = x (1 + k1 r2 + k2 r2^2 + k3 r2^3 + k4 r2^4) + 2 p1 x y + p2 (r2 + 2 x^2)
-    y' = y (1 + k1 r2 + k2 r2^2 + k3 r2^3 + k4 r2^4) + 2 p2 x y + p1 (r2 + 2 y^2)
-
-Source: OpenCV, "Camera Calibration and 3D Reconstruction" (Brown 1966); k4 as Metashape and nerfstudio have it.
-
-Posed cameras: from pixels to rays and from points to pixels.
+"""Posed cameras: from pixels to rays and from points to pixels.
 
 Notation: `N` cameras, `R` rays, `P` points. Axes are OpenGL: +x right, +y up, a camera looks along -z. Pixel
 coordinates are x to the right and y down in pixels from the image's top left corner, so pixel centres lie at +0.5.
@@ -16,6 +6,14 @@ coordinates are x to the right and y down in pixels from the image's top left co
 A pose is a function of the camera and of y: constant for frame cameras, interpolated between key poses for line
 cameras. At each y a line camera sees the line that its x axis and its optical axis span; its focal length and principal
 point along y don't count.
+
+Lens distortion is OPENCV's, of image coordinates divided by depth, x to the right and y **down**, r2 = x^2 + y^2, with
+`D` coefficients, 4 (k1, k2, p1, p2) or 6 (and k3, k4):
+
+    x' = x (1 + k1 r2 + k2 r2^2 + k3 r2^3 + k4 r2^4) + 2 p1 x y + p2 (r2 + 2 x^2)
+    y' = y (1 + k1 r2 + k2 r2^2 + k3 r2^3 + k4 r2^4) + 2 p2 x y + p1 (r2 + 2 y^2)
+
+Source: OpenCV, "Camera Calibration and 3D Reconstruction" (Brown 1966); k4 as Metashape and nerfstudio have it.
 """
 
 from __future__ import annotations
@@ -31,70 +29,6 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.key_poses import KeyPoses, project_by_row
 from unmix_plugin.engine.geometry.space import RayBundle
-
-_NEWTON_STEPS = 12
-"""Steps of the inversion; quadratic convergence reaches float64 precision in 5 or 6 for photographic lenses."""
-
-
-def distort(
-    coords: Float[Tensor, "*points 2"], coefficients: Float[Tensor, "*#points D"]
-) -> Float[Tensor, "*points 2"]:
-    """Bend ideal coordinates as the lens does.
-
-    Args:
-        coords: Ideal x, y, without unit.
-        coefficients: k1, k2, p1, p2 and perhaps k3, k4, one row a point or one that broadcasts.
-    """
-    x, y = coords.unbind(-1)
-    p1, p2 = coefficients[..., 2], coefficients[..., 3]
-    r2 = x * x + y * y
-    radial, _ = _radial(r2, coefficients)
-    bent_x = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
-    bent_y = y * radial + 2.0 * p2 * x * y + p1 * (r2 + 2.0 * y * y)
-    return torch.stack([bent_x, bent_y], dim=-1)
-
-
-def undistort(
-    bent: Float[Tensor, "*points 2"], coefficients: Float[Tensor, "*#points D"]
-) -> Float[Tensor, "*points 2"]:
-    """Invert `distort` by Newton's method, started at the bent point itself.
-
-    Exact to rounding where the lens model is invertible along the way, as it is for every lens whose image does not
-    fold over; where its Jacobian vanishes the step is left out.
-
-    Args:
-        bent: Distorted x', y', without unit.
-        coefficients: k1, k2, p1, p2 and perhaps k3, k4, one row a point or one that broadcasts.
-    """
-    p1, p2 = coefficients[..., 2], coefficients[..., 3]
-    coords = bent
-    for _ in range(_NEWTON_STEPS):
-        x, y = coords.unbind(-1)
-        error_x, error_y = (distort(coords, coefficients) - bent).unbind(-1)
-        r2 = x * x + y * y
-        radial, slope = _radial(r2, coefficients)
-        dxx = radial + 2.0 * x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
-        dxy = 2.0 * x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
-        dyy = radial + 2.0 * y * y * slope + 2.0 * p2 * x + 6.0 * p1 * y
-        determinant = dxx * dyy - dxy * dxy
-        inverse = torch.where(determinant.abs() > 1e-6, 1.0 / determinant, torch.zeros_like(determinant))
-        step_x = (dyy * error_x - dxy * error_y) * inverse
-        step_y = (dxx * error_y - dxy * error_x) * inverse
-        coords = torch.stack([x - step_x, y - step_y], dim=-1)
-    return coords
-
-
-def _radial(
-    r2: Float[Tensor, "*points"], coefficients: Float[Tensor, "*#points D"]
-) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points"]]:
-    """The radial factor and its derivative by r2."""
-    k1, k2, _, _, *higher = coefficients.unbind(-1)
-    factor, slope = torch.zeros_like(r2), torch.zeros_like(r2)
-    for k in reversed([k1, k2, *higher]):  # Horner's scheme
-        slope = factor + slope * r2
-        factor = k + factor * r2
-    return 1.0 + factor * r2, factor + slope * r2
-
 
 _LONGEST_EDGE_PX = 1 << 16
 
@@ -156,15 +90,13 @@ class Cameras:
 
     def to(self, device: torch.device | str) -> Cameras:
         """The same cameras on another device."""
-        return Cameras(
-            self.camera_to_world.to(device),
-            self.focal_px.to(device),
-            self.center_px.to(device),
-            self.distortion.to(device),
-            self.width,
-            self.height,
-            self.sizes,
-            None if self.key_poses is None else self.key_poses.to(device),
+        return replace(
+            self,
+            camera_to_world=self.camera_to_world.to(device),
+            focal_px=self.focal_px.to(device),
+            center_px=self.center_px.to(device),
+            distortion=self.distortion.to(device),
+            key_poses=None if self.key_poses is None else self.key_poses.to(device),
         )
 
     def resized(self, width: int, height: int) -> Cameras:
@@ -176,16 +108,9 @@ class Cameras:
         keys = self.key_poses
         if keys is not None:
             factors = scale[:, 0].repeat_interleave(torch.tensor(keys.counts, device=scale.device))
-            keys = keys.with_heights(keys.heights * factors)
-        return Cameras(
-            self.camera_to_world,
-            self.focal_px * scale,
-            center_px,
-            self.distortion,
-            width,
-            height,
-            key_poses=keys,
-        )
+            keys = replace(keys, heights=keys.heights * factors)
+        parts = (self.camera_to_world, self.focal_px * scale, center_px, self.distortion)
+        return Cameras(*parts, width, height, key_poses=keys)
 
     def crop(self, left: int, top: int, width: int, height: int) -> Cameras:
         """The same cameras of a part of each image, pixels: what is rendered of it is that part of the image."""
@@ -196,7 +121,7 @@ class Cameras:
             width=width,
             height=height,
             sizes=None,
-            key_poses=None if keys is None else keys.with_heights(keys.heights - top),
+            key_poses=None if keys is None else replace(keys, heights=keys.heights - top),
         )
 
     def poses_at(self, camera_indices: Int[Tensor, " R"], y: Float[Tensor, " R"]) -> Float[Tensor, "R 3 4"]:
@@ -351,3 +276,67 @@ class Cameras:
         ):
             raise ValueError("poses, centres and distortion must be finite, focal lengths above 0")
         return cameras
+
+
+_NEWTON_STEPS = 12
+"""Steps of the inversion; quadratic convergence reaches float64 precision in 5 or 6 for photographic lenses."""
+
+
+def distort(
+    coords: Float[Tensor, "*points 2"], coefficients: Float[Tensor, "*#points D"]
+) -> Float[Tensor, "*points 2"]:
+    """Bend ideal coordinates as the lens does.
+
+    Args:
+        coords: Ideal x, y, without unit.
+        coefficients: k1, k2, p1, p2 and perhaps k3, k4, one row a point or one that broadcasts.
+    """
+    x, y = coords.unbind(-1)
+    p1, p2 = coefficients[..., 2], coefficients[..., 3]
+    r2 = x * x + y * y
+    radial, _ = _radial(r2, coefficients)
+    bent_x = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    bent_y = y * radial + 2.0 * p2 * x * y + p1 * (r2 + 2.0 * y * y)
+    return torch.stack([bent_x, bent_y], dim=-1)
+
+
+def undistort(
+    bent: Float[Tensor, "*points 2"], coefficients: Float[Tensor, "*#points D"]
+) -> Float[Tensor, "*points 2"]:
+    """Invert `distort` by Newton's method, started at the bent point itself.
+
+    Exact to rounding where the lens model is invertible along the way, as it is for every lens whose image does not
+    fold over; where its Jacobian vanishes the step is left out.
+
+    Args:
+        bent: Distorted x', y', without unit.
+        coefficients: k1, k2, p1, p2 and perhaps k3, k4, one row a point or one that broadcasts.
+    """
+    p1, p2 = coefficients[..., 2], coefficients[..., 3]
+    coords = bent
+    for _ in range(_NEWTON_STEPS):
+        x, y = coords.unbind(-1)
+        error_x, error_y = (distort(coords, coefficients) - bent).unbind(-1)
+        r2 = x * x + y * y
+        radial, slope = _radial(r2, coefficients)
+        dxx = radial + 2.0 * x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
+        dxy = 2.0 * x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
+        dyy = radial + 2.0 * y * y * slope + 2.0 * p2 * x + 6.0 * p1 * y
+        determinant = dxx * dyy - dxy * dxy
+        inverse = torch.where(determinant.abs() > 1e-6, 1.0 / determinant, torch.zeros_like(determinant))
+        step_x = (dyy * error_x - dxy * error_y) * inverse
+        step_y = (dxx * error_y - dxy * error_x) * inverse
+        coords = torch.stack([x - step_x, y - step_y], dim=-1)
+    return coords
+
+
+def _radial(
+    r2: Float[Tensor, "*points"], coefficients: Float[Tensor, "*#points D"]
+) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points"]]:
+    """The radial factor and its derivative by r2."""
+    k1, k2, _, _, *higher = coefficients.unbind(-1)
+    factor, slope = torch.zeros_like(r2), torch.zeros_like(r2)
+    for k in reversed([k1, k2, *higher]):  # Horner's scheme
+        slope = factor + slope * r2
+        factor = k + factor * r2
+    return 1.0 + factor * r2, factor + slope * r2

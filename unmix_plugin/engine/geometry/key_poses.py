@@ -1,64 +1,25 @@
-"""Rotation vectors and rotation matrices.
-
-Notation: `w` is a rotation vector: its direction is the axis, its length the angle in radians.
-
-Source: Rodrigues' formula; see Sola et al. 2018, A micro Lie theory for state estimation in robotics, example 4.
-
-Poses of line cameras: a function of the row, interpolated between key poses.
+"""Poses of line cameras: a function of the row, interpolated between key poses; and which row sees a point.
 
 A line camera takes one row of its image after the other while it moves, so each row has a pose of its own. Between key
 poses the rotation turns about one axis at an even rate (slerp) and the position moves along a straight line; beyond the
 first and the last key pose, by half a row at most, both go on.
 
-Notation: `N` cameras, `M` key poses of all cameras, `R` rays; `y` is a height in the image in pixels, so row r is taken
-at y = r + 0.5. A frame camera has one key pose, which holds for all rows.
+Notation: `N` cameras, `M` key poses of all cameras, `R` rays, `P` points; `y` is a height in the image in pixels, so
+row r is taken at y = r + 0.5. A frame camera has one key pose, which holds for all rows. `w` is a rotation vector: its
+direction is the axis, its length the angle in radians.
 
-Which row of a line camera sees a point: the one whose line passes through it.
-
-Notation: `P` points, `y` height in the image in pixels.
+Source: Rodrigues' formula; see Sola et al. 2018, A micro Lie theory for state estimation in robotics, example 4.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
-
-_SMALL = 1e-6
-"""Squared angle below which series replace the closed forms."""
-
-
-def rotation_matrix(w: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
-    """exp([w]x); differentiable everywhere, also at 0."""
-    squared = (w * w).sum(dim=-1)[..., None, None]
-    is_small = squared < _SMALL
-    safe = torch.where(is_small, torch.ones_like(squared), squared)
-    angle = safe.sqrt()
-    first = torch.where(is_small, 1 - squared / 6, angle.sin() / angle)
-    second = torch.where(is_small, 0.5 - squared / 24, (1 - angle.cos()) / safe)
-    cross = _cross_matrix(w)
-    return torch.eye(3, dtype=w.dtype, device=w.device) + first * cross + second * (cross @ cross)
-
-
-def rotation_vector(matrix: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 3"]:
-    """The inverse of `rotation_matrix` for angles below pi."""
-    skew = 0.5 * (matrix - matrix.transpose(-1, -2))
-    axis = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1)
-    sine = axis.norm(dim=-1, keepdim=True)
-    cosine = 0.5 * (matrix.diagonal(dim1=-2, dim2=-1).sum(dim=-1, keepdim=True) - 1)
-    angle = torch.atan2(sine, cosine)
-    return axis * torch.where(sine * sine < _SMALL, 1 + angle * angle / 6, angle / sine.clamp(min=1e-12))
-
-
-def _cross_matrix(w: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
-    """[w]x, with which a product is the cross product by w."""
-    x, y, z = w.unbind(-1)
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
 
 
 @dataclass(frozen=True)
@@ -95,10 +56,6 @@ class KeyPoses:
     def to(self, device: torch.device | str) -> KeyPoses:
         """The same on another device."""
         return KeyPoses(self.poses.to(device), self.heights.to(device), self.counts)
-
-    def with_heights(self, heights: Float[Tensor, " M"]) -> KeyPoses:
-        """The same poses at other heights, in the same order."""
-        return replace(self, heights=heights)
 
     def at(self, cameras: Int[Tensor, " R"], y: Float[Tensor, " R"]) -> Float[Tensor, "R 3 4"]:
         """The pose of each camera at each height."""
@@ -228,3 +185,36 @@ def _first_stripes(
 def _local(points: Float[Tensor, "P 3"], poses: Float[Tensor, "P 3 4"]) -> Float[Tensor, "P 3"]:
     """Points in the axes of their poses."""
     return torch.einsum("pi,pij->pj", points - poses[:, :, 3], poses[:, :, :3])
+
+
+_SMALL = 1e-6
+"""Squared angle below which series replace the closed forms."""
+
+
+def rotation_matrix(w: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
+    """exp([w]x); differentiable everywhere, also at 0."""
+    squared = (w * w).sum(dim=-1)[..., None, None]
+    is_small = squared < _SMALL
+    safe = torch.where(is_small, torch.ones_like(squared), squared)
+    angle = safe.sqrt()
+    first = torch.where(is_small, 1 - squared / 6, angle.sin() / angle)
+    second = torch.where(is_small, 0.5 - squared / 24, (1 - angle.cos()) / safe)
+    cross = _cross_matrix(w)
+    return torch.eye(3, dtype=w.dtype, device=w.device) + first * cross + second * (cross @ cross)
+
+
+def rotation_vector(matrix: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 3"]:
+    """The inverse of `rotation_matrix` for angles below pi."""
+    skew = 0.5 * (matrix - matrix.transpose(-1, -2))
+    axis = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1)
+    sine = axis.norm(dim=-1, keepdim=True)
+    cosine = 0.5 * (matrix.diagonal(dim1=-2, dim2=-1).sum(dim=-1, keepdim=True) - 1)
+    angle = torch.atan2(sine, cosine)
+    return axis * torch.where(sine * sine < _SMALL, 1 + angle * angle / 6, angle / sine.clamp(min=1e-12))
+
+
+def _cross_matrix(w: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
+    """[w]x, with which a product is the cross product by w."""
+    x, y, z = w.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))

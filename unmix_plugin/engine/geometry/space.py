@@ -1,21 +1,18 @@
-"""A bundle of rays: where each starts, where it points, which camera sent it.
+"""Rays, the box that holds the scene, and the unit cube that grids divide.
 
-Notation: `R` counts rays. A point on a ray is `origin + t * direction`, t in scene units since directions are unit.
+Notation: `R` rays; a point on a ray is `origin + t * direction`, t in scene units since directions are unit vectors.
 
-The axis-aligned box of model space outside which nothing is modelled.
-
-From an unbounded world to the unit cube: space around the scene box is contracted, the box itself is not.
-
-Notation: `P` points; u are coordinates in which the box's longest edge runs from -1 to 1, r = max |u| (the maximum
-norm). Where r <= 1, nothing happens; elsewhere u becomes (2 - 1/r) u / r, so that infinity lies at r = 2. The cube of
-edge 4 that this fills is scaled to the unit cube. The maximum norm leaves no corner of that cube empty.
+An unbounded world is contracted around the box, whose inside stays as it is. With u the coordinates in which the box's
+longest edge runs from -1 to 1, and r = max |u|: where r <= 1 nothing happens, elsewhere u becomes (2 - 1/r) u / r, so
+that infinity lies at r = 2. The cube of edge 4 that this fills is scaled to the unit cube; the maximum norm leaves no
+corner of it empty.
 
 Source: Barron et al. 2022, mip-NeRF 360, eq. 10, with the norm of Tancik et al. 2023, Nerfstudio, section 4.2.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -44,31 +41,20 @@ class RayBundle:
 
     def __getitem__(self, index: slice | Tensor) -> RayBundle:
         """The rays at a slice, an index tensor (R',) or a boolean mask (R,)."""
-        return self._map(lambda values: values[index])
+        return RayBundle(*(None if column is None else column[index] for column in self._columns()))
 
     @staticmethod
     def join(bundles: Sequence[RayBundle]) -> RayBundle:
         """The rays of several bundles that know the same of their rays, one after the other."""
-        named = {
-            field.name: [getattr(bundle, field.name) for bundle in bundles] for field in fields(RayBundle)
-        }
-        parts: dict[str, Any] = {
-            name: None if values[0] is None else torch.cat(values) for name, values in named.items()
-        }
-        return RayBundle(**parts)
+        columns = zip(*(bundle._columns() for bundle in bundles), strict=True)
+        return RayBundle(*(None if column[0] is None else torch.cat(column) for column in columns))
 
     def to(self, device: torch.device | str) -> RayBundle:
         """The same rays on another device."""
-        return self._map(lambda values: values.to(device))
+        return RayBundle(*(None if column is None else column.to(device) for column in self._columns()))
 
-    def _map(self, change: Callable[[Tensor], Tensor]) -> RayBundle:
-        return RayBundle(
-            change(self.origins),
-            change(self.directions),
-            change(self.camera_indices),
-            None if self.axes is None else change(self.axes),
-            None if self.image_y is None else change(self.image_y),
-        )
+    def _columns(self) -> list[Any]:
+        return [getattr(self, field.name) for field in fields(self)]
 
 
 @dataclass(frozen=True)

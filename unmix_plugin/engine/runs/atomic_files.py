@@ -1,6 +1,6 @@
 """Files that a kill, a crash or a full disk at any moment leaves whole: the old one or the new one, never a part.
 
-The JSON files of a run: one format version for all of them, and nothing read that can't be meant.
+The JSON files of a run have one format version for all of them, and nothing is read that no run writes.
 """
 
 import contextlib

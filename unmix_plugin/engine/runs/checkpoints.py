@@ -1,9 +1,7 @@
-"""Checkpoints: tensors as safetensors beside a JSON record with their hash.
+"""Checkpoints: all that training goes on from, as safetensors beside a JSON record with their hash.
 
 `step-NNNNNN.json` is written last, so a checkpoint exists if and only if its record does; and it counts as complete
-only if the tensors' SHA-256 is the record's.
-
-Everything that training goes on from, as named tensors: parameters, optimiser, average, data manager.
+only if the tensors' SHA-256 is the record's. The tensors are those of parameters, optimiser, average and data manager.
 """
 
 import hashlib

@@ -1,7 +1,4 @@
-"""The folder of one run: what lies where in it, making one, finding one.
-
-One training at a time writes to a run.
-"""
+"""The folder of one run: what lies where in it, making and finding one, and letting one training at a time write it."""
 
 import errno
 import os

@@ -1,11 +1,7 @@
-"""Optimisers and learning-rate schedules.
+"""What gradients do: Adam with a schedule, a guard against non-finite numbers, and an average of the parameters.
 
 A schedule is a pure function of the training progress in [0, 1], so it stretches over whichever limit, steps or
 seconds, a run has.
-
-Keeping non-finite numbers out of the parameters.
-
-A moving average of the parameters, which renders better than the last step's.
 """
 
 from collections.abc import Collection, Iterator, Mapping

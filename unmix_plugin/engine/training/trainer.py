@@ -1,23 +1,32 @@
-"""The training loop."""
+"""The training loop: steps (one batch, its gradients, the update), and what is saved, shown and measured between them.
 
-from collections.abc import Mapping
-from contextlib import nullcontext, suppress
-from dataclasses import replace
+Steps are the same in each of the processes that train together; the first of them has the `Trainer`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 from rich.console import Console
 from torch import Tensor
 
-from unmix_plugin.engine.configs import TrainerConfig
-from unmix_plugin.engine.machine import keep_freed_memory
-from unmix_plugin.engine.processes import ALONE, Processes
+from unmix_plugin.engine.configs import OptimizerConfig, TrainerConfig
+from unmix_plugin.engine.machine import keep_freed_memory, resolve_device, seed_everything
+from unmix_plugin.engine.model import TrainingCallbackLocation, run_callbacks
+from unmix_plugin.engine.pipeline import Pipeline
+from unmix_plugin.engine.processes import ALONE, Follower, Processes, joined, require_equal_settings
 from unmix_plugin.engine.runs.atomic_files import write_run_json
 from unmix_plugin.engine.runs.checkpoints import (
     AVERAGE,
+    Checkpoint,
     TrainingRecord,
     collect_tensors,
     part,
+    restore_training,
     save_checkpoint,
 )
 from unmix_plugin.engine.runs.config_json import config_to_json
@@ -30,7 +39,14 @@ from unmix_plugin.engine.runs.run_folder import (
     open_run_folder,
 )
 from unmix_plugin.engine.runs.scene_record import check_same_scene, read_scene_record, scene_record_to_json
-from unmix_plugin.engine.training.optimizers import AVERAGE_INTERVAL, ParameterAverage
+from unmix_plugin.engine.training.optimizers import (
+    AVERAGE_INTERVAL,
+    GradientGuard,
+    ParameterAverage,
+    build_optimizer,
+    forget_gradients,
+    set_learning_rates,
+)
 from unmix_plugin.engine.training.progress import (
     Limits,
     MetricsWriter,
@@ -41,8 +57,194 @@ from unmix_plugin.engine.training.progress import (
     TrainingStatus,
 )
 from unmix_plugin.engine.training.training_control import Interrupted, StopSignals, TrainingControl
-from unmix_plugin.engine.training.training_steps import StepResult, prepare_steps
-from unmix_plugin.errors import RunError
+from unmix_plugin.errors import ConfigError, RunError, UnmixError
+
+
+@dataclass(frozen=True)
+class _StepResult:
+    """What a training step gave."""
+
+    loss: float
+    """Mean over the processes."""
+    values: dict[str, Tensor]
+    """Losses and metrics of this process's rays without their graphs, and how many rays and samples there were."""
+    num_rays: int
+    """Of all processes."""
+    is_refused: bool
+    """Whether loss or gradients were not finite, so that nothing was updated."""
+    has_reset: bool = False
+    """Whether parameters were reset before it."""
+
+
+class TrainingSteps:
+    """Takes the training steps of one pipeline."""
+
+    def __init__(
+        self, pipeline: Pipeline, configs: Mapping[str, OptimizerConfig], processes: Processes = ALONE
+    ) -> None:
+        """
+        Args:
+            pipeline: Its model has its first values.
+            configs: Settings of the optimiser by parameter group.
+            processes: That take these steps together.
+        Raises:
+            ConfigError: a group of the model has no optimizer config.
+        """
+        self.pipeline, self.configs, self.processes = pipeline, configs, processes
+        pipeline.model.processes = processes
+        self.optimizer = build_optimizer(pipeline.model.get_param_groups(), configs)
+        self.guard = GradientGuard(self.optimizer)
+        self.callbacks = [
+            *pipeline.datamanager.get_training_callbacks(),
+            *pipeline.model.get_training_callbacks(),
+        ]
+        self.learning_rates: dict[str, float] = {}
+
+    @property
+    def num_rays(self) -> int:
+        """Rays of the next step in all processes."""
+        return self.pipeline.datamanager.get_train_rays_per_batch() * self.processes.count
+
+    def share_rays(self, num_rays: int) -> None:
+        """Let the next steps have so many rays in all processes.
+
+        Raises:
+            ConfigError: more processes than rays.
+        """
+        own = num_rays // self.processes.count
+        if own == 0:
+            raise ConfigError(
+                f"{self.processes.count} processes for {num_rays} rays a step; use fewer processes"
+            )
+        self.pipeline.datamanager.set_train_rays_per_batch(own)
+
+    def restore(self, checkpoint: Checkpoint) -> TrainingRecord:
+        """Go on from a checkpoint, whatever number of processes wrote it; how far it had come.
+
+        Raises:
+            RunError: it does not fit the model, or is damaged.
+            ConfigError: more processes than rays.
+        """
+        restore_training(checkpoint.tensors, self.pipeline.model, self.optimizer, self.pipeline.datamanager)
+        record = TrainingRecord.from_json(checkpoint.record)
+        self.share_rays(record.num_rays)
+        self.learning_rates = record.learning_rates
+        self.guard.skipped = record.skipped_steps
+        return record
+
+    def begin(self, step: int) -> None:
+        """Start all processes from the first one's model, before step number `step`.
+
+        Raises:
+            RunError: a process is at another step: their checkpoints differ.
+        """
+        self.processes.equalise(self.pipeline.model.state_dict().values())
+        found = set(self.processes.gather(step))
+        if len(found) > 1:
+            raise RunError(
+                f"the processes go on from checkpoints of different steps, {sorted(found)}: a run folder is "
+                "not the same for all of them"
+            )
+        self.pipeline.draw_as(self.processes.rank)
+
+    def take(self, step: int, progress: float) -> _StepResult:
+        """Take step number `step` at `progress` in [0, 1].
+
+        Raises:
+            RunError: loss and gradients stay non-finite, or another process has ended.
+        """
+        pipeline, datamanager = self.pipeline, self.pipeline.datamanager
+        pipeline.train()  # a guest may have left it in evaluation mode
+        pipeline.seed_step(step)
+        run_callbacks(self.callbacks, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, step, progress)
+        with torch.no_grad():
+            reset = pipeline.model.between_steps(step, progress, datamanager)
+        forget_gradients(self.optimizer, reset)
+        num_rays = datamanager.get_train_rays_per_batch()
+        self.learning_rates = set_learning_rates(self.optimizer, self.configs, progress)
+        outputs, losses, metrics = pipeline.get_train_loss_dict(step)
+        total = torch.stack(list(losses.values())).sum()
+        self.optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        wanted = pipeline.model.next_num_rays(outputs, num_rays)
+        total, wanted = self._averaged(total, wanted)
+        is_finite, loss = self.guard.check(total)
+        if is_finite:
+            self.optimizer.step()
+        run_callbacks(self.callbacks, TrainingCallbackLocation.AFTER_TRAIN_ITERATION, step, progress)
+        if wanted is not None:
+            datamanager.set_train_rays_per_batch(wanted)
+        counts = {"num_rays": num_rays, "num_samples": pipeline.model.num_samples(outputs)}
+        values = {name: value.detach() for name, value in {**losses, **metrics}.items()}
+        values.update({name: torch.tensor(float(count)) for name, count in counts.items()})
+        return _StepResult(loss, values, num_rays * self.processes.count, not is_finite, bool(reset))
+
+    def _averaged(self, total: Tensor, wanted: int | None) -> tuple[Tensor, int | None]:
+        """Gradients, loss and the rays wanted for the next step, as means over the processes."""
+        if self.processes.count == 1:
+            return total, wanted
+        parameters = [param for group in self.optimizer.param_groups for param in group["params"]]
+        rays = total.new_tensor(float("nan") if wanted is None else float(wanted))
+        total, rays = self.processes.average_gradients(parameters, [total, rays])
+        return total, None if wanted is None else max(1, int(rays))
+
+
+def prepare_steps(config: TrainerConfig, processes: Processes = ALONE) -> tuple[TrainerConfig, TrainingSteps]:
+    """Read the scene and make the model; settings without `auto`, and what takes the steps.
+
+    Raises:
+        SceneError, ConfigError: scene or settings are wrong.
+    """
+    device = resolve_device(config.device)
+    seed_everything(config.seed)
+    pipeline: Pipeline = config.pipeline.setup(data=require_data(config), device=device, seed=config.seed)
+    if config.load_run is None:
+        pipeline.initialise()
+    steps = TrainingSteps(pipeline, config.optimizers, processes)
+    if processes.count > 1:
+        steps.share_rays(pipeline.datamanager.get_train_rays_per_batch())
+    return replace(config, pipeline=pipeline.config), steps
+
+
+@contextmanager
+def joined_training(config: TrainerConfig) -> Iterator[Processes]:
+    """Context in which this process trains with the others that were started with it.
+
+    Raises:
+        ConfigError: their settings differ, or this machine can't run them.
+        Follower: the same, in a process that isn't the first.
+    """
+    with joined(config.device) as processes:
+        everywhere = replace(config, output_dir=Path(), data=None, load_run=None)
+        require_equal_settings(processes, config_to_json(everywhere))
+        yield processes
+
+
+def follow_training(config: TrainerConfig, processes: Processes) -> TrainingSteps:
+    """Train along with the first process, which has a `Trainer`, until it says that training is over.
+
+    Returns:
+        What took the steps, with the model as it is then.
+    Raises:
+        Follower: the training fails, which the first process says.
+    """
+    try:
+        with processes.together():
+            _, steps = prepare_steps(config, processes)
+        step = 0
+        with processes.together():
+            if config.load_run is not None:
+                step = steps.restore(require_checkpoint(open_run_folder(config.load_run))).steps
+        steps.pipeline.model.warm_up()
+        # A terminal's Ctrl-C reaches all processes; the first decides when to stop, and saves.
+        with StopSignals():
+            steps.begin(step)
+            while (progress := processes.announce(None)) is not None:
+                steps.take(step, progress)
+                step += 1
+    except UnmixError as error:
+        raise Follower(2) from error
+    return steps
 
 
 class Trainer:
@@ -214,7 +416,7 @@ class Trainer:
     def _is_at_limit(self) -> bool:
         return self.limits.reached(self.step, self.clock.seconds)
 
-    def _train_step(self) -> StepResult:
+    def _train_step(self) -> _StepResult:
         with self.clock.running():
             step, progress = self.step, self.progress
             self.processes.announce(progress)

@@ -1,9 +1,4 @@
-"""Turns on one device: training and a guest that also computes on it, in a stated proportion, neither starved.
-
-What others may see of a training that is under way in another thread, and what they may ask of it.
-
-Stopping between two steps when asked to, so that what is saved is a whole step.
-"""
+"""Who may do what while a training is under way: turns on the device, what other threads see and ask, and signals."""
 
 from __future__ import annotations
 
