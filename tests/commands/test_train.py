@@ -209,6 +209,7 @@ def test_ctrl_c_saves_exits_130_and_says_how_to_go_on_which_then_works(trained, 
     assert (path / "endmembers.csv").is_file()
 
 
+@pytest.mark.slow
 def test_training_into_a_pipe_that_closes_saves_and_exits_141(trained, tmp_path):
     """As `unmix-train ... | head -2`."""
     argv = [str(word) for word in small_training(trained, tmp_path / "out", "--max-num-iterations", 10**6)]

@@ -1,14 +1,17 @@
-"""What the engine's tests share: the second method, registered, and short configs of it."""
+"""What the engine's tests share: the second method, registered, short configs of it, and a run."""
 
 import importlib.metadata
 from dataclasses import replace
 from pathlib import Path
+from shutil import copytree
 
 import pytest
 
 from tests.engine.rgb_nerf_plugin import rgb_nerf
 from unmix_plugin.engine import registry
 from unmix_plugin.engine.configs import TrainerConfig
+from unmix_plugin.engine.runs.run_folder import RunFolder
+from unmix_plugin.engine.training.trainer import Trainer
 
 RGB_NERF_ENTRY = importlib.metadata.EntryPoint(
     "rgb-nerf", "tests.engine.rgb_nerf_plugin:rgb_nerf", registry.METHOD_GROUP
@@ -26,14 +29,32 @@ def registered(monkeypatch: pytest.MonkeyPatch):
 @pytest.fixture
 def short_config(tmp_path: Path, registered: list) -> TrainerConfig:  # noqa: ARG001
     """Twelve steps of the second method."""
-    scene = tmp_path / "ball"
+    return short_training(tmp_path)
+
+
+def short_training(folder: Path) -> TrainerConfig:
+    scene = folder / "ball"
     scene.mkdir()
     return replace(
         rgb_nerf.config,
         data=scene,
-        output_dir=tmp_path / "outputs",
+        output_dir=folder / "outputs",
         max_num_iterations=12,
         steps_per_save=4,
         steps_per_log=1,
         device="cpu",
     )
+
+
+@pytest.fixture(scope="session")
+def trained_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run that nobody changes."""
+    trainer = Trainer(short_training(tmp_path_factory.mktemp("trained")))
+    trainer.train()
+    return trainer.run.path
+
+
+@pytest.fixture
+def trained(short_config: TrainerConfig, trained_once: Path) -> RunFolder:
+    """A finished run of its own for each test."""
+    return RunFolder(copytree(trained_once, short_config.output_dir / "run"))

@@ -1,7 +1,4 @@
-"""What auto, cpu and cuda mean.
-
-Randomness is a function of seed, step and stream.
-"""
+"""Devices by name; randomness is a function of seed, step and stream."""
 
 import random
 

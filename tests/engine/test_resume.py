@@ -30,8 +30,9 @@ def train_lines(run: Path) -> list[dict]:
     return [{k: v for k, v in line.items() if k not in ("seconds", "rays_per_second")} for line in lines]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-@pytest.mark.parametrize("average_decay", [None, 0.9])
+@pytest.mark.parametrize(
+    ("number", "average_decay"), [(signal.SIGINT, None), (signal.SIGTERM, 0.9), (signal.SIGHUP, 0.9)]
+)
 def test_stopped_and_resumed_equals_straight_to_the_bit(
     short_config: TrainerConfig, number: int, average_decay: float | None
 ):

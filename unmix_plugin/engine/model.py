@@ -85,7 +85,7 @@ class DataManager(ABC):
         return f"eval_{index:03d}"
 
     def metadata(self) -> dict[str, Any]:
-        """What gives the model its shape beyond its config (say, the bands); kept in the run folder as JSON.
+        """What gives the model its shape beyond its config (say, a number of channels); kept in the run folder as JSON.
 
         Only dictionaries with string keys, lists, strings, finite numbers, booleans and None. Arrays that fill
         parameters belong in `initial_data`.

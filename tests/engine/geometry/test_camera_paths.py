@@ -1,9 +1,4 @@
-"""Moving cameras: where they go, and that they are cameras.
-
-Where cameras look.
-
-Cameras of built-in scenes: upright, and as wide as asked.
-"""
+"""Where cameras stand and look: paths are of real cameras, and the focus is where axes meet."""
 
 import numpy as np
 import pytest

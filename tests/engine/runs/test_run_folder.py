@@ -30,13 +30,6 @@ def complete_run(output_dir: Path, started: datetime, scene: str = "s", checkpoi
     return run
 
 
-@pytest.fixture
-def trained(short_config: TrainerConfig) -> RunFolder:
-    trainer = Trainer(short_config)
-    trainer.train()
-    return trainer.run
-
-
 def test_a_run_is_named_for_scene_method_and_second(tmp_path: Path):
     run = create_run_folder(tmp_path, "pots", "unmix", NOON)
     assert run.path == tmp_path / "pots" / "unmix" / "2024-05-06_120007"
@@ -105,18 +98,19 @@ def test_a_cut_off_or_foreign_file_is_refused(trained: RunFolder, name: str, tex
 
 
 @pytest.mark.parametrize("name", ["config.json", "scene.json", "checkpoints/step-000012.json"])
-def test_a_newer_version_is_refused_with_what_to_do(trained: RunFolder, name: str):
+@pytest.mark.parametrize(
+    ("version", "message"),
+    [
+        (99, r"format 99, written by a newer version.*update this package"),
+        (RUN_FORMAT - 1, rf"format {RUN_FORMAT - 1}, written by an older version.*train again"),
+    ],
+)
+def test_another_version_is_refused_with_what_to_do(
+    trained: RunFolder, name: str, version: int, message: str
+):
     path = trained.path / name
-    path.write_text(json.dumps({**json.loads(path.read_text()), "format_version": 99}))
-    with pytest.raises(RunError, match=r"format 99, written by a newer version.*update this package"):
-        load_model(trained.path)
-
-
-@pytest.mark.parametrize("name", ["config.json", "scene.json", "checkpoints/step-000012.json"])
-def test_an_older_version_is_refused_with_what_to_do(trained: RunFolder, name: str):
-    path = trained.path / name
-    path.write_text(json.dumps({**json.loads(path.read_text()), "format_version": RUN_FORMAT - 1}))
-    with pytest.raises(RunError, match=rf"format {RUN_FORMAT - 1}, written by an older version.*train again"):
+    path.write_text(json.dumps({**json.loads(path.read_text()), "format_version": version}))
+    with pytest.raises(RunError, match=message):
         load_model(trained.path)
 
 

@@ -1,9 +1,4 @@
-"""Learning-rate schedules as functions of progress, and the optimiser they drive.
-
-Non-finite numbers never reach the parameters.
-
-The moving average of the parameters.
-"""
+"""Optimisers and schedules, the guard against non-finite numbers, and the average of the parameters."""
 
 import io
 import math

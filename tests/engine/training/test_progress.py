@@ -1,9 +1,4 @@
-"""Training ends at whichever limit is reached first, and progress says how near that is.
-
-Progress is a live bar on a terminal and plain lines elsewhere.
-
-Metrics as JSON lines and TensorBoard files, events as a log.
-"""
+"""When training ends, what is shown of it, and what is written down."""
 
 import contextlib
 import errno

@@ -1,7 +1,4 @@
-"""Turns on a device: exclusive, in the proportion stated, and nobody waits forever.
-
-Watching and steering a training from another thread: it does as asked between steps, and nothing else changes.
-"""
+"""Turns on a device, and a training that is watched and steered from another thread."""
 
 import io
 import math
