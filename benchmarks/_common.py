@@ -221,7 +221,7 @@ def run_command(
 
 def quiet_trainer(words: Sequence[str]) -> Trainer:
     """What `unmix-train` with these words would train, without its display."""
-    from unmix_plugin.commands.train_arguments import parse
+    from unmix_plugin.commands.train import parse
     from unmix_plugin.engine.training.trainer import Trainer
 
     with open(os.devnull, "w") as nowhere:  # noqa: PTH123 - a device, not a path

@@ -23,7 +23,7 @@ UNTIMED_STEPS = 10
 _PAGE = """
 import contextlib, sys, time
 sys.path.insert(0, {folder!r})
-from _viewer_page import ConnectionClosed, Page
+from tests.viewer_page import ConnectionClosed, Page
 with contextlib.suppress(OSError, ConnectionClosed), Page({address!r}, width=512, height=512) as page:
     page.look_from(0.3)
     print("there", flush=True)
@@ -100,7 +100,7 @@ def _seconds(words: list[str], way: str, options: TrainingViewerOptions) -> tupl
 
 def _page(port: int, moves: bool) -> subprocess.Popen[str]:
     """A page in a process of its own, as a browser is; there before this returns."""
-    folder = str(Path(__file__).resolve().parent)
+    folder = str(_common.REPOSITORY)
     code = _PAGE.format(folder=folder, address=f"ws://127.0.0.1:{port}", moves=moves)
     page = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert page.stdout is not None

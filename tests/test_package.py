@@ -11,7 +11,10 @@ from shutil import copytree, ignore_patterns
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-HEAVY = ("colour", "scipy", "skimage", "matplotlib", "warp", "OpenEXR", "viser", "pandas", "tensorboard")
+HEAVY = (
+    *("colour", "scipy", "skimage", "matplotlib", "warp", "OpenEXR", "viser", "pandas", "tensorboard"),
+    *("h5py", "tifffile", "PIL", "pycolmap"),
+)
 COMMANDS = ("train", "eval", "render", "demo_scene", "process", "view", "export")
 
 

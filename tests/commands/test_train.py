@@ -1,4 +1,4 @@
-"""`unmix-train`: the contract of its words, its last line, its exit codes, and going on with a run."""
+"""`unmix-train`: the contract of its words, its last line, its exit codes, going on with a run, and its remarks."""
 
 import errno
 import importlib.metadata
@@ -15,9 +15,8 @@ import pytest
 import torch
 
 from tests.commands.running import SMALL_METHOD, run
-from unmix_plugin.commands import train_arguments
-from unmix_plugin.commands.train import train
-from unmix_plugin.commands.train_arguments import parse
+from unmix_plugin.commands import train as train_arguments
+from unmix_plugin.commands.train import _read_remarks, parse, remarks, train
 from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
 from unmix_plugin.engine import registry
 from unmix_plugin.engine.runs.load_run import load_model
@@ -164,7 +163,7 @@ def test_help_imports_nothing_heavy_but_torch():
     code = (
         "import sys\nfrom unmix_plugin.commands.entry import run_command\n"
         "from unmix_plugin.commands.train import train\n"
-        "for words in ['--help'], ['unmix-nerf', '--help'], ['unmix-nerf', '--help-all']:\n"
+        "for words in ['unmix-nerf', '--help'], ['unmix-nerf', '--help-all']:\n"
         "    try:\n        run_command(train, words)\n"
         "    except SystemExit as stop:\n"
         "        names = {'warp', 'scipy', 'skimage', 'matplotlib', 'colour', 'PIL', 'tensorboard'}\n"
@@ -172,9 +171,9 @@ def test_help_imports_nothing_heavy_but_torch():
     )
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     helps = ended.stdout.split("end: 0 []\n")
-    assert len(helps) == 4, ended.stdout
-    assert all("unmix-nerf" in text for text in helps[:3])
-    assert helps[3] == ""
+    assert len(helps) == 3, ended.stdout
+    assert all("unmix-nerf" in text for text in helps[:2])
+    assert helps[2] == ""
 
 
 def test_a_defect_exits_1(trained, tmp_path, monkeypatch):
@@ -261,3 +260,55 @@ def test_a_full_disk_while_saving_exits_2_and_says_so(trained, tmp_path, monkeyp
     assert "No space left on device" in ended.err
     assert not list(tmp_path.rglob("*.tmp"))
     assert not list(tmp_path.rglob("step-*"))
+
+
+def course(*quarters: float) -> list[dict]:
+    """Five lines a quarter of a training, around a loss each, one batch far off."""
+    return [
+        {"step": 50 * (5 * quarter + row + 1), "loss": loss * (10 if row == 2 else 1), "split": "train"}
+        for quarter, loss in enumerate(quarters)
+        for row in range(5)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("quarters", "said"),
+    [
+        ((1.0, 0.4, 0.2, 0.16), None),
+        ((1.0, 0.9, 0.85, 0.8), "hardly fell: in the last quarter of the training it was 80%"),
+        ((1.0, 0.6, 0.4, 0.2), "still fell by 50%"),
+    ],
+)
+def test_a_training_that_did_not_settle_is_told_from_one_that_did(quarters, said):
+    found = remarks(course(*quarters))
+    assert len(found) == (said is not None)
+    assert said is None or said in found[0]
+
+
+def test_few_lines_and_losses_that_are_not_finite_say_nothing():
+    assert remarks(course(1.0, 0.9, 0.85, 0.8)[-5:]) == []
+    assert remarks([{**line, "loss": None} for line in course(1.0, 0.9, 0.85, 0.8)]) == []
+
+
+def test_remarks_are_read_from_the_metrics_of_a_run(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    lines = [*course(1.0, 0.9, 0.85, 0.8), {"step": 1000, "split": "eval_all", "psnr": 20.0}]
+    path.write_text("\n".join(json.dumps(line) for line in lines) + "\n")
+    assert "hardly fell" in _read_remarks(path)[0]
+    path.write_text('{"step": 1')
+    assert _read_remarks(path) == []
+    assert _read_remarks(tmp_path / "missing.jsonl") == []
+
+
+def test_poses_that_ran_away_are_said():
+    lines = course(1.0, 0.2, 0.1, 0.09)
+    assert remarks([*lines[:-1], {**lines[-1], "poses_undone": 0.0}]) == []
+    said = remarks([*lines[:-1], {**lines[-1], "poses_undone": 3.0}])
+    assert "corrections of the poses of 3 views went beyond" in said[0]
+
+
+def test_poses_that_are_not_believed_are_said():
+    lines = course(1.0, 0.2, 0.1, 0.09)
+    assert remarks([*lines[:-1], {**lines[-1], "poses_doubted": 0.01}]) == []
+    said = remarks([*lines[:-1], {**lines[-1], "poses_doubted": 0.12}])
+    assert "12% of the views, or of the rows of line cameras, still fit far worse than the others" in said[0]

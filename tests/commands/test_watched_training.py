@@ -8,9 +8,9 @@ import threading
 import numpy as np
 import pytest
 
-from benchmarks._viewer_page import Page
 from tests.commands.running import SMALL_METHOD, run
 from tests.commands.watching import START_S, address, looking, started, visited
+from tests.viewer_page import Page
 from unmix_plugin.commands import train as train_module
 from unmix_plugin.commands.train import parse_all, train
 from unmix_plugin.engine.training.trainer import Trainer

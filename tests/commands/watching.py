@@ -10,8 +10,8 @@ import threading
 import time
 from contextlib import contextmanager
 
-from benchmarks._viewer_page import Page
 from tests.commands.running import run
+from tests.viewer_page import Page
 
 START_S = 90.0
 

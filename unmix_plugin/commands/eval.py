@@ -67,8 +67,7 @@ def evaluate(argv: list[str]) -> None:
 def _evaluate(options: EvalOptions, processes: Processes) -> None:
     from functools import partial
 
-    from unmix_plugin.commands.reporting import CommandConsole, follow, working
-    from unmix_plugin.commands.run_choice import chosen_run, spectral_scene
+    from unmix_plugin.commands.reporting import CommandConsole, chosen_run, follow, spectral_scene, working
     from unmix_plugin.editing.apply import edit_scene, light_factors
     from unmix_plugin.editing.edited_run import requested_recipe
     from unmix_plugin.editing.recipe_files import recipe_to_yaml
@@ -129,7 +128,7 @@ def _materials_scene(loaded: LoadedPipeline, is_edited: bool) -> TrainedScene | 
     Raises:
         ConfigError: edits are asked for, and there is none.
     """
-    from unmix_plugin.commands.run_choice import spectral_scene
+    from unmix_plugin.commands.reporting import spectral_scene
     from unmix_plugin.engine.registry import find_method
     from unmix_plugin.trained.open_run import require_materials
     from unmix_plugin.trained.trained_scene import TrainedScene

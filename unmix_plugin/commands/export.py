@@ -152,8 +152,7 @@ def _open(product: RunProduct, own: dict[str, OwnProduct], processes: Processes)
     """Load the run that a product is of."""
     from functools import partial
 
-    from unmix_plugin.commands.reporting import CommandConsole, follow, say, working
-    from unmix_plugin.commands.run_choice import chosen_run
+    from unmix_plugin.commands.reporting import CommandConsole, chosen_run, follow, say, working
 
     if isinstance(product, Product):
         _refuse_sensor(product)

@@ -102,8 +102,7 @@ def render(argv: list[str]) -> None:
 
 
 def _render_run(options: RenderOptions, request: CameraRequest, processes: Processes) -> None:
-    from unmix_plugin.commands.reporting import CommandConsole, say, working
-    from unmix_plugin.commands.run_choice import chosen_run
+    from unmix_plugin.commands.reporting import CommandConsole, chosen_run, say, working
     from unmix_plugin.editing.edited_run import load_edited_run
     from unmix_plugin.products.render.cameras import choose_cameras
     from unmix_plugin.products.render.files import choose_formats

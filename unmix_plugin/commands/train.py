@@ -1,17 +1,26 @@
-"""`unmix-train METHOD --data DIR`: train a method on a scene, or go on with a run."""
+"""`unmix-train METHOD --data DIR`: train a method on a scene, or go on with a run.
+
+Arguments are settings of the method, or of the run to go on with, changed by what is given. After training the course
+of the loss is told in words: whether it settled, and what to try where it did not.
+"""
 
 from __future__ import annotations
 
+import json
 import shlex
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass, replace
+from pathlib import Path
+from statistics import median
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+
+import tyro
 
 from unmix_plugin.commands.entry import INTERRUPTED, run_command
-from unmix_plugin.commands.train_arguments import PROGRAM, overview, parse_all
-from unmix_plugin.engine.configs import TrainerConfig
-from unmix_plugin.engine.registry import discover_methods
+from unmix_plugin.engine.configs import Common, TrainerConfig
+from unmix_plugin.engine.registry import MethodSpecification, discover_methods, find_method
 from unmix_plugin.errors import ConfigError, counted
 from unmix_plugin.viewer.access import TrainingViewerOptions
 
@@ -21,6 +30,128 @@ if TYPE_CHECKING:
     from unmix_plugin.engine.processes import Processes
     from unmix_plugin.engine.training.trainer import Trainer
     from unmix_plugin.scenes.scene import Scene
+
+
+_PROGRAM = "unmix-train"
+_USAGE = f"""usage: {_PROGRAM} METHOD --data DIR [options]
+       {_PROGRAM} METHOD --load-run RUN [options]
+
+Train a method on a folder of posed spectral images (--data demo: the built-in scene), or go on with a run.
+"""
+
+
+@dataclass(frozen=True)
+class _Given:
+    """What has to be known before the rest can be read: text, or None where it was not given."""
+
+    load_run: Path | None = None
+    max_num_iterations: str | None = None
+    max_seconds: str | None = None
+
+
+def parse(argv: Sequence[str]) -> TrainerConfig:
+    """The settings of a training, without how it is shown: see `parse_all`.
+
+    Raises:
+        ConfigError, RunError: as there.
+    """
+    return parse_all(argv)[0]
+
+
+def parse_all(argv: Sequence[str]) -> tuple[TrainerConfig, TrainingViewerOptions]:
+    """All settings: the method's defaults, or those of the run to go on with, changed by the arguments.
+
+    A limit given alone is the only one: with `--max-seconds` the method's number of iterations does not end training,
+    with `--max-num-iterations` no time that a resumed run was given does.
+
+    Raises:
+        ConfigError: no or an unknown method, not that of the run to go on with, or impossible settings.
+        RunError: the run to go on with is unusable.
+        SystemExit: help was asked for (0), or arguments do not parse (2).
+    """
+    if not argv or argv[0].startswith("-"):
+        installed = ", ".join(sorted(discover_methods()[0]))
+        raise ConfigError(
+            f"say which method to train first, as in {_PROGRAM} METHOD --data DIR; installed: {installed}"
+        )
+    name, options = argv[0], list(argv[1:])
+    method = find_method(name)
+    if "--help-all" in options:
+        _parse(method, method.config, ["--help"])
+    if {"--help", "-h"} & set(options):
+        _parse(method, method.config, ["--help"], only_common=True)
+    given = tyro.cli(
+        _Given, args=options, prog=f"{_PROGRAM} {name}", return_unknown_args=True, add_help=False
+    )[0]
+    default = method.config if given.load_run is None else _stored_config(name, given.load_run)
+    config, viewing = _parse(method, default, options)
+    if given.max_num_iterations is None and given.max_seconds is not None and config.max_seconds is not None:
+        config = replace(config, max_num_iterations=None)
+    elif (
+        given.max_seconds is None
+        and given.max_num_iterations is not None
+        and config.max_num_iterations is not None
+    ):
+        config = replace(config, max_seconds=None)
+    return config, viewing
+
+
+def _overview(methods: dict[str, MethodSpecification]) -> str:
+    """Help without a method: which there are."""
+    width = max((len(name) for name in methods), default=0)
+    lines = [f"  {name:{width}}  {method.description}" for name, method in sorted(methods.items())]
+    ending = f"{_PROGRAM} METHOD --help lists the common options of a method, --help-all all of them."
+    return "\n".join([_USAGE, "methods:", *lines, "", ending])
+
+
+def _parse(
+    method: MethodSpecification, default: TrainerConfig, options: list[str], only_common: bool = False
+) -> tuple[TrainerConfig, TrainingViewerOptions]:
+    name, viewing = method.config.method_name, TrainingViewerOptions(enabled=sys.stdout.isatty())
+    ending = ""
+    if only_common:
+        default, viewing = _common_only(default), _common_only(viewing)
+        ending = " --help-all lists all options, also those of the viewer."
+    settings, viewer = type(default), type(viewing)
+    parts = [("config", Annotated[settings, tyro.conf.arg(name="")]), ("viewer", viewer)]
+    kind = make_dataclass("Arguments", parts, frozen=True)
+    found: Any = tyro.cli(
+        kind,
+        default=kind(default, viewing),
+        args=options,
+        prog=f"{_PROGRAM} {name}",
+        description=f"Train {name}: {method.description}.{ending}",
+    )
+    return found.config, found.viewer
+
+
+def _stored_config(name: str, path: Path) -> TrainerConfig:
+    """Settings of the run to go on with."""
+    from unmix_plugin.engine.runs.load_run import load_config
+
+    stored = load_config(path)
+    if stored.method_name != name:
+        raise ConfigError(
+            f"{path} is a run of {stored.method_name}, not of {name}; go on with its own method"
+        )
+    return stored
+
+
+def _common_only(config: Any) -> Any:
+    """The same settings in classes whose help leaves out all fields but those annotated with `Common`."""
+    hints = get_type_hints(type(config), include_extras=True)
+    shown: list[tuple[str, Any, Any]] = []
+    values: dict[str, Any] = {}
+    for entry in fields(config):
+        hint, value = hints[entry.name], getattr(config, entry.name)
+        if is_dataclass(value) and not isinstance(value, type):
+            value = _common_only(value)
+            hint = type(value)
+        elif Common not in getattr(hint, "__metadata__", ()):
+            hint = Annotated[hint, tyro.conf.Suppress]
+        values[entry.name] = value
+        shown.append((entry.name, hint, field(default_factory=lambda value=value: value)))
+    return make_dataclass(type(config).__name__, shown, bases=(type(config),), frozen=True)(**values)
 
 
 def train(argv: list[str]) -> None:
@@ -34,7 +165,7 @@ def train(argv: list[str]) -> None:
     for plugin in broken:
         print(f"warning: {plugin}", file=sys.stderr)
     if argv and argv[0] in ("-h", "--help", "--help-all"):
-        print(overview(methods))
+        print(_overview(methods))
         return
     config, viewing = parse_all(argv)
 
@@ -86,9 +217,7 @@ def _run(trainer: Trainer, console: Console) -> None:
     Raises:
         SystemExit: 130, after a stop on request.
     """
-    from unmix_plugin.commands.reporting import say
-    from unmix_plugin.commands.run_choice import spectral_scene
-    from unmix_plugin.commands.training_remarks import read_remarks
+    from unmix_plugin.commands.reporting import say, spectral_scene
     from unmix_plugin.engine.training.training_control import Interrupted
 
     try:
@@ -96,14 +225,14 @@ def _run(trainer: Trainer, console: Console) -> None:
     except Interrupted as stop:
         print(stop, file=sys.stderr)
         if stop.step is not None:
-            resume = shlex.join([PROGRAM, trainer.config.method_name, "--load-run", str(stop.run)])
+            resume = shlex.join([_PROGRAM, trainer.config.method_name, "--load-run", str(stop.run)])
             print(f"go on with: {resume}", file=sys.stderr)
         print(f"run: {stop.run}", flush=True)
         sys.exit(INTERRUPTED)
     speed = f"{record.train_rays_per_second:,.0f} rays/s"
     say(console, f"trained {counted(record.steps, 'step')} in {record.train_seconds:.1f} s, {speed}")
     if spectral_scene(trainer.pipeline.datamanager) is not None:  # remarks name settings of spectral methods
-        for remark in read_remarks(trainer.run.metrics_path):
+        for remark in _read_remarks(trainer.run.metrics_path):
             say(console, remark)
     _write_endmembers(trainer)
 
@@ -149,7 +278,7 @@ def _scene_of(trainer: Trainer) -> Scene:
     Raises:
         ConfigError: its data manager has none.
     """
-    from unmix_plugin.commands.run_choice import spectral_scene
+    from unmix_plugin.commands.reporting import spectral_scene
 
     scene = spectral_scene(trainer.pipeline.datamanager)
     if scene is None:
@@ -176,3 +305,71 @@ def main() -> None:
 
 if __name__ == "__main__":
     main()
+
+
+_FEWEST_LINES = 8
+"""Lines of metrics below which nothing is said."""
+_DOUBTED = 0.02
+"""Share of poses that are not believed, of which more is said."""
+_HARDLY_FELL = 0.6
+"""Loss in the last quarter of the training, over that in the first, above which it hardly fell. Trainings that settle
+stay below 0.35, also short ones."""
+_STILL_FALLS = 0.3
+"""Share by which the loss fell from the third to the last quarter, above which more steps are worthwhile."""
+
+
+def _read_remarks(metrics_path: Path) -> list[str]:
+    """Remarks on the training whose `metrics.jsonl` this is; none where the file can't be read."""
+    try:
+        lines = [json.loads(line) for line in metrics_path.read_text(encoding="utf-8").splitlines()]
+    except (OSError, ValueError):
+        return []
+    return remarks([line for line in lines if line.get("split") == "train"])
+
+
+def remarks(lines: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Sentences for whoever trains.
+
+    Args:
+        lines: Of training batches in order, each with `step` and `loss` (None where it was not finite).
+    """
+    known = [line for line in lines if line.get("loss") is not None]
+    if len(known) < _FEWEST_LINES:
+        return []
+    first, third, last = (_typical_loss(known, quarter) for quarter in (1, 3, 4))
+    if None in (first, third, last) or not first or not third or last is None:
+        return []
+    found = []
+    undone = int(known[-1].get("poses_undone") or 0)
+    if undone:
+        found.append(
+            f"corrections of the poses of {counted(undone, 'view')} went beyond a quarter of the distance to the scene "
+            "(or 14 degrees) and were undone: look whether these views belong to the scene, or train with --poses fixed"
+        )
+    doubted = float(known[-1].get("poses_doubted") or 0)
+    if doubted > _DOUBTED:
+        found.append(
+            f"{doubted:.0%} of the views, or of the rows of line cameras, still fit far worse than the others and "
+            "hardly shape the scene: their poses are off by more than was found, or they show something else"
+        )
+    if last > _HARDLY_FELL * first:
+        found.append(
+            f"the loss hardly fell: in the last quarter of the training it was {last / first:.0%} of that in the "
+            "first. The views don't agree on one scene. Look at the pictures of unmix-eval: double edges mean wrong "
+            "poses; blurred brightness, a light that moves (try --light camera, or --light per-view where exposures "
+            "differ); bright specks, blown-out pixels or background within the masks"
+        )
+    elif 1 - last / third > _STILL_FALLS:
+        found.append(
+            f"the loss still fell by {1 - last / third:.0%} from the third to the last quarter: a longer training "
+            "(--max-num-iterations, --max-seconds) will show more"
+        )
+    return found
+
+
+def _typical_loss(lines: Sequence[Mapping[str, Any]], quarter: int) -> float | None:
+    """Median over a quarter of the lines' time, 1 to 4; None without lines in it."""
+    start, end = (lines[at]["step"] for at in (0, -1))
+    low, high = (start + (end - start) * part / 4 for part in (quarter - 1, quarter))
+    losses = [float(line["loss"]) for line in lines if low < line["step"] <= high]
+    return median(losses) if losses else None

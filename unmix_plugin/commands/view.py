@@ -67,8 +67,7 @@ def prepared(options: ViewOptions) -> Viewer:
         SpectrumError: there is no such light.
     """
 
-    from unmix_plugin.commands.reporting import CommandConsole, working
-    from unmix_plugin.commands.run_choice import chosen_run
+    from unmix_plugin.commands.reporting import CommandConsole, chosen_run, working
     from unmix_plugin.editing.apply import assumption_of_light
     from unmix_plugin.editing.edited_run import requested_recipe
     from unmix_plugin.trained.open_run import load_run

@@ -12,7 +12,7 @@ Source: Barron et al. 2022, mip-NeRF 360, eq. 10, with the norm of Tancik et al.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -41,17 +41,22 @@ class RayBundle:
 
     def __getitem__(self, index: slice | Tensor) -> RayBundle:
         """The rays at a slice, an index tensor (R',) or a boolean mask (R,)."""
-        return RayBundle(*(None if column is None else column[index] for column in self._columns()))
+        return self._map(lambda column: column[index])
 
     @staticmethod
     def join(bundles: Sequence[RayBundle]) -> RayBundle:
         """The rays of several bundles that know the same of their rays, one after the other."""
         columns = zip(*(bundle._columns() for bundle in bundles), strict=True)
-        return RayBundle(*(None if column[0] is None else torch.cat(column) for column in columns))
+        joined: list[Any] = [None if column[0] is None else torch.cat(column) for column in columns]
+        return RayBundle(*joined)
 
     def to(self, device: torch.device | str) -> RayBundle:
         """The same rays on another device."""
-        return RayBundle(*(None if column is None else column.to(device) for column in self._columns()))
+        return self._map(lambda column: column.to(device))
+
+    def _map(self, change: Callable[[Tensor], Tensor]) -> RayBundle:
+        columns: list[Any] = [None if column is None else change(column) for column in self._columns()]
+        return RayBundle(*columns)
 
     def _columns(self) -> list[Any]:
         return [getattr(self, field.name) for field in fields(self)]
