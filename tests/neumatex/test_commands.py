@@ -12,7 +12,7 @@ from unmix_plugin.commands.export import export
 from unmix_plugin.commands.render import render
 from unmix_plugin.commands.train import train
 from unmix_plugin.engine import load_model
-from unmix_plugin.neumatex.export.product import material_paths
+from unmix_plugin.neumatex.export.material import material_paths
 from unmix_plugin.neumatex.fit.trained_object import TrainedObject
 from unmix_plugin.trained.open_run import load_run, snapshot
 

@@ -15,8 +15,9 @@ from tests.neumatex.surfaces import LAYERED, PBR, ball, knot
 from tests.products.mesh_reading import loaded_mesh
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.export.atlas import _Atlas, _texels_of, _unwrap
+from unmix_plugin.neumatex.export.material import material_paths, write_material
 from unmix_plugin.neumatex.export.pbr_fit import fit_pbr
-from unmix_plugin.neumatex.export.product import _require_texture_size, material_paths, write_material
+from unmix_plugin.neumatex.export.product import _require_texture_size
 from unmix_plugin.neumatex.tracing.families import LayeredFamily
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.colour.conversion import srgb_to_linear

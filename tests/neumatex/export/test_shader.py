@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.commands.browser import CHROMIUM, FLAGS
-from unmix_plugin.neumatex.export.files import shader_paths, write_shader
+from unmix_plugin.neumatex.export.shader import shader_paths, write_shader
 from unmix_plugin.neumatex.tracing.neural import NeuralFamily
 
 

@@ -39,7 +39,7 @@ from unmix_plugin.neumatex.fit.start import (
 from unmix_plugin.neumatex.fit.tone import LampRatio, SpectralDisplay, ToneMapping, psnr_db, tone_curve
 from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.neumatex.tracing.mesh import Mesh
-from unmix_plugin.neumatex.tracing.path_tracer import SeenPoints, TracedObject, TracedObjectCache
+from unmix_plugin.neumatex.tracing.path_tracer import TracedObject, TracedObjectCache
 from unmix_plugin.neumatex.tracing.surface import Triplane, TriplaneSurface
 
 _START_SEED = 0
@@ -153,11 +153,13 @@ class NeumatexModel(Model):
         seen = traced.seen(ray_bundle.origins, ray_bundle.directions)
         if self.training:
             samples = self.config.samples // 2
-            twice = SeenPoints.cat([seen, seen])
-            light = traced.light(twice, samples, self.config.bounces, self._random())
+            rows = torch.arange(len(seen.to_eye), device=seen.to_eye.device).repeat(2)
+            points, to_eye = seen.points.select(rows), seen.to_eye[rows]
+            light = traced.light(points, to_eye, samples, self.config.bounces, self._random())
             halves = torch.stack([seen.scatter(part) for part in light.unflatten(0, (2, -1)).unbind()])
             return {"halves": halves, "found": seen.found, "positions": seen.points.positions}
-        light = traced.light(seen, self.config.render_samples, self.config.bounces, self._random())
+        samples, bounces = self.config.render_samples, self.config.bounces
+        light = traced.light(seen.points, seen.to_eye, samples, bounces, self._random())
         base = self.family.base_colour(self.surface.parameters(seen.points.positions))
         if isinstance(self.curve, SpectralDisplay):
             base = self.curve.rgb(base)

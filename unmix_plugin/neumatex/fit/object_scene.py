@@ -1,20 +1,12 @@
-"""What is known of the light of pictures of many bands: their wavelengths, and the lamp's spectrum.
+"""A validated object, read from its folder: its mesh, the light around it, and posed pictures of it.
 
-Notation: `B` bands.
-
-True endmembers and abundances of an object's spectral pictures, where a folder has them.
-
-Notation: `H x W` pixels, `B` bands, `M` true materials.
-
-A validated object: its mesh, the light around it, and posed pictures of it.
+The folder has transforms.json and pictures as any scene has, a mesh, an environment map, and perhaps `relit/<light>/`
+with the same under lights that training never sees. docs/background/neumatex.md says what its keys mean.
 
 World space is that of the mesh's file, and of the poses before nerfstudio's `applied_transform`; z is up. Model space
 has the mesh's bounding box in the middle of [-1, 1]^3, axes as in the world.
 
-From an object's folder to a validated `ObjectScene`.
-
-The folder has transforms.json and pictures as any scene has, a mesh, an environment map, and perhaps `relit/<light>/`
-with the same under lights that training never sees. docs/background/neumatex.md says what its keys mean.
+Notation: `H x W` pixels, `B` bands, `M` true materials.
 """
 
 from __future__ import annotations
@@ -27,19 +19,18 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 
 from unmix_plugin.errors import SceneError
-from unmix_plugin.neumatex.fit.checks import light_doubt, mesh_fit
+from unmix_plugin.neumatex.fit.checks import compare_outlines, light_doubt
 from unmix_plugin.neumatex.fit.pictures import PosedPictures, has_alpha, read_picture, read_posed_pictures
 from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS, ToneMapping
 from unmix_plugin.neumatex.tracing.environment import Environment
-from unmix_plugin.neumatex.tracing.light_files import ENVIRONMENT_SUFFIXES as ENVIRONMENT_SUFFIXES
 from unmix_plugin.neumatex.tracing.light_files import (
+    ENVIRONMENT_SUFFIXES,
     mean_spectrum,
     read_environment,
     read_environment_of_bands,
     read_lamp,
 )
-from unmix_plugin.neumatex.tracing.mesh import MESH_SUFFIXES as MESH_SUFFIXES
-from unmix_plugin.neumatex.tracing.mesh import Mesh, read_mesh
+from unmix_plugin.neumatex.tracing.mesh import MESH_SUFFIXES, Mesh, read_mesh
 from unmix_plugin.neumatex.tracing.rays import RayMesh
 from unmix_plugin.scenes.placement import Placement
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array
@@ -57,79 +48,20 @@ from unmix_plugin.scenes.reading.transforms_json import FILE_NAME, SceneEntry, r
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.bands import Bands
 
+EVAL_INTERVAL = 8
+"""Every so many frames one is for evaluation, where transforms.json does not say which."""
+MOST_STOPS = 20.0
 _NUM_COLOURS = 3
 
 
 @dataclass(frozen=True)
-class _SpectralLight:
-    """Bands and lamp of spectral pictures."""
+class _HeldOutLight:
+    """The object under a light that training never sees."""
 
-    bands: Bands
-    lamp: Float64[np.ndarray, " B"] | None
-    """Relative power, greatest 1; None where it is not given."""
-
-    def _lamp_of(self, environment: Environment) -> Float64[np.ndarray, " B"]:
-        """The lamp; the environment's mean spectrum where none is given."""
-        return mean_spectrum(environment).double().numpy() if self.lamp is None else self.lamp
-
-    def _of_held_out(self, folder: Path, entry: SceneEntry, pictures: PosedPictures) -> _SpectralLight:
-        """The same bands, lit by the held-out light's own lamp where it has one.
-
-        Raises:
-            SceneError: its pictures have other bands.
-        """
-        own = entry.wavelengths_nm
-        if pictures.num_colours != len(self.bands) or (own is not None and Bands(own) != self.bands):
-            raise SceneError(
-                f"{folder}: pictures of {pictures.num_colours} bands"
-                + ("" if own is None else f", wavelengths of {Bands(own)}")
-                + f"; the object has {self.bands}: give the same"
-            )
-        lamp = _own_lamp(folder, entry, self.bands)
-        return self if lamp is None else replace(self, lamp=lamp)
-
-
-def _spectral_light(
-    root: Path, entry: SceneEntry, pictures: PosedPictures, lamp: str | None
-) -> _SpectralLight | None:
-    """Bands and lamp of an object's pictures; None for pictures in colours.
-
-    Args:
-        root: The object's folder.
-        entry: Its transforms.json.
-        pictures: Its pictures.
-        lamp: What to take instead of the folder's lamp; see `read_lamp`.
-    Raises:
-        SceneError: pictures of more than three colours without wavelengths, or with another number of them; display
-            pictures; a lamp for pictures in colours.
-        SpectrumError: the lamp can't be read, or is not known at all bands.
-    """
-    found, count = entry.wavelengths_nm, pictures.num_colours
-    if count == _NUM_COLOURS and (found is None or len(found) != count):
-        if lamp is not None:
-            raise SceneError(f"{root}: a lamp is given, but its pictures have {count} colours; leave it out")
-        return None
-    if found is None or len(found) != count:
-        given = "no 'wavelengths'" if found is None else f"{len(found)} 'wavelengths'"
-        raise SceneError(
-            f"{root / FILE_NAME}: {given} for pictures of {count} bands; list the centre of each band in nm"
-        )
-    if pictures.tone != "linear":
-        raise SceneError(
-            f"{root / FILE_NAME}: pictures of {count} bands with 'tone_mapping' {pictures.tone}; expected linear light"
-        )
-    bands = Bands(found)
-    return _SpectralLight(bands, _own_lamp(root, entry, bands) if lamp is None else read_lamp(lamp, bands))
-
-
-def _own_lamp(root: Path, entry: SceneEntry, bands: Bands) -> Float64[np.ndarray, " B"] | None:
-    """What 'illuminant_path' names; None where there is none."""
-    if entry.illuminant_path is None:
-        return None
-    faults = Faults(root)
-    path = resolve_path(root, entry.illuminant_path, None, "'illuminant_path'", faults)
-    faults.raise_if_any()
-    return None if path is None else read_lamp(str(path), bands)
+    name: str
+    environment: Environment
+    pictures: PosedPictures
+    """All for evaluation."""
 
 
 @dataclass(frozen=True)
@@ -160,43 +92,6 @@ class _TrueMaterials:
                 f"{path}: has shape {found.shape}; expected rows x columns x {len(self.names)} materials"
             )
         return found
-
-
-def _read_true_materials(
-    root: Path, entry: SceneEntry, spectral: _SpectralLight | None
-) -> _TrueMaterials | None:
-    """What 'endmembers_path' and each frame's 'abundance_file_path' name; None without spectra or endmembers.
-
-    Raises:
-        SceneError: a file is missing, or does not fit the bands.
-    """
-    if spectral is None or entry.endmembers_path is None:
-        return None
-    faults = Faults(root)
-    path = resolve_path(root, entry.endmembers_path, None, "'endmembers_path'", faults)
-    table = None
-    if path is not None:
-        centers = spectral.bands.centers_nm
-        table = read_endmembers(path, centers, entry.materials, "'endmembers_path'", faults)
-    files = tuple(
-        resolve_path(root, frame.paths["abundance_file_path"], None, frame.where, faults)
-        if "abundance_file_path" in frame.paths
-        else None
-        for frame in entry.frames
-    )
-    faults.raise_if_any()
-    assert table is not None
-    return _TrueMaterials(table.names, table.spectra, files)
-
-
-@dataclass(frozen=True)
-class _HeldOutLight:
-    """The object under a light that training never sees."""
-
-    name: str
-    environment: Environment
-    pictures: PosedPictures
-    """All for evaluation."""
 
 
 @dataclass(frozen=True)
@@ -255,11 +150,6 @@ class ObjectScene:
         }
 
 
-EVAL_INTERVAL = 8
-"""Every so many frames one is for evaluation, where transforms.json does not say which."""
-MOST_STOPS = 20.0
-
-
 def load_object(root: Path, lamp: str | None = None) -> ObjectScene:
     """Read and check an object's folder.
 
@@ -278,15 +168,17 @@ def load_object(root: Path, lamp: str | None = None) -> ObjectScene:
     faults.raise_if_any()
     assert light is not None
     assert mesh_path is not None
-    frame, mesh, pictures = _placed(
-        read_mesh(mesh_path, notes), mesh_path.name, root, entry, light, notes, faults
-    )
+    given = read_mesh(mesh_path, notes)
+    frame, mesh, pictures = _placed(given, mesh_path.name, root, entry, light, notes, faults)
     spectral = _spectral_light(root, entry, pictures, lamp)
     environment = light.environment(spectral)
     doubt = light_doubt(pictures, environment)
     notes += [] if doubt is None else [doubt]
-    files = {mesh_path.name: mesh_path, light.environment_path.name: light.environment_path}
+    own_lamp = None if spectral is None else spectral.lamp
+    if spectral is not None and own_lamp is None:
+        own_lamp = mean_spectrum(environment).double().numpy()
     truth = root / "truth" / "base_colour"
+    files = {path.name: sha256_of(path) for path in (mesh_path, light.environment_path)}
     return ObjectScene(
         root=root,
         mesh=mesh,
@@ -296,12 +188,70 @@ def load_object(root: Path, lamp: str | None = None) -> ObjectScene:
         split=split,
         lights=tuple(_read_held_out(path, frame, spectral) for path in _held_out_folders(root)),
         bands=None if spectral is None else spectral.bands,
-        lamp=None if spectral is None else spectral._lamp_of(environment),
+        lamp=own_lamp,
         truth=truth if truth.is_dir() else None,
-        true_materials=_read_true_materials(root, entry, spectral),
-        input_hashes={**{name: sha256_of(path) for name, path in files.items()}, **pictures.hashes},
+        true_materials=None if spectral is None else _read_true_materials(root, entry, spectral.bands),
+        input_hashes={**files, **pictures.hashes},
         notes=tuple(notes),
     )
+
+
+@dataclass(frozen=True)
+class _SpectralLight:
+    """Bands and lamp of spectral pictures."""
+
+    bands: Bands
+    lamp: Float64[np.ndarray, " B"] | None
+    """Relative power, greatest 1; None where it is not given."""
+
+
+def _spectral_light(
+    root: Path, entry: SceneEntry, pictures: PosedPictures, lamp: str | None
+) -> _SpectralLight | None:
+    """Bands and lamp of an object's pictures; None for pictures in colours."""
+    found, count = entry.wavelengths_nm, pictures.num_colours
+    if count == _NUM_COLOURS and (found is None or len(found) != count):
+        if lamp is not None:
+            raise SceneError(f"{root}: a lamp is given, but its pictures have {count} colours; leave it out")
+        return None
+    if found is None or len(found) != count:
+        given = "no 'wavelengths'" if found is None else f"{len(found)} 'wavelengths'"
+        raise SceneError(
+            f"{root / FILE_NAME}: {given} for pictures of {count} bands; list the centre of each band in nm"
+        )
+    if pictures.tone != "linear":
+        raise SceneError(
+            f"{root / FILE_NAME}: pictures of {count} bands with 'tone_mapping' {pictures.tone}; expected linear light"
+        )
+    bands = Bands(found)
+    return _SpectralLight(bands, _own_lamp(root, entry, bands) if lamp is None else read_lamp(lamp, bands))
+
+
+def _own_lamp(root: Path, entry: SceneEntry, bands: Bands) -> Float64[np.ndarray, " B"] | None:
+    """What 'illuminant_path' names; None where there is none."""
+    if entry.illuminant_path is None:
+        return None
+    faults = Faults(root)
+    path = resolve_path(root, entry.illuminant_path, None, "'illuminant_path'", faults)
+    faults.raise_if_any()
+    return None if path is None else read_lamp(str(path), bands)
+
+
+def _read_true_materials(root: Path, entry: SceneEntry, bands: Bands) -> _TrueMaterials | None:
+    """What 'endmembers_path' and each frame's 'abundance_file_path' name; None without endmembers."""
+    if entry.endmembers_path is None:
+        return None
+    faults, table = Faults(root), None
+    path = resolve_path(root, entry.endmembers_path, None, "'endmembers_path'", faults)
+    if path is not None:
+        table = read_endmembers(path, bands.centers_nm, entry.materials, "'endmembers_path'", faults)
+    named = [(frame.paths.get("abundance_file_path"), frame.where) for frame in entry.frames]
+    files = tuple(
+        None if file is None else resolve_path(root, file, None, where, faults) for file, where in named
+    )
+    faults.raise_if_any()
+    assert table is not None
+    return _TrueMaterials(table.names, table.spectra, files)
 
 
 @dataclass(frozen=True)
@@ -379,25 +329,19 @@ def _placed(
     """
     found: list[str] = []
     for placed in (given, given.with_y_upwards()):
-        frame, mesh = _model_space(placed)
+        scale, offset = placed.to_model_space()
+        frame = Normalisation(np.eye(3), np.zeros(3), scale, -offset.double().numpy())
+        mesh = placed.transformed(scale, offset)
         pictures = read_posed_pictures(root, entry, _from_poses(frame, entry.placement), light.tone, faults)
-        alphas = [_alpha(pictures, index) for index in range(len(pictures))]
-        fit = mesh_fit(RayMesh(mesh), pictures.cameras, alphas, frame, name)
-        if fit.misplaced is None:
-            doubt = fit.doubt(name)
-            notes += [] if doubt is None else [doubt]
-            notes += (
-                [f"{name} has y as its upward axis, the poses have z: the mesh was turned"] if found else []
-            )
+        read = (pictures.read(index) for index in range(len(pictures)))
+        alphas = [picture.alpha if has_alpha(picture) else None for picture in read]
+        misplaced, doubt = compare_outlines(RayMesh(mesh), pictures.cameras, alphas, frame, name)
+        if misplaced is None:
+            turned = f"{name} has y as its upward axis, the poses have z: the mesh was turned"
+            notes += ([] if doubt is None else [doubt]) + ([turned] if found else [])
             return frame, mesh, pictures
-        found.append(fit.misplaced)
+        found.append(misplaced)
     raise SceneError(found[0])
-
-
-def _model_space(mesh: Mesh) -> tuple[Normalisation, Mesh]:
-    scale, offset = mesh.to_model_space()
-    middle = -offset.double().numpy()
-    return Normalisation(np.eye(3), np.zeros(3), scale, middle), mesh.transformed(scale, offset)
 
 
 def _from_poses(frame: Normalisation, placement: Placement) -> Normalisation:
@@ -405,11 +349,6 @@ def _from_poses(frame: Normalisation, placement: Placement) -> Normalisation:
     back = placement.rotation.T
     shift = placement.scale * (placement.offset - frame.offset - back @ placement.translation)
     return Normalisation(back, shift, frame.scale / placement.scale)
-
-
-def _alpha(pictures: PosedPictures, index: int) -> np.ndarray | None:
-    picture = pictures.read(index)
-    return picture.alpha if has_alpha(picture) else None
 
 
 def _held_out_folders(root: Path) -> list[Path]:
@@ -426,5 +365,12 @@ def _read_held_out(folder: Path, frame: Normalisation, spectral: _SpectralLight 
         raise SceneError(f"{folder} has no environment map")
     pictures = read_posed_pictures(folder, entry, _from_poses(frame, entry.placement), light.tone, faults)
     if spectral is not None:
-        spectral = spectral._of_held_out(folder, entry, pictures)
+        own, bands = entry.wavelengths_nm, spectral.bands
+        if pictures.num_colours != len(bands) or (own is not None and Bands(own) != bands):
+            named = "" if own is None else f", wavelengths of {Bands(own)}"
+            raise SceneError(
+                f"{folder}: pictures of {pictures.num_colours} bands{named}; the object has {bands}: give the same"
+            )
+        lamp = _own_lamp(folder, entry, bands)
+        spectral = spectral if lamp is None else replace(spectral, lamp=lamp)
     return _HeldOutLight(folder.name, light.environment(spectral), pictures)

@@ -228,7 +228,8 @@ def _plain_light(traced: TracedObject, seen: SeenPoints, base: float) -> Float[T
     """What a plain material whose base reflects the same in all bands would send to the eye; direct light only."""
     endmember = torch.full((1, traced.environment.num_colours), base, device=seen.to_eye.device)
     plain = TracedObject(traced.ray_mesh, traced.environment, _Plain(SpectralFamily(endmember)))
-    return plain.light(seen, _SAMPLES, 0, torch.Generator(seen.to_eye.device).manual_seed(0))
+    generator = torch.Generator(seen.to_eye.device).manual_seed(0)
+    return plain.light(seen.points, seen.to_eye, _SAMPLES, 0, generator)
 
 
 def _as_bright(

@@ -1,8 +1,4 @@
-"""An object as rays meet it: mesh, light and materials together.
-
-Notation: `R` rays, of which `N` meet the mesh; `C` colours.
-
-Radiance that a mesh reflects under an environment, with gradients to its materials.
+"""Radiance that a mesh reflects under an environment, with gradients to its materials.
 
 At each vertex of a path two directions are drawn: one by the environment's density, one by the material's. Both give
 direct light, weighed by the power heuristic; the material's, where it meets the mesh again, carries the path on.
@@ -10,26 +6,19 @@ Directions, densities and weights have no gradient, reflectances do: the estimat
 is that of its derivative (detached sampling), since neither the visibility nor the densities of the integral depend
 on the materials.
 
-Notation: `N` points, `M` vertices of paths that are alive, `C` colours, `P` parameters, S samples a point.
+Random numbers are uniform for each path, and evenly spread over the paths of a point: a Sobol sequence over the samples
+is shifted by random numbers of each point (modulo 1).
+
+Notation: `R` rays, `N` points, S samples a point, `M` vertices of paths that are alive, `C` colours, `P` parameters,
+`H x W` pixels, `K` rays of a picture that meet the mesh.
 
 Source: Veach 1997, Robust Monte Carlo Methods for Light Transport Simulation, chapter 9; Zeltner et al. 2021, Monte
-Carlo Estimators for Differential Light Transport, for the name detached sampling.
-
-Random numbers of paths: uniform for each path, evenly spread over the paths of a point.
-
-A Sobol sequence over the samples is shifted by random numbers of each point (modulo 1), so that each path's numbers
-are uniform and independent between points, dimensions and calls, but fill the unit cube evenly.
-
-Source: Cranley and Patterson 1976, Randomization of Number Theoretic Methods for Multiple Integration.
-
-Whole pictures by the path tracer.
-
-Notation: `H x W` pixels, `C` colours, `K` rays that meet the mesh.
+Carlo Estimators for Differential Light Transport, for the name detached sampling; Cranley and Patterson 1976,
+Randomization of Number Theoretic Methods for Multiple Integration.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -51,6 +40,11 @@ from unmix_plugin.neumatex.tracing.rays import (
 )
 from unmix_plugin.neumatex.tracing.surface import Surface, decoded_once
 
+_PATHS_AT_ONCE = 1 << 18
+"""Paths of one call for a picture, which bounds the memory."""
+_NUMBERS_A_VERTEX = 5
+"""Two for the environment, three for the material."""
+
 
 @dataclass(frozen=True)
 class SeenPoints:
@@ -61,23 +55,6 @@ class SeenPoints:
     """N of them, in the order of the rays that found one."""
     to_eye: Float[Tensor, "N 3"]
     """Unit vectors back along the rays."""
-    distances: Float[Tensor, " N"]
-    """Along the rays, model units."""
-
-    @staticmethod
-    def cat(parts: Sequence[SeenPoints]) -> SeenPoints:
-        """One after the other."""
-        points = [part.points for part in parts]
-        return SeenPoints(
-            torch.cat([part.found for part in parts]),
-            SurfacePoints(
-                torch.cat([point.positions for point in points]),
-                torch.cat([point.normals for point in points]),
-                torch.cat([point.geometric_normals for point in points]),
-            ),
-            torch.cat([part.to_eye for part in parts]),
-            torch.cat([part.distances for part in parts]),
-        )
 
     def scatter(self, values: Float[Tensor, "N *rest"]) -> Float[Tensor, "R *rest"]:
         """Values of points as those of rays; 0 where a ray meets nothing."""
@@ -87,7 +64,7 @@ class SeenPoints:
 
 @dataclass(frozen=True)
 class TracedObject:
-    """Mesh, light and materials."""
+    """Mesh, light and materials: what light meets on its way."""
 
     ray_mesh: RayMesh
     environment: Environment
@@ -103,19 +80,23 @@ class TracedObject:
             hits = self.ray_mesh.closest(origins, directions)
             rows = hits.found.nonzero(as_tuple=True)[0]
             along = directions[rows]
-            met = hits.select(rows)
-            return SeenPoints(hits.found, self.ray_mesh.points(met, along), -along, met.distances)
+            return SeenPoints(hits.found, self.ray_mesh.points(hits.select(rows), along), -along)
 
     def light(
-        self, seen: SeenPoints, samples: int, bounces: int, generator: torch.Generator
+        self,
+        points: SurfacePoints,
+        to_eye: Float[Tensor, "N 3"],
+        samples: int,
+        bounces: int,
+        generator: torch.Generator,
     ) -> Float[Tensor, "N C"]:
-        """Light that the points send to the eye, an estimate from so many paths; differentiable by the materials."""
+        """Light that points send to the eye, an estimate from so many paths; differentiable by the materials."""
         return reflected_radiance(
             self.surface,
             self.ray_mesh,
             self.environment,
-            seen.points,
-            seen.to_eye,
+            points,
+            to_eye,
             samples=samples,
             bounces=bounces,
             generator=generator,
@@ -143,15 +124,6 @@ class TracedObjectCache:
 
 
 @dataclass(frozen=True)
-class _World:
-    """What light meets on its way."""
-
-    surface: Surface
-    ray_mesh: RayMesh
-    environment: Environment
-
-
-@dataclass(frozen=True)
 class _Vertices:
     """Ends of the paths that are alive."""
 
@@ -170,13 +142,13 @@ class _Vertices:
         """Whether directions (world) leave the surface: above the shading normal's horizon and the triangle's."""
         return (cosines > 0) & ((directions * self.points.geometric_normals).sum(dim=-1) > 0)
 
+    def select(self, rows: Int[Tensor, " M"]) -> _Vertices:
+        others = {name: part[rows] for name, part in vars(self).items() if name != "points"}
+        return _Vertices(points=self.points.select(rows), **others)
 
-@dataclass(frozen=True)
-class _Light:
-    """Light that paths found at one vertex."""
 
-    paths: Int[Tensor, " M"]
-    radiance: Float[Tensor, "M C"]
+_Light = tuple[Tensor, Tensor]
+"""Paths (M), and the radiance that they found at one vertex (M, C)."""
 
 
 def reflected_radiance(
@@ -209,7 +181,7 @@ def reflected_radiance(
             f"the environment has {environment.num_colours} colours, the materials have "
             f"{surface.family.num_colours}; they must be the same"
         )
-    world = _World(decoded_once(surface), ray_mesh, environment)
+    world = TracedObject(ray_mesh, environment, decoded_once(surface))
     device, num_points = to_eye.device, len(to_eye)
     numbers = _SamplePoints.draw(num_points, samples, bounces + 1, generator, device)
     vertices = _first_vertices(world, points, to_eye, samples)
@@ -217,42 +189,36 @@ def reflected_radiance(
     for depth in range(bounces + 1):
         drawn = numbers.of(vertices.paths, depth)
         lights, vertices = _shade(world, vertices, drawn, is_last=depth == bounces)
-        for light in lights:
-            radiance = radiance.index_add(0, light.paths // samples, light.radiance)
+        for paths, found in lights:
+            radiance = radiance.index_add(0, paths // samples, found)
     return radiance / samples
 
 
-def _first_vertices(world: _World, points: SurfacePoints, to_eye: Tensor, samples: int) -> _Vertices:
+def _first_vertices(world: TracedObject, points: SurfacePoints, to_eye: Tensor, samples: int) -> _Vertices:
     # Materials are looked up once a point, not once a sample.
-    parameters = world.surface.parameters(points.positions)
-    axes = frames(points.normals)
+    parameters, axes = world.surface.parameters(points.positions), frames(points.normals)
     wo = to_local(axes, to_eye)
     rows = torch.arange(len(to_eye), device=to_eye.device).repeat_interleave(samples)
-    return _Vertices(
-        torch.arange(len(rows), device=to_eye.device),
-        points.select(rows),
-        axes[rows],
-        wo[rows],
-        parameters[rows],
-        torch.ones(len(rows), world.environment.num_colours, device=to_eye.device),
-    )
+    throughput = torch.ones(len(rows), world.environment.num_colours, device=to_eye.device)
+    paths = torch.arange(len(rows), device=to_eye.device)
+    return _Vertices(paths, points.select(rows), axes[rows], wo[rows], parameters[rows], throughput)
 
 
 def _shade(
-    world: _World, vertices: _Vertices, drawn: Float[Tensor, "M D"], is_last: bool
+    world: TracedObject, vertices: _Vertices, drawn: Float[Tensor, "M D"], is_last: bool
 ) -> tuple[list[_Light], _Vertices]:
     """Direct light at vertices by both strategies, and the vertices that the paths reach next."""
     light = _light_by_environment(world, vertices, drawn[:, :2])
     wi = world.surface.family.sample(vertices.parameters.detach(), vertices.wo, drawn[:, 2:].float())
     directions = to_world(vertices.axes, wi)
     rows = vertices.front(directions, wi[:, 2]).nonzero()[:, 0]
-    vertices, wi, directions = _select(vertices, rows), wi[rows], directions[rows]
+    vertices, wi, directions = vertices.select(rows), wi[rows], directions[rows]
     if is_last:
         free = ~world.ray_mesh.blocked(vertices.points.positions, directions)
         rows = free.nonzero()[:, 0]
-        carried, density = _carried(world, _select(vertices, rows), wi[rows])
+        carried, density = _carried(world, vertices.select(rows), wi[rows])
         escaped = _light_by_material(world, vertices.paths[rows], directions[rows], carried, density)
-        return [light, escaped], _select(vertices, rows[:0])
+        return [light, escaped], vertices.select(rows[:0])
     hits = world.ray_mesh.closest(vertices.points.positions, directions)
     carried, density = _carried(world, vertices, wi)
     free, met = (~hits.found).nonzero()[:, 0], hits.found.nonzero()[:, 0]
@@ -261,23 +227,23 @@ def _shade(
     return [light, escaped], reached
 
 
-def _light_by_environment(world: _World, vertices: _Vertices, drawn: Float[Tensor, "M 2"]) -> _Light:
+def _light_by_environment(world: TracedObject, vertices: _Vertices, drawn: Float[Tensor, "M 2"]) -> _Light:
     """Direct light from directions that the environment draws."""
     directions, density = world.environment.sample(drawn)
     cosines = (directions * vertices.points.normals).sum(dim=-1)
     rows = (vertices.front(directions, cosines) & (density > 0)).nonzero()[:, 0]
     rows = rows[~world.ray_mesh.blocked(vertices.points.positions[rows], directions[rows])]
-    vertices, directions, density = _select(vertices, rows), directions[rows], density[rows]
+    vertices, directions, density = vertices.select(rows), directions[rows], density[rows]
     family, wi = world.surface.family, to_local(vertices.axes, directions)
     reflectance = family.evaluate(vertices.parameters, wi, vertices.wo)
     other = family.density(vertices.parameters.detach(), wi, vertices.wo)
     factor = (cosines[rows] * _power_heuristic(density, other) / density)[:, None]
     radiance = world.environment.radiance(directions)
-    return _Light(vertices.paths, vertices.throughput * reflectance * (factor * radiance))
+    return vertices.paths, vertices.throughput * reflectance * (factor * radiance)
 
 
 def _carried(
-    world: _World, vertices: _Vertices, wi: Float[Tensor, "M 3"]
+    world: TracedObject, vertices: _Vertices, wi: Float[Tensor, "M 3"]
 ) -> tuple[Float[Tensor, "M C"], Float[Tensor, " M"]]:
     """Throughput behind a reflection into directions that the material drew, and their density."""
     family = world.surface.family
@@ -289,30 +255,20 @@ def _carried(
 
 
 def _light_by_material(
-    world: _World, paths: Tensor, directions: Tensor, carried: Tensor, density: Tensor
+    world: TracedObject, paths: Tensor, directions: Tensor, carried: Tensor, density: Tensor
 ) -> _Light:
     """Direct light of paths that leave the scene in directions that the material drew."""
     weight = _power_heuristic(density, world.environment.density(directions))
-    return _Light(paths, carried * (weight[:, None] * world.environment.radiance(directions)))
+    return paths, carried * (weight[:, None] * world.environment.radiance(directions))
 
 
-def _reached(world: _World, paths: Tensor, hits: Hits, directions: Tensor, carried: Tensor) -> _Vertices:
+def _reached(
+    world: TracedObject, paths: Tensor, hits: Hits, directions: Tensor, carried: Tensor
+) -> _Vertices:
     """The next vertices of paths that met the mesh."""
     points = world.ray_mesh.points(hits, directions)
-    axes = frames(points.normals)
-    parameters = world.surface.parameters(points.positions)
+    axes, parameters = frames(points.normals), world.surface.parameters(points.positions)
     return _Vertices(paths, points, axes, to_local(axes, -directions), parameters, carried)
-
-
-def _select(vertices: _Vertices, rows: Int[Tensor, " M"]) -> _Vertices:
-    return _Vertices(
-        vertices.paths[rows],
-        vertices.points.select(rows),
-        vertices.axes[rows],
-        vertices.wo[rows],
-        vertices.parameters[rows],
-        vertices.throughput[rows],
-    )
 
 
 def _power_heuristic(chosen: Float[Tensor, " M"], other: Float[Tensor, " M"]) -> Float[Tensor, " M"]:
@@ -320,10 +276,6 @@ def _power_heuristic(chosen: Float[Tensor, " M"], other: Float[Tensor, " M"]) ->
     # By the ratio, since squares of the densities of sharp lobes overflow.
     ratio = other / chosen
     return torch.where(torch.isfinite(ratio), 1 / (1 + ratio * ratio), 0.0)
-
-
-NUMBERS_A_VERTEX = 5
-"""Two for the environment, three for the material."""
 
 
 @dataclass(frozen=True)
@@ -337,11 +289,7 @@ class _SamplePoints:
 
     @staticmethod
     def draw(
-        num_points: int,
-        samples: int,
-        vertices: int,
-        generator: torch.Generator | None,
-        device: torch.device,
+        num_points: int, samples: int, vertices: int, generator: torch.Generator | None, device: torch.device
     ) -> _SamplePoints:
         """Numbers for paths of so many vertices.
 
@@ -350,7 +298,7 @@ class _SamplePoints:
         """
         if samples < 1:
             raise ValueError(f"samples must be at least 1; got {samples}")
-        dimensions = NUMBERS_A_VERTEX * vertices
+        dimensions = _NUMBERS_A_VERTEX * vertices
         sequence = torch.quasirandom.SobolEngine(dimensions).draw(samples, dtype=torch.float64)
         shifts = torch.rand(num_points, dimensions, generator=generator, dtype=torch.float64, device=device)
         return _SamplePoints(sequence.to(device), shifts)
@@ -358,14 +306,10 @@ class _SamplePoints:
     def of(self, paths: Int[Tensor, " M"], vertex: int) -> Float[Tensor, "M 5"]:
         """Numbers of a vertex of paths; path p is sample p % S of point p // S."""
         samples = len(self.sequence)
-        part = slice(NUMBERS_A_VERTEX * vertex, NUMBERS_A_VERTEX * (vertex + 1))
+        part = slice(_NUMBERS_A_VERTEX * vertex, _NUMBERS_A_VERTEX * (vertex + 1))
         moved = self.sequence[:, part][paths % samples] + self.shifts[:, part][paths // samples]
         # Rounding to float32 later must not reach 1.
         return (moved - moved.floor()).clamp(max=1 - 2.0**-24)
-
-
-_PATHS_AT_ONCE = 1 << 18
-"""Paths of one call, which bounds the memory."""
 
 
 def render_view(
@@ -398,7 +342,12 @@ def render_view(
     )
     image, alpha = hits.image(radiance), hits.alpha()
     if background == "environment":
-        image = image + _background(ray_mesh, environment, cameras, index, subpixels)
+        missing = torch.zeros(alpha.numel(), environment.num_colours, device=ray_mesh.device)
+        for offset in subpixel_offsets(subpixels):
+            rays = cameras.to(ray_mesh.device).image_rays(index, offset)
+            missed = ~ray_mesh.blocked(rays.origins, rays.directions)
+            missing[missed] += environment.radiance(rays.directions[missed])
+        image = image + (missing / subpixels**2).reshape(image.shape)
     return image, alpha
 
 
@@ -429,18 +378,4 @@ def rays_radiance(
         )
         for part in rows
     ]
-    colours = environment.num_colours
-    return torch.cat(parts) if parts else torch.zeros(0, colours, device=ray_mesh.device)
-
-
-def _background(
-    ray_mesh: RayMesh, environment: Environment, cameras: Cameras, index: int, subpixels: int
-) -> Float[Tensor, "H W C"]:
-    """Radiance of the environment where rays miss the mesh, as a mean over each pixel's rays."""
-    width, height = cameras.size(index)
-    total = torch.zeros(height * width, environment.num_colours, device=ray_mesh.device)
-    for offset in subpixel_offsets(subpixels):
-        rays = cameras.to(ray_mesh.device).image_rays(index, offset)
-        missed = ~ray_mesh.blocked(rays.origins, rays.directions)
-        total[missed] += environment.radiance(rays.directions[missed])
-    return (total / subpixels**2).reshape(height, width, -1)
+    return torch.cat(parts) if parts else torch.zeros(0, environment.num_colours, device=ray_mesh.device)

@@ -1,0 +1,243 @@
+"""A material on a mesh as files: textures, a textured mesh, all parameters, and a report of what is what.
+
+Notation: `S x S` texels, `T` of them in charts, `C` channels, `N` points, `P` parameters, `K` endmembers, `B` bands.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from unmix_plugin.formats.exr import write_exr
+from unmix_plugin.formats.files import make_folder, rgba_png_bytes, write_file
+from unmix_plugin.formats.meshes import TexturedMesh, write_textured_glb
+from unmix_plugin.neumatex.export.atlas import BakedMaterial, bake
+from unmix_plugin.neumatex.export.pbr_fit import PbrFit, fit_pbr
+from unmix_plugin.neumatex.export.shader import shader_paths, write_shader
+from unmix_plugin.neumatex.tracing.families import MaterialFamily, SpectralFamily
+from unmix_plugin.neumatex.tracing.mesh import Mesh
+from unmix_plugin.neumatex.tracing.neural import NeuralFamily
+from unmix_plugin.neumatex.tracing.surface import Surface
+from unmix_plugin.scenes.scene import Normalisation
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
+from unmix_plugin.spectral.materials import default_names
+from unmix_plugin.trained.run_views import directions_to_world, positions_for_files
+
+_TEXTURES = ("base_colour", "gltf_base_colour", "gltf_metallic_roughness")
+_NEURAL_TEXTURES = ("diffuse_colour", "latents_a", "latents_b")
+_COLOURS = ("red", "green", "blue")
+
+
+@dataclass(frozen=True)
+class _Texture:
+    """One texture, written as a picture of 8 bits and as numbers."""
+
+    name: str
+    """Of its files."""
+    values: Tensor
+    """(T, 3), [0, 1]."""
+    channels: tuple[str, str, str]
+    """What red, green and blue are."""
+    is_colour: bool
+    """Whether the picture is encoded as sRGB: linear numbers stay so in it otherwise."""
+
+
+def material_paths(folder: Path, family: MaterialFamily) -> list[Path]:
+    """Files that `write_material` makes."""
+    own = _NEURAL_TEXTURES if isinstance(family, NeuralFamily) else ()
+    single = [folder / name for name in ("parameters.exr", "material.glb", "material.json")]
+    paths = [path for name in (*_TEXTURES, *own) for path in _texture_paths(folder, name)] + single
+    if isinstance(family, SpectralFamily):
+        return [*paths, *_spectral_paths(folder)]
+    return [*paths, *shader_paths(folder)] if isinstance(family, NeuralFamily) else paths
+
+
+def write_material(
+    folder: Path,
+    mesh: Mesh,
+    surface: Surface,
+    frame: Normalisation,
+    texture_size: int,
+    seed: int = 0,
+    bands: Bands | None = None,
+) -> tuple[list[Path], float]:
+    """Write a material on a mesh.
+
+    Args:
+        folder: Where to write; it is made.
+        mesh: Model space.
+        surface: Its materials.
+        frame: From the world to model space; files are in the world.
+        texture_size: Width and height of the textures, texels.
+        seed: Of the fit of the glTF material.
+        bands: Of a spectral material.
+    Returns:
+        The files, and the mean error of the glTF material as a part of the reflected light.
+    Raises:
+        ConfigError: xatlas is not installed, or the mesh does not fit into the texture.
+        RunError: the disk is full or refuses.
+    """
+    family, baked = surface.family, bake(mesh, surface, texture_size)
+    seen = family
+    if isinstance(family, SpectralFamily) and bands is not None:
+        family = SpectralFamily(family.endmembers.detach().cpu())  # where the baked parameters are
+        seen = _InColours(family, bands)
+    fit = fit_pbr(seen, baked.parameters, torch.Generator().manual_seed(seed))
+    textures = _textures_of(seen, baked.parameters, fit.parameters)
+    written, pictures = [], {}
+    for texture in textures:
+        paths, pictures[texture.name] = _write_texture(folder, baked, texture)
+        written += paths
+    numbers = tuple(f"parameter {index}" for index in range(family.num_parameters))
+    names = tuple(getattr(family, "PARAMETERS", numbers))
+    about = "parameters of the material, 0 to 1, linear"
+    written.append(_write_channels(folder / "parameters.exr", baked, baked.parameters, names, about))
+    shown = (pictures["gltf_base_colour"], pictures["gltf_metallic_roughness"])
+    written.append(_write_glb(folder / "material.glb", mesh, baked, frame, shown))
+    report = _report_bytes(baked, type(family).__name__, names, fit, textures)
+    written.append(write_file(folder / "material.json", report))
+    if isinstance(family, NeuralFamily):
+        written += write_shader(folder, family)
+    if isinstance(family, SpectralFamily) and bands is not None:
+        written += _write_spectral_files(folder, baked, family, bands)
+    return written, fit.mean_error
+
+
+def _textures_of(
+    family: MaterialFamily, parameters: Float[Tensor, "T P"], fitted: Float[Tensor, "T 5"]
+) -> list[_Texture]:
+    """The textures of a material and of its glTF approximation."""
+    roughness, metallicity = fitted[:, 3], fitted[:, 4]
+    unused = torch.ones_like(roughness)  # red may hold occlusion: nothing is hidden
+    surface = torch.stack([unused, roughness, metallicity], dim=1)
+    textures = [
+        _Texture("base_colour", family.base_colour(parameters), _COLOURS, True),
+        _Texture("gltf_base_colour", fitted[:, :3], _COLOURS, True),
+        _Texture("gltf_metallic_roughness", surface, ("1", "roughness", "metallicity"), False),
+    ]
+    if isinstance(family, NeuralFamily):
+        textures.append(_Texture("diffuse_colour", family.diffuse_colour(parameters), _COLOURS, True))
+        for letter, first in (("a", 0), ("b", 3)):
+            channels = (f"latent {first + 1}", f"latent {first + 2}", f"latent {first + 3}")
+            values = parameters[:, 3 + first : 6 + first]
+            textures.append(_Texture(f"latents_{letter}", values, channels, False))
+    return textures
+
+
+def _texture_paths(folder: Path, name: str) -> list[Path]:
+    return [folder / f"{name}.png", folder / f"{name}.exr"]
+
+
+def _write_texture(folder: Path, baked: BakedMaterial, texture: _Texture) -> tuple[list[Path], bytes]:
+    """Write a texture as PNG and as OpenEXR (float32); gives the bytes of the PNG, too."""
+    picture_path, numbers_path = _texture_paths(make_folder(folder), texture.name)
+    numbers = baked.texture(texture.values)
+    shown = linear_to_srgb(torch.from_numpy(numbers)).numpy() if texture.is_colour else numbers
+    channels = ", ".join(texture.channels)
+    description = f"{texture.name}: {channels}; {'sRGB' if texture.is_colour else 'linear'}"
+    picture = rgba_png_bytes(np.round(255 * shown.clip(0, 1)).astype(np.uint8), description)
+    write_file(picture_path, picture)
+    planes = {name: numbers[..., index] for index, name in enumerate("RGB")}
+    write_exr(numbers_path, planes, {"comments": f"{channels}; linear"})
+    return [picture_path, numbers_path], picture
+
+
+def _write_channels(
+    path: Path, baked: BakedMaterial, values: Tensor, names: Sequence[str], about: str
+) -> Path:
+    """Numbers of texels as one OpenEXR image, a channel each; readers get channels in the order of their names."""
+    numbers = baked.texture(values)
+    channels = {f"{index:02d} {name}": numbers[..., index] for index, name in enumerate(names)}
+    return write_exr(path, channels, {"comments": about})
+
+
+def _write_glb(
+    path: Path, mesh: Mesh, baked: BakedMaterial, frame: Normalisation, pictures: tuple[bytes, bytes]
+) -> Path:
+    """Write the mesh in world coordinates with base colour (sRGB) and metallic-roughness pictures."""
+    chosen = baked.atlas.vertices
+    world = positions_for_files(frame.to_world(mesh.vertices.cpu().double().numpy()))[chosen]
+    extras: dict[str, Any] = {"about": "metallic-roughness approximation of a neumatex run"}
+    if world.dtype == np.float64:  # glTF has float32 only
+        extras["offset"] = np.round(world.mean(axis=0)).tolist()
+        world = world - extras["offset"]
+    normals = directions_to_world(frame, mesh.normals.cpu().double().numpy())[chosen]
+    geometry = (world.astype(np.float32), normals.astype(np.float32), baked.atlas.uv, baked.atlas.faces)
+    return write_textured_glb(path, TexturedMesh(*geometry, *pictures), extras)
+
+
+def _report_bytes(
+    baked: BakedMaterial, family_name: str, names: Sequence[str], fit: PbrFit, textures: Sequence[_Texture]
+) -> bytes:
+    """What the other files are, as JSON."""
+    content = {
+        "version": 1,
+        "texture_size": baked.texels.size,
+        "texels_in_charts": len(baked.texels.places),
+        "triangles": len(baked.atlas.faces),
+        "vertices": len(baked.atlas.uv),
+        "family": family_name,
+        "parameters": list(names),
+        "texture_coordinates": "u to the right, v downwards, as in glTF: the first row of a picture is v = 0",
+        "textures": {
+            one.name: {
+                "png": f"8 bits, {'sRGB' if one.is_colour else 'linear'}",
+                "exr": "float32, linear",
+                "channels": list(one.channels),
+                "mean": [round(value, 6) for value in one.values.double().mean(dim=0).tolist()],
+            }
+            for one in textures
+        },
+        "gltf": {
+            "model": "metallic-roughness (glTF 2.0, appendix B)",
+            "mean_error_of_reflected_light": round(fit.mean_error, 6),
+        },
+    }
+    return json.dumps(content, indent=1).encode()
+
+
+class _InColours:
+    """A spectral family as an eye sees it in light of a flat spectrum: the same materials in three colours."""
+
+    num_colours = 3
+
+    def __init__(self, family: SpectralFamily, bands: Bands) -> None:
+        self._family = family
+        self._matrix = rgb_matrix(bands).to(family.endmembers)
+        self.num_parameters = family.num_parameters
+        self.sample, self.density = family.sample, family.density
+
+    def evaluate(
+        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N 3"]:
+        return (self._family.evaluate(parameters, wi, wo) @ self._matrix).clamp(min=0)
+
+    def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N 3"]:
+        return (self._family.base_colour(parameters) @ self._matrix).clamp(0, 1)
+
+
+def _spectral_paths(folder: Path) -> list[Path]:
+    return [folder / "abundances.exr", folder / "endmembers.csv"]
+
+
+def _write_spectral_files(
+    folder: Path, baked: BakedMaterial, family: SpectralFamily, bands: Bands
+) -> list[Path]:
+    """Write abundances as one texture, a channel an endmember, and the endmembers' reflectances."""
+    textures, table = _spectral_paths(folder)
+    names = default_names(family.num_endmembers)
+    about = "shares of the endmembers of endmembers.csv; linear"
+    _write_channels(textures, baked, family.abundances(baked.parameters), names, about)
+    reflectances = family.endmembers.detach().to("cpu", torch.float64).numpy()
+    write_spectra_csv(table, SpectraTable(bands, names, reflectances))
+    return [textures, table]
