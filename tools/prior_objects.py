@@ -33,6 +33,8 @@ from unmix_plugin.neumatex.tracing.surface import Surface
 
 _WAVES = 12
 _INDEX = {name: index for index, name in enumerate(LayeredFamily.PARAMETERS)}
+_FIRST_DEMO_SEED = 10_000_000
+"""Of the built-in objects that training objects are like; those of smaller seeds are never seen in training."""
 
 
 def random_materials(count: int, generator: torch.Generator) -> Float[Tensor, "M P"]:
@@ -194,10 +196,6 @@ def _deformed(points: Tensor, generator: torch.Generator) -> Tensor:
 def _random_rotation(generator: torch.Generator) -> Tensor:
     rotation, _ = torch.linalg.qr(torch.randn(3, 3, generator=generator))
     return rotation * torch.linalg.det(rotation)
-
-
-_FIRST_DEMO_SEED = 10_000_000
-"""Of the built-in objects that training objects are like; those of smaller seeds are never seen in training."""
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,14 @@ from unmix_plugin.neumatex.prior.small import (
 from unmix_plugin.neumatex.tracing.neural import NeuralFamily
 from unmix_plugin.neumatex.tracing.surface import NUM_CHANNELS
 
+Truth = dict[TaskName, Tensor]
+"""What is to be learnt of each task, B x N x P."""
+_PBR_COLUMNS = [0, 1, 2, 4, 3]
+"""Base colour, roughness and metallicity among the parameters of `LayeredFamily`."""
+_DESCRIBED = {6: [7], 8: [9, 10], 11: [12]}
+"""Weights of coat, sheen and haze, and the parameters that describe these layers."""
+_OBJECTS_A_FILE = 50
+
 
 def beta_nll(
     predicted: Float[Tensor, "*n P"],
@@ -65,15 +73,6 @@ def beta_nll(
     """
     likelihood = 0.5 * ((predicted - target).square() * torch.exp(-log_variance) + log_variance)
     return (likelihood * torch.exp(beta * log_variance.detach())).mean()
-
-
-Truth = dict[TaskName, Tensor]
-"""What is to be learnt of each task, B x N x P."""
-_PBR_COLUMNS = [0, 1, 2, 4, 3]
-"""Base colour, roughness and metallicity among the parameters of `LayeredFamily`."""
-
-_DESCRIBED = {6: [7], 8: [9, 10], 11: [12]}
-"""Weights of coat, sheen and haze, and the parameters that describe these layers."""
 
 
 @dataclass(frozen=True)
@@ -258,9 +257,6 @@ def what_is_said(
     """What the prior says of points, or the truth with the prior's log-variances."""
     parameters, log_variance = prior.estimate(prior(objects.observations), material)
     return Estimates(objects.observations.positions, truth if use_truth else parameters, log_variance)
-
-
-_OBJECTS_A_FILE = 50
 
 
 def write_small_prior(folder: Path, prior: SmallPrior, record: dict[str, Any]) -> None:

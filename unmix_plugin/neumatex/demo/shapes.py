@@ -1,10 +1,6 @@
-"""Smooth random functions of position.
+"""Procedural meshes: zero levels of smooth random functions, closed and without holes in the surface.
 
-Notation: `N` positions, `F` waves.
-
-Procedural meshes: zero levels of random functions, closed and without holes in the surface.
-
-Notation: `N` points, `R` samples along the longest edge of the bounding cube.
+Notation: `N` points, `F` waves of a noise, `R` samples along the longest edge of the bounding cube.
 """
 
 from __future__ import annotations
@@ -19,6 +15,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.neumatex.tracing.mesh import Mesh, mesh_of
+
+Field: TypeAlias = Callable[[Float[np.ndarray, "N 3"]], Float[np.ndarray, " N"]]
+"""About the distance to a surface, negative inside."""
+_HALF_EDGE = 1.4
+"""Of the cube that is sampled."""
 
 
 @dataclass(frozen=True)
@@ -42,13 +43,6 @@ class Noise:
         """Values at positions."""
         angles = positions @ self.waves.to(positions).T + self.phases.to(positions)
         return angles.cos().sum(dim=-1) * (2 / len(self.phases)) ** 0.5
-
-
-Field: TypeAlias = Callable[[Float[np.ndarray, "N 3"]], Float[np.ndarray, " N"]]
-"""About the distance to a surface, negative inside."""
-
-_HALF_EDGE = 1.4
-"""Of the cube that is sampled."""
 
 
 def demo_mesh(seed: int, resolution: int = 96) -> Mesh:

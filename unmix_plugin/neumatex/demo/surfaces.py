@@ -1,10 +1,6 @@
-"""Surfaces of layered materials that vary over an object: regions, and a pattern in each of them.
+"""Surfaces of built-in objects: layered materials in regions, and measured materials that mix smoothly.
 
-Notation: `N` positions, `K` materials, `P` parameters of `LayeredFamily`.
-
-A surface of a few measured materials that mix smoothly, under a gloss that each material has its own of.
-
-Notation: `N` positions, `K` materials, `B` bands, `P` parameters of `SpectralFamily`.
+Notation: `N` positions, `K` materials, `B` bands, `P` parameters of the family.
 """
 
 from __future__ import annotations
@@ -20,6 +16,9 @@ from torch import Tensor
 from unmix_plugin.neumatex.demo.shapes import Noise
 from unmix_plugin.neumatex.tracing.families import LayeredFamily, SpectralFamily
 from unmix_plugin.scenes.demo.shading import MATERIALS, reflectances
+
+NUM_MATERIALS = 4
+_ROUNDS = 30
 
 
 @dataclass(frozen=True)
@@ -194,10 +193,6 @@ _KINDS: dict[str, Callable[[np.random.Generator], _Pattern]] = {
     "worn metal": _worn_metal,
     "glazed clay": _glazed_clay,
 }
-
-
-NUM_MATERIALS = 4
-_ROUNDS = 30
 
 
 class SpectralSurface:

@@ -1,21 +1,12 @@
-"""Cutting a mesh into charts: connected triangles that face about the same way, each seen flat along an axis.
+"""Texture coordinates, and the material of every texel.
 
-Cutting by direction takes time proportional to the triangles and can't fail; no length in a chart shrinks below half.
+A mesh is cut into charts, connected triangles that face about the same way, each seen flat along an axis; xatlas packs
+them side by side into the unit square. Cutting by direction takes time proportional to the triangles and can't fail; no
+length in a chart shrinks below half.
 
-Notation: `V` vertices, `F` triangles.
-
-Texture coordinates: a mesh cut into charts that lie side by side in the unit square.
-
-Notation: `V` vertices of the mesh, `U` of the cut one (a vertex on a seam is there once a chart), `F` triangles.
-
-Which point of a surface each texel shows, and textures filled beyond the charts.
-
-Notation: `T` texels that lie in a chart, `F` triangles, `S x S` texels; texel (row, column) has its centre at
-u = (column + 0.5) / S, v = (row + 0.5) / S.
-
-The material of every texel of an atlas.
-
-Notation: `T` texels in charts, `P` parameters.
+Notation: `V` vertices of the mesh, `U` of the cut one (a vertex on a seam is there once a chart), `F` triangles, `S x
+S` texels, `T` of them in charts, `P` parameters. Texel (row, column) has its centre at u = (column + 0.5) / S,
+v = (row + 0.5) / S.
 """
 
 from __future__ import annotations
@@ -43,6 +34,14 @@ _LEAST_COSINE = 0.3
 
 _SMALL = 24
 """Triangles of a chart that had better join another one."""
+_PADDING = 4
+"""Texels between charts, so that linear interpolation and two levels of smaller copies don't mix them."""
+_TRIES = 6
+_CHUNK = 1 << 21
+"""Texels of bounding boxes that are looked at together."""
+_EDGE = 1e-6
+"""Barycentric weight down to which a texel on an edge counts as inside."""
+_CHUNK_BAKING = 1 << 17
 
 
 def _chart_labels(
@@ -117,12 +116,6 @@ def _components(axes: np.ndarray, links: Any) -> tuple[np.ndarray, np.ndarray]:
     return charts, np.bincount(charts)
 
 
-_PADDING = 4
-"""Texels between charts, so that linear interpolation and two levels of smaller copies don't mix them."""
-
-_TRIES = 6
-
-
 @dataclass(frozen=True)
 class _Atlas:
     """A mesh cut open."""
@@ -186,13 +179,6 @@ def _packed(flat: np.ndarray, cut: np.ndarray, charts: np.ndarray, texture_size:
         f"the {charts.max() + 1} charts of {len(cut)} triangles don't fit into a texture of {texture_size} x "
         f"{texture_size}; choose a larger --texture-size or simplify the mesh"
     )
-
-
-_CHUNK = 1 << 21
-"""Texels of bounding boxes that are looked at together."""
-
-_EDGE = 1e-6
-"""Barycentric weight down to which a texel on an edge counts as inside."""
 
 
 @dataclass(frozen=True)
@@ -272,9 +258,6 @@ def _barycentric(corners: Float[np.ndarray, "N 3 2"], points: Int[np.ndarray, "N
     third = (ab[:, 0] * ap[:, 1] - ab[:, 1] * ap[:, 0]) / safe
     weights = np.stack([1 - second - third, second, third], axis=1)
     return np.where(is_flat[:, None], -1.0, weights)
-
-
-_CHUNK_BAKING = 1 << 17
 
 
 @dataclass(frozen=True)

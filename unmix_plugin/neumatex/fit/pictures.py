@@ -1,8 +1,5 @@
-"""One picture of an object: 8-bit pictures, OpenEXR with linear light, .npy cubes.
-
-Notation: `H x W` pixels, `C` colours or bands.
-
-Pictures of an object with their cameras: what a transforms.json lists.
+"""Pictures of an object with their cameras, as a transforms.json lists them: 8-bit pictures, OpenEXR with linear light,
+.npy cubes.
 
 Notation: `N` pictures of `H x W` pixels, `C` colours or bands.
 """

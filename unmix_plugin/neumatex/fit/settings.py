@@ -19,6 +19,11 @@ from unmix_plugin.spectral.unmixing.endmembers import EndmemberMethod
 if TYPE_CHECKING:
     from unmix_plugin.neumatex.fit.object_scene import ObjectScene
 
+Auto = Literal["auto"]
+PriorName = Literal["small", "none"]
+MaterialName = Literal["neural", "pbr", "spectral"]
+"""Families that can be trained."""
+
 
 @dataclass(frozen=True)
 class ObjectRecord:
@@ -95,12 +100,6 @@ class ObjectRecord:
                 f"{len(record.wavelengths_nm)} and {len(record.lamp)}"
             )
         return record
-
-
-Auto = Literal["auto"]
-PriorName = Literal["small", "none"]
-MaterialName = Literal["neural", "pbr", "spectral"]
-"""Families that can be trained."""
 
 
 def _model() -> type[Model]:

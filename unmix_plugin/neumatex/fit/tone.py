@@ -1,19 +1,12 @@
-"""A camera's response, learnt with the materials: how the numbers of its pictures grow with light.
+"""From linear light to the numbers of a picture, and to numbers that are compared or shown.
 
-The response is given by the logarithm of its slope, which is a mean and a few principal components. So whatever the
-coefficients are, it increases from 0 to 1. The components come from a family of curves made here (powers, logarithms,
-S-shaped ones), since the measured curves of Grossberg and Nayar (2004, EMoR) can't be shipped with this package.
+A camera's response is learnt with the materials. It is given by the logarithm of its slope, which is a mean and a few
+principal components; so whatever the coefficients are, it increases from 0 to 1. The components come from a family of
+curves made here (powers, logarithms, S-shaped ones), since the measured curves of Grossberg and Nayar (2004, EMoR)
+can't be shipped with this package.
 
-Notation: `S` steps of the curve, `F` curves of the family, `K` coefficients.
-
-Tone curves by name: what a picture's numbers are of linear light.
-
-Notation: `C` colours, 3 or the bands of a sensor. Light is linear and at least 0; what a curve gives is a picture's
-numbers in [0, 1].
-
-Spectra as numbers that are compared or shown.
-
-Notation: `B` bands.
+Notation: `C` colours, 3 or the bands of a sensor, `B` bands. Light is linear and at least 0; what a curve gives is a
+picture's numbers in [0, 1]. `S` steps of the response, `F` curves of the family, `K` coefficients.
 """
 
 from __future__ import annotations
@@ -33,6 +26,12 @@ NUM_STEPS = 256
 NUM_COEFFICIENTS = 6
 MAX_STOPS = 8.0
 """Exposure that can be learnt, either way."""
+ToneMapping = Literal["linear", "srgb", "agx", "camera"]
+"""How pictures were made of light: `linear` is light itself, `camera` an unknown response."""
+LightCurve = Literal["agx", "srgb", "linear"]
+"""Through which pictures of light can be compared."""
+_DARK = 0.25
+"""Brightness, as a part of the mean, far below which pixels count alike."""
 
 
 class _CameraResponse(nn.Module):
@@ -94,11 +93,7 @@ def _curve_family() -> Float[Tensor, "F S_plus_1"]:
     return torch.stack([*powers, *logs, *shaped])
 
 
-ToneMapping = Literal["linear", "srgb", "agx", "camera"]
-"""How pictures were made of light: `linear` is light itself, `camera` an unknown response."""
 TONE_MAPPINGS: tuple[ToneMapping, ...] = get_args(ToneMapping)
-LightCurve = Literal["agx", "srgb", "linear"]
-"""Through which pictures of light can be compared."""
 
 
 class _Linear(nn.Module):
@@ -141,10 +136,6 @@ def tone_curve(name: ToneMapping) -> nn.Module:
 def psnr_db(squared_error: Float[Tensor, "*pixels"]) -> Float[Tensor, ""]:
     """Peak signal to noise ratio for a peak of 1; at most 120 dB, nan without pixels."""
     return -10 * torch.log10(squared_error.mean().clamp(min=1e-12))
-
-
-_DARK = 0.25
-"""Brightness, as a part of the mean, far below which pixels count alike."""
 
 
 class LampRatio(nn.Module):

@@ -25,6 +25,20 @@ from unmix_plugin.neumatex.tracing.mesh import Mesh
 from unmix_plugin.neumatex.tracing.rays import RayMesh, SurfacePoints
 from unmix_plugin.neumatex.tracing.surface import encode
 
+SHARPNESSES = (128.0, 20.0, 4.0)
+"""Of the blurred lobes exp(k cos): about what GGX of roughness 0.25, 0.4 and 0.6 reflects."""
+_MIRROR_ROWS = 64
+_BLURRED_ROWS = 32
+_LEAST_COSINE = 0.08
+"""Views that graze a point more than this say little of it."""
+_OFF_SURFACE = 2e-5
+"""Distance from the surface at which rays start, model units."""
+_SHADOW_RAYS = 32
+_BRIGHTEST = 8.0
+"""Light above this is cut: a sample of a path tracer or a clipped picture says no more."""
+_RIDGE = 0.02
+"""Variance that is added to that of the light in a fit, so that light that hardly varies explains little."""
+
 
 @dataclass(frozen=True)
 class PosedViews:
@@ -70,12 +84,8 @@ def well_spread(positions: Float[Tensor, "V 3"], count: int) -> list[int]:
     return sorted(chosen)
 
 
-SHARPNESSES = (128.0, 20.0, 4.0)
-"""Of the blurred lobes exp(k cos): about what GGX of roughness 0.25, 0.4 and 0.6 reflects."""
 NUM_LOBES = 1 + len(SHARPNESSES)
 """K: the nearly unblurred light and the blurred lobes."""
-_MIRROR_ROWS = 64
-_BLURRED_ROWS = 32
 
 
 @dataclass(frozen=True)
@@ -116,13 +126,6 @@ def _shrunk(environment: Environment, rows: int) -> Float[Tensor, "H W C"]:
     """Means of an environment's radiance over larger pixels."""
     picture = (environment.image.float() * 2.0**environment.exposure_stops).permute(2, 0, 1)
     return functional.adaptive_avg_pool2d(picture, (rows, 2 * rows)).permute(1, 2, 0)
-
-
-_LEAST_COSINE = 0.08
-"""Views that graze a point more than this say little of it."""
-_OFF_SURFACE = 2e-5
-"""Distance from the surface at which rays start, model units."""
-_SHADOW_RAYS = 32
 
 
 @dataclass(frozen=True)
@@ -217,10 +220,6 @@ def _unshadowed(
 
 NUM_VIEW_FEATURES = 3 + 3 * NUM_LOBES + 3 + 3 + 3
 NUM_POINT_FEATURES = 3 + 3 + 1 + 3 + 18 + 7 * NUM_LOBES
-_BRIGHTEST = 8.0
-"""Light above this is cut: a sample of a path tracer or a clipped picture says no more."""
-_RIDGE = 0.02
-"""Variance that is added to that of the light in a fit, so that light that hardly varies explains little."""
 
 
 def view_features(

@@ -55,6 +55,7 @@ WAN_1_3B: Mapping[str, Any] = {
     "freq_dim": 256,
 }
 """Configuration of the transformer of Wan2.1-T2V-1.3B; the autoencoder's is diffusers' default."""
+_NULL_TEXT = "null_text.safetensors"
 
 
 class WanPrior(nn.Module):
@@ -169,9 +170,6 @@ def diffusers_models() -> tuple[type[WanTransformer3DModel], type[AutoencoderKLW
             "the large prior needs diffusers, which is not installed; pip install 'unmix-nerf[lmrm]'"
         ) from error
     return WanTransformer3DModel, AutoencoderKLWan
-
-
-_NULL_TEXT = "null_text.safetensors"
 
 
 def read_wan_prior(folder: Path, num_parameters: int) -> WanPrior:

@@ -4,12 +4,6 @@ Directions are unit vectors in the scene's world, +z up. The picture is Blender'
 atan2(y, x) / 2 pi from left to right, v = acos(z) / pi from top to bottom, pixel centres at half integers.
 
 Notation: `H x W` pixels, `C` colours, `N` directions.
-
-Drawing pixels of a picture in proportion to weights, by inverting the distribution of rows, then of columns.
-
-Numbers that lie close together lead to places that do: evenly spread numbers give evenly spread places.
-
-Notation: `H x W` pixels, `N` draws.
 """
 
 from __future__ import annotations

@@ -1,21 +1,13 @@
-"""Environment maps from OpenEXR and Radiance files, checked.
-
-Notation: `H x W` pixels.
-
-Reading Radiance's RGBE pictures (.hdr).
-
-Source: Ward 1991, Real Pixels, Graphics Gems II; the run-length code of the Radiance file format's documentation.
-
-Notation: `H x W` pixels.
-
-Light for pictures of many bands: a lamp's spectrum, and environments that have a spectrum in every direction.
+"""Light from files: environment maps in colours (OpenEXR, Radiance RGBE) or of wavelengths, and a lamp's spectrum.
 
 An environment in colours says how bright each direction is, not what its spectrum is. With a lamp, every direction has
 the lamp's spectrum times the luminance of its colour: radiance of band b is `Y(direction) lamp_b`, where the lamp's
 greatest band is 1. An environment whose channels are wavelengths needs no lamp; it is brought to the bands by linear
 interpolation.
 
-Notation: `B` bands, `H x W` pixels.
+Notation: `H x W` pixels, `B` bands.
+
+Source: Ward 1991, Real Pixels, Graphics Gems II; the run-length code of the Radiance file format's documentation.
 """
 
 from __future__ import annotations
@@ -37,6 +29,11 @@ from unmix_plugin.spectral.library.spectra_csv import resample_spectra
 
 ENVIRONMENT_SUFFIXES = (".exr", ".hdr")
 """Formats that are read."""
+_NEW_RUNS = (8, 0x7FFF)
+"""Widths, in pixels, that may have the newer run-length code."""
+_LUMINANCE = (0.2126, 0.7152, 0.0722)
+"""Of the sRGB primaries."""
+_FILES = (".csv", ".hdr", ".sli")
 
 
 def read_environment(path: Path, rotation_deg: float = 0.0, exposure_stops: float = 0.0) -> Environment:
@@ -99,10 +96,6 @@ def _check_environment(path: Path, image: np.ndarray) -> None:
         raise SceneError(
             f"{path}: is black everywhere, so nothing would be lit; choose another environment map"
         )
-
-
-_NEW_RUNS = (8, 0x7FFF)
-"""Widths, in pixels, that may have the newer run-length code."""
 
 
 def _read_hdr(path: Path) -> Float32[np.ndarray, "H W 3"]:
@@ -180,11 +173,6 @@ def _read_old_row(data: bytes, start: int, row: np.ndarray) -> int:
             row[column] = pixel
             column, shift = column + 1, 0
     return start
-
-
-_LUMINANCE = (0.2126, 0.7152, 0.0722)
-"""Of the sRGB primaries."""
-_FILES = (".csv", ".hdr", ".sli")
 
 
 def read_lamp(lamp: str, bands: Bands) -> Float64[np.ndarray, " B"]:

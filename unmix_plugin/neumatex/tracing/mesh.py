@@ -1,13 +1,9 @@
-"""A triangle mesh with shading normals.
-
-Notation: `V` vertices, `F` triangles. Triangles are counter-clockwise seen from outside.
-
-Meshes from glTF, OBJ and PLY files, checked.
+"""A triangle mesh with shading normals, read from glTF, OBJ and PLY files and checked.
 
 Coordinates are taken as they are, as those of the cameras' world: a file whose axes were exchanged on export (many
 programs write glTF with +y up) has to be exported without that.
 
-Notation: `V` vertices, `F` triangles.
+Notation: `V` vertices, `F` triangles. Triangles are counter-clockwise seen from outside.
 """
 
 from __future__ import annotations
@@ -22,6 +18,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from unmix_plugin.errors import SceneError
+
+MAX_TRIANGLES = 5_000_000
+"""More are refused: the tree over them and the memory of a training would not fit common machines."""
+MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
+"""Formats that are read."""
+_SMALLEST_FACE = 1e-14
+"""Part of the squared bounding box diagonal; triangles of less area are dropped, since they have no normal."""
 
 
 @dataclass(frozen=True)
@@ -85,16 +88,6 @@ def _area_weighted_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F
     lengths = sums.norm(dim=-1, keepdim=True)
     upwards = sums.new_tensor((0.0, 0.0, 1.0))
     return torch.where(lengths > 1e-30, sums / lengths.clamp(min=1e-30), upwards).float()
-
-
-MAX_TRIANGLES = 5_000_000
-"""More are refused: the tree over them and the memory of a training would not fit common machines."""
-
-MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
-"""Formats that are read."""
-
-_SMALLEST_FACE = 1e-14
-"""Part of the squared bounding box diagonal; triangles of less area are dropped, since they have no normal."""
 
 
 def read_mesh(path: Path, notes: list[str] | None = None) -> Mesh:

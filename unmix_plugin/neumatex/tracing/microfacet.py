@@ -12,6 +12,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+SMALLEST_ALPHA = 0.002
+"""Width of the sharpest lobe; a perfect mirror has no reflectance that could be evaluated."""
+SMALLEST_COSINE = 1e-4
+"""Grazing directions count as this steep in denominators."""
+
 
 def frames(normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3 3"]:
     """Right-handed orthonormal frames; the rows are tangent, bitangent and normal.
@@ -41,12 +46,6 @@ def to_local(frames: Float[Tensor, "N 3 3"], directions: Float[Tensor, "N 3"]) -
 def to_world(frames: Float[Tensor, "N 3 3"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
     """Directions of local frames as seen in the world."""
     return (frames * directions[:, :, None]).sum(-2)
-
-
-SMALLEST_ALPHA = 0.002
-"""Width of the sharpest lobe; a perfect mirror has no reflectance that could be evaluated."""
-SMALLEST_COSINE = 1e-4
-"""Grazing directions count as this steep in denominators."""
 
 
 def alpha_of(roughness: Tensor) -> Tensor:

@@ -44,6 +44,8 @@ _PATHS_AT_ONCE = 1 << 18
 """Paths of one call for a picture, which bounds the memory."""
 _NUMBERS_A_VERTEX = 5
 """Two for the environment, three for the material."""
+_Light = tuple[Tensor, Tensor]
+"""Paths (M), and the radiance that they found at one vertex (M, C)."""
 
 
 @dataclass(frozen=True)
@@ -145,10 +147,6 @@ class _Vertices:
     def select(self, rows: Int[Tensor, " M"]) -> _Vertices:
         others = {name: part[rows] for name, part in vars(self).items() if name != "points"}
         return _Vertices(points=self.points.select(rows), **others)
-
-
-_Light = tuple[Tensor, Tensor]
-"""Paths (M), and the radiance that they found at one vertex (M, C)."""
 
 
 def reflected_radiance(

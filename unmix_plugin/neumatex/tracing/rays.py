@@ -1,17 +1,14 @@
-"""Rays against a triangle mesh: closest hits, occlusion, and surface points that new rays can start from.
-
-Notation: `N` rays. A ray's direction has unit length, so that distances are in the mesh's unit.
-
-Where the rays of a camera's pixels meet a mesh.
+"""Rays against a triangle mesh: closest hits, occlusion, surface points that new rays can start from, and pixels.
 
 A pixel has n x n rays through the middles of its n x n parts; n = 1 is the ray through the pixel's centre.
 
-Notation: `H x W` pixels, `K` rays that meet the mesh.
+Notation: `N` rays. A ray's direction has unit length, so that distances are in the mesh's unit. `H x W` pixels of a
+picture, `K` of its rays meet the mesh.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -47,7 +44,7 @@ class Hits:
 
     def select(self, rows: Tensor) -> Hits:
         """Hits of some of the rays: by a mask or by indices."""
-        return Hits(self.found[rows], self.triangles[rows], self.barycentric[rows], self.distances[rows])
+        return Hits(**{name: part[rows] for name, part in vars(self).items()})
 
 
 @dataclass(frozen=True)
@@ -63,7 +60,7 @@ class SurfacePoints:
 
     def select(self, rows: Tensor) -> SurfacePoints:
         """Some of the points: by a mask or by indices."""
-        return SurfacePoints(self.positions[rows], self.normals[rows], self.geometric_normals[rows])
+        return SurfacePoints(**{name: part[rows] for name, part in vars(self).items()})
 
 
 class RayMesh:
@@ -192,14 +189,8 @@ class PixelHits:
 
     def select(self, rows: Tensor) -> PixelHits:
         """Some of the rays, by increasing indices or a mask."""
-        return PixelHits(
-            self.pixels[rows],
-            self.points.select(rows),
-            self.to_eye[rows],
-            self.width,
-            self.height,
-            self.rays_a_pixel,
-        )
+        points = self.points.select(rows)
+        return replace(self, pixels=self.pixels[rows], points=points, to_eye=self.to_eye[rows])
 
 
 def pixel_hits(ray_mesh: RayMesh, cameras: Cameras, index: int, subpixels: int = 1) -> PixelHits:
@@ -214,13 +205,12 @@ def pixel_hits(ray_mesh: RayMesh, cameras: Cameras, index: int, subpixels: int =
         parts.append(ray_mesh.points(hits.select(found), directions))
         pixels.append(found)
         to_eye.append(-directions)
-    order = torch.cat(pixels).argsort(stable=True)
     points = SurfacePoints(
-        torch.cat([part.positions for part in parts])[order],
-        torch.cat([part.normals for part in parts])[order],
-        torch.cat([part.geometric_normals for part in parts])[order],
+        *(torch.cat(part) for part in zip(*(vars(one).values() for one in parts), strict=True))
     )
-    return PixelHits(torch.cat(pixels)[order], points, torch.cat(to_eye)[order], width, height, subpixels**2)
+    order = torch.cat(pixels).argsort(stable=True)
+    hits = PixelHits(torch.cat(pixels), points, torch.cat(to_eye), width, height, subpixels**2)
+    return hits.select(order)
 
 
 def subpixel_offsets(subpixels: int) -> list[tuple[float, float]]:

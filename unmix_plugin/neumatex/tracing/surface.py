@@ -21,6 +21,16 @@ from torch.nn import functional
 
 from unmix_plugin.neumatex.tracing.families import DecodableFamily, MaterialFamily
 
+NUM_CHANNELS = 12
+"""Channels of a plane, as published."""
+_NUM_FREQUENCIES = 3
+"""Bands of the positional encoding, as published."""
+PLANE_AXES = ((0, 1), (1, 2), (0, 2))
+"""Axes of the model that run along the columns and the rows of XY, YZ, XZ."""
+LOG_VARIANCE_RANGE = (-9.0, 0.0)
+"""Least and largest log-variance of a parameter: standard deviations of 0.011 and 1, the parameters being in [0, 1]."""
+_WIDTH = 64
+
 
 @runtime_checkable
 class Surface(Protocol):
@@ -72,17 +82,6 @@ class TriplaneSurface:
 
     def parameters(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N P"]:
         return self.triplane.parameters_at(positions)
-
-
-NUM_CHANNELS = 12
-"""Channels of a plane, as published."""
-_NUM_FREQUENCIES = 3
-"""Bands of the positional encoding, as published."""
-PLANE_AXES = ((0, 1), (1, 2), (0, 2))
-"""Axes of the model that run along the columns and the rows of XY, YZ, XZ."""
-LOG_VARIANCE_RANGE = (-9.0, 0.0)
-"""Least and largest log-variance of a parameter: standard deviations of 0.011 and 1, the parameters being in [0, 1]."""
-_WIDTH = 64
 
 
 class Readers(nn.Module):
