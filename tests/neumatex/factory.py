@@ -1,9 +1,4 @@
-"""Settings with which a training of a few steps is fast.
-
-A tiny object on disk: a ball in a small studio, six views of 24 x 24 pixels, and one held-out light.
-
-A tiny spectral object: the ball of `object_factory`, one material above and another below, in even light.
-"""
+"""Tiny objects on disk: a ball in a small studio, in colours or bands, and settings with which a training is fast."""
 
 from __future__ import annotations
 

@@ -1,13 +1,4 @@
-"""Reflectances with closed forms, for tests of what uses materials.
-
-Materials, directions and uniform numbers for the laws of reflectances.
-
-Procedural surfaces with known materials.
-
-Small objects and cameras for the tests of the prior.
-
-A trained object without a training.
-"""
+"""Reflectances with closed forms, directions, meshes, cameras and a trained object without a training."""
 
 from __future__ import annotations
 

@@ -1,11 +1,4 @@
-"""Procedural meshes: closed, in model space, with normals that point out.
-
-Surfaces of built-in objects: parameters in range, varied, functions of position alone.
-
-The folder of a built-in object: what is in it, and that its parts agree.
-
-The built-in spectral object: that its files explain its pictures, and that unmix-nerf can read it too.
-"""
+"""Built-in objects: shapes, surfaces, and folders in colours and bands."""
 
 import json
 

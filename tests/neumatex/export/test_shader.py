@@ -175,6 +175,7 @@ void main() { colour = vec4(reflectance(at(0), at(1), at(2), at(3), at(4)), 1.0)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
 def test_the_shader_itself_gives_the_reflectance_of_the_family(family, written):
     playwright = pytest.importorskip("playwright.sync_api")

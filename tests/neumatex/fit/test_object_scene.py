@@ -1,7 +1,4 @@
-"""Reading an object's folder: where things lie afterwards, and one message for each thing that is wrong.
-
-Reading an object with spectral pictures, and one message for each thing that is wrong with its light.
-"""
+"""Objects from their folders, in colours and in bands, and what is refused."""
 
 import json
 import shutil

@@ -1,7 +1,4 @@
-"""Spectral materials from the command line on a ball of two materials: train, evaluate, show, export, refuse.
-
-The brightness of endmembers: how it is first found, and how gains change it.
-"""
+"""Spectral materials from the command line on a ball of two, and gains of endmembers."""
 
 import json
 from dataclasses import replace
@@ -138,6 +135,7 @@ def test_the_export_has_abundance_textures_and_endmembers(trained):
     assert (folder / "material.glb").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_the_number_of_materials_is_proposed_where_it_is_asked_for(tmp_path):
     write_spectral_object(tmp_path / "ball")
     words = ["--data", tmp_path / "ball", "--output-dir", tmp_path / "out", "--max-num-iterations", 1]
@@ -148,6 +146,7 @@ def test_the_number_of_materials_is_proposed_where_it_is_asked_for(tmp_path):
     assert len(model.get_parameter("endmembers")) == 2
 
 
+@pytest.mark.slow
 def test_a_fit_starts_from_the_endmembers_and_abundances_of_a_run(tmp_path, monkeypatch):
     there = Normalisation(np.eye(3), -CENTRE, RUN_RADIUS / RADIUS)
     of_run = replace(ball_scene(), frame=there)

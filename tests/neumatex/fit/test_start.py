@@ -1,9 +1,4 @@
-"""The distance from a prior's material, and the views that a prior gets.
-
-Endmembers and abundances of a run of unmix-nerf at points of a mesh that lies in another space.
-
-A fit starts from a plain material.
-"""
+"""Where a fit begins: the distance from the prior, its views, materials of a run, the plain material."""
 
 from pathlib import Path
 

@@ -1,9 +1,4 @@
-"""Fixed tone curves: their fixed points, and their slopes.
-
-The learnt response increases whatever its coefficients, and finds curves that it was not told of.
-
-How spectra are compared and shown.
-"""
+"""Tone curves, the camera's response, and spectra as they are compared and shown."""
 
 import pytest
 import torch

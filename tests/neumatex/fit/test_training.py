@@ -1,7 +1,4 @@
-"""The method from the command line on a ball of one colour: train, resume, evaluate, and what is refused.
-
-A fit begins where the prior does; the prior stays; the networks move if they may.
-"""
+"""The method from the command line on a ball of one colour: train, resume, evaluate; fits that begin at the prior."""
 
 import json
 import shutil

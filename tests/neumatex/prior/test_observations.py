@@ -1,11 +1,4 @@
-"""Which views a prior takes.
-
-Lobes of a known light against their integrals.
-
-Points on a mesh, who sees them and what light reaches them: cases whose answers are known.
-
-What views show of points: fits that must find what colours were made of.
-"""
+"""What the prior looks at: spread views, lobes of light, points of a mesh, and their features."""
 
 import math
 

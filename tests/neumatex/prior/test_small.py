@@ -1,9 +1,4 @@
-"""Planes that are fitted to what is said of points.
-
-The small prior: data, training steps, prediction from pictures, and its weights on disk.
-
-The loss against its closed form and its limits.
-"""
+"""The small prior: planes, data, training steps, prediction from pictures, and its weights on disk."""
 
 from dataclasses import replace
 from typing import NamedTuple

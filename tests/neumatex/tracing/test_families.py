@@ -1,13 +1,4 @@
-"""Frames are orthonormal and right-handed, and turn directions there and back.
-
-Laws that hold for the reflectances of every family: reciprocity, exact densities, unbiased sampling, finiteness.
-
-Layered materials keep the light they get, and each layer does what it is there for.
-
-Families accept no points at all, as when no path of a batch goes on.
-
-Spectral materials: what a constant mixture reflects in even light, band by band, and where gradients go.
-"""
+"""Families of materials: shading frames, reciprocity, energy, sampling, and closed forms."""
 
 import math
 

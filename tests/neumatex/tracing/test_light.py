@@ -1,9 +1,4 @@
-"""Environments: directions, densities and draws agree with each other.
-
-Environment maps from files, and what is refused.
-
-Lamps and environments of many bands.
-"""
+"""Environments: looked up, drawn from, built in and read; lamps for pictures of many bands."""
 
 import math
 

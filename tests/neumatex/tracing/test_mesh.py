@@ -1,7 +1,4 @@
-"""Meshes from files: what is kept, turned, noted and refused.
-
-Rays against meshes: kernels beside the brute-force twin, and points that rays can start from.
-"""
+"""Meshes from files, and rays against them."""
 
 import numpy as np
 import pytest

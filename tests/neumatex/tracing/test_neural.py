@@ -1,7 +1,4 @@
-"""The decoder stands for layered materials it has not seen, keeps light, and is trained the same way twice.
-
-The shipped weights are those of their record, frozen and small; other files are refused with a reason.
-"""
+"""Neural materials against layered ones, and the shipped weights; other files are refused with a reason."""
 
 import hashlib
 import json
@@ -92,6 +89,7 @@ def test_training_is_the_same_twice():
     assert runs[0] == runs[1]
 
 
+@pytest.mark.slow
 def test_training_gets_better():
     figures: list[float] = []
     train(DecoderTraining(steps=300, materials=32, lights=2), lambda _, psnr: figures.append(psnr))

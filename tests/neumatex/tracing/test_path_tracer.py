@@ -1,7 +1,4 @@
-"""The path tracer against closed forms, single strategies and finite differences.
-
-Pictures: which pixels see the mesh, how rays of a pixel are averaged, what is behind.
-"""
+"""The path tracer against closed forms, and whole pictures."""
 
 import dataclasses
 import math
