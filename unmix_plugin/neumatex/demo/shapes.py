@@ -102,23 +102,23 @@ def _torus(rng: np.random.Generator) -> Field:
     thickness = rng.uniform(0.22, 0.4)
     flat = rng.uniform(0.8, 1.2)
 
-    def field(p: np.ndarray) -> np.ndarray:
+    def _field(p: np.ndarray) -> np.ndarray:
         ring = np.hypot(p[:, 0], p[:, 1]) - (1.0 - thickness)
         return np.hypot(ring, p[:, 2] * flat) - thickness
 
-    return _turned(field, rng)
+    return _turned(_field, rng)
 
 
 def _superquadric(rng: np.random.Generator) -> Field:
     around, along = rng.uniform(1.4, 5.0, 2)
     axes = rng.uniform(0.6, 1.0, 3)
 
-    def field(p: np.ndarray) -> np.ndarray:
+    def _field(p: np.ndarray) -> np.ndarray:
         x, y, z = np.abs(p / axes).T + 1e-9
         flat = (x**around + y**around) ** (1 / around)
         return ((flat**along + z**along) ** (1 / along) - 1.0) * axes.min()
 
-    return _turned(field, rng)
+    return _turned(_field, rng)
 
 
 def _blob(rng: np.random.Generator) -> Field:
@@ -134,27 +134,27 @@ def _vase(rng: np.random.Generator) -> Field:
     profile = CubicSpline(heights, rng.uniform(0.38, 0.72, 7))
     wall = rng.uniform(0.10, 0.14)
 
-    def field(p: np.ndarray) -> np.ndarray:
+    def _field(p: np.ndarray) -> np.ndarray:
         radius, z = np.hypot(p[:, 0], p[:, 1]), p[:, 2]
         outside = np.maximum(0.8 * (radius - profile(z)), np.abs(z) - 1.0)
         cavity = np.maximum(0.8 * (radius - profile(z) + wall / 0.8), -0.75 - z)
         return _smooth_max(outside, -cavity, 0.04)
 
-    return field
+    return _field
 
 
 def _parts(rng: np.random.Generator) -> Field:
     """Three to five primitives that melt into each other where they touch."""
     parts = [_part(rng) for _ in range(rng.integers(3, 6))]
 
-    def field(p: np.ndarray) -> np.ndarray:
+    def _field(p: np.ndarray) -> np.ndarray:
         values = parts[0](p)
         for part in parts[1:]:
             values = -_smooth_max(-values, -part(p), 0.08)
         # All parts reach a ball in the middle, which joins them.
         return -_smooth_max(-values, 0.38 - np.linalg.norm(p, axis=-1), 0.08)
 
-    return field
+    return _field
 
 
 def _part(rng: np.random.Generator) -> Field:
@@ -181,11 +181,11 @@ def _bar(centre: np.ndarray, direction: np.ndarray, size: float) -> Field:
     """A rod with round ends through the middle of the shape."""
     direction = direction / np.linalg.norm(direction)
 
-    def field(p: np.ndarray) -> np.ndarray:
+    def _field(p: np.ndarray) -> np.ndarray:
         along = np.clip((p - centre) @ direction, -0.6, 0.6)
         return np.linalg.norm(p - centre - along[:, None] * direction, axis=-1) - 0.45 * size
 
-    return field
+    return _field
 
 
 def _smooth_max(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:

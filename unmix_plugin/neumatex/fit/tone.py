@@ -11,7 +11,7 @@ picture's numbers in [0, 1]. `S` steps of the response, `F` curves of the family
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Literal, get_args
 
@@ -96,41 +96,28 @@ def _curve_family() -> Float[Tensor, "F S_plus_1"]:
 TONE_MAPPINGS: tuple[ToneMapping, ...] = get_args(ToneMapping)
 
 
-class _Linear(nn.Module):
-    """Numbers that are light; more than 1 is allowed."""
+class _FixedCurve(nn.Module):
+    """A tone curve without parameters."""
+
+    def __init__(self, curve: Callable[[Tensor], Tensor]) -> None:
+        super().__init__()
+        self._curve = curve
 
     def forward(self, light: Float[Tensor, "*pixels C"]) -> Float[Tensor, "*pixels C"]:
-        """The light itself."""
-        return light
+        """Numbers in [0, 1], but of `linear`; no gradient where light is beyond white."""
+        return self._curve(light)
 
 
-class _Srgb(nn.Module):
-    """Light encoded for an sRGB display, clipped at white."""
-
-    def forward(self, light: Float[Tensor, "*pixels C"]) -> Float[Tensor, "*pixels C"]:
-        """Numbers in [0, 1]; no gradient where light is beyond white."""
-        return linear_to_srgb(light.clamp(0, 1))
-
-
-class _Agx(nn.Module):
-    """Light as AgX encodes it: see `unmix_plugin.spectral.colour.conversion`; RGB only."""
-
-    def forward(self, light: Float[Tensor, "*pixels 3"]) -> Float[Tensor, "*pixels 3"]:
-        """Numbers in [0, 1]."""
-        return agx(light).clamp(0, 1)
-
-
-_CURVES: dict[str, type[nn.Module]] = {
-    "linear": _Linear,
-    "srgb": _Srgb,
-    "agx": _Agx,
-    "camera": _CameraResponse,
+_FIXED: dict[str, Callable[[Tensor], Tensor]] = {
+    "linear": lambda light: light,
+    "srgb": lambda light: linear_to_srgb(light.clamp(0, 1)),
+    "agx": lambda light: agx(light).clamp(0, 1),
 }
 
 
 def tone_curve(name: ToneMapping) -> nn.Module:
     """The curve of that name; only `camera` has parameters."""
-    return _CURVES[name]()
+    return _CameraResponse() if name == "camera" else _FixedCurve(_FIXED[name])
 
 
 def psnr_db(squared_error: Float[Tensor, "*pixels"]) -> Float[Tensor, ""]:
@@ -184,7 +171,7 @@ class SpectralDisplay(nn.Module):
         self.register_buffer("matrix", rgb_matrix(bands), persistent=False)
 
     def rgb(self, spectra: Float[Tensor, "*pixels B"]) -> Float[Tensor, "*pixels 3"]:
-        """_Linear colour, at least 0."""
+        """Linear colour, at least 0."""
         return (spectra @ self.matrix).clamp(min=0)
 
     def forward(self, light: Float[Tensor, "*pixels B"]) -> Float[Tensor, "*pixels 3"]:

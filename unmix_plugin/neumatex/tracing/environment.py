@@ -48,11 +48,11 @@ class Environment:
         next_column, next_row = (column + 1) % width, (row + 1).clamp(max=height - 1)
         pixels = self._scaled_image.reshape(-1, colours)
 
-        def pixel(row: Tensor, column: Tensor) -> Tensor:
+        def _pixel(row: Tensor, column: Tensor) -> Tensor:
             return pixels.index_select(0, row * width + column)
 
-        upper = torch.lerp(pixel(row, column), pixel(row, next_column), right_share)
-        lower = torch.lerp(pixel(next_row, column), pixel(next_row, next_column), right_share)
+        upper = torch.lerp(_pixel(row, column), _pixel(row, next_column), right_share)
+        lower = torch.lerp(_pixel(next_row, column), _pixel(next_row, next_column), right_share)
         return torch.lerp(upper, lower, low_share)
 
     def sample(self, uniforms: Float[Tensor, "N 2"]) -> tuple[Float[Tensor, "N 3"], Float[Tensor, " N"]]:
