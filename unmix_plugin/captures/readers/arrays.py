@@ -388,6 +388,7 @@ _MATRIX, _COMPRESSED = 14, 15
 _IS_COMPLEX = 0x0800
 _HEAD_BYTES = 2**16
 """Enough for what precedes the numbers of an array."""
+_PIECE_BYTES = 2**20
 
 
 @dataclass(frozen=True)
@@ -488,14 +489,21 @@ def _tag(head: bytes, order: str, position: int) -> tuple[int, int, int, int]:
 
 
 def _unpack(path: Path, array: _MatlabArray) -> np.ndarray:
-    """The numbers of a compressed variable; no more is unpacked than the variable needs."""
-    start, length = array.packed or (0, 0)
+    """The numbers of a compressed variable, unpacked piece by piece to where they stay, and no more than it needs."""
+    start, left = array.packed or (0, 0)
+    numbers = np.zeros(prod(array.shape), array.stored)
+    target, at, unpacking = numbers.view(np.uint8), -array.offset, zlib.decompressobj()
     with path.open("rb") as file:
         file.seek(start)
-        packed = file.read(length)
-    count = prod(array.shape)
-    needed = array.offset + count * array.stored.itemsize
-    unpacked = zlib.decompressobj().decompress(packed, needed)
-    if len(unpacked) < needed:
-        raise CaptureError(f"{path}: variable '{array.name}' is cut short; copy the file again")
-    return np.frombuffer(unpacked, array.stored, count, array.offset).reshape(array.shape, order="F")
+        while at < len(target):
+            packed = unpacking.unconsumed_tail
+            if not packed:
+                packed = file.read(min(_PIECE_BYTES, left))
+                left -= len(packed)
+            piece = unpacking.decompress(packed, _PIECE_BYTES)
+            if not packed and not piece:
+                raise CaptureError(f"{path}: variable '{array.name}' is cut short; copy the file again")
+            part = piece[max(0, -at) : len(target) - at]
+            target[max(0, at) : max(0, at) + len(part)] = np.frombuffer(part, np.uint8)
+            at += len(piece)
+    return numbers.reshape(array.shape, order="F")
