@@ -110,6 +110,7 @@ def draw_panels(
         legend: Names and their colours, listed below.
     """
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     height_px, width_px, _ = rows[0][0].image.shape
     longer = float(np.clip(max(height_px, width_px) / FIGURE_DPI, *_PANEL_BOUNDS))
@@ -133,20 +134,19 @@ def draw_panels(
             _draw_panel(figure, panel, (left, bottom, width, height), page)
     if scale is not None:
         box = (_MARGIN + grid_width + 0.18, _MARGIN + below, _BAR_WIDTH, grid_height - _TITLE)
-        _draw_bar(figure, scale, box, page)
+        axes = figure.add_axes(_in_parts(box, page))
+        bar = draw_colour_bar(figure, axes, scale.colour_map, (scale.low, scale.high))
+        bar.set_label(scale.label, fontsize=_FONT_PT)
+        bar.ax.tick_params(labelsize=_FONT_PT - 1)
+        bar.locator = MaxNLocator(5)
     _draw_legend(figure, legend, legend_columns, below, page)
     return figure_bytes(figure)
-
-
-def _axes(figure: Any, box: tuple[float, float, float, float], page: tuple[float, float]) -> Any:
-    left, bottom, width, height = box
-    return figure.add_axes((left / page[0], bottom / page[1], width / page[0], height / page[1]))
 
 
 def _draw_panel(
     figure: Any, panel: TitledPicture, box: tuple[float, float, float, float], page: tuple[float, float]
 ) -> None:
-    axes = _axes(figure, box, page)
+    axes = figure.add_axes(_in_parts(box, page))
     axes.imshow(np.clip(panel.image, 0, 1))
     axes.set_xticks([])
     axes.set_yticks([])
@@ -161,15 +161,9 @@ def _draw_panel(
     figure.text(left / page[0], (base + 0.02) / page[1], title, fontsize=_FONT_PT, va="bottom")
 
 
-def _draw_bar(
-    figure: Any, scale: ColourScale, box: tuple[float, float, float, float], page: tuple[float, float]
-) -> None:
-    from matplotlib.ticker import MaxNLocator
-
-    bar = draw_colour_bar(figure, _axes(figure, box, page), scale.colour_map, (scale.low, scale.high))
-    bar.set_label(scale.label, fontsize=_FONT_PT)
-    bar.ax.tick_params(labelsize=_FONT_PT - 1)
-    bar.locator = MaxNLocator(5)
+def _in_parts(box: tuple[float, float, float, float], page: tuple[float, float]) -> tuple[float, ...]:
+    left, bottom, width, height = box
+    return left / page[0], bottom / page[1], width / page[0], height / page[1]
 
 
 def _legend_width(legend: Sequence[tuple[str, Colour]]) -> float:

@@ -56,15 +56,8 @@ def css_colour(srgb: Colour) -> str:
 def draw_swatch(
     figure: Any, colour: Colour, corner: tuple[float, float], side: float = 0.15, edge: str = "0.3"
 ) -> None:
-    """A square of a colour.
-
-    Args:
-        figure: To draw on.
-        colour: Clipped to [0, 1].
-        corner: Left and bottom in inches.
-        side: Inches.
-        edge: Colour of its outline, `none` for no outline.
-    """
+    """A square of a colour, its left and bottom and its side in inches; `edge` is the colour of its outline, or
+    `none`."""
     from matplotlib.patches import Rectangle
 
     width, height = figure.get_size_inches()
@@ -146,7 +139,9 @@ def draw_chart(chart: LineChart) -> bytes:
             axes.set_yscale("log", nonpositive="mask")
         elif chart.from_zero:
             low, high = axes.get_ylim()
-            axes.set_ylim(min(low, 0.0) if _least(chart) < 0 else 0.0, max(high, 0.0))
+            values = np.concatenate([np.asarray(line.y, dtype=np.float64) for line in chart.lines])
+            least = values[np.isfinite(values)].min(initial=0.0)
+            axes.set_ylim(min(low, 0.0) if least < 0 else 0.0, max(high, 0.0))
         axes.margins(x=0)
         axes.set_xlabel(chart.x_label, color=_INK)
         axes.set_ylabel(chart.y_label, color=_INK)
@@ -155,11 +150,6 @@ def draw_chart(chart: LineChart) -> bytes:
         buffer = io.BytesIO()
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
     return buffer.getvalue()
-
-
-def _least(chart: LineChart) -> float:
-    values = np.concatenate([np.asarray(line.y, dtype=np.float64) for line in chart.lines])
-    return float(values[np.isfinite(values)].min(initial=0.0))
 
 
 _LIGHTNESS_BOUNDS = (30.0, 85.0)
@@ -185,13 +175,10 @@ def distinct_colours(own_srgb: Float[np.ndarray, "K 3"]) -> Float64[np.ndarray, 
     array([[0.8, 0.2, 0.2],
            [0.2, 0.3, 0.8]])
     """
-    wanted = _lab(own_srgb)
     distance = _DISTANCE
-    while True:
-        chosen = _choose_apart(wanted, distance)
-        if chosen is not None:
-            return chosen
+    while (chosen := _choose_apart(_lab(own_srgb), distance)) is None:
         distance *= 0.9
+    return chosen
 
 
 def _choose_apart(wanted: Float64[np.ndarray, "K 3"], distance: float) -> Float64[np.ndarray, "K 3"] | None:

@@ -33,10 +33,6 @@ def unseen(_):
     raise AssertionError("this edit does not depend on pictures")
 
 
-def test_no_edit_is_the_scene_itself(trained):
-    assert Edit().apply(trained, 0, unseen) is trained
-
-
 def test_an_edit_leaves_the_scene_alone(trained):
     before = trained.materials.endmembers.clone()
     edited = Edit(Recipe((Scale(0, 2.0), Rename(1, "clay")), Light("A"))).apply(trained, 0, unseen)
@@ -44,6 +40,9 @@ def test_an_edit_leaves_the_scene_alone(trained):
     assert_close(trained.materials.endmembers, before)
     assert edited.materials.names[1] == "clay"
     assert not torch.allclose(edited.materials.endmembers, before)
+    assert Edit().apply(trained, 0, unseen) is trained
+    with pytest.raises(ConfigError, match="there is no endmember 7"):
+        Edit(Recipe((Scale(7, 2.0),))).apply(trained, 0, unseen)
 
 
 def test_an_edited_scene_is_made_once_for_a_scene_that_stays(trained, monkeypatch):
@@ -95,11 +94,6 @@ def test_pictures_are_rendered_anew_only_where_shapes_or_gloss_change(recipe, re
     assert edit.reuses(Edit()) is not renders
     assert Edit().reuses(edit) is not renders
     assert edit.reuses(edit)
-
-
-def test_an_edit_that_does_not_fit_says_so(trained):
-    with pytest.raises(ConfigError, match="there is no endmember 7"):
-        Edit(Recipe((Scale(7, 2.0),))).apply(trained, 0, unseen)
 
 
 BALL = 0.5
@@ -176,12 +170,6 @@ def test_a_point_is_measured_by_the_view_nearest_to_the_camera(views, scene):
 def test_a_point_inside_is_seen_by_nobody(views, scene):
     camera = scene.cameras[scene.train_indices[0]]
     assert views.measurement(torch.zeros(3), camera, None, ball_frame(camera).scene) is None
-
-
-def test_depths_of_few_views_are_kept(views, scene):
-    for index in range(len(scene.train_indices)):
-        views.error(ball_frame(scene.cameras[scene.train_indices[index]]))
-    assert len(views._distances) == min(len(scene.train_indices), 4)
 
 
 def test_what_was_measured_is_compared_in_the_light_that_the_scene_is_shown_in(views, scene):
