@@ -282,12 +282,14 @@ class RenderLoop:
             view.frame, view.frame_edit, view.frame_version = frame, edit, version
             settings, wants_depth = view.settings, view.wants_depth
             is_moving = frame.camera.height < self._maker.target_height(view.pose, view.largest_height)
+            had_reported = view.has_reported
         started = time.perf_counter()
-        view.show(self._maker.paint(frame, settings, wants_depth, is_moving))
+        shown = self._maker.paint(frame, settings, wants_depth, is_moving)
+        view.has_reported = False
+        view.show(shown)
         self._maker.source.device.charge(time.perf_counter() - started)
         view.shown_at = time.monotonic()
-        if view.has_reported:
-            view.has_reported = False
+        if had_reported:
             view.report("")
 
     def _advance_capture(self, capture: Capture) -> None:
