@@ -37,6 +37,7 @@ def source_of_bands(folder, *centers_nm):
     return source_of_model(model, folder)
 
 
+@pytest.mark.slow
 def test_pages_get_a_picture_of_their_shape_that_becomes_finer_at_rest(viewer):
     with opened(viewer, rows=160, width=400, height=200) as page:
         picture = decoded(page.last_picture)
@@ -106,6 +107,7 @@ def test_an_index_is_chosen_by_name_or_typed_as_a_formula_and_a_wrong_one_says_w
         page.wait_until(lambda: np.abs(decoded(page.last_picture) - first).mean() < 3)
 
 
+@pytest.mark.slow
 def test_a_formula_is_shown_when_it_is_typed_not_letter_by_letter(viewer):
     with opened(viewer) as page:
         show_layer(page, "spectral index")
@@ -133,6 +135,7 @@ def test_the_ends_of_a_range_are_shown_when_they_are_ones_own_and_begin_as_they_
         assert not low["visible"]
 
 
+@pytest.mark.slow
 def test_bands_that_no_named_index_takes_say_so_and_a_formula_is_shown(tmp_path):
     source = source_of_bands(tmp_path, 1000.0, 1010.0, 1020.0, 1030.0, 1040.0)
     with serving(source) as (viewer, _), opened(viewer) as page:
@@ -208,6 +211,7 @@ CHANGES = (
 )
 
 
+@pytest.mark.slow
 def test_every_change_is_an_edit_of_the_recipe_and_can_be_undone(viewer):
     with opened(viewer) as page:
         recipe = page.controls[page.control("recipe")]
@@ -223,6 +227,7 @@ def test_every_change_is_an_edit_of_the_recipe_and_can_be_undone(viewer):
         assert not any(title == "not done" for title, _ in page.notices)
 
 
+@pytest.mark.slow
 def test_a_name_can_be_typed_letter_by_letter_as_one_edit_and_one_that_is_taken_goes_back(viewer):
     with opened(viewer) as page:
         name, recipe = (page.controls[page.control(label)] for label in ("name", "recipe"))
@@ -244,6 +249,7 @@ def test_a_name_can_be_typed_letter_by_letter_as_one_edit_and_one_that_is_taken_
         page.wait_until(lambda: name["value"] == "endmember_0")
 
 
+@pytest.mark.slow
 def test_a_colour_that_is_refused_again_and_again_is_one_notice(viewer, monkeypatch):
     accept, refused = viewer.services.maker.edited, threading.Semaphore(0)
 
@@ -263,6 +269,7 @@ def test_a_colour_that_is_refused_again_and_again_is_one_notice(viewer, monkeypa
         assert [text for _, text in page.notices].count("that can't be") == 1
 
 
+@pytest.mark.slow
 def test_what_a_user_has_to_know_of_an_edit_is_said_once(viewer):
     with opened(viewer) as page:
         page.set("colour", (120, 110, 100))
@@ -304,6 +311,7 @@ def test_a_recipe_that_does_not_fit_is_refused_and_changes_nothing(viewer):
         assert page.controls[page.control("recipe")]["value"] == "edits: []\n"
 
 
+@pytest.mark.slow
 def test_every_light_that_is_offered_can_be_chosen(tmp_path):
     source = source_of_bands(tmp_path, 700.0, 800.0, 900.0, 1000.0, 1100.0)
     with serving(source) as (viewer, _), opened(viewer) as page:
@@ -327,6 +335,7 @@ def test_a_screenshot_has_the_size_asked_for_and_lies_in_the_run_folder(viewer):
         assert np.asarray(picture).std() > 5
 
 
+@pytest.mark.slow
 def test_spectra_are_saved_as_exr(viewer):
     import OpenEXR
 
@@ -342,6 +351,7 @@ def test_spectra_are_saved_as_exr(viewer):
             assert channels["S0.450,000000nm"].pixels.shape == (24, 32)
 
 
+@pytest.mark.slow
 def test_sizes_that_are_too_large_or_out_of_bounds_are_refused(viewer):
     with opened(viewer) as page:
         for label, value in (("width", 100_000), ("height", 1e9), ("width", -3)):

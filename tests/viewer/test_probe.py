@@ -10,7 +10,7 @@ import torch
 
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.scene import Normalisation
-from unmix_plugin.viewer.panels.probe import abundances_csv, probe_through, spectra_csv
+from unmix_plugin.viewer.panels.probe import _abundances_csv, _probe_through, _spectra_csv
 from unmix_plugin.viewer.view_cameras import camera_of, pose_of
 
 TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -25,7 +25,7 @@ def camera(source):
 @pytest.fixture
 def taken(source, camera):
     with source.borrowed() as scene:
-        return probe_through(scene, camera, camera.width / 2, camera.height / 2, 1)
+        return _probe_through(scene, camera, camera.width / 2, camera.height / 2, 1)
 
 
 def test_a_probe_is_what_the_picture_shows_there(source, camera, taken):
@@ -46,11 +46,11 @@ def test_a_probe_lies_on_the_ray_through_the_click(camera, taken):
 def test_what_users_read_of_a_place_is_in_the_world(source, camera, taken):
     with source.borrowed() as scene:
         shown = replace(scene, frame=WORLD)
-        moved = probe_through(shown, camera, camera.width / 2, camera.height / 2, 1)
+        moved = _probe_through(shown, camera, camera.width / 2, camera.height / 2, 1)
     assert moved.point == taken.point
     expected = WORLD.to_world(np.array([taken.point]))[0]
     np.testing.assert_allclose(moved.world, expected, rtol=1e-6)
-    rows = list(csv.reader(io.StringIO(abundances_csv([moved]).decode())))
+    rows = list(csv.reader(io.StringIO(_abundances_csv([moved]).decode())))
     np.testing.assert_allclose([float(value) for value in rows[1][1:4]], expected, rtol=1e-6)
 
 
@@ -59,7 +59,7 @@ def test_where_nothing_is_there_is_nothing_to_probe(source, camera):
     away[0, :, 3] *= 50
     away[0, :, 1:3] *= -1  # looks the other way
     with source.borrowed() as scene, pytest.raises(ConfigError, match="nothing is there to probe"):
-        probe_through(scene, replace(camera, camera_to_world=away), 100.0, 100.0, 1)
+        _probe_through(scene, replace(camera, camera_to_world=away), 100.0, 100.0, 1)
 
 
 def test_contributions_of_the_endmembers_add_up_to_the_diffuse_spectrum(source, camera, taken):
@@ -71,12 +71,12 @@ def test_contributions_of_the_endmembers_add_up_to_the_diffuse_spectrum(source, 
 
 def test_the_files_of_probes_hold_every_number(taken):
     measured = replace(taken, number=2, measured=taken.predicted * 2, measured_in="train_003")
-    rows = list(csv.reader(io.StringIO(spectra_csv([taken, measured]).decode())))
+    rows = list(csv.reader(io.StringIO(_spectra_csv([taken, measured]).decode())))
     assert rows[0] == ["wavelength", "probe_1_predicted", "probe_2_predicted", "probe_2_measured"]
     values = np.array(rows[1:], dtype=float)
     np.testing.assert_allclose(values[:, 0], taken.materials.bands.centers_nm)
     np.testing.assert_allclose(values[:, 3], 2 * taken.predicted, rtol=1e-7)
-    rows = list(csv.reader(io.StringIO(abundances_csv([taken, measured]).decode())))
+    rows = list(csv.reader(io.StringIO(_abundances_csv([taken, measured]).decode())))
     assert rows[0][:6] == ["probe", "x", "y", "z", "material", "measured_in"]
     assert rows[0][6:] == list(taken.materials.names)
     assert rows[2][5] == "train_003"
@@ -86,12 +86,12 @@ def test_the_files_of_probes_hold_every_number(taken):
 
 def test_names_with_commas_stay_one_field(taken):
     odd = replace(taken, materials=replace(taken.materials, names=("a,b", 'c"d', "e")))
-    rows = list(csv.reader(io.StringIO(abundances_csv([odd]).decode())))
+    rows = list(csv.reader(io.StringIO(_abundances_csv([odd]).decode())))
     assert rows[0][6:] == ["a,b", 'c"d', "e"]
 
 
 def test_a_probe_changes_no_random_state(source, camera):
     before = torch.get_rng_state()
     with source.borrowed() as scene:
-        probe_through(scene, camera, camera.width / 2, camera.height / 2, 1)
+        _probe_through(scene, camera, camera.width / 2, camera.height / 2, 1)
     assert torch.equal(torch.get_rng_state(), before)

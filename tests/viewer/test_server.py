@@ -66,6 +66,7 @@ def test_the_training_panel_steers_the_training(tmp_path):
         assert control.take_save_request()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("is_stopped", "said"), [(True, "stopped, and saved"), (False, "done")])
 def test_the_last_that_a_page_shows_is_how_training_ended(tmp_path, is_stopped, said):
     control = TrainingControl()
@@ -82,13 +83,14 @@ def test_the_last_that_a_page_shows_is_how_training_ended(tmp_path, is_stopped, 
         assert page.controls[page.control("pause")]["disabled"]
 
 
+@pytest.mark.slow
 def test_waiting_ends_when_no_page_is_left(source, monkeypatch):
     monkeypatch.setattr("unmix_plugin.viewer.server._UNWATCHED_S", 1)
     with serving(source) as (viewer, _):
         waiting = threading.Thread(target=viewer.wait, args=(True,))
         with opened(viewer):
             waiting.start()
-            waiting.join(2.5)
+            waiting.join(2.0)
             assert waiting.is_alive()
         waiting.join(120)
         assert not waiting.is_alive()
@@ -113,6 +115,7 @@ NO_CAMERAS = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.viser. .* does not match annotation")
 def test_a_camera_that_is_none_harms_nobody(viewer):
     with opened(viewer) as page:
@@ -124,6 +127,7 @@ def test_a_camera_that_is_none_harms_nobody(viewer):
             page.wait_until(lambda count=count: len(page.pictures) > count)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("label", ["layer", "formula", "low", "finest picture (rows)", "width", "brightness"])
 def test_values_that_no_control_would_send_harm_nobody(viewer, label):
     with opened(viewer) as page:
@@ -151,6 +155,7 @@ def test_a_page_that_sends_nonsense_loses_its_connection_and_others_go_on(viewer
             good.wait_until(lambda count=count: len(good.pictures) > count)
 
 
+@pytest.mark.slow
 def test_pages_that_leave_in_mid_render_are_forgotten(viewer):
     for _ in range(5):
         with page_of(viewer) as page:
@@ -183,6 +188,12 @@ def try_a_wrong_token(page):
     page.wait_until(lambda: has_control(page, "token"))
     enter_token(page, "barley")
     page.wait_until(lambda: "That is not the token" in page.texts)
+
+
+@pytest.fixture(autouse=True)
+def brief(monkeypatch):
+    """Pages that are turned away need no time to read why."""
+    monkeypatch.setattr("unmix_plugin.viewer.web_server._READING_S", 0.2)
 
 
 @pytest.fixture(scope="module")
@@ -269,6 +280,7 @@ def test_what_a_page_uploads_is_not_kept(viewer, guarded, is_guarded):
         assert all(not api._current_file_upload_states for api in apis)
 
 
+@pytest.mark.slow
 def test_there_is_a_limit_to_connections_that_are_not_served(viewer, monkeypatch):
     monkeypatch.setattr("unmix_plugin.viewer.web_server._MOST_CONNECTIONS", 2)
     with page_of(viewer) as first, page_of(viewer) as second:
@@ -280,8 +292,11 @@ def test_there_is_a_limit_to_connections_that_are_not_served(viewer, monkeypatch
         assert not first.is_closed
 
 
+@pytest.mark.slow
 def test_nobody_can_ask_for_a_public_tunnel(viewer, monkeypatch):
-    monkeypatch.setattr("viser._viser.ViserTunnel", lambda *_, **__: pytest.fail("a tunnel was opened"))
+    tunnels = []
+    monkeypatch.setattr("viser._viser.ViserTunnel", lambda *words, **_: tunnels.append(words))
     with opened(viewer) as page:
         page.send("ShareUrlRequest")
         show_layer(page, "depth")
+    assert tunnels == []

@@ -6,11 +6,11 @@ from tests.viewer.pages import decoded, opened, page_of, show_layer
 from unmix_plugin.engine.training.progress import TrainingStatus
 from unmix_plugin.viewer.layers.painting import LayerSettings
 from unmix_plugin.viewer.recipes import RecipeHistory
-from unmix_plugin.viewer.session import KEPT_S, KeptPages, PageState, TrainingCurve
+from unmix_plugin.viewer.session import KEPT_S, KeptPages, _PageState, _TrainingCurve
 
 
 def state(rows):
-    return PageState(None, LayerSettings(), RecipeHistory(), rows, 1)
+    return _PageState(None, LayerSettings(), RecipeHistory(), rows, 1)
 
 
 def test_the_page_that_was_closed_last_comes_back_first_and_once():
@@ -62,7 +62,7 @@ def status(step, psnr: float | None = 20.0):
 
 
 def test_a_short_curve_has_every_point_once():
-    curve = TrainingCurve()
+    curve = _TrainingCurve()
     for step in (1, 2, 2, 3, 1):
         curve.add(status(step))
     curve.add(None)
@@ -72,7 +72,7 @@ def test_a_short_curve_has_every_point_once():
 
 
 def test_a_long_curve_stays_small_and_covers_the_whole_training():
-    curve = TrainingCurve()
+    curve = _TrainingCurve()
     for step in range(1, 10_001):
         curve.add(status(step))
     steps, losses = curve.line("loss")
@@ -84,7 +84,7 @@ def test_a_long_curve_stays_small_and_covers_the_whole_training():
 
 
 def test_a_training_without_psnr_has_no_curve_of_it():
-    curve = TrainingCurve()
+    curve = _TrainingCurve()
     curve.add(status(1, None))
     steps, values = curve.line("psnr")
     assert len(steps) == len(values) == 0

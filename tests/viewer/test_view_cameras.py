@@ -12,12 +12,12 @@ from torch.testing import assert_close
 from tests.viewer.view_factory import ring, some_pose
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.viewer.view_cameras import (
+    _checked_pose,
+    _quaternion,
+    _rotation_matrix,
     camera_of,
-    checked_pose,
     path_poses,
     pose_of,
-    quaternion,
-    rotation_matrix,
     up_direction,
 )
 
@@ -28,15 +28,15 @@ quaternions = st.tuples(components, components, components, components).filter(l
 @given(quaternions)
 def test_a_rotation_keeps_its_quaternion_up_to_sign(wxyz):
     unit = np.array(wxyz) / np.linalg.norm(wxyz)
-    rotation = rotation_matrix(unit)
+    rotation = _rotation_matrix(unit)
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(rotation) == pytest.approx(1)
-    assert abs(np.dot(quaternion(rotation), unit)) == pytest.approx(1, abs=1e-9)
+    assert abs(np.dot(_quaternion(rotation), unit)) == pytest.approx(1, abs=1e-9)
 
 
 @given(quaternions, st.floats(0.2, 2.5), st.floats(0.3, 3.0))
 def test_a_pose_survives_the_way_to_a_camera_and_back(wxyz, fov, aspect):
-    pose = checked_pose(wxyz, (0.3, -2.0, 1.5), fov, aspect)
+    pose = _checked_pose(wxyz, (0.3, -2.0, 1.5), fov, aspect)
     back = pose_of(camera_of(pose, 240))
     assert abs(np.dot(back.wxyz, pose.wxyz)) == pytest.approx(1, abs=1e-5)
     np.testing.assert_allclose(back.position, pose.position, rtol=1e-6)
@@ -47,7 +47,7 @@ def test_a_pose_survives_the_way_to_a_camera_and_back(wxyz, fov, aspect):
 
 
 def test_a_browser_looking_along_its_z_is_a_camera_looking_along_minus_z():
-    camera = camera_of(checked_pose((1, 0, 0, 0), (0, 0, -3), math.radians(60), 1.0), 3)
+    camera = camera_of(_checked_pose((1, 0, 0, 0), (0, 0, -3), math.radians(60), 1.0), 3)
     middle = camera.image_rays(0).directions[4]
     assert_close(middle, torch.tensor([0.0, 0.0, 1.0]))
     above = camera.image_rays(0).directions[1]
@@ -55,7 +55,7 @@ def test_a_browser_looking_along_its_z_is_a_camera_looking_along_minus_z():
 
 
 def test_the_vertical_field_of_view_spans_the_height():
-    camera = camera_of(checked_pose((1, 0, 0, 0), (0, 0, 0), math.radians(90), 2.0), 100)
+    camera = camera_of(_checked_pose((1, 0, 0, 0), (0, 0, 0), math.radians(90), 2.0), 100)
     assert (camera.width, camera.height) == (200, 100)
     assert camera.focal_px[0].tolist() == pytest.approx([50, 50])
 
@@ -78,19 +78,19 @@ def test_the_vertical_field_of_view_spans_the_height():
 )
 def test_a_camera_that_is_none_is_refused(wxyz, position, fov, aspect):
     with pytest.raises(ConfigError, match="the browser sent a camera"):
-        checked_pose(wxyz, position, fov, aspect)
+        _checked_pose(wxyz, position, fov, aspect)
 
 
 def test_absurd_fields_of_view_and_shapes_are_brought_within_bounds():
-    wide = checked_pose((1, 0, 0, 0), (0, 0, 0), 100.0, 1e6)
+    wide = _checked_pose((1, 0, 0, 0), (0, 0, 0), 100.0, 1e6)
     assert wide.fov < math.pi
     assert wide.aspect == 10
-    assert checked_pose((1, 0, 0, 0), (0, 0, 0), -5.0, 1e-9).fov > 0
+    assert _checked_pose((1, 0, 0, 0), (0, 0, 0), -5.0, 1e-9).fov > 0
 
 
 @given(st.integers(1, 100_000), st.floats(0.1, 10))
 def test_a_picture_never_has_more_pixels_than_allowed_nor_none(height, aspect):
-    camera = camera_of(checked_pose((1, 0, 0, 0), (0, 0, 0), 1.0, aspect), height, largest_pixels=5000)
+    camera = camera_of(_checked_pose((1, 0, 0, 0), (0, 0, 0), 1.0, aspect), height, largest_pixels=5000)
     assert 1 <= camera.width * camera.height <= 5000
 
 
@@ -105,7 +105,7 @@ def test_a_path_goes_through_its_key_frames_in_their_order():
     for index, key in enumerate(keys):
         pose = poses[10 * index]
         np.testing.assert_allclose(pose.position, key.position, atol=1e-6)
-        np.testing.assert_allclose(rotation_matrix(pose.wxyz), rotation_matrix(key.wxyz), atol=1e-6)
+        np.testing.assert_allclose(_rotation_matrix(pose.wxyz), _rotation_matrix(key.wxyz), atol=1e-6)
         assert pose.fov == pytest.approx(key.fov)
 
 

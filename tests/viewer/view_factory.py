@@ -25,7 +25,7 @@ from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.layers.layers import LAYERS, LayerAids, layer_named, render_reference
 from unmix_plugin.viewer.layers.painting import LayerSettings, Legend, Picture
-from unmix_plugin.viewer.rendering.pictures import PictureMaker, Shown, Speedometer, num_channels
+from unmix_plugin.viewer.rendering.pictures import PictureMaker, Shown, _Speedometer, num_channels
 from unmix_plugin.viewer.rendering.render_loop import RenderLoop, View
 from unmix_plugin.viewer.rendering.scene import SceneAids, SceneSource
 from unmix_plugin.viewer.session import Services
@@ -131,7 +131,7 @@ class Screen:
 LARGEST = 32
 
 
-class FixedSpeed(Speedometer):
+class FixedSpeed(_Speedometer):
     """A speed that is set, not measured."""
 
     def add(self, rays, seconds):

@@ -161,7 +161,9 @@ def _draw_panel(
     figure.text(left / page[0], (base + 0.02) / page[1], title, fontsize=_FONT_PT, va="bottom")
 
 
-def _in_parts(box: tuple[float, float, float, float], page: tuple[float, float]) -> tuple[float, ...]:
+def _in_parts(
+    box: tuple[float, float, float, float], page: tuple[float, float]
+) -> tuple[float, float, float, float]:
     left, bottom, width, height = box
     return left / page[0], bottom / page[1], width / page[0], height / page[1]
 

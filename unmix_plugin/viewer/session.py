@@ -55,7 +55,7 @@ Raises:
 _MOST_POINTS = 400
 
 
-class TrainingCurve:
+class _TrainingCurve:
     """How loss and PSNR went, in points that are thinned evenly as they become many."""
 
     def __init__(self) -> None:
@@ -114,7 +114,7 @@ class Services:
         """Where files go that clients ask for: in the run folder, and nowhere else."""
         self.recipes_folder = source.run.path / "recipes"
         self.videos = VideoQueue()
-        self.curve = TrainingCurve()
+        self.curve = _TrainingCurve()
         self._read_scene = read_scene
         self._reader = threading.Thread(target=self._read, name="unmix-viewer-scene", daemon=True)
         paths = tuple(str(path.resolve()) for path in environments)
@@ -195,7 +195,7 @@ _ANSWER_S = 2.0
 
 
 @dataclass(frozen=True)
-class PageState:
+class _PageState:
     """What a page shows, and the edits that it may go back to."""
 
     pose: ViewPose | None
@@ -211,15 +211,15 @@ class KeptPages:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._left: list[tuple[float, str, PageState]] = []
+        self._left: list[tuple[float, str, _PageState]] = []
         self._lock = threading.Lock()
 
-    def leave(self, browser: str, state: PageState) -> None:
+    def leave(self, browser: str, state: _PageState) -> None:
         """Keep the state of a page that was closed."""
         with self._lock:
             self._left = [*self._left, (self._clock(), browser, state)][-_MOST_KEPT:]
 
-    def take(self, browser: str) -> PageState | None:
+    def take(self, browser: str) -> _PageState | None:
         """The state of the browser's page that was closed last and has not come back; None if there is none."""
         with self._lock:
             self._left = [kept for kept in self._left if self._clock() - kept[0] < KEPT_S]
@@ -266,7 +266,7 @@ class Session:
         self,
         client: viser.ClientHandle,
         services: Services,
-        state: PageState | None = None,
+        state: _PageState | None = None,
         browser: str = "",
     ) -> None:
         """
@@ -341,10 +341,10 @@ class Session:
             tell()
 
     @property
-    def state(self) -> PageState:
+    def state(self) -> _PageState:
         """What the page shows, to be restored when it is loaded again."""
         view = self.view
-        return PageState(
+        return _PageState(
             view.pose, view.settings, self.history, view.largest_height, view.subpixels, view.edit.light
         )
 

@@ -1,12 +1,7 @@
 """Between a browser's camera and ours: axes, field of view, image size; everything that comes in is checked here.
 
-Notation: a browser's pose has OpenCV axes (+x right, +y down, +z forward) as a quaternion w, x, y, z and a position in
-model space, and the vertical field of view in radians; ours has OpenGL axes and focal lengths in pixels.
-
-A path through key frames in the order in which they were set: smooth, with even time between them.
-
-Notation: `F` frames of the path.
-"""
+Notation: a browser's pose has OpenCV axes (+x right, +y down, +z forward) as a _quaternion w, x, y, z and a position in
+model space, and the vertical field of view in radians; ours has OpenGL axes and focal lengths in pixels."""
 
 from __future__ import annotations
 
@@ -40,7 +35,7 @@ class ViewPose:
     """Where a browser looks from; always finite and within bounds."""
 
     wxyz: tuple[float, float, float, float]
-    """Rotation from camera (OpenCV axes) to model space, unit quaternion."""
+    """Rotation from camera (OpenCV axes) to model space, unit _quaternion."""
     position: tuple[float, float, float]
     """Model space."""
     fov: float
@@ -49,12 +44,8 @@ class ViewPose:
     """Width over height of the canvas."""
 
 
-def checked_pose(wxyz: Any, position: Any, fov: Any, aspect: Any) -> ViewPose:
-    """The pose that a browser sent, whatever that is; see `ViewPose` for what the values should be.
-
-    Raises:
-        ConfigError: a number is missing, not finite or absurd; nothing can be shown from there.
-    """
+def _checked_pose(wxyz: Any, position: Any, fov: Any, aspect: Any) -> ViewPose:
+    """The pose that a browser sent, whatever that is; a ConfigError where nothing can be shown from there."""
     try:
         rotation = np.array([float(value) for value in wxyz])
         place = np.array([float(value) for value in position])
@@ -84,7 +75,7 @@ def pose_from(camera: viser.CameraHandle) -> ViewPose:
     """
     height, width = camera.image_height, camera.image_width
     has_size = isinstance(height, int) and isinstance(width, int) and height > 0 and width > 0
-    return checked_pose(
+    return _checked_pose(
         camera.wxyz, camera.position, camera.fov, width / height if has_size else float("nan")
     )
 
@@ -99,7 +90,7 @@ def sized_camera(pose: ViewPose, width: int, height: int) -> Cameras:
     """The pinhole camera of a pose for pictures of a size: the vertical field of view stays, whatever the aspect."""
     focal = height / 2 / math.tan(pose.fov / 2)
     camera_to_world = np.concatenate(
-        [rotation_matrix(pose.wxyz) @ _OPENCV_TO_OPENGL, np.array(pose.position)[:, None]], axis=1
+        [_rotation_matrix(pose.wxyz) @ _OPENCV_TO_OPENGL, np.array(pose.position)[:, None]], axis=1
     )
     return Cameras(
         torch.tensor(camera_to_world, dtype=torch.float32)[None],
@@ -115,8 +106,8 @@ def pose_of(camera: Cameras) -> ViewPose:
     """The pose from which a browser sees about what one of our cameras sees: centred, without distortion."""
     pose = camera.camera_to_world[0].double().cpu().numpy()
     fov = 2 * math.atan(camera.height / 2 / float(camera.focal_px[0, 1]))
-    return checked_pose(
-        quaternion(pose[:, :3] @ _OPENCV_TO_OPENGL), pose[:, 3], fov, camera.width / camera.height
+    return _checked_pose(
+        _quaternion(pose[:, :3] @ _OPENCV_TO_OPENGL), pose[:, 3], fov, camera.width / camera.height
     )
 
 
@@ -141,15 +132,15 @@ def point_ahead(camera: Cameras, box: SceneBox) -> tuple[float, float, float]:
     return x, y, z
 
 
-def rotation_matrix(wxyz: Sequence[float] | np.ndarray) -> Float64[np.ndarray, "3 3"]:
-    """Rotation of a unit quaternion."""
+def _rotation_matrix(wxyz: Sequence[float] | np.ndarray) -> Float64[np.ndarray, "3 3"]:
+    """Rotation of a unit _quaternion."""
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_quat(np.roll(wxyz, -1)).as_matrix()
 
 
-def quaternion(rotation: Float[np.ndarray, "3 3"]) -> tuple[float, float, float, float]:
-    """Unit quaternion w, x, y, z of a rotation."""
+def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> tuple[float, float, float, float]:
+    """Unit _quaternion w, x, y, z of a rotation."""
     from scipy.spatial.transform import Rotation
 
     x, y, z, w = Rotation.from_matrix(rotation).as_quat().tolist()
@@ -157,11 +148,12 @@ def quaternion(rotation: Float[np.ndarray, "3 3"]) -> tuple[float, float, float,
 
 
 def path_poses(key_frames: Sequence[ViewPose], num_frames: int) -> list[ViewPose]:
-    """Poses along the path: through every key frame, positions and fields of view by splines, turns by slerp.
+    """Poses along a path through key frames in the order in which they were set, with even time between them: positions
+    and fields of view by splines, turns by slerp.
 
     Args:
         key_frames: At least two.
-        num_frames: F, at least two: the first and the last are at the ends.
+        num_frames: At least two: the first and the last are at the ends.
     Raises:
         ConfigError: fewer than two key frames.
     """
@@ -174,9 +166,9 @@ def path_poses(key_frames: Sequence[ViewPose], num_frames: int) -> list[ViewPose
     times = np.linspace(0.0, keys[-1], num_frames)
     values = np.array([[*pose.position, pose.fov] for pose in key_frames])
     smooth = CubicSpline(keys, values, bc_type="natural")(times)
-    turns = Slerp(keys, Rotation.from_matrix(np.stack([rotation_matrix(pose.wxyz) for pose in key_frames])))
+    turns = Slerp(keys, Rotation.from_matrix(np.stack([_rotation_matrix(pose.wxyz) for pose in key_frames])))
     aspect = key_frames[0].aspect
     return [
-        checked_pose(quaternion(rotation), row[:3], float(row[3]), aspect)
+        _checked_pose(_quaternion(rotation), row[:3], float(row[3]), aspect)
         for row, rotation in zip(smooth, turns(times).as_matrix(), strict=True)
     ]

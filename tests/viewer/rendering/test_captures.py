@@ -5,10 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 import tyro
 
 from tests.viewer.view_factory import make_frame, make_services, some_pose
 from unmix_plugin.commands.render import RenderOptions
+from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.products.render.files import choose_formats
 from unmix_plugin.trained.model_scene import LightChoice
@@ -66,9 +68,13 @@ def test_strips_make_up_the_picture_of_the_whole(services, source, monkeypatch, 
     assert np.abs(pixels - whole.astype(int)).max() <= 1
 
 
-def test_spectra_of_strips_are_those_of_the_whole(services, source, monkeypatch):
+@pytest.mark.parametrize("is_line", [False, True])
+def test_spectra_of_strips_are_those_of_the_whole(services, source, monkeypatch, is_line):
     monkeypatch.setattr(captures, "_STRIP_PIXELS", 64)
     camera = sized_camera(some_pose(), 17, 13)
+    if is_line:
+        ends = torch.cat([camera.camera_to_world, sized_camera(some_pose(1), 17, 13).camera_to_world])
+        camera = replace(camera, key_poses=KeyPoses(ends, torch.tensor([0.5, 12.5]), (2,)))
     canvas = SpectraCanvas(camera, 5)
     reason, _ = captured(services, camera, canvas.take)
     assert reason == ""

@@ -16,10 +16,10 @@ from unmix_plugin.viewer.rendering.pictures import (
     _FEWEST_PIXELS,
     _LONGEST_MOVING_S,
     FrameRender,
-    Speedometer,
     _finer_height,
     _moving_height,
     _picture_depth,
+    _Speedometer,
     num_channels,
 )
 from unmix_plugin.viewer.view_cameras import camera_of, pose_of
@@ -101,7 +101,7 @@ def test_pictures_become_finer_until_the_finest_and_then_no_more(start, largest)
 
 
 def test_a_speedometer_follows_what_is_measured():
-    speed = Speedometer()
+    speed = _Speedometer()
     for _ in range(30):
         speed.add(1000, 0.01)
     assert speed.rays_per_second == pytest.approx(1e5, rel=0.01)
@@ -110,7 +110,7 @@ def test_a_speedometer_follows_what_is_measured():
     speed.add(0, 1.0)
     speed.add(100, 0.0)
     assert speed.rays_per_second == before
-    assert (Speedometer(1.0).block_rays, Speedometer(1e12).block_rays) == (256, 1 << 17)
+    assert (_Speedometer(1.0).block_rays, _Speedometer(1e12).block_rays) == (256, 1 << 17)
 
 
 def test_depth_is_along_the_axis_where_something_is_and_far_elsewhere(source):

@@ -17,7 +17,7 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.materials import Coefficients, Materials
 from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.viewer.panels.probe import take_probe
+from unmix_plugin.viewer.panels.probe import _take_probe
 from unmix_plugin.viewer.rendering import scene as scene_module
 from unmix_plugin.viewer.rendering.pictures import PictureMaker
 from unmix_plugin.viewer.rendering.scene import Edit, MeasuredViews, SceneAids
@@ -197,7 +197,7 @@ def test_a_click_takes_one_device_turn_and_is_measured_in_it(views, scene, sourc
     maker = PictureMaker(ball, SceneAids(ball, has_materials=True), num_channels=8)
     turns, turn = [], source.device.guest_turn
     monkeypatch.setattr(source.device, "guest_turn", lambda cost: turns.append(cost) or turn(cost))
-    taken = take_probe(maker, Edit(), camera, (camera.width / 2, camera.height / 2), 1, views)
+    taken = _take_probe(maker, Edit(), camera, (camera.width / 2, camera.height / 2), 1, views)
     assert len(turns) == 1
     assert taken.measured_in == scene.frames[scene.train_indices[1]].name
     expected = scene.cube(scene.train_indices[1])[camera.height // 2, camera.width // 2]

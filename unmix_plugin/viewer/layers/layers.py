@@ -122,11 +122,11 @@ class LayerAids:
             lambda: torch.as_tensor(endmember_colours(materials)).to(materials.endmembers),
         )
 
-    def pca_of(self, materials: Materials) -> PcaColours:
+    def _pca_of(self, materials: Materials) -> PcaColours:
         """Principal components of what the reference rays show with the materials."""
         return self._remembered("pca", materials, lambda: PcaColours.fit(self.reference.spectra(materials)))
 
-    def depth_range(self, frame: MaterialView) -> tuple[float, float]:
+    def _depth_range(self, frame: MaterialView) -> tuple[float, float]:
         """Distances between which the scene box lies, world units."""
         aabb, scale = self.scene_box.aabb.cpu(), frame.scene.frame.scale
         middle, radius = aabb.mean(dim=0), float((aabb[1] - aabb[0]).norm()) / 2
@@ -337,7 +337,7 @@ def _paint_segmentation(
 
 
 def _paint_pca(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
-    colours = aids.pca_of(frame.materials)
+    colours = aids._pca_of(frame.materials)
     seen = _unpremultiplied(frame.materials.through(frame.coefficients, colours.axes), frame.opacity)
     components = seen - colours.mean @ colours.axes
     stretched = (components - colours.low) / (colours.high - colours.low).clamp(min=1e-9)
@@ -347,7 +347,7 @@ def _paint_pca(frame: MaterialView, settings: LayerSettings, aids: LayerAids) ->
 
 def _paint_depth(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
     label = "distance along the viewing axis, world units"
-    return _paint_scaled(frame.depth, frame.opacity, settings, aids.depth_range(frame), label)
+    return _paint_scaled(frame.depth, frame.opacity, settings, aids._depth_range(frame), label)
 
 
 def _paint_error(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:

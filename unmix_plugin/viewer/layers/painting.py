@@ -146,17 +146,11 @@ class TextLegend:
 Legend: TypeAlias = ColourMapLegend | SwatchLegend | TextLegend
 
 
-def to_display(
+def _to_display(
     light: Float[Tensor, "*pixels 3"], exposure_ev: float, gamma: float, transform: _ViewTransform
 ) -> Float[Tensor, "*pixels 3"]:
-    """Light as a display shows it.
-
-    Args:
-        light: Linear RGB.
-        exposure_ev: Stops: each doubles the light.
-        gamma: Applied last; above 1 lifts what is dark.
-        transform: `srgb` clips at white; `agx` compresses 16.5 stops, as film does.
-    """
+    """Light as a display shows it: `srgb` clips at white, `agx` compresses 16.5 stops, as film does; gamma comes last
+    and lifts what is dark if it is above 1."""
     exposed = light * 2.0**exposure_ev
     shown = agx(exposed) if transform == "agx" else linear_to_srgb(exposed.clamp(0, 1))
     shown = shown.clamp(0, 1)
@@ -189,7 +183,7 @@ def tone_mapped(
 ) -> Picture:
     """Linear light seen on black as a display shows it, over the background; edges are mixed in linear light."""
     part = opacity.clamp(0, 1)[..., None]
-    solid = to_display(
+    solid = _to_display(
         light / part.clamp(min=1e-3), settings.exposure_ev, settings.gamma, settings.view_transform
     )
     behind = BACKGROUNDS[settings.background]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -48,21 +49,17 @@ class CapturePanel:
         self._keys: list[ViewPose] = []
         self._preview = threading.Event()
         gui = session.client.gui
-
-        def add_button(label: str, work: Callable[[], None]) -> None:
-            gui.add_button(label).on_click(session.guarded(work))
-
         with gui.add_folder("picture"):
             self._width = gui.add_number("width", 1024, min=SIDE_BOUNDS[0], max=SIDE_BOUNDS[1], step=1)
             self._height = gui.add_number("height", 1024, min=SIDE_BOUNDS[0], max=SIDE_BOUNDS[1], step=1)
             self._name = gui.add_text("file name", "view")
             self._progress = gui.add_progress_bar(0.0)
-            add_button("save a screenshot (PNG)", self._save_picture)
+            self._add_button("save a screenshot (PNG)", self._save_picture)
             if session.services.has_materials:
-                add_button("save the spectra (EXR)", self._save_spectra)
-            add_button("cancel", self._cancel)
+                self._add_button("save the spectra (EXR)", self._save_spectra)
+            self._add_button("cancel", self._cancel)
         with gui.add_folder("camera path"):
-            add_button("add a key frame here", self._add_key)
+            self._add_button("add a key frame here", self._add_key)
             self._key = gui.add_dropdown("key frame", _NO_KEYS)
             keys = gui.add_button_group("this one", ("look", "replace", "remove"))
             keys.on_click(session.guarded(lambda: self._change_key(str(keys.value))))
@@ -71,11 +68,18 @@ class CapturePanel:
             self._fps = gui.add_number("frames a second", 24, min=_FPS_BOUNDS[0], max=_FPS_BOUNDS[1], step=1)
             preview = gui.add_button_group("preview", ("play", "stop"))
             preview.on_click(session.guarded(lambda: self._play(preview.value == "play")))
-            add_button("save the path", lambda: session.say("saved", str(self._save_path())))
-            add_button("render a video", self._render_video)
-            add_button("cancel the video", self._cancel_video)
+            self._add_button("save the path", lambda: session.say("saved", str(self._save_path())))
+            self._add_button("render a video", self._render_video)
+            self._add_button("cancel the video", self._cancel_video)
             self._video_progress = gui.add_progress_bar(0.0)
         session.on_close.append(self._abandon)
+
+    def _add_button(self, label: str, work: Callable[[], None]) -> None:
+        self._session.client.gui.add_button(label).on_click(self._session.guarded(work))
+
+    def _show_progress(self, bar: Any, fraction: float) -> None:
+        if not self._session.is_closed:
+            bar.value = 100.0 * fraction
 
     def _abandon(self) -> None:
         """Nobody waits for what is under way."""
@@ -127,20 +131,15 @@ class CapturePanel:
 
         def done(reason: str) -> None:
             self._capture = None
-            show_progress(0.0)
+            self._show_progress(self._progress, 0.0)
             if reason:
                 session.warn(reason, "no picture")
             else:
                 session.guarded(finish)()
 
-        def show_progress(fraction: float) -> None:
-            if not session.is_closed:
-                self._progress.value = 100.0 * fraction
-
-        view = session.view
-        self._capture = StripCapture(
-            session.services.loop, camera, view.edit, view.subpixels, take, done, show_progress
-        )
+        view, loop = session.view, session.services.loop
+        show = partial(self._show_progress, self._progress)
+        self._capture = StripCapture(loop, camera, view.edit, view.subpixels, take, done, show)
         self._capture.start()
 
     def _new_file(self, suffix: str) -> Path:
@@ -230,19 +229,17 @@ class CapturePanel:
         folder = cameras.with_suffix("")
         argv = render_argv(services.source.run.path, cameras, output, folder, recipe, session.view.edit.light)
 
-        def show_progress(fraction: float) -> None:
-            if not session.is_closed:
-                self._video_progress.value = 100.0 * fraction
+        show = partial(self._show_progress, self._video_progress)
 
         def done(video: Path | None, reason: str) -> None:
             self._video = None
-            show_progress(0.0)
+            show(0.0)
             if video is None:
                 session.warn(reason, "no video")
             else:
                 session.guarded(lambda: self._hand_over(video))()
 
-        self._video = VideoJob(argv, folder, show_progress, done)
+        self._video = VideoJob(argv, folder, show, done)
         services.videos.start(self._video)
         session.say("video", f"unmix-render writes it to {folder}, after those of other pages")
 

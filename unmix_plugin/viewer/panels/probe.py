@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class ProbedPoint:
+class _ProbedPoint:
     """What one point is made of."""
 
     number: int
@@ -60,19 +60,10 @@ class ProbedPoint:
         return self.materials.names[int(self.abundances.argmax())]
 
 
-def probe_through(
+def _probe_through(
     scene: TrainedScene, camera: Cameras, column: float, row: float, number: int
-) -> ProbedPoint:
-    """What is seen through a point of a picture.
-
-    Args:
-        scene: With the materials as they are shown.
-        camera: One camera.
-        column, row: In pixels.
-        number: Of the probe.
-    Raises:
-        ConfigError: nothing is there.
-    """
+) -> _ProbedPoint:
+    """What is seen through a point of a picture, given in pixels; a ConfigError where nothing is there."""
     pixel = min(max(int(column), 0), camera.width - 1), min(max(int(row), 0), camera.height - 1)
     found = scene.probe(camera, *pixel)
     if found.opacity < OCCUPIED_ACCUMULATION or found.position is None or found.world_position is None:
@@ -80,7 +71,7 @@ def probe_through(
     x, y, z = found.position.tolist()
     world_x, world_y, world_z = found.world_position.tolist()
     endmembers = scene.materials.endmembers.double().cpu().numpy()
-    return ProbedPoint(
+    return _ProbedPoint(
         number,
         (x, y, z),
         (world_x, world_y, world_z),
@@ -91,28 +82,17 @@ def probe_through(
     )
 
 
-def take_probe(
+def _take_probe(
     maker: PictureMaker,
     edit: Edit,
     camera: Cameras,
     place: tuple[float, float],
     number: int,
     measured: MeasuredViews | None = None,
-) -> ProbedPoint:
-    """What is seen through a point of a camera's picture, and what a training view measured there.
-
-    Args:
-        maker: Has the scene.
-        edit: What is changed.
-        camera: One camera.
-        place: Column and row, pixels.
-        number: Of the probe.
-        measured: The training views, if they are at hand.
-    Raises:
-        UnmixError: nothing is there, or the edit does not fit the run.
-    """
+) -> _ProbedPoint:
+    """What is seen through a point (column, row) of a picture, and what a training view measured there."""
     with maker.edit_turn(edit) as (scene, shown):
-        taken = probe_through(shown, camera, *place, number)
+        taken = _probe_through(shown, camera, *place, number)
         point = torch.tensor(taken.point)
         found = measured and measured.measurement(point, camera, shown.light_power, scene)
     if found is None:
@@ -121,7 +101,7 @@ def take_probe(
     return replace(taken, measured=found.spectrum.double().numpy(), measured_in=view)
 
 
-def spectra_csv(probes: Sequence[ProbedPoint]) -> bytes:
+def _spectra_csv(probes: Sequence[_ProbedPoint]) -> bytes:
     """One row a band: wavelength, and for each probe what was predicted and, where known, measured."""
     header, columns = ["wavelength"], [probes[0].materials.bands.centers_nm]
     for one in probes:
@@ -133,7 +113,7 @@ def spectra_csv(probes: Sequence[ProbedPoint]) -> bytes:
     return _csv(header, [[f"{value:.9g}" for value in row] for row in np.stack(columns, axis=1)])
 
 
-def abundances_csv(probes: Sequence[ProbedPoint]) -> bytes:
+def _abundances_csv(probes: Sequence[_ProbedPoint]) -> bytes:
     """One row a probe: number, position in the world, material, the training view measured in, abundances."""
     header = ["probe", "x", "y", "z", "material", "measured_in", *probes[0].materials.names]
     rows = [
@@ -180,7 +160,7 @@ class ProbePanel:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._probes: list[ProbedPoint] = []
+        self._probes: list[_ProbedPoint] = []
         self._markers: dict[int, viser.IcosphereHandle] = {}
         self._taken = 0
         gui = session.client.gui
@@ -203,7 +183,7 @@ class ProbePanel:
             return
         session, services = self._session, self._session.services
         camera, place = _clicked(session, x, y)
-        taken = take_probe(
+        taken = _take_probe(
             services.maker, session.view.edit, camera, place, self._taken + 1, services.aids.measured
         )
         self._taken += 1
@@ -252,8 +232,8 @@ class ProbePanel:
             raise ConfigError("there is no probe to save; click a point of the picture first")
         folder = self._session.services.folder
         for name, content in (
-            ("probes", spectra_csv(self._probes)),
-            ("probe-abundances", abundances_csv(self._probes)),
+            ("probes", _spectra_csv(self._probes)),
+            ("probe-abundances", _abundances_csv(self._probes)),
         ):
             path = write_file(new_file(folder, name, ".csv", name), content)
             self._session.client.send_file_download(path.name, content)
@@ -268,16 +248,16 @@ class ProbePanel:
         for chart in (self._chart, self._comparison):
             chart.draw(np.zeros(0), ())
 
-    def _drop(self, one: ProbedPoint) -> None:
+    def _drop(self, one: _ProbedPoint) -> None:
         self._probes.remove(one)
         self._markers.pop(one.number).remove()
 
 
-def _label(one: ProbedPoint) -> str:
+def _label(one: _ProbedPoint) -> str:
     return f"{one.number}: {one.name}"
 
 
-def _colour(one: ProbedPoint) -> tuple[float, float, float]:
+def _colour(one: _ProbedPoint) -> tuple[float, float, float]:
     return _COLOURS[(one.number - 1) % len(_COLOURS)]
 
 

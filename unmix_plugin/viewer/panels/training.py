@@ -5,7 +5,7 @@ from __future__ import annotations
 from unmix_plugin.engine.training.progress import TrainingStatus
 from unmix_plugin.engine.training.training_control import SHARE_BOUNDS
 from unmix_plugin.viewer.page import Chart, Line, number, table
-from unmix_plugin.viewer.session import Services, Session
+from unmix_plugin.viewer.session import Session
 
 _LOSS_COLOUR, _PSNR_COLOUR = (0.85, 0.3, 0.1), (0.1, 0.4, 0.8)
 _TICKS_A_CHART = 4
@@ -91,11 +91,6 @@ class TrainingPanel:
         self._control.device.guest_share = number(
             self._share.value, *SHARE_BOUNDS, fallback=self._control.device.guest_share
         )
-
-
-def is_training(services: Services) -> bool:
-    """Whether there is a training to show."""
-    return services.source.control is not None
 
 
 def _rows(status: TrainingStatus | None, condition: str, is_running: bool) -> list[tuple[str, str]]:

@@ -267,10 +267,7 @@ class ScenePanel:
     def _add_cameras(self) -> list[viser.CameraFrustumHandle]:
         """A frustum for each view, with its image where there is one; a click looks from there."""
         services, cameras = self._session.services, list(self._views.values())
-        size, places = (
-            _LARGEST_FRUSTUM,
-            torch.cat([camera.camera_to_world[:, :, 3] for camera in cameras]).cpu(),
-        )
+        size, places = _LARGEST_FRUSTUM, torch.cat([one.camera_to_world[:, :, 3] for one in cameras]).cpu()
         if len(places) > 1:
             nearest = torch.cdist(places, places).fill_diagonal_(torch.inf).min(dim=1).values
             size = min(size, max(_FRUSTUM_SHARE * float(nearest.median()), 1e-3))

@@ -148,9 +148,8 @@ class SpectraCanvas:
 
 
 _LAUNCH = "from unmix_plugin.commands.render import main; main()"
-_LONGEST_MESSAGE = 1000
+_LONGEST_MESSAGE, _LINES_KEPT = 1000, 100
 _WAIT_S = 10.0
-_LINES_KEPT = 100
 _PROGRESS = re.compile(r"rendering: (\d+) of ([1-9]\d*) done")
 
 
@@ -202,10 +201,21 @@ class VideoQueue:
             with self._lock:
                 process = None
                 if not self._is_stopping and not job.is_cancelled:
-                    process = _start(job.argv)
+                    process = subprocess.Popen(
+                        [sys.executable, "-c", _LAUNCH, *job.argv],
+                        stdin=subprocess.DEVNULL,
+                        stdout=subprocess.PIPE,
+                        stderr=subprocess.STDOUT,
+                        text=True,
+                        start_new_session=True,
+                    )
                     self._running = (job, process)
             if process is not None:
-                _follow(process, lines, job.progress)
+                with process:
+                    for line in process.stdout or ():
+                        lines.append(line)
+                        if found := _PROGRESS.match(line):
+                            job.progress(int(found[1]) / int(found[2]))
             with self._lock:
                 self._running = None
         if process is not None and process.returncode == 0:
@@ -214,27 +224,6 @@ class VideoQueue:
             job.done(None, "cancelled")
         else:
             job.done(None, f"rendering the video failed: {''.join(lines).strip()[-_LONGEST_MESSAGE:]}")
-
-
-def _start(argv: list[str]) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-c", _LAUNCH, *argv],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=True,
-    )
-
-
-def _follow(process: subprocess.Popen[str], lines: deque[str], progress: Callable[[float], None]) -> None:
-    """Read what a render prints until it ends."""
-    with process:
-        assert process.stdout is not None
-        for line in process.stdout:
-            lines.append(line)
-            if found := _PROGRESS.match(line):
-                progress(int(found[1]) / int(found[2]))
 
 
 def _end(process: subprocess.Popen[str]) -> None:

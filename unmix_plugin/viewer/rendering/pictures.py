@@ -51,7 +51,7 @@ _MEMORY = 0.7
 
 
 @dataclass
-class Speedometer:
+class _Speedometer:
     """Rays a second, as measured recently."""
 
     rays_per_second: float = 20_000.0
@@ -271,7 +271,7 @@ class PictureMaker:
             num_channels: Numbers a pixel that a frame keeps.
             layers: What can be shown, by name.
         """
-        self.speed = Speedometer()
+        self.speed = _Speedometer()
         self.source = source
         self._aids = aids
         self._queue, self._num_asking = threading.Condition(), 0
@@ -322,21 +322,13 @@ class PictureMaker:
             return render.frame(shown) if render.rays_left == 0 else None
 
     def edited(self, edit: Edit) -> TrainedScene:
-        """The scene after an edit.
-
-        Raises:
-            UnmixError: the edit does not fit the run.
-        """
+        """The scene after an edit; an UnmixError if the edit does not fit the run."""
         with self.edit_turn(edit) as (_, shown):
             return shown
 
     @contextmanager
     def edit_turn(self, edit: Edit) -> Iterator[tuple[TrainedScene, TrainedScene]]:
-        """Context with the scene before and after an edit, and the device.
-
-        Raises:
-            UnmixError: the edit does not fit the run.
-        """
+        """Context with the scene before and after an edit, and the device; an UnmixError if the edit does not fit."""
         self._ask(1)
         with ExitStack() as stack:
             try:
@@ -353,11 +345,7 @@ class PictureMaker:
             self._queue.notify_all()
 
     def with_materials_of(self, edit: Edit, frame: RenderedView) -> RenderedView:
-        """What a frame would be with other materials on the same shapes.
-
-        Raises:
-            UnmixError: the edit does not fit the run.
-        """
+        """What a frame would be with other materials on the same shapes; an UnmixError if the edit does not fit."""
         return replace(frame, scene=self.edited(edit)) if isinstance(frame, MaterialView) else frame
 
     def paint(self, frame: RenderedView, settings: LayerSettings, with_depth: bool, is_moving: bool) -> Shown:

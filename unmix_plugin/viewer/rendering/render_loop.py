@@ -68,7 +68,7 @@ class View:
     """Whether its client was told of a failure."""
 
     @property
-    def asked_at(self) -> float | None:
+    def _asked_at(self) -> float | None:
         """Since when it waits for a picture at once."""
         return self.restyled_at if self.moved_at is None else self.moved_at
 
@@ -201,9 +201,9 @@ class RenderLoop:
     def _next_unit(self) -> Callable[[], None] | None:
         """What is most urgent: answers in the order in which they were asked for, then blocks in turn."""
         active = [view for view in self._views if view.pose is not None and not view.is_stuck]
-        waiting = [view for view in active if view.asked_at is not None]
+        waiting = [view for view in active if view._asked_at is not None]
         if waiting:
-            first = min(waiting, key=lambda view: view.asked_at or 0.0)
+            first = min(waiting, key=lambda view: view._asked_at or 0.0)
             return lambda: self._guarded(first, self._answer if first.moved_at is not None else self._redraw)
         if not self._maker.source.device.guest_may_go:
             return None

@@ -176,7 +176,7 @@ _VIEWS_TRIED = 6
 
 
 @dataclass(frozen=True)
-class Measurement:
+class _Measurement:
     """What a training view measured of a point."""
 
     view: str
@@ -231,7 +231,7 @@ class MeasuredViews:
         camera: Cameras,
         light: Float64[np.ndarray, " B"] | None,
         scene: TrainedScene,
-    ) -> Measurement | None:
+    ) -> _Measurement | None:
         """What the training view nearest to a camera measured of a point; None where no view tried sees it.
 
         Args:
@@ -245,7 +245,7 @@ class MeasuredViews:
             if bool(sees[0]):
                 cube = self._scene.cube(self._indices[index])
                 spectrum = self._in_light(cube[int(rows[0]), int(columns[0])].copy(), light)
-                return Measurement(self._scene.frames[self._indices[index]].name, spectrum)
+                return _Measurement(self._scene.frames[self._indices[index]].name, spectrum)
         return None
 
     def _in_light(
