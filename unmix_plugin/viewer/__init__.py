@@ -1,5 +1,5 @@
 """The live viewer: a run in the browser, while it trains and after.
 
-Rooms: layers (what can be shown), panels (the controls), the render loop (when to render and how finely), the server
-(life cycle). Only `server`, `session`, `scene_objects` and the panels know viser; everything else is tested without it.
+Rooms: rendering (the scene, when to render and how finely, what leaves the viewer), layers (what can be shown), panels
+(the controls); the server (life cycle) and sessions (one a page). Layers and rendering know nothing of viser.
 """

@@ -68,89 +68,6 @@ def likeness_rows(spectrum: Float[np.ndarray, "B"], materials: Materials) -> lis
 
 
 _NO_RECIPE = "none saved yet"
-
-
-class _RecipeControls:
-    """The recipe of one client: undo and redo, its text, its files."""
-
-    def __init__(self, session: Session, refused: Callable[[], None]) -> None:
-        """`refused` is called when a change does not fit the run, so that controls can show what is in force."""
-        self._session, self._refused = session, refused
-        self._gui = session.client.gui
-
-    @property
-    def present(self) -> Recipe:
-        """The one in force; endmembers are given by their numbers."""
-        return self._session.history.present
-
-    def change(self, recipe: Recipe, subject: Hashable = None) -> None:
-        """Put a recipe in force if it fits the run.
-
-        Raises:
-            UnmixError: it does not; nothing has changed.
-        """
-        edit = Edit(recipe)
-        try:
-            self._session.services.maker.edited(edit)
-        except UnmixError:
-            self._refused()
-            raise
-        self._session.history.take(recipe, subject)
-        self._session.change_edit(edit)
-
-    def add_history(self) -> None:
-        """Buttons to go back and forth."""
-        buttons = self._gui.add_button_group("changes", ("undo", "redo", "start again"))
-
-        def step() -> None:
-            if buttons.value == "start again":
-                self.change(Recipe())
-                return
-            history = self._session.history
-            recipe = history.undone() if buttons.value == "undo" else history.redone()
-            if recipe is None:
-                raise ConfigError("there is nothing more to undo or redo")
-            self._session.change_edit(Edit(recipe))
-
-        buttons.on_click(self._session.guarded(step))
-
-    def add_files(self) -> None:
-        """The recipe's text, and files of the run folder to save it to and to load it from."""
-        with self._gui.add_folder("recipes"):
-            self._text = self._gui.add_text("recipe", "", multiline=True, disabled=True)
-            self._name = self._gui.add_text("save as", "recipe")
-            self._gui.add_button("save").on_click(self._session.guarded(self._save))
-            self._saved = self._gui.add_dropdown("saved", self._files())
-            self._gui.add_button("load").on_click(self._session.guarded(self._load))
-
-    def show(self) -> None:
-        """Show the text of the recipe in force."""
-        self._text.value = recipe_to_yaml(self.present)
-
-    def _save(self) -> None:
-        content = recipe_to_yaml(self.present).encode()
-        folder = self._session.services.recipes_folder
-        path = write_file(new_file(folder, self._name.value, ".yml", "recipe"), content)
-        self._saved.options = self._files()
-        self._saved.value = path.name
-        self._session.client.send_file_download(path.name, content)
-        self._session.say("saved", f"{path}; other commands take it as --edits {path}")
-
-    def _load(self) -> None:
-        files = self._files()
-        self._saved.options = files
-        if self._saved.value not in files or self._saved.value == _NO_RECIPE:
-            raise ConfigError("choose one of the recipes saved in the run folder")
-        services = self._session.services
-        recipe = read_recipe(services.recipes_folder / str(self._saved.value))
-        self.change(numbered(recipe, services.maker.edited(Edit()).materials.names))
-
-    def _files(self) -> tuple[str, ...]:
-        folder = self._session.services.recipes_folder
-        found = sorted(path.name for path in folder.glob("*.y*ml")) if folder.is_dir() else []
-        return tuple(found) or (_NO_RECIPE,)
-
-
 _OWN_LIGHT = "as recorded"
 _COMMON_LIGHTS = ("D65", "D50", "A", "E", "C", "FL2", "FL7", "FL11")
 _FACTOR_BOUNDS = (0.0, 5.0)
@@ -167,19 +84,66 @@ class MaterialsPanel:
         self._is_showing = False
         self._named = 0
         self._gui = session.client.gui
-        self._recipe = _RecipeControls(session, refused=self._show_chosen)
         self._listing = self._gui.add_html("")
         self._light = self._gui.add_dropdown("light", self._lights())
         self._on(self._light, self._change_light)
-        self._recipe.add_history()
+        self._add_history()
         names = session.materials().names
         self._chosen = self._gui.add_dropdown("endmember", names)
         self._on(self._chosen, self._choose)
         self._add_changes(names)
         self._chart = Chart(self._gui, "spectra under the light")
-        self._recipe.add_files()
+        self._add_files()
         self._show_materials()
         session.on_edit.append(self._show_materials)
+
+    def _add_history(self) -> None:
+        """Buttons to go back and forth."""
+        buttons = self._gui.add_button_group("changes", ("undo", "redo", "start again"))
+
+        def step() -> None:
+            history = self._session.history
+            if buttons.value == "start again":
+                self._change_recipe(Recipe())
+                return
+            recipe = history.undone() if buttons.value == "undo" else history.redone()
+            if recipe is None:
+                raise ConfigError("there is nothing more to undo or redo")
+            self._session.change_edit(Edit(recipe))
+
+        buttons.on_click(self._session.guarded(step))
+
+    def _add_files(self) -> None:
+        """The recipe's text, and files of the run folder to save it to and to load it from."""
+        with self._gui.add_folder("recipes"):
+            self._text = self._gui.add_text("recipe", "", multiline=True, disabled=True)
+            self._recipe_name = self._gui.add_text("save as", "recipe")
+            self._gui.add_button("save").on_click(self._session.guarded(self._save))
+            self._saved = self._gui.add_dropdown("saved", self._files())
+            self._gui.add_button("load").on_click(self._session.guarded(self._load))
+
+    def _save(self) -> None:
+        content = recipe_to_yaml(self._recipe).encode()
+        folder = self._session.services.recipes_folder
+        path = write_file(new_file(folder, self._recipe_name.value, ".yml", "recipe"), content)
+        self._saved.options = self._files()
+        self._saved.value = path.name
+        self._session.client.send_file_download(path.name, content)
+        self._session.say("saved", f"{path}; other commands take it as --edits {path}")
+
+    def _load(self) -> None:
+        files = self._files()
+        self._saved.options = files
+        if self._saved.value not in files or self._saved.value == _NO_RECIPE:
+            raise ConfigError("choose one of the recipes saved in the run folder")
+        services = self._session.services
+        recipe = read_recipe(services.recipes_folder / str(self._saved.value))
+        self._change_recipe(numbered(recipe, services.maker.edited(Edit()).materials.names))
+
+    def _files(self) -> tuple[str, ...]:
+        folder = self._session.services.recipes_folder
+        found = sorted(path.name for path in folder.glob("*.y*ml")) if folder.is_dir() else []
+        return tuple(found) or (_NO_RECIPE,)
 
     def _add_changes(self, names: tuple[str, ...]) -> None:
         gui = self._gui
@@ -209,6 +173,22 @@ class MaterialsPanel:
         swap_button.on_click(self._session.guarded(self._swap))
 
     @property
+    def _recipe(self) -> Recipe:
+        """The one in force; endmembers are given by their numbers."""
+        return self._session.history.present
+
+    def _change_recipe(self, recipe: Recipe, subject: Hashable = None) -> None:
+        """Put a recipe in force; if it does not fit the run nothing changes, and the controls show what is in force."""
+        edit = Edit(recipe)
+        try:
+            self._session.services.maker.edited(edit)
+        except UnmixError:
+            self._show_chosen()
+            raise
+        self._session.history.take(recipe, subject)
+        self._session.change_edit(edit)
+
+    @property
     def _index(self) -> int:
         """Number of the endmember chosen."""
         return index_in(self._chosen)
@@ -218,7 +198,7 @@ class MaterialsPanel:
         control.on_update(self._session.guarded(lambda: None if self._is_showing else work()))
 
     def _change(self, change: Replace | Retint | Scale | Rename | Gloss) -> None:
-        self._recipe.change(with_change(self._recipe.present, change), (type(change), change.endmember))
+        self._change_recipe(with_change(self._recipe, change), (type(change), change.endmember))
 
     def _type_name(self) -> None:
         self._named = self._index
@@ -235,21 +215,21 @@ class MaterialsPanel:
         self._show_chosen()
 
     def _change_light(self) -> None:
-        name, recipe = str(self._light.value), self._recipe.present
+        name, recipe = str(self._light.value), self._recipe
         if name not in self._lights(recipe.illuminant):
             raise ConfigError(f"there is no light {name[:40]!r} to choose")
-        self._recipe.change(replace(recipe, illuminant=None if name == _OWN_LIGHT else Light(name)))
+        self._change_recipe(replace(recipe, illuminant=None if name == _OWN_LIGHT else Light(name)))
 
     def _change_visibility(self, control: Any) -> None:
-        hidden, _ = visibility(self._recipe.present)
+        hidden, _ = visibility(self._recipe)
         index = self._index
         if control is self._is_alone:
             alone = index if self._is_alone.value is True else None
-            changed = with_visible(self._recipe.present, hidden - {index}, alone)
+            changed = with_visible(self._recipe, hidden - {index}, alone)
         else:
             now_hidden = hidden - {index} if self._is_visible.value is True else hidden | {index}
-            changed = with_visible(self._recipe.present, now_hidden, None)
-        self._recipe.change(changed)
+            changed = with_visible(self._recipe, now_hidden, None)
+        self._change_recipe(changed)
 
     def _change_gloss(self) -> None:
         is_white = tuple(self._gloss_colour.value[:3]) == _WHITE
@@ -261,7 +241,7 @@ class MaterialsPanel:
         self._change(Replace(self._index, known, extrapolate=True))
 
     def _swap(self) -> None:
-        self._recipe.change(with_swap(self._recipe.present, Swap(self._index, index_in(self._other))))
+        self._change_recipe(with_swap(self._recipe, Swap(self._index, index_in(self._other))))
 
     def _show_materials(self) -> None:
         """Show the materials as they are now; the menus have the same endmembers chosen as before."""
@@ -286,7 +266,7 @@ class MaterialsPanel:
         self._is_showing = True
         try:
             materials = self._session.materials() if materials is None else materials
-            index, recipe = self._index, self._recipe.present
+            index, recipe = self._index, self._recipe
             hidden, isolated = visibility(recipe)
             self._is_visible.value = index not in hidden and (not isolated or index in isolated)
             self._is_alone.value = index in isolated
@@ -303,7 +283,7 @@ class MaterialsPanel:
             self._light.value = _OWN_LIGHT if recipe.illuminant is None else str(recipe.illuminant.light)
             spectrum = materials.endmembers[index].double().cpu().numpy()
             self._alike.content = table(likeness_rows(spectrum, materials))
-            self._recipe.show()
+            self._text.value = recipe_to_yaml(recipe)
         finally:
             self._is_showing = False
 
@@ -317,7 +297,7 @@ class MaterialsPanel:
 
     def _colour_of(self, materials: Materials, index: int) -> tuple[int, int, int]:
         """8-bit sRGB colour that was asked for an endmember, or that of its spectrum in full light."""
-        retint = change_of(self._recipe.present, Retint, index)
+        retint = change_of(self._recipe, Retint, index)
         if isinstance(retint, Retint):
             return _bytes(torch.tensor(retint.colour))
         linear = materials.endmembers[index] @ rgb_matrix(materials.bands).to(materials.endmembers)
@@ -325,7 +305,7 @@ class MaterialsPanel:
 
     def _list(self, materials: Materials, colours: list[tuple[float, ...]]) -> str:
         """Every endmember with its colour, its nearest known material, and whether it is hidden."""
-        hidden, isolated = visibility(self._recipe.present)
+        hidden, isolated = visibility(self._recipe)
         spectra = materials.endmembers[:_LONGEST_LIST].double().cpu().numpy()
         matches = _nearest_materials(spectra, materials, 1)
         entries = []
