@@ -1,12 +1,8 @@
-"""From a folder of cubes to a scene that loads.
-
-A start that was cut off is gone on with, and a scene is never half there.
-
-What a user is told of captures that are pictures for people.
-"""
+"""From a capture to a scene that loads; going on after a start that was cut off; what a user is told of pictures."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -51,6 +47,9 @@ def test_counts_become_reflectances_of_a_scene_that_loads(tmp_path: Path, kind):
     record = json.loads((tmp_path / "scene" / "process.json").read_text())
     assert record["decisions"]["scale"]["calibrated"] == 1.0
     assert {Path(file["path"]).stem for file in record["references"]} == {"white", "dark"}
+    for source in (source for view in record["views"] for source in view["sources"]):
+        data = Path(source["path"]).read_bytes()
+        assert (source["sha256"], source["bytes"]) == (hashlib.sha256(data).hexdigest(), len(data))
 
 
 def test_background_is_cut_out_at_the_threshold_of_the_border(tmp_path: Path):
@@ -229,21 +228,18 @@ def interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     return capture
 
 
-def _write_with(monkeypatch: pytest.MonkeyPatch) -> _Writer:
+@pytest.fixture
+def writer(interrupted, monkeypatch: pytest.MonkeyPatch) -> _Writer:  # noqa: ARG001 - after the first start
     writer = _Writer()
     monkeypatch.setattr(process_module, "write_view", writer)
     return writer
 
 
-@pytest.mark.usefixtures("interrupted")
-def test_what_is_half_there_is_no_scene(tmp_path: Path):
+def test_the_next_start_goes_on_with_the_next_view(interrupted, writer, tmp_path: Path):
     assert not (tmp_path / "scene").exists()
     assert len(list((tmp_path / "scene.unfinished" / "cubes").glob("*.npy"))) == 2
     assert not (tmp_path / "scene.unfinished" / "transforms.json").exists()
 
-
-def test_the_next_start_goes_on_with_the_next_view(interrupted, tmp_path: Path, monkeypatch):
-    writer = _write_with(monkeypatch)
     process(interrupted.root, tmp_path / "scene")
     assert writer.written == ["view_02", "view_03"]
     assert not (tmp_path / "scene.unfinished").exists()
@@ -256,25 +252,22 @@ def test_the_next_start_goes_on_with_the_next_view(interrupted, tmp_path: Path, 
     assert len(load_scene(tmp_path / "scene").frames) == 4
 
 
-def test_other_options_start_again(interrupted, tmp_path: Path, monkeypatch):
-    writer = _write_with(monkeypatch)
+def test_other_options_start_again(interrupted, writer, tmp_path: Path):
     process(interrupted.root, tmp_path / "scene", bin_bands=3)
     assert len(writer.written) == 4
 
 
-def test_changed_input_starts_again(interrupted, tmp_path: Path, monkeypatch):
+def test_changed_input_starts_again(interrupted, writer, tmp_path: Path):
     path = interrupted.root / "view_03.raw"
     numbers = np.fromfile(path, "<u2")
     numbers[5] += 1
     numbers.tofile(path)
-    writer = _write_with(monkeypatch)
     process(interrupted.root, tmp_path / "scene")
     assert len(writer.written) == 4
 
 
-def test_a_damaged_record_is_written_again(interrupted, tmp_path: Path, monkeypatch):
+def test_a_damaged_record_is_written_again(interrupted, writer, tmp_path: Path):
     (tmp_path / "scene.unfinished" / "views" / "view_00.json").write_text('{"name": "view')
-    writer = _write_with(monkeypatch)
     process(interrupted.root, tmp_path / "scene")
     assert writer.written == ["view_00", "view_02", "view_03"]
 
@@ -287,19 +280,6 @@ def test_a_scene_is_replaced_only_if_asked(tmp_path: Path):
     process(capture.root, tmp_path / "scene", overwrite=True, bin_bands=3)
     assert len(load_scene(tmp_path / "scene").wavelengths_nm) == 3
     assert sorted(path.name for path in tmp_path.iterdir()) == ["capture", "scene"]
-
-
-def test_inputs_are_recorded_with_their_hashes(tmp_path: Path):
-    import hashlib
-
-    capture = make_capture(tmp_path / "capture")
-    process(capture.root, tmp_path / "scene")
-    record = json.loads((tmp_path / "scene" / "process.json").read_text())
-    for view in record["views"]:
-        for source in view["sources"]:
-            data = Path(source["path"]).read_bytes()
-            assert source["sha256"] == hashlib.sha256(data).hexdigest()
-            assert source["bytes"] == len(data)
 
 
 def test_a_scene_may_be_written_to_the_working_directory(tmp_path: Path, monkeypatch):

@@ -112,7 +112,7 @@ def estimated_poses(plan: Plan, records: Mapping[str, ViewRecord], scene: Path, 
     shown = {name: _shown(scene, record) for name, record in records.items()}
     pictures = {
         name: contrast_picture(
-            map_array(scene / record.paths["hyperspectral_file_path"]), FULL_SCALE, shown[name]
+            map_array(scene / record.paths["hyperspectral_file_path"]), float(FULL_SCALE), shown[name]
         )
         for name, record in records.items()
     }

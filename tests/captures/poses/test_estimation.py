@@ -92,7 +92,7 @@ def test_dark_texture_uses_the_whole_range_and_what_does_not_count_is_black():
     valid = np.ones((150, 80), bool)
     valid[:, :20] = False
     cube[:, :20], cube[5, 50, 1] = 9e4, np.nan
-    picture = contrast_picture(cube, 65535, valid)
+    picture = contrast_picture(cube, 65535.0, valid)
     assert not picture[:, :20].any()
     assert picture[5, 50] == 0
     assert picture[:, 20:].max() - np.percentile(picture[:, 20:], 5) > 150

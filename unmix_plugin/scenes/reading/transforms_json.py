@@ -122,7 +122,7 @@ def read_lens(
             faults.add(owner, f"'{key}' is {number:g}; expected {expected}")
         return number
 
-    sides = [read(key, 1, _GREATEST_PX, "a whole number of pixels", is_whole=True) for key in ("w", "h")]
+    sides = [read(key, 1.0, _GREATEST_PX, "a whole number of pixels", is_whole=True) for key in ("w", "h")]
     focal_px, angles, center_px = (
         (read(f"{key}x", low, high, expected), read(f"{key}y", low, high, expected))
         for key, low, high, expected in (
