@@ -37,6 +37,12 @@ _PIXELS_TO_GROUP = 20_000
 _COLOUR_GROUPS = 24
 _LIT_BEST = 0.9
 """Quantile of a group's brightness that stands for full light."""
+_PIXELS_TO_JUDGE_BY = 20_000
+_LEAST_OVERLAP = 0.1
+"""Share of what a sensor sees that another must see too."""
+_MOST_POINTS = 4000
+_FEWEST_BAD = 1e-5
+"""Share of bad values below which nothing is said."""
 
 
 class AlphaEvidence:
@@ -141,14 +147,6 @@ def _level(block: PixelBlock) -> float | None:
     pixels = torch.arange(0, len(block), stride) if is_whole else block.valid.nonzero()[::stride, 0]
     chosen = pixels.to(block.alpha.device)
     return background_level(block.spectra(chosen), block.alpha[chosen])
-
-
-_PIXELS_TO_JUDGE_BY = 20_000
-_LEAST_OVERLAP = 0.1
-"""Share of what a sensor sees that another must see too."""
-_MOST_POINTS = 4000
-_FEWEST_BAD = 1e-5
-"""Share of bad values below which nothing is said."""
 
 
 def judge_sensors(scene: Scene, table: PixelTable, seed: int) -> dict[int, BandNoise]:

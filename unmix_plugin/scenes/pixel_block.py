@@ -37,6 +37,19 @@ _PIXELS_PER_STEP = 2048
 _CHUNKS_AHEAD = 4
 """Read before they are needed."""
 _ORDER_SEED = 23
+FEWEST_CHANNELS = 100
+"""Of a sensor whose pixels are projected without being asked for."""
+_LARGEST_SHARE = 0.25
+"""Of the memory of whole pixels that projected ones may take for that."""
+_LARGEST_RESIDUAL = 2.0
+"""In multiples of the noise; of a pixel that is kept whole it is more. Noise alone makes about 1."""
+_UNSATURATED = 0.9999
+"""Largest value of a pixel that isn't kept whole: 1 stands for a saturated one."""
+_COMPACT_TYPES = ("f2", "u1", "i1", "i2", "u2")
+"""Of NumPy, at most half as large as float32."""
+_CHUNK_VALUES = 1 << 23
+"""Values of a view in single precision at a time: a view of many bands takes a GB."""
+_LARGEST_INT16, _UINT16_VALUES = 2**15 - 1, 2**16
 
 
 class _PixelPool:
@@ -117,16 +130,6 @@ class _PixelPool:
         generator = torch.Generator().manual_seed(_ORDER_SEED + turn)
         first = self._firsts[int(torch.randperm(len(self._firsts), generator=generator)[place])]
         return first, min(first + self._chunk_pixels, len(self._valid))
-
-
-FEWEST_CHANNELS = 100
-"""Of a sensor whose pixels are projected without being asked for."""
-_LARGEST_SHARE = 0.25
-"""Of the memory of whole pixels that projected ones may take for that."""
-_LARGEST_RESIDUAL = 2.0
-"""In multiples of the noise; of a pixel that is kept whole it is more. Noise alone makes about 1."""
-_UNSATURATED = 0.9999
-"""Largest value of a pixel that isn't kept whole: 1 stands for a saturated one."""
 
 
 @dataclass(frozen=True)
@@ -213,13 +216,6 @@ class _ProjectedPixels:
 
 def _must_stay_whole(spectra: Float[Tensor, "R b"], residuals: Float[Tensor, " R"]) -> Bool[Tensor, " R"]:
     return (residuals > _LARGEST_RESIDUAL) | (spectra > _UNSATURATED).any(dim=-1)
-
-
-_COMPACT_TYPES = ("f2", "u1", "i1", "i2", "u2")
-"""Of NumPy, at most half as large as float32."""
-_CHUNK_VALUES = 1 << 23
-"""Values of a view in single precision at a time: a view of many bands takes a GB."""
-_LARGEST_INT16, _UINT16_VALUES = 2**15 - 1, 2**16
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,9 @@ _USABLE_SHARE = 0.8
 """Of the memory that is left."""
 _LARGEST_POOL = 2**30
 """Of pixels on disk; more in memory would not be drawn from more evenly."""
+_PIXELS_TO_JUDGE_BY = 20_000
+_MOST_LISTED = 1 << 24
+"""Pixels of a block that are listed one by one to sample from; of larger blocks some are."""
 
 
 def available_bytes(device: torch.device) -> int | None:
@@ -88,9 +91,6 @@ def _describe_pool(blocks: tuple[PixelBlock, ...]) -> str:
 
 
 Components: TypeAlias = int | Literal["auto", "none"]
-_PIXELS_TO_JUDGE_BY = 20_000
-_MOST_LISTED = 1 << 24
-"""Pixels of a block that are listed one by one to sample from; of larger blocks some are."""
 
 
 class PixelTable:

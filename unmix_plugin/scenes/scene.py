@@ -25,6 +25,9 @@ from unmix_plugin.scenes.reading.images import read_colour, read_labels, read_ma
 from unmix_plugin.scenes.reading.transforms_json import FILE_NAME
 from unmix_plugin.spectral.sensor import SceneSensor
 
+_COMPARED = ("wavelengths_nm", "frames", "train_indices", "eval_indices", "cameras", "normalisation")
+_OF_RIGS = ("sensors", "frame_sensors")
+
 
 @dataclass(frozen=True)
 class SceneOptions:
@@ -210,10 +213,6 @@ class Scene:
     def _size(self, index: int) -> tuple[int, int]:
         width, height = self.cameras.size(index)
         return height, width
-
-
-_COMPARED = ("wavelengths_nm", "frames", "train_indices", "eval_indices", "cameras", "normalisation")
-_OF_RIGS = ("sensors", "frame_sensors")
 
 
 def scene_identity(summary: Mapping[str, Any]) -> dict[str, Any]:

@@ -24,6 +24,17 @@ _REACH_PX = 2
 """Pixels around one that it is compared with."""
 _MOST_ALIKE = 5
 """Of these 24, so many may deviate like a bad value, as those of its line do; at the corner of a real thing, 8 do."""
+_FEWEST_JUDGED_BANDS, _PIXELS_PER_BAND = 8, 10
+"""Least number of bands, and of pixels for each, from which noise can be estimated."""
+_PLAIN_FACTOR = 3.0
+"""Noise up to this multiple of the usual band's weighs nothing down."""
+_PLAIN_NOISE = 0.02
+"""Share of the median brightness up to which a band counts as clean, whatever the others are."""
+_NOISE_SHARE = 0.7
+"""Standard deviation of noise, as a share of the band's own, above which a band is mostly noise."""
+_DEAD_SPREAD, _LEAST_WEIGHT = 1e-5, 1e-4
+"""Standard deviation up to which a band shows one value everywhere; and its weight, before weights are scaled."""
+_SIGMA_OF_MAD = 1.4826
 
 
 def deviations(spectra: Float[Tensor, "*pixels B"]) -> Float[Tensor, "*pixels B"]:
@@ -87,19 +98,6 @@ def _mirrored(places: Int[Tensor, "C 24"], size: int) -> Int[Tensor, "C 24"]:
     """Places within an image, mirrored at its first and last line so that no pixel is its own neighbour."""
     inside = places.abs()
     return torch.where(inside < size, inside, 2 * size - 2 - inside).clamp(0, size - 1)
-
-
-_FEWEST_JUDGED_BANDS, _PIXELS_PER_BAND = 8, 10
-"""Least number of bands, and of pixels for each, from which noise can be estimated."""
-_PLAIN_FACTOR = 3.0
-"""Noise up to this multiple of the usual band's weighs nothing down."""
-_PLAIN_NOISE = 0.02
-"""Share of the median brightness up to which a band counts as clean, whatever the others are."""
-_NOISE_SHARE = 0.7
-"""Standard deviation of noise, as a share of the band's own, above which a band is mostly noise."""
-_DEAD_SPREAD, _LEAST_WEIGHT = 1e-5, 1e-4
-"""Standard deviation up to which a band shows one value everywhere; and its weight, before weights are scaled."""
-_SIGMA_OF_MAD = 1.4826
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,10 @@ _PLAIN_CONTRAST = 2.75
 """Brightness of that quantile, in medians, up to which absolute errors are right."""
 _LARGEST_POWER = 1.5
 """Of brightness by which squared errors are divided, where that quantile is at least twice as bright as that."""
+_FAINT = 0.02
+"""Brightness below which weights hardly grow: there is noise."""
+_SURELY_LIT = 0.05
+"""Root mean square over bands from which a pixel surely shows something."""
 
 
 def brightness(spectra: Float[Tensor, "R B"]) -> Float[Tensor, "R"]:
@@ -152,10 +156,6 @@ def bounded_square(errors: Float[Tensor, "R C"], outliers: Float[Tensor, "R 1"])
     return torch.where(size <= outliers, errors.square(), outliers * (2 * size - outliers))
 
 
-_FAINT = 0.02
-"""Brightness below which weights hardly grow: there is noise."""
-
-
 def relative_weights(pred_spectra: Float[Tensor, "R B"], power: float) -> Float[Tensor, "R"]:
     """Weights of squared errors that fall with a power of the brightness of the rendered pixels, without gradient.
 
@@ -164,10 +164,6 @@ def relative_weights(pred_spectra: Float[Tensor, "R B"], power: float) -> Float[
     Source: Mildenhall et al. 2022, NeRF in the Dark, for a power of 2.
     """
     return ((_PLAIN_BRIGHTNESS + _FAINT) / (brightness(pred_spectra.detach()) + _FAINT)) ** power
-
-
-_SURELY_LIT = 0.05
-"""Root mean square over bands from which a pixel surely shows something."""
 
 
 def solid_evidence(measured: Float[Tensor, "R B"]) -> Float[Tensor, "R"]:

@@ -24,6 +24,10 @@ _FEWEST_SPECTRA = 4
 
 _STRETCH = (0.01, 0.99)
 """Quantiles of a component that become 0 and 1."""
+_LEAST_NOISE = 0.005
+"""Noise that is assumed at least, as a share of the median brightness: what any model misses is more."""
+_SHARE, _SIGMAS_OF_SHARE = 0.95, 1.96
+"""Of normal errors, so many are within so many standard deviations; spikes are among the others."""
 
 
 @dataclass(frozen=True)
@@ -61,12 +65,6 @@ class PcaColours:
         """Colours of spectra."""
         components = (spectra - self.mean) @ self.axes
         return ((components - self.low) / (self.high - self.low).clamp(min=1e-9)).clamp(0, 1)
-
-
-_LEAST_NOISE = 0.005
-"""Noise that is assumed at least, as a share of the median brightness: what any model misses is more."""
-_SHARE, _SIGMAS_OF_SHARE = 0.95, 1.96
-"""Of normal errors, so many are within so many standard deviations; spikes are among the others."""
 
 
 @dataclass(frozen=True)

@@ -48,6 +48,21 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 
+_VIEW_ANGLE_DEG = 38.0
+_CAMERA_DISTANCE = 4.1
+_LOOK_AT = (0.0, 0.0, 0.22)
+_ELEVATIONS_DEG = (16.0, 68.0)
+_GROUND_HEIGHT = -0.12
+"""The table's underside."""
+_GROUND_EDGE = 400.0
+"""Half of the ground's edge, scene units: its end is a tenth of a pixel below the horizon."""
+_SKY_BRIGHTNESS = 0.75
+_PHONE_ANGLE_DEG = 62.0
+DEFAULT_SIZE, DEFAULT_BANDS, DEFAULT_VIEWS = 96, 31, 32
+SIZE_BOUNDS, _BANDS_BOUNDS, VIEWS_BOUNDS = (16, 1024), (3, 512), (4, 1000)
+_FOLDERS = ("images", "cubes", "labels", "abundances")
+_TRANSFORMS = "transforms.json"
+
 
 def check_bounds(what: str, numbers: Mapping[str, tuple[int, tuple[int, int]]]) -> None:
     """Refuse numbers out of bounds.
@@ -132,12 +147,6 @@ def written_once(
     return target
 
 
-_VIEW_ANGLE_DEG = 38.0
-_CAMERA_DISTANCE = 4.1
-_LOOK_AT = (0.0, 0.0, 0.22)
-_ELEVATIONS_DEG = (16.0, 68.0)
-
-
 def demo_cameras(size: int, views: int) -> Cameras:
     """Cameras on a dome around the table, azimuths spread by the golden angle."""
     i = np.arange(views)
@@ -192,14 +201,6 @@ def reflected(view: ViewCoefficients, spectra: Float[np.ndarray, "K B"]) -> Floa
 def label_image(view: ViewCoefficients) -> UInt8[np.ndarray, "H W"]:
     """The material with the largest abundance where at least half a pixel is covered, otherwise 255."""
     return np.where(view.alpha >= 0.5, view.abundances.argmax(axis=-1), UNLABELLED).astype(np.uint8)
-
-
-_GROUND_HEIGHT = -0.12
-"""The table's underside."""
-_GROUND_EDGE = 400.0
-"""Half of the ground's edge, scene units: its end is a tenth of a pixel below the horizon."""
-_SKY_BRIGHTNESS = 0.75
-_PHONE_ANGLE_DEG = 62.0
 
 
 @dataclass(frozen=True)
@@ -312,13 +313,6 @@ _WORLD = _Place((*THINGS, _ground(), *_far_things()), demo_cameras, _open_sky)
 _ROOM = _Place((*THINGS, *_room(), _ground(), *_far_things(20, seed=8)), _room_cameras, _open_sky)
 """The table in a room with windows onto the same world."""
 PLACES: Mapping[str, _Place] = {"table": _TABLE, "world": _WORLD, "room": _ROOM}
-
-
-DEFAULT_SIZE, DEFAULT_BANDS, DEFAULT_VIEWS = 96, 31, 32
-SIZE_BOUNDS, _BANDS_BOUNDS, VIEWS_BOUNDS = (16, 1024), (3, 512), (4, 1000)
-
-_FOLDERS = ("images", "cubes", "labels", "abundances")
-_TRANSFORMS = "transforms.json"
 
 
 def demo_scene_path(cache_dir: Path | None = None) -> Path:

@@ -39,6 +39,16 @@ _LEAST_FACING = 0.35
 """Cosine between normal and direction to the camera from which a place is looked at."""
 _CLEAR_CELLS, _MOST_CELLS = 4.0, 64
 """Way from a place, in cells, that is not checked for what is in front of it; and how far it is checked."""
+_MOVING_SHARE = 0.015
+"""Share of the changes of brightness that must be predicted in every half of the views. Two turntables have 0.03 and
+0.2 or more, three scenes with a fixed light none."""
+_LEAST_GAIN_SPREAD = 0.04
+"""Standard deviation of the views' log gains that both halves of the places must agree on. Seven scenes of one exposure
+have up to 0.02, since hulls are not surfaces; with gains of +-20 % all have 0.09 or more, with +-10 % 0.04 to 0.08."""
+_FEWEST_VIEWS, _FEWEST_PLACES = 4, 50
+"""Views that must see a place, of one half of them for a moving light; and places that must be seen by so many."""
+_NUM_FITS, _SMALLEST_ERROR = 10, 0.02
+"""Least squares fits of gains; and error of a place's log brightness below which it weighs no more."""
 
 
 @dataclass(frozen=True)
@@ -147,17 +157,6 @@ def _is_hidden(
 
 
 _FoundLight = Literal["fixed", "camera", "per-view"]
-
-_MOVING_SHARE = 0.015
-"""Share of the changes of brightness that must be predicted in every half of the views. Two turntables have 0.03 and
-0.2 or more, three scenes with a fixed light none."""
-_LEAST_GAIN_SPREAD = 0.04
-"""Standard deviation of the views' log gains that both halves of the places must agree on. Seven scenes of one exposure
-have up to 0.02, since hulls are not surfaces; with gains of +-20 % all have 0.09 or more, with +-10 % 0.04 to 0.08."""
-_FEWEST_VIEWS, _FEWEST_PLACES = 4, 50
-"""Views that must see a place, of one half of them for a moving light; and places that must be seen by so many."""
-_NUM_FITS, _SMALLEST_ERROR = 10, 0.02
-"""Least squares fits of gains; and error of a place's log brightness below which it weighs no more."""
 
 
 def judge_light(

@@ -56,6 +56,14 @@ _LEAST_KNOWN = 0.35
 _SURROUNDINGS = 21
 """Edge of what is around a pixel, in pixels of the thinned-out view."""
 _CHANCE_PIXELS = 4000
+_WITNESSES = 3
+"""Views that must look through a cell."""
+_MOST_CONTRADICTION = 0.15
+"""Views that may see a surface in it, over those that look through it."""
+_MARGIN = 1.5
+"""Between a cell's centre and a surface behind it, in edges of the cell."""
+_CELLS = 64
+"""Along an edge of the grid in which empty space is sought; finer grids repeat it."""
 
 
 @dataclass(frozen=True)
@@ -173,14 +181,6 @@ def _patch_means(differences: Float[Tensor, "P D"], own: Float[Tensor, "h w F"])
     return means.flatten(1).T
 
 
-_WITNESSES = 3
-"""Views that must look through a cell."""
-_MOST_CONTRADICTION = 0.15
-"""Views that may see a surface in it, over those that look through it."""
-_MARGIN = 1.5
-"""Between a cell's centre and a surface behind it, in edges of the cell."""
-
-
 def _seen_through(depths: _SweptDepths, cameras: Cameras, box: SceneBox, cells: int) -> Bool[Tensor, "C C C"]:
     """Cells of the contracted world that are empty.
 
@@ -217,10 +217,6 @@ def _looked_up(
     own = distances[rows, columns].masked_fill(~is_seen, torch.inf)
     away = (points - cameras.camera_to_world[view, :, 3]).norm(dim=-1)
     return least[rows, columns], own, away
-
-
-_CELLS = 64
-"""Along an edge of the grid in which empty space is sought; finer grids repeat it."""
 
 
 class SurfaceEvidence:

@@ -29,6 +29,25 @@ READ_HEADER = {
 }
 _ONE_PARSER = Lock()
 """NumPy parses headers as Python literals, which fails in CPython 3.11 if several threads do so at the same moment."""
+_BLOCK_VALUES = 1 << 20
+"""Values looked at together; 4 MiB as float32."""
+_EXCESS_SHARE = 0.01
+"""Share of values above 1 that is still taken for saturated highlights when no scale was given; also share of values
+far below 0 that a cube with noise around black may have."""
+_EXCESS_VALUE = 10.0
+"""Greatest value that is still taken for a highlight when no scale was given."""
+_NOISE = 0.1
+"""Negative values above minus this may be noise around black."""
+_EXCESS_SHARE_SCALED = 0.5
+"""Share of values above 1 at which a scale that was given must be wrong."""
+_SENSOR_BITS = (8, 10, 12, 14, 16)
+"""Of cameras; the greatest number of each stands for 1."""
+_REFLECTANCE_SCALE = 10000.0
+"""Of reflectances kept as integers, as satellites deliver them."""
+_FLOAT_SCALES = (100.0, 255.0, _REFLECTANCE_SCALE, 65535.0)
+"""Per cent, or integers kept as floats."""
+_MOST_READERS = 8
+"""Cubes read at once: hashing and comparing take longer than a disk, and don't hold each other up."""
 
 
 class UnreadableArrayError(ValueError):
@@ -96,24 +115,6 @@ def map_array(path: Path) -> np.ndarray:
     with _ONE_PARSER:
         return np.load(path, mmap_mode="r", allow_pickle=False)
 
-
-_BLOCK_VALUES = 1 << 20
-"""Values looked at together; 4 MiB as float32."""
-_EXCESS_SHARE = 0.01
-"""Share of values above 1 that is still taken for saturated highlights when no scale was given; also share of values
-far below 0 that a cube with noise around black may have."""
-_EXCESS_VALUE = 10.0
-"""Greatest value that is still taken for a highlight when no scale was given."""
-_NOISE = 0.1
-"""Negative values above minus this may be noise around black."""
-_EXCESS_SHARE_SCALED = 0.5
-"""Share of values above 1 at which a scale that was given must be wrong."""
-_SENSOR_BITS = (8, 10, 12, 14, 16)
-"""Of cameras; the greatest number of each stands for 1."""
-_REFLECTANCE_SCALE = 10000.0
-"""Of reflectances kept as integers, as satellites deliver them."""
-_FLOAT_SCALES = (100.0, 255.0, _REFLECTANCE_SCALE, 65535.0)
-"""Per cent, or integers kept as floats."""
 
 InvalidPixels = Literal["refuse", "mask", "clip"]
 
@@ -280,10 +281,6 @@ def _describe_scale(scale: float) -> str:
     if bits is None:
         return " (reflectances times 10000; 14 bits need 16383)" if scale == _REFLECTANCE_SCALE else ""
     return f" ({bits} bits{'; reflectances times 10000 need 10000' if 8 < bits < 16 else ''})"
-
-
-_MOST_READERS = 8
-"""Cubes read at once: hashing and comparing take longer than a disk, and don't hold each other up."""
 
 
 def check_cube_headers(

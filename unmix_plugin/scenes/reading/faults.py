@@ -17,6 +17,7 @@ MAX_LISTED = 20
 """Faults written out in one message; the rest is counted."""
 _MAX_PLACES = 3
 """Places written out for a fault that many frames share."""
+_HASH_BLOCK_BYTES = 1 << 20
 
 
 class Faults:
@@ -117,9 +118,6 @@ def read_number(value: Any) -> float | None:
     except OverflowError:
         return None
     return number if math.isfinite(number) else None
-
-
-_HASH_BLOCK_BYTES = 1 << 20
 
 
 def resolve_path(

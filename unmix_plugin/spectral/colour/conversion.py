@@ -35,6 +35,33 @@ from unmix_plugin.spectral.library.spectra_csv import TOLERANCE_NM, read_spectra
 
 _FORMULA_RANGE_NM = (250.0, 3000.0)
 """Where the lights that are defined by a formula are given."""
+XYZ_TO_LINEAR_SRGB = np.array(
+    [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]
+)
+"""IEC 61966-2-1:1999, D65; rows are R, G, B."""
+_SRGB_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""Y of the sRGB primaries (IEC 61966-2-1:1999)."""
+_PRIMARY_REGIONS_NM = ((VISIBLE_RANGE_NM[0], 500.0), (500.0, 600.0), (600.0, VISIBLE_RANGE_NM[1]))
+"""A sensor needs a band in each to tell blue, green and red apart."""
+_MIN_WHITE = 0.2
+"""Smallest channel of unscaled white, relative to its luminance. Below it, a sensor hardly sees that primary, and
+scaling it to white would amplify noise."""
+# Inset and outset keep saturated colours from clipping in one channel: bright ones fade to white instead. Rows sum to
+# 1, so greys stay grey.
+_INSET = (
+    (0.842479062253094, 0.0784335999999992, 0.0792237451477643),
+    (0.0423282422610123, 0.878468636469772, 0.0791661274605434),
+    (0.0423756549057051, 0.0784336, 0.879142973793104),
+)
+_OUTSET = (
+    (1.19687900512017, -0.0980208811401368, -0.0990297440797205),
+    (-0.0528968517574562, 1.15190312990417, -0.0989611768448433),
+    (-0.0529716355144438, -0.0980434501171241, 1.15107367264116),
+)
+_LOG2_BOUNDS = (-12.47393, 4.026069)
+"""Light that becomes black and white: 10 stops below and 6.5 above middle grey, 0.18."""
+_CURVE = (15.5, -40.14, 31.96, -6.868, 0.4298, 0.1191, -0.00232)
+"""Polynomial of the contrast curve, highest power first."""
 
 
 def parse_light(text: str) -> str | Path:
@@ -146,21 +173,6 @@ def _incandescent(wavelengths_nm: Float64[np.ndarray, " N"]) -> Float64[np.ndarr
 
 
 _ColourMode = Literal["true-colour", "false-colour"]
-
-XYZ_TO_LINEAR_SRGB = np.array(
-    [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]
-)
-"""IEC 61966-2-1:1999, D65; rows are R, G, B."""
-
-_SRGB_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-"""Y of the sRGB primaries (IEC 61966-2-1:1999)."""
-
-_PRIMARY_REGIONS_NM = ((VISIBLE_RANGE_NM[0], 500.0), (500.0, 600.0), (600.0, VISIBLE_RANGE_NM[1]))
-"""A sensor needs a band in each to tell blue, green and red apart."""
-
-_MIN_WHITE = 0.2
-"""Smallest channel of unscaled white, relative to its luminance. Below it, a sensor hardly sees that primary, and
-scaling it to white would amplify noise."""
 
 
 def colour_mode(bands: Bands) -> _ColourMode:
@@ -297,25 +309,6 @@ def _thirds_of_range(bands: Bands) -> Float64[np.ndarray, "B 3"]:
     overlaps = np.minimum(high, thirds[1:]) - np.maximum(low, thirds[:-1])
     overlaps = overlaps.clip(min=0)[:, ::-1]
     return overlaps / overlaps.sum(axis=0)
-
-
-# Inset and outset keep saturated colours from clipping in one channel: bright ones fade to white instead. Rows sum to
-# 1, so greys stay grey.
-_INSET = (
-    (0.842479062253094, 0.0784335999999992, 0.0792237451477643),
-    (0.0423282422610123, 0.878468636469772, 0.0791661274605434),
-    (0.0423756549057051, 0.0784336, 0.879142973793104),
-)
-_OUTSET = (
-    (1.19687900512017, -0.0980208811401368, -0.0990297440797205),
-    (-0.0528968517574562, 1.15190312990417, -0.0989611768448433),
-    (-0.0529716355144438, -0.0980434501171241, 1.15107367264116),
-)
-_LOG2_BOUNDS = (-12.47393, 4.026069)
-"""Light that becomes black and white: 10 stops below and 6.5 above middle grey, 0.18."""
-
-_CURVE = (15.5, -40.14, 31.96, -6.868, 0.4298, 0.1191, -0.00232)
-"""Polynomial of the contrast curve, highest power first."""
 
 
 def agx(light: Float[Tensor, "*pixels 3"]) -> Float[Tensor, "*pixels 3"]:

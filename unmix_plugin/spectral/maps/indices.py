@@ -41,6 +41,15 @@ _TOKEN = re.compile(
     re.IGNORECASE | re.DOTALL,
 )
 _WAVELENGTH = re.compile(r"r([0-9]+(?:\.[0-9]+)?)")
+_FUNCTIONS: dict[str, tuple[Callable[..., Tensor], int, float]] = {
+    "sqrt": (torch.sqrt, 1, 1),
+    "log": (torch.log, 1, 1),
+    "exp": (torch.exp, 1, 1),
+    "abs": (torch.abs, 1, 1),
+    "min": (lambda *values: reduce(torch.minimum, values), 2, math.inf),
+    "max": (lambda *values: reduce(torch.maximum, values), 2, math.inf),
+}
+"""With the least and the greatest number of arguments."""
 
 
 def _power(base: Tensor, exponent: Tensor) -> Tensor:
@@ -56,15 +65,6 @@ _OPERATORS: dict[type[ast.AST], Callable[..., Tensor]] = {
     ast.Pow: _power,
     ast.USub: torch.neg,
 }
-_FUNCTIONS: dict[str, tuple[Callable[..., Tensor], int, float]] = {
-    "sqrt": (torch.sqrt, 1, 1),
-    "log": (torch.log, 1, 1),
-    "exp": (torch.exp, 1, 1),
-    "abs": (torch.abs, 1, 1),
-    "min": (lambda *values: reduce(torch.minimum, values), 2, math.inf),
-    "max": (lambda *values: reduce(torch.maximum, values), 2, math.inf),
-}
-"""With the least and the greatest number of arguments."""
 
 
 @dataclass(frozen=True)

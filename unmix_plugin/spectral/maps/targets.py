@@ -29,6 +29,27 @@ LOADING = 1e-3
 3% of the background's standard deviation in each band. Rendered spectra are mixtures of a few and vary in no other
 direction, so that with much less, the smallest difference makes the target unlike everything in view; with much more,
 similar materials can no longer be told apart. Chosen on rendered views against true reflectances of seven materials."""
+_GREATEST_REFLECTANCE = 2.0
+"""A target of mf or ace with a value above it is not in reflectances; glossy and fluorescent surfaces exceed 1."""
+_LEAST_DISTANCE = 1e-4
+"""From the background's mean to a target, in standard deviations: the rounding of float32 reaches a tenth of it."""
+_DetectionMethod = Literal["angle", "mf", "ace"]
+"""Spectral angle, matched filter, adaptive coherence estimator."""
+_GRAMMAR = re.compile(
+    rf"((?P<method>{'|'.join(get_args(_DetectionMethod))}):)?(?P<file>.+?\.csv)(#(?P<name>.*?))?"
+    r"(\s*(?P<side>[<>])\s*(?P<limit>[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?)\s*)?",
+    re.IGNORECASE | re.DOTALL,
+)
+_EXAMPLES = "paint.csv, ace:paint.csv, mf:paint.csv#gold or 'paint.csv#gold<0.1'"
+_SIDES: dict[_DetectionMethod, str] = {"angle": "<", "mf": ">", "ace": ">"}
+"""On which side of a threshold a pixel is like the target."""
+_POSSIBLE = {"angle": (0.0, math.pi), "mf": (-math.inf, math.inf), "ace": (0.0, 1.0)}
+_USUAL = {"angle": (0.0, 0.5), "mf": (0.0, 1.0), "ace": (0.0, 1.0)}
+_LABELS: dict[_DetectionMethod, tuple[str, str]] = {
+    "angle": ("spectral angle in radians to", "0 = the same but for brightness"),
+    "mf": ("matched filter score of", "1 = like the target, 0 = like the background's mean"),
+    "ace": ("adaptive coherence with", "1 = differs from the background as the target does, 0 = does not"),
+}
 
 
 @dataclass(frozen=True)
@@ -100,34 +121,6 @@ def adaptive_coherence(
     wanted, found = background._whiten(target), background._whiten(spectra)
     lengths = wanted.norm() * found.norm(dim=-1)
     return (found @ wanted / lengths).clamp(0, 1).square()
-
-
-_DetectionMethod = Literal["angle", "mf", "ace"]
-"""Spectral angle, matched filter, adaptive coherence estimator."""
-
-_GREATEST_REFLECTANCE = 2.0
-"""A target of mf or ace with a value above it is not in reflectances; glossy and fluorescent surfaces exceed 1."""
-
-_LEAST_DISTANCE = 1e-4
-"""From the background's mean to a target, in standard deviations: the rounding of float32 reaches a tenth of it."""
-
-_GRAMMAR = re.compile(
-    rf"((?P<method>{'|'.join(get_args(_DetectionMethod))}):)?(?P<file>.+?\.csv)(#(?P<name>.*?))?"
-    r"(\s*(?P<side>[<>])\s*(?P<limit>[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?)\s*)?",
-    re.IGNORECASE | re.DOTALL,
-)
-_EXAMPLES = "paint.csv, ace:paint.csv, mf:paint.csv#gold or 'paint.csv#gold<0.1'"
-
-_SIDES: dict[_DetectionMethod, str] = {"angle": "<", "mf": ">", "ace": ">"}
-"""On which side of a threshold a pixel is like the target."""
-
-_POSSIBLE = {"angle": (0.0, math.pi), "mf": (-math.inf, math.inf), "ace": (0.0, 1.0)}
-_USUAL = {"angle": (0.0, 0.5), "mf": (0.0, 1.0), "ace": (0.0, 1.0)}
-_LABELS: dict[_DetectionMethod, tuple[str, str]] = {
-    "angle": ("spectral angle in radians to", "0 = the same but for brightness"),
-    "mf": ("matched filter score of", "1 = like the target, 0 = like the background's mean"),
-    "ace": ("adaptive coherence with", "1 = differs from the background as the target does, 0 = does not"),
-}
 
 
 @dataclass(frozen=True)

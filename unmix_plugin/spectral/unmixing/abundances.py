@@ -30,6 +30,14 @@ _PIXELS_AT_A_TIME = 65_536
 
 _SUM_WEIGHT = 1e3
 """How much heavier than a spectrum of the endmembers' length the sum-to-one row of `fcls` weighs."""
+_MOST_MATERIALS = 3
+_MOST_SEARCHED = 12
+"""Endmembers up to which all choices are tried."""
+_SETS_KEPT = 6
+_NUMBERS_AT_A_TIME = 2_000_000
+"""Bounds memory: spectra are taken in parts of so many candidate fits."""
+_RIDGE = 1e-13
+"""Added to the diagonal of normal equations, so that endmembers of one shape can be solved for."""
 
 
 def nnls(pixels: Float[Tensor, "N B"], endmembers: Float[Tensor, "K B"]) -> Float[Tensor, "N K"]:
@@ -168,17 +176,6 @@ def _require_fitting(pixels: Tensor, endmembers: Tensor) -> None:
     for what, values in (("pixels", pixels), ("endmembers", endmembers)):
         if not bool(torch.isfinite(values).all()):
             raise SpectrumError(f"the {what} hold NaN or infinite values; mask them out first")
-
-
-_MOST_MATERIALS = 3
-_MOST_SEARCHED = 12
-"""Endmembers up to which all choices are tried."""
-_SETS_KEPT = 6
-_NUMBERS_AT_A_TIME = 2_000_000
-"""Bounds memory: spectra are taken in parts of so many candidate fits."""
-
-_RIDGE = 1e-13
-"""Added to the diagonal of normal equations, so that endmembers of one shape can be solved for."""
 
 
 def sparse_abundances(

@@ -35,6 +35,22 @@ _ROUNDING = 0.01
 
 _HEAD_START = 1.2
 """How much larger than N-FINDR's simplex the first one is."""
+_VCA_DRAWS = 5
+"""Of which that of the largest simplex stays. The other methods restart by themselves, as often."""
+DARK_RMS = 0.005
+"""Root mean square over bands below which a pixel counts as black: its direction is noise."""
+_DARK_SHARE = 0.03
+"""Pixels darker than this share of the bright ones (99th percentile) say little about material either."""
+_SMOOTHNESS = 1e-3
+"""Weight of differences between neighbouring bands, against that of what was seen."""
+_CONTRAST = 0.6
+"""Of distinct spectra: how far they are from the typical one, in both directions."""
+_LIT_QUANTILE = 0.99
+_LIT_SCALE = 0.75
+"""Scale that fully lit pixels should need: a sigmoid near 1 hardly learns (vnir-pots, 500 steps: +0.9 dB against 1)."""
+_MOST_PIXELS = 5000
+_DARK_MATERIAL = 0.25
+"""Length of the darkest endmember, as a share of the brightest, below which brightness does not decide amounts."""
 
 
 def minimum_volume_simplex(
@@ -110,15 +126,6 @@ def _minimise(
 
 
 EndmemberMethod = Literal["kmeans", "vca", "nfindr", "minimum-volume", "pairs", "pooled-pairs"]
-
-_VCA_DRAWS = 5
-"""Of which that of the largest simplex stays. The other methods restart by themselves, as often."""
-
-DARK_RMS = 0.005
-"""Root mean square over bands below which a pixel counts as black: its direction is noise."""
-
-_DARK_SHARE = 0.03
-"""Pixels darker than this share of the bright ones (99th percentile) say little about material either."""
 
 
 def initialise_endmembers(
@@ -234,12 +241,6 @@ def _count_distinct(pixels: Tensor, enough: int) -> int:
     return count
 
 
-_SMOOTHNESS = 1e-3
-"""Weight of differences between neighbouring bands, against that of what was seen."""
-_CONTRAST = 0.6
-"""Of distinct spectra: how far they are from the typical one, in both directions."""
-
-
 def fill_bands(
     seen: Float[Tensor, "K b"], matrix: Float[Tensor, "b B"], typical: Float[Tensor, "B"]
 ) -> Float[Tensor, "K B"]:
@@ -282,12 +283,6 @@ def distinct_spectra(typical: Float[Tensor, "B"], count: int) -> Float[Tensor, "
     middles = (torch.arange(count)[:, None] + 0.5) / count
     shapes = 1 - _CONTRAST + 2 * _CONTRAST * torch.exp(-0.5 * ((bands - middles) * count) ** 2)
     return (shapes.to(typical) * typical).clamp(0, 1)
-
-
-_LIT_QUANTILE = 0.99
-_LIT_SCALE = 0.75
-"""Scale that fully lit pixels should need: a sigmoid near 1 hardly learns (vnir-pots, 500 steps: +0.9 dB against 1)."""
-_MOST_PIXELS = 5000
 
 
 def _brightness_factor(
@@ -342,10 +337,6 @@ def given_endmembers(
         )
     radiance = (torch.as_tensor(table.spectra, dtype=torch.float32) * lamp).clamp(min=0)
     return radiance * _brightness_factor(radiance, pixels, generator)
-
-
-_DARK_MATERIAL = 0.25
-"""Length of the darkest endmember, as a share of the brightest, below which brightness does not decide amounts."""
 
 
 def unmix_pixels(

@@ -39,6 +39,18 @@ _DISTINCT = 4e-10
 
 _LEAST_GAIN = 1e-7
 """Least fall of the mean distance that counts: rounding errors must not swap forever."""
+_DRAWS = 5
+_NUM_SEEDS = 10_000
+"""Pixels of which the candidates of a draw are the cluster means."""
+_ITERATIONS = 10
+_NUM_POOLED_JUDGES = 1500
+_DARK = 0.3
+"""Length below which a distance counts less, as a share of that of bright pixels (95th percentile)."""
+_POWER = 1.2
+"""Of a distance in the cost: squared, highlights would choose; by itself, the variability of a common material would
+outweigh a rare one."""
+_SAME_MATERIAL = 0.995
+"""Cosine above which members of two sets are one material: an angle of 0.1 rad."""
 
 
 @dataclass(frozen=True)
@@ -180,20 +192,6 @@ def _count_shapes(pixels: Float[Tensor, "N B"], enough: int) -> int:
         left = left[(left - left[0]).square().sum(dim=1) > _DISTINCT]
         count += 1
     return count
-
-
-_DRAWS = 5
-_NUM_SEEDS = 10_000
-"""Pixels of which the candidates of a draw are the cluster means."""
-_ITERATIONS = 10
-_NUM_POOLED_JUDGES = 1500
-_DARK = 0.3
-"""Length below which a distance counts less, as a share of that of bright pixels (95th percentile)."""
-_POWER = 1.2
-"""Of a distance in the cost: squared, highlights would choose; by itself, the variability of a common material would
-outweigh a rare one."""
-_SAME_MATERIAL = 0.995
-"""Cosine above which members of two sets are one material: an angle of 0.1 rad."""
 
 
 def pooled_pair_endmembers(
