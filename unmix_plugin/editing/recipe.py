@@ -199,7 +199,7 @@ def _require_some(endmembers: tuple[Endmember, ...]) -> None:
 
 
 LightName: TypeAlias = str | Path
-"""Name of a known light (`spectral.colour.illuminants.illuminant_names`), or a CSV file, wavelength,power."""
+"""Name of a known light (`spectral.colour.conversion.illuminant_names`), or a CSV file, wavelength,power."""
 
 
 @dataclass(frozen=True)

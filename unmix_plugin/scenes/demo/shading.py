@@ -65,7 +65,7 @@ def lamp_power(
 
     Args:
         wavelengths_nm: Band centres.
-        illuminant: Name of a known light, or a CSV file, as `spectral.colour.illuminants.illuminant_power` takes it.
+        illuminant: Name of a known light, or a CSV file, as `spectral.colour.conversion.illuminant_power` takes it.
     Raises:
         SpectrumError: an unknown light, or one that is not known at all bands.
     """
