@@ -16,7 +16,7 @@ import torch
 
 from tests.commands.running import SMALL_METHOD, run
 from unmix_plugin.commands import train as train_arguments
-from unmix_plugin.commands.train import _read_remarks, parse, remarks, train
+from unmix_plugin.commands.train import _read_remarks, _remarks, parse, train
 from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
 from unmix_plugin.engine import registry
 from unmix_plugin.engine.runs.load_run import load_model
@@ -280,14 +280,14 @@ def course(*quarters: float) -> list[dict]:
     ],
 )
 def test_a_training_that_did_not_settle_is_told_from_one_that_did(quarters, said):
-    found = remarks(course(*quarters))
+    found = _remarks(course(*quarters))
     assert len(found) == (said is not None)
     assert said is None or said in found[0]
 
 
 def test_few_lines_and_losses_that_are_not_finite_say_nothing():
-    assert remarks(course(1.0, 0.9, 0.85, 0.8)[-5:]) == []
-    assert remarks([{**line, "loss": None} for line in course(1.0, 0.9, 0.85, 0.8)]) == []
+    assert _remarks(course(1.0, 0.9, 0.85, 0.8)[-5:]) == []
+    assert _remarks([{**line, "loss": None} for line in course(1.0, 0.9, 0.85, 0.8)]) == []
 
 
 def test_remarks_are_read_from_the_metrics_of_a_run(tmp_path):
@@ -302,13 +302,13 @@ def test_remarks_are_read_from_the_metrics_of_a_run(tmp_path):
 
 def test_poses_that_ran_away_are_said():
     lines = course(1.0, 0.2, 0.1, 0.09)
-    assert remarks([*lines[:-1], {**lines[-1], "poses_undone": 0.0}]) == []
-    said = remarks([*lines[:-1], {**lines[-1], "poses_undone": 3.0}])
+    assert _remarks([*lines[:-1], {**lines[-1], "poses_undone": 0.0}]) == []
+    said = _remarks([*lines[:-1], {**lines[-1], "poses_undone": 3.0}])
     assert "corrections of the poses of 3 views went beyond" in said[0]
 
 
 def test_poses_that_are_not_believed_are_said():
     lines = course(1.0, 0.2, 0.1, 0.09)
-    assert remarks([*lines[:-1], {**lines[-1], "poses_doubted": 0.01}]) == []
-    said = remarks([*lines[:-1], {**lines[-1], "poses_doubted": 0.12}])
+    assert _remarks([*lines[:-1], {**lines[-1], "poses_doubted": 0.01}]) == []
+    said = _remarks([*lines[:-1], {**lines[-1], "poses_doubted": 0.12}])
     assert "12% of the views, or of the rows of line cameras, still fit far worse than the others" in said[0]

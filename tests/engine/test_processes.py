@@ -8,7 +8,7 @@ import torch
 from torch import distributed
 
 from tests.engine.process_worker import STEPS, config_for, fixed_batch
-from unmix_plugin.engine.processes import ALONE, Follower, Processes, joined, run_processes
+from unmix_plugin.engine.processes import ALONE, Follower, Processes, _run_processes, joined
 from unmix_plugin.engine.training.trainer import Trainer, prepare_steps
 from unmix_plugin.errors import ConfigError
 
@@ -65,7 +65,7 @@ def run(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
     """
 
     def run_action(action: str) -> tuple[int, str, list[dict[str, torch.Tensor]]]:
-        code = run_processes(MODULE, [str(tmp_path), action], 2)
+        code = _run_processes(MODULE, [str(tmp_path), action], 2)
         kept = [torch.load(path) for path in sorted(tmp_path.glob("rank-*.pt"))]
         left = [path.read_text() for path in tmp_path.glob("threads-*.txt")]
         assert left

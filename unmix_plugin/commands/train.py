@@ -324,10 +324,10 @@ def _read_remarks(metrics_path: Path) -> list[str]:
         lines = [json.loads(line) for line in metrics_path.read_text(encoding="utf-8").splitlines()]
     except (OSError, ValueError):
         return []
-    return remarks([line for line in lines if line.get("split") == "train"])
+    return _remarks([line for line in lines if line.get("split") == "train"])
 
 
-def remarks(lines: Sequence[Mapping[str, Any]]) -> list[str]:
+def _remarks(lines: Sequence[Mapping[str, Any]]) -> list[str]:
     """Sentences for whoever trains.
 
     Args:

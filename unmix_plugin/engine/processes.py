@@ -280,7 +280,7 @@ def start_together(module: str, argv: Sequence[str], count: int) -> None:
     """Run a command in several processes and end this one, unless it is one of them or one is enough.
 
     Args:
-        module, argv: As `run_processes` takes them.
+        module, argv: As `_run_processes` takes them.
         count: Processes asked for.
     Raises:
         ConfigError: fewer than one.
@@ -288,10 +288,10 @@ def start_together(module: str, argv: Sequence[str], count: int) -> None:
     """
     require_in_range("num-devices", count, 1, MOST_PROCESSES)
     if count > 1 and not _are_started():
-        sys.exit(run_processes(module, argv, count))
+        sys.exit(_run_processes(module, argv, count))
 
 
-def run_processes(module: str, argv: Sequence[str], count: int) -> int:
+def _run_processes(module: str, argv: Sequence[str], count: int) -> int:
     """Run `python -m module argv` in `count` processes that find each other; only the first one's output is shown.
 
     Returns:

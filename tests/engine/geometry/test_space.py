@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
-from unmix_plugin.engine.geometry.space import RayBundle, SceneBox, UnitSpace, contract, uncontract
+from unmix_plugin.engine.geometry.space import RayBundle, SceneBox, UnitSpace, _contract, _uncontract
 
 
 def make_bundle(count: int) -> RayBundle:
@@ -97,29 +97,29 @@ POINTS = st.lists(st.floats(-100, 100, width=32), min_size=3, max_size=3).map(to
 
 @given(POINTS)
 def test_uncontract_inverts_contract(point):
-    found = uncontract(contract(point.double()))
+    found = _uncontract(_contract(point.double()))
     assert_close(found, point.double(), rtol=1e-6, atol=1e-9)
 
 
 @given(POINTS, POINTS)
 def test_contraction_brings_points_nearer_and_is_continuous(a, b):
     """Its greatest stretch is 1, inside the inner cube and across its faces."""
-    moved = (contract(a.double()) - contract(b.double())).abs().amax()
+    moved = (_contract(a.double()) - _contract(b.double())).abs().amax()
     assert moved <= 2 * (a.double() - b.double()).abs().amax() + 1e-12
-    near = contract(a.double() * (1 + 1e-9)) - contract(a.double())
+    near = _contract(a.double() * (1 + 1e-9)) - _contract(a.double())
     assert near.abs().amax() < 1e-8
 
 
 @given(POINTS)
 def test_contraction_stays_below_two_and_leaves_the_inner_cube_alone(point):
-    found = contract(point.double())
+    found = _contract(point.double())
     assert found.abs().amax() < 2
     inner = point.double() / 100
-    assert torch.equal(contract(inner), inner)
+    assert torch.equal(_contract(inner), inner)
 
 
 def test_the_far_end_of_a_direction_lies_on_the_outer_cube():
-    assert_close(contract(torch.tensor([1e6, 0.0, 5e5])), torch.tensor([2.0, 0.0, 1.0]), rtol=0, atol=1e-5)
+    assert_close(_contract(torch.tensor([1e6, 0.0, 5e5])), torch.tensor([2.0, 0.0, 1.0]), rtol=0, atol=1e-5)
 
 
 def test_the_unit_cube_of_a_bounded_scene_is_its_box_to_the_last_bit():

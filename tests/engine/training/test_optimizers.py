@@ -19,9 +19,9 @@ from unmix_plugin.engine.training import optimizers as guards
 from unmix_plugin.engine.training.optimizers import (
     GradientGuard,
     ParameterAverage,
+    _learning_rate,
     build_optimizer,
     forget_gradients,
-    learning_rate,
     set_learning_rates,
 )
 from unmix_plugin.engine.training.trainer import Trainer
@@ -38,21 +38,21 @@ fractions = st.floats(0.0, 1.0)
 @settings(deadline=None)
 @given(configs)
 def test_a_schedule_starts_at_lr_and_ends_at_its_final_factor(config: OptimizerConfig):
-    assert math.isclose(learning_rate(config, 0.0), config.lr, rel_tol=1e-12)
-    assert math.isclose(learning_rate(config, 1.0), config.lr * config.final_factor, rel_tol=1e-9)
+    assert math.isclose(_learning_rate(config, 0.0), config.lr, rel_tol=1e-12)
+    assert math.isclose(_learning_rate(config, 1.0), config.lr * config.final_factor, rel_tol=1e-9)
 
 
 @settings(deadline=None)
 @given(configs, fractions, fractions)
 def test_a_schedule_falls_by_equal_factors(config: OptimizerConfig, a: float, b: float):
-    ratio = learning_rate(config, a) / learning_rate(config, b)
+    ratio = _learning_rate(config, a) / _learning_rate(config, b)
     assert math.isclose(ratio, config.final_factor ** (a - b), rel_tol=1e-9)
 
 
 @settings(deadline=None)
 @given(configs, st.floats(-5, 5))
 def test_outside_its_range_progress_counts_as_the_nearer_end(config: OptimizerConfig, progress: float):
-    assert learning_rate(config, progress) == learning_rate(config, min(max(progress, 0.0), 1.0))
+    assert _learning_rate(config, progress) == _learning_rate(config, min(max(progress, 0.0), 1.0))
 
 
 def test_each_group_has_its_own_settings_and_rate():

@@ -183,7 +183,7 @@ def test_a_console_that_is_gone_ends_training_with_all_saved(short_config: Train
     with pytest.raises(Interrupted) as stopped:
         trainer.train()
     assert stopped.value.step == 1
-    assert "its output is closed" in trainer.run.log_path.read_text()
+    assert "its output is closed" in trainer.log.path.read_text()
 
 
 def test_training_off_a_terminal_prints_lines_without_control_codes(short_config: TrainerConfig, monkeypatch):

@@ -43,16 +43,6 @@ class RunFolder:
         return self.path / "metrics.jsonl"
 
     @property
-    def log_path(self) -> Path:
-        """What happened, one line an event."""
-        return self.path / "run.log"
-
-    @property
-    def lock_path(self) -> Path:
-        """Held by the training that writes to the run."""
-        return self.path / "run.lock"
-
-    @property
     def eval(self) -> Path:
         """Folder of evaluations."""
         return self.path / "eval"

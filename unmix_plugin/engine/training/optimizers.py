@@ -17,10 +17,10 @@ _BETAS = (0.9, 0.99)
 _EPS = 1e-15  # far below any gradient, so that the size of the loss does not matter
 
 
-def learning_rate(config: OptimizerConfig, progress: float) -> float:
+def _learning_rate(config: OptimizerConfig, progress: float) -> float:
     """Step size at `progress` in [0, 1]; beyond, that of the nearer end.
 
-    >>> learning_rate(OptimizerConfig(lr=1.0, final_factor=0.01), 0.5)
+    >>> _learning_rate(OptimizerConfig(lr=1.0, final_factor=0.01), 0.5)
     0.1
     """
     return config.lr * config.final_factor ** min(max(progress, 0.0), 1.0)
@@ -59,7 +59,7 @@ def set_learning_rates(
 ) -> dict[str, float]:
     """Set every group's step size for `progress`; returns them by group name."""
     names = [group["name"] for group in optimizer.param_groups]
-    rates = {name: learning_rate(configs[name], progress) for name in names}
+    rates = {name: _learning_rate(configs[name], progress) for name in names}
     for group in optimizer.param_groups:
         group["lr"] = rates[group["name"]]
     return rates

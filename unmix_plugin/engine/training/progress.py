@@ -252,7 +252,7 @@ class RunLog:
     """Appends dated lines to `run.log`."""
 
     def __init__(self, run: RunFolder) -> None:
-        self.path = run.log_path
+        self.path = run.path / "run.log"
 
     def write(self, text: str) -> None:
         """One event.

@@ -474,7 +474,7 @@ class Trainer:
         scene = scene_record_to_json(self.pipeline.datamanager)
         data = require_data(self.config)
         run = create_run_folder(self.config.output_dir, data.resolve().name, self.config.method_name)
-        self._lock = RunLock(run.lock_path)
+        self._lock = RunLock(run.path / "run.lock")
         write_run_json(run.scene_path, scene)
         write_config(run, self.config)
         return run
@@ -484,7 +484,7 @@ class Trainer:
         datamanager = self.pipeline.datamanager
         check_same_scene(read_scene_record(self.run, type(datamanager)), datamanager, self.run)
         require_checkpoint(self.run)  # before anything is written
-        self._lock = RunLock(self.run.lock_path)
+        self._lock = RunLock(self.run.path / "run.lock")
         checkpoint = require_checkpoint(self.run)  # another training may have saved one since
         record = self.steps.restore(checkpoint)
         self.step = self._saved_step = record.steps

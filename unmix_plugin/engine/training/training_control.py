@@ -163,12 +163,8 @@ class TrainingControl:
         self._save_requested = threading.Event()
         self._resumed = threading.Event()
         self._resumed.set()
-        self._is_running = False
-
-    @property
-    def is_running(self) -> bool:
+        self.is_running = False
         """Whether the training loop has begun and not ended; true while paused."""
-        return self._is_running
 
     @property
     def is_paused(self) -> bool:
@@ -182,7 +178,7 @@ class TrainingControl:
 
     def resume(self) -> None:
         """Let a paused training go on."""
-        self.device.is_training = self._is_running
+        self.device.is_training = self.is_running
         self._resumed.set()
 
     def request_stop(self) -> None:
@@ -196,12 +192,12 @@ class TrainingControl:
     @contextmanager
     def running(self) -> Iterator[None]:
         """Context of the training loop, entered by the trainer."""
-        self._is_running = True
+        self.is_running = True
         self.device.is_training = not self.is_paused
         try:
             yield
         finally:
-            self._is_running = False
+            self.is_running = False
             self.device.is_training = False
 
     def wait_while_paused(self) -> bool:
