@@ -218,11 +218,7 @@ class TrainingObjects:
 
 
 def training_object(
-    seed: int,
-    num_points: int = 640,
-    num_views: int = 12,
-    samples: int = 24,
-    demo_share: float = 0.75,
+    seed: int, num_points: int = 640, num_views: int = 12, samples: int = 24, demo_share: float = 0.75
 ) -> TrainingObjects:
     """One object under one light, its views path-traced with one indirect bounce.
 

@@ -248,11 +248,7 @@ def train_readers(
 
 @torch.no_grad()
 def what_is_said(
-    prior: SmallPrior,
-    objects: TrainingObjects,
-    truth: torch.Tensor,
-    material: MaterialName,
-    use_truth: bool,
+    prior: SmallPrior, objects: TrainingObjects, truth: torch.Tensor, material: MaterialName, use_truth: bool
 ) -> Estimates:
     """What the prior says of points, or the truth with the prior's log-variances."""
     parameters, log_variance = prior.estimate(prior(objects.observations), material)

@@ -218,10 +218,7 @@ FAULTS = {
         lambda folder: write_picture(folder / "images/001.exr", (-1.0, 0.0, 0.0)),
         "001.exr: negative values, NaN or infinity in .* pixels?;",
     ),
-    "mixed pictures": (
-        lambda folder: _change(folder, frames=_with_png(folder)),
-        "mix pictures of light",
-    ),
+    "mixed pictures": (lambda folder: _change(folder, frames=_with_png(folder)), "mix pictures of light"),
     "wrong held-out light": (
         lambda folder: write_light(folder / "relit" / "dim", sky=0.0),
         "relit/dim/environment.exr",

@@ -13,13 +13,7 @@ from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.fit import data_manager
 from unmix_plugin.neumatex.fit.data_manager import _view_arrays
 from unmix_plugin.neumatex.fit.object_scene import load_object
-from unmix_plugin.neumatex.fit.start import (
-    PriorAnchor,
-    _RunMaterials,
-    material_family,
-    start_plain,
-    views_of,
-)
+from unmix_plugin.neumatex.fit.start import PriorAnchor, _RunMaterials, material_family, start_plain, views_of
 from unmix_plugin.neumatex.tracing.surface import Triplane, TriplaneSurface
 from unmix_plugin.spectral.bands import Bands
 

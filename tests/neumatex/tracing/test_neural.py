@@ -14,13 +14,7 @@ from tests.neumatex.surfaces import eye_directions, numbers
 from tools.train_decoder import DecoderTraining, draw_materials, response_error, train, write_weights
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.tracing.families import LayeredFamily
-from unmix_plugin.neumatex.tracing.neural import (
-    SHIPPED,
-    Decoder,
-    Encoder,
-    NeuralFamily,
-    read_weights,
-)
+from unmix_plugin.neumatex.tracing.neural import SHIPPED, Decoder, Encoder, NeuralFamily, read_weights
 
 FAMILY = NeuralFamily()
 

@@ -85,10 +85,7 @@ class _Regression(nn.Module):
 
 
 def _train(
-    network: _Regression,
-    family: MaterialFamily,
-    parameters: Float[Tensor, "T P"],
-    generator: torch.Generator,
+    network: _Regression, family: MaterialFamily, parameters: Float[Tensor, "T P"], generator: torch.Generator
 ) -> None:
     optimiser = torch.optim.Adam(network.parameters(), lr=1e-2)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, _STEPS)

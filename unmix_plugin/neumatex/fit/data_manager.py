@@ -126,10 +126,7 @@ class ObjectDataManager(DataManager):
         light, view = place
         environment = light.environment
         placement = torch.tensor([environment.rotation_deg, environment.exposure_stops], device=self.device)
-        entries = {
-            "environment": environment.image.to(self.device),
-            "environment_placement": placement,
-        }
+        entries = {"environment": environment.image.to(self.device), "environment_placement": placement}
         return self._image(light.pictures, view, entries)
 
     def eval_name(self, index: int) -> str:

@@ -24,10 +24,7 @@ from torch import Tensor, nn
 from unmix_plugin.engine import Cameras, Model, Output, RayBundle, TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.fit.data_manager import batch_environment
-from unmix_plugin.neumatex.fit.evaluation import (
-    evaluate_object_image,
-    evaluation_outputs,
-)
+from unmix_plugin.neumatex.fit.evaluation import evaluate_object_image, evaluation_outputs
 from unmix_plugin.neumatex.fit.settings import NeumatexModelConfig, ObjectRecord
 from unmix_plugin.neumatex.fit.start import (
     PriorAnchor,
