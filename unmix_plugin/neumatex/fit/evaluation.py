@@ -38,15 +38,8 @@ def evaluation_outputs(
     """`light` and `base_colour`, both linear, and `parameters` of the material, where pixels count; 0 elsewhere."""
     hits = pixel_hits(traced.ray_mesh, camera, 0, SUBPIXELS)
     hits = hits.select((batch["alpha"] >= OPAQUE_ALPHA).flatten()[hits.pixels])
-    light = rays_radiance(
-        traced.surface,
-        traced.ray_mesh,
-        traced.environment,
-        hits,
-        samples=model.config.eval_samples,
-        bounces=model.config.bounces,
-        generator=torch.Generator(model.device).manual_seed(0),
-    )
+    generator = torch.Generator(model.device).manual_seed(0)
+    light = rays_radiance(traced, hits, model.config.eval_samples, model.config.bounces, generator)
     parameters = traced.surface.parameters(hits.points.positions)
     values = {"light": light, "base_colour": model.family.base_colour(parameters), "parameters": parameters}
     return {name: hits.image(value) for name, value in values.items()}

@@ -29,7 +29,7 @@ from unmix_plugin.neumatex.tracing.light_files import (
     read_environment_of_bands,
 )
 from unmix_plugin.neumatex.tracing.mesh import Mesh
-from unmix_plugin.neumatex.tracing.path_tracer import rays_radiance
+from unmix_plugin.neumatex.tracing.path_tracer import TracedObject, rays_radiance
 from unmix_plugin.neumatex.tracing.rays import PixelHits, RayMesh, pixel_hits
 from unmix_plugin.neumatex.tracing.surface import Surface
 from unmix_plugin.scenes.scene import Normalisation
@@ -222,15 +222,9 @@ class TrainedObject:
         hits = pixel_hits(self.ray_mesh, camera, 0, subpixels)
         # Another seed for each strip of rows of a picture, always the same for the same one.
         seed = 7919 * number + round(abs(float(camera.center_px[0, 1]))) % 7907
-        light = rays_radiance(
-            self.surface,
-            self.ray_mesh,
-            self.environment,
-            hits,
-            samples=samples,
-            bounces=self.bounces,
-            generator=torch.Generator(self.device).manual_seed(seed),
-        )
+        traced = TracedObject(self.ray_mesh, self.environment, self.surface)
+        generator = torch.Generator(self.device).manual_seed(seed)
+        light = rays_radiance(traced, hits, samples, self.bounces, generator)
         return ModelView(camera, self._view_outputs(camera, hits, light))
 
     def _view_outputs(

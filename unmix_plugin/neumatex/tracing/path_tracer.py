@@ -90,7 +90,7 @@ class TracedObject:
         to_eye: Float[Tensor, "N 3"],
         samples: int,
         bounces: int,
-        generator: torch.Generator,
+        generator: torch.Generator | None,
     ) -> Float[Tensor, "N C"]:
         """Light that points send to the eye, an estimate from so many paths; differentiable by the materials."""
         return reflected_radiance(
@@ -335,9 +335,8 @@ def render_view(
         Linear radiance and alpha; without gradient.
     """
     hits = pixel_hits(ray_mesh, cameras, index, subpixels)
-    radiance = rays_radiance(
-        surface, ray_mesh, environment, hits, samples=samples, bounces=bounces, generator=generator
-    )
+    traced = TracedObject(ray_mesh, environment, surface)
+    radiance = rays_radiance(traced, hits, samples, bounces, generator)
     image, alpha = hits.image(radiance), hits.alpha()
     if background == "environment":
         missing = torch.zeros(alpha.numel(), environment.num_colours, device=ray_mesh.device)
@@ -351,29 +350,13 @@ def render_view(
 
 @torch.no_grad()
 def rays_radiance(
-    surface: Surface,
-    ray_mesh: RayMesh,
-    environment: Environment,
-    hits: PixelHits,
-    *,
-    samples: int,
-    bounces: int = 1,
-    generator: torch.Generator | None = None,
+    traced: TracedObject, hits: PixelHits, samples: int, bounces: int, generator: torch.Generator | None
 ) -> Float[Tensor, "K C"]:
     """Radiance along each ray of an image, chunk after chunk; samples are those of a pixel. Without gradient."""
     samples_a_ray = max(1, -(-samples // hits.rays_a_pixel))
-    rows = torch.arange(len(hits), device=ray_mesh.device).split(max(1, _PATHS_AT_ONCE // samples_a_ray))
+    device = traced.ray_mesh.device
     parts = [
-        reflected_radiance(
-            surface,
-            ray_mesh,
-            environment,
-            hits.points.select(part),
-            hits.to_eye[part],
-            samples=samples_a_ray,
-            bounces=bounces,
-            generator=generator,
-        )
-        for part in rows
+        traced.light(hits.points.select(rows), hits.to_eye[rows], samples_a_ray, bounces, generator)
+        for rows in torch.arange(len(hits), device=device).split(max(1, _PATHS_AT_ONCE // samples_a_ray))
     ]
-    return torch.cat(parts) if parts else torch.zeros(0, environment.num_colours, device=ray_mesh.device)
+    return torch.cat(parts) if parts else torch.zeros(0, traced.environment.num_colours, device=device)
