@@ -1,5 +1,7 @@
 """Cameras whose poses are refined, for tests."""
 
+from dataclasses import replace
+
 import torch
 
 from unmix_plugin.engine.geometry.cameras import Cameras
@@ -26,6 +28,11 @@ def cameras() -> Cameras:
     keys = KeyPoses(torch.cat([poses[:1], ends, poses[2:]]), torch.tensor([0.5, 0.5, 39.5, 0.5]), (1, 2, 1))
     focal, center = torch.full((3, 2), 20.0), torch.tensor([[6.0, 20.0]]).repeat(3, 1)
     return Cameras(poses, focal, center, torch.zeros(3, 4), WIDTH, HEIGHT, key_poses=keys)
+
+
+def line_camera() -> Cameras:
+    """The line camera alone, with a lens that bends."""
+    return replace(cameras()[1], distortion=torch.tensor([[0.1, -0.02, 0.001, 0.002]]))
 
 
 def refinement(lens: str = "fixed", size: float = 0.04, pixel_size: float = 0.1) -> PoseRefinement:

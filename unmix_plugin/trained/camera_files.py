@@ -1,8 +1,9 @@
 """Cameras as files: nerfstudio's camera_path.json, and the frames of a transforms.json.
 
 `camera_path` holds a path in model space, as a viewer of a run shows it. `frames` holds poses in the world space of the
-scene, or in model space where the file says `"space": "model"`, with the lens keys of transforms.json. What the keys
-`applied_transform`, `applied_scale` and `offset` of a scene's own transforms.json did is undone first.
+scene, or in model space where the file says `"space": "model"`, with the lens keys of transforms.json, and of line
+cameras with `key_poses` or `row_poses` in place of `transform_matrix`. What the keys `applied_transform`,
+`applied_scale` and `offset` of a scene's own transforms.json did is undone first.
 
 Source: nerfstudio 1.1, viewer/render_panel.py and cameras/camera_paths.py: matrices of 16 numbers row by row, OpenGL
 axes, vertical field of view in degrees.
@@ -23,6 +24,7 @@ import torch
 from jaxtyping import Float64
 
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.scenes.placement import read_placement
 from unmix_plugin.scenes.reading.faults import (
@@ -32,17 +34,15 @@ from unmix_plugin.scenes.reading.faults import (
     read_json_file,
     read_number,
 )
-from unmix_plugin.scenes.reading.transforms_json import read_intrinsics, read_pose
+from unmix_plugin.scenes.reading.transforms_json import read_intrinsics, read_line_poses, read_pose
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.trained.run_views import RunView
 
-FORMAT_VERSION = 1
+_FORMAT_VERSION = 1
 """Of the camera files that we write."""
-
-GREATEST_SIDE_PX = 16_384
-"""Width and height of the largest picture."""
-
-_GREATEST_FPS = 1000
+_GREATEST_SIDE_PX = 16_384
+_GREATEST_FPS, _USUAL_FPS = 1000, 24
+_LENS_KEYS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4")
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,10 @@ class CameraFile:
 
 
 def check_size(width: float | int, height: float | int, where: str) -> tuple[int, int]:
-    """Width and height of a picture in pixels: whole numbers from 1 to `GREATEST_SIDE_PX`, or a ConfigError."""
-    if not all(side == int(side) and 1 <= side <= GREATEST_SIDE_PX for side in (width, height)):
+    """Width and height of a picture in pixels: whole numbers from 1 to 16384, or a ConfigError."""
+    if not all(side == int(side) and 1 <= side <= _GREATEST_SIDE_PX for side in (width, height)):
         raise ConfigError(
-            f"{where}: {width:g} x {height:g} pixels; expected whole numbers from 1 to {GREATEST_SIDE_PX}"
+            f"{where}: {width:g} x {height:g} pixels; expected whole numbers from 1 to {_GREATEST_SIDE_PX}"
         )
     return int(width), int(height)
 
@@ -73,11 +73,11 @@ def check_frames_per_second(value: float | int | None, where: str) -> float:
     return float(value)
 
 
-def read_camera_json(path: Path) -> dict[str, Any]:
-    """The object in a camera file.
+def read_camera_file(path: Path, frame: Normalisation) -> CameraFile:
+    """Read the cameras of a file; `frame` leads from world to model space.
 
     Raises:
-        ConfigError: the file is missing, empty, no JSON object, or of another version.
+        ConfigError: it is missing, empty, no camera file, from a newer version, or a camera in it is impossible.
     """
     try:
         content = read_json_file(path)
@@ -87,122 +87,15 @@ def read_camera_json(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path} {error}") from error
     if not isinstance(content, dict):
         raise ConfigError(f"{path} holds {describe(content)}; expected an object with cameras")
-    version = content.get("format_version", FORMAT_VERSION)
-    if version != FORMAT_VERSION:
+    version = content.get("format_version", _FORMAT_VERSION)
+    if version != _FORMAT_VERSION:
         raise ConfigError(
-            f"{path} has format_version {describe(version)}; this version reads {FORMAT_VERSION}: update this package "
+            f"{path} has format_version {describe(version)}; this version reads {_FORMAT_VERSION}: update this package "
             "or write the file again"
         )
-    return content
-
-
-def one_view(
-    name: str,
-    pose: Float64[np.ndarray, "3 4"],
-    focal_px: Sequence[float],
-    center_px: Sequence[float],
-    distortion: Sequence[float],
-    size: tuple[int, int],
-) -> RunView:
-    """A view of one camera, model space; sizes and lengths in pixels, `size` is width and height."""
-    width, height = size
-    matrix, focal, center, bending = (
-        torch.tensor(np.array([values]), dtype=torch.float32)
-        for values in (pose, focal_px, center_px, distortion)
-    )
-    return RunView(name, Cameras(matrix, focal, center, bending, width, height))
-
-
-def camera_entries(content: dict[str, Any], key: str, path: Path) -> list[dict[str, Any]]:
-    """The objects in a list, one a camera; a ConfigError for anything else, and for an empty list."""
-    entries = content[key]
-    if not isinstance(entries, list):
-        raise ConfigError(f"{path}: '{key}' is {describe(entries)}; expected a list with one object a camera")
-    if not entries:
-        raise ConfigError(f"{path}: '{key}' is empty; expected at least one camera")
-    for index, entry in enumerate(entries):
-        if not isinstance(entry, dict):
-            raise ConfigError(f"{path}: {key}[{index}] is {describe(entry)}; expected an object")
-    return entries
-
-
-def needed_number(values: dict[str, Any], key: str, where: Path | str) -> float:
-    """A finite number; a ConfigError where it is absent or no number."""
-    number = read_number(values.get(key))
-    if number is None:
-        found = describe(values[key]) if key in values else "absent"
-        raise ConfigError(f"{where}: '{key}' is {found}; expected a number")
-    return number
-
-
-def needed_pose(matrix: Any, where: str, path: Path, key: str) -> Float64[np.ndarray, "3 4"]:
-    """Camera to world, its rotation orthonormal.
-
-    Args:
-        matrix: 4 (or 3) rows of 4 numbers.
-        where, path, key: Camera, file and key of the matrix, for messages.
-    Raises:
-        ConfigError: no matrix, or not rigid.
-    """
-    faults = Faults(path)
-    pose = read_pose(matrix, where, faults)
-    try:
-        faults.raise_if_any()
-    except SceneError as error:
-        raise ConfigError(str(error).replace("'transform_matrix'", f"'{key}'")) from error
-    assert pose is not None
-    return pose
-
-
-_USUAL_FPS = 24
-
-
-def read_camera_path(path: Path, content: dict[str, Any]) -> CameraFile:
-    """The cameras of a file whose content has a `camera_path`; pinholes of the file's size.
-
-    Raises:
-        ConfigError: an impossible size, lens or pose, or something that has no counterpart here.
-    """
-    kind = content.get("camera_type", "perspective")
-    if kind != "perspective":
-        raise ConfigError(f"{path}: camera_type {describe(kind)} is not supported; expected perspective")
-    if content.get("crop") is not None:
-        raise ConfigError(f"{path}: 'crop' is not supported; take it out to render all of the scene")
-    width, height = (needed_number(content, key, path) for key in ("render_width", "render_height"))
-    width, height = check_size(width, height, f"{path}: render_width and render_height")
-    views = [
-        _keyed_view(entry, index, (width, height), path)
-        for index, entry in enumerate(camera_entries(content, "camera_path", path))
-    ]
-    frames_per_second = content.get("fps", _USUAL_FPS)
-    return CameraFile(tuple(views), check_frames_per_second(read_number(frames_per_second), f"{path}: 'fps'"))
-
-
-def _keyed_view(entry: dict[str, Any], index: int, size: tuple[int, int], path: Path) -> RunView:
-    where = f"{path}: camera_path[{index}]"
-    values = entry.get("camera_to_world")
-    if isinstance(values, list) and len(values) == 16:
-        values = [values[row : row + 4] for row in range(0, 16, 4)]
-    fov_deg = needed_number(entry, "fov", where)
-    if not 0 < fov_deg < 180:
-        raise ConfigError(f"{where}: 'fov' is {fov_deg:g}; expected degrees between 0 and 180, vertical")
-    focal = 0.5 * size[1] / math.tan(math.radians(fov_deg) / 2)
-    pose = needed_pose(values, f"camera_path[{index}]", path, "camera_to_world")
-    return one_view(
-        f"frame_{index:04d}", pose, (focal, focal), (size[0] / 2, size[1] / 2), (0.0, 0.0, 0.0, 0.0), size
-    )
-
-
-def read_camera_file(path: Path, frame: Normalisation) -> CameraFile:
-    """Read the cameras of a file; `frame` leads from world to model space.
-
-    Raises:
-        ConfigError: it is missing, empty, no camera file, from a newer version, or a camera in it is impossible.
-    """
-    content = read_camera_json(path)
     try:
         if "camera_path" in content:
-            return read_camera_path(path, content)
+            return _read_camera_path(path, content)
         if "frames" in content:
             return _read_frames(path, content, frame)
     except SceneError as error:
@@ -226,34 +119,107 @@ def camera_file_bytes(
     """
     camera = views[0].camera
     content = {
-        "format_version": FORMAT_VERSION,
+        "format_version": _FORMAT_VERSION,
         "space": "world",
         "camera_model": "OPENCV",
         "w": camera.width,
         "h": camera.height,
         **({} if frames_per_second is None else {"fps": frames_per_second}),
-        "frames": [_frame_entry(view, frame) for view in views],
+        "frames": [camera_entry(view, frame) for view in views],
     }
     return (json.dumps(content, indent=1) + "\n").encode()
+
+
+def camera_entry(view: RunView, frame: Normalisation) -> dict[str, Any]:
+    """Name, lens and pose of a view as the frames of transforms.json have them; of a line camera `key_poses`."""
+    camera = view.camera
+
+    def matrix(pose: torch.Tensor) -> list[list[float]]:
+        values = pose.double().cpu().numpy()
+        rows = np.column_stack([frame.rotation.T @ values[:, :3], frame.to_world(values[:, 3])])
+        return [*rows.tolist(), [0.0, 0.0, 0.0, 1.0]]
+
+    lens = torch.cat([camera.focal_px, camera.center_px, camera.distortion], dim=1)[0].tolist()
+    entry = {"name": view.name, **dict(zip(_LENS_KEYS, lens, strict=False))}
+    if camera.key_poses is None:
+        return {**entry, "transform_matrix": matrix(camera.camera_to_world[0])}
+    keys = zip(camera.key_poses.heights.tolist(), camera.key_poses.poses, strict=True)
+    return {**entry, "key_poses": [{"row": y - 0.5, "transform_matrix": matrix(pose)} for y, pose in keys]}
+
+
+def _read_camera_path(path: Path, content: dict[str, Any]) -> CameraFile:
+    """The cameras of a nerfstudio path: pinholes of the file's size."""
+    kind = content.get("camera_type", "perspective")
+    if kind != "perspective":
+        raise ConfigError(f"{path}: camera_type {describe(kind)} is not supported; expected perspective")
+    if content.get("crop") is not None:
+        raise ConfigError(f"{path}: 'crop' is not supported; take it out to render all of the scene")
+    sides = [_needed_number(content, key, path) for key in ("render_width", "render_height")]
+    width, height = check_size(sides[0], sides[1], f"{path}: render_width and render_height")
+    views = []
+    for index, entry in enumerate(_entries(content, "camera_path", path)):
+        values = entry.get("camera_to_world")
+        if isinstance(values, list) and len(values) == 16:
+            values = [values[row : row + 4] for row in range(0, 16, 4)]
+        fov_deg = _needed_number(entry, "fov", f"{path}: camera_path[{index}]")
+        if not 0 < fov_deg < 180:
+            raise ConfigError(
+                f"{path}: camera_path[{index}]: 'fov' is {fov_deg:g}; expected degrees between 0 and 180, vertical"
+            )
+        focal = 0.5 * height / math.tan(math.radians(fov_deg) / 2)
+        faults = Faults(path)
+        pose = read_pose(values, f"camera_path[{index}]", faults, "'camera_to_world'")
+        faults.raise_if_any()
+        assert pose is not None
+        camera = _camera(pose, (focal, focal), (width / 2, height / 2), (0.0,) * 4, (width, height))
+        views.append(RunView(f"frame_{index:04d}", camera))
+    fps = read_number(content.get("fps", _USUAL_FPS))
+    return CameraFile(tuple(views), check_frames_per_second(fps, f"{path}: 'fps'"))
 
 
 def _read_frames(path: Path, content: dict[str, Any], frame: Normalisation) -> CameraFile:
     space = content.get("space", "world")
     if space not in ("world", "model"):
         raise ConfigError(f"{path}: 'space' is {describe(space)}; expected world or model")
-    entries = camera_entries(content, "frames", path)
-    names = _names(entries, path)
-    faults = Faults(path)
+    entries = _entries(content, "frames", path)
+    names, faults = _names(entries, path), Faults(path)
     placement = read_placement(content, faults, path.name)
     faults.raise_if_any()
+
+    def in_model(poses: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, "n 3 4"]:
+        if space == "model":
+            return poses
+        positions = frame.to_model(placement.to_source(poses[:, :, 3]))
+        rotations = frame.rotation @ placement.rotation.T @ poses[:, :, :3]
+        return np.concatenate([rotations, positions[:, :, None]], axis=2)
+
     views = []
     for index, (entry, name) in enumerate(zip(entries, names, strict=True)):
-        pose = needed_pose(entry.get("transform_matrix"), f"frames[{index}]", path, "transform_matrix")
-        if space == "world":
-            position = frame.to_model(placement.to_source(pose[:, 3]))
-            rotation = frame.rotation @ placement.rotation.T @ pose[:, :3]
-            pose = np.concatenate([rotation, position[:, None]], axis=1)
-        views.append(_frame_view(name, pose, {**content, **entry}, index, path))
+        where = f"frames[{index}]"
+        lines = read_line_poses(entry, where, faults)
+        has_rows = lines is not None or faults.noted > 0
+        pose = None if has_rows else read_pose(entry.get("transform_matrix"), where, faults)
+        lens = read_intrinsics({}, {**content, **entry}, where, faults)
+        faults.raise_if_any()
+        assert lens is not None
+        if lens.width is None or lens.height is None:
+            raise ConfigError(
+                f"{path}: {where}: 'w' and 'h' are absent; expected the size of the picture in pixels"
+            )
+        width, height = check_size(lens.width, lens.height, f"{path}: {where}")
+        middle = [
+            0.5 * side if x is None else x for x, side in zip(lens.center_px, (width, height), strict=True)
+        ]
+        focal_px = lens.focal_at(width, height)
+        assert focal_px is not None
+        one = lines.middle if lines is not None else pose
+        assert one is not None
+        keys = None
+        if lines is not None:
+            poses, heights = (torch.from_numpy(x).float() for x in (in_model(lines.poses), lines.rows + 0.5))
+            keys = KeyPoses(poses, heights, (len(heights),))
+        camera = _camera(in_model(one[None])[0], focal_px, middle, lens.coefficients, (width, height), keys)
+        views.append(RunView(name, camera))
     sizes = {(view.camera.width, view.camera.height) for view in views}
     if len(sizes) > 1:
         raise ConfigError(f"{path}: frames have the sizes {sorted(sizes)}; expected one size for all")
@@ -262,24 +228,39 @@ def _read_frames(path: Path, content: dict[str, Any], frame: Normalisation) -> C
     return CameraFile(tuple(views), check_frames_per_second(read_number(content["fps"]), f"{path}: 'fps'"))
 
 
-def _frame_view(
-    name: str, pose: Float64[np.ndarray, "3 4"], values: dict[str, Any], index: int, path: Path
-) -> RunView:
-    where = f"frames[{index}]"
-    faults = Faults(path)
-    lens = read_intrinsics({}, values, where, faults)
-    faults.raise_if_any()
-    assert lens is not None
-    if lens.width is None or lens.height is None:
-        raise ConfigError(
-            f"{path}: {where}: 'w' and 'h' are absent; expected the size of the picture in pixels"
-        )
-    width, height = check_size(lens.width, lens.height, f"{path}: {where}")
-    x, y = lens.center_px
-    centre = (width / 2 if x is None else x, height / 2 if y is None else y)
-    focal_px = lens.focal_at(width, height)
-    assert focal_px is not None
-    return one_view(name, pose, focal_px, centre, lens.coefficients, (width, height))
+def _camera(
+    pose: Float64[np.ndarray, "3 4"],
+    focal_px: Sequence[float],
+    center_px: Sequence[float],
+    distortion: Sequence[float],
+    size: tuple[int, int],
+    keys: KeyPoses | None = None,
+) -> Cameras:
+    matrix, focal, center, bending = (
+        torch.tensor(np.array([x]), dtype=torch.float32) for x in (pose, focal_px, center_px, distortion)
+    )
+    return Cameras(matrix, focal, center, bending, *size, key_poses=keys)
+
+
+def _entries(content: dict[str, Any], key: str, path: Path) -> list[dict[str, Any]]:
+    """The objects in a list, one a camera; a ConfigError for anything else, and for an empty list."""
+    entries = content[key]
+    if not isinstance(entries, list):
+        raise ConfigError(f"{path}: '{key}' is {describe(entries)}; expected a list with one object a camera")
+    if not entries:
+        raise ConfigError(f"{path}: '{key}' is empty; expected at least one camera")
+    for index, entry in enumerate(entries):
+        if not isinstance(entry, dict):
+            raise ConfigError(f"{path}: {key}[{index}] is {describe(entry)}; expected an object")
+    return entries
+
+
+def _needed_number(values: dict[str, Any], key: str, where: Path | str) -> float:
+    number = read_number(values.get(key))
+    if number is None:
+        found = describe(values[key]) if key in values else "absent"
+        raise ConfigError(f"{where}: '{key}' is {found}; expected a number")
+    return number
 
 
 def _names(entries: Sequence[dict[str, Any]], path: Path) -> list[str]:
@@ -296,14 +277,3 @@ def _names(entries: Sequence[dict[str, Any]], path: Path) -> list[str]:
         if key == "name":
             raise ConfigError(f"{path}: two frames have one name, or a name that no file can have")
     return numbers
-
-
-def _frame_entry(view: RunView, frame: Normalisation) -> dict[str, Any]:
-    camera = view.camera
-    pose = camera.camera_to_world[0].double().cpu().numpy()
-    position = frame.to_world(pose[:, 3])
-    pose = np.concatenate([frame.rotation.T @ pose[:, :3], position[:, None]], axis=1)
-    lens = torch.cat([camera.focal_px, camera.center_px, camera.distortion], dim=1)[0].tolist()
-    keys = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4")[: len(lens)]
-    matrix = [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]]
-    return {"name": view.name, "transform_matrix": matrix, **dict(zip(keys, lens, strict=True))}

@@ -2,6 +2,7 @@
 
 import errno
 import os
+from dataclasses import replace
 
 import imageio.v3 as iio
 import numpy as np
@@ -10,11 +11,14 @@ from matplotlib import colormaps
 from PIL import Image
 
 from tests.formats.video_reading import read_video
+from tests.pose_factory import line_camera
 from tests.products.render.render_factory import SCENE, read_envi, read_exr, render, truth, views
 from unmix_plugin.errors import RunError
 from unmix_plugin.figures.pictures import CanvasLayout
+from unmix_plugin.products.render.cameras import RenderCameras
 from unmix_plugin.products.render.files import still_paths
 from unmix_plugin.products.render.job import RenderJob, Survey, output_paths
+from unmix_plugin.trained.run_views import RunView
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 pytestmark = pytest.mark.usefixtures("no_wait_for_the_disk")
@@ -43,6 +47,18 @@ def test_arrays_are_what_the_model_renders_bit_for_bit(written):
             np.testing.assert_array_equal(array, values[product.output.name])
             read += 1
     assert read == 2 * 17
+
+
+def test_a_sweep_of_a_line_camera_is_rendered_by_the_poses_of_its_rows(tmp_path):
+    """Block by block, and through a lens that bends."""
+    lines = line_camera()
+    cameras = RenderCameras((RunView("sweep", lines),), False, None)
+    render(tmp_path, ["spectral"], ["npy"], cameras, pixels=5 * lines.width)
+    expected = SCENE.look(lines)["spectral"].numpy()
+    written = np.load(tmp_path / "spectral" / "sweep.npy")
+    np.testing.assert_allclose(written, expected, atol=1e-5)
+    still = SCENE.look(replace(lines, key_poses=None))["spectral"].numpy()
+    assert np.abs(written - still).max() > 0.05
 
 
 def test_envi_cubes_are_what_the_model_renders_bit_for_bit(written):

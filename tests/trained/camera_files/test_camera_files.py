@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.pose_factory import line_camera
 from tests.scenes.scene_factory import look_at
 from tests.trained.camera_files.camera_scenes import FRAME, around
 from unmix_plugin.errors import ConfigError
@@ -99,6 +100,19 @@ def test_what_is_written_is_read_back_as_the_same_cameras(tmp_path, frames_per_s
             torch.testing.assert_close(
                 getattr(again.camera, part), getattr(view.camera, part), atol=1e-6, rtol=0
             )
+
+
+def test_a_line_camera_keeps_the_poses_of_its_rows(tmp_path):
+    """Small as a render may be, with a lens that bends."""
+    lines = line_camera().resized(9, 30)
+    path = tmp_path / "cameras.json"
+    path.write_bytes(camera_file_bytes([RunView("sweep", lines)], None, FRAME))
+    [view] = read_camera_file(path, FRAME).views
+    torch.testing.assert_close(view.camera.distortion, lines.distortion)
+    again, rays = view.camera.image_rays(0), lines.image_rays(0)
+    torch.testing.assert_close(again.origins, rays.origins, atol=1e-5, rtol=0)
+    torch.testing.assert_close(again.directions, rays.directions, atol=1e-5, rtol=0)
+    assert (rays.origins - rays.origins[0]).norm(dim=1).max() > 0.5
 
 
 def scaled(matrix):

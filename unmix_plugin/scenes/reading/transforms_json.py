@@ -264,7 +264,7 @@ class _LinePoses:
         )
 
 
-def _read_line_poses(frame: dict[str, Any], where: str, faults: Faults) -> _LinePoses | None:
+def read_line_poses(frame: dict[str, Any], where: str, faults: Faults) -> _LinePoses | None:
     """The poses of a line camera; None for a frame camera, and with a noted fault where they are wrong."""
     given = [key for key in (_ROW_POSES, _KEY_POSES) if frame.get(key) is not None]
     if not given:
@@ -449,7 +449,7 @@ def _read_frame(
     if frame.get("hyperspectral_file_path") is None and frame.get("file_path") is None and not needs_cube:
         faults.add(where, "has no 'file_path'; expected the path of its picture")
     noted = faults.noted
-    lines = _read_line_poses(frame, where, faults)
+    lines = read_line_poses(frame, where, faults)
     is_frame_camera = lines is None and faults.noted == noted
     pose = read_pose(frame.get("transform_matrix"), where, faults) if is_frame_camera else None
     return FrameEntry(
