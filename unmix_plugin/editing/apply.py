@@ -81,11 +81,7 @@ from unmix_plugin.spectral.colour.conversion import (
     rgb_matrix,
     srgb_to_linear,
 )
-from unmix_plugin.spectral.library.material_library import (
-    DARK_LIGHT,
-    MaterialLibrary,
-    measured_library,
-)
+from unmix_plugin.spectral.library.material_library import DARK_LIGHT, MaterialLibrary, measured_library
 from unmix_plugin.spectral.materials import Coefficients
 from unmix_plugin.spectral.sensor import Sensor
 from unmix_plugin.trained.trained_scene import TrainedScene
@@ -231,7 +227,7 @@ _REPLACED, _RETINTED, _NAMED, _COLOURED = "replaced", "retinted", "renamed", "gi
 _REMOVED, _ISOLATED = "removed", "isolated"
 
 
-def carry_out(recipe: Recipe, state: MaterialState) -> None:
+def _carry_out(recipe: Recipe, state: MaterialState) -> None:
     """Make all edits of a recipe, in order.
 
     Raises:
@@ -412,7 +408,7 @@ def edit_scene(scene: TrainedScene, recipe: Recipe, seen: Coefficients | None = 
     if seen is None and recipe.wants_pictures:
         seen = sample_seen(scene)
     state = MaterialState.of(scene.materials, light, seen)
-    carry_out(recipe, state)
+    _carry_out(recipe, state)
     factors, told = _light_factors(scene, recipe)
     specular_spectra, gloss = _specular(state)
     materials = replace(

@@ -21,11 +21,11 @@ Endmember: TypeAlias = str | int
 Colour: TypeAlias = tuple[float, float, float]
 """sRGB, [0, 1]."""
 
-Match: TypeAlias = Literal["picture", "spectrum"]
+_Match: TypeAlias = Literal["picture", "spectrum"]
 """What is given a colour: the material as cameras see it, shaded, or its spectrum in full light."""
 
-LONGEST_NAME = 40
-GREATEST_FACTOR = 1000.0
+_LONGEST_NAME = 40
+_GREATEST_FACTOR = 1000.0
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class Retint(Operation):
 
     endmember: Endmember
     colour: Colour
-    match: Match = "picture"
+    match: _Match = "picture"
 
     def __post_init__(self) -> None:
         _require_colour(self.colour)
@@ -152,9 +152,9 @@ class Rename(Operation):
         """Names end up in CSV headers, ENVI lists, EXR channels and legends, so they are kept plain."""
         name = self.name
         is_plain = all(letter.isalnum() or letter in " _-" for letter in name)
-        if not (name[:1].isalpha() and is_plain and name == name.strip() and len(name) <= LONGEST_NAME):
+        if not (name[:1].isalpha() and is_plain and name == name.strip() and len(name) <= _LONGEST_NAME):
             raise ConfigError(
-                f"a name has at most {LONGEST_NAME} letters, digits, spaces, - and _ and starts with a letter; "
+                f"a name has at most {_LONGEST_NAME} letters, digits, spaces, - and _ and starts with a letter; "
                 f"found {name!r}"
             )
 
@@ -189,8 +189,8 @@ def _require_colour(colour: Colour) -> None:
 
 
 def _require_factor(name: str, factor: float) -> None:
-    if not (math.isfinite(factor) and 0 <= factor <= GREATEST_FACTOR):
-        raise ConfigError(f"{name} must be a number from 0 to {GREATEST_FACTOR:g}; found {factor!r}")
+    if not (math.isfinite(factor) and 0 <= factor <= _GREATEST_FACTOR):
+        raise ConfigError(f"{name} must be a number from 0 to {_GREATEST_FACTOR:g}; found {factor!r}")
 
 
 def _require_some(endmembers: tuple[Endmember, ...]) -> None:

@@ -62,12 +62,12 @@ _ERROR_SCALE = ColourScale("magma", 0.0, 0.2, "error of sRGB")
 _COLUMNS = 7
 
 
-Follow = Callable[[str, Sequence[Any]], Iterator[Any]]
+_Follow = Callable[[str, Sequence[Any]], Iterator[Any]]
 """The items given, while it is shown how many are done."""
 
 
 @dataclass(frozen=True)
-class Evaluated:
+class _Evaluated:
     """What was found of a run."""
 
     figures: dict[str, float | None]
@@ -95,7 +95,7 @@ class Evaluated:
         return figures
 
 
-def evaluate_images(pipeline: Pipeline, folder: Path, follow: Follow) -> Evaluated:
+def evaluate_images(pipeline: Pipeline, folder: Path, follow: _Follow) -> _Evaluated:
     """What a model says of its own images, and its pictures of each: KIND/NAME.png in the folder.
 
     Raises:
@@ -112,7 +112,7 @@ def evaluate_images(pipeline: Pipeline, folder: Path, follow: Follow) -> Evaluat
     means = average_metrics([metrics for _, metrics in found])
     figures = {**finite_or_none(means), "views": len(pipeline.datamanager.eval_cameras)}
     per_image = [{"name": name, **finite_or_none(metrics)} for name, metrics in found]
-    return Evaluated(figures, per_image, {}, num_pictures, has_materials=False)
+    return _Evaluated(figures, per_image, {}, num_pictures, has_materials=False)
 
 
 def evaluate_scene(
@@ -120,9 +120,9 @@ def evaluate_scene(
     measured: Scene,
     light_factors: Float[np.ndarray, " B"] | None,
     folder: Path,
-    follow: Follow,
+    follow: _Follow,
     processes: Processes,
-) -> Evaluated | None:
+) -> _Evaluated | None:
     """Measure a scene of mixed materials on the evaluation views of what was measured, and draw each view.
 
     Args:
@@ -177,7 +177,7 @@ def evaluate_scene(
     aligned = [*(["pose"] if "pose" in scene.fitted else []), *(["gain"] if fits_gain else [])]
     more |= {"aligned": aligned} if aligned else {}
     per_view = [{"name": name, **finite_or_none(found)} for name, found in evaluation.per_view.items()]
-    return Evaluated(finite_or_none(evaluation.figures()), per_view, more, 3 * len(ids))
+    return _Evaluated(finite_or_none(evaluation.figures()), per_view, more, 3 * len(ids))
 
 
 @dataclass(frozen=True)

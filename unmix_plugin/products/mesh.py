@@ -190,7 +190,7 @@ def _links(mesh: TriangleMesh):  # noqa: ANN202 - a sparse matrix of scipy, whic
     return coo_matrix((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count)).tocsr()
 
 
-MeshFormat = Literal["ply", "glb", "obj"]
+_MeshFormat = Literal["ply", "glb", "obj"]
 
 _MOST_SMOOTHING = 8.0
 _NUM_RAYS = 300_000
@@ -204,7 +204,7 @@ class Mesh(Product):
 
     name = "mesh"
 
-    formats: tuple[MeshFormat, ...] = ("ply", "glb")
+    formats: tuple[_MeshFormat, ...] = ("ply", "glb")
     """ply, glb, obj (with mesh.mtl)."""
     resolution: int = 192
     """Cells along the longest edge of the scene box."""
@@ -261,7 +261,7 @@ class Mesh(Product):
         return without_stray_pieces(trim_unseen(mesh, surface))
 
 
-def mesh_paths(folder: Path, formats: tuple[MeshFormat, ...]) -> list[Path]:
+def mesh_paths(folder: Path, formats: tuple[_MeshFormat, ...]) -> list[Path]:
     """Files that `write_mesh` makes."""
     return [path for kind in formats for path in _paths(folder, kind)]
 
@@ -280,7 +280,7 @@ def require_sound(density: float | None, smoothing: float) -> None:
 
 def write_mesh(
     folder: Path,
-    formats: tuple[MeshFormat, ...],
+    formats: tuple[_MeshFormat, ...],
     mesh: TriangleMesh,
     scene: TrainedScene,
     frame: Normalisation,
@@ -364,7 +364,7 @@ def _write_glb(
     return [write_glb(path, positions, normals, looks.linear_rgb, mesh.faces, numbers, extras)]
 
 
-def _paths(folder: Path, kind: MeshFormat) -> list[Path]:
+def _paths(folder: Path, kind: _MeshFormat) -> list[Path]:
     return obj_paths(folder / "mesh") if kind == "obj" else [folder / f"mesh.{kind}"]
 
 

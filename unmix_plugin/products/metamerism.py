@@ -70,7 +70,7 @@ class Metamerism(Product):
 
 
 @dataclass(frozen=True)
-class Metamers:
+class _Metamers:
     """What was found."""
 
     names: tuple[str, ...]
@@ -92,7 +92,7 @@ def find_metamers(
     scene_light: Float64[np.ndarray, " B"] | None,
     library: MaterialLibrary,
     options: Metamerism,
-) -> Metamers:
+) -> _Metamers:
     """Look at all pairs of surfaces in all lights.
 
     Args:
@@ -120,10 +120,10 @@ def find_metamers(
     num_own = 0 if options.surfaces == "library" else len(materials.names)
     pairs.sort(key=lambda pair: pair.first >= num_own)  # stable: the run's own first, then by difference
     labels = tuple(light.stem if isinstance(light, Path) else light for light in lights)
-    return Metamers(tuple(names), reflectance, bands, labels, powers, pairs)
+    return _Metamers(tuple(names), reflectance, bands, labels, powers, pairs)
 
 
-def write_metamerism(folder: Path, found: Metamers) -> list[Path]:
+def write_metamerism(folder: Path, found: _Metamers) -> list[Path]:
     """Write the pairs as CSV and swatches of the first dozen in every light.
 
     Pairs with an endmember of the run come first, each kind sorted by their greatest difference.
@@ -132,10 +132,10 @@ def write_metamerism(folder: Path, found: Metamers) -> list[Path]:
         RunError: the disk is full or refuses.
     """
     table_path, figure_path = metamerism_paths(folder)
-    return [write_file(table_path, _table(found)), write_file(figure_path, draw_metamers(found))]
+    return [write_file(table_path, _table(found)), write_file(figure_path, _draw_metamers(found))]
 
 
-def draw_metamers(found: Metamers) -> bytes:
+def _draw_metamers(found: _Metamers) -> bytes:
     """A row a pair, a column a light: both surfaces side by side as an eye adapted to the light sees them."""
     from matplotlib.figure import Figure
 
@@ -193,7 +193,7 @@ def _surfaces(
     return names, rows
 
 
-def _table(found: Metamers) -> bytes:
+def _table(found: _Metamers) -> bytes:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     shown = [f"CIEDE2000 in {light}" for light in found.lights]

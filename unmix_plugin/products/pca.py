@@ -29,7 +29,8 @@ from unmix_plugin.trained.run_views import ViewChoice, resized_views
 if TYPE_CHECKING:
     from unmix_plugin.trained.trained_scene import TrainedScene
 
-PcaOf = Literal["spectra", "abundances"]
+
+_PcaOf = Literal["spectra", "abundances"]
 
 _PIXELS = 48 * 48
 """Of each view that the components are found from."""
@@ -45,7 +46,7 @@ class Pca(Product):
 
     name = "pca"
 
-    of: PcaOf = "spectra"
+    of: _PcaOf = "spectra"
     """What has its components taken."""
     views: ViewChoice = "eval"
     """Which of the scene's views to render."""
@@ -53,7 +54,7 @@ class Pca(Product):
     def write(self, job: Job) -> list[Path]:
         """Find the components of all views, then paint each."""
         views, scene = resized_views(job.views(self.views)), job.scene
-        job.claim([*(pca_path(job.folder, view.name) for view in views), components_path(job.folder)])
+        job.claim([*(_pca_path(job.folder, view.name) for view in views), _components_path(job.folder)])
         seen = [survey_view(scene, view.camera, self.of) for view in job.follow("finding components", views)]
         components = find_components(seen, self.of)
         written = [
@@ -64,16 +65,16 @@ class Pca(Product):
 
 
 @dataclass(frozen=True)
-class Components:
+class _Components:
     """Three components, and how much they tell."""
 
-    of: PcaOf
+    of: _PcaOf
     colours: PcaColours
     explained: tuple[float, float, float]
     """Part of the variance that lies along each."""
 
 
-def component_values(outputs: dict[str, Tensor], of: PcaOf) -> Float[Tensor, "N C"]:
+def _component_values(outputs: dict[str, Tensor], of: _PcaOf) -> Float[Tensor, "N C"]:
     """What is seen of a view in pixels where something is: spectra, or abundances that sum to 1."""
     accumulation = outputs["accumulation"]
     seen = accumulation > OCCUPIED_ACCUMULATION
@@ -81,13 +82,13 @@ def component_values(outputs: dict[str, Tensor], of: PcaOf) -> Float[Tensor, "N 
     return (values if of == "spectra" else values / accumulation[seen][:, None]).cpu()
 
 
-def survey_view(scene: TrainedScene, camera: Cameras, of: PcaOf) -> Float[Tensor, "N C"]:
+def survey_view(scene: TrainedScene, camera: Cameras, of: _PcaOf) -> Float[Tensor, "N C"]:
     """What a small render of a view shows, to find components from."""
     names = ("spectral", "abundances", "accumulation")
-    return component_values(scene.render(camera.shrunk(_PIXELS), names), of)
+    return _component_values(scene.render(camera.shrunk(_PIXELS), names), of)
 
 
-def find_components(values: Sequence[Float[Tensor, "_ C"]], of: PcaOf) -> Components:
+def find_components(values: Sequence[Float[Tensor, "_ C"]], of: _PcaOf) -> _Components:
     """The components of what all views show."""
     together = torch.cat(list(values)).double()
     colours = PcaColours.fit(together)
@@ -99,20 +100,20 @@ def find_components(values: Sequence[Float[Tensor, "_ C"]], of: PcaOf) -> Compon
     tells = (torch.tensor([first, second, third]) > _LEAST_EXPLAINED).double()
     high = colours.high * tells + (1 - tells)
     colours = PcaColours(colours.mean, colours.axes * tells, colours.low * tells, high)
-    return Components(of, colours, (first, second, third))
+    return _Components(of, colours, (first, second, third))
 
 
-def pca_path(folder: Path, name: str) -> Path:
+def _pca_path(folder: Path, name: str) -> Path:
     """The file that `write_pca` makes for a view."""
     return folder / f"{name}.png"
 
 
-def components_path(folder: Path) -> Path:
+def _components_path(folder: Path) -> Path:
     """The file that `write_components` makes."""
     return folder / "components.csv"
 
 
-def write_pca(folder: Path, name: str, view: PredictedView, components: Components) -> Path:
+def write_pca(folder: Path, name: str, view: PredictedView, components: _Components) -> Path:
     """Write a view's components as red, green and blue, fading into grey where nothing is; a pixel a pixel.
 
     Raises:
@@ -125,10 +126,10 @@ def write_pca(folder: Path, name: str, view: PredictedView, components: Componen
         f"{name}: three principal components of the {components.of}, each from its 1st to its 99th percentile"
     )
     pixels = np.round(255 * np.clip(painted, 0, 1)).astype(np.uint8)
-    return write_file(pca_path(folder, name), rgba_png_bytes(pixels, what))
+    return write_file(_pca_path(folder, name), rgba_png_bytes(pixels, what))
 
 
-def write_components(folder: Path, components: Components, materials: Materials) -> Path:
+def write_components(folder: Path, components: _Components, materials: Materials) -> Path:
     """Write what red, green and blue stand for: a row for each band or endmember, with its mean and its weight in each
     component; then the values that become 0 and 1, and the part of the variance that each component explains.
 
@@ -149,4 +150,4 @@ def write_components(folder: Path, components: Components, materials: Materials)
         ("explained variance", components.explained),
     ):
         writer.writerow([name, "", *(f"{value:.9g}" for value in row)])
-    return write_file(components_path(folder), text.getvalue().encode())
+    return write_file(_components_path(folder), text.getvalue().encode())

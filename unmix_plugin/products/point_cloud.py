@@ -137,7 +137,7 @@ _LONGEST_COMMENT = 300
 
 
 @dataclass(frozen=True)
-class PointScore:
+class _PointScore:
     """A number to add to every point."""
 
     output: str
@@ -167,7 +167,7 @@ class PointScore:
         return f"{self.property}: {self.output}, {self.map.what}"[:_LONGEST_COMMENT] + caveat
 
 
-def require_point_scores(outputs: Sequence[str], bands: Bands) -> list[PointScore]:
+def require_point_scores(outputs: Sequence[str], bands: Bands) -> list[_PointScore]:
     """Numbers to add to points; an output asked for twice is given once.
 
     Args:
@@ -177,7 +177,7 @@ def require_point_scores(outputs: Sequence[str], bands: Bands) -> list[PointScor
         ConfigError: another output, an unknown index, a formula that can't be read.
         SpectrumError: the bands do not cover what one needs, or a target that can't be read.
     """
-    scores: list[PointScore] = []
+    scores: list[_PointScore] = []
     for output in dict.fromkeys(_plain(output) for output in outputs):
         if not is_reflectance_map(output) or not output.partition(":")[2]:
             raise ConfigError(
@@ -186,7 +186,7 @@ def require_point_scores(outputs: Sequence[str], bands: Bands) -> list[PointScor
                 "are in every cloud"
             )
         name = _property_name(output, [score.property for score in scores])
-        scores.append(PointScore(output, name, parse_reflectance_map(output, bands)))
+        scores.append(_PointScore(output, name, parse_reflectance_map(output, bands)))
     return scores
 
 
@@ -230,7 +230,7 @@ class PointCloud(Product):
 
         count, materials = require_count(self.num_points), job.materials
         scores = require_point_scores(self.outputs, materials.bands)
-        job.claim([point_cloud_path(job.folder)])
+        job.claim([_point_cloud_path(job.folder)])
         surface = job.surface(_RAYS_PER_POINT * count)
         with job.working("cleaning and thinning the points"):
             path, written = write_point_cloud(
@@ -240,7 +240,7 @@ class PointCloud(Product):
         return [path]
 
 
-def point_cloud_path(folder: Path) -> Path:
+def _point_cloud_path(folder: Path) -> Path:
     """The file that `write_point_cloud` makes."""
     return folder / "points.ply"
 
@@ -263,7 +263,7 @@ def write_point_cloud(
     num_points: int,
     materials: Materials,
     frame: Normalisation,
-    scores: Sequence[PointScore] = (),
+    scores: Sequence[_PointScore] = (),
 ) -> tuple[Path, int]:
     """Write `points.ply`, binary, in world coordinates.
 
@@ -307,4 +307,4 @@ def write_point_cloud(
     }
     comments = looks.comments("surface points of an unmix-nerf run")
     comments += [score.comment(materials) for score in scores]
-    return write_ply(point_cloud_path(folder), vertices, comments=comments), len(chosen)
+    return write_ply(_point_cloud_path(folder), vertices, comments=comments), len(chosen)

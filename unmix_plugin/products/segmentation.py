@@ -42,7 +42,7 @@ class Segmentation(ViewProduct):
         write_file(scores_path, array_bytes(scores_of(rendered, materials).numpy().astype(np.float32)))
         write_file(figure_path, draw_segmentation(view, rendered, materials))
         ids = rendered.segmentation.numpy()
-        palette = id_palette(dict(enumerate(endmember_colours(materials))))
+        palette = _id_palette(dict(enumerate(endmember_colours(materials))))
         write_file(labels_path, indexed_png_bytes(ids, palette, NOTHING_ID))
         return [scores_path, figure_path, labels_path]
 
@@ -62,7 +62,7 @@ def legend_bytes(materials: Materials) -> bytes:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["id", "name", "red", "green", "blue"])
-    palette = np.round(255 * id_palette(dict(enumerate(endmember_colours(materials))))).astype(int)
+    palette = np.round(255 * _id_palette(dict(enumerate(endmember_colours(materials))))).astype(int)
     for index, name in [*enumerate(materials.names), (NOTHING_ID, "nothing")]:
         writer.writerow([index, name, *palette[index]])
     return text.getvalue().encode()
@@ -89,10 +89,10 @@ def draw_segmentation(name: str, view: PredictedView, materials: Materials) -> b
 
 def paint_ids(ids: UInt8[np.ndarray, "H W"], colours: Mapping[int, Colour]) -> Picture:
     """Ids as their colours; those without one, and 255, as neutral grey."""
-    return id_palette(colours)[ids]
+    return _id_palette(colours)[ids]
 
 
-def id_palette(colours: Mapping[int, Colour]) -> Float64[np.ndarray, "256 3"]:
+def _id_palette(colours: Mapping[int, Colour]) -> Float64[np.ndarray, "256 3"]:
     """sRGB of each id, neutral grey for those without a colour."""
     palette = np.full((256, 3), NEUTRAL)
     for index, colour in colours.items():

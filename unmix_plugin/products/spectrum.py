@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from unmix_plugin.trained.protocol import Probe
     from unmix_plugin.trained.run_materials import ShownMatch
 
+
 _MOST_BARS = 12
 
 
@@ -57,26 +58,26 @@ class Spectrum(Product):
         if self.point is not None and self.view is None and self.pixel is None:
             point = _numbers(self.point, 3, "--point", "0.1,0.2,0.5")
             name = f"point_{'_'.join(f'{value:g}' for value in point)}"
-            job.claim(spectrum_paths(job.folder, name))
+            job.claim(_spectrum_paths(job.folder, name))
             place = self._point(job, (point[0], point[1], point[2]))
         elif self.point is None and self.view is not None and self.pixel is not None:
             pixel = _whole_numbers(self.pixel)
             view = find_view(job.views("eval"), self.view, job.views("train"))
             name = f"{view.name}_x{pixel[0]}_y{pixel[1]}"
-            job.claim(spectrum_paths(job.folder, name))
+            job.claim(_spectrum_paths(job.folder, name))
             place = self._pixel(job, view, pixel)
         else:
             raise ConfigError("give a pixel with --view and --pixel, or a point with --point")
-        return write_spectrum(job.folder, name, place, job.materials)
+        return _write_spectrum(job.folder, name, place, job.materials)
 
-    def _pixel(self, job: Job, view: RunView, pixel: tuple[int, int]) -> ProbedPlace:
+    def _pixel(self, job: Job, view: RunView, pixel: tuple[int, int]) -> _ProbedPlace:
 
         probe = job.scene.probe(view.camera, *pixel)
         facts = {"view": view.name, "pixel": list(pixel)}
         title = f"{view.name}, column {pixel[0]}, row {pixel[1]}"
         return self._place(job, title, facts, probe, self._measured(job, view, pixel))
 
-    def _point(self, job: Job, point: tuple[float, float, float]) -> ProbedPlace:
+    def _point(self, job: Job, point: tuple[float, float, float]) -> _ProbedPlace:
 
         probe = job.scene.probe_point(*point)
         title = f"point {', '.join(f'{value:g}' for value in point)}"
@@ -84,7 +85,7 @@ class Spectrum(Product):
 
     def _place(
         self, job: Job, title: str, facts: dict[str, object], probe: Probe, measured: np.ndarray | None
-    ) -> ProbedPlace:
+    ) -> _ProbedPlace:
         from unmix_plugin.trained.run_materials import LIGHT_UNKNOWN, library_with, shown_matches
 
         light = job.scene.light_power
@@ -92,11 +93,11 @@ class Spectrum(Product):
             job.say(LIGHT_UNKNOWN)
         if probe.opacity < OCCUPIED_ACCUMULATION:
             job.say(f"hardly anything is there: opacity {probe.opacity:.2f}")
-            return ProbedPlace(title, facts, probe, measured, ())
+            return _ProbedPlace(title, facts, probe, measured, ())
         library, bands = library_with(self.library), job.materials.bands
         spectra = probe.spectra["predicted"][None]
         [matches] = shown_matches(spectra, bands, light, library, comparison=self.compare)
-        return ProbedPlace(title, facts, probe, measured, matches)
+        return _ProbedPlace(title, facts, probe, measured, matches)
 
     def _measured(self, job: Job, view: RunView, pixel: tuple[int, int]) -> np.ndarray | None:
         """What the scene has in a pixel, in the light asked for."""
@@ -117,7 +118,7 @@ class Spectrum(Product):
 
 
 @dataclass(frozen=True)
-class ProbedPlace:
+class _ProbedPlace:
     """A place, and all that is known of it."""
 
     title: str
@@ -131,19 +132,19 @@ class ProbedPlace:
     """Known materials that the predicted spectrum resembles, nearest first; none where nothing is."""
 
 
-def spectrum_paths(folder: Path, name: str) -> list[Path]:
-    """Files that `write_spectrum` makes."""
+def _spectrum_paths(folder: Path, name: str) -> list[Path]:
+    """Files that `_write_spectrum` makes."""
     return [folder / f"{name}.{kind}" for kind in ("csv", "json", "png")]
 
 
-def write_spectrum(folder: Path, name: str, place: ProbedPlace, materials: Materials) -> list[Path]:
+def _write_spectrum(folder: Path, name: str, place: _ProbedPlace, materials: Materials) -> list[Path]:
     """Write NAME.csv (`wavelength,predicted,...`, `measured` where it is known), NAME.json (where the place is, its
     opacity, abundances and nearest known materials) and NAME.png, a plot.
 
     Raises:
         RunError: the disk is full or refuses.
     """
-    table_path, facts_path, plot_path = spectrum_paths(make_folder(folder), name)
+    table_path, facts_path, plot_path = _spectrum_paths(make_folder(folder), name)
     columns = dict(place.probe.spectra)
     if place.measured is not None:
         columns["measured"] = place.measured.astype(np.float64)
@@ -151,10 +152,10 @@ def write_spectrum(folder: Path, name: str, place: ProbedPlace, materials: Mater
     write_spectra_csv(table_path, table)
     content = json.dumps(_facts(place, materials), indent=1, allow_nan=False) + "\n"
     write_file(facts_path, content.encode())
-    return [table_path, facts_path, write_file(plot_path, draw_spectrum(place, materials))]
+    return [table_path, facts_path, write_file(plot_path, _draw_spectrum(place, materials))]
 
 
-def draw_spectrum(place: ProbedPlace, materials: Materials) -> bytes:
+def _draw_spectrum(place: _ProbedPlace, materials: Materials) -> bytes:
     """The spectra over wavelength, and the abundances beside them."""
     from matplotlib.figure import Figure
 
@@ -195,7 +196,7 @@ def _draw_abundances(axes: Any, probe: Probe, materials: Materials) -> None:
     axes.set_title(f"opacity {probe.opacity:.2f}", loc="left")
 
 
-def _facts(place: ProbedPlace, materials: Materials) -> dict[str, Any]:
+def _facts(place: _ProbedPlace, materials: Materials) -> dict[str, Any]:
     probe = place.probe
     is_something = probe.opacity >= OCCUPIED_ACCUMULATION
     shares = dict(zip(materials.names, probe.abundances.tolist(), strict=True))

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from unmix_plugin.trained.surface import GridPoints
     from unmix_plugin.trained.trained_scene import TrainedScene
 
+
 _FASTEST = 1
 """Compression that the disk doesn't wait for; most of a volume is empty and shrinks to nothing anyway."""
 

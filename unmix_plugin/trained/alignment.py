@@ -63,11 +63,11 @@ def align_gain(
     if not bool(counts.any()):
         return predicted
     shown, measured = predicted.spectra[counts].double(), truth.spectra[counts].double()
-    gain = fitted_gain((shown * shown).sum(dim=0), (shown * measured).sum(dim=0), wavelengths_nm.double())
+    gain = _fitted_gain((shown * shown).sum(dim=0), (shown * measured).sum(dim=0), wavelengths_nm.double())
     return replace(predicted, spectra=predicted.spectra * gain.to(predicted.spectra))
 
 
-def fitted_gain(
+def _fitted_gain(
     power: Float[Tensor, "B"], agreement: Float[Tensor, "B"], wavelengths_nm: Float[Tensor, "B"]
 ) -> Float[Tensor, "B"]:
     """Smooth gain g of least squared error, by Gauss-Newton steps.
@@ -86,9 +86,9 @@ def fitted_gain(
     return (logs @ terms).exp()
 
 
-SIDES_PX = (24, 48, 96, 192)
+_SIDES_PX = (24, 48, 96, 192)
 """Longest sides of the pictures compared, one after the other; none larger than the view."""
-STEPS = (6, 3, 2, 1)
+_STEPS = (6, 3, 2, 1)
 """Most steps taken on each."""
 _FIRST_STEPS = 3
 """Steps taken from each start before the best is chosen."""
@@ -107,7 +107,7 @@ _DIFFERENCE_PX = 0.5
 _SMALLEST_STEP_PX = 0.05
 """Below which no further step is taken on a picture."""
 
-Residuals = Callable[[Float[Tensor, "m 6"]], Float[Tensor, "m n"]]
+_Residuals = Callable[[Float[Tensor, "m 6"]], Float[Tensor, "m n"]]
 """Of each of some steps."""
 
 
@@ -116,11 +116,11 @@ def align_pose(scene: TrainedScene, camera: Cameras, truth: ViewTruth) -> Camera
     """The camera, moved to where the scene looks most like what was measured; one camera, of a frame or of lines."""
     axes = main_axes(truth.spectra[truth.valid])
     step = torch.zeros(6)
-    for side, count in zip(SIDES_PX, STEPS, strict=True):
-        if side > max(camera.width, camera.height) and side > SIDES_PX[0]:
+    for side, count in zip(_SIDES_PX, _STEPS, strict=True):
+        if side > max(camera.width, camera.height) and side > _SIDES_PX[0]:
             break
         comparison = _Comparison.of(scene, _shrunk(camera, side), truth, axes)
-        if side == SIDES_PX[0]:
+        if side == _SIDES_PX[0]:
             step = _best_start(comparison)
         step = _fit(comparison.residuals, step, count, comparison.difference)
     return moved(camera, step, scene)
@@ -178,7 +178,7 @@ class _Comparison:
 
     def residuals(self, steps: Float[Tensor, "m 6"]) -> Float[Tensor, "m n"]:
         """Shown less measured, of each pixel or block and channel, after each step."""
-        is_coarse = self.block == 1 and max(self.camera.width, self.camera.height) <= SIDES_PX[0]
+        is_coarse = self.block == 1 and max(self.camera.width, self.camera.height) <= _SIDES_PX[0]
         cameras = [moved(self.camera, step, self.scene) for step in steps]
         seen = _shown(self.scene, cameras, self.truth, self.axes, subpixels=2 if is_coarse else 1)
         errors = (seen - self.wanted) * self.counts
@@ -211,7 +211,7 @@ def moved(camera: Cameras, step: Float[Tensor, "6"], scene: TrainedScene) -> Cam
 
 
 def _fit(
-    residuals: Residuals, start: Float[Tensor, "6"], count: int, difference: float, num_moves: int = 6
+    residuals: _Residuals, start: Float[Tensor, "6"], count: int, difference: float, num_moves: int = 6
 ) -> Float[Tensor, "6"]:
     """Levenberg-Marquardt steps from `start` that each lower the sum of squares, within `LARGEST_STEP`, in the first
     numbers of a pose."""

@@ -46,7 +46,7 @@ _LENS_KEYS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4")
 
 
 @dataclass(frozen=True)
-class CameraFile:
+class _CameraFile:
     """What a camera file says."""
 
     views: tuple[RunView, ...]
@@ -73,7 +73,7 @@ def check_frames_per_second(value: float | int | None, where: str) -> float:
     return float(value)
 
 
-def read_camera_file(path: Path, frame: Normalisation) -> CameraFile:
+def read_camera_file(path: Path, frame: Normalisation) -> _CameraFile:
     """Read the cameras of a file; `frame` leads from world to model space.
 
     Raises:
@@ -147,7 +147,7 @@ def camera_entry(view: RunView, frame: Normalisation) -> dict[str, Any]:
     return {**entry, "key_poses": [{"row": y - 0.5, "transform_matrix": matrix(pose)} for y, pose in keys]}
 
 
-def _read_camera_path(path: Path, content: dict[str, Any]) -> CameraFile:
+def _read_camera_path(path: Path, content: dict[str, Any]) -> _CameraFile:
     """The cameras of a nerfstudio path: pinholes of the file's size."""
     kind = content.get("camera_type", "perspective")
     if kind != "perspective":
@@ -174,10 +174,10 @@ def _read_camera_path(path: Path, content: dict[str, Any]) -> CameraFile:
         camera = _camera(pose, (focal, focal), (width / 2, height / 2), (0.0,) * 4, (width, height))
         views.append(RunView(f"frame_{index:04d}", camera))
     fps = read_number(content.get("fps", _USUAL_FPS))
-    return CameraFile(tuple(views), check_frames_per_second(fps, f"{path}: 'fps'"))
+    return _CameraFile(tuple(views), check_frames_per_second(fps, f"{path}: 'fps'"))
 
 
-def _read_frames(path: Path, content: dict[str, Any], frame: Normalisation) -> CameraFile:
+def _read_frames(path: Path, content: dict[str, Any], frame: Normalisation) -> _CameraFile:
     space = content.get("space", "world")
     if space not in ("world", "model"):
         raise ConfigError(f"{path}: 'space' is {describe(space)}; expected world or model")
@@ -224,8 +224,8 @@ def _read_frames(path: Path, content: dict[str, Any], frame: Normalisation) -> C
     if len(sizes) > 1:
         raise ConfigError(f"{path}: frames have the sizes {sorted(sizes)}; expected one size for all")
     if "fps" not in content:
-        return CameraFile(tuple(views), None)
-    return CameraFile(tuple(views), check_frames_per_second(read_number(content["fps"]), f"{path}: 'fps'"))
+        return _CameraFile(tuple(views), None)
+    return _CameraFile(tuple(views), check_frames_per_second(read_number(content["fps"]), f"{path}: 'fps'"))
 
 
 def _camera(

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from unmix_plugin.trained.trained_scene import TrainedScene
 
 
-MOST_SENSOR_SUBPIXELS = 4
+_MOST_SENSOR_SUBPIXELS = 4
 """Along an edge of a coarse sensor's pixel, in multiples of the finest sensor's."""
 
 
@@ -92,7 +92,7 @@ def subpixels_for(scene: Scene, index: int, subpixels: int, pixel_size: float) -
         return subpixels
     distance = scene.cameras.camera_to_world[index, :, 3] - scene.scene_box.aabb.mean(dim=0)
     edge = float(distance.norm() / scene.cameras.focal_px[index].mean())
-    return subpixels * min(max(1, round(edge / pixel_size)), MOST_SENSOR_SUBPIXELS)
+    return subpixels * min(max(1, round(edge / pixel_size)), _MOST_SENSOR_SUBPIXELS)
 
 
 def picture(spectra: Float[Tensor, "H W B"], coverage: Float[Tensor, "H W"], bands: Bands) -> Picture:
@@ -113,10 +113,10 @@ def as_numpy(values: Tensor) -> np.ndarray:
     return values.double().numpy()
 
 
-OPAQUE_ALPHA = 0.99
+_OPAQUE_ALPHA = 0.99
 """Opacity from which an unlabelled pixel counts for the spectral angle."""
 
-HALF_COVERED = 0.5
+_HALF_COVERED = 0.5
 """Opacity from which a pixel's abundances count."""
 
 VIEW_FIGURES = (
@@ -196,7 +196,7 @@ class ViewTruth:
     @property
     def shows_matter(self) -> Bool[Tensor, "H W"]:
         """Valid pixels that are labelled or opaque."""
-        opaque = self.opacity > OPAQUE_ALPHA
+        opaque = self.opacity > _OPAQUE_ALPHA
         return self.valid & (opaque if self.labels is None else opaque | (self.labels != NOTHING_ID))
 
     def in_light(self, factors: Float[np.ndarray, " B"] | None) -> ViewTruth:
@@ -310,7 +310,7 @@ class Evaluation:
     def _abundance_rmse(self, view: ViewTruth, predicted: PredictedView) -> float:
         if self.matching is None or view.abundances is None:
             return math.nan
-        counts = view.valid & (view.opacity >= HALF_COVERED) & (view.abundances.sum(dim=-1) > 0)
+        counts = view.valid & (view.opacity >= _HALF_COVERED) & (view.abundances.sum(dim=-1) > 0)
         # Divided by the larger opacity, a partly covered pixel is not blamed for its background, nor is a surface that
         # is missing forgiven.
         opacity = torch.maximum(predicted.accumulation, view.opacity).clamp(min=1e-6)

@@ -95,7 +95,7 @@ class MaterialView:
 
 
 @dataclass(frozen=True)
-class FamilyMember:
+class _FamilyMember:
     """One output of a family."""
 
     what: str
@@ -105,7 +105,7 @@ class FamilyMember:
 
 
 @dataclass(frozen=True)
-class OutputFamily:
+class _OutputFamily:
     """Outputs of one kind that differ by an argument."""
 
     kind: OutputKind
@@ -113,7 +113,7 @@ class OutputFamily:
     needs: str
     """What the argument is."""
     example: str
-    make: Callable[[str, str, Materials], FamilyMember]
+    make: Callable[[str, str, Materials], _FamilyMember]
     """From name, argument and materials to the output.
 
     Raises:
@@ -122,29 +122,29 @@ class OutputFamily:
     """
 
 
-def _band(name: str, argument: str, materials: Materials) -> FamilyMember:
+def _band(name: str, argument: str, materials: Materials) -> _FamilyMember:
     band = materials.bands.nearest(_wavelength_nm(argument, name))
     column = torch.eye(len(materials.bands))[:, band : band + 1]
-    return FamilyMember(
+    return _FamilyMember(
         f"radiance of one band on black, 1 = full scale: {argument}",
         lambda view: view.materials.through(view.coefficients, column)[..., 0],
     )
 
 
-def _false_colour(name: str, argument: str, materials: Materials) -> FamilyMember:
+def _false_colour(name: str, argument: str, materials: Materials) -> _FamilyMember:
     wavelengths = [_wavelength_nm(part, name) for part in argument.split(",")]
     if len(wavelengths) != 3:
         raise ConfigError(
             f"false-colour takes three wavelengths, as in {FAMILIES['false-colour'].example}; got {name}"
         )
     matrix = band_composite_matrix(materials.bands, (wavelengths[0], wavelengths[1], wavelengths[2]))
-    return FamilyMember(
+    return _FamilyMember(
         f"three bands as red, green and blue, radiance on black: {argument}",
         lambda view: view.materials.through(view.coefficients, matrix).clamp(0, 1),
     )
 
 
-def _reflectance_map(name: str, _: str, materials: Materials) -> FamilyMember:
+def _reflectance_map(name: str, _: str, materials: Materials) -> _FamilyMember:
     asked = parse_reflectance_map(name, materials.bands)
     caveat = "" if materials.light is not None else "; of radiance, since the scene's light is unknown"
 
@@ -152,7 +152,7 @@ def _reflectance_map(name: str, _: str, materials: Materials) -> FamilyMember:
         reflectance = view.materials.reflectance(view.coefficients)
         return asked.fit(reflectance[view.coefficients.is_occupied])(reflectance)
 
-    return FamilyMember(f"{asked.what}{caveat}; NaN where undefined", compute, asked.usual_range)
+    return _FamilyMember(f"{asked.what}{caveat}; NaN where undefined", compute, asked.usual_range)
 
 
 def _wavelength_nm(text: str, name: str) -> float:
@@ -162,13 +162,13 @@ def _wavelength_nm(text: str, name: str) -> float:
         raise ConfigError(f"{text!r} in the output {name} is not a wavelength in nm, such as 650nm") from None
 
 
-FAMILIES: dict[str, OutputFamily] = {
-    "band": OutputFamily("grey", "one band", "a wavelength", "band:650nm", _band),
-    "false-colour": OutputFamily(
+FAMILIES: dict[str, _OutputFamily] = {
+    "band": _OutputFamily("grey", "one band", "a wavelength", "band:650nm", _band),
+    "false-colour": _OutputFamily(
         "linear", "false colour", "wavelengths", "false-colour:860,650,550", _false_colour
     ),
-    "index": OutputFamily("map", "spectral index", "to know which", "index:ndvi", _reflectance_map),
-    "target": OutputFamily(
+    "index": _OutputFamily("map", "spectral index", "to know which", "index:ndvi", _reflectance_map),
+    "target": _OutputFamily(
         "map", "likeness to a target", "to know which", "target:paint.csv", _reflectance_map
     ),
 }

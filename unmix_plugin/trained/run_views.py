@@ -93,7 +93,7 @@ def _names(record: SceneRecord, split: str, count: int) -> list[str]:
     return [f"{split}_{index:03d}" for index in range(count)]
 
 
-PRECISION = 1e-6
+_PRECISION = 1e-6
 """Of positions in files, as a part of the extent of what is exported."""
 
 
@@ -127,7 +127,7 @@ def positions_for_files(
         (world.max(axis=tuple(range(world.ndim - 1))) - world.min(axis=tuple(range(world.ndim - 1)))).max()
     )
     rounding = 0.5 * float(np.spacing(np.float32(np.abs(world).max())))
-    return world if rounding > PRECISION * extent else world.astype(np.float32)
+    return world if rounding > _PRECISION * extent else world.astype(np.float32)
 
 
 def directions_to_world(

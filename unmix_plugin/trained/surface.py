@@ -37,7 +37,7 @@ from unmix_plugin.spectral.segmentation import material_ids, material_scores
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.trained_scene import TrainedScene
 
-SOLID_ACCUMULATION = 0.9
+_SOLID_ACCUMULATION = 0.9
 """Rays of which at least this much ends on something give points."""
 
 _TOLERANCE_PX = 2.0
@@ -110,7 +110,7 @@ class SeenSurface:
         self._views.append((view, distances.unflatten(0, (view.height, view.width))))
         rays = view.image_rays(0)
         positions = rays.origins + distances[:, None] * rays.directions
-        solid = accumulation >= SOLID_ACCUMULATION
+        solid = accumulation >= _SOLID_ACCUMULATION
         if self._scene.renderer.is_unbounded:  # a horizon would dwarf everything else
             solid &= self._scene.scene_box.to("cpu").contains(positions)
         self._points.append(
@@ -310,7 +310,7 @@ class SurfaceAppearance:
         colours = np.round(255 * self.srgb).astype(np.uint8)
         named = {name: colours[:, axis] for axis, name in enumerate(("red", "green", "blue"))}
         shares = self.abundances.numpy().astype(np.float32)
-        columns = {name: shares[:, index] for index, name in enumerate(property_names(self.materials.names))}
+        columns = {name: shares[:, index] for index, name in enumerate(_property_names(self.materials.names))}
         return {**named, "material": self.material_ids, **columns}
 
     def comments(self, what: str) -> list[str]:
@@ -320,10 +320,10 @@ class SurfaceAppearance:
         return [what, f"coordinates: world of the scene's transforms.json; {colours}", *materials]
 
 
-def property_names(names: tuple[str, ...]) -> list[str]:
+def _property_names(names: tuple[str, ...]) -> list[str]:
     """Names of abundances as formats without spaces take them, all different.
 
-    >>> property_names(("red clay", "red-clay", "leaf"))
+    >>> _property_names(("red clay", "red-clay", "leaf"))
     ['abundance_red_clay', 'abundance_red_clay_1', 'abundance_leaf']
     """
     plain: list[str] = []

@@ -34,7 +34,7 @@ from unmix_plugin.trained.run_views import RunView
 
 
 @torch.no_grad()
-def probe_pixel(scene: TrainedScene, camera: Cameras, pixel: tuple[int, int]) -> Probe:
+def _probe_pixel(scene: TrainedScene, camera: Cameras, pixel: tuple[int, int]) -> Probe:
     """What is seen in a pixel (column, row), as a render of the whole view has it: radiance on black.
 
     Raises:
@@ -63,7 +63,7 @@ def probe_pixel(scene: TrainedScene, camera: Cameras, pixel: tuple[int, int]) ->
 
 
 @torch.no_grad()
-def probe_point(scene: TrainedScene, point: tuple[float, float, float]) -> Probe:
+def _probe_point(scene: TrainedScene, point: tuple[float, float, float]) -> Probe:
     """What a point of the world is made of: its spectrum, lit squarely where the light moves with the camera, without
     the view-dependent part.
 
@@ -207,7 +207,7 @@ class TrainedScene:
         Raises:
             ConfigError: the pixel is outside the image.
         """
-        return probe_pixel(self, camera, (column, row))
+        return _probe_pixel(self, camera, (column, row))
 
     def probe_point(self, x: float, y: float, z: float) -> Probe:
         """What a point of the world is made of, lit squarely, without the view-dependent part.
@@ -215,7 +215,7 @@ class TrainedScene:
         Raises:
             ConfigError: the point is outside the scene box.
         """
-        return probe_point(self, (x, y, z))
+        return _probe_point(self, (x, y, z))
 
     def to(self, device: torch.device | str) -> TrainedScene:
         """The same scene on another device; `self` stays where it is."""

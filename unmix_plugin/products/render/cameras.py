@@ -13,12 +13,12 @@ from unmix_plugin.trained.camera_files import check_frames_per_second, check_siz
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.run_views import RunView, cameras_of, find_view, resized_views, views_of
 
-DATASET_CAMERAS = ("dataset-eval", "dataset-train")
-PATH_CAMERAS = ("orbit", "interpolate")
-CAMERA_CHOICES = (*DATASET_CAMERAS, *PATH_CAMERAS)
+_DATASET_CAMERAS = ("dataset-eval", "dataset-train")
+_PATH_CAMERAS = ("orbit", "interpolate")
+_CAMERA_CHOICES = (*_DATASET_CAMERAS, *_PATH_CAMERAS)
 """Cameras that have a name; any other choice is a file."""
 
-USUAL_FRAMES = 120
+_USUAL_FRAMES = 120
 _MOST_FRAMES = 100_000
 _GREATEST_DOWNSCALE = 1000
 _LEAST_PATH_HEIGHT = 512
@@ -30,7 +30,7 @@ class CameraRequest:
     """What cameras are asked for."""
 
     source: str = "dataset-eval"
-    """One of `CAMERA_CHOICES`, or the path of a camera file."""
+    """One of `_CAMERA_CHOICES`, or the path of a camera file."""
     only: tuple[str, ...] = ()
     """Names of views, or numbers from 0; none: all."""
     size: tuple[int, int] | None = None
@@ -78,17 +78,17 @@ def _from_source(scene: RenderableScene, request: CameraRequest) -> RenderCamera
     source = request.source
     if request.num_frames is not None:
         _check_frames(source, request.num_frames)
-    if source in DATASET_CAMERAS:
+    if source in _DATASET_CAMERAS:
         views = views_of(scene.views, "eval" if source == "dataset-eval" else "train")
         return RenderCameras(resized_views(views), False, None)
-    count = USUAL_FRAMES if request.num_frames is None else request.num_frames
+    count = _USUAL_FRAMES if request.num_frames is None else request.num_frames
     if source == "orbit":
         return _path("orbit", orbit(cameras_of(scene.views, "train"), scene.scene_box, count))
     if source == "interpolate":
         return _path("interpolate", interpolated(cameras_of(scene.views, "eval"), scene.scene_box, count))
     if not source.endswith(".json") and not Path(source).is_file():
         raise ConfigError(
-            f"unknown cameras {source!r}{_near(source, CAMERA_CHOICES)}; known are {', '.join(CAMERA_CHOICES)}, and "
+            f"unknown cameras {source!r}{_near(source, _CAMERA_CHOICES)}; known are {', '.join(_CAMERA_CHOICES)}, and "
             "the path of a camera file (.json)"
         )
     found = read_camera_file(Path(source), scene.frame)
@@ -102,9 +102,9 @@ def _path(name: str, cameras: Cameras) -> RenderCameras:
 
 
 def _check_frames(source: str, num_frames: int) -> None:
-    if source not in PATH_CAMERAS:
+    if source not in _PATH_CAMERAS:
         raise ConfigError(
-            f"--frames is for the paths that are made here, {' and '.join(PATH_CAMERAS)}; "
+            f"--frames is for the paths that are made here, {' and '.join(_PATH_CAMERAS)}; "
             f"--cameras {source} has cameras of its own"
         )
     if not 1 <= num_frames <= _MOST_FRAMES:
@@ -127,7 +127,7 @@ def _size(size: tuple[int, int], request: CameraRequest) -> tuple[int, int]:
         raise ConfigError("--size and --downscale both say how large pictures are; give one of them")
     if request.size is not None:
         return check_size(*request.size, "--size")
-    if request.downscale is None and request.source in PATH_CAMERAS and size[1] < _LEAST_PATH_HEIGHT:
+    if request.downscale is None and request.source in _PATH_CAMERAS and size[1] < _LEAST_PATH_HEIGHT:
         return round(size[0] * _LEAST_PATH_HEIGHT / size[1]), _LEAST_PATH_HEIGHT
     if request.downscale is None:
         return size

@@ -37,9 +37,9 @@ from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.trained_scene import TrainedScene
 
-Format = Literal["envi", "exr", "npy", "png", "mp4"]
-FORMATS: tuple[Format, ...] = ("envi", "exr", "npy", "png", "mp4")
-EVERY_OUTPUT = "all"
+_Format = Literal["envi", "exr", "npy", "png", "mp4"]
+_FORMATS: tuple[_Format, ...] = ("envi", "exr", "npy", "png", "mp4")
+_EVERY_OUTPUT = "all"
 """Stands for every output that takes no argument."""
 
 _LONGEST_FILE_NAME = 100
@@ -47,10 +47,10 @@ _DEFAULT_STILLS = ("spectral", "rgb", "abundances", "segmentation", "depth")
 
 
 class _KindFormats(NamedTuple):
-    suited: tuple[Format, ...]
-    stills: tuple[Format, ...]
+    suited: tuple[_Format, ...]
+    stills: tuple[_Format, ...]
     """Where none are asked for, of single views."""
-    moving: tuple[Format, ...] = ("mp4",)
+    moving: tuple[_Format, ...] = ("mp4",)
     """The same where views follow each other."""
 
 
@@ -84,7 +84,7 @@ class FormattedOutput:
     """An output in a format."""
 
     output: Output
-    format: Format
+    format: _Format
 
 
 def file_name(output: Output) -> str:
@@ -114,7 +114,7 @@ def choose_formats(
 
     Args:
         outputs: Names, or `all`; none: those that are usually wanted, as far as the scene has them.
-        formats: Of `FORMATS`; none: what suits each output best.
+        formats: Of `_FORMATS`; none: what suits each output best.
         scene: It says what outputs there are.
         is_path: Whether views follow each other.
     Raises:
@@ -123,7 +123,7 @@ def choose_formats(
     """
     names = dict.fromkeys(_expanded(outputs or _default_outputs(scene, is_path), scene))
     chosen = [scene.output(name) for name in names]
-    wanted: list[Format] = [_format(name) for name in dict.fromkeys(formats)]
+    wanted: list[_Format] = [_format(name) for name in dict.fromkeys(formats)]
     _refuse_same_files(chosen)
     found = [
         FormattedOutput(output, one)
@@ -145,7 +145,7 @@ def _default_outputs(scene: RenderableScene, is_path: bool) -> list[str]:
 
 def _expanded(outputs: Iterable[str], scene: RenderableScene) -> Iterable[str]:
     for name in outputs:
-        if name == EVERY_OUTPUT:
+        if name == _EVERY_OUTPUT:
             yield from (output.name for output in scene.outputs)
         else:
             yield name
@@ -157,21 +157,21 @@ def _kind_formats(output: Output) -> _KindFormats:
     return _COMPOSITE if is_composite else _BY_KIND[output.kind]
 
 
-def _usual(output: Output, is_path: bool) -> tuple[Format, ...]:
+def _usual(output: Output, is_path: bool) -> tuple[_Format, ...]:
     return _kind_formats(output).moving if is_path else _kind_formats(output).stills
 
 
-def _format(name: str) -> Format:
-    for known in FORMATS:
+def _format(name: str) -> _Format:
+    for known in _FORMATS:
         if name == known:
             return known
-    hint = did_you_mean(name, FORMATS, likeness=0.5, form=" ({})")
-    raise ConfigError(f"there is no format {name!r}{hint}; known are {', '.join(FORMATS)}")
+    hint = did_you_mean(name, _FORMATS, likeness=0.5, form=" ({})")
+    raise ConfigError(f"there is no format {name!r}{hint}; known are {', '.join(_FORMATS)}")
 
 
-def _suited(output: Output, wanted: Sequence[Format]) -> list[Format]:
+def _suited(output: Output, wanted: Sequence[_Format]) -> list[_Format]:
     known = _kind_formats(output).suited
-    suited: list[Format] = [one for one in wanted if one in known]
+    suited: list[_Format] = [one for one in wanted if one in known]
     if not suited:
         reason = _REASONS.get((output.kind, wanted[0]), "the format does not suit it")
         raise ConfigError(
@@ -310,7 +310,7 @@ def frame(output: Output, progress: float, setting: RenderSetting, add: FrameSin
     add(canvas.pixels)
 
 
-def shape_of(output: Output, setting: RenderSetting) -> tuple[int, ...]:
+def _shape_of(output: Output, setting: RenderSetting) -> tuple[int, ...]:
     """Shape of an output of a whole view."""
     width, height = setting.size
     names = setting.channels.get(output.name)
@@ -320,7 +320,7 @@ def shape_of(output: Output, setting: RenderSetting) -> tuple[int, ...]:
 @contextmanager
 def _npy(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSink]:
     dtype = np.uint8 if output.kind == "labels" else np.float32
-    with npy_rows(path, shape_of(output, setting), dtype) as add:
+    with npy_rows(path, _shape_of(output, setting), dtype) as add:
         yield lambda rows: add(rows.values[output.name])
 
 

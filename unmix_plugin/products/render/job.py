@@ -125,7 +125,7 @@ def _bounds(values: Float[Tensor, "..."]) -> tuple[float, float]:
     return low, max(high, low + 1e-6)
 
 
-class FrameExchange:
+class _FrameExchange:
     """Takes the frames that this process draws; at the end of a round they follow each other by rank."""
 
     def __init__(self, processes: Processes, num_videos: int, videos: Sequence[FrameSink]) -> None:
@@ -171,7 +171,7 @@ _BLOCK_PIXELS, _BLOCK_NUMBERS = 1 << 16, 1 << 22
 
 
 @dataclass(frozen=True)
-class Block:
+class _Block:
     """Some rows of a view, as a camera of their own."""
 
     view: int
@@ -212,7 +212,7 @@ class RenderJob:
             folder,
             cameras.size,
             Palette.of(materials, survey.scales),
-            scene_bands(scene),
+            _scene_bands(scene),
             channel_names(scene, cameras.views[0].camera, [one.output for one in outputs]),
             cameras.frames_per_second,
         )
@@ -220,7 +220,7 @@ class RenderJob:
         self._still = [one for one in outputs if one not in self._moving]
         self._asked = self._asked_of_scene([one.output.name for one in outputs])
         self._files, self._view = ExitStack(), ExitStack()
-        self._exchange = FrameExchange(processes, len(self._moving), ())
+        self._exchange = _FrameExchange(processes, len(self._moving), ())
         self._sinks: list[RowsSink] = []
 
     @property
@@ -228,7 +228,7 @@ class RenderJob:
         """The colours of the pictures."""
         return self._setting.palette
 
-    def blocks(self, pixels: int | None = None) -> list[Block]:
+    def blocks(self, pixels: int | None = None) -> list[_Block]:
         """All that this process is to render.
 
         Args:
@@ -241,7 +241,7 @@ class RenderJob:
         rows = max(1, pixels // width)
         own = list(enumerate(self._cameras.views))[self._processes.rank :: self._processes.count]
         return [
-            Block(
+            _Block(
                 index,
                 first,
                 view.camera.crop(0, first, width, min(rows, height - first)),
@@ -260,7 +260,7 @@ class RenderJob:
                 for one in self._moving
                 if self._processes.is_first
             ]
-            self._exchange = FrameExchange(self._processes, len(self._moving), videos)
+            self._exchange = _FrameExchange(self._processes, len(self._moving), videos)
             self._view = opening.enter_context(ExitStack())
             self._files = opening.pop_all()
         return self
@@ -270,7 +270,7 @@ class RenderJob:
     ) -> None:
         self._files.__exit__(kind, error, traceback)
 
-    def render(self, block: Block) -> None:
+    def render(self, block: _Block) -> None:
         """Render a block and hand it to the files.
 
         Raises:
@@ -355,7 +355,7 @@ def channel_names(
 ) -> dict[str, tuple[str, ...]]:
     """Names of the channels of outputs that have several; a scene without materials is asked how many."""
     names: dict[str, tuple[str, ...]] = {}
-    bands = scene_bands(scene)
+    bands = _scene_bands(scene)
     for output in outputs:
         if output.kind in ("grey", "map", "labels"):
             continue
@@ -371,7 +371,7 @@ def channel_names(
     return names
 
 
-def scene_bands(scene: RenderableScene) -> Bands | None:
+def _scene_bands(scene: RenderableScene) -> Bands | None:
     """Of outputs of kind `channels`; None where a scene has no spectra."""
     bands = getattr(scene, "bands", None)
     return bands if isinstance(bands, Bands) else None

@@ -127,7 +127,7 @@ def render_page(values: Mapping[str, Any]) -> str:
         lstrip_blocks=True,
         undefined=StrictUndefined,
     )
-    environment.filters |= {"css": css_colour, "png": png_url, "svg": svg_url}
+    environment.filters |= {"css": css_colour, "png": png_url, "svg": _svg_url}
     return environment.get_template("report.html").render(values)
 
 
@@ -146,6 +146,6 @@ def png_url(image: Float[np.ndarray, "H W 3"] | UInt8[np.ndarray, "H W 3"]) -> s
     return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}"
 
 
-def svg_url(chart: LineChart) -> str:
+def _svg_url(chart: LineChart) -> str:
     """A chart as a URL with the drawing in it."""
     return f"data:image/svg+xml;base64,{base64.b64encode(draw_chart(chart)).decode()}"

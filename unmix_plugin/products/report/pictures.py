@@ -37,7 +37,7 @@ _MAP_COLUMNS = (7, 6, 5)
 
 
 @dataclass(frozen=True)
-class CaptionedPicture:
+class _CaptionedPicture:
     """A picture with a line below it."""
 
     image: np.ndarray
@@ -49,39 +49,39 @@ class CaptionedPicture:
 
 
 @dataclass(frozen=True)
-class ShownSegmentation:
+class _ShownSegmentation:
     """Materials of some views; against labels where there are some."""
 
-    pictures: Sequence[CaptionedPicture]
+    pictures: Sequence[_CaptionedPicture]
     legend: Sequence[tuple[str, Colour]]
     scores: Sequence[tuple[str, Colour, str, str]] = ()
     """True material, its colour, the endmember that it is matched to, intersection over union."""
 
 
-def colour_pictures(views: Sequence[ShownView]) -> list[CaptionedPicture]:
+def colour_pictures(views: Sequence[_ShownView]) -> list[_CaptionedPicture]:
     """Each view as measured, as predicted, and their difference; as predicted alone where nothing was measured."""
-    pictures: list[CaptionedPicture] = []
+    pictures: list[_CaptionedPicture] = []
     for view in views:
         if view.measured is None or view.error is None:
-            pictures.append(CaptionedPicture(view.predicted, view.name, f"{view.name}, predicted"))
+            pictures.append(_CaptionedPicture(view.predicted, view.name, f"{view.name}, predicted"))
             continue
         name = f"{view.name}: " if len(view.name) < 40 else ""
         pictures += [
-            CaptionedPicture(view.measured, f"{name}measured", f"{view.name}, measured"),
-            CaptionedPicture(view.predicted, "predicted", f"{view.name}, predicted"),
-            CaptionedPicture(view.error, f"error, PSNR {view.psnr_db:.1f} dB", f"{view.name}, error"),
+            _CaptionedPicture(view.measured, f"{name}measured", f"{view.name}, measured"),
+            _CaptionedPicture(view.predicted, "predicted", f"{view.name}, predicted"),
+            _CaptionedPicture(view.error, f"error, PSNR {view.psnr_db:.1f} dB", f"{view.name}, error"),
         ]
     return pictures
 
 
-def share_pictures(views: ReportViews) -> list[tuple[str, list[CaptionedPicture]]]:
+def share_pictures(views: ReportViews) -> list[tuple[str, list[_CaptionedPicture]]]:
     """Maps of every endmember in the views chosen for it, by view."""
     colours = endmember_colours(views.materials)
     return [
         (
             view.name,
             [
-                CaptionedPicture(image, name, f"{view.name}, abundance of {name}", colour)
+                _CaptionedPicture(image, name, f"{view.name}, abundance of {name}", colour)
                 for image, name, colour in zip(view.shares, views.materials.names, colours, strict=True)
             ],
         )
@@ -111,19 +111,19 @@ def error_chart(views: ReportViews) -> LineChart | None:
     )
 
 
-def segmentation_pictures(views: ReportViews) -> ShownSegmentation:
+def segmentation_pictures(views: ReportViews) -> _ShownSegmentation:
     """Materials of some views; against labels where there are some."""
     evaluation = views.evaluation
     chosen = evenly(views.shown, SHOWN_VIEWS)
     if evaluation is None or not any(view.labels is not None for view in chosen):
         colours = endmember_colours(views.materials)
         pictures = [
-            CaptionedPicture(
+            _CaptionedPicture(
                 paint_ids(view.ids, dict(enumerate(colours))), view.name, f"{view.name}, materials"
             )
             for view in chosen
         ]
-        return ShownSegmentation(pictures, list(zip(views.materials.names, colours, strict=True)))
+        return _ShownSegmentation(pictures, list(zip(views.materials.names, colours, strict=True)))
     scores, look = evaluation.segmentation(), material_look(evaluation)
     matching = scores.matching
     surplus = [
@@ -139,7 +139,7 @@ def segmentation_pictures(views: ReportViews) -> ShownSegmentation:
     ]
     pictures = [one for view in chosen for one in _against_labels(view, look, matching)]
     legend = [*look.true_entries, *surplus, ("right", RIGHT), ("wrong", WRONG)]
-    return ShownSegmentation(pictures, legend, rows)
+    return _ShownSegmentation(pictures, legend, rows)
 
 
 def scale_strip(scale: ColourScale) -> np.ndarray:
@@ -148,8 +148,8 @@ def scale_strip(scale: ColourScale) -> np.ndarray:
 
 
 def _against_labels(
-    view: ShownView, look: MaterialLook, matching: Mapping[int, int]
-) -> list[CaptionedPicture]:
+    view: _ShownView, look: MaterialLook, matching: Mapping[int, int]
+) -> list[_CaptionedPicture]:
     labels = view.labels if view.labels is not None else np.full_like(view.ids, NOTHING_ID)
     as_true = np.full(256, NOTHING_ID, dtype=np.uint8)
     as_true[list(matching)] = list(matching.values())
@@ -158,9 +158,9 @@ def _against_labels(
     predicted = paint_ids(view.ids, look.pred_colours(matching))
     true = paint_ids(labels, dict(enumerate(look.true_colours)))
     return [
-        CaptionedPicture(true, f"{view.name}: labels", f"{view.name}, labels"),
-        CaptionedPicture(predicted, "predicted", f"{view.name}, predicted materials"),
-        CaptionedPicture(agreement, "agreement", f"{view.name}, agreement"),
+        _CaptionedPicture(true, f"{view.name}: labels", f"{view.name}, labels"),
+        _CaptionedPicture(predicted, "predicted", f"{view.name}, predicted materials"),
+        _CaptionedPicture(agreement, "agreement", f"{view.name}, agreement"),
     ]
 
 
@@ -177,7 +177,7 @@ class TrueMaterials:
 
 
 @dataclass(frozen=True)
-class MaterialCard:
+class _MaterialCard:
     """What is shown of an endmember."""
 
     name: str
@@ -195,7 +195,7 @@ def material_cards(
     light: Float64[np.ndarray, " B"] | None,
     library: MaterialLibrary,
     truth: TrueMaterials | None,
-) -> list[MaterialCard]:
+) -> list[_MaterialCard]:
     """A card for each endmember.
 
     Args:
@@ -210,13 +210,13 @@ def material_cards(
     wavelengths = materials.bands.centers_nm
     known = shown_matches(spectra, materials.bands, light, library)
     partners = {} if truth is None else _partners(spectra, truth, wavelengths)
-    cards: list[MaterialCard] = []
+    cards: list[_MaterialCard] = []
     for index, name in enumerate(materials.names):
         matches = [*_known_lines(known[index], wavelengths), *partners.get(index, ())]
         own = ChartLine(wavelengths, spectra[index], name, css_colour(colours[index]), 3.0)
         lines = [*(line for line, *_ in matches), own]
         chart = LineChart(lines, "wavelength (nm)", "radiance", from_zero=True, size=(480.0, 240.0))
-        cards.append(MaterialCard(name, colours[index], float(proportions[index]), chart, matches))
+        cards.append(_MaterialCard(name, colours[index], float(proportions[index]), chart, matches))
     return cards
 
 
@@ -251,26 +251,26 @@ def _partners(
 ERROR_SCALE = ColourScale("magma", 0.0, 0.1, "root mean squared error over bands")
 """Colours of errors of spectra."""
 
-ItemT = TypeVar("ItemT")
-EightBits = UInt8[np.ndarray, "H W 3"]
+_ItemT = TypeVar("_ItemT")
+_EightBits = UInt8[np.ndarray, "H W 3"]
 
 
 @dataclass(frozen=True)
-class ShownView:
+class _ShownView:
     """A view as pictures, 8-bit sRGB, and ids."""
 
     name: str
-    predicted: EightBits
+    predicted: _EightBits
     ids: UInt8[np.ndarray, "H W"]
-    measured: EightBits | None = None
-    error: EightBits | None = None
+    measured: _EightBits | None = None
+    error: _EightBits | None = None
     labels: UInt8[np.ndarray, "H W"] | None = None
     psnr_db: float = math.nan
-    shares: tuple[EightBits, ...] = ()
+    shares: tuple[_EightBits, ...] = ()
     """One for each endmember, of views chosen for it."""
 
 
-def evenly(items: Sequence[ItemT], count: int) -> list[ItemT]:
+def evenly(items: Sequence[_ItemT], count: int) -> list[_ItemT]:
     """At most `count` of the items, evenly spread, the first and the last among them.
 
     >>> evenly("abcdefg", 3)
@@ -296,7 +296,7 @@ class ReportViews:
         num_bands = len(materials.bands)
         self.materials = materials
         self.evaluation = evaluation
-        self.shown: list[ShownView] = []
+        self.shown: list[_ShownView] = []
         self._with_shares = frozenset(with_shares)
         self._squares, self._offsets, self._pixels = np.zeros(num_bands), np.zeros(num_bands), 0
         self._amounts = np.zeros(len(materials.names))
@@ -308,13 +308,13 @@ class ReportViews:
         predicted = _eight_bits(picture(view.spectra, view.coverage, self.materials.bands))
         ids = view.segmentation.numpy()
         if truth is None or self.evaluation is None:
-            self.shown.append(ShownView(name, predicted, ids, shares=shares))
+            self.shown.append(_ShownView(name, predicted, ids, shares=shares))
             return
         figures = self.evaluation.add(truth, view)
         labels = None if truth.labels is None else truth.labels.numpy()
         measured = _eight_bits(picture(truth.spectra, truth.opacity, self.materials.bands))
         error = self._count_error(view, truth)
-        shown = ShownView(name, predicted, ids, measured, error, labels, figures["psnr"], shares)
+        shown = _ShownView(name, predicted, ids, measured, error, labels, figures["psnr"], shares)
         self.shown.append(shown)
 
     @property
@@ -333,12 +333,12 @@ class ReportViews:
         return self._offsets / self._pixels if self._pixels else np.full(len(self._offsets), np.nan)
 
     @property
-    def worst_first(self) -> list[ShownView]:
+    def worst_first(self) -> list[_ShownView]:
         """Views with a PSNR, the lowest first."""
         known = [view for view in self.shown if math.isfinite(view.psnr_db)]
         return sorted(known, key=lambda view: view.psnr_db)
 
-    def _count_error(self, view: PredictedView, truth: ViewTruth) -> EightBits:
+    def _count_error(self, view: PredictedView, truth: ViewTruth) -> _EightBits:
         difference = as_numpy(view.spectra.clamp(0, 1)) - as_numpy(truth.spectra)
         matter = truth.shows_matter.numpy()
         self._squares += (difference[matter] ** 2).sum(axis=0)
@@ -348,11 +348,11 @@ class ReportViews:
         seen = np.maximum(as_numpy(view.coverage), as_numpy(truth.opacity)) > 0.01
         return _eight_bits(over_neutral(painted, seen.astype(np.float64)))
 
-    def _share_pictures(self, view: PredictedView) -> tuple[EightBits, ...]:
+    def _share_pictures(self, view: PredictedView) -> tuple[_EightBits, ...]:
         opacity = as_numpy(view.accumulation)
         maps = np.moveaxis(as_numpy(view.shares), -1, 0)
         return tuple(_eight_bits(over_neutral(paint(one, SHARE_SCALE), opacity)) for one in maps)
 
 
-def _eight_bits(colours: np.ndarray) -> EightBits:
+def _eight_bits(colours: np.ndarray) -> _EightBits:
     return np.round(255 * np.clip(colours, 0, 1)).astype(np.uint8)
