@@ -16,7 +16,7 @@ from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.material_library import measured_library
 from unmix_plugin.trained.outputs import MaterialView
-from unmix_plugin.trained.run_materials import endmember_table
+from unmix_plugin.trained.run_materials import _endmember_table
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 BANDS = Bands.of(WAVELENGTHS_NM)
@@ -129,7 +129,7 @@ def test_a_new_name_is_used_from_then_on_and_ends_up_in_tables():
     result = edited(
         scene, "rename: {endmember: 1, name: red brick}", "scale: {endmember: red brick, factor: 0}"
     )
-    table = endmember_table(result.materials)
+    table = _endmember_table(result.materials)
     assert table.names == ("endmember_0", "red brick", "endmember_2")
     assert table.spectra[1].max() == 0
     assert result.materials.endmembers[0].max() > 0

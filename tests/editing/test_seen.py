@@ -9,7 +9,7 @@ from torch.testing import assert_close
 
 from tests.editing.scenes import CAMERAS, LIGHT, edited, lit_scene
 from unmix_plugin.editing import sample_seen
-from unmix_plugin.editing.edited_field import Appearance, MaterialState, appearance_of
+from unmix_plugin.editing.edited_field import MaterialState, _Appearance, appearance_of
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.materials import Coefficients
@@ -77,13 +77,13 @@ def test_highlights_count_in_the_mean_and_mixtures_hardly():
 
 
 def test_a_shaded_material_may_be_brighter_than_white_in_full_light_but_not_where_it_is_seen():
-    appearance = Appearance(np.linspace(0.2, 0.5, 100), np.zeros((100, 3)), np.ones(100))
+    appearance = _Appearance(np.linspace(0.2, 0.5, 100), np.zeros((100, 3)), np.ones(100))
     assert appearance.greatest_reflectance == pytest.approx(1 / 0.485, rel=0.01)
-    assert Appearance(np.full(9, 2.0), np.zeros((9, 3)), np.ones(9)).greatest_reflectance == 1
+    assert _Appearance(np.full(9, 2.0), np.zeros((9, 3)), np.ones(9)).greatest_reflectance == 1
 
 
 def test_where_the_rest_of_the_pixels_is_too_bright_the_nearest_colour_is_taken():
-    appearance = Appearance(np.full(20, 0.5), np.full((20, 3), [0.3, 0.0, 0.0]), np.ones(20))
+    appearance = _Appearance(np.full(20, 0.5), np.full((20, 3), [0.3, 0.0, 0.0]), np.ones(20))
     np.testing.assert_allclose(appearance.full_colour((0.2, 0.0, 0.5)), [0.0, 0.0, 2 * 0.21404], atol=1e-4)
 
 

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from tests.products.ball_model import ALL_ROUND, ball_scene, cameras_around
 from tests.products.mesh_reading import loaded_mesh
 from tests.trained.camera_files.camera_scenes import FRAME, around
-from unmix_plugin.products.mesh import TriangleMesh, write_mesh
-from unmix_plugin.products.point_cloud import write_point_cloud
-from unmix_plugin.products.volume import write_volume
+from unmix_plugin.products.mesh import _TriangleMesh, _write_mesh
+from unmix_plugin.products.point_cloud import _write_point_cloud
+from unmix_plugin.products.volume import _write_volume
 from unmix_plugin.scenes.placement import Placement
 from unmix_plugin.trained.camera_files import camera_file_bytes, read_camera_file
 from unmix_plugin.trained.run_views import RunView, positions_for_files
@@ -49,7 +49,7 @@ def test_points_are_where_the_source_says(tmp_path):
     for camera in cameras:
         surface.look(camera)
     near, far = (
-        columns(write_point_cloud(tmp_path / name, surface.points(), 300, SCENE.materials, frame)[0])
+        columns(_write_point_cloud(tmp_path / name, surface.points(), 300, SCENE.materials, frame)[0])
         for name, frame in (("near", FRAME), ("far", FAR))
     )
     assert near.dtype == np.float32
@@ -58,8 +58,8 @@ def test_points_are_where_the_source_says(tmp_path):
 
 def test_meshes_of_all_formats_are_where_the_source_says(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
-    mesh = TriangleMesh(np.array(ball.vertices), np.array(ball.faces))
-    ply, obj, _, glb = write_mesh(tmp_path, ("ply", "obj", "glb"), mesh, SCENE, FAR)
+    mesh = _TriangleMesh(np.array(ball.vertices), np.array(ball.faces))
+    ply, obj, _, glb = _write_mesh(tmp_path, ("ply", "obj", "glb"), mesh, SCENE, FAR)
     expected = source_of(FRAME.to_world(mesh.vertices))
     assert_close(columns(ply), expected)
     lines = [line.split()[1:4] for line in obj.read_text().splitlines() if line.startswith("v ")]
@@ -70,7 +70,7 @@ def test_meshes_of_all_formats_are_where_the_source_says(tmp_path):
 
 def test_volumes_are_where_the_source_says(tmp_path):
     grid = GridPoints.over(SCENE.scene_box.aabb, 8)
-    path = write_volume(tmp_path, SCENE, grid, FAR, range(grid.shape[0]))
+    path = _write_volume(tmp_path, SCENE, grid, FAR, range(grid.shape[0]))
     matrix = np.load(path)["index_to_world"]
     index = np.array([1.0, 2.0, 3.0])
     model = grid.origin.astype(np.float64) + grid.cell * index

@@ -18,15 +18,15 @@ from tests.products.mesh_reading import loaded_mesh
 from tests.trained.camera_files.camera_scenes import FRAME
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.products.mesh import (
-    TriangleMesh,
-    extract_mesh,
-    filled,
-    mesh_paths,
-    require_sound,
-    surface_density,
-    trim_unseen,
-    without_stray_pieces,
-    write_mesh,
+    _extract_mesh,
+    _filled,
+    _mesh_paths,
+    _require_sound,
+    _surface_density,
+    _TriangleMesh,
+    _trim_unseen,
+    _without_stray_pieces,
+    _write_mesh,
 )
 from unmix_plugin.trained.surface import GridPoints, SeenSurface, sample_slice
 
@@ -44,7 +44,7 @@ def densities():
 @pytest.fixture(scope="module")
 def whole(densities):
     """Both sides of the hollow ball."""
-    return extract_mesh(densities, GRID, THRESHOLD, 0.0, PIXEL)
+    return _extract_mesh(densities, GRID, THRESHOLD, 0.0, PIXEL)
 
 
 def seen(directions):
@@ -57,7 +57,7 @@ def seen(directions):
 
 @pytest.fixture(scope="module")
 def outside(whole):
-    return without_stray_pieces(trim_unseen(whole, seen(ALL_ROUND)))
+    return _without_stray_pieces(_trim_unseen(whole, seen(ALL_ROUND)))
 
 
 def radii(mesh):
@@ -94,18 +94,18 @@ def test_what_no_camera_sees_into_is_solid(densities):
     points = np.stack([GRID.slice_points(index).numpy() for index in range(GRID.shape[0])])
     rendered = np.where(np.linalg.norm(points, axis=-1) < INNER_RADIUS + 0.1, 0, densities)
     rendered[rendered < 1e-3 * THRESHOLD] = 0
-    shell = extract_mesh(rendered, GRID, THRESHOLD, 0.0, PIXEL)
+    shell = _extract_mesh(rendered, GRID, THRESHOLD, 0.0, PIXEL)
     surface = seen(ALL_ROUND)
-    solid = extract_mesh(filled(rendered, GRID, SCENE, surface), GRID, THRESHOLD, 0.0, PIXEL)
+    solid = _extract_mesh(_filled(rendered, GRID, SCENE, surface), GRID, THRESHOLD, 0.0, PIXEL)
     assert radii(shell).min() < INNER_RADIUS + 0.15
     assert radii(solid).min() > RADIUS - 0.05
-    seen_from_outside = trim_unseen(solid, surface)
+    seen_from_outside = _trim_unseen(solid, surface)
     assert len(seen_from_outside.vertices) == int((radii(shell) > RADIUS - 0.05).sum())
     assert radii(seen_from_outside).max() < RADIUS + 0.05
 
 
 def test_undersides_that_no_camera_sees_are_trimmed(whole):
-    trimmed = trim_unseen(whole, seen(FROM_ABOVE))
+    trimmed = _trim_unseen(whole, seen(FROM_ABOVE))
     assert trimmed.vertices[:, 2].max() > 0.55
     assert trimmed.vertices[:, 2].min() > -0.5
     assert radii(trimmed).min() > RADIUS - 0.05
@@ -129,19 +129,19 @@ def test_stray_pieces_go_though_they_touch_the_rest_in_a_point_and_large_ones_st
     two_faces = two_faces + len(large) + len(middle)
     two_faces[0, 0] = len(large) - 1  # the last vertex of the large piece
     faces = np.concatenate([large_faces, middle_faces + len(large), two_faces])
-    kept = without_stray_pieces(TriangleMesh(vertices, faces))
+    kept = _without_stray_pieces(_TriangleMesh(vertices, faces))
     assert len(kept.faces) == 120 + 20
     assert len(kept.vertices) == len(large) + len(middle)
-    assert len(without_stray_pieces(TriangleMesh(*ribbon(2, 0.0))).faces) == 2
-    empty = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
-    assert len(without_stray_pieces(empty).faces) == 0
+    assert len(_without_stray_pieces(_TriangleMesh(*ribbon(2, 0.0))).faces) == 2
+    empty = _TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+    assert len(_without_stray_pieces(empty).faces) == 0
 
 
 def test_a_blur_rounds_and_does_not_move_a_flat_wall():
     grid = GridPoints(np.zeros(3, dtype=np.float32), 0.1, (12, 12, 12))
     wall = np.zeros(grid.shape, dtype=np.float32)
     wall[6:] = 1e4
-    mesh = extract_mesh(wall, grid, -np.log(0.5) / PIXEL, 1.5, PIXEL)
+    mesh = _extract_mesh(wall, grid, -np.log(0.5) / PIXEL, 1.5, PIXEL)
     middle = mesh.vertices[(np.abs(mesh.vertices[:, 1:] - 0.55) < 0.15).all(axis=1)]
     front = middle[middle[:, 0] < 0.9]
     np.testing.assert_allclose(front[:, 0], 0.55, atol=0.01)
@@ -149,26 +149,26 @@ def test_a_blur_rounds_and_does_not_move_a_flat_wall():
 
 def test_a_surface_that_reaches_the_box_is_closed_there():
     grid = GridPoints(np.zeros(3, dtype=np.float32), 0.1, (5, 5, 5))
-    mesh = extract_mesh(np.full(grid.shape, 1e4, dtype=np.float32), grid, 1.0, 0.0, PIXEL)
+    mesh = _extract_mesh(np.full(grid.shape, 1e4, dtype=np.float32), grid, 1.0, 0.0, PIXEL)
     assert trimesh.Trimesh(mesh.vertices, mesh.faces).is_watertight
     np.testing.assert_allclose(mesh.vertices.max(axis=0), 0.4, atol=0.1)
 
 
 def test_the_surface_lies_at_the_density_where_rays_end():
     points = seen(ALL_ROUND).points()
-    threshold = surface_density(SCENE, points)
+    threshold = _surface_density(SCENE, points)
     found, _ = SCENE.field.get_density(points.positions)
     assert (found < threshold).float().mean() == pytest.approx(0.07, abs=0.01)
     nowhere = points.select(torch.zeros(len(points), dtype=torch.bool))
     with pytest.raises(RunError, match="no ray of the run's cameras ends"):
-        surface_density(SCENE, nowhere)
+        _surface_density(SCENE, nowhere)
 
 
 @pytest.fixture(scope="module")
 def files(outside, tmp_path_factory):
     folder = tmp_path_factory.mktemp("mesh")
-    written = write_mesh(folder, ("ply", "obj", "glb"), outside, SCENE, FRAME)
-    assert written == mesh_paths(folder, ("ply", "obj", "glb"))
+    written = _write_mesh(folder, ("ply", "obj", "glb"), outside, SCENE, FRAME)
+    assert written == _mesh_paths(folder, ("ply", "obj", "glb"))
     return {path.suffix: path for path in written}
 
 
@@ -207,13 +207,13 @@ def test_vertices_have_the_material_of_their_half(files):
 
 def test_a_density_that_nothing_reaches_is_refused(densities):
     with pytest.raises(ConfigError, match=r"the density asked for; choose a lower --density"):
-        extract_mesh(densities, GRID, 1e9, 0.0, PIXEL)
+        _extract_mesh(densities, GRID, 1e9, 0.0, PIXEL)
 
 
 def test_a_mesh_without_faces_is_not_written(tmp_path):
-    empty = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+    empty = _TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
     with pytest.raises(RunError, match="no camera of the run sees it; keep it with --unseen keep"):
-        write_mesh(tmp_path, ("ply",), empty, SCENE, FRAME)
+        _write_mesh(tmp_path, ("ply",), empty, SCENE, FRAME)
 
 
 @pytest.mark.parametrize(
@@ -228,4 +228,4 @@ def test_a_mesh_without_faces_is_not_written(tmp_path):
 )
 def test_impossible_settings_are_refused(density, smoothing, said):
     with pytest.raises(ConfigError, match=said):
-        require_sound(density, smoothing)
+        _require_sound(density, smoothing)

@@ -12,9 +12,9 @@ from PIL import Image
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.products.metamerism import (
     Metamerism,
-    find_metamers,
-    metamerism_paths,
-    write_metamerism,
+    _find_metamers,
+    _metamerism_paths,
+    _write_metamerism,
 )
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_power, xyz_matrix
@@ -51,7 +51,7 @@ MATERIALS = run_materials(GREY, hidden(0.25), names=("slate", "paint"))
 
 
 def pairs_of(surfaces: str) -> list[set[str]]:
-    found = find_metamers(MATERIALS, SCENE_LIGHT, LIBRARY, replace(BOTH, surfaces=surfaces))
+    found = _find_metamers(MATERIALS, SCENE_LIGHT, LIBRARY, replace(BOTH, surfaces=surfaces))
     return [{found.names[pair.first], found.names[pair.second]} for pair in found.pairs]
 
 
@@ -66,7 +66,7 @@ def test_pairs_are_of_the_run_or_of_the_library_or_of_both_with_the_runs_first()
 
 def test_materials_that_do_not_reach_all_bands_are_passed_over():
     longer = LIBRARY.extended(SHORT, "test")
-    found = find_metamers(MATERIALS, SCENE_LIGHT, longer, BOTH)
+    found = _find_metamers(MATERIALS, SCENE_LIGHT, longer, BOTH)
     assert "own/short" not in found.names
 
 
@@ -79,7 +79,7 @@ def test_bands_that_no_eye_sees_play_no_part():
     library = LIBRARY.extended(
         SpectraTable(Bands.of([390, 790]), ("own/wide",), np.full((1, 2), 0.4)), "test"
     )
-    found = find_metamers(
+    found = _find_metamers(
         Materials(wide, spectra, torch.zeros(0, 61), names=MATERIALS.names), light, library, BOTH
     )
     assert found.bands == Bands.of(np.linspace(400, 780, 39))
@@ -87,12 +87,12 @@ def test_bands_that_no_eye_sees_play_no_part():
     assert {"slate", "paint"} in [{found.names[pair.first], found.names[pair.second]} for pair in found.pairs]
     infrared = Bands.of(np.linspace(800, 1000, 61))
     with pytest.raises(SpectrumError, match="no visible light"):
-        find_metamers(Materials(infrared, spectra, torch.zeros(0, 61)), None, library, BOTH)
+        _find_metamers(Materials(infrared, spectra, torch.zeros(0, 61)), None, library, BOTH)
 
 
 def test_the_table_names_materials_lights_and_differences(tmp_path):
-    found = find_metamers(MATERIALS, SCENE_LIGHT, LIBRARY, replace(BOTH, surfaces="run"))
-    assert write_metamerism(tmp_path / "new", found) == metamerism_paths(tmp_path / "new")
+    found = _find_metamers(MATERIALS, SCENE_LIGHT, LIBRARY, replace(BOTH, surfaces="run"))
+    assert _write_metamerism(tmp_path / "new", found) == _metamerism_paths(tmp_path / "new")
     rows = list(csv.DictReader(io.StringIO((tmp_path / "new" / "metamerism.csv").read_text())))
     [row] = rows
     assert {row["first"], row["second"]} == {"slate", "paint"}
@@ -102,8 +102,8 @@ def test_the_table_names_materials_lights_and_differences(tmp_path):
 
 
 def test_swatches_have_the_colours_that_an_adapted_eye_sees(tmp_path):
-    found = find_metamers(MATERIALS, SCENE_LIGHT, LIBRARY, replace(BOTH, surfaces="run"))
-    write_metamerism(tmp_path, found)
+    found = _find_metamers(MATERIALS, SCENE_LIGHT, LIBRARY, replace(BOTH, surfaces="run"))
+    _write_metamerism(tmp_path, found)
     with Image.open(tmp_path / "metamerism.png") as picture:
         pixels = np.asarray(picture.convert("RGB")).reshape(-1, 3) / 255
     for name in ("D65", "A"):
@@ -116,9 +116,9 @@ def test_swatches_have_the_colours_that_an_adapted_eye_sees(tmp_path):
 @pytest.mark.parametrize("lights", [("D65", "A"), ("D65", "A", "FL2", "FL11", "E")])
 def test_a_figure_without_pairs_is_drawn_all_the_same(tmp_path, lights):
     grey = run_materials(GREY, names=("slate",))
-    found = find_metamers(grey, None, MaterialLibrary(()), Metamerism(lights=lights))
+    found = _find_metamers(grey, None, MaterialLibrary(()), Metamerism(lights=lights))
     assert found.pairs == []
-    write_metamerism(tmp_path, found)
+    _write_metamerism(tmp_path, found)
     with Image.open(tmp_path / "metamerism.png") as picture:
         assert np.asarray(picture.convert("L")).min() < 50
     assert len((tmp_path / "metamerism.csv").read_text().splitlines()) == 1

@@ -7,7 +7,7 @@ from PIL import Image
 
 from tests.method_factory import make_scene
 from tests.trained.camera_files.camera_scenes import around
-from unmix_plugin.products.pca import find_components, survey_view, write_components, write_pca
+from unmix_plugin.products.pca import _find_components, _survey_view, _write_components, _write_pca
 from unmix_plugin.trained.evaluation import render_view
 
 SCENE = make_scene()
@@ -24,7 +24,7 @@ def spread(seed=0):
 
 def test_components_are_the_directions_of_largest_variance_of_all_views_together():
     spectra, axes = spread()
-    components = find_components([spectra[:1000], spectra[1000:]], "spectra")
+    components = _find_components([spectra[:1000], spectra[1000:]], "spectra")
     cosines = (components.colours.axes.T @ axes.double()).diagonal().numpy()
     np.testing.assert_allclose(np.abs(cosines), 1, atol=0.01)
     variances = np.array([0.25, 0.04, 0.0025])
@@ -32,15 +32,15 @@ def test_components_are_the_directions_of_largest_variance_of_all_views_together
 
 
 def test_spectra_all_alike_explain_nothing():
-    assert find_components([torch.ones(10, 5)], "spectra").explained == (0.0, 0.0, 0.0)
-    assert find_components([torch.zeros(0, 5)], "abundances").explained == (0.0, 0.0, 0.0)
+    assert _find_components([torch.ones(10, 5)], "spectra").explained == (0.0, 0.0, 0.0)
+    assert _find_components([torch.zeros(0, 5)], "abundances").explained == (0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("of", ["spectra", "abundances"])
 def test_a_picture_shows_the_components_of_its_pixels(tmp_path, of):
-    components = find_components([survey_view(SCENE, CAMERA, of)], of)
+    components = _find_components([_survey_view(SCENE, CAMERA, of)], of)
     view = render_view(SCENE, CAMERA)
-    with Image.open(write_pca(tmp_path, "view", view, components)) as picture:
+    with Image.open(_write_pca(tmp_path, "view", view, components)) as picture:
         pixels = np.asarray(picture)
     assert pixels.shape == (30, 40, 3)
     values = view.spectra if of == "spectra" else view.shares
@@ -54,7 +54,7 @@ def test_a_picture_shows_the_components_of_its_pixels(tmp_path, of):
 
 def test_a_component_that_tells_nothing_is_black_rather_than_noise():
     shares = torch.softmax(torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
-    components = find_components([shares], "abundances")
+    components = _find_components([shares], "abundances")
     assert components.explained[1] > 0.01
     assert components.explained[2] < 1e-9
     colours = components.colours(shares.double())
@@ -63,15 +63,15 @@ def test_a_component_that_tells_nothing_is_black_rather_than_noise():
 
 
 def test_a_view_is_surveyed_where_something_is():
-    shares = survey_view(SCENE, CAMERA, "abundances")
+    shares = _survey_view(SCENE, CAMERA, "abundances")
     torch.testing.assert_close(shares.sum(dim=-1), torch.ones(len(shares)), atol=1e-4, rtol=0)
-    assert survey_view(SCENE, CAMERA, "spectra").shape == (len(shares), 5)
+    assert _survey_view(SCENE, CAMERA, "spectra").shape == (len(shares), 5)
 
 
 @pytest.mark.parametrize(("of", "first"), [("spectra", "450"), ("abundances", "endmember_0")])
 def test_the_table_gives_back_the_colours(tmp_path, of, first):
-    components = find_components([survey_view(SCENE, CAMERA, of)], of)
-    with write_components(tmp_path, components, SCENE.materials).open() as file:
+    components = _find_components([_survey_view(SCENE, CAMERA, of)], of)
+    with _write_components(tmp_path, components, SCENE.materials).open() as file:
         rows = list(csv.reader(file))
     body = {row[0]: row[1:] for row in rows[1:]}
     names = list(body)[:-3]

@@ -19,18 +19,18 @@ from unmix_plugin.figures.pictures import (
     paint,
     premultiplied_over_neutral,
 )
-from unmix_plugin.products.abundances import Abundances, colour_panel, draw_abundances
-from unmix_plugin.products.endmembers import draw_endmembers
+from unmix_plugin.products.abundances import Abundances, _draw_abundances, colour_panel
+from unmix_plugin.products.endmembers import _draw_endmembers
 from unmix_plugin.products.evaluation import (
-    draw_colour,
-    draw_matched_abundances,
-    draw_matched_segmentation,
+    _draw_colour,
+    _draw_matched_abundances,
+    _draw_matched_segmentation,
     material_look,
 )
-from unmix_plugin.products.segmentation import draw_segmentation, paint_ids, scores_of
+from unmix_plugin.products.segmentation import _draw_segmentation, _scores_of, paint_ids
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.materials import Materials
-from unmix_plugin.trained.evaluation import Evaluation, PredictedView, SceneTruth, ViewTruth
+from unmix_plugin.trained.evaluation import Evaluation, PredictedView, ViewTruth, _SceneTruth
 from unmix_plugin.trained.run_materials import endmember_colours
 
 SCALE = ColourScale("viridis", 0.0, 1.0, "abundance")
@@ -69,9 +69,9 @@ def rendered(given: Materials, height: int = 12, width: int = 16) -> PredictedVi
 def test_no_figure_is_cut_off_however_many_materials(count):
     given = materials(count, 32)
     view = rendered(given)
-    assert_has_white_margins(draw_abundances("view", view, given))
-    assert_has_white_margins(draw_segmentation("view", view, given))
-    plot = decoded(draw_endmembers(given))
+    assert_has_white_margins(_draw_abundances("view", view, given))
+    assert_has_white_margins(_draw_segmentation("view", view, given))
+    plot = decoded(_draw_endmembers(given))
     assert plot[:, -2:].min() == 1.0
     assert plot.min() < 0.2
 
@@ -122,7 +122,7 @@ def test_ids_are_painted_in_their_own_colours():
 def test_the_segmentation_figure_shows_the_colours_of_the_endmembers():
     given = materials(4)
     view = rendered(given)
-    picture = decoded(draw_segmentation("view", view, given)).reshape(-1, 3)
+    picture = decoded(_draw_segmentation("view", view, given)).reshape(-1, 3)
     for index, colour in enumerate(endmember_colours(given)):
         near = np.abs(picture - colour).max(axis=1) < 0.02
         assert near.any() == bool((view.segmentation == index).any())
@@ -133,8 +133,8 @@ def test_scores_are_what_the_ids_were_chosen_by():
     view = rendered(given)
     cosines = torch.rand(12, 16, 4)
     view = replace(view, material_scores=cosines)
-    torch.testing.assert_close(scores_of(view, given), view.abundances)
-    probe = scores_of(view, replace(given, segmentation="probe"))
+    torch.testing.assert_close(_scores_of(view, given), view.abundances)
+    probe = _scores_of(view, replace(given, segmentation="probe"))
     torch.testing.assert_close(probe[:, 4:], cosines[:, 4:])
     assert float(probe[:, :4].abs().max()) == 0.0
 
@@ -154,7 +154,7 @@ def test_an_exported_array_is_zero_where_nothing_is(tmp_path):
 def test_evaluation_figures_are_whole_with_more_as_many_and_fewer_materials(num_true):
     given = materials(3)
     view = rendered(given)
-    truth = SceneTruth(given.bands, num_true, torch.rand(num_true, 8).double())
+    truth = _SceneTruth(given.bands, num_true, torch.rand(num_true, 8).double())
     labels = (view.segmentation % num_true).masked_fill(view.segmentation == 255, 255)
     abundances = torch.nn.functional.one_hot(labels.long() % num_true, num_true).float()
     seen = ViewTruth(
@@ -163,16 +163,16 @@ def test_evaluation_figures_are_whole_with_more_as_many_and_fewer_materials(num_
     evaluation = Evaluation(truth, given.endmembers)
     evaluation.add(seen, view)
     look, matching = material_look(evaluation), evaluation.segmentation().matching
-    assert_has_white_margins(draw_colour(seen, view, truth.bands, 30.0))
-    assert_has_white_margins(draw_matched_abundances(seen, view, evaluation, look))
+    assert_has_white_margins(_draw_colour(seen, view, truth.bands, 30.0))
+    assert_has_white_margins(_draw_matched_abundances(seen, view, evaluation, look))
     ids = view.segmentation.numpy()
-    assert_has_white_margins(draw_matched_segmentation("view", labels.numpy(), ids, look, matching))
-    assert_has_white_margins(draw_matched_segmentation("view", None, ids, look, matching))
+    assert_has_white_margins(_draw_matched_segmentation("view", labels.numpy(), ids, look, matching))
+    assert_has_white_margins(_draw_matched_segmentation("view", None, ids, look, matching))
 
 
 def test_a_matched_endmember_has_the_colour_of_its_material_and_a_surplus_one_its_own():
     given = materials(3)
-    evaluation = Evaluation(SceneTruth(given.bands, 2, torch.rand(2, 8).double()), given.endmembers)
+    evaluation = Evaluation(_SceneTruth(given.bands, 2, torch.rand(2, 8).double()), given.endmembers)
     look = material_look(evaluation)
     colours = look.pred_colours({0: 1, 2: 0})
     np.testing.assert_array_equal(colours[0], look.true_colours[1])

@@ -6,7 +6,7 @@ from plyfile import PlyData
 from tests.products.ball_model import ALL_ROUND, RADIUS, ball_scene, cameras_around
 from tests.trained.camera_files.camera_scenes import FRAME
 from unmix_plugin.errors import ConfigError, RunError
-from unmix_plugin.products.point_cloud import require_count, require_point_scores, write_point_cloud
+from unmix_plugin.products.point_cloud import _require_count, _require_point_scores, _write_point_cloud
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.trained.surface import SeenSurface
@@ -26,7 +26,7 @@ def points():
 @pytest.fixture(scope="module")
 def cloud(points, tmp_path_factory):
     folder = tmp_path_factory.mktemp("cloud")
-    path, count = write_point_cloud(folder, points, 800, SCENE.materials, FRAME)
+    path, count = _write_point_cloud(folder, points, 800, SCENE.materials, FRAME)
     return PlyData.read(path), count
 
 
@@ -79,8 +79,8 @@ def test_indices_and_targets_are_written_for_each_point(points, tmp_path):
     spectra = SCENE.materials.endmembers.detach().double().numpy()
     write_spectra_csv(tmp_path / "top.csv", SpectraTable(SCENE.bands, ("top",), spectra[:1]))
     asked = ["index:r650/r500", "index:pri", f"target:{tmp_path / 'top.csv'}<0.1"]
-    scores = require_point_scores(asked, SCENE.bands)
-    path, count = write_point_cloud(tmp_path, points, 300, SCENE.materials, FRAME, scores)
+    scores = _require_point_scores(asked, SCENE.bands)
+    path, count = _write_point_cloud(tmp_path, points, 300, SCENE.materials, FRAME, scores)
     ply = PlyData.read(path)
     written = [ply["vertex"].properties[index].name for index in (-3, -2, -1)]
     assert written == ["index_1", "index_pri", "target_1"]
@@ -100,11 +100,11 @@ def test_indices_and_targets_are_written_for_each_point(points, tmp_path):
 def test_nothing_to_export_is_said(points, tmp_path):
     nothing = points.select(torch.zeros(len(points), dtype=torch.bool))
     with pytest.raises(RunError, match="no ray of the run's cameras ends on a surface"):
-        write_point_cloud(tmp_path, nothing, 800, SCENE.materials, FRAME)
+        _write_point_cloud(tmp_path, nothing, 800, SCENE.materials, FRAME)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("count", [0, -3, 10_000_001])
 def test_an_impossible_number_of_points_is_refused(count):
     with pytest.raises(ConfigError, match=f"--num-points is {count}; choose 1 to 10000000"):
-        require_count(count)
+        _require_count(count)

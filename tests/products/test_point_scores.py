@@ -6,7 +6,7 @@ import torch
 
 from tests.method_factory import WAVELENGTHS_NM, make_model
 from unmix_plugin.errors import ConfigError, SpectrumError
-from unmix_plugin.products.point_cloud import require_point_scores
+from unmix_plugin.products.point_cloud import _require_point_scores
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 
@@ -23,7 +23,7 @@ def paint(tmp_path):
 
 
 def properties(*outputs):
-    return [score.property for score in require_point_scores(outputs, BANDS)]
+    return [score.property for score in _require_point_scores(outputs, BANDS)]
 
 
 def test_named_indices_keep_their_names_and_the_rest_is_numbered(paint):
@@ -39,7 +39,7 @@ def test_an_output_asked_for_twice_is_given_once():
 
 
 def test_values_are_of_reflectance_and_undefined_where_the_index_is():
-    (score,) = require_point_scores(["index:r650/r450"], BANDS)
+    (score,) = _require_point_scores(["index:r650/r450"], BANDS)
     reflectances = torch.tensor([[0.1, 0.2, 0.3, 0.4, 0.5], [0.0, 0.2, 0.3, 0.4, 0.5]])
     light = torch.tensor(LIGHT)
     values = score.values(reflectances * light, light)
@@ -50,7 +50,7 @@ def test_values_are_of_reflectance_and_undefined_where_the_index_is():
 
 
 def test_a_target_is_judged_against_the_points_themselves(paint):
-    (score,) = require_point_scores([f"target:mf:{paint}"], BANDS)
+    (score,) = _require_point_scores([f"target:mf:{paint}"], BANDS)
     g = torch.Generator().manual_seed(0)
     others = 0.3 + 0.05 * torch.randn(400, 5, generator=g)
     both = torch.cat([others, PAINT[None]])
@@ -60,7 +60,7 @@ def test_a_target_is_judged_against_the_points_themselves(paint):
 
 
 def test_a_comment_says_what_a_property_is_and_whether_the_light_was_known():
-    formula, named = require_point_scores(["index:r650/r450", "index:pri"], BANDS)
+    formula, named = _require_point_scores(["index:r650/r450", "index:pri"], BANDS)
     unknown, known = make_model().materials, make_model(light=LIGHT).materials
     assert formula.comment(known) == (
         "index_1: index:r650/r450, formula r650/r450; from the bands at 450, 650 nm"
@@ -72,7 +72,7 @@ def test_a_comment_says_what_a_property_is_and_whether_the_light_was_known():
 @pytest.mark.parametrize("output", ["rgb", "band:650nm", "index", "index:", "target:", "ndvi", ""])
 def test_other_outputs_are_refused_with_what_points_take(output):
     with pytest.raises(ConfigError, match=f"--outputs {output}: points take spectral indices, index:NAME"):
-        require_point_scores(["index:pri", output], BANDS)
+        _require_point_scores(["index:pri", output], BANDS)
 
 
 @pytest.mark.parametrize(
@@ -85,4 +85,4 @@ def test_other_outputs_are_refused_with_what_points_take(output):
 )
 def test_what_cannot_be_computed_is_refused(output, error, message):
     with pytest.raises(error, match=message):
-        require_point_scores([output], BANDS)
+        _require_point_scores([output], BANDS)

@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
-from unmix_plugin.products.poses import poses_json
+from unmix_plugin.products.poses import _poses_json
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.trained.camera_files import read_camera_file
 from unmix_plugin.trained.run_views import RunView
@@ -27,7 +27,7 @@ CAMERA = Cameras(
 
 def test_a_frame_camera_comes_back_as_it_was(tmp_path):
     path = tmp_path / "transforms.json"
-    path.write_text(json.dumps(poses_json([RunView("a", CAMERA, "train")], FRAME, True)))
+    path.write_text(json.dumps(_poses_json([RunView("a", CAMERA, "train")], FRAME, True)))
     found = read_camera_file(path, FRAME).views[0]
     assert found.name == "a"
     assert_close(found.camera.camera_to_world, CAMERA.camera_to_world, atol=1e-6, rtol=0)
@@ -39,7 +39,7 @@ def test_a_frame_camera_comes_back_as_it_was(tmp_path):
 def test_a_line_camera_has_its_key_poses_at_rows():
     keys = KeyPoses(POSE.repeat(2, 1, 1), torch.tensor([0.5, 9.5]), (2,))
     lines = Cameras(POSE, CAMERA.focal_px, CAMERA.center_px, CAMERA.distortion, 12, 10, key_poses=keys)
-    entry = poses_json([RunView("a", lines)], FRAME, False)["frames"][0]
+    entry = _poses_json([RunView("a", lines)], FRAME, False)["frames"][0]
     assert "transform_matrix" not in entry
     assert [key["row"] for key in entry["key_poses"]] == [0.0, 9.0]
     matrix = np.array(entry["key_poses"][1]["transform_matrix"])

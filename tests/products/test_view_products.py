@@ -15,8 +15,8 @@ from tests.method_factory import make_scene
 from tests.trained.camera_files.camera_scenes import around
 from unmix_plugin.products.abundances import Abundances
 from unmix_plugin.products.cubes import Cubes
-from unmix_plugin.products.endmembers import endmember_paths, write_endmembers
-from unmix_plugin.products.segmentation import Segmentation, legend_bytes
+from unmix_plugin.products.endmembers import _endmember_paths, _write_endmembers
+from unmix_plugin.products.segmentation import Segmentation, _legend_bytes
 from unmix_plugin.trained.evaluation import render_view
 from unmix_plugin.trained.run_materials import endmember_colours
 
@@ -62,7 +62,7 @@ def test_every_format_of_abundances_holds_the_same_float32_shares(tmp_path):
 
 
 def test_spectral_python_opens_the_endmembers_as_a_library(tmp_path):
-    assert write_endmembers(tmp_path, MATERIALS) == endmember_paths(tmp_path)
+    assert _write_endmembers(tmp_path, MATERIALS) == _endmember_paths(tmp_path)
     library: Any = envi.open(str(tmp_path / "endmembers.hdr"), str(tmp_path / "endmembers.sli"))
     assert library.names == list(MATERIALS.names)
     np.testing.assert_array_equal(library.spectra, SCENE.materials.endmembers.numpy())
@@ -76,7 +76,7 @@ def test_labels_are_ids_whose_palette_and_legend_name_the_materials(tmp_path):
         assert labels.mode == "P"
     np.testing.assert_array_equal(ids, VIEW.segmentation.numpy())
     assert len(np.unique(ids)) > 2
-    legend = legend_bytes(MATERIALS).decode().splitlines()
+    legend = _legend_bytes(MATERIALS).decode().splitlines()
     rows = {int(row["id"]): row for row in csv.DictReader(legend)}
     assert [rows[index]["name"] for index in (0, 1, 2, 255)] == [*MATERIALS.names, "nothing"]
     for index in np.unique(ids):

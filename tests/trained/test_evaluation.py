@@ -15,11 +15,11 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.metrics import abundance_rmse, psnr, sam
 from unmix_plugin.spectral.sensor import SceneSensor
 from unmix_plugin.trained.evaluation import (
-    VIEW_FIGURES,
+    _VIEW_FIGURES,
     Evaluation,
     PredictedView,
-    SceneTruth,
     ViewTruth,
+    _SceneTruth,
     finite_or_none,
     scene_truth,
     view_truth,
@@ -29,16 +29,16 @@ SHUFFLED = [2, 0, 1]
 
 
 @pytest.fixture
-def scene() -> SceneTruth:
+def scene() -> _SceneTruth:
     """Three materials in five bands."""
     endmembers = torch.tensor(
         [[0.9, 0.1, 0.1, 0.2, 0.3], [0.1, 0.8, 0.3, 0.1, 0.1], [0.2, 0.2, 0.2, 0.9, 0.6]]
     )
-    return SceneTruth(Bands.of([450, 500, 550, 600, 650]), 3, endmembers.double(), ("a", "b", "c"))
+    return _SceneTruth(Bands.of([450, 500, 550, 600, 650]), 3, endmembers.double(), ("a", "b", "c"))
 
 
 @pytest.fixture
-def view(scene: SceneTruth) -> ViewTruth:
+def view(scene: _SceneTruth) -> ViewTruth:
     """Stripes of the materials, mixed a little, half covered along one edge, nothing beyond it."""
     assert scene.endmembers is not None
     labels = (torch.arange(12) // 4).to(torch.uint8).repeat(10, 1)
@@ -62,7 +62,7 @@ def perfect(view: ViewTruth, order: list[int]) -> PredictedView:
     return PredictedView(view.spectra, view.opacity, composited, position[view.labels.long()], composited)
 
 
-def evaluated(scene: SceneTruth, view: ViewTruth, predicted: PredictedView, order: list[int]) -> Evaluation:
+def evaluated(scene: _SceneTruth, view: ViewTruth, predicted: PredictedView, order: list[int]) -> Evaluation:
     """An evaluation of one view."""
     assert scene.endmembers is not None
     evaluation = Evaluation(scene, scene.endmembers[order])
@@ -98,7 +98,7 @@ def test_a_real_scene_predicted_by_its_own_truth_has_angle_0_and_miou_1(tmp_path
 
 
 def test_figures_without_truth_are_unknown_and_the_others_stay(scene, view):
-    untold_scene = SceneTruth(scene.bands, 0)
+    untold_scene = _SceneTruth(scene.bands, 0)
     untold_view = ViewTruth("view", view.spectra, view.valid)
     evaluation = Evaluation(untold_scene, scene.endmembers)
     evaluation.add(untold_view, replace(perfect(view, [0, 1, 2]), spectra=view.spectra * 0.9))
@@ -194,7 +194,7 @@ def test_means_are_over_views_that_have_the_figure(scene, view):
     assert math.isnan(second)
     assert evaluation.figures()["abundance_rmse"] == pytest.approx(first)
     assert set(evaluation.per_view) == {"view", "other"}
-    assert tuple(evaluation.per_view["view"]) == VIEW_FIGURES
+    assert tuple(evaluation.per_view["view"]) == _VIEW_FIGURES
 
 
 def test_images_too_small_for_its_window_have_no_ssim(scene):
@@ -274,7 +274,7 @@ def test_a_view_is_measured_as_its_sensor_sees_it():
     spectra = torch.rand(10, 12, 5, generator=torch.Generator().manual_seed(4))
     measured = torch.stack([spectra[..., :2].mean(dim=-1), spectra[..., 3]], dim=-1)
     valid = torch.ones(10, 12, dtype=torch.bool)
-    evaluation = Evaluation(SceneTruth(Bands.of([450, 500, 550, 600, 650]), 0), torch.rand(3, 5))
+    evaluation = Evaluation(_SceneTruth(Bands.of([450, 500, 550, 600, 650]), 0), torch.rand(3, 5))
     flat = torch.zeros(10, 12)
     predicted = PredictedView(spectra, flat, torch.zeros(10, 12, 3), flat.byte(), torch.zeros(10, 12, 3))
     figures = evaluation.add(ViewTruth("a", measured, valid, sensor=sensor), predicted)

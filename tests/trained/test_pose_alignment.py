@@ -9,7 +9,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.poses.refinement import LARGEST_STEP
 from unmix_plugin.trained import alignment as pose_alignment
-from unmix_plugin.trained.alignment import align_pose, moved
+from unmix_plugin.trained.alignment import _moved, align_pose
 from unmix_plugin.trained.evaluation import ViewTruth
 
 POSE = torch.tensor([[[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4.0]]])
@@ -19,8 +19,8 @@ OFF = torch.tensor([0.02, -0.015, 0.02, 0.01, 0.02, -0.01])
 
 def swept() -> Cameras:
     """The same view taken row by row, while the camera turns."""
-    poses = moved(CAMERA, torch.tensor([0.2, 0.0, 0.0, 0.0, 0.0, 0.0]), make_scene()).camera_to_world
-    ends = moved(CAMERA, torch.tensor([-0.2, 0.0, 0.0, 0.0, 0.0, 0.0]), make_scene()).camera_to_world
+    poses = _moved(CAMERA, torch.tensor([0.2, 0.0, 0.0, 0.0, 0.0, 0.0]), make_scene()).camera_to_world
+    ends = _moved(CAMERA, torch.tensor([-0.2, 0.0, 0.0, 0.0, 0.0, 0.0]), make_scene()).camera_to_world
     keys = KeyPoses(torch.cat([poses, ends]), torch.tensor([0.5, 31.5]), (2,))
     return Cameras(POSE, CAMERA.focal_px, CAMERA.center_px, CAMERA.distortion, 32, 32, key_poses=keys)
 
@@ -40,7 +40,7 @@ def points_seen(camera: Cameras) -> torch.Tensor:
 @pytest.mark.parametrize(("camera", "share"), [(CAMERA, 1.0), (swept(), 0.4)])
 def test_a_view_that_is_off_by_pixels_is_brought_back(camera, share):
     scene = make_scene()
-    given = moved(camera, share * OFF, scene)
+    given = _moved(camera, share * OFF, scene)
     before = (points_seen(given) - points_seen(camera)).norm(dim=1).mean()
     found = align_pose(scene, given, truth_of(scene, camera))
     after = (points_seen(found) - points_seen(camera)).norm(dim=1).mean()
@@ -50,7 +50,7 @@ def test_a_view_that_is_off_by_pixels_is_brought_back(camera, share):
 
 def test_a_view_that_is_off_by_a_quarter_of_its_width_is_brought_back_too():
     scene = make_scene()
-    given = moved(CAMERA, torch.tensor([-0.1, 0.12, 0.1, 0.0, 0.0, 0.0]), scene)
+    given = _moved(CAMERA, torch.tensor([-0.1, 0.12, 0.1, 0.0, 0.0, 0.0]), scene)
     assert float((points_seen(given) - points_seen(CAMERA)).norm(dim=1).mean()) > 7
     found = align_pose(scene, given, truth_of(scene, CAMERA))
     assert float((points_seen(found) - points_seen(CAMERA)).norm(dim=1).mean()) < 0.5

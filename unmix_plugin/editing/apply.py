@@ -141,7 +141,7 @@ _EXACTNESS = 1e5
 
 
 @dataclass(frozen=True)
-class LitReflectance:
+class _LitReflectance:
     """A spectrum to change, and the light that it is seen in."""
 
     bands: Bands
@@ -155,8 +155,8 @@ class LitReflectance:
         return self.light[:, None] * rgb_matrix(self.bands, torch.float64).numpy()
 
 
-def retinted(
-    surface: LitReflectance, linear_rgb: Float64[np.ndarray, "3"], greatest: float = 1.0
+def _retinted(
+    surface: _LitReflectance, linear_rgb: Float64[np.ndarray, "3"], greatest: float = 1.0
 ) -> Float64[np.ndarray, " B"]:
     """The reflectance most like a surface's own that has the wanted colour in its light, or comes nearest to it.
 
@@ -288,12 +288,12 @@ def _retint(state: MaterialState, edit: Retint, where: str) -> None:
     is_lit = state.light > DARK_LIGHT * state.light.max()
     light = np.where(is_lit, state.light, 0.0)
     reflectance = np.where(is_lit, state.spectra[index] / np.where(is_lit, light, 1.0), 0.0)
-    surface = LitReflectance(state.bands, reflectance, light)
+    surface = _LitReflectance(state.bands, reflectance, light)
     if seen is None:
-        changed = retinted(surface, _linear(edit.colour))
+        changed = _retinted(surface, _linear(edit.colour))
         reached = _srgb(changed @ surface.to_linear_rgb)
     else:
-        changed = retinted(surface, seen.full_colour(edit.colour), seen.greatest_reflectance)
+        changed = _retinted(surface, seen.full_colour(edit.colour), seen.greatest_reflectance)
         reached = seen.mean_srgb(changed @ surface.to_linear_rgb)
     state.spectra[index] = changed * light
     what = state.names[index] if seen is None else f"pictures of {state.names[index]}"
@@ -348,8 +348,8 @@ def _gloss(state: MaterialState, edit: Gloss, where: str) -> None:
     chosen = range(len(state.names)) if edit.endmember is None else [state.index_of(edit.endmember)]
     if edit.colour is not None and edit.colour not in state.mirror_reflectances:
         flat = np.ones(len(state.bands))
-        white = LitReflectance(state.bands, flat, flat)
-        mirror = retinted(white, _linear(edit.colour))
+        white = _LitReflectance(state.bands, flat, flat)
+        mirror = _retinted(white, _linear(edit.colour))
         state.mirror_reflectances[edit.colour] = mirror
         _note_nearest(state, f"{where}: highlights", edit.colour, _srgb(mirror @ white.to_linear_rgb))
     for index in chosen:

@@ -55,7 +55,7 @@ def sample_seen(scene: TrainedScene) -> Coefficients:
 
 
 @dataclass(frozen=True)
-class Appearance:
+class _Appearance:
     """An endmember as cameras see it."""
 
     strengths: Float64[np.ndarray, " N"]
@@ -87,7 +87,7 @@ class Appearance:
         return np.average(linear_to_srgb(torch.from_numpy(shown)).numpy(), axis=0, weights=self.weights)
 
 
-def appearance_of(state: MaterialState, index: int) -> Appearance | None:
+def appearance_of(state: MaterialState, index: int) -> _Appearance | None:
     """How an endmember looks among the materials as they are now; None where too little of it is seen to tell."""
     seen = state.seen
     if seen is None:
@@ -100,7 +100,7 @@ def appearance_of(state: MaterialState, index: int) -> Appearance | None:
     others = np.where(np.arange(scaled.shape[1]) == index, 0.0, scaled)
     spectra = others @ state.spectra + specular @ state.specular_spectra
     shares = _rows(seen.abundances[..., index] / seen.accumulation, is_its)
-    return Appearance(
+    return _Appearance(
         scaled[:, index],
         spectra @ rgb_matrix(state.bands, torch.float64).numpy(),
         shares**_PURITY_EXPONENT,

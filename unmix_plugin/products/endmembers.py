@@ -27,12 +27,12 @@ class Endmembers(Product):
 
     def write(self, job: Job) -> list[Path]:
         """Write table, library and plot."""
-        job.claim(endmember_paths(job.folder))
-        return write_endmembers(job.folder, job.materials)
+        job.claim(_endmember_paths(job.folder))
+        return _write_endmembers(job.folder, job.materials)
 
 
-def endmember_paths(folder: Path) -> list[Path]:
-    """Files that `write_endmembers` makes."""
+def _endmember_paths(folder: Path) -> list[Path]:
+    """Files that `_write_endmembers` makes."""
     return [
         folder / "endmembers.csv",
         *envi_library_paths(folder / "endmembers"),
@@ -40,22 +40,22 @@ def endmember_paths(folder: Path) -> list[Path]:
     ]
 
 
-def write_endmembers(folder: Path, materials: Materials) -> list[Path]:
+def _write_endmembers(folder: Path, materials: Materials) -> list[Path]:
     """Write the endmembers as CSV (wavelength in nm, one column a spectrum), as an ENVI spectral library and as a plot.
 
     Raises:
         RunError: the disk is full or refuses.
     """
-    table_path, *_, plot_path = endmember_paths(make_folder(folder))
+    table_path, *_, plot_path = _endmember_paths(make_folder(folder))
     spectra = materials.endmembers.detach().cpu().numpy().astype(np.float32)
     about = "endmembers: radiance, 1 = full scale"
     write_envi_library(folder / "endmembers", spectra, materials.bands, materials.names, about)
     write_endmembers_csv(table_path, materials)
-    write_file(plot_path, draw_endmembers(materials))
-    return endmember_paths(folder)
+    write_file(plot_path, _draw_endmembers(materials))
+    return _endmember_paths(folder)
 
 
-def draw_endmembers(materials: Materials) -> bytes:
+def _draw_endmembers(materials: Materials) -> bytes:
     """The spectra as lines in the endmembers' colours; from the ninth on, dashes tell near colours apart too."""
     from matplotlib.figure import Figure
 

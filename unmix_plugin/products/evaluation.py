@@ -156,8 +156,8 @@ def evaluate_scene(
             if measured.is_rig:
                 evaluation.sensors[view.name] = measured.sensor_of(index).name
             psnr_db, name = evaluation.add(view, predicted)["psnr"], f"{view.name}.png"
-            write_file(folder / "rgb" / name, draw_colour(view, predicted, truth.bands, psnr_db))
-            drawn = draw_matched_abundances(view, predicted, evaluation, look)
+            write_file(folder / "rgb" / name, _draw_colour(view, predicted, truth.bands, psnr_db))
+            drawn = _draw_matched_abundances(view, predicted, evaluation, look)
             write_file(folder / "abundances" / name, drawn)
             ids[index] = predicted.segmentation.numpy()
     if processes.count > 1:
@@ -169,7 +169,7 @@ def evaluate_scene(
     matching = evaluation.segmentation().matching
     for index in follow("drawing segmentations", list(ids)):
         name = measured.frames[index].name
-        drawn = draw_matched_segmentation(name, measured.labels(index), ids[index], look, matching)
+        drawn = _draw_matched_segmentation(name, measured.labels(index), ids[index], look, matching)
         write_file(folder / "segmentation" / f"{name}.png", drawn)
     more: dict[str, Any] = {"definitions": DEFINITIONS}
     per_sensor = {name: finite_or_none(found) for name, found in evaluation.per_sensor().items()}
@@ -221,7 +221,7 @@ def material_look(evaluation: Evaluation) -> MaterialLook:
     )
 
 
-def draw_colour(view: ViewTruth, predicted: PredictedView, bands: Bands, psnr_db: float) -> bytes:
+def _draw_colour(view: ViewTruth, predicted: PredictedView, bands: Bands, psnr_db: float) -> bytes:
     """True colour, predicted colour, and their difference; in false colours for sensors without all bands."""
     weights, spectra = view.colour_weights(bands), view.seen(predicted.spectra)
     error = np.abs(_srgb_on_black(spectra, weights) - _srgb_on_black(view.spectra, weights)).mean(axis=-1)
@@ -236,7 +236,7 @@ def draw_colour(view: ViewTruth, predicted: PredictedView, bands: Bands, psnr_db
     return draw_panels([panels], heading, _ERROR_SCALE)
 
 
-def draw_matched_segmentation(
+def _draw_matched_segmentation(
     name: str,
     labels: UInt8[np.ndarray, "H W"] | None,
     ids: UInt8[np.ndarray, "H W"],
@@ -266,7 +266,7 @@ def draw_matched_segmentation(
     return draw_panels([panels], f"{name}: segmentation", legend=true_entries + surplus + extra)
 
 
-def draw_matched_abundances(
+def _draw_matched_abundances(
     view: ViewTruth, predicted: PredictedView, evaluation: Evaluation, look: MaterialLook
 ) -> bytes:
     """Each true material's abundance above that of the endmember matched to it; surplus endmembers at the end."""

@@ -53,17 +53,17 @@ _LEAST_FACES = 8
 
 
 @dataclass(frozen=True)
-class TriangleMesh:
+class _TriangleMesh:
     """Triangles that are seen from the side on which their corners go round counter-clockwise."""
 
     vertices: Float[np.ndarray, "V 3"]
     faces: Int[np.ndarray, "F 3"]
 
-    def select(self, chosen: Bool[np.ndarray, " F"]) -> TriangleMesh:
+    def select(self, chosen: Bool[np.ndarray, " F"]) -> _TriangleMesh:
         """Some of the faces, and the vertices that they have."""
         faces = self.faces[chosen]
         used, renumbered = np.unique(faces, return_inverse=True)
-        return TriangleMesh(self.vertices[used], renumbered.reshape(faces.shape))
+        return _TriangleMesh(self.vertices[used], renumbered.reshape(faces.shape))
 
     @property
     def normals(self) -> Float[np.ndarray, "V 3"]:
@@ -77,7 +77,7 @@ class TriangleMesh:
         return np.where(lengths > 0, sums / np.where(lengths > 0, lengths, 1.0), [0.0, 0.0, 1.0])
 
 
-def surface_density(scene: TrainedScene, ends: SurfacePoints) -> float:
+def _surface_density(scene: TrainedScene, ends: SurfacePoints) -> float:
     """Density per model unit at which the surface lies, from the densities where rays end.
 
     Raises:
@@ -92,13 +92,13 @@ def surface_density(scene: TrainedScene, ends: SurfacePoints) -> float:
     return float(np.quantile(densities.double().numpy(), _END_QUANTILE))
 
 
-def extract_mesh(
+def _extract_mesh(
     densities: Float32[np.ndarray, "X Y Z"],
     grid: GridPoints,
     threshold: float,
     softness: float,
     pixel_size: float,
-) -> TriangleMesh:
+) -> _TriangleMesh:
     """Marching cubes where the density passes a threshold.
 
     The cubes go through the opacity of a pixel's length rather than the density itself, which differs by many orders
@@ -129,10 +129,10 @@ def extract_mesh(
         )
     vertices, faces, _, _ = marching_cubes(opacities, level, gradient_direction="ascent")
     # The padding put the grid's first point at index 1.
-    return TriangleMesh((vertices.astype(np.float64) - 1) * grid.cell + grid.origin, faces.astype(np.int64))
+    return _TriangleMesh((vertices.astype(np.float64) - 1) * grid.cell + grid.origin, faces.astype(np.int64))
 
 
-def filled(
+def _filled(
     densities: Float32[np.ndarray, "X Y Z"], grid: GridPoints, scene: TrainedScene, surface: SeenSurface
 ) -> Float32[np.ndarray, "X Y Z"]:
     """Densities with what no camera sees into as solid as the densest point, so that surfaces have no inner side.
@@ -152,7 +152,7 @@ def filled(
     return result
 
 
-def trim_unseen(mesh: TriangleMesh, surface: SeenSurface) -> TriangleMesh:
+def _trim_unseen(mesh: _TriangleMesh, surface: SeenSurface) -> _TriangleMesh:
     """The parts of a mesh that the cameras see, with small gaps left whole."""
     seen = surface.shows(torch.from_numpy(mesh.vertices).float()).numpy()
     links = _links(mesh)
@@ -161,7 +161,7 @@ def trim_unseen(mesh: TriangleMesh, surface: SeenSurface) -> TriangleMesh:
     return mesh.select(np.all(seen[mesh.faces], axis=1, keepdims=False))
 
 
-def without_stray_pieces(mesh: TriangleMesh) -> TriangleMesh:
+def _without_stray_pieces(mesh: _TriangleMesh) -> _TriangleMesh:
     """The pieces of a mesh, each joined by common edges, that have a hundredth of the faces of the largest or more."""
     if len(mesh.faces) == 0:
         return mesh
@@ -180,7 +180,7 @@ def without_stray_pieces(mesh: TriangleMesh) -> TriangleMesh:
     return mesh.select(np.asarray(sizes[piece[:count]] >= smallest))
 
 
-def _links(mesh: TriangleMesh):  # noqa: ANN202 - a sparse matrix of scipy, which is imported here only
+def _links(mesh: _TriangleMesh):  # noqa: ANN202 - a sparse matrix of scipy, which is imported here only
     """Symmetric matrix (V, V) that is not 0 where an edge joins two vertices."""
     from scipy.sparse import coo_matrix
 
@@ -219,16 +219,16 @@ class Mesh(Product):
     def write(self, job: Job) -> list[Path]:
         """Sample the density, march through it, trim and colour the surface."""
 
-        require_sound(self.density, self.smoothing)
-        job.claim(mesh_paths(job.folder, self.formats))
+        _require_sound(self.density, self.smoothing)
+        job.claim(_mesh_paths(job.folder, self.formats))
         surface, densities, grid = job.surface(_NUM_RAYS), *self._sample(job)
         with job.working("making the mesh"):
             if self.density is None:
-                threshold = surface_density(job.scene, surface.points())
+                threshold = _surface_density(job.scene, surface.points())
             else:
                 threshold = self.density / job.frame.scale
             mesh = self._extract(job, densities, grid, threshold, surface)
-            written = write_mesh(job.folder, self.formats, mesh, job.scene, job.frame)
+            written = _write_mesh(job.folder, self.formats, mesh, job.scene, job.frame)
         job.say(
             f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, "
             f"at a density of {threshold * job.frame.scale:.4g} per world unit"
@@ -250,23 +250,25 @@ class Mesh(Product):
         grid: GridPoints,
         threshold: float,
         surface: SeenSurface,
-    ) -> TriangleMesh:
+    ) -> _TriangleMesh:
         """The surface, model space."""
 
         pixel_size = job.scene.pixel_size
         if self.unseen == "keep":
-            return without_stray_pieces(extract_mesh(densities, grid, threshold, self.smoothing, pixel_size))
-        solid = filled(densities, grid, job.scene, surface)
-        mesh = extract_mesh(solid, grid, threshold, self.smoothing, pixel_size)
-        return without_stray_pieces(trim_unseen(mesh, surface))
+            return _without_stray_pieces(
+                _extract_mesh(densities, grid, threshold, self.smoothing, pixel_size)
+            )
+        solid = _filled(densities, grid, job.scene, surface)
+        mesh = _extract_mesh(solid, grid, threshold, self.smoothing, pixel_size)
+        return _without_stray_pieces(_trim_unseen(mesh, surface))
 
 
-def mesh_paths(folder: Path, formats: tuple[_MeshFormat, ...]) -> list[Path]:
-    """Files that `write_mesh` makes."""
+def _mesh_paths(folder: Path, formats: tuple[_MeshFormat, ...]) -> list[Path]:
+    """Files that `_write_mesh` makes."""
     return [path for kind in formats for path in _paths(folder, kind)]
 
 
-def require_sound(density: float | None, smoothing: float) -> None:
+def _require_sound(density: float | None, smoothing: float) -> None:
     """Refuse impossible settings.
 
     Raises:
@@ -278,10 +280,10 @@ def require_sound(density: float | None, smoothing: float) -> None:
         raise ConfigError(f"--smoothing is {smoothing:g}; choose 0 to {_MOST_SMOOTHING:g} cells")
 
 
-def write_mesh(
+def _write_mesh(
     folder: Path,
     formats: tuple[_MeshFormat, ...],
-    mesh: TriangleMesh,
+    mesh: _TriangleMesh,
     scene: TrainedScene,
     frame: Normalisation,
 ) -> list[Path]:
@@ -311,7 +313,7 @@ def write_mesh(
     positions = torch.from_numpy(mesh.vertices).float()
     seen = look_from_above(scene, positions, torch.from_numpy(normals).float())
     looks = SurfaceAppearance(scene.materials, *seen)
-    world = TriangleMesh(positions_for_files(frame.to_world(mesh.vertices)), mesh.faces)
+    world = _TriangleMesh(positions_for_files(frame.to_world(mesh.vertices)), mesh.faces)
     turned = directions_to_world(frame, normals).astype(np.float32)
     writers = {"ply": _write_ply, "obj": _write_obj, "glb": _write_glb}
     return [path for kind in formats for path in writers[kind](_paths(folder, kind)[0], world, turned, looks)]
@@ -321,7 +323,7 @@ _WHAT = "surface of an unmix-nerf run"
 
 
 def _write_ply(
-    path: Path, mesh: TriangleMesh, normals: Float32[np.ndarray, "V 3"], looks: SurfaceAppearance
+    path: Path, mesh: _TriangleMesh, normals: Float32[np.ndarray, "V 3"], looks: SurfaceAppearance
 ) -> list[Path]:
     vertices = {
         **{name: mesh.vertices[:, axis] for axis, name in enumerate("xyz")},
@@ -332,7 +334,7 @@ def _write_ply(
 
 
 def _write_obj(
-    path: Path, mesh: TriangleMesh, normals: Float32[np.ndarray, "V 3"], looks: SurfaceAppearance
+    path: Path, mesh: _TriangleMesh, normals: Float32[np.ndarray, "V 3"], looks: SurfaceAppearance
 ) -> list[Path]:
     materials = _majority(looks.material_ids.astype(np.int64)[mesh.faces])
     return write_obj(
@@ -349,7 +351,7 @@ def _write_obj(
 
 
 def _write_glb(
-    path: Path, mesh: TriangleMesh, normals: Float32[np.ndarray, "V 3"], looks: SurfaceAppearance
+    path: Path, mesh: _TriangleMesh, normals: Float32[np.ndarray, "V 3"], looks: SurfaceAppearance
 ) -> list[Path]:
     numbers = {"_MATERIAL": looks.material_ids.astype(np.float32)}
     for name, values in looks.properties().items():

@@ -58,10 +58,10 @@ class Metamerism(Product):
         """Compare all pairs in all lights."""
         from unmix_plugin.trained.run_materials import library_with
 
-        job.claim(metamerism_paths(job.folder))
+        job.claim(_metamerism_paths(job.folder))
         with job.working("comparing colours"):
-            found = find_metamers(job.materials, job.scene.light_power, library_with(self.library), self)
-            written = write_metamerism(job.folder, found)
+            found = _find_metamers(job.materials, job.scene.light_power, library_with(self.library), self)
+            written = _write_metamerism(job.folder, found)
         job.say(
             f"{len(found.pairs)} pairs of {len(found.names)} materials, seen in {', '.join(found.lights)} "
             f"over {found.bands}"
@@ -82,12 +82,12 @@ class _Metamers:
     pairs: list[MetamericPair]
 
 
-def metamerism_paths(folder: Path) -> list[Path]:
-    """Files that `write_metamerism` makes."""
+def _metamerism_paths(folder: Path) -> list[Path]:
+    """Files that `_write_metamerism` makes."""
     return [folder / "metamerism.csv", folder / "metamerism.png"]
 
 
-def find_metamers(
+def _find_metamers(
     materials: Materials,
     scene_light: Float64[np.ndarray, " B"] | None,
     library: MaterialLibrary,
@@ -123,7 +123,7 @@ def find_metamers(
     return _Metamers(tuple(names), reflectance, bands, labels, powers, pairs)
 
 
-def write_metamerism(folder: Path, found: _Metamers) -> list[Path]:
+def _write_metamerism(folder: Path, found: _Metamers) -> list[Path]:
     """Write the pairs as CSV and swatches of the first dozen in every light.
 
     Pairs with an endmember of the run come first, each kind sorted by their greatest difference.
@@ -131,7 +131,7 @@ def write_metamerism(folder: Path, found: _Metamers) -> list[Path]:
     Raises:
         RunError: the disk is full or refuses.
     """
-    table_path, figure_path = metamerism_paths(folder)
+    table_path, figure_path = _metamerism_paths(folder)
     return [write_file(table_path, _table(found)), write_file(figure_path, _draw_metamers(found))]
 
 

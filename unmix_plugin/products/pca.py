@@ -55,13 +55,13 @@ class Pca(Product):
         """Find the components of all views, then paint each."""
         views, scene = resized_views(job.views(self.views)), job.scene
         job.claim([*(_pca_path(job.folder, view.name) for view in views), _components_path(job.folder)])
-        seen = [survey_view(scene, view.camera, self.of) for view in job.follow("finding components", views)]
-        components = find_components(seen, self.of)
+        seen = [_survey_view(scene, view.camera, self.of) for view in job.follow("finding components", views)]
+        components = _find_components(seen, self.of)
         written = [
-            write_pca(job.folder, view.name, job.render(view), components)
+            _write_pca(job.folder, view.name, job.render(view), components)
             for view in job.follow("rendering views", views)
         ]
-        return [*written, write_components(job.folder, components, job.materials)]
+        return [*written, _write_components(job.folder, components, job.materials)]
 
 
 @dataclass(frozen=True)
@@ -82,13 +82,13 @@ def _component_values(outputs: dict[str, Tensor], of: _PcaOf) -> Float[Tensor, "
     return (values if of == "spectra" else values / accumulation[seen][:, None]).cpu()
 
 
-def survey_view(scene: TrainedScene, camera: Cameras, of: _PcaOf) -> Float[Tensor, "N C"]:
+def _survey_view(scene: TrainedScene, camera: Cameras, of: _PcaOf) -> Float[Tensor, "N C"]:
     """What a small render of a view shows, to find components from."""
     names = ("spectral", "abundances", "accumulation")
     return _component_values(scene.render(camera.shrunk(_PIXELS), names), of)
 
 
-def find_components(values: Sequence[Float[Tensor, "_ C"]], of: _PcaOf) -> _Components:
+def _find_components(values: Sequence[Float[Tensor, "_ C"]], of: _PcaOf) -> _Components:
     """The components of what all views show."""
     together = torch.cat(list(values)).double()
     colours = PcaColours.fit(together)
@@ -104,16 +104,16 @@ def find_components(values: Sequence[Float[Tensor, "_ C"]], of: _PcaOf) -> _Comp
 
 
 def _pca_path(folder: Path, name: str) -> Path:
-    """The file that `write_pca` makes for a view."""
+    """The file that `_write_pca` makes for a view."""
     return folder / f"{name}.png"
 
 
 def _components_path(folder: Path) -> Path:
-    """The file that `write_components` makes."""
+    """The file that `_write_components` makes."""
     return folder / "components.csv"
 
 
-def write_pca(folder: Path, name: str, view: PredictedView, components: _Components) -> Path:
+def _write_pca(folder: Path, name: str, view: PredictedView, components: _Components) -> Path:
     """Write a view's components as red, green and blue, fading into grey where nothing is; a pixel a pixel.
 
     Raises:
@@ -129,7 +129,7 @@ def write_pca(folder: Path, name: str, view: PredictedView, components: _Compone
     return write_file(_pca_path(folder, name), rgba_png_bytes(pixels, what))
 
 
-def write_components(folder: Path, components: _Components, materials: Materials) -> Path:
+def _write_components(folder: Path, components: _Components, materials: Materials) -> Path:
     """Write what red, green and blue stand for: a row for each band or endmember, with its mean and its weight in each
     component; then the values that become 0 and 1, and the part of the variance that each component explains.
 

@@ -53,7 +53,7 @@ _CHUNK = 50_000
 _BISECTIONS = 20
 
 
-def is_outlier(positions: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
+def _is_outlier(positions: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
     """Which points lie far from all others, by the mean distance to their nearest eight."""
     if len(positions) <= _OUTLIER_NEIGHBOURS:
         return np.zeros(len(positions), dtype=bool)
@@ -64,7 +64,7 @@ def is_outlier(positions: Float[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:
     return to_others > _OUTLIER_FACTOR * np.median(to_others)
 
 
-def thinned(positions: Float[np.ndarray, "P 3"], count: int) -> Int64[np.ndarray, " kept"]:
+def _thinned(positions: Float[np.ndarray, "P 3"], count: int) -> Int64[np.ndarray, " kept"]:
     """Indices of at most `count` points, evenly spread: of each cube of a grid, the point nearest to their mean.
 
     The grid is the finest that has not more than `count` cubes with points in them.
@@ -81,7 +81,7 @@ def thinned(positions: Float[np.ndarray, "P 3"], count: int) -> Int64[np.ndarray
     return np.sort(_nearest_to_means(positions, _cube_numbers(positions - low, coarse)))
 
 
-def plane_normals(
+def _plane_normals(
     positions: Float[np.ndarray, "P 3"],
     towards: Float[np.ndarray, "P 3"],
     wanted: Int64[np.ndarray, " chosen"],
@@ -167,7 +167,7 @@ class _PointScore:
         return f"{self.property}: {self.output}, {self.map.what}"[:_LONGEST_COMMENT] + caveat
 
 
-def require_point_scores(outputs: Sequence[str], bands: Bands) -> list[_PointScore]:
+def _require_point_scores(outputs: Sequence[str], bands: Bands) -> list[_PointScore]:
     """Numbers to add to points; an output asked for twice is given once.
 
     Args:
@@ -228,12 +228,12 @@ class PointCloud(Product):
     def write(self, job: Job) -> list[Path]:
         """Look through all cameras of the run, clean and thin what they see."""
 
-        count, materials = require_count(self.num_points), job.materials
-        scores = require_point_scores(self.outputs, materials.bands)
+        count, materials = _require_count(self.num_points), job.materials
+        scores = _require_point_scores(self.outputs, materials.bands)
         job.claim([_point_cloud_path(job.folder)])
         surface = job.surface(_RAYS_PER_POINT * count)
         with job.working("cleaning and thinning the points"):
-            path, written = write_point_cloud(
+            path, written = _write_point_cloud(
                 job.folder, surface.points(), count, materials, job.frame, scores
             )
         job.say(counted(written, "point"))
@@ -241,11 +241,11 @@ class PointCloud(Product):
 
 
 def _point_cloud_path(folder: Path) -> Path:
-    """The file that `write_point_cloud` makes."""
+    """The file that `_write_point_cloud` makes."""
     return folder / "points.ply"
 
 
-def require_count(num_points: int) -> int:
+def _require_count(num_points: int) -> int:
     """The number of points asked for.
 
     Raises:
@@ -257,7 +257,7 @@ def require_count(num_points: int) -> int:
     return num_points
 
 
-def write_point_cloud(
+def _write_point_cloud(
     folder: Path,
     points: SurfacePoints,
     num_points: int,
@@ -286,14 +286,14 @@ def write_point_cloud(
     from unmix_plugin.trained.run_views import directions_to_world, positions_for_files
     from unmix_plugin.trained.surface import SurfaceAppearance
 
-    points = points.select(torch.from_numpy(~is_outlier(points.positions.numpy())))
+    points = points.select(torch.from_numpy(~_is_outlier(points.positions.numpy())))
     if len(points) == 0:
         raise RunError(
             "no ray of the run's cameras ends on a surface: train longer, or there is nothing to export"
         )
     positions = points.positions.double().numpy()
-    chosen = thinned(positions, num_points)
-    normals = plane_normals(positions, -points.directions.double().numpy(), chosen)
+    chosen = _thinned(positions, num_points)
+    normals = _plane_normals(positions, -points.directions.double().numpy(), chosen)
     kept = points.select(torch.from_numpy(chosen))
     diffuse = kept.diffuse(materials)
     looks = SurfaceAppearance(materials, kept.abundances, diffuse)

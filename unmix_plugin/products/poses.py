@@ -30,12 +30,12 @@ class Poses(Product):
         make_folder(job.folder)
         scene = job.loaded.scene
         is_refined = isinstance(scene, TrainedScene) and "pose" in scene.fitted
-        content = poses_json(scene.views, scene.frame, is_refined)
+        content = _poses_json(scene.views, scene.frame, is_refined)
         write_file(path, (json.dumps(content, indent=1) + "\n").encode())
         return [path]
 
 
-def poses_json(views: Sequence[RunView], frame: Normalisation, is_refined: bool) -> dict[str, Any]:
+def _poses_json(views: Sequence[RunView], frame: Normalisation, is_refined: bool) -> dict[str, Any]:
     """What the file says; `frame` leads from world to model space."""
     frames = []
     for view in views:

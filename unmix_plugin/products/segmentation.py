@@ -39,8 +39,8 @@ class Segmentation(ViewProduct):
     ) -> list[Path]:
         """Write a view's scores, a figure, and its ids; the id of a pixel is the index of its largest score."""
         scores_path, figure_path, labels_path = self.paths(folder, view)
-        write_file(scores_path, array_bytes(scores_of(rendered, materials).numpy().astype(np.float32)))
-        write_file(figure_path, draw_segmentation(view, rendered, materials))
+        write_file(scores_path, array_bytes(_scores_of(rendered, materials).numpy().astype(np.float32)))
+        write_file(figure_path, _draw_segmentation(view, rendered, materials))
         ids = rendered.segmentation.numpy()
         palette = _id_palette(dict(enumerate(endmember_colours(materials))))
         write_file(labels_path, indexed_png_bytes(ids, palette, NOTHING_ID))
@@ -48,7 +48,7 @@ class Segmentation(ViewProduct):
 
     def write(self, job: Job) -> list[Path]:
         """Write the legend, then each view."""
-        path, legend = job.folder / "legend.csv", legend_bytes(job.materials)
+        path, legend = job.folder / "legend.csv", _legend_bytes(job.materials)
         if not (path.is_file() and path.read_bytes() == legend):  # other views of the same run have the same
             job.claim([path])
         written = super().write(job)
@@ -57,7 +57,7 @@ class Segmentation(ViewProduct):
         return [*written, path]
 
 
-def legend_bytes(materials: Materials) -> bytes:
+def _legend_bytes(materials: Materials) -> bytes:
     """What the ids mean as CSV: `id,name,red,green,blue`, sRGB of the palette as 0 to 255."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -68,14 +68,14 @@ def legend_bytes(materials: Materials) -> bytes:
     return text.getvalue().encode()
 
 
-def scores_of(view: PredictedView, materials: Materials) -> Float[Tensor, "H W K"]:
+def _scores_of(view: PredictedView, materials: Materials) -> Float[Tensor, "H W K"]:
     """What the ids are chosen by: abundances, or cosines to the endmembers (0 where nothing is)."""
     if materials.segmentation == "abundances":
         return view.abundances
     return view.material_scores * (view.segmentation != NOTHING_ID)[..., None]
 
 
-def draw_segmentation(name: str, view: PredictedView, materials: Materials) -> bytes:
+def _draw_segmentation(name: str, view: PredictedView, materials: Materials) -> bytes:
     """A figure of a view in colour and of its materials, with a legend of those that occur."""
     colours = endmember_colours(materials)
     ids = view.segmentation.numpy()

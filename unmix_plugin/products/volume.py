@@ -42,17 +42,17 @@ class Volume(Product):
 
         scene = job.scene
         grid = GridPoints.over(scene.scene_box.aabb, self.resolution)
-        job.claim([volume_path(job.folder)])
+        job.claim([_volume_path(job.folder)])
         slices = job.follow("sampling the field", range(grid.shape[0]))
-        return [write_volume(job.folder, scene, grid, job.frame, slices)]
+        return [_write_volume(job.folder, scene, grid, job.frame, slices)]
 
 
-def volume_path(folder: Path) -> Path:
-    """The file that `write_volume` makes."""
+def _volume_path(folder: Path) -> Path:
+    """The file that `_write_volume` makes."""
     return folder / "volume.npz"
 
 
-def write_volume(
+def _write_volume(
     folder: Path, scene: TrainedScene, grid: GridPoints, frame: Normalisation, slices: Iterable[int]
 ) -> Path:
     """Write `volume.npz`, of which one slice is in memory at a time, and all densities.
@@ -73,7 +73,7 @@ def write_volume(
     from unmix_plugin.trained.run_views import affine_to_world
     from unmix_plugin.trained.surface import sample_slice
 
-    path, materials = volume_path(folder), scene.materials
+    path, materials = _volume_path(folder), scene.materials
     density = np.zeros(grid.shape, dtype=np.float32)
     others = {
         "index_to_world": affine_to_world(frame, grid.origin.astype(np.float64), grid.cell),

@@ -123,7 +123,7 @@ def align_pose(scene: TrainedScene, camera: Cameras, truth: ViewTruth) -> Camera
         if side == _SIDES_PX[0]:
             step = _best_start(comparison)
         step = _fit(comparison.residuals, step, count, comparison.difference)
-    return moved(camera, step, scene)
+    return _moved(camera, step, scene)
 
 
 def _best_start(comparison: _Comparison) -> Float[Tensor, "6"]:
@@ -179,7 +179,7 @@ class _Comparison:
     def residuals(self, steps: Float[Tensor, "m 6"]) -> Float[Tensor, "m n"]:
         """Shown less measured, of each pixel or block and channel, after each step."""
         is_coarse = self.block == 1 and max(self.camera.width, self.camera.height) <= _SIDES_PX[0]
-        cameras = [moved(self.camera, step, self.scene) for step in steps]
+        cameras = [_moved(self.camera, step, self.scene) for step in steps]
         seen = _shown(self.scene, cameras, self.truth, self.axes, subpixels=2 if is_coarse else 1)
         errors = (seen - self.wanted) * self.counts
         if self.block == 1:
@@ -193,7 +193,7 @@ class _Comparison:
         return float(self.residuals(step[None]).square().sum())
 
 
-def moved(camera: Cameras, step: Float[Tensor, "6"], scene: TrainedScene) -> Cameras:
+def _moved(camera: Cameras, step: Float[Tensor, "6"], scene: TrainedScene) -> Cameras:
     """A camera that is turned about itself and shifted, by a share of its distance to the scene's middle."""
     middle = scene.scene_box.aabb.mean(dim=0).to(camera.camera_to_world)
     reach = (camera.camera_to_world[0, :, 3] - middle).norm()

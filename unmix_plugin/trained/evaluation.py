@@ -119,7 +119,7 @@ _OPAQUE_ALPHA = 0.99
 _HALF_COVERED = 0.5
 """Opacity from which a pixel's abundances count."""
 
-VIEW_FIGURES = (
+_VIEW_FIGURES = (
     "psnr",
     "psnr_matter",
     "psnr_unsaturated",
@@ -208,7 +208,7 @@ class ViewTruth:
 
 
 @dataclass(frozen=True)
-class SceneTruth:
+class _SceneTruth:
     """What is known of a scene's materials."""
 
     bands: Bands
@@ -218,7 +218,7 @@ class SceneTruth:
     """True radiance of each material: reflectance x illuminant, under flat light where the illuminant is unknown."""
     names: tuple[str, ...] | None = None
 
-    def in_light(self, factors: Float[np.ndarray, " B"] | None) -> SceneTruth:
+    def in_light(self, factors: Float[np.ndarray, " B"] | None) -> _SceneTruth:
         """The scene in another light; itself where `factors` are None."""
         if factors is None or self.endmembers is None:
             return self
@@ -229,7 +229,7 @@ class Evaluation:
     """Figures of merit of one scene, fed view by view; keeps no image."""
 
     def __init__(
-        self, truth: SceneTruth, endmembers: Float[Tensor, "P B"], names: tuple[str, ...] | None = None
+        self, truth: _SceneTruth, endmembers: Float[Tensor, "P B"], names: tuple[str, ...] | None = None
     ) -> None:
         """Nothing counted yet; `endmembers` are the model's, their `names` None for `default_names`."""
         self.truth = truth
@@ -240,7 +240,7 @@ class Evaluation:
         )
         """Predicted and true endmembers, paired by spectral angle; None without true ones."""
         self.per_view: dict[str, dict[str, float]] = {}
-        """`VIEW_FIGURES` of each view; NaN where it has no truth."""
+        """`_VIEW_FIGURES` of each view; NaN where it has no truth."""
         self.sensors: dict[str, str] = {}
         """Name of the sensor of each view of a rig."""
         self._tally = SegmentationTally(len(endmembers), truth.num_materials) if truth.num_materials else None
@@ -289,7 +289,7 @@ class Evaluation:
         return self._tally.scores()
 
     def per_sensor(self) -> dict[str, dict[str, float]]:
-        """Means of `VIEW_FIGURES` over the views of each sensor, by its name; empty unless the scene is a rig."""
+        """Means of `_VIEW_FIGURES` over the views of each sensor, by its name; empty unless the scene is a rig."""
         return {
             sensor: _means([self.per_view[view] for view, own in self.sensors.items() if own == sensor])
             for sensor in dict.fromkeys(self.sensors.values())
@@ -325,13 +325,15 @@ class Evaluation:
         return linear_to_srgb(linear.clamp(0, 1))
 
 
-def scene_truth(scene: Scene) -> SceneTruth:
+def scene_truth(scene: Scene) -> _SceneTruth:
     """What a scene says of its materials."""
     endmembers = None
     if scene.endmembers is not None:
         light = np.ones(len(scene.wavelengths_nm)) if scene.illuminant is None else scene.illuminant
         endmembers = torch.from_numpy(scene.endmembers * light)
-    return SceneTruth(Bands.of(scene.wavelengths_nm), _num_materials(scene), endmembers, scene.material_names)
+    return _SceneTruth(
+        Bands.of(scene.wavelengths_nm), _num_materials(scene), endmembers, scene.material_names
+    )
 
 
 def view_truth(scene: Scene, index: int) -> ViewTruth:
@@ -372,7 +374,7 @@ def _tensor(array: np.ndarray | None) -> Tensor | None:
 
 
 def _means(views: Collection[dict[str, float]]) -> dict[str, float]:
-    return {name: _mean(view[name] for view in views) for name in VIEW_FIGURES}
+    return {name: _mean(view[name] for view in views) for name in _VIEW_FIGURES}
 
 
 def _mean(values: Iterable[float]) -> float:

@@ -270,7 +270,7 @@ OUTPUTS = {
 """All outputs that take no argument, in the order in which they are offered."""
 
 
-def output_names() -> tuple[str, ...]:
+def _output_names() -> tuple[str, ...]:
     """Every name, with an example of each output that takes an argument."""
     return (*OUTPUTS, *(family.example for family in FAMILIES.values()))
 
@@ -287,7 +287,7 @@ def find_output(name: str, materials: Materials) -> MaterialOutput:
     prefix, _, argument = name.partition(":")
     family = FAMILIES.get(prefix)
     if family is None:
-        raise no_output(name, [*OUTPUTS, *FAMILIES], output_names())
+        raise no_output(name, [*OUTPUTS, *FAMILIES], _output_names())
     if not argument:
         raise ConfigError(f"the output {prefix} needs {family.needs}, as in {family.example}")
     made = family.make(name, argument, materials)

@@ -35,7 +35,7 @@ def endmember_colours(materials: Materials) -> Float64[np.ndarray, "K 3"]:
     return distinct_colours(own_colours(materials.endmembers, materials.bands))
 
 
-def endmember_table(materials: Materials) -> SpectraTable:
+def _endmember_table(materials: Materials) -> SpectraTable:
     """The endmembers with names: spectra under the scene's light, [0, 1]."""
     spectra = materials.endmembers.detach().to("cpu", torch.float64).numpy()
     return SpectraTable(materials.bands, materials.names, spectra)
@@ -47,7 +47,7 @@ def write_endmembers_csv(path: Path, materials: Materials) -> Path:
     Raises:
         RunError: the disk is full or refuses.
     """
-    write_spectra_csv(path, endmember_table(materials))
+    write_spectra_csv(path, _endmember_table(materials))
     return path
 
 

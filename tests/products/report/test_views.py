@@ -10,11 +10,11 @@ import torch
 from tests.products.report.page_outline import Outline, assert_self_contained
 from unmix_plugin.products.report.page import render_page, view_values
 from unmix_plugin.products.report.pictures import ReportViews, TrueMaterials, evenly, material_cards
-from unmix_plugin.products.report.report import figure_rows, read_metrics, training_charts
+from unmix_plugin.products.report.report import _read_metrics, figure_rows, training_charts
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.material_library import measured_library
 from unmix_plugin.spectral.materials import Materials
-from unmix_plugin.trained.evaluation import Evaluation, PredictedView, SceneTruth, ViewTruth
+from unmix_plugin.trained.evaluation import Evaluation, PredictedView, ViewTruth, _SceneTruth
 
 BANDS = Bands.of([450, 500, 550, 600, 650])
 SPECTRA = torch.tensor([[0.9, 0.1, 0.1, 0.2, 0.3], [0.1, 0.8, 0.3, 0.1, 0.1], [0.2, 0.2, 0.2, 0.9, 0.6]])
@@ -36,7 +36,7 @@ def striped(name, offset=0.0):
 
 
 def gathered(offsets, with_truth=True, materials=MATERIALS):
-    truth = SceneTruth(BANDS, 3, SPECTRA.double(), ("clay", "leaf", "paint"))
+    truth = _SceneTruth(BANDS, 3, SPECTRA.double(), ("clay", "leaf", "paint"))
     evaluation = Evaluation(truth, materials.endmembers, materials.names) if with_truth else None
     views = ReportViews(materials, evaluation, {"view_0"})
     for index, offset in enumerate(offsets):
@@ -182,8 +182,8 @@ def test_a_training_is_drawn_with_its_evaluations(tmp_path):
 def test_lines_that_a_killed_run_left_incomplete_are_passed_over(tmp_path):
     path = tmp_path / "metrics.jsonl"
     path.write_text('{"step": 1, "loss": 0.5}\n[1]\n{"step": 2, "lo')
-    assert read_metrics(path) == [{"step": 1, "loss": 0.5}]
-    assert read_metrics(tmp_path / "none") == []
+    assert _read_metrics(path) == [{"step": 1, "loss": 0.5}]
+    assert _read_metrics(tmp_path / "none") == []
 
 
 @pytest.mark.parametrize(

@@ -88,7 +88,7 @@ def figure_rows(values: Mapping[str, Any]) -> list[tuple[str, str, str]]:
 
 def training_charts(path: Path) -> list[LineChart]:
     """Loss, PSNR, learning rates and speed over training, from a run's `metrics.jsonl`; none without a record."""
-    records = read_metrics(path)
+    records = _read_metrics(path)
     train = [record for record in records if record.get("split") == "train"]
     if len(train) < 2:
         return []
@@ -133,7 +133,7 @@ def version_rows(loaded: LoadedRun) -> list[tuple[str, str]]:
     ]
 
 
-def read_metrics(path: Path) -> list[dict[str, Any]]:
+def _read_metrics(path: Path) -> list[dict[str, Any]]:
     """Lines of a run's `metrics.jsonl`; those that a killed run left incomplete are passed over."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
