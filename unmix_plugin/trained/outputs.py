@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import torch
 from jaxtyping import Float
@@ -95,87 +95,6 @@ class MaterialView:
 
 
 @dataclass(frozen=True)
-class _FamilyMember:
-    """One output of a family."""
-
-    what: str
-    """What its numbers are."""
-    compute: Callable[[MaterialView], Tensor]
-    value_range: tuple[float, float] | None = None
-
-
-@dataclass(frozen=True)
-class _OutputFamily:
-    """Outputs of one kind that differ by an argument."""
-
-    kind: OutputKind
-    title: str
-    needs: str
-    """What the argument is."""
-    example: str
-    make: Callable[[str, str, Materials], _FamilyMember]
-    """From name, argument and materials to the output.
-
-    Raises:
-        ConfigError: the argument can't be read.
-        SpectrumError: the bands don't cover it.
-    """
-
-
-def _band(name: str, argument: str, materials: Materials) -> _FamilyMember:
-    band = materials.bands.nearest(_wavelength_nm(argument, name))
-    column = torch.eye(len(materials.bands))[:, band : band + 1]
-    return _FamilyMember(
-        f"radiance of one band on black, 1 = full scale: {argument}",
-        lambda view: view.materials.through(view.coefficients, column)[..., 0],
-    )
-
-
-def _false_colour(name: str, argument: str, materials: Materials) -> _FamilyMember:
-    wavelengths = [_wavelength_nm(part, name) for part in argument.split(",")]
-    if len(wavelengths) != 3:
-        raise ConfigError(
-            f"false-colour takes three wavelengths, as in {FAMILIES['false-colour'].example}; got {name}"
-        )
-    matrix = band_composite_matrix(materials.bands, (wavelengths[0], wavelengths[1], wavelengths[2]))
-    return _FamilyMember(
-        f"three bands as red, green and blue, radiance on black: {argument}",
-        lambda view: view.materials.through(view.coefficients, matrix).clamp(0, 1),
-    )
-
-
-def _reflectance_map(name: str, _: str, materials: Materials) -> _FamilyMember:
-    asked = parse_reflectance_map(name, materials.bands)
-    caveat = "" if materials.light is not None else "; of radiance, since the scene's light is unknown"
-
-    def compute(view: MaterialView) -> Tensor:
-        reflectance = view.materials.reflectance(view.coefficients)
-        return asked.fit(reflectance[view.coefficients.is_occupied])(reflectance)
-
-    return _FamilyMember(f"{asked.what}{caveat}; NaN where undefined", compute, asked.usual_range)
-
-
-def _wavelength_nm(text: str, name: str) -> float:
-    try:
-        return float(text.strip().removesuffix("nm"))
-    except ValueError:
-        raise ConfigError(f"{text!r} in the output {name} is not a wavelength in nm, such as 650nm") from None
-
-
-FAMILIES: dict[str, _OutputFamily] = {
-    "band": _OutputFamily("grey", "one band", "a wavelength", "band:650nm", _band),
-    "false-colour": _OutputFamily(
-        "linear", "false colour", "wavelengths", "false-colour:860,650,550", _false_colour
-    ),
-    "index": _OutputFamily("map", "spectral index", "to know which", "index:ndvi", _reflectance_map),
-    "target": _OutputFamily(
-        "map", "likeness to a target", "to know which", "target:paint.csv", _reflectance_map
-    ),
-}
-"""By the part of the name before the colon."""
-
-
-@dataclass(frozen=True)
 class MaterialOutput(Output):
     """An output with its function."""
 
@@ -193,81 +112,185 @@ def _pca(view: MaterialView) -> Tensor:
     return PcaColours.fit(spectra[seen])(spectra) * seen[..., None]
 
 
-def _material_scores(view: MaterialView) -> Tensor:
+def _scores(view: MaterialView) -> Tensor:
     return material_scores(view.spectra, view.materials.endmembers)
 
 
 _UNIT = (0.0, 1.0)
-
-
-_DESCRIBED = (
-    Output("rgb", "srgb", "colour", "sRGB on black, 0 to 1"),
-    Output("linear_rgb", "linear", "linear colour", "linear light in sRGB primaries on black, 0 to 1"),
-    Output("spectral", "channels", "spectra", "radiance on black, 1 = full scale"),
-    Output("diffuse", "channels", "diffuse part", "radiance without the view-dependent part, 1 = full scale"),
-    Output("specular", "channels", "specular part", "view-dependent part of the radiance, 1 = full scale"),
-    Output("abundances", "shares", "all abundances", "abundances, summing to the opacity", _UNIT),
-    Output("segmentation", "labels", "segmentation", "index of the material, 255 where nothing is"),
-    Output(
+_TABLE = (
+    MaterialOutput(
+        "rgb",
+        "srgb",
+        "colour",
+        "sRGB on black, 0 to 1",
+        compute=lambda view: linear_to_srgb(_linear_rgb(view)),
+    ),
+    MaterialOutput(
+        "linear_rgb",
+        "linear",
+        "linear colour",
+        "linear light in sRGB primaries on black, 0 to 1",
+        compute=_linear_rgb,
+    ),
+    MaterialOutput(
+        "spectral",
+        "channels",
+        "spectra",
+        "radiance on black, 1 = full scale",
+        compute=lambda view: view.spectra,
+    ),
+    MaterialOutput(
+        "diffuse",
+        "channels",
+        "diffuse part",
+        "radiance without the view-dependent part, 1 = full scale",
+        compute=lambda view: view.materials.diffuse(view.coefficients),
+    ),
+    MaterialOutput(
+        "specular",
+        "channels",
+        "specular part",
+        "view-dependent part of the radiance, 1 = full scale",
+        compute=lambda view: view.materials.specular(view.coefficients),
+    ),
+    MaterialOutput(
+        "abundances",
+        "shares",
+        "all abundances",
+        "abundances, summing to the opacity",
+        _UNIT,
+        compute=lambda view: view.coefficients.abundances,
+    ),
+    MaterialOutput(
+        "segmentation",
+        "labels",
+        "segmentation",
+        "index of the material, 255 where nothing is",
+        compute=lambda view: view.materials.ids(view.coefficients),
+    ),
+    MaterialOutput(
         "confidence",
         "map",
         "segmentation confidence",
         "estimated probability that the material is right",
         _UNIT,
+        compute=lambda view: view.materials.confidence(view.coefficients),
     ),
-    Output(
+    MaterialOutput(
         "material_scores",
         "shares",
         "similarity to each endmember",
         "cosine of the spectrum to each endmember",
         _UNIT,
+        compute=_scores,
     ),
-    Output(
+    MaterialOutput(
         "probe_probabilities",
         "shares",
         "probabilities of the probe",
         "softmax over the endmembers of the cosine of the spectrum to each, as published",
         _UNIT,
+        compute=lambda view: torch.softmax(_scores(view), dim=-1),
     ),
-    Output(
+    MaterialOutput(
         "pca",
         "picture",
         "principal components",
         "three principal components of the spectra, each stretched from its 1st to its 99th percentile",
+        compute=_pca,
     ),
-    Output("depth", "map", "depth", "distance along the viewing axis in world units, 0 where nothing is"),
-    Output(
+    MaterialOutput(
+        "depth",
+        "map",
+        "depth",
+        "distance along the viewing axis in world units, 0 where nothing is",
+        compute=lambda view: view.depth,
+    ),
+    MaterialOutput(
         "ray_distance",
         "map",
         "distance along the ray",
         "distance along the ray in world units, 0 where nothing is",
+        compute=lambda view: view.ray_distance,
     ),
-    Output("accumulation", "map", "opacity", "opacity, 0 to 1", _UNIT, "gray"),
-    Output("normals", "vectors", "normals", "unit normals in world axes, 0 where nothing is"),
+    MaterialOutput(
+        "accumulation", "map", "opacity", "opacity, 0 to 1", _UNIT, "gray", compute=lambda view: view.opacity
+    ),
+    MaterialOutput(
+        "normals",
+        "vectors",
+        "normals",
+        "unit normals in world axes, 0 where nothing is",
+        compute=lambda view: view.normals,
+    ),
 )
-
-_COMPUTED: dict[str, Callable[[MaterialView], Tensor]] = {
-    "rgb": lambda view: linear_to_srgb(_linear_rgb(view)),
-    "linear_rgb": _linear_rgb,
-    "spectral": lambda view: view.spectra,
-    "diffuse": lambda view: view.materials.diffuse(view.coefficients),
-    "specular": lambda view: view.materials.specular(view.coefficients),
-    "abundances": lambda view: view.coefficients.abundances,
-    "segmentation": lambda view: view.materials.ids(view.coefficients),
-    "confidence": lambda view: view.materials.confidence(view.coefficients),
-    "material_scores": _material_scores,
-    "probe_probabilities": lambda view: torch.softmax(_material_scores(view), dim=-1),
-    "pca": _pca,
-    "depth": lambda view: view.depth,
-    "ray_distance": lambda view: view.ray_distance,
-    "accumulation": lambda view: view.opacity,
-    "normals": lambda view: view.normals,
-}
-
-OUTPUTS = {
-    output.name: MaterialOutput(**vars(output), compute=_COMPUTED[output.name]) for output in _DESCRIBED
-}
+OUTPUTS = {output.name: output for output in _TABLE}
 """All outputs that take no argument, in the order in which they are offered."""
+
+
+@dataclass(frozen=True)
+class _Family:
+    """Outputs of one kind that differ by an argument after a colon."""
+
+    kind: OutputKind
+    title: str
+    needs: str
+    """What the argument is."""
+    example: str
+    make: Callable[[str, str, Materials], _Made]
+    """From name, argument and materials to the output; raises a ConfigError where the argument can't be read, and a
+    SpectrumError where the bands don't cover it."""
+
+
+_Made: TypeAlias = tuple[str, Callable[[MaterialView], Tensor], tuple[float, float] | None]
+"""What an output's numbers are, how they are computed, and their usual range."""
+
+
+def _band(name: str, argument: str, materials: Materials) -> _Made:
+    band = materials.bands.nearest(_wavelength_nm(argument, name))
+    column = torch.eye(len(materials.bands))[:, band : band + 1]
+    what = f"radiance of one band on black, 1 = full scale: {argument}"
+    return what, lambda view: view.materials.through(view.coefficients, column)[..., 0], None
+
+
+def _false_colour(name: str, argument: str, materials: Materials) -> _Made:
+    wavelengths = [_wavelength_nm(part, name) for part in argument.split(",")]
+    if len(wavelengths) != 3:
+        raise ConfigError(
+            f"false-colour takes three wavelengths, as in {FAMILIES['false-colour'].example}; got {name}"
+        )
+    matrix = band_composite_matrix(materials.bands, (wavelengths[0], wavelengths[1], wavelengths[2]))
+    what = f"three bands as red, green and blue, radiance on black: {argument}"
+    return what, lambda view: view.materials.through(view.coefficients, matrix).clamp(0, 1), None
+
+
+def _reflectance_map(name: str, _: str, materials: Materials) -> _Made:
+    asked = parse_reflectance_map(name, materials.bands)
+    caveat = "" if materials.light is not None else "; of radiance, since the scene's light is unknown"
+
+    def compute(view: MaterialView) -> Tensor:
+        reflectance = view.materials.reflectance(view.coefficients)
+        return asked.fit(reflectance[view.coefficients.is_occupied])(reflectance)
+
+    return f"{asked.what}{caveat}; NaN where undefined", compute, asked.usual_range
+
+
+def _wavelength_nm(text: str, name: str) -> float:
+    try:
+        return float(text.strip().removesuffix("nm"))
+    except ValueError:
+        raise ConfigError(f"{text!r} in the output {name} is not a wavelength in nm, such as 650nm") from None
+
+
+FAMILIES: dict[str, _Family] = {
+    "band": _Family("grey", "one band", "a wavelength", "band:650nm", _band),
+    "false-colour": _Family(
+        "linear", "false colour", "wavelengths", "false-colour:860,650,550", _false_colour
+    ),
+    "index": _Family("map", "spectral index", "to know which", "index:ndvi", _reflectance_map),
+    "target": _Family("map", "likeness to a target", "to know which", "target:paint.csv", _reflectance_map),
+}
+"""By the part of the name before the colon."""
 
 
 def _output_names() -> tuple[str, ...]:
@@ -290,5 +313,5 @@ def find_output(name: str, materials: Materials) -> MaterialOutput:
         raise no_output(name, [*OUTPUTS, *FAMILIES], _output_names())
     if not argument:
         raise ConfigError(f"the output {prefix} needs {family.needs}, as in {family.example}")
-    made = family.make(name, argument, materials)
-    return MaterialOutput(name, family.kind, family.title, made.what, made.value_range, compute=made.compute)
+    what, compute, value_range = family.make(name, argument, materials)
+    return MaterialOutput(name, family.kind, family.title, what, value_range, compute=compute)
