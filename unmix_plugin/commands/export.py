@@ -1,8 +1,7 @@
-"""Products that methods bring along: `MethodSpecification.products`.
+"""`unmix-export PRODUCT --run PATH`: files for others, from the run folder alone.
 
-`unmix-export PRODUCT --run PATH`: files for others, from the run folder alone.
-
-A product is one module in `products` and one entry in `PRODUCTS`, or is brought along by a method.
+A product is one module in `products` and one entry in `PRODUCTS`, or is brought along by a method
+(`MethodSpecification.products`).
 """
 
 from __future__ import annotations

@@ -1,44 +1,29 @@
-"""Materials while a recipe changes them, and what has been done to which of them, so that no edit undoes another.
+"""Recipes applied to a trained scene: another scene that shares its weights.
 
-Notation: `B` bands, `K` endmembers, `J` specular spectra.
+*Materials.* Each kind of edit is one function of the state of the materials.
 
-Another light: what it multiplies every spectrum of a scene with.
+*Light.* A spectrum in a new light is the one seen, divided by the light that the scene was recorded in, times the new
+one. That is right if the recorded light has one spectrum everywhere; shadows, shading and gloss stay as they are. Bands
+that either light does not reach become 0: nothing is known of them. The power of the new light is chosen so that a
+perfect white is as bright as before: as luminous if the bands see colours (CIE Y), otherwise of the same mean radiance.
+So single bands may exceed 1, the full scale of the sensor.
 
-A spectrum in the new light is the one seen, divided by the light that the scene was recorded in, times the new one.
-That is right if the recorded light has one spectrum everywhere; shadows, shading and gloss stay as they are. Bands
-that either light does not reach become 0: nothing is known of them.
-
-Brightness. The power of a new light is chosen so that a perfect white is as bright as before: as luminous if the bands
-see colours (CIE Y), otherwise of the same mean radiance. So single bands may exceed 1, the full scale of the sensor.
-
-Notation: `B` bands.
-
-The smoothest change of a spectrum that gives it a wanted colour, or the nearest colour that a surface can have.
-
-Notation: `B` bands; `r` a reflectance, `L` the light, M (B, 3) the matrix from radiance to linear RGB. The changed
+*Colour.* Retinting makes the smoothest change of a spectrum that gives it a wanted colour, or the nearest colour that a
+surface can have. With `r` a reflectance, `L` the light and M (B, 3) the matrix from radiance to linear RGB, the changed
 reflectance is r + (r + f) d with a floor f, so that d is a relative change that still reaches where r is 0. Of all d
 with M^T L (r + (r + f) d) = colour and bounds on the result, the one is taken whose
 
     integral of d'^2 + (d / reach)^2 over wavelength
 
-is least: it changes with wavelength as little as the colour allows, and fades far from where colour is seen. Asking
-for the colour that a surface has leaves its spectrum as it is. The equation is solved in least squares, with a large
-weight: exactly if the bounds allow it, otherwise as nearly as they do. Channels count by the slope of the sRGB curve at
-the wanted colour, so that "near" is near on a display.
+is least: it changes with wavelength as little as the colour allows, and fades far from where colour is seen. The
+equation is solved in least squares, with a large weight: exactly if the bounds allow it, otherwise as nearly as they
+do. Channels count by the slope of the sRGB curve at the wanted colour, so that "near" is near on a display.
 
-A scene seen through another camera: its spectra have a value for each channel of a sensor.
+*Sensor.* A rendered spectrum is linear in endmembers and specular spectra, and so is what another camera makes of it:
+both are seen through its sensor once. Radiance and light become the channels' means of them, neither of them rescaled,
+so that their ratio stays reflectance.
 
-A rendered spectrum is linear in endmembers and specular spectra, and so is what a sensor makes of it: both are seen
-through the sensor once. Radiance and light become the channels' means of them, neither of them rescaled, so that their
-ratio stays reflectance: the mean of the reflectance, weighted with response and light.
-
-Notation: `B` bands, `S` channels, `K` endmembers, `J` specular spectra.
-
-What each kind of edit does to the materials: one function of the state for each kind.
-
-Recipes applied to a trained scene: another scene that shares its weights.
-
-Notation: `B` bands, `K` endmembers, `J` specular spectra, `G` mirrors.
+Notation: `B` bands, `S` channels of a sensor, `K` endmembers, `J` specular spectra, `G` mirrors.
 """
 
 from __future__ import annotations

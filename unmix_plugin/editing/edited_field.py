@@ -1,18 +1,17 @@
-"""How cameras see the materials of a run: what a colour asked for in a picture means for a spectrum.
+"""The state of materials while a recipe changes them, how cameras see them, and the field after the change.
 
 Cameras see an endmember shaded, under highlights and with traces of others, so that pictures of it have another colour
 than its spectrum; how much is left to shading, hence how bright an endmember is, training leaves open. What pixels are
 made of is linear: each channel of their mean sRGB colour rises with the same channel of the spectrum's linear colour,
 and one can be solved for the other.
 
-Notation: `N` pixels, `K` endmembers; a pixel of an endmember is one of which it has the largest share.
+In the edited field a material that is removed is transparent: density is multiplied with a function of the share that
+is kept, which is 0 up to a quarter and 1 from three quarters on, and abundances of what is left are renormalised. A
+plain product with the share would leave everything where it is: unmixing sees a trace of each material everywhere, and
+a trace of a dense surface is opaque.
 
-A field of which some materials are gone and others have another gloss.
-
-Notation: `S` samples, `K` endmembers, `J` specular coefficients, `G` mirrors. A material that is removed is
-transparent: density is multiplied with a function of the share that is kept, which is 0 up to a quarter and 1 from
-three quarters on, and abundances of what is left are renormalised. A plain product with the share would leave
-everything where it is: unmixing sees a trace of each material everywhere, and a trace of a dense surface is opaque.
+Notation: `N` pixels, `S` samples, `B` bands, `K` endmembers, `J` specular coefficients, `G` mirrors; a pixel of an
+endmember is one of which it has the largest share.
 """
 
 from __future__ import annotations

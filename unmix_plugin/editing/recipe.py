@@ -1,9 +1,8 @@
-"""What can be done to the materials of a run: one dataclass for each kind of edit, validated where it is made.
+"""A recipe: edits of materials in the order in which they are made, and optionally another light.
 
-An endmember is given by its name at that point of the recipe, or by its number from 0. Colours are sRGB in [0, 1].
-Fields are also the keys of a recipe's YAML, see `recipe_files`.
-
-A recipe: edits of materials in the order in which they are made, and optionally another light.
+Each kind of edit is a dataclass, validated where it is made. An endmember is given by its name at that point of the
+recipe, or by its number from 0. Colours are sRGB in [0, 1]. Fields are also the keys of a recipe's YAML, see
+`recipe_files`.
 """
 
 from __future__ import annotations

@@ -1,12 +1,8 @@
-"""The scene's surface as triangles: marching cubes through the density, trimmed to what the run's cameras see.
+"""The scene's surface as triangles (PLY, glTF, OBJ): marching cubes through the density, trimmed to what cameras see.
 
 The surface is where the density is that rays end at, softened a little since the field is trained on images and not
 on surfaces. What no camera sees (insides, undersides) was never learnt: it is taken for solid and its surfaces are cut
 away unless asked for, and so are stray pieces.
-
-Notation: `V` vertices, `F` faces.
-
-The scene's surface as a mesh: PLY, glTF and OBJ.
 
 Notation: `V` vertices, `F` faces.
 """

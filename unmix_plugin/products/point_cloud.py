@@ -1,17 +1,9 @@
-"""Clouds of points: outliers, normals, and fewer points that still cover everything evenly.
-
-Notation: `P` points. Any units.
-
-Spectral indices and scores of targets for every point of a surface.
-
-Notation: `P` points, `B` bands.
-
-The scene's surface as a cloud of points with their spectra's mixture: PLY.
+"""The scene's surface as a cloud of points with their mixture, spectral indices and scores of targets: PLY.
 
 Points are the ends of rays of the run's own cameras where nearly all of a ray ends, and where the cameras agree on it;
 lone points are left out, and the rest is thinned evenly. Normals are those of planes through the neighbours.
 
-Notation: `P` points.
+Notation: `P` points, `B` bands.
 """
 
 from __future__ import annotations

@@ -1,30 +1,21 @@
-"""The gain of an evaluation view, fitted to what was measured of it, where each training view had a gain of its own.
+"""Evaluation views aligned with what was measured of them, where training fitted the like for each of its own views.
 
-A trained gain says nothing of views that were not trained on, so each is aligned first, with the same few numbers as in
-training: exposure and a smooth white balance. Figures after it say how well a view is predicted but for these.
+Nothing of the field changes.
 
-Notation: `B` bands, `T` terms.
+*Gain.* A trained gain says nothing of views that were not trained on, so exposure and a smooth white balance are
+fitted. Figures after it say how well a view is predicted but for these.
 
-The pose of an evaluation view, fitted to its picture with the field as it is, where training corrected poses.
+*Pose.* Corrected poses and field move together, so a given pose no longer says exactly from where a view was taken. One
+turn and one shift are found with which the field shows it best, coarse pictures first. A view that is off by a tenth of
+its width must first be brought near: pictures three pixels wide are alike within a third of the width. A turn alone
+does so first, since a shift as well would be drawn away. What is found is taken only where it is clearly better than
+what the given pose leads to: coarse pictures also move a view that is right, and a line camera whose rows can hardly be
+told apart. The rows of a line camera wobble, so they are fitted one by one afterwards.
 
-Corrected poses and field move together, so a given pose no longer says exactly from where a view was taken. As is usual
-for fields that refine poses, each evaluation view is aligned before it is measured: one turn and one shift are found
-with which the field shows it best, coarse pictures first. Nothing of the field changes.
-
-A view that is off by a tenth of its width must first be brought near: pictures three pixels wide are alike within a
-third of the width. A turn alone does so first, since a shift as well would be drawn away. What is found is taken only
-where it is clearly better than what the given pose leads to: coarse pictures also move a view that is right, and a line
-camera whose rows can hardly be told apart.
-
-Notation: `P` pixels of a coarse picture, `C` spectral channels compared, `D` those and opacity.
+Notation: `B` bands, `T` terms, `P` pixels of a coarse picture, `C` spectral channels compared, `D` those and opacity.
 
 Source: Lin et al. 2021, BARF (alignment of views at test time); here by Levenberg-Marquardt steps with central
 differences of renders, since one-sided ones stop early.
-
-Poses of an evaluation view's rows, fitted to its picture with the field as it is, where training corrected poses.
-
-A line camera's rows wobble, so no single turn and shift aligns such a view. Once these are found (pose_alignment.py),
-its rows are fitted one by one.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""A trained scene of any model that names its outputs: what a method gets that brings no scene of its own.
+"""A trained scene of any model that names its outputs, for methods that bring no scene of their own.
 
-What a scene offers beside the common protocol if its light can be exchanged or its pictures are estimates.
-"""
+And what a scene may offer beside the common protocol: another light, and pictures that are estimates."""
 
 from __future__ import annotations
 

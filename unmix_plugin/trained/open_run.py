@@ -1,9 +1,4 @@
-"""From a model, trained or in training, to the scene that it holds at this moment.
-
-The scene that a run was trained on, where it can still be found: measurements to put beside predictions.
-
-Opening a run: from its folder to the trained scene in it.
-"""
+"""Opening a run: from its folder, or a model in training, to its trained scene; and finding the measured scene."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""The materials of a trained scene: their spectra, names and colours.
+"""The materials of a trained scene: their spectra, names and colours, and which known materials they resemble.
 
-Which known materials a run's spectra resemble: radiance is divided by the light it was seen in, if that is known.
+Radiance is divided by the light it was seen in, if that is known, before it is compared.
 
-Notation: `N` spectra, `B` bands.
+Notation: `N` spectra, `B` bands, `K` endmembers.
 """
 
 from __future__ import annotations

@@ -1,20 +1,11 @@
-"""The surface of a trained scene as its own cameras see it: where their rays end, and whether they agree.
+"""The surface of a trained scene: where rays of its own cameras end and agree, what is there, and the field on a grid.
 
 A ray that grazes an edge ends, on average, between what is before and what is behind it: in the air. And what no camera
 sees was never learnt. Both are found by comparing with the other cameras: a point lies on the surface where cameras see
-something at its distance, and few see through it.
+something at its distance, and few see through it. On a grid, only cells that are rendered are asked: elsewhere the
+field was never trained, and what it says there is nothing.
 
-Notation: `P` points, `K` endmembers. Model space.
-
-The field of a trained scene on a regular grid, slice by slice: density, and what there is of each endmember.
-
-Only cells that are rendered are asked: elsewhere the field was never trained, and what it says there is nothing.
-
-Notation: `X x Y x Z` grid points, `P` points, `K` endmembers. Model space.
-
-What every point of a surface carries: its colour, its material, its abundances; the same in all formats.
-
-Notation: `P` points, `K` endmembers.
+Notation: `P` points, `X x Y x Z` grid points, `B` bands, `K` endmembers. Model space.
 """
 
 from __future__ import annotations

@@ -1,11 +1,8 @@
-"""The one probe: the spectrum that a scene shows in a pixel, or has at a point, and what it is made of.
+"""A trained scene of mixed materials as a value: it renders, is probed, and is edited into another one.
 
-Notation: `B` bands, `K` endmembers.
+No trainer and no settings: what it shows follows from its parts alone.
 
-A trained scene of mixed materials as a value: it renders, is probed, and is edited into another one.
-
-No trainer and no settings: what it shows follows from its parts alone. Notation: `H x W` pixels, `B` bands, `K`
-endmembers.
+Notation: `H x W` pixels, `B` bands, `K` endmembers.
 """
 
 from __future__ import annotations

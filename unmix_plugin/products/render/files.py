@@ -1,6 +1,4 @@
-"""What is written of a render: which formats suit an output, and which it gets where none are asked for.
-
-Each output of a render as a file that takes the rows of a view as they come.
+"""What is written of a render: the formats of each output, and its files, which take the rows of a view as they come.
 
 Notation: `h x W` pixels, some rows of a view; `B` bands, `K` endmembers.
 """

@@ -1,13 +1,9 @@
-"""A look ahead at all views, small: what their pictures must have in common, so that a video does not flicker.
-
-Frames of videos that several processes draw in rounds, one view each: the first puts them into the videos.
-
-Rendering views block by block into files: each view is composited once, and all its outputs follow from that.
+"""Rendering views block by block into files: each view is composited once, and all its outputs follow from that.
 
 Of a view, a block of rows is in memory at a time, and what a format needs as a whole: nothing for ENVI and .npy, the
-picture for PNG and video, the output itself for EXR.
-
-Several processes share the views in rounds, one view each.
+picture for PNG and video, the output itself for EXR. A look ahead at all views, small, tells what their pictures must
+have in common, so that a video does not flicker. Several processes share the views in rounds, one view each; the first
+puts the frames of a round into the videos.
 """
 
 from __future__ import annotations

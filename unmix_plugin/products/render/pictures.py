@@ -1,11 +1,9 @@
-"""Outputs of a render as colours: what a PNG or a video shows.
+"""Outputs of a render as colours, and the legends of these: what a PNG or a video shows.
 
 A picture has tiles side by side, one for most outputs and one for each endmember for abundances. For a PNG, colours
 come with opacity, by which they are not multiplied; for a video, they are laid over the neutral grey.
 
 Notation: `h x W` pixels, some rows of an image; `T` tiles, `K` endmembers.
-
-What the colours of an output's pictures mean: a figure with its scale and a swatch for each material.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""The contents of a report put together.
-
-The report as one HTML file that holds everything it shows: no script, no font, no request.
-"""
+"""The report as one HTML file that holds everything it shows: no script, no font, no request."""
 
 from __future__ import annotations
 

@@ -1,12 +1,6 @@
-"""Pictures of a report: views in colour, their errors, abundances and segmentations.
+"""What a report shows and counts of views and endmembers, fed view by view; keeps small pictures, never spectra.
 
-What a report says about the endmembers: their spectra, and what they resemble.
-
-Notation: `B` bands, `K` endmembers, `M` true materials.
-
-What a report shows and counts of views, fed view by view; keeps small pictures, never spectra.
-
-Notation: `H x W` pixels, `B` bands, `K` endmembers.
+Notation: `H x W` pixels, `B` bands, `K` endmembers, `M` true materials.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""What a report says about the run itself: the scene, the figures, the training, the settings, the versions.
-
-One HTML file about a run: everything that it learnt and how well, to read, to send or to print.
-"""
+"""One HTML file about a run: everything that it learnt and how well, to read, to send or to print."""
 
 from __future__ import annotations
 
