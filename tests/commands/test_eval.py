@@ -1,4 +1,4 @@
-"""`unmix-eval`: the keys of metrics.json, what is drawn, and what is refused."""
+"""`unmix-eval`: the keys of metrics.json, what is drawn, what edits change, and what is refused."""
 
 import errno
 import json
@@ -7,13 +7,16 @@ import os
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
-from tests.commands.running import picture_size, run
+from tests.commands.running import SMALL_METHOD, picture_size, run
 from unmix_plugin.commands.eval import evaluate
+from unmix_plugin.commands.train import train
 from unmix_plugin.datamanager import HyperspectralDataManager
 from unmix_plugin.engine.runs.load_run import load_pipeline
+from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.spectral.metrics import psnr
 from unmix_plugin.trained.evaluation import DEFINITIONS
 
@@ -146,3 +149,84 @@ def test_two_processes_find_what_one_finds(evaluated, tmp_path):
     assert {picture.name for picture in (path / "eval").glob("*/*.png")} == {
         picture.name for picture in (evaluated[0] / "eval").glob("*/*.png")
     }
+
+
+@pytest.fixture
+def recipe(tmp_path):
+    path = tmp_path / "new look.yml"
+    path.write_text("edits:\n- rename: {endmember: 0, name: cloth}\n- scale: {endmember: 1, factor: 0.5}\n")
+    return path
+
+
+def metrics(folder):
+    return json.loads((folder / "metrics.json").read_text())
+
+
+def test_an_edited_run_is_evaluated_into_a_folder_of_its_own(run_copy, recipe):
+    plain = run(evaluate, "--run", run_copy, "--device", "cpu")
+    before = metrics(run_copy / "eval")
+    ended = run(evaluate, "--run", run_copy, "--edits", recipe, "--device", "cpu")
+    assert (plain.status, ended.status) == (0, 0), ended.err
+    assert metrics(run_copy / "eval") == before
+    folder = run_copy / "exports" / "eval-new_look"
+    found = metrics(folder)
+    assert found["psnr"] != before["psnr"]
+    assert found["miou"] == before["miou"]
+    assert "name: cloth" in found["edits"]
+    assert "edits" not in before
+    assert str(folder) in ended.out
+    assert "edited, against the scene as measured" in " ".join(ended.out.split())
+    assert min(picture_size(folder / "rgb" / "eval_002.png")) > 100
+
+
+def test_another_light_lights_prediction_and_truth_alike(run_copy):
+    ended = run(evaluate, "--run", run_copy, "--illuminant", "e", "--device", "cpu")
+    plain = run(evaluate, "--run", run_copy, "--device", "cpu")
+    assert (ended.status, plain.status) == (0, 0), ended.err
+    found, before = metrics(run_copy / "exports" / "eval-e"), metrics(run_copy / "eval")
+    # The scene's light is nearly flat: the figures are nearly those of the unedited run, though not quite.
+    assert found["psnr"] == pytest.approx(before["psnr"], abs=0.5)
+    assert found["psnr"] != before["psnr"]
+    assert found["endmember_angle"] == pytest.approx(before["endmember_angle"], abs=0.05)
+    assert "in the same light" in " ".join(ended.out.split())
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--illuminant", "D66"], "there is no light 'D66'; nearest: D65"),
+        (["--edits", "gone.yml"], "can't read the recipe gone.yml"),
+    ],
+)
+def test_what_is_wrong_with_edits_exits_2_and_writes_nothing(run_copy, words, message):
+    ended = run(evaluate, "--run", run_copy, *words)
+    assert ended.status == 2
+    assert message in ended.err
+    assert not (run_copy / "eval").exists()
+    assert not (run_copy / "exports").exists()
+
+
+def evaluated_psnr(scene: Path, output: Path) -> tuple[float, str]:
+    words = ["--data", scene, "--output-dir", output, "--max-num-iterations", 20, "--light", "per-view"]
+    ended = run(train, "unmix-nerf", *words, *SMALL_METHOD)
+    assert ended.status == 0, ended.err
+    path = Path(ended.last_line.removeprefix("run: "))
+    found = run(evaluate, "--run", path, "--device", "cpu")
+    assert found.status == 0, found.err
+    return json.loads((path / "eval" / "metrics.json").read_text())["psnr_matter"], found.out
+
+
+def test_the_gain_of_an_evaluation_view_does_not_count(tmp_path):
+    scene = tmp_path / "scene"
+    make_demo_scene(scene, 16, 8, 8)
+    plain, said = evaluated_psnr(scene, tmp_path / "plain")
+    assert "each evaluation view was aligned first" in said
+    content = json.loads((scene / "transforms.json").read_text())
+    names = content.get("val_filenames") or content["test_filenames"]
+    for frame in content["frames"]:
+        if frame["file_path"] in names:
+            cube = scene / frame["hyperspectral_file_path"]
+            np.save(cube, (0.5 * np.load(cube).astype(np.float32)).astype(np.float16))
+    halved, _ = evaluated_psnr(scene, tmp_path / "halved")
+    # Half the light has half the error after alignment: 6 dB.
+    assert abs(halved - plain - 6.02) < 0.5

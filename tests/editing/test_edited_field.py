@@ -1,11 +1,21 @@
-"""A field without some of its materials: what vanishes, what stays, and what is left of mixtures."""
+"""The field after edits, and how cameras see its materials."""
 
+from dataclasses import replace
+
+import numpy as np
+import pytest
 import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from unmix_plugin.editing.edited_field import EditedField
+from tests.editing.scenes import CAMERAS, LIGHT, edited, lit_scene
+from unmix_plugin.editing import sample_seen
+from unmix_plugin.editing.edited_field import EditedField, MaterialState, _Appearance, appearance_of
+from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.field import CoefficientField
+from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.materials import Coefficients
+from unmix_plugin.trained.run_views import RunView
 
 ALL = torch.tensor([True, True, True])
 PLAIN = torch.ones(1, 3)
@@ -95,3 +105,129 @@ def test_nothing_removed_costs_no_look_at_the_materials():
     field = GivenField(MIXTURES)
     field.abundances_of = None  # type: ignore[method-assign,assignment]
     assert_close(EditedField(field, ALL, PLAIN).get_density(torch.zeros(5, 3))[0], torch.full((5,), 5.0))
+
+
+def seen_pixels(shading: list[float], share: float = 1.0) -> Coefficients:
+    """Opaque pixels, all of endmember 0 and without gloss."""
+    strengths = torch.tensor(shading)
+    abundances = torch.tensor([share, 1 - share, 0.0]).expand(len(shading), 3)
+    return Coefficients.of(
+        torch.ones(len(shading)),
+        torch.ones(len(shading)),
+        abundances,
+        strengths[:, None] * abundances,
+        torch.zeros(len(shading), 1),
+    )
+
+
+def own_srgb(spectrum: torch.Tensor, bands) -> torch.Tensor:
+    return linear_to_srgb(spectrum.double() @ rgb_matrix(bands, torch.float64))
+
+
+def test_a_spectrum_gets_the_colour_itself_where_the_picture_is_not_known_or_not_meant():
+    scene = lit_scene()
+    asked = torch.tensor([0x80, 0x70, 0x40], dtype=torch.float64) / 255
+    for result in (
+        edited(scene, "retint: {endmember: 0, colour: '#807040'}"),
+        edited(
+            scene, "retint: {endmember: 0, colour: '#807040', match: spectrum}", seen=seen_pixels([0.4] * 50)
+        ),
+        edited(scene, "retint: {endmember: 1, colour: '#807040'}", seen=seen_pixels([0.4] * 50)),
+    ):
+        index = 1 if result.materials.endmembers[0].equal(scene.materials.endmembers[0]) else 0
+        assert_close(own_srgb(result.materials.endmembers[index], result.bands), asked, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.6])
+def test_pixels_get_the_colour_in_the_mean_where_the_picture_is_known(share):
+    scene = lit_scene()
+    shading = torch.linspace(0.3, 0.8, 60)
+    pixels = seen_pixels(shading.tolist(), share)
+    result = edited(scene, "retint: {endmember: 0, colour: '#a09060'}", seen=pixels)
+    shown = own_srgb(pixels.scaled_abundances @ result.materials.endmembers, result.bands).mean(0)
+    assert_close(shown, torch.tensor([0xA0, 0x90, 0x60]).double() / 255, atol=1e-4, rtol=0)
+
+
+def test_highlights_count_in_the_mean_and_mixtures_hardly():
+    scene = lit_scene()
+    pure, mixed = seen_pixels([0.6] * 30), seen_pixels([0.6] * 30, 0.55)
+    pure.specular[:] = 0.1
+    pixels = Coefficients.concatenate([pure, mixed])
+    result = edited(scene, "retint: {endmember: 0, colour: '#a09080'}", seen=pixels)
+    materials = result.materials
+    asked = torch.tensor([0xA0, 0x90, 0x80]).double() / 255
+    shown = [
+        own_srgb(
+            part.scaled_abundances @ materials.endmembers + part.specular @ materials.specular_spectra,
+            result.bands,
+        )
+        for part in (pure, mixed)
+    ]
+    assert_close(shown[0][0], asked, atol=0.02, rtol=0)
+    assert (shown[1][0] - asked).abs().max() > 0.05
+
+
+def test_a_shaded_material_may_be_brighter_than_white_in_full_light_but_not_where_it_is_seen():
+    appearance = _Appearance(np.linspace(0.2, 0.5, 100), np.zeros((100, 3)), np.ones(100))
+    assert appearance.greatest_reflectance == pytest.approx(1 / 0.485, rel=0.01)
+    assert _Appearance(np.full(9, 2.0), np.zeros((9, 3)), np.ones(9)).greatest_reflectance == 1
+
+
+def test_where_the_rest_of_the_pixels_is_too_bright_the_nearest_colour_is_taken():
+    appearance = _Appearance(np.full(20, 0.5), np.full((20, 3), [0.3, 0.0, 0.0]), np.ones(20))
+    np.testing.assert_allclose(appearance.full_colour((0.2, 0.0, 0.5)), [0.0, 0.0, 2 * 0.21404], atol=1e-4)
+
+
+def test_a_colour_that_pictures_cannot_have_becomes_the_nearest_that_they_can():
+    result = edited(
+        lit_scene(), "retint: {endmember: 0, colour: '#ffffff'}", seen=seen_pixels([0.1] * 50 + [0.6] * 10)
+    )
+    [note] = result.notes
+    assert "(retint): pictures of endmember_0 can't be #ffffff in this light; took the nearest colour" in note
+    brightest = result.materials.endmembers[0].detach().double() / torch.tensor(LIGHT).double()
+    assert_close(
+        brightest, torch.full_like(brightest, 1 / 0.6), rtol=1e-3, atol=0
+    )  # all that the bound allows
+
+
+def test_endmembers_that_are_hardly_seen_have_no_appearance():
+    materials = lit_scene().materials
+    appearances = [
+        appearance_of(MaterialState.of(materials, None, seen_pixels([0.5] * count)), index)
+        for count, index in ((15, 0), (16, 0), (50, 2))
+    ]
+    assert [appearance is None for appearance in appearances] == [True, False, True]
+    assert appearance_of(MaterialState.of(materials, None, None), 0) is None
+
+
+def test_what_is_seen_is_sampled_from_coarse_pictures_of_several_views():
+    scene = lit_scene()
+    seen = sample_seen(scene)
+    assert seen.abundances.shape == (2 * 12 * 10, 3)
+    wide = Cameras(
+        CAMERAS.camera_to_world,
+        CAMERAS.focal_px * 8,
+        CAMERAS.center_px * 8,
+        CAMERAS.distortion,
+        96,
+        80,
+    )
+    views = tuple(RunView(f"wide_{view}", wide[view], "train") for view in range(2))
+    coarse = sample_seen(replace(scene, views=views))
+    assert coarse.abundances.shape == (2 * 32 * 26, 3)
+    assert_close(coarse.accumulation.mean(), seen.accumulation.mean(), rtol=0.05, atol=0)
+
+
+def test_pictures_of_a_scene_have_the_colour_in_the_mean_over_a_materials_pixels():
+    scene = lit_scene()
+    seen = sample_seen(scene)
+    index = int(seen.abundances.argmax(-1)[seen.accumulation >= 0.5].mode().values)
+    result = edited(scene, f"retint: {{endmember: {index}, colour: '#606858'}}", seen=seen)
+    views = [result.look(CAMERAS[view], subpixels=1) for view in range(2)]
+    shares = torch.cat([view["abundances"].flatten(0, 1) for view in views])
+    opacity = torch.cat([view.opacity.flatten() for view in views])
+    srgb = torch.cat([view["rgb"].flatten(0, 1) for view in views])
+    is_its = (shares.argmax(-1) == index) & (opacity >= 0.5)
+    weights = (shares[is_its][:, index] / opacity[is_its])[:, None] ** 4
+    mean = (weights * srgb[is_its]).sum(0) / weights.sum()
+    assert_close(mean, torch.tensor([0x60, 0x68, 0x58]) / 255, atol=2e-3, rtol=0)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from tests.method_factory import make_model, scene_of
 from tests.scenes.scene_factory import look_at
-from tests.trained.camera_files.camera_scenes import cameras_at
+from tests.trained.camera_scenes import cameras_at
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.light.shading import Lamplight

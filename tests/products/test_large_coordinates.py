@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.products.ball_model import ALL_ROUND, ball_scene, cameras_around
 from tests.products.mesh_reading import loaded_mesh
-from tests.trained.camera_files.camera_scenes import FRAME, around
+from tests.trained.camera_scenes import FRAME, around
 from unmix_plugin.products.mesh import _TriangleMesh, _write_mesh
 from unmix_plugin.products.point_cloud import _write_point_cloud
 from unmix_plugin.products.volume import _write_volume

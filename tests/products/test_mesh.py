@@ -15,7 +15,7 @@ from tests.products.ball_model import (
     cameras_around,
 )
 from tests.products.mesh_reading import loaded_mesh
-from tests.trained.camera_files.camera_scenes import FRAME
+from tests.trained.camera_scenes import FRAME
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.products.mesh import (
     _extract_mesh,

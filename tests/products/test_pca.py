@@ -6,7 +6,7 @@ import torch
 from PIL import Image
 
 from tests.method_factory import make_scene
-from tests.trained.camera_files.camera_scenes import around
+from tests.trained.camera_scenes import around
 from unmix_plugin.products.pca import _find_components, _survey_view, _write_components, _write_pca
 from unmix_plugin.trained.evaluation import render_view
 

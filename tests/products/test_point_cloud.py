@@ -1,15 +1,167 @@
+"""Points of the surface: cleaned and thinned, with normals and scores, in a file."""
+
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from plyfile import PlyData
+from scipy.spatial import KDTree
 
+from tests.method_factory import WAVELENGTHS_NM, make_model
 from tests.products.ball_model import ALL_ROUND, RADIUS, ball_scene, cameras_around
-from tests.trained.camera_files.camera_scenes import FRAME
-from unmix_plugin.errors import ConfigError, RunError
-from unmix_plugin.products.point_cloud import _require_count, _require_point_scores, _write_point_cloud
+from tests.trained.camera_scenes import FRAME
+from unmix_plugin.errors import ConfigError, RunError, SpectrumError
+from unmix_plugin.products.point_cloud import (
+    _is_outlier,
+    _plane_normals,
+    _require_count,
+    _require_point_scores,
+    _thinned,
+    _write_point_cloud,
+)
+from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.trained.surface import SeenSurface
+
+
+def sphere(count: int, seed: int = 0) -> np.ndarray:
+    vectors = np.random.default_rng(seed).normal(size=(count, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def test_lone_points_are_told_from_a_surface():
+    lone = np.array([[3.0, 0.0, 0.0], [0.0, -2.0, 0.0]])
+    alone = _is_outlier(np.concatenate([sphere(2000), lone]))
+    assert alone[-2:].all()
+    assert alone[:-2].mean() < 0.01
+
+
+@pytest.mark.parametrize("count", [0, 1, 8])
+def test_few_points_are_company_enough(count):
+    assert not _is_outlier(sphere(count)).any()
+
+
+@given(st.integers(1, 400), st.integers(1, 500))
+def test_thinning_gives_distinct_points_and_never_more_than_asked_for(count, wanted):
+    positions = sphere(count, seed=count)
+    kept = _thinned(positions, wanted)
+    assert len(np.unique(kept)) == len(kept)
+    assert 1 <= len(kept) <= wanted
+    if count <= wanted:
+        np.testing.assert_array_equal(kept, np.arange(count))
+
+
+def test_thinning_covers_evenly_what_was_seen_unevenly():
+    dense = sphere(40_000)
+    dense = dense[dense[:, 2] > 0.5]
+    positions = np.concatenate([sphere(20_000, seed=1), dense])
+    kept = positions[_thinned(positions, 1000)]
+    assert len(kept) > 900
+    gaps, _ = KDTree(kept).query(positions)
+    ideal = np.sqrt(4 * np.pi / 1000)
+    assert gaps.max() < 1.6 * ideal
+    upper = (kept[:, 2] > 0.5).mean()
+    assert upper == pytest.approx(0.25, abs=0.03)
+
+
+def test_points_that_coincide_are_thinned_to_one():
+    assert len(_thinned(np.zeros((50, 3)), 10)) == 1
+
+
+def test_normals_of_a_sphere_are_its_radii_and_face_the_viewer():
+    positions = sphere(5000)
+    outwards = _plane_normals(positions, positions, np.arange(200))
+    inwards = _plane_normals(positions, -positions, np.arange(200))
+    np.testing.assert_allclose(np.linalg.norm(outwards, axis=1), 1, atol=1e-9)
+    assert (outwards * positions[:200]).sum(axis=1).min() > 0.99
+    np.testing.assert_allclose(inwards, -outwards)
+
+
+def test_where_there_is_no_plane_the_normal_is_the_viewers_direction():
+    towards = np.array([[0.0, 0.0, 2.0], [1.0, 0.0, 0.0]])
+    normals = _plane_normals(np.zeros((2, 3)), towards, np.array([0, 1]))
+    np.testing.assert_allclose(normals, [[0, 0, 1], [1, 0, 0]])
+
+
+BANDS = Bands.of(WAVELENGTHS_NM)
+LIGHT = [0.2, 0.4, 0.6, 0.8, 1.0]
+PAINT = torch.tensor([0.1, 0.2, 0.5, 0.7, 0.8])
+
+
+@pytest.fixture
+def paint(tmp_path):
+    path = tmp_path / "my paint.csv"
+    write_spectra_csv(path, SpectraTable(BANDS, ("gold",), PAINT[None].double().numpy()))
+    return path
+
+
+def properties(*outputs):
+    return [score.property for score in _require_point_scores(outputs, BANDS)]
+
+
+def test_named_indices_keep_their_names_and_the_rest_is_numbered(paint):
+    outputs = ("index:r650/r450", "index:PRI", "index:iron-oxide", "index:1+r450", f"target:ace:{paint}")
+    assert properties(*outputs) == ["index_1", "index_pri", "index_iron_oxide", "index_2", "target_1"]
+
+
+def test_an_output_asked_for_twice_is_given_once():
+    assert properties("index:pri", "index: PRI", "index:r650/r450", "index:r650/r450") == [
+        "index_pri",
+        "index_1",
+    ]
+
+
+def test_values_are_of_reflectance_and_undefined_where_the_index_is():
+    (score,) = _require_point_scores(["index:r650/r450"], BANDS)
+    reflectances = torch.tensor([[0.1, 0.2, 0.3, 0.4, 0.5], [0.0, 0.2, 0.3, 0.4, 0.5]])
+    light = torch.tensor(LIGHT)
+    values = score.values(reflectances * light, light)
+    assert values.dtype == np.float32
+    assert values[0] == pytest.approx(5.0, rel=1e-5)
+    assert np.isnan(values[1])
+    assert score.values(reflectances * light, None)[0] == pytest.approx(25.0, rel=1e-5)
+
+
+def test_a_target_is_judged_against_the_points_themselves(paint):
+    (score,) = _require_point_scores([f"target:mf:{paint}"], BANDS)
+    g = torch.Generator().manual_seed(0)
+    others = 0.3 + 0.05 * torch.randn(400, 5, generator=g)
+    both = torch.cat([others, PAINT[None]])
+    values = score.values(both, None)
+    assert values[-1] == pytest.approx(1.0, abs=1e-4)
+    assert abs(values.mean()) < 1e-4  # scores are taken from the mean of the points
+
+
+def test_a_comment_says_what_a_property_is_and_whether_the_light_was_known():
+    formula, named = _require_point_scores(["index:r650/r450", "index:pri"], BANDS)
+    unknown, known = make_model().materials, make_model(light=LIGHT).materials
+    assert formula.comment(known) == (
+        "index_1: index:r650/r450, formula r650/r450; from the bands at 450, 650 nm"
+    )
+    assert formula.comment(unknown).endswith("; of radiance, since the scene's light is unknown")
+    assert named.comment(known).startswith("index_pri: index:pri, photochemical reflectance index")
+
+
+@pytest.mark.parametrize("output", ["rgb", "band:650nm", "index", "index:", "target:", "ndvi", ""])
+def test_other_outputs_are_refused_with_what_points_take(output):
+    with pytest.raises(ConfigError, match=f"--outputs {output}: points take spectral indices, index:NAME"):
+        _require_point_scores(["index:pri", output], BANDS)
+
+
+@pytest.mark.parametrize(
+    ("output", "error", "message"),
+    [
+        ("index:prri", ConfigError, "there is no index 'prri'; nearest: pri"),
+        ("index:ndvi", SpectrumError, "needs 800 nm"),
+        ("target:none.csv", ConfigError, "none.csv"),
+    ],
+)
+def test_what_cannot_be_computed_is_refused(output, error, message):
+    with pytest.raises(error, match=message):
+        _require_point_scores([output], BANDS)
+
 
 SCENE = ball_scene()
 

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from tests.method_factory import make_scene
-from tests.trained.camera_files.camera_scenes import around
+from tests.trained.camera_scenes import around
 from unmix_plugin.products.abundances import Abundances
 from unmix_plugin.products.cubes import Cubes
 from unmix_plugin.products.endmembers import _endmember_paths, _write_endmembers

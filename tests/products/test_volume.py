@@ -6,7 +6,7 @@ import torch
 
 from tests.method_factory import make_scene
 from tests.products.ball_model import INNER_RADIUS, RADIUS, ball_scene
-from tests.trained.camera_files.camera_scenes import FRAME
+from tests.trained.camera_scenes import FRAME
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.products.volume import _volume_path, _write_volume
 from unmix_plugin.trained.surface import GridPoints, sample_densities, sample_slice

@@ -11,7 +11,7 @@ from torch.testing import assert_close
 from tests.engine.rgb_nerf_plugin import RgbNerf, RgbNerfConfig
 from tests.method_factory import CAMERA, NUM_BANDS, make_scene
 from tests.products.ball_model import RADIUS, ball_scene, cameras_around
-from tests.trained.camera_files.camera_scenes import BOX, FRAME, around, record
+from tests.trained.camera_scenes import BOX, FRAME, around, record
 from unmix_plugin.engine.registry import Output
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.products.render.job import needs_survey, take_survey

@@ -6,7 +6,7 @@ import torch
 
 from tests.method_factory import make_scene
 from tests.products.ball_model import RADIUS, SHADE, BallField, ball_scene, cameras_around
-from tests.trained.camera_files.camera_scenes import FRAME, around
+from tests.trained.camera_scenes import FRAME, around
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.trained.trained_scene import one_pixel
 

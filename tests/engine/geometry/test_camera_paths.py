@@ -7,7 +7,7 @@ from torch.testing import assert_close
 
 from tests.scenes.geometry.ground_views import flight_poses
 from tests.scenes.scene_factory import look_at, ring_poses
-from tests.trained.camera_files.camera_scenes import BOX, around, cameras_at, in_front
+from tests.trained.camera_scenes import BOX, around, cameras_at, in_front
 from unmix_plugin.engine.geometry.camera_paths import (
     focus_point,
     interpolated,

@@ -12,7 +12,7 @@ import spectral.io.envi as envi
 
 from tests.method_factory import make_scene
 from tests.scenes.scene_factory import ring_poses
-from tests.trained.camera_files.camera_scenes import cameras_at
+from tests.trained.camera_scenes import cameras_at
 from unmix_plugin.products.render.cameras import RenderCameras
 from unmix_plugin.products.render.files import FormattedOutput, choose_formats
 from unmix_plugin.products.render.job import RenderJob, Survey, take_survey

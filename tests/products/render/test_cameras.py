@@ -8,7 +8,7 @@ import torch
 
 from tests.method_factory import make_scene
 from tests.scenes.scene_factory import ring_poses
-from tests.trained.camera_files.camera_scenes import around, cameras_at, record
+from tests.trained.camera_scenes import around, cameras_at, record
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.products.render.cameras import CameraRequest, choose_cameras
 from unmix_plugin.trained.camera_files import camera_file_bytes

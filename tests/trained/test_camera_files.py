@@ -9,7 +9,7 @@ import torch
 
 from tests.pose_factory import line_camera
 from tests.scenes.scene_factory import look_at
-from tests.trained.camera_files.camera_scenes import FRAME, around
+from tests.trained.camera_scenes import FRAME, around
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.trained.camera_files import camera_file_bytes, read_camera_file
 from unmix_plugin.trained.run_views import RunView
