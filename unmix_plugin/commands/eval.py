@@ -123,11 +123,7 @@ _ALIGNED = {
 
 
 def _materials_scene(loaded: LoadedPipeline, is_edited: bool) -> TrainedScene | None:
-    """The scene of mixed materials that the run's method makes; None where its model measures its images itself.
-
-    Raises:
-        ConfigError: edits are asked for, and there is none.
-    """
+    """The scene of mixed materials that the run's method makes; None where its model measures its images itself."""
     from unmix_plugin.commands.reporting import spectral_scene
     from unmix_plugin.engine.registry import find_method
     from unmix_plugin.trained.open_run import require_materials

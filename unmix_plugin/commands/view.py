@@ -94,12 +94,7 @@ def prepared(options: ViewOptions) -> Viewer:
 
 
 def _scene_of(source: SceneSource, data: Path | None) -> Scene:
-    """The scene that the run was trained on.
-
-    Raises:
-        SceneError: it is not at hand.
-        RunError: it is another one.
-    """
+    """The scene that the run was trained on."""
     from unmix_plugin.errors import SceneError
     from unmix_plugin.trained.open_run import find_scene
 

@@ -143,13 +143,7 @@ class _LitReflectance:
 def _retinted(
     surface: _LitReflectance, linear_rgb: Float64[np.ndarray, "3"], greatest: float = 1.0
 ) -> Float64[np.ndarray, " B"]:
-    """The reflectance most like a surface's own that has the wanted colour in its light, or comes nearest to it.
-
-    Args:
-        surface: What is changed.
-        linear_rgb: The wanted colour, as `spectral.colour.rgb_matrix` makes it of the light that the surface sends.
-        greatest: Upper bound of the reflectance; the lower one is 0.
-    """
+    """The reflectance most like a surface's own that has the wanted colour in its light, or comes nearest to it."""
     from scipy.optimize import lsq_linear
 
     reflectance, to_rgb = surface.reflectance, surface.to_linear_rgb
@@ -213,11 +207,7 @@ _REMOVED, _ISOLATED = "removed", "isolated"
 
 
 def _carry_out(recipe: Recipe, state: MaterialState) -> None:
-    """Make all edits of a recipe, in order.
-
-    Raises:
-        ConfigError: an edit can't be made, or contradicts another; the message says where it is.
-    """
+    """Make all edits of a recipe, in order."""
     for position, operation in enumerate(recipe.operations):
         where = recipe.where(position)
         try:

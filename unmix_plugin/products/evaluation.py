@@ -81,11 +81,7 @@ class _Evaluated:
     """Whether the figures are those of `DEFINITIONS`."""
 
     def write(self, path: Path, times: Mapping[str, float | None]) -> dict[str, Any]:
-        """Write metrics.json; its figures, those of training among them.
-
-        Raises:
-            RunError: the disk is full or refuses.
-        """
+        """Write metrics.json; its figures, those of training among them."""
         known = {**self.figures, **times}
         figures = (
             {name: known[name] for name in DEFINITIONS if name in known} if self.has_materials else known

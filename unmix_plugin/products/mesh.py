@@ -74,11 +74,7 @@ class _TriangleMesh:
 
 
 def _surface_density(scene: TrainedScene, ends: SurfacePoints) -> float:
-    """Density per model unit at which the surface lies, from the densities where rays end.
-
-    Raises:
-        RunError: no ray ends anywhere.
-    """
+    """Density per model unit at which the surface lies, from the densities where rays end."""
     densities = sample_densities(scene, ends.positions)
     densities = densities[densities > 0]
     if len(densities) == 0:
@@ -100,14 +96,6 @@ def _extract_mesh(
     The cubes go through the opacity of a pixel's length rather than the density itself, which differs by many orders
     of magnitude between neighbours.
 
-    Args:
-        densities: At the grid's points, per model unit.
-        grid: Of the densities, model space.
-        threshold: Density of the surface, > 0.
-        softness: Standard deviation, in cells, of a blur applied first; 0 for none.
-        pixel_size: Edge of a pixel in the middle of the scene, model units.
-    Raises:
-        ConfigError: no density passes the threshold.
     Source:
         Lewiner et al. 2003, as in scikit-image.
     """
@@ -131,13 +119,7 @@ def _extract_mesh(
 def _filled(
     densities: Float32[np.ndarray, "X Y Z"], grid: GridPoints, scene: TrainedScene, surface: SeenSurface
 ) -> Float32[np.ndarray, "X Y Z"]:
-    """Densities with what no camera sees into as solid as the densest point, so that surfaces have no inner side.
-
-    Args:
-        densities: At the grid's points, 0 where nothing is rendered.
-        grid: Of the densities, model space.
-        surface: What the cameras see.
-    """
+    """Densities with what no camera sees into as solid as the densest point, so that surfaces have no inner side."""
     result, solid = densities.copy(), densities.max()
     for index in range(len(result)):
         points = grid.slice_points(index)
@@ -265,11 +247,7 @@ def _mesh_paths(folder: Path, formats: tuple[_MeshFormat, ...]) -> list[Path]:
 
 
 def _require_sound(density: float | None, smoothing: float) -> None:
-    """Refuse impossible settings.
-
-    Raises:
-        ConfigError: a density that is not positive, or a smoothing that is negative or wider than what it smooths.
-    """
+    """Refuse impossible settings."""
     if density is not None and not 0 < density < math.inf:
         raise ConfigError(f"--density is {density:g}; it must be greater than 0")
     if not 0 <= smoothing <= _MOST_SMOOTHING:
@@ -288,15 +266,6 @@ def _write_mesh(
     PLY carries all of it; glTF positions, normals, colours (linear), `_MATERIAL` and abundances; OBJ positions,
     normals, colours (sRGB) and the material of each face. Large coordinates are float64 in PLY and OBJ; glTF has them
     less `offset` in the extras of its mesh.
-
-    Args:
-        folder: Where to write; it is made.
-        formats: Which.
-        mesh: Model space.
-        scene: Trained.
-        frame: From the scene's world to model space; files are in world coordinates.
-    Raises:
-        RunError: there is no face, or the disk is full or refuses.
     """
     from unmix_plugin.trained.run_views import directions_to_world, positions_for_files
     from unmix_plugin.trained.surface import SurfaceAppearance, look_from_above

@@ -93,17 +93,7 @@ def _find_metamers(
     library: MaterialLibrary,
     options: Metamerism,
 ) -> _Metamers:
-    """Look at all pairs of surfaces in all lights.
-
-    Args:
-        materials: The run's materials.
-        scene_light: What it was recorded in; None for flat light.
-        library: Measured materials.
-        options: Which materials and lights, and what counts as alike and as different.
-    Raises:
-        SpectrumError: a light that is unknown or does not cover the run's bands, bands that can't tell colours, or
-            thresholds the wrong way round.
-    """
+    """Look at all pairs of surfaces in all lights."""
     is_visible = materials.bands.visible_mask
     if not is_visible.any():
         raise SpectrumError(f"{materials.bands} hold no visible light, so nothing is known of metamerism")
@@ -127,9 +117,6 @@ def _write_metamerism(folder: Path, found: _Metamers) -> list[Path]:
     """Write the pairs as CSV and swatches of the first dozen in every light.
 
     Pairs with an endmember of the run come first, each kind sorted by their greatest difference.
-
-    Raises:
-        RunError: the disk is full or refuses.
     """
     table_path, figure_path = _metamerism_paths(folder)
     return [write_file(table_path, _table(found)), write_file(figure_path, _draw_metamers(found))]

@@ -114,11 +114,7 @@ def _components_path(folder: Path) -> Path:
 
 
 def _write_pca(folder: Path, name: str, view: PredictedView, components: _Components) -> Path:
-    """Write a view's components as red, green and blue, fading into grey where nothing is; a pixel a pixel.
-
-    Raises:
-        RunError: the disk is full or refuses.
-    """
+    """Write a view's components as red, green and blue, fading into grey where nothing is; a pixel a pixel."""
     values = view.spectra if components.of == "spectra" else view.shares
     colours = as_numpy(components.colours(values.double()))
     painted = over_neutral(colours, as_numpy(view.accumulation))
@@ -132,9 +128,6 @@ def _write_pca(folder: Path, name: str, view: PredictedView, components: _Compon
 def _write_components(folder: Path, components: _Components, materials: Materials) -> Path:
     """Write what red, green and blue stand for: a row for each band or endmember, with its mean and its weight in each
     component; then the values that become 0 and 1, and the part of the variance that each component explains.
-
-    Raises:
-        RunError: the disk is full or refuses.
     """
     colours = components.colours
     of_spectra = components.of == "spectra"

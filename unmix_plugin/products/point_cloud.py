@@ -78,13 +78,7 @@ def _plane_normals(
     towards: Float[np.ndarray, "P 3"],
     wanted: Int64[np.ndarray, " chosen"],
 ) -> Float[np.ndarray, "chosen 3"]:
-    """Unit normals of the planes through the neighbours of some points.
-
-    Args:
-        positions: All points.
-        towards: Directions, of which a point's normal makes an acute angle with its own.
-        wanted: Points to have normals of.
-    """
+    """Unit normals of the planes through the neighbours of some points."""
     if len(positions) < 3:
         return _unit(towards[wanted])
     from scipy.spatial import KDTree
@@ -141,14 +135,7 @@ class _PointScore:
     def values(
         self, diffuse: Float[Tensor, "P B"], light: Float[Tensor, "B"] | None
     ) -> Float32[np.ndarray, " P"]:
-        """The numbers, relative to all the points given where a target needs a background; NaN where undefined.
-
-        Args:
-            diffuse: Spectra of points without the view-dependent part.
-            light: Relative power of the light that they are seen in; None where it is unknown.
-        Raises:
-            SpectrumError: too few points to judge a target against, or all are alike.
-        """
+        """The numbers, relative to all the points given where a target needs a background; NaN where undefined."""
         opaque = torch.ones(len(diffuse), dtype=diffuse.dtype)
         reflectance = seen_reflectance(diffuse, opaque, light, 0.5)
         return self.map.fit(reflectance)(reflectance).numpy().astype(np.float32)
@@ -160,15 +147,7 @@ class _PointScore:
 
 
 def _require_point_scores(outputs: Sequence[str], bands: Bands) -> list[_PointScore]:
-    """Numbers to add to points; an output asked for twice is given once.
-
-    Args:
-        outputs: Such as `index:ndvi`, `index:r800/r670`, `target:ace:paint.csv`.
-        bands: The run's bands.
-    Raises:
-        ConfigError: another output, an unknown index, a formula that can't be read.
-        SpectrumError: the bands do not cover what one needs, or a target that can't be read.
-    """
+    """Numbers to add to points; an output asked for twice is given once."""
     scores: list[_PointScore] = []
     for output in dict.fromkeys(_plain(output) for output in outputs):
         if not is_reflectance_map(output) or not output.partition(":")[2]:
@@ -238,11 +217,7 @@ def _point_cloud_path(folder: Path) -> Path:
 
 
 def _require_count(num_points: int) -> int:
-    """The number of points asked for.
-
-    Raises:
-        ConfigError: none, or more than ten million.
-    """
+    """The number of points asked for."""
     low, high = _COUNT_BOUNDS
     if not low <= num_points <= high:
         raise ConfigError(f"--num-points is {num_points}; choose {low} to {high}")
@@ -262,18 +237,8 @@ def _write_point_cloud(
     x y z (float32, float64 where coordinates are large), nx ny nz (float32), red green blue (uint8, sRGB of the diffuse
     spectrum), material (uint8), every abundance and every score (float32).
 
-    Args:
-        folder: Where to write; it is made.
-        points: Candidates, model space.
-        num_points: The most to write.
-        materials: The scene's materials.
-        frame: From the scene's world to model space.
-        scores: More numbers for every point, from its diffuse spectrum; targets take the cloud as background.
     Returns:
         The file, and how many points are in it.
-    Raises:
-        RunError: there is no point, or the disk is full or refuses.
-        SpectrumError: too few points to judge a target against, or all are alike.
     """
     from unmix_plugin.trained.run_views import directions_to_world, positions_for_files
     from unmix_plugin.trained.surface import SurfaceAppearance

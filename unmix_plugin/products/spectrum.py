@@ -140,9 +140,6 @@ def _spectrum_paths(folder: Path, name: str) -> list[Path]:
 def _write_spectrum(folder: Path, name: str, place: _ProbedPlace, materials: Materials) -> list[Path]:
     """Write NAME.csv (`wavelength,predicted,...`, `measured` where it is known), NAME.json (where the place is, its
     opacity, abundances and nearest known materials) and NAME.png, a plot.
-
-    Raises:
-        RunError: the disk is full or refuses.
     """
     table_path, facts_path, plot_path = _spectrum_paths(make_folder(folder), name)
     columns = dict(place.probe.spectra)

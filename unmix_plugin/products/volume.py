@@ -60,15 +60,6 @@ def _write_volume(
     Arrays: `density` (X, Y, Z) float32 per world unit; `abundances` (X, Y, Z, K) float32, summing to 1; both are 0 in
     cells that are never rendered. `index_to_world` (4, 4) float64 leads from (i, j, k, 1) to world points.
     `endmember_names`, `endmembers` (K, B) float32 and `wavelengths_nm` (B,) say what the abundances are of.
-
-    Args:
-        folder: Where to write; it is made.
-        scene: Trained.
-        grid: Where to sample.
-        frame: From the scene's world to model space.
-        slices: 0 to X - 1, in order.
-    Raises:
-        RunError: the disk is full or refuses.
     """
     from unmix_plugin.trained.run_views import affine_to_world
     from unmix_plugin.trained.surface import sample_slice

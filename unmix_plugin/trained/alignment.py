@@ -61,11 +61,7 @@ def align_gain(
 def _fitted_gain(
     power: Float[Tensor, "B"], agreement: Float[Tensor, "B"], wavelengths_nm: Float[Tensor, "B"]
 ) -> Float[Tensor, "B"]:
-    """Smooth gain g of least squared error, by Gauss-Newton steps.
-
-    Args:
-        power, agreement: Sums over pixels of p p and p m, where p is predicted and m measured.
-    """
+    """Smooth gain g of least squared error, by Gauss-Newton steps."""
     terms = smooth_terms(wavelengths_nm)
     logs = torch.zeros(len(terms), dtype=terms.dtype)
     ridge = 1e-9 * power.sum() * torch.eye(len(terms), dtype=terms.dtype)

@@ -32,11 +32,7 @@ from unmix_plugin.trained.run_views import RunView
 
 @torch.no_grad()
 def _probe_pixel(scene: TrainedScene, camera: Cameras, pixel: tuple[int, int]) -> Probe:
-    """What is seen in a pixel (column, row), as a render of the whole view has it: radiance on black.
-
-    Raises:
-        ConfigError: the pixel is outside the image.
-    """
+    """What is seen in a pixel (column, row), as a render of the whole view has it: radiance on black."""
     one = one_pixel(camera, *pixel).to(scene.device)
     found, materials = scene.look(one).coefficients.flatten(), scene.materials
     opacity = float(found.accumulation)
@@ -63,9 +59,6 @@ def _probe_pixel(scene: TrainedScene, camera: Cameras, pixel: tuple[int, int]) -
 def _probe_point(scene: TrainedScene, point: tuple[float, float, float]) -> Probe:
     """What a point of the world is made of: its spectrum, lit squarely where the light moves with the camera, without
     the view-dependent part.
-
-    Raises:
-        ConfigError: the point is outside the scene box.
     """
     world = np.array(point, dtype=np.float64)
     place = scene.frame.to_model(world)

@@ -125,12 +125,7 @@ class _FrameExchange:
     """Takes the frames that this process draws; at the end of a round they follow each other by rank."""
 
     def __init__(self, processes: Processes, num_videos: int, videos: Sequence[FrameSink]) -> None:
-        """
-        Args:
-            processes: All of which end each round.
-            num_videos: Frames of a view.
-            videos: Where frames go; only the first process has them.
-        """
+        """"""
         self._processes, self._videos = processes, videos
         self._drawn: list[np.ndarray | None] = [None] * num_videos
 
@@ -143,11 +138,7 @@ class _FrameExchange:
         return take
 
     def end_round(self) -> None:
-        """Hand over the frames of this round; a process without a view in it has none.
-
-        Raises:
-            RunError: in the first process, the disk is full or refuses.
-        """
+        """Hand over the frames of this round; a process without a view in it has none."""
         if not self._drawn:
             return
         drawn = self._processes.gather(self._drawn)
