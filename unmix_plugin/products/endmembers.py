@@ -41,7 +41,7 @@ def _endmember_paths(folder: Path) -> list[Path]:
 
 
 def _write_endmembers(folder: Path, materials: Materials) -> list[Path]:
-    """Write the endmembers as CSV (wavelength in nm, a column a spectrum), as an ENVI spectral library and as a plot."""
+    """Write the endmembers as CSV (wavelength in nm, a column a spectrum), ENVI spectral library and plot."""
     table_path, *_, plot_path = _endmember_paths(make_folder(folder))
     spectra = materials.endmembers.detach().cpu().numpy().astype(np.float32)
     about = "endmembers: radiance, 1 = full scale"
