@@ -223,7 +223,10 @@ def test_each_point_has_material_abundances_and_the_colour_of_its_diffuse_spectr
 def test_the_file_says_what_it_is(cloud):
     ply, _ = cloud
     assert ply.comments[0] == "surface points of an unmix-nerf run"
-    assert "coordinates: world of the scene's transforms.json" in ply.comments[1]
+    assert (
+        "coordinates: world of the given poses, or of transforms.json if they were estimated"
+        in ply.comments[1]
+    )
     assert ply.comments[2:] == [f"material {index}: endmember_{index}" for index in range(3)]
 
 

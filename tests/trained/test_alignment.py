@@ -16,13 +16,14 @@ from unmix_plugin.trained.evaluation import ViewTruth
 
 POSE = torch.tensor([[[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4.0]]])
 CAMERA = Cameras(POSE, torch.full((1, 2), 60.0), torch.full((1, 2), 16.0), torch.zeros(1, 4), 32, 32)
+SCENE = make_scene()
 OFF = torch.tensor([0.02, -0.015, 0.02, 0.01, 0.02, -0.01])
 
 
 def swept() -> Cameras:
     """The same view taken row by row, while the camera turns."""
-    poses = _moved(CAMERA, torch.tensor([0.2, 0.0, 0.0, 0.0, 0.0, 0.0]), make_scene()).camera_to_world
-    ends = _moved(CAMERA, torch.tensor([-0.2, 0.0, 0.0, 0.0, 0.0, 0.0]), make_scene()).camera_to_world
+    poses = _moved(CAMERA, torch.tensor([0.2, 0.0, 0.0, 0.0, 0.0, 0.0]), SCENE).camera_to_world
+    ends = _moved(CAMERA, torch.tensor([-0.2, 0.0, 0.0, 0.0, 0.0, 0.0]), SCENE).camera_to_world
     keys = KeyPoses(torch.cat([poses, ends]), torch.tensor([0.5, 31.5]), (2,))
     return Cameras(POSE, CAMERA.focal_px, CAMERA.center_px, CAMERA.distortion, 32, 32, key_poses=keys)
 
@@ -41,7 +42,7 @@ def points_seen(camera: Cameras) -> torch.Tensor:
 
 @pytest.mark.parametrize(("camera", "share"), [(CAMERA, 1.0), (swept(), 0.4)])
 def test_a_view_that_is_off_by_pixels_is_brought_back(camera, share):
-    scene = make_scene()
+    scene = SCENE
     given = _moved(camera, share * OFF, scene)
     before = (points_seen(given) - points_seen(camera)).norm(dim=1).mean()
     found = align_pose(scene, given, truth_of(scene, camera))
@@ -51,7 +52,7 @@ def test_a_view_that_is_off_by_pixels_is_brought_back(camera, share):
 
 
 def test_a_view_that_is_off_by_a_quarter_of_its_width_is_brought_back_too():
-    scene = make_scene()
+    scene = SCENE
     given = _moved(CAMERA, torch.tensor([-0.1, 0.12, 0.1, 0.0, 0.0, 0.0]), scene)
     assert float((points_seen(given) - points_seen(CAMERA)).norm(dim=1).mean()) > 7
     found = align_pose(scene, given, truth_of(scene, CAMERA))
@@ -59,13 +60,13 @@ def test_a_view_that_is_off_by_a_quarter_of_its_width_is_brought_back_too():
 
 
 def test_a_view_that_is_right_stays():
-    scene = make_scene()
+    scene = SCENE
     found = align_pose(scene, CAMERA, truth_of(scene, CAMERA))
     assert float((points_seen(found) - points_seen(CAMERA)).norm(dim=1).mean()) < 0.05
 
 
 def test_a_view_of_something_else_does_not_leave_the_scene():
-    scene = make_scene()
+    scene = SCENE
     noise = torch.rand(32, 32, 5, generator=torch.Generator().manual_seed(0))
     found = align_pose(scene, CAMERA, ViewTruth("a", noise, torch.ones(32, 32, dtype=torch.bool)))
     turn = found.camera_to_world[0, :, :3].diagonal().sum()
@@ -86,7 +87,7 @@ def swept_rows(wobble: float) -> Cameras:
     for row in y.tolist():
         turn = [0.2 - 0.4 * row / 32, 0.0, wobble * float(torch.sin(torch.tensor(0.3 * row)))]
         turn[1] = wobble * float(torch.cos(torch.tensor(0.25 * row)))
-        poses.append(moved(CAMERA, torch.tensor([*turn, 0.0, 0.0, 0.0]), make_scene()).camera_to_world)
+        poses.append(_moved(CAMERA, torch.tensor([*turn, 0.0, 0.0, 0.0]), SCENE).camera_to_world)
     return replace(CAMERA, key_poses=KeyPoses(torch.cat(poses), y, (32,)))
 
 
@@ -101,21 +102,21 @@ def off_by(found: Cameras, truth: Cameras) -> float:
 
 
 def test_rows_that_wobble_are_aligned():
-    scene, truth, given = make_scene(), swept_rows(0.02), swept_rows(0.0)
+    scene, truth, given = SCENE, swept_rows(0.02), swept_rows(0.0)
     found = align_rows(scene, given, truth_of(scene, truth))
     assert off_by(given, truth) > 0.7
     assert off_by(found, truth) < 0.3 * off_by(given, truth)
 
 
 def test_rows_that_are_right_stay():
-    scene, truth = make_scene(), swept_rows(0.02)
+    scene, truth = SCENE, swept_rows(0.02)
     found = align_rows(scene, truth, truth_of(scene, truth))
     assert off_by(found, truth) < 0.1
     assert points_seen(found).isfinite().all()
 
 
 def test_a_view_that_shows_nothing_keeps_its_poses():
-    scene, camera = make_scene(), swept_rows(0.02)
+    scene, camera = SCENE, swept_rows(0.02)
     empty = truth_of(scene, camera)
     empty = replace(empty, valid=torch.zeros_like(empty.valid))
     found = align_rows(scene, camera, empty)

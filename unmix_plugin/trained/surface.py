@@ -308,7 +308,11 @@ class SurfaceAppearance:
         """What a file says of itself."""
         colours = describe_colour(self.materials.bands)
         materials = [f"material {index}: {name}" for index, name in enumerate(self.materials.names)]
-        return [what, f"coordinates: world of the scene's transforms.json; {colours}", *materials]
+        return [
+            what,
+            f"coordinates: world of the given poses, or of transforms.json if they were estimated; {colours}",
+            *materials,
+        ]
 
 
 def _property_names(names: tuple[str, ...]) -> list[str]:
