@@ -32,7 +32,7 @@ def finished(page, viewer):
         return (
             isinstance(frame, ModelView)
             and frame.camera.height == 48
-            and view.asked_at is None
+            and view._asked_at is None
             and frame.num_estimates == frame.num_wanted == 4
         )
 
