@@ -16,6 +16,7 @@ from tests.fuzz.mutation import mutate_json, mutate_png
 from tests.fuzz.reader import Reader
 from tests.scenes.scene_factory import look_at
 from unmix_plugin.errors import ConfigError, SceneError, SpectrumError
+from unmix_plugin.formats.envi import read_library_table
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, _measure_cube, read_array_header
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.images import UnreadableImageError, read_colour, read_labels, read_mask
