@@ -140,6 +140,7 @@ def test_a_full_disk_exits_2_and_leaves_no_part_of_a_file(run_copy, monkeypatch)
     assert [path for path in (run_copy / "eval").rglob("*") if path.is_file()] == []
 
 
+@pytest.mark.slow
 def test_two_processes_find_what_one_finds(evaluated, tmp_path):
     path = Path(shutil.copytree(evaluated[0], tmp_path / "run"))
     alone = (path / "eval" / "metrics.json").read_bytes()
