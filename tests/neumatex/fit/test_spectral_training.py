@@ -26,7 +26,7 @@ from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.train import train
 from unmix_plugin.engine import load_model
-from unmix_plugin.neumatex.fit import start
+from unmix_plugin.neumatex.fit import data_manager, start
 from unmix_plugin.neumatex.fit.model import NeumatexModel, _settle
 from unmix_plugin.neumatex.fit.start import _as_bright
 from unmix_plugin.neumatex.fit.trained_object import TrainedObject
@@ -39,6 +39,15 @@ from unmix_plugin.viewer.layers.layers import layers_of
 from unmix_plugin.viewer.layers.painting import LayerSettings, SwatchLegend
 
 SPECTRAL = [*SMALL, "--pipeline.model.material=spectral", "--pipeline.model.num-endmembers=2"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_pixels():
+    """A ball of two materials needs few pixels to start from."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(data_manager, "_NUM_PIXELS", 2000)
+        patch.setattr(start, "_POINTS", 512)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +144,6 @@ def test_the_export_has_abundance_textures_and_endmembers(trained):
     assert (folder / "material.glb").stat().st_size > 1000
 
 
-@pytest.mark.slow
 def test_the_number_of_materials_is_proposed_where_it_is_asked_for(tmp_path):
     write_spectral_object(tmp_path / "ball")
     words = ["--data", tmp_path / "ball", "--output-dir", tmp_path / "out", "--max-num-iterations", 1]
@@ -146,7 +154,6 @@ def test_the_number_of_materials_is_proposed_where_it_is_asked_for(tmp_path):
     assert len(model.get_parameter("endmembers")) == 2
 
 
-@pytest.mark.slow
 def test_a_fit_starts_from_the_endmembers_and_abundances_of_a_run(tmp_path, monkeypatch):
     there = Normalisation(np.eye(3), -CENTRE, RUN_RADIUS / RADIUS)
     of_run = replace(ball_scene(), frame=there)
