@@ -54,7 +54,7 @@ class Subject:
 
         from unmix_plugin.editing import sample_seen
         from unmix_plugin.scenes.reading.loader import load_scene
-        from unmix_plugin.scenes.scene import SceneOptions
+        from unmix_plugin.settings import SceneOptions
         from unmix_plugin.spectral.segmentation import SegmentationTally
         from unmix_plugin.trained.open_run import open_run
 
@@ -197,7 +197,7 @@ def built_in_scene(run: LoadedRun, folder: Path, illuminant: str) -> Scene:
     """The scene that a run of it learnt, made in a light."""
     from unmix_plugin.scenes.demo.scene import make_demo_scene
     from unmix_plugin.scenes.reading.loader import load_scene
-    from unmix_plugin.scenes.scene import SceneOptions
+    from unmix_plugin.settings import SceneOptions
 
     cameras = run.record.train_cameras
     views = len(cameras) + len(run.record.eval_cameras)

@@ -16,7 +16,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from unmix_plugin.losses.training_losses import LossConfig
+from unmix_plugin.settings import LossConfig
 from unmix_plugin.spectral.segmentation import material_scores
 from unmix_plugin.spectral.unmixing.abundances import fcls, nnls, sparse_abundances, sunsal
 from unmix_plugin.spectral.unmixing.endmembers import (

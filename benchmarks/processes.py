@@ -25,7 +25,7 @@ import _machine
 import tyro
 
 from unmix_plugin.engine.runs.checkpoints import newest_complete_checkpoint
-from unmix_plugin.model_settings import UnmixModelConfig
+from unmix_plugin.settings import UnmixModelConfig
 
 PSNR_DIFFERENCE = _common.Limit(0.2, is_upper=True, unit=" dB")
 MIOU_DIFFERENCE = _common.Limit(0.02, is_upper=True)

@@ -146,7 +146,7 @@ def baselines(folder: Path, num_endmembers: int) -> dict[str, list[float]]:
     from _unmixing_2d import opaque_pixels
 
     from unmix_plugin.scenes.reading.loader import load_scene
-    from unmix_plugin.scenes.scene import SceneOptions
+    from unmix_plugin.settings import SceneOptions
     from unmix_plugin.spectral.unmixing.endmembers import initialise_endmembers
 
     scene = load_scene(folder, SceneOptions())

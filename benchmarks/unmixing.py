@@ -155,7 +155,7 @@ def measure_pixels(folder: Path, names: list[str], seeds: tuple[int, ...], found
     from _unmixing_methods import METHODS
 
     from unmix_plugin.scenes.reading.loader import load_scene
-    from unmix_plugin.scenes.scene import SceneOptions
+    from unmix_plugin.settings import SceneOptions
     from unmix_plugin.trained.evaluation import finite_or_none
 
     baselines = PixelBaselines(load_scene(folder, SceneOptions()))

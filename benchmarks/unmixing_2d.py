@@ -130,7 +130,7 @@ class _Views:
         from _unmixing_2d import PixelBaselines
 
         from unmix_plugin.scenes.reading.loader import load_scene
-        from unmix_plugin.scenes.scene import SceneOptions
+        from unmix_plugin.settings import SceneOptions
 
         self._baselines = PixelBaselines(load_scene(folder, SceneOptions()))
         if self._baselines.truth.endmembers is None:

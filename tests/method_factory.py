@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -11,10 +11,13 @@ import torch
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.engine.runs.load_run import SceneRecord
-from unmix_plugin.field import UnmixFieldConfig
-from unmix_plugin.model import UnmixModel
-from unmix_plugin.model_settings import UnmixModelConfig
-from unmix_plugin.rendering.settings import RendererConfig
+from unmix_plugin.losses.comparison import ComparedPixels
+from unmix_plugin.model import TrainingBatch, UnmixModel
+from unmix_plugin.poses.training import CorrectedRays
+from unmix_plugin.rendering.renderer import RenderedRays
+from unmix_plugin.sensors.batches import from_batch
+from unmix_plugin.settings import RendererConfig, UnmixFieldConfig, UnmixModelConfig
+from unmix_plugin.spectral.materials import Coefficients
 from unmix_plugin.trained.open_run import unmix_scene
 from unmix_plugin.trained.trained_scene import TrainedScene
 
@@ -90,3 +93,23 @@ def make_rays(num_rays: int, seed: int = 0) -> RayBundle:
     directions = torch.nn.functional.normalize(targets - origins, dim=-1)
     directions[-1:] *= -1
     return RayBundle(origins, directions, torch.zeros(num_rays, dtype=torch.int64))
+
+
+def losses_of(
+    model: UnmixModel,
+    batch: dict[str, torch.Tensor],
+    spectra: torch.Tensor,
+    opacities: torch.Tensor,
+    abundances: torch.Tensor | None = None,
+    sparsity: float = 0.0,
+) -> dict[str, torch.Tensor]:
+    """Losses of pixels, with one ray each, that are rendered so; `spectra` are on black."""
+    count, none = len(spectra), torch.zeros(0)
+    abundances = torch.zeros(count, model.num_endmembers) if abundances is None else abundances
+    nothing = Coefficients(torch.zeros(count, 2), 0)
+    rendered = RenderedRays(
+        nothing, abundances, 0, torch.tensor(sparsity), torch.zeros(0, 3), none, none.long(), cast(Any, None)
+    )
+    [measured] = from_batch({"pixels": torch.arange(count), **batch}, count, model.seen_by.num_channels)
+    compared = ComparedPixels(measured, 1.0, slice(0, count, 1), spectra, opacities, abundances)
+    return model.losses(TrainingBatch(CorrectedRays(make_rays(count)), rendered, [compared]))

@@ -12,15 +12,15 @@ from PIL import Image
 from torch.testing import assert_close
 
 from tests.scenes.scene_factory import make_scene
+from unmix_plugin import datamanager
 from unmix_plugin.datamanager import HyperspectralDataManager
-from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.runs.scene_record import SceneRecord, check_same_scene, scene_record_to_json
 from unmix_plugin.errors import ConfigError, RunError, SceneError
 from unmix_plugin.scenes import pixel_block, pixel_table
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.scenes.evidence import relative_power
-from unmix_plugin.scenes.scene import SceneOptions
+from unmix_plugin.settings import HyperspectralDataManagerConfig, SceneOptions
 
 CONFIG = HyperspectralDataManagerConfig(train_num_rays_per_batch=64, grid_resolution=16, single_ray_until=0.0)
 
@@ -110,14 +110,15 @@ def test_an_evaluation_image_carries_the_truth(scene_folder):
     assert_close(camera.camera_to_world[0], manager.scene.cameras.camera_to_world[view])
 
 
-def test_initial_pixels_come_from_opaque_pixels_of_all_training_views(scene_folder):
+def test_initial_pixels_come_from_opaque_pixels_of_all_training_views(scene_folder, monkeypatch):
     manager = make(scene_folder)
     data = manager.initial_data()
     opaque = sum(int((manager.scene.alpha(i) > 0.99).sum()) for i in manager.scene.train_indices)  # type: ignore[operator]
     assert data["pixels"].shape == (opaque, 6)
     assert data["reachable"].shape == (16, 16, 16)
     assert 0.02 < data["reachable"].mean() < 1
-    assert len(make(scene_folder, max_initial_pixels=50).initial_data()["pixels"]) == 50
+    monkeypatch.setattr(datamanager, "_MOST_INITIAL_PIXELS", 50)
+    assert len(make(scene_folder).initial_data()["pixels"]) == 50
 
 
 @pytest.mark.parametrize(("has_alpha", "power"), [(True, 1.5), (False, 0.0)])

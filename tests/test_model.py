@@ -16,7 +16,8 @@ from tests.method_factory import (
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.operators.compositing import volume_weights_twin
-from unmix_plugin.rendering.lit_samples import points_of
+from unmix_plugin.rendering.renderer import points_of
+from unmix_plugin.sensors.batches import from_batch
 
 
 def naive_spectra(model: UnmixModel, rays) -> torch.Tensor:
@@ -139,10 +140,10 @@ def occupied_after_training(has_alpha: bool = True, visible_weight: float | str 
     grey = torch.full((2000, NUM_BANDS), 0.3)
     batch = {"spectra": grey, "alpha": torch.ones(2000), "pixels": torch.arange(2000)}
     with torch.no_grad():
-        outputs = model.get_outputs(bundle)
-        seen_before = int(model.grid.visibility.num_rays)
-        model.observe(outputs, batch)
-        assert seen_before == 0
+        step = model.training_batch(bundle, from_batch(batch, 2000, model.seen_by.num_channels))
+        model.losses(step)
+        assert int(model.grid.visibility.num_rays) == 0
+        model.learn_from(step)
         model.get_training_callbacks()[0].func(0, 0.0)
     return model.grid.occupied.float().mean(dim=(0, 1)).flip(0)
 
@@ -158,24 +159,29 @@ def test_nothing_is_left_out_of_rooms_or_by_request():
     assert occupied_after_training(visible_weight=1.0).all()
 
 
-def test_outputs_and_losses_change_nothing_in_the_model():
+def test_rendering_and_losses_change_nothing_in_the_model():
     model = make_model().train()
     before = {name: value.clone() for name, value in model.state_dict().items()}
     rays = make_rays(16)
     spectra = torch.rand(16, NUM_BANDS)
     batch = {"spectra": spectra, "alpha": torch.ones(16), "pixels": torch.arange(16)}
-    losses = model.get_loss_dict(model.get_outputs(rays), batch)
+    losses = model.losses(model.training_batch(rays, from_batch(batch, 16, model.seen_by.num_channels)))
     torch.stack(list(losses.values())).sum().backward()
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
 
 
+def samples_of(model: UnmixModel) -> int:
+    batch = {"spectra": torch.rand(50, NUM_BANDS), "alpha": torch.ones(50), "pixels": torch.arange(50)}
+    return model.num_samples(model.get_train_loss_dict(make_rays(50), batch)[0])
+
+
 def test_images_of_many_pixels_are_sampled_coarsely_at_first():
-    renderer = replace(CONFIG.renderer, coarse_samples=10, coarse_until=0.5)
+    renderer = replace(CONFIG.renderer, coarse_samples=10)
     model = make_model(renderer=renderer).train()
     counts = []
     for progress in (0.0, 0.25, 0.5, 1.0):
         model._progress = progress
-        counts.append(int(model.get_outputs(make_rays(50))["num_samples"]))
+        counts.append(samples_of(model))
     assert 2.0 < counts[2] / counts[0] < 2.6  # 23 samples along an edge in the end
     assert counts[0] < counts[1] < counts[2] == counts[3]
-    assert int(model.eval().get_outputs(make_rays(50))["num_samples"]) == counts[3]
+    assert samples_of(model.eval()) == counts[3]

@@ -13,8 +13,7 @@ from tests.method_factory import (
     make_rays,
 )
 from unmix_plugin.errors import ConfigError, SpectrumError
-from unmix_plugin.losses.training_losses import LossConfig
-from unmix_plugin.model_settings import UnmixModelConfig
+from unmix_plugin.settings import LossConfig, UnmixModelConfig
 
 
 @pytest.mark.parametrize("trained", [True, False])

@@ -3,17 +3,16 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
 from torch.testing import assert_close
 
 from tests.method_factory import BOX, CONFIG, NUM_BANDS, WAVELENGTHS_NM, initial_data, make_rays
 from tests.scenes.rig_factory import make_rig
 from unmix_plugin.datamanager import HyperspectralDataManager
-from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
-from unmix_plugin.losses.training_losses import LossConfig
+from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.model import UnmixModel
-from unmix_plugin.sensors.batches import join_parts, split_parts
+from unmix_plugin.sensors.batches import MeasuredPixels, from_batch, to_batch
+from unmix_plugin.settings import HyperspectralDataManagerConfig, LossConfig
 
 BANDS = [2, 0, 3, 1]
 RESPONSES = [[0.5, 0.5, 0.0, 0.0, 0.0], [0.0, 0.0, 0.2, 0.3, 0.5]]
@@ -42,55 +41,48 @@ def make_model(**settings) -> UnmixModel:
     return model
 
 
-def make_batch():
+def make_batch() -> tuple[RayBundle, list[MeasuredPixels]]:
     generator = torch.Generator().manual_seed(3)
-    parts, first = [], 0
-    for sensor, (count, rays, channels) in enumerate(zip(PIXELS, RAYS, (4, 2), strict=True)):
-        measured = {
-            "spectra": 0.1 + 0.8 * torch.rand(count, channels, generator=generator),
-            "alpha": torch.rand(count, generator=generator),
-            "pixels": torch.arange(first, first + count),
-        }
-        parts.append((sensor, make_rays(count * rays, seed=sensor), measured))
+    rays, pixels, first = [], [], 0
+    for sensor, (count, each, channels) in enumerate(zip(PIXELS, RAYS, (4, 2), strict=True)):
+        spectra = 0.1 + 0.8 * torch.rand(count, channels, generator=generator)
+        alpha = torch.rand(count, generator=generator)
+        numbers = torch.arange(first, first + count)
+        pixels.append(MeasuredPixels(sensor, count * each, spectra, alpha, numbers))
+        rays.append(make_rays(count * each, seed=sensor))
         first += count
-    return join_parts(parts)
+    return RayBundle.join(rays), pixels
 
 
 def operator(sensor: int) -> torch.Tensor:
     return torch.eye(NUM_BANDS)[BANDS] if sensor == 0 else torch.tensor(RESPONSES)
 
 
-def test_what_was_joined_comes_apart_again():
-    rays, batch = make_batch()
+def test_a_batch_is_the_pixels_that_it_was_made_of():
+    rays, pixels = make_batch()
+    batch = to_batch(pixels)
     assert batch["spectra"].shape == (9, 4)
-    outputs = {"accumulation": torch.arange(18.0), "num_samples": torch.tensor(5)}
-    first, second = split_parts(outputs, batch, [4, 2].__getitem__)
-    assert (first.sensor, second.sensor) == (0, 1)
-    assert (first.share, second.share) == pytest.approx((6 / 18, 12 / 18))
-    assert second.outputs["accumulation"].tolist() == list(range(6, 18))
-    assert second.batch["spectra"].shape == (3, 2)
-    assert second.batch["pixels"].tolist() == [6, 7, 8]
-    assert len(rays) == 18
-    [whole] = split_parts(outputs, {"spectra": torch.zeros(18, 3)}, [3].__getitem__)
-    assert whole.outputs is outputs
+    for own, expected in zip(from_batch(batch, len(rays), [4, 2].__getitem__), pixels, strict=True):
+        assert (own.sensor, own.num_rays) == (expected.sensor, expected.num_rays)
+        assert torch.equal(own.spectra, expected.spectra)
+        assert torch.equal(own.pixels, expected.pixels)
+        assert own.surfaces is None
+    alone = replace(pixels[0], sensor=None)
+    [whole] = from_batch(to_batch([alone]), alone.num_rays, [4].__getitem__)
+    assert (whole.sensor, whole.num_rays, len(whole)) == (None, 6, 6)
 
 
 def test_the_loss_is_the_mean_error_of_what_each_sensor_sees():
-    model = make_model(
-        losses=LossConfig(background="black", rgb=0.0, opacity=0.0, spread=0.0, abundances=0.0)
-    ).eval()
-    rays, batch = make_batch()
-    outputs = model.get_outputs(rays)
-    loss = model.get_loss_dict(outputs, batch)["spectral"]
-    model.seen_by = type(model.seen_by)((), model.rgb_weights)
+    settings = LossConfig(background="black", rgb=0.0, abundances=0.0)
+    model = make_model(losses=settings).eval()
+    rays, pixels = make_batch()
+    loss = model.losses(model.training_batch(rays, pixels))["spectral"]
     spectra = model.get_outputs(rays)["spectral"]
-    errors, first_ray, first_pixel = [], 0, 0
-    for sensor, (count, num_rays) in enumerate(zip(PIXELS, RAYS, strict=True)):
-        seen = spectra[first_ray : first_ray + count * num_rays] @ operator(sensor).T
-        pixels = seen.unflatten(0, (count, num_rays)).mean(dim=1)
-        measured = batch["spectra"][first_pixel : first_pixel + count, : pixels.shape[1]]
-        errors.append((pixels - measured).square().mean())
-        first_ray, first_pixel = first_ray + count * num_rays, first_pixel + count
+    errors, first = [], 0
+    for sensor, own in enumerate(pixels):
+        seen = spectra[first : first + own.num_rays] @ operator(sensor).T
+        errors.append((seen.unflatten(0, (len(own), -1)).mean(dim=1) - own.spectra).square().mean())
+        first += own.num_rays
     assert_close(loss, 6 / 18 * errors[0] + 12 / 18 * errors[1])
     loss.backward()
     assert model.endmembers.grad is not None
@@ -99,18 +91,16 @@ def test_the_loss_is_the_mean_error_of_what_each_sensor_sees():
 
 def test_every_loss_works_on_every_sensor_and_pixels_of_few_channels_are_not_unmixed():
     model = make_model(losses=LossConfig(abundances=0.5)).train()
-    rays, batch = make_batch()
-    outputs = model.get_outputs(rays)
-    losses = model.get_loss_dict(outputs, batch, model.get_metrics_dict(outputs, batch))
+    rays, pixels = make_batch()
+    opaque = [replace(own, alpha=torch.ones(len(own))) for own in pixels]
+    _, losses, metrics = model.get_train_loss_dict(rays, to_batch(opaque))
     assert {"spectral", "rgb", "abundances"} <= losses.keys()
     assert all(loss.isfinite() and loss > 0 for loss in losses.values())
+    assert metrics["psnr"].isfinite()
     assert [model.seen_by.tells_materials(sensor, 3) for sensor in (0, 1)] == [True, False]
-    model.observe(outputs, {**batch, "alpha": torch.ones(9)})
     assert model.guide.margin_variance.isfinite()
-    _, colour = split_parts(outputs, batch, model.seen_by.num_channels)
-    alone = {**colour.batch, "sensors": torch.tensor([1])}
-    alone |= {"sensor_pixels": torch.tensor([3]), "sensor_rays": torch.tensor([4])}
-    assert "abundances" not in model.get_loss_dict(dict(colour.outputs), alone)
+    alone = model.losses(model.training_batch(rays[6:], pixels[1:]))
+    assert "abundances" not in alone
 
 
 def test_first_endmembers_are_right_on_the_bands_that_were_seen_and_positive_on_others():

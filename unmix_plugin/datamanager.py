@@ -16,7 +16,6 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.engine.machine import step_generator
@@ -39,12 +38,15 @@ from unmix_plugin.scenes.geometry.view_agreement import check_scene_poses, paral
 from unmix_plugin.scenes.pixel_table import PixelRays, PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import check_recorded_scene, scene_identity
-from unmix_plugin.sensors.batches import join_parts
+from unmix_plugin.sensors.batches import MeasuredPixels, to_batch
+from unmix_plugin.settings import HyperspectralDataManagerConfig
 from unmix_plugin.spectral.bad_values import BandNoise
 from unmix_plugin.spectral.unmixing.endmembers import typical_spectrum
 
 _MANY_PIXELS = 4_000_000
 """Pixels of all training views beyond which one ray a pixel is enough."""
+_MOST_INITIAL_PIXELS = 50_000
+"""Pixels, drawn from all training views, from which the endmembers are initialised."""
 _FAIRLY_EXPLAINED = 0.99
 """Share of the foreground that a hull must explain to be carved by refined cameras; where poses are off by many pixels,
 views look through what others show."""
@@ -86,18 +88,23 @@ class HyperspectralDataManager(DataManager):
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
         """Random valid pixels of the training views; the draw depends on (seed, step) only."""
         generator = step_generator(self.seed, step)
-        parts = []
+        rays, measured = [], []
         for drawn in self._pixels.draw(self._pixels_for(self._num_rays), generator, step, self._shares):
-            measured = {
-                "spectra": drawn.spectra,
-                "alpha": drawn.alpha,
-                "alpha_trust": self._evidence.trust(drawn),
-                "pixels": drawn.numbers,
-            }
-            if self._surfaces.is_known:
-                measured["surfaces"] = self._surfaces.points(drawn)
-            parts.append((drawn.sensor, self._rays.through(drawn, self._subpixels, generator), measured))
-        return join_parts(parts) if self.scene.is_rig else parts[0][1:]
+            trust = self._evidence.trust(drawn)
+            surfaces = self._surfaces.points(drawn) if self._surfaces.is_known else None
+            rays.append(self._rays.through(drawn, self._subpixels, generator))
+            measured.append(
+                MeasuredPixels(
+                    drawn.sensor if self.scene.is_rig else None,
+                    len(rays[-1]),
+                    drawn.spectra,
+                    drawn.alpha,
+                    drawn.numbers,
+                    trust,
+                    surfaces,
+                )
+            )
+        return RayBundle.join(rays), to_batch(measured)
 
     def eval_image(self, index: int) -> tuple[Cameras, dict[str, Tensor]]:
         """Camera and whole image of one evaluation view."""
@@ -165,7 +172,7 @@ class HyperspectralDataManager(DataManager):
 
     @cached_property
     def _initial_data(self) -> Mapping[str, np.ndarray]:
-        most, seed, sensors = self.options.max_initial_pixels, self.seed, self.scene.sensors
+        most, seed, sensors = _MOST_INITIAL_PIXELS, self.seed, self.scene.sensors
         shares = self._pixels.shares
         chosen = max(shares, key=lambda sensor: (sensors[sensor].num_channels, shares[sensor]))
         reachable, _ = self._carved

@@ -11,99 +11,38 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from dataclasses import dataclass, field
-from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from unmix_plugin.engine.configs import InstantiateConfig, Target
 from unmix_plugin.engine.geometry.space import SceneBox, contracted_unit
 from unmix_plugin.engine.model import Field
-from unmix_plugin.errors import require
-from unmix_plugin.light.directions import (
+from unmix_plugin.light.lamp import Lamp, MovingLamp
+from unmix_plugin.light.shading import (
+    LOBES,
     NUM_DIRECTION_FEATURES,
     NUM_SKY_FEATURES,
+    Lamplight,
+    LampShading,
+    LitSurface,
+    bias_free_network,
     direction_features,
+    in_parts,
+    rows_of_outputs,
     sky_features,
 )
-from unmix_plugin.light.lamp import Lamp, MovingLamp
-from unmix_plugin.light.networks import bias_free_network, in_parts, rows_of_outputs
-from unmix_plugin.light.shading import LOBES, Lamplight, LampShading, LitSurface
 from unmix_plugin.operators.hash_encoding import HashGridLayout, hash_encode
-from unmix_plugin.presets import Auto
+from unmix_plugin.presets import choose
+from unmix_plugin.settings import LARGEST_RESOLUTION, UnmixFieldConfig
 
 _LARGEST_LOG_DENSITY = 15.0
-LARGEST_RESOLUTION = 4096
 _ROWS_PER_CELL_OF_A_FACE = 1 / 3
 _FEWEST_LOG2_ROWS, _MOST_LOG2_ROWS = 16, 19
-
-
-@dataclass(frozen=True)
-class UnmixFieldConfig(InstantiateConfig):
-    """Sizes of the field's grid and networks."""
-
-    _target: Target = field(default_factory=lambda: UnmixField)
-    num_levels: int = 8
-    """Levels of the hash grid."""
-    features_per_level: int = 4
-    """Features that the hash grid holds at each vertex of a level."""
-    coarsest_resolution: int = 16
-    """Cells along an edge of the scene box on the coarsest level."""
-    cells_per_pixel: float = 1.7
-    """Cells of the finest level along the edge of a pixel where it meets the middle of the scene box: finer ones would
-    fit what the views don't show."""
-    log2_rows_per_level: int | Auto = "auto"
-    """Largest number of vertices that a level stores, as a power of two; finer levels share rows by a hash. auto: from
-    16 to 19, about a third of the finest level's cells in a face of the scene box."""
-    hidden_width: int = 64
-    """Width of the hidden layers."""
-    num_features: int = 15
-    """Geometry features that the heads see."""
-    temperature: float = 1.0
-    """T of the abundances' softmax: lower is purer."""
-    scale: Literal["shared", "per-endmember"] = "shared"
-    """One brightness a point, or one a point and endmember as published."""
-    specular_bias: float = -3.0
-    """Logit of the view-dependent part at the start; low, so that colour is first explained by materials."""
-
-    def __post_init__(self) -> None:
-        """Refuse impossible settings.
-
-        Raises:
-            ConfigError: a number out of its range.
-        """
-        rules = {
-            "num-levels of 1 to 32": 1 <= self.num_levels <= 32,
-            "features-per-level of 1 to 8": 1 <= self.features_per_level <= 8,
-            "coarsest-resolution of 2 to 4096": 2 <= self.coarsest_resolution <= LARGEST_RESOLUTION,
-            "cells-per-pixel of 0.001 to 100": 0.001 <= self.cells_per_pixel <= 100,
-            "log2-rows-per-level of 4 to 24 or auto": (
-                self.log2_rows_per_level == "auto" or 4 <= self.log2_rows_per_level <= 24
-            ),
-            "hidden-width of 1 to 1024": 1 <= self.hidden_width <= 1024,
-            "num-features of 1 to 256": 1 <= self.num_features <= 256,
-            "a temperature of 0.01 to 100": 0.01 <= self.temperature <= 100,
-            "a specular-bias of -50 to 50": -50 <= self.specular_bias <= 50,
-        }
-        require("the field", self, rules)
-
-    def cells_of_finest_level(self, scene_box: SceneBox, pixel_size: float) -> int:
-        """Cells along the scene box's longest edge; `pixel_size` is as `UnmixField` takes it."""
-        cells = math.ceil(self.cells_per_pixel * float(scene_box.size.max()) / pixel_size)
-        return max(self.coarsest_resolution, min(cells, LARGEST_RESOLUTION))
-
-    def rows_of_level(self, finest_resolution: int) -> int:
-        """Log2 of the rows that a level may have, where the finest has so many cells along the longest edge.
-
-        A surface passes through as many cells as it has area, so the rows that large scenes need grow with the square
-        of their resolution; small ones would only learn more slowly with more rows.
-        """
-        if self.log2_rows_per_level != "auto":
-            return self.log2_rows_per_level
-        wanted = math.log2(finest_resolution**2 * _ROWS_PER_CELL_OF_A_FACE)
-        return max(_FEWEST_LOG2_ROWS, min(round(wanted), _MOST_LOG2_ROWS))
+NUM_FEATURES = 15
+"""Geometry features that the heads see."""
+_SPECULAR_BIAS = -3.0
+"""Logit of the view-dependent part at the start; low, so that colour is first explained by materials."""
 
 
 class CoefficientField(Field):
@@ -191,17 +130,17 @@ class UnmixField(CoefficientField):
         self.config, self.lit_by_camera = config, lit_by_camera
         self.lamp = MovingLamp(lamp) if lamp is not None and lit_by_camera else None
         self.lamp_shading: LampShading | None = None
-        self.specular_bias = config.specular_bias - math.log(exposure)
+        self.specular_bias = _SPECULAR_BIAS - math.log(exposure)
         self.num_endmembers, self.num_specular = num_endmembers, num_specular
         self.num_encoded = config.num_levels * config.features_per_level
         self.log_initial_density = math.log(initial_density)
-        finest_resolution = config.cells_of_finest_level(scene_box, pixel_size) * (2 if is_unbounded else 1)
+        finest_resolution = cells_of_finest_level(config, scene_box, pixel_size) * (2 if is_unbounded else 1)
         self.layout = HashGridLayout(
             config.num_levels,
             config.features_per_level,
             config.coarsest_resolution,
             finest_resolution,
-            config.rows_of_level(finest_resolution),
+            rows_of_level(config, finest_resolution),
         )
         self.register_buffer("aabb", scene_box.aabb.clone())
         self.is_unbounded = is_unbounded
@@ -214,7 +153,7 @@ class UnmixField(CoefficientField):
         self.register_buffer("level_weights", weights)
 
     def _make_networks(self) -> None:
-        width, num_features = self.config.hidden_width, self.config.num_features + 1
+        width, num_features = self.config.hidden_width, NUM_FEATURES + 1
         num_scales = 1 if self.config.scale == "shared" else self.num_endmembers
         num_seen = NUM_DIRECTION_FEATURES if self.lamp is None else len(LOBES)
         self.density_network = bias_free_network(self.num_encoded, width, num_features)
@@ -315,3 +254,20 @@ class UnmixField(CoefficientField):
 def bounded_exp(raw: Float[Tensor, "S"]) -> Float[Tensor, "S"]:
     """exp, clamped in value only: a point that grew too dense can still become less dense."""
     return (raw + (raw.clamp(max=_LARGEST_LOG_DENSITY) - raw).detach()).exp()
+
+
+def cells_of_finest_level(config: UnmixFieldConfig, scene_box: SceneBox, pixel_size: float) -> int:
+    """Cells along the scene box's longest edge; `pixel_size` is as `UnmixField` takes it."""
+    wanted = math.ceil(config.cells_per_pixel * float(scene_box.size.max()) / pixel_size)
+    cells = choose(config.finest_resolution, min(wanted, LARGEST_RESOLUTION))
+    return max(config.coarsest_resolution, cells)
+
+
+def rows_of_level(config: UnmixFieldConfig, finest_resolution: int) -> int:
+    """Log2 of the rows that a level may have, where the finest has so many cells along the longest edge.
+
+    A surface passes through as many cells as it has area, so the rows that large scenes need grow with the square of
+    their resolution; small ones would only learn more slowly with more rows.
+    """
+    wanted = round(math.log2(finest_resolution**2 * _ROWS_PER_CELL_OF_A_FACE))
+    return choose(config.log2_rows_per_level, max(_FEWEST_LOG2_ROWS, min(wanted, _MOST_LOG2_ROWS)))

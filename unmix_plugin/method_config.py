@@ -17,8 +17,7 @@ def _scene(*arguments: Any) -> Any:
 
 
 def _unmix_nerf() -> TrainerConfig:
-    from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
-    from unmix_plugin.model_settings import UnmixModelConfig
+    from unmix_plugin.settings import HyperspectralDataManagerConfig, UnmixModelConfig
 
     return TrainerConfig(
         method_name="unmix-nerf",
@@ -52,11 +51,13 @@ _AS_PUBLISHED = OptimizerConfig(lr=2e-2, final_factor=5e-4)
 
 
 def _unmix_nerf_published() -> TrainerConfig:
-    from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
-    from unmix_plugin.losses.training_losses import LossConfig
-    from unmix_plugin.model_settings import UnmixModelConfig
-    from unmix_plugin.rendering.published_field import PublishedFieldConfig
-    from unmix_plugin.rendering.settings import RendererConfig
+    from unmix_plugin.settings import (
+        HyperspectralDataManagerConfig,
+        LossConfig,
+        RendererConfig,
+        UnmixFieldConfig,
+        UnmixModelConfig,
+    )
 
     return TrainerConfig(
         method_name="unmix-nerf-published",
@@ -69,19 +70,22 @@ def _unmix_nerf_published() -> TrainerConfig:
                 specular="full",
                 light="fixed",
                 segmentation="probe",
-                field=PublishedFieldConfig(),
+                as_published=True,
+                field=UnmixFieldConfig(
+                    num_levels=16,
+                    features_per_level=2,
+                    finest_resolution=2048,
+                    log2_rows_per_level=19,
+                    temperature=0.4,
+                ),
                 renderer=RendererConfig(visible_weight=1.0),
                 losses=LossConfig(
                     background="random",
                     spectral=5.0,
                     rgb=1.0,
-                    opacity=0.0,
-                    spread=0.0,
-                    surface=0.0,
                     abundances=0.0,
                     exposure=1.0,
                     band_weights=(),
-                    outlier=1e6,
                     relative=0.0,
                 ),
             ),

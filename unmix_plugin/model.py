@@ -12,44 +12,60 @@ Source: Perez et al. 2025, UnMix-NeRF, eqs. 4 to 9.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from jaxtyping import Bool
 from torch import Tensor, nn
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle
-from unmix_plugin.engine.model import DataManager, Model, TrainingCallback, TrainingCallbackLocation
+from unmix_plugin.engine.model import (
+    DataManager,
+    Model,
+    TrainingCallback,
+    TrainingCallbackLocation,
+    TrainOutputs,
+)
 from unmix_plugin.field import CoefficientField, UnmixField
-from unmix_plugin.light.shadows import ShadowDetail
-from unmix_plugin.losses.abundance_guide import AbundanceGuide
-from unmix_plugin.losses.batch_comparison import BatchComparison
-from unmix_plugin.losses.first_endmembers import first_endmembers, first_specular_spectra
-from unmix_plugin.losses.normals import normals_error
-from unmix_plugin.losses.surfaces import surface_loss
-from unmix_plugin.model_settings import UnmixModelConfig
-from unmix_plugin.poses.training import PoseTraining
+from unmix_plugin.light.lamp import Lamp
+from unmix_plugin.light.shading import ShadowDetail
+from unmix_plugin.losses.abundance_guide import AbundanceGuide, first_endmembers, first_specular_spectra
+from unmix_plugin.losses.comparison import BatchComparison, ComparedPixels, loss_weights
+from unmix_plugin.losses.geometry import normals_error, stray_light
+from unmix_plugin.operators.occupancy import OccupancyGrid
+from unmix_plugin.poses.refinement import PoseRefinement
+from unmix_plugin.poses.training import CorrectedRays, PoseTraining
 from unmix_plugin.presets import choose, preset_for
 from unmix_plugin.rendering.grid_upkeep import is_due, record_seen, update_grid
-from unmix_plugin.rendering.model_parts import (
-    make_field,
-    make_grid,
-    make_pose_refinement,
-    make_renderer,
-    make_view_gains,
-)
-from unmix_plugin.rendering.ray_outputs import observed_by_rays, ray_outputs
-from unmix_plugin.rendering.renderer import VolumeRenderer
-from unmix_plugin.sensors.band_balance import BandBalance
-from unmix_plugin.sensors.views import SensorViews
+from unmix_plugin.rendering.published_field import PublishedField
+from unmix_plugin.rendering.renderer import RenderedRays, VolumeRenderer
+from unmix_plugin.sensors.batches import MeasuredPixels, from_batch
+from unmix_plugin.sensors.views import BandBalance, SensorViews, ViewGains
+from unmix_plugin.settings import UnmixModelConfig
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.metrics import psnr
 
 _FEWEST_RAYS, _MOST_RAYS = 64, 8192
+_COARSEST_REFINED = 4
+"""Cells along the scene box on the coarsest level at most where poses are refined: a pose that is off by a cell still
+finds its way."""
+
+
+@dataclass(frozen=True)
+class TrainingBatch:
+    """What a training step compares, worked out once."""
+
+    corrected: CorrectedRays
+    """Rays as their cameras send them."""
+    rendered: RenderedRays
+    compared: list[ComparedPixels]
+    """Pixels of each sensor, measured and rendered."""
 
 
 class UnmixModel(Model):
@@ -75,24 +91,36 @@ class UnmixModel(Model):
         self.endmembers = nn.Parameter(torch.zeros(shape), requires_grad=config.train_endmembers)
         num_dictionary = config.num_dictionary_spectra(self.preset, self.num_endmembers)
         self.specular_spectra = nn.Parameter(torch.zeros(num_dictionary, len(self.bands)))
-        reachable = torch.ones((metadata["grid_resolution"],) * 3, dtype=torch.bool)
-        self.grid = make_grid(config, reachable, self.is_unbounded)
+        lamp = config.lamp if config.light == "camera" else ()
+        self._lamp = None if lamp in ("auto", ()) else Lamp.of_numbers([float(x) for x in lamp])
+        self.grid = self._new_grid(torch.ones((metadata["grid_resolution"],) * 3, dtype=torch.bool))
         self._renderer: VolumeRenderer | None = None
         self.step = config.renderer.sample_distance(
             metadata["pixel_size"], float(self.scene_box.size.max()), metadata["has_alpha"]
         )
-        self.field = self._untrained_field()
+        self.field = self._new_field()
         self.register_buffer("rgb_weights", rgb_matrix(self.bands), persistent=False)
         self.register_buffer("every_band", torch.eye(len(self.bands)), persistent=False)
         self.register_buffer("endmember_bound", torch.ones(()))
         self.guide = AbundanceGuide(*shape)
-        self.view_gains = make_view_gains(config, metadata)
-        self.poses = make_pose_refinement(config, metadata)
+        per_view = config.light == "per-view"
+        wavelengths_nm = torch.tensor(metadata["wavelengths_nm"])
+        self.view_gains = ViewGains(metadata["num_train_views"], wavelengths_nm) if per_view else None
+        self.poses: PoseRefinement | None = None
+        if config.poses == "refine":
+            rows = metadata.get("line_rows") or [0] * metadata["num_train_views"]
+            self.poses = PoseRefinement(rows, config.pose_refinement.lens)
         self.seen_by = SensorViews(metadata.get("sensors", ()), self.rgb_weights)
         weights = () if config.losses.band_weights == "auto" else config.losses.band_weights
         self.balance = BandBalance(weights, self.bands, self.seen_by)
         self.comparison = BatchComparison(
-            config.losses, self.preset, self.seen_by, self.balance, self.guide, self.view_gains
+            config.losses,
+            self.preset,
+            self.seen_by,
+            self.balance,
+            self.guide,
+            self.view_gains,
+            config.as_published,
         )
         self._pose_training = PoseTraining(config.pose_refinement, self.poses)
         self._progress = 0.0
@@ -121,15 +149,15 @@ class UnmixModel(Model):
         sensor = initial_data.get("sensor")
         pixels = self.balance.scaled(torch.from_numpy(initial_data["pixels"]), sensor)
         seen = self.balance.scaled(self.seen_by.project(endmembers, sensor), sensor)
-        self.guide.start(pixels, endmembers, self.config.losses.mixing_penalty, seen)
+        self.guide.start(pixels, endmembers, seen)
         self.specular_spectra.copy_(first_specular_spectra(len(self.specular_spectra), lamp, endmembers))
         reachable = self._pose_training.begin(initial_data, self.scene_box, self.metadata["pixel_size"])
-        self.grid = make_grid(self.config, reachable, self.is_unbounded).to(self.device)
+        self.grid = self._new_grid(reachable).to(self.device)
 
     @torch.no_grad()
     def between_steps(self, step: int, progress: float, data: DataManager) -> Collection[str]:
         """Keep empty what the masks carve away as seen by the corrected cameras, once poses hardly change any more."""
-        reachable = self._pose_training.carved(data)
+        reachable = self._pose_training.between_steps(data)
         if reachable is not None:
             self.grid.empty_beyond(reachable.to(self.device))
         return ()
@@ -147,9 +175,17 @@ class UnmixModel(Model):
     def renderer(self) -> VolumeRenderer:
         """How rays are rendered at present; its grid follows the training."""
         if self._renderer is None or self._renderer.skips is not self.grid.skips:
-            box = self.scene_box.to(self.device)
-            self._renderer = make_renderer(
-                self.config, self.preset, box, self.grid, self.step, self.is_unbounded
+            config = self.config
+            self._renderer = VolumeRenderer(
+                self.scene_box.to(self.device),
+                self.grid.skips,
+                self.grid.reachable,
+                self.step,
+                choose(config.renderer.smallest_weight, self.preset.smallest_weight),
+                self.is_unbounded,
+                config.losses.background == "last",
+                config.eval_num_rays_per_chunk,
+                self.grid.opaque_skips,
             )
         return self._renderer
 
@@ -167,25 +203,24 @@ class UnmixModel(Model):
         )
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
-        """`spectral` (R, B) on black (of a rig `coefficients`, from which follows what its sensors see), all that
-        `ray_outputs` gives, and what `observed_by_rays` gives where the grid records it."""
-        generator = self.generator if self.training else None
-        if self.training:
-            ray_bundle = self._pose_training.corrected(ray_bundle)
-        renderer = self._training_renderer if self.training else self.renderer
-        rendered = renderer.render(self.field, ray_bundle, generator)
-        coefficients = rendered.coefficients
-        seen = (
-            {"coefficients": coefficients.packed}
-            if self.seen_by
-            else {"spectral": self.materials.spectra(coefficients)}
-        )
-        if self.view_gains is not None:
-            seen["cameras"] = ray_bundle.camera_indices
-        if self.training and self.grid.observed is not None:
-            seen.update(observed_by_rays(rendered, self.renderer.space))
-        outputs = {**seen, **ray_outputs(rendered, ray_bundle)}
-        return self._pose_training.believed(outputs, ray_bundle) if self.training else outputs
+        """`spectral` (R, B) on black, `accumulation` (R) and `abundances` (R, K), those of the sky among them."""
+        rendered = self._rendered(ray_bundle)
+        return {
+            "spectral": self.materials.spectra(rendered.coefficients),
+            "accumulation": rendered.coefficients.accumulation,
+            "abundances": rendered.mixtures,
+        }
+
+    def get_train_loss_dict(self, ray_bundle: RayBundle, batch: dict[str, Tensor]) -> TrainOutputs:
+        """`num_samples`; weighted losses by name, those of no weight left out; and `psnr` of the batch in dB, on black,
+        with how far poses were corrected."""
+        measured = from_batch(batch, len(ray_bundle), self.seen_by.num_channels)
+        step = self.training_batch(ray_bundle, measured)
+        losses = self.losses(step)
+        metrics = {"psnr": self.comparison.psnr(step.compared), **self._pose_training.figures(step.corrected)}
+        with torch.no_grad():
+            self.learn_from(step)
+        return {"num_samples": torch.tensor(step.rendered.num_samples)}, losses, metrics
 
     def get_loss_dict(
         self,
@@ -193,41 +228,55 @@ class UnmixModel(Model):
         batch: dict[str, Tensor],
         metrics_dict: dict[str, Tensor] | None = None,
     ) -> dict[str, Tensor]:
-        """Weighted losses by name; those of no weight are left out. See training_losses.py."""
-        config = self.config.losses
-        weights = {name: x for name, x in config.weights(self.preset, self._progress).items() if x > 0}
-        parts = self.comparison.parts(outputs, batch, self.materials)
-        losses = self.comparison.losses(parts, set(weights), self.generator)
-        if "spread" in weights:
-            losses["spread"] = outputs["spread"]
-        if "surface" in weights and "surfaces" in batch:
-            losses["surface"] = surface_loss(outputs, batch["surfaces"], self.renderer.space)
+        """`get_train_loss_dict` has the losses: they need more than outputs by name."""
+        raise NotImplementedError
+
+    def training_batch(self, ray_bundle: RayBundle, measured: list[MeasuredPixels]) -> TrainingBatch:
+        """Rays of training views, rendered and laid beside what was measured along them; changes nothing."""
+        corrected = self._pose_training.corrected(ray_bundle)
+        rendered = self._rendered(corrected.rays)
+        views, materials = ray_bundle.camera_indices, self.materials
+        compared = self.comparison.compare(measured, rendered, views, materials, corrected.weights)
+        return TrainingBatch(corrected, rendered, compared)
+
+    def losses(self, step: TrainingBatch) -> dict[str, Tensor]:
+        """Weighted losses by name, and `poses`, what their corrections cost; changes nothing."""
+        config, rendered = self.config, step.rendered
+        weights = loss_weights(config.losses, self.preset, self._progress, config.as_published)
+        losses = self.comparison.losses(step.compared, set(weights), self.generator)
+        losses["sparsity"] = rendered.sparsity
+        surfaces = [part.measured.surfaces_of_rays() for part in step.compared]
+        if "surface" in weights and (known := [each for each in surfaces if each is not None]):
+            light = (rendered.weights, rendered.positions, rendered.ray_indices)
+            losses["surface"] = stray_light(*light, torch.cat(known), self.renderer.space)
         shading = self.field.lamp_shading if isinstance(self.field, UnmixField) else None
         if "normals" in weights and shading is not None:
-            places = self.renderer.space.from_unit(outputs["positions"])
+            places = self.renderer.space.from_unit(rendered.positions)
             losses["normals"] = normals_error(
-                self.field.get_density, shading, places, outputs["weights"], self.generator
+                self.field.get_density, shading, places, rendered.weights, self.generator
             )
         weighed = {name: weights[name] * losses[name] for name in weights if name in losses}
-        return weighed | self._pose_training.penalty()
+        return weighed | self._pose_training.penalty(step.corrected)
 
-    def observe(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> None:
+    def learn_from(self, step: TrainingBatch) -> None:
         """Note which cells the views see, and how far margins of abundances are from those of measured spectra."""
         visible_weight = choose(self.config.renderer.visible_weight, self.preset.visible_weight)
-        record_seen(self.grid, outputs, visible_weight, self.processes)
-        if "observed_densities" in outputs:
-            self.grid.record_observed(outputs["observed_positions"], outputs["observed_densities"])
-        self.comparison.observe(outputs, batch)
-        self._pose_training.observe(outputs, batch, self.comparison, self.materials)
+        record_seen(
+            self.grid, step.rendered, step.corrected.rays.camera_indices, visible_weight, self.processes
+        )
+        if self.grid.observed is not None:
+            positions, densities = step.rendered.visible.observed()
+            self.grid.record_observed(self.renderer.space.to_unit(positions), densities)
+        self.comparison.observe(step.compared)
+        self._pose_training.observe(step.compared, step.corrected)
+
+    def _rendered(self, rays: RayBundle) -> RenderedRays:
+        renderer = self._training_renderer if self.training else self.renderer
+        return renderer.render(self.field, rays, self.generator if self.training else None)
 
     def warnings(self) -> list[str]:
         """Sensors whose pixels can't be unmixed into so many endmembers one by one."""
         return self.seen_by.warnings(self.num_endmembers)
-
-    def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        """`psnr` of the batch in dB, on black; of poses that are corrected by how much, and how many were undone."""
-        parts = self.comparison.parts(outputs, batch, self.materials)
-        return {"psnr": self.comparison.psnr(parts), **self._pose_training.figures()}
 
     @torch.no_grad()
     def get_outputs_for_camera(
@@ -248,7 +297,9 @@ class UnmixModel(Model):
 
     def get_evaluation_outputs(self, camera: Cameras, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """A view as the lens sees it that training corrected, if it did."""
-        return self.get_outputs_for_camera(camera if self.poses is None else self.poses.lens.of(camera))
+        return self.get_outputs_for_camera(
+            camera if self.poses is None else self.poses.corrected_lens(camera)
+        )
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
@@ -264,11 +315,11 @@ class UnmixModel(Model):
         return [TrainingCallback(before, self._begin_step), TrainingCallback(after, self._bound_spectra)]
 
     def num_samples(self, outputs: dict[str, Tensor]) -> int:
-        """Samples looked at for `outputs`."""
+        """Samples that light may reach, of the batch with these outputs."""
         return int(outputs["num_samples"])
 
     def next_num_rays(self, outputs: dict[str, Tensor], current: int) -> int | None:
-        """Half of the way to the rays with which a step would look at `samples_per_step`."""
+        """Half of the way to the rays with which a step would have `samples_per_step`."""
         samples_a_ray = max(self.num_samples(outputs) / current, 1.0)
         wanted = self.config.samples_per_step / self.processes.count / samples_a_ray
         return int(min(max((current + wanted) / 2, _FEWEST_RAYS), _MOST_RAYS))
@@ -292,20 +343,33 @@ class UnmixModel(Model):
     def _coarseness(self, progress: float) -> float:
         """How many times farther apart samples are in training than in the end: large images begin coarsely."""
         samples = float(self.scene_box.size.max()) / self.step
-        config = self.config.renderer
-        return config.coarseness(samples, choose(config.coarse_samples, self.preset.coarse_samples), progress)
+        return self.config.renderer.coarseness(samples, self.preset, progress)
 
-    def _untrained_field(self) -> CoefficientField:
-        config = self.config
-        num_specular = len(self.bands) if config.specular == "full" else len(self.specular_spectra)
-        return make_field(
-            config,
-            self.preset,
+    def _new_field(self) -> CoefficientField:
+        config, opacity = self.config, choose(self.config.initial_opacity, self.preset.initial_opacity)
+        field, refines = config.field, config.poses == "refine"
+        if refines:
+            field = replace(field, coarsest_resolution=min(field.coarsest_resolution, _COARSEST_REFINED))
+        make = PublishedField if config.as_published else UnmixField
+        return make(
+            field,
             self.scene_box,
-            self.metadata,
-            (self.num_endmembers, num_specular),
-            self.step * self._coarseness(0.0),
+            self.num_endmembers,
+            len(self.bands) if config.specular == "full" else len(self.specular_spectra),
+            -math.log1p(-opacity) / (self.step * self._coarseness(0.0)),
+            self.metadata["pixel_size"],
+            choose(config.losses.exposure, 1.0),
+            config.light == "camera",
+            self._lamp,
+            self.is_unbounded,
+            refines,
         )
+
+    def _new_grid(self, reachable: Bool[Tensor, "X Y Z"]) -> OccupancyGrid:
+        """Before training. Where nothing was carved, cells are too many to wait until each was probed: what rays meet
+        in them counts as well."""
+        observes = self.is_unbounded or self.config.poses == "refine"
+        return OccupancyGrid(reachable, self._lamp is not None, observes)
 
     def _begin_step(self, step: int, progress: float) -> None:
         self._progress = progress
@@ -321,7 +385,7 @@ class UnmixModel(Model):
                 self.metadata.get("num_train_pixels", 0),
             )
             self.processes.mean(self.guide.margin_variance)
-            self._pose_training.judge(self.processes)
+            self._pose_training.update_weights(self.processes)
 
     @torch.no_grad()
     def _bound_spectra(self, step: int, progress: float) -> None:

@@ -29,7 +29,7 @@ class AlphaPreset:
     """Random greys would reward floaters before the cameras where alpha is unknown."""
     rgb_loss_weight: float
     opacity_loss_weight: float
-    spread_loss_weight: float
+    sparsity_loss_weight: float
     surface_loss_weight: float
     coarse_samples: int
     specular_endmembers: bool
@@ -45,7 +45,7 @@ WITH_ALPHA = AlphaPreset(
     background="random",
     rgb_loss_weight=0.2,
     opacity_loss_weight=0.0,
-    spread_loss_weight=0.0,
+    sparsity_loss_weight=0.0,
     surface_loss_weight=0.0,
     coarse_samples=256,
     specular_endmembers=False,
@@ -59,7 +59,7 @@ WITHOUT_ALPHA = AlphaPreset(
     background="black",
     rgb_loss_weight=0.0,
     opacity_loss_weight=0.01,
-    spread_loss_weight=1e-3,
+    sparsity_loss_weight=1e-3,
     surface_loss_weight=0.0,
     coarse_samples=256,
     specular_endmembers=True,

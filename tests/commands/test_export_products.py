@@ -19,7 +19,7 @@ from unmix_plugin.commands.export import PRODUCTS, export
 from unmix_plugin.commands.train import train
 from unmix_plugin.scenes import load_scene
 from unmix_plugin.scenes.demo.scene import make_demo_scene
-from unmix_plugin.scenes.scene import SceneOptions
+from unmix_plugin.settings import SceneOptions
 from unmix_plugin.trained.open_run import load_run, open_run
 
 SMALL = {

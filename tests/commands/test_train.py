@@ -17,13 +17,12 @@ import torch
 from tests.commands.running import SMALL_METHOD, run
 from unmix_plugin.commands import train as train_arguments
 from unmix_plugin.commands.train import _read_remarks, _remarks, parse, train
-from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
 from unmix_plugin.engine import registry
 from unmix_plugin.engine.runs.load_run import load_model
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.model import UnmixModel
-from unmix_plugin.model_settings import UnmixModelConfig
+from unmix_plugin.settings import HyperspectralDataManagerConfig, UnmixModelConfig
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 
 
@@ -309,6 +308,6 @@ def test_poses_that_ran_away_are_said():
 
 def test_poses_that_are_not_believed_are_said():
     lines = course(1.0, 0.2, 0.1, 0.09)
-    assert _remarks([*lines[:-1], {**lines[-1], "poses_doubted": 0.01}]) == []
-    said = _remarks([*lines[:-1], {**lines[-1], "poses_doubted": 0.12}])
+    assert _remarks([*lines[:-1], {**lines[-1], "pose_outliers": 0.01}]) == []
+    said = _remarks([*lines[:-1], {**lines[-1], "pose_outliers": 0.12}])
     assert "12% of the views, or of the rows of line cameras, still fit far worse than the others" in said[0]

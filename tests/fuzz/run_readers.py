@@ -26,7 +26,8 @@ from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.runs.scene_record import read_scene_record
 from unmix_plugin.engine.training.progress import _keep_until
 from unmix_plugin.errors import ConfigError, RunError
-from unmix_plugin.scenes.scene import Normalisation, SceneOptions
+from unmix_plugin.scenes.scene import Normalisation
+from unmix_plugin.settings import SceneOptions
 from unmix_plugin.trained.run_views import recorded_views, world_frame
 
 

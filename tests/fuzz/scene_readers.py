@@ -23,7 +23,8 @@ from unmix_plugin.scenes.reading.images import UnreadableImageError, read_colour
 from unmix_plugin.scenes.reading.loader import _locate_files
 from unmix_plugin.scenes.reading.splits import split_frames
 from unmix_plugin.scenes.reading.transforms_json import read_transforms
-from unmix_plugin.scenes.scene import Normalisation, SceneOptions
+from unmix_plugin.scenes.scene import Normalisation
+from unmix_plugin.settings import SceneOptions
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 from unmix_plugin.spectral.maps.indices import parse_formula
 from unmix_plugin.trained.camera_files import read_camera_file

@@ -14,11 +14,10 @@ from tests.method_factory import BOX, CAMERA, CONFIG, initial_data, make_model, 
 from unmix_plugin.editing.edited_field import EditedField
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.light.lamp import Lamp, MovingLamp
-from unmix_plugin.light.shading import Lamplight
-from unmix_plugin.light.shadows import FINEST, ShadowDetail, lamplight, visible_part
+from unmix_plugin.light.shading import FINEST, Lamplight, ShadowDetail, lamplight, visible_part
 from unmix_plugin.model import UnmixModel
-from unmix_plugin.model_settings import UnmixModelConfig
 from unmix_plugin.operators.occupancy import skip_distances
+from unmix_plugin.settings import UnmixModelConfig
 
 TURNTABLE = Lamp("turntable", (0.0, 0.0, 0.1), (0.0, 0.0, 1.0), (-1.0, 2.0, 3.0))
 NUMBERS = TURNTABLE.numbers()

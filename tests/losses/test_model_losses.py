@@ -1,18 +1,18 @@
 """What the losses of the model ask for, with alpha and without."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 from torch.testing import assert_close
 
 from tests.method_factory import (
     NUM_BANDS,
+    losses_of,
     make_model,
     make_rays,
 )
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.losses.training_losses import LossConfig
+from unmix_plugin.presets import WITHOUT_ALPHA
+from unmix_plugin.settings import LossConfig
 from unmix_plugin.spectral.evidence import _FAINT, relative_weights
 
 
@@ -26,19 +26,16 @@ def test_a_last_colour_background_closes_every_ray_that_meets_something():
 def test_a_perfect_prediction_has_no_loss_over_any_background(background):
     model = make_model(losses=LossConfig(background=background, rgb=1.0, abundances=0.0))
     spectra, alpha = torch.rand(8, NUM_BANDS), torch.rand(8)
-    losses = model.get_loss_dict(
-        {"spectral": spectra, "accumulation": alpha}, {"spectra": spectra, "alpha": alpha}
-    )
+    losses = losses_of(model, {"spectra": spectra, "alpha": alpha}, spectra, alpha)
     assert set(losses) == {"spectral", "rgb"}
     assert all(float(loss) < 1e-12 for loss in losses.values())
 
 
 def test_colours_count_by_default_where_alpha_tells_black_from_the_void():
     spectra, alpha = torch.rand(8, NUM_BANDS), torch.ones(8)
-    outputs = {"spectral": spectra / 2, "accumulation": alpha, "spread": torch.zeros(())}
     losses = {
-        has_alpha: make_model(has_alpha=has_alpha, losses=LossConfig(abundances=0.0)).get_loss_dict(
-            outputs, {"spectra": spectra, "alpha": alpha}
+        has_alpha: losses_of(
+            make_model(has_alpha=has_alpha), {"spectra": spectra, "alpha": alpha}, spectra / 2, alpha
         )
         for has_alpha in (True, False)
     }
@@ -48,29 +45,19 @@ def test_colours_count_by_default_where_alpha_tells_black_from_the_void():
 
 def test_a_bright_background_penalises_missing_opacity():
     batch = {"spectra": torch.zeros(4, NUM_BANDS), "alpha": torch.ones(4)}
-    outputs = {"spectral": torch.zeros(4, NUM_BANDS), "accumulation": torch.zeros(4)}
-    losses = {
-        b: float(
-            make_model(losses=LossConfig(background=b, abundances=0.0)).get_loss_dict(outputs, batch)[
-                "spectral"
-            ]
-        )
-        for b in ("black", "white")
-    }
+    losses = {}
+    for background in ("black", "white"):
+        model = make_model(losses=LossConfig(background=background, abundances=0.0))
+        found = losses_of(model, batch, torch.zeros(4, NUM_BANDS), torch.zeros(4))
+        losses[background] = float(found["spectral"])
     assert losses == {"black": 0.0, "white": 1.0}
 
 
 def test_brighter_than_a_saturated_sensor_is_no_error_but_darker_is():
     model = make_model(losses=LossConfig(background="black", abundances=0.0))
     batch = {"spectra": torch.ones(1, NUM_BANDS), "alpha": torch.ones(1)}
-    error = [
-        float(
-            model.get_loss_dict(
-                {"spectral": torch.full((1, NUM_BANDS), v), "accumulation": torch.ones(1)}, batch
-            )["spectral"]
-        )
-        for v in (1.5, 0.5)
-    ]
+    rendered = (torch.full((1, NUM_BANDS), value) for value in (1.5, 0.5))
+    error = [float(losses_of(model, batch, x, torch.ones(1))["spectral"]) for x in rendered]
     assert error == [0.0, 0.25]
 
 
@@ -79,9 +66,9 @@ def test_relative_errors_count_the_more_the_darker_the_rendered_pixel_is(power):
     model = make_model(losses=LossConfig(background="black", rgb=0.0, abundances=0.0, relative=power))
 
     def loss(rendered: float) -> float:
-        outputs = {"spectral": torch.full((1, NUM_BANDS), rendered), "accumulation": torch.ones(1)}
-        batch = {"spectra": torch.full((1, NUM_BANDS), 0.9 * rendered), "alpha": torch.ones(1)}
-        return float(model.get_loss_dict(outputs, batch)["spectral"])
+        spectra = torch.full((1, NUM_BANDS), rendered)
+        batch = {"spectra": 0.9 * spectra, "alpha": torch.ones(1)}
+        return float(losses_of(model, batch, spectra, torch.ones(1))["spectral"])
 
     faint = (0.2 + _FAINT) / (0.1 + _FAINT)
     assert loss(0.2) == pytest.approx(0.02**2, rel=1e-4)
@@ -104,48 +91,34 @@ def test_transparency_is_penalised_only_where_no_alpha_says_what_is_solid():
         1, NUM_BANDS
     )  # the last pixel is black: it may be void
     batch = {"spectra": spectra, "alpha": torch.ones(3)}
-    outputs = {"spectral": spectra, "accumulation": torch.tensor([1.0, 0.5, 0.0])}
-    closed = make_model(
-        has_alpha=False, losses=LossConfig(opacity=0.2, spread=0.0, abundances=0.0)
-    ).get_loss_dict(outputs, batch)
+    opacities = torch.tensor([1.0, 0.5, 0.0])
+    closed = losses_of(make_model(has_alpha=False), batch, spectra, opacities)
     assert float(closed["spectral"]) == 0
-    assert_close(closed["opacity"], torch.tensor(0.2 * 0.25 / 3))
-    with_alpha = make_model(losses=LossConfig(abundances=0.0)).get_loss_dict(outputs, batch)
-    assert "opacity" not in with_alpha
+    assert_close(closed["opacity"], torch.tensor(WITHOUT_ALPHA.opacity_loss_weight * 0.25 / 3))
+    assert "opacity" not in losses_of(make_model(), batch, spectra, opacities)
 
 
 def test_the_automatic_background_is_black_without_alpha_and_random_with_it():
     batch = {"spectra": torch.zeros(50, NUM_BANDS), "alpha": torch.ones(50)}
-    outputs = {"spectral": torch.zeros(50, NUM_BANDS), "accumulation": torch.zeros(50)}
     losses = [
-        float(
-            make_model(has_alpha=has, losses=LossConfig(abundances=0.0, spread=0.0)).get_loss_dict(
-                outputs, batch
-            )["spectral"]
-        )
+        float(losses_of(make_model(has_alpha=has), batch, batch["spectra"], torch.zeros(50))["spectral"])
         for has in (False, True)
     ]
     assert losses[0] == 0
     assert 0.2 < losses[1] < 0.5  # the mean square of a grey drawn evenly from [0, 1]
 
 
-def test_spread_density_is_penalised_early_and_only_where_no_alpha_says_what_is_empty():
+def test_sparsity_is_asked_for_early_and_only_where_no_alpha_says_what_is_empty():
     batch = {"spectra": torch.zeros(4, NUM_BANDS), "alpha": torch.ones(4)}
-    outputs = {
-        "spectral": torch.zeros(4, NUM_BANDS),
-        "accumulation": torch.zeros(4),
-        "spread": torch.tensor(3.0),
-    }
-    losses = LossConfig(spread=0.2, spread_until=0.5, abundances=0.0)
-    model = make_model(has_alpha=False, losses=losses)
+    model = make_model(has_alpha=False)
     begin_step = model.get_training_callbacks()[0].func
     found = []
-    for progress in (0.0, 0.25, 0.5, 1.0):
+    for progress in (0.0, 0.125, 0.25, 1.0):
         begin_step(1, progress)
-        found.append(float(model.get_loss_dict(outputs, batch).get("spread", 0.0)))
-    assert found == pytest.approx([0.6, 0.15, 0.0, 0.0])
-    with_alpha = make_model(losses=replace(losses, spread="auto"))
-    assert "spread" not in with_alpha.get_loss_dict(outputs, batch)
+        losses = losses_of(model, batch, batch["spectra"], torch.zeros(4), sparsity=3.0)
+        found.append(float(losses.get("sparsity", 0.0)) / WITHOUT_ALPHA.sparsity_loss_weight)
+    assert found == pytest.approx([3.0, 0.75, 0.0, 0.0])
+    assert "sparsity" not in losses_of(make_model(), batch, batch["spectra"], torch.zeros(4), sparsity=3.0)
 
 
 def test_abundances_are_drawn_to_those_that_measured_spectra_show():
@@ -155,11 +128,7 @@ def test_abundances_are_drawn_to_those_that_measured_spectra_show():
     batch = {"spectra": spectra, "alpha": torch.ones(3), "pixels": torch.arange(3)}
     right = torch.eye(3)[shown]
     losses = [
-        float(
-            model.get_loss_dict(
-                {"spectral": spectra, "accumulation": torch.ones(3), "abundances": abundances}, batch
-            )["abundances"]
-        )
+        float(losses_of(model, batch, spectra, torch.ones(3), abundances)["abundances"])
         for abundances in (right, right.roll(1, dims=1))
     ]
     assert losses[0] < 1e-6
@@ -167,31 +136,26 @@ def test_abundances_are_drawn_to_those_that_measured_spectra_show():
 
 
 def test_the_guide_of_abundances_lets_go_of_them_as_training_goes_on():
-    model = make_model(losses=LossConfig(abundances=0.5, abundances_final_factor=0.01))
+    model = make_model(losses=LossConfig(abundances=0.5))
     begin_step = model.get_training_callbacks()[0].func
     batch = {
         "spectra": 0.5 * model.guide.endmembers,
         "alpha": torch.ones(3),
         "pixels": torch.arange(3),
     }
-    outputs = {
-        "spectral": batch["spectra"],
-        "accumulation": torch.ones(3),
-        "abundances": torch.eye(3).roll(1, dims=1),
-    }
+    wrong = torch.eye(3).roll(1, dims=1)
     found = []
     for progress in (0.0, 0.5, 1.0):
         begin_step(1, progress)
-        found.append(float(model.get_loss_dict(outputs, batch)["abundances"]))
-    assert found == pytest.approx([1.0, 0.1, 0.01], rel=0.01)
+        found.append(float(losses_of(model, batch, batch["spectra"], torch.ones(3), wrong)["abundances"]))
+    assert found == pytest.approx([1.0, 0.1**0.5, 0.1], rel=0.01)
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"rgb": -1.0}, r"rgb of at least 0 \(got -1.0\)$"),
-        ({"mixing_penalty": -0.1}, r"mixing-penalty of at least 0 \(got -0.1\)$"),
-        ({"spread_until": 0.0}, r"spread-until in \(0, 1\]"),
+        ({"exposure": 0.0}, r"an exposure above 0 or auto"),
     ],
 )
 def test_impossible_losses_are_refused(settings, message):
@@ -203,5 +167,4 @@ def test_where_alpha_is_not_trusted_missing_opacity_costs_nothing():
     spectra = torch.full((2, NUM_BANDS), 0.3)
     batch = {"spectra": spectra, "alpha": torch.tensor([1.0, 1.0]), "alpha_trust": torch.tensor([1.0, 0.0])}
     model = make_model(losses=LossConfig(background="white", abundances=0.0, rgb=0.0))
-    outputs = {"spectral": spectra, "accumulation": torch.zeros(2)}
-    assert float(model.get_loss_dict(outputs, batch)["spectral"]) == pytest.approx(0.5)
+    assert float(losses_of(model, batch, spectra, torch.zeros(2))["spectral"]) == pytest.approx(0.5)

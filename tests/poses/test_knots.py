@@ -6,9 +6,9 @@ import torch
 from scipy.interpolate import BSpline
 from torch.testing import assert_close
 
+from unmix_plugin.poses import refinement
 from unmix_plugin.poses.knots import row_waves, spline_weights
 from unmix_plugin.poses.refinement import PoseRefinement
-from unmix_plugin.poses.settings import PoseConfig
 
 
 def test_a_line_camera_is_corrected_by_waves_over_its_rows():
@@ -62,7 +62,7 @@ def test_knots_follow_a_wobble_of_three_waves_of_10_px_within_a_fraction_of_a_pi
 
 
 def test_a_bend_of_a_line_camera_costs_and_a_drift_does_not():
-    found, config = PoseRefinement((0, 40, 40)), PoseConfig(penalty=0.0, roughness=2.0)
+    found = PoseRefinement((0, 40, 40))
 
     def cost(*shapes: torch.Tensor) -> float:
         """Of corrections of the two sweeps; the frame has its own."""
@@ -72,19 +72,22 @@ def test_a_bend_of_a_line_camera_costs_and_a_drift_does_not():
                 found.steps[first : first + 11] = torch.linalg.solve(row_waves(11), shape[:, None]).expand(
                     -1, 6
                 )
-            return float(found.penalty(config))
+            return float(found.penalty(found.free_steps())) - refinement._SIZE_PENALTY * float(
+                found.free_steps().square().mean()
+            )
 
     drift, bump = torch.linspace(0.0, 0.2, 11), torch.eye(11)[5] * 0.01
     assert cost(drift, -3 * drift + 0.5) < 1e-10
     # A bump bends by 1, -2 and 1 of its height; each sweep has 9 bends.
-    assert abs(cost(drift + bump, drift) - 2.0 * 6 * 1e-4 / 18) < 1e-8
+    assert abs(cost(drift + bump, drift) - refinement._BEND_PENALTY * 6 * 1e-4 / 18) < 1e-8
 
 
 def test_frames_have_no_roughness():
     found = PoseRefinement((0, 0, 0))
     with torch.no_grad():
         found.steps.normal_(generator=torch.Generator().manual_seed(0))
-        assert float(found.penalty(PoseConfig(penalty=0.0))) == 0.0
+        large = refinement._SIZE_PENALTY * found.steps.square().mean()
+        assert_close(found.penalty(found.free_steps()), large)
 
 
 def test_a_sweep_that_goes_far_in_a_few_rows_is_not_undone_and_one_that_goes_far_in_all_is():

@@ -13,13 +13,12 @@ from tests.engine.stopped_runs import stop_at
 from tests.method_factory import CONFIG
 from tests.poses.test_training import trained
 from tests.scenes.line_factory import make_line_scene
-from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
 from unmix_plugin.engine.configs import PipelineConfig, TrainerConfig
 from unmix_plugin.engine.runs.load_run import load_config
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.method_config import unmix_nerf
 from unmix_plugin.poses.refinement import PoseRefinement
-from unmix_plugin.poses.settings import PoseConfig
+from unmix_plugin.settings import HyperspectralDataManagerConfig, PoseConfig
 from unmix_plugin.trained.open_run import open_run
 
 
@@ -43,8 +42,8 @@ def trainer(tmp_path_factory) -> Trainer:
 def test_training_rays_start_where_their_row_was_taken(trainer):
     manager = trainer.pipeline.datamanager
     rays, _ = manager.next_train(0)
-    assert rays.image_y is not None
-    expected = manager.train_cameras.poses_at(rays.camera_indices, rays.image_y)
+    assert rays.pixel_coords is not None
+    expected = manager.train_cameras.poses_at(rays.camera_indices, rays.pixel_coords[:, 1])
     assert_close(rays.origins, expected[:, :, 3])
     assert len(rays.origins.unique(dim=0)) > len(manager.train_cameras)
 

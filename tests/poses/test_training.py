@@ -14,7 +14,6 @@ from torch.testing import assert_close
 from tests.engine.stopped_runs import stop_at
 from tests.method_factory import CONFIG
 from tests.scenes.scene_factory import make_scene
-from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
 from unmix_plugin.engine.configs import PipelineConfig, TrainerConfig
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import rotation_matrix
@@ -22,7 +21,7 @@ from unmix_plugin.engine.runs.load_run import load_config, load_model
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.method_config import unmix_nerf
 from unmix_plugin.poses.refinement import PoseRefinement
-from unmix_plugin.poses.settings import PoseConfig
+from unmix_plugin.settings import HyperspectralDataManagerConfig, PoseConfig
 from unmix_plugin.trained.open_run import open_run
 
 
@@ -61,7 +60,7 @@ def test_poses_that_are_taken_as_they_are_leave_training_as_it_was(folder):
     rays, _ = Trainer(
         config_for(folder, "fixed"), console=Console(file=io.StringIO())
     ).pipeline.datamanager.next_train(0)
-    bare = replace(rays, axes=None, image_y=None)
+    bare = replace(rays, axes=None, pixel_coords=None)
     model.generator = torch.Generator().manual_seed(0)
     first = model.train().get_outputs(rays)["spectral"]
     model.generator = torch.Generator().manual_seed(0)

@@ -13,7 +13,7 @@ from tests.trained.camera_scenes import cameras_at
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.light.shading import Lamplight
-from unmix_plugin.rendering.settings import RendererConfig
+from unmix_plugin.settings import RendererConfig
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 RADIUS, INNER_RADIUS = 0.6, 0.35

@@ -8,19 +8,20 @@ from torch.testing import assert_close
 
 from tests.method_factory import BOX, NUM_BANDS, make_model, make_rays, scene_of
 from unmix_plugin.engine.runs.config_json import config_from_json, config_to_json
+from unmix_plugin.errors import ConfigError
 from unmix_plugin.method_config import unmix_nerf_published
-from unmix_plugin.model_settings import UnmixModelConfig
-from unmix_plugin.rendering.published_field import PublishedField, PublishedFieldConfig
+from unmix_plugin.rendering.published_field import PublishedField
+from unmix_plugin.settings import UnmixFieldConfig, UnmixModelConfig
 
-SMALL = PublishedFieldConfig(num_levels=3, log2_rows_per_level=8, finest_resolution=32, hidden_width=16)
+SMALL = UnmixFieldConfig(
+    temperature=0.4, num_levels=3, log2_rows_per_level=8, finest_resolution=32, hidden_width=16
+)
 
 
 @pytest.fixture
 def field() -> PublishedField:
     torch.manual_seed(0)
-    made: PublishedField = SMALL.setup(
-        scene_box=BOX, num_endmembers=3, num_specular=NUM_BANDS, initial_density=2.0, pixel_size=0.1
-    )
+    made = PublishedField(SMALL, BOX, 3, NUM_BANDS, initial_density=2.0, pixel_size=0.1)
     with torch.no_grad():
         made.table.normal_(std=0.5)
     return made
@@ -76,19 +77,30 @@ def test_the_registered_settings_are_written_down_and_read_back():
     assert restored == config
     model = restored.pipeline.model
     assert isinstance(model, UnmixModelConfig)
-    assert isinstance(model.field, PublishedFieldConfig)
+    assert model.as_published
+
+
+def test_a_light_that_moves_is_refused_where_the_field_has_no_shading():
+    published = unmix_nerf_published.config.pipeline.model
+    with pytest.raises(ConfigError, match="light fixed or per-view: the field as published has no shading"):
+        replace(published, light="camera")
 
 
 def test_a_model_as_published_has_one_specular_value_a_band_and_the_probe_chooses():
     published = unmix_nerf_published.config.pipeline.model
     assert isinstance(published, UnmixModelConfig)
     model = make_model(
-        field=SMALL, specular=published.specular, segmentation=published.segmentation, losses=published.losses
+        field=SMALL,
+        specular=published.specular,
+        segmentation=published.segmentation,
+        losses=published.losses,
+        as_published=True,
     )
+    assert isinstance(model.field, PublishedField)
     assert model.field.num_specular == NUM_BANDS
     assert model.materials.margin_error is None
     batch = {"spectra": torch.rand(8, NUM_BANDS), "alpha": torch.ones(8), "pixels": torch.arange(8)}
-    losses = model.get_loss_dict(model.get_outputs(make_rays(8)), batch)
+    _, losses, _ = model.get_train_loss_dict(make_rays(8), batch)
     assert set(losses) == {"spectral", "rgb"}
     scene = scene_of(model)
     view = scene.look(scene.views[0].camera)

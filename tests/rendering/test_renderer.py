@@ -1,4 +1,7 @@
-"""The renderer of coefficients, apart from the model that owns it."""
+"""The renderer of coefficients, apart from the model that owns it.
+
+Samples found from the front are those that looking at all finds; what light can't reach is not looked at.
+"""
 
 import math
 from dataclasses import replace
@@ -9,11 +12,12 @@ from torch.testing import assert_close
 
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.field import UnmixField, UnmixFieldConfig
+from unmix_plugin.field import UnmixField
+from unmix_plugin.operators.compositing import volume_weights
 from unmix_plugin.operators.occupancy import skip_distances
 from unmix_plugin.presets import WITH_ALPHA, WITHOUT_ALPHA
-from unmix_plugin.rendering.renderer import VolumeRenderer
-from unmix_plugin.rendering.settings import RendererConfig
+from unmix_plugin.rendering.renderer import VolumeRenderer, points_of, visible_samples
+from unmix_plugin.settings import RendererConfig, UnmixFieldConfig
 
 BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 PIXEL = 0.1
@@ -53,14 +57,14 @@ def test_a_homogeneous_box_absorbs_what_beer_lambert_says():
 
 
 @pytest.mark.parametrize("density", [0.1, 10.0])
-def test_spread_counts_the_samples_that_density_is_spread_over(density):
+def test_sparsity_counts_the_samples_that_density_is_spread_over(density):
     """Closed form in a homogeneous box; a sample of depth 10 counts a few times one of depth 0.1, not 100 times."""
     renderer, field = make()
     bundle = rays(20)
     with torch.no_grad():
         field.table.zero_()
         field.log_initial_density = math.log(density / renderer.step)
-        spread = renderer.render(field, bundle).spread
+        spread = renderer.render(field, bundle).sparsity
     t_near, t_far = BOX.intersect(bundle.origins, bundle.directions)
     carrying = [
         sum(
@@ -83,7 +87,7 @@ def test_without_alpha_an_untrained_scene_can_grow_dense_along_the_whole_of_a_ra
             field.log_initial_density = math.log(-math.log1p(-0.01) / renderer.step)
             rendered = renderer.render(field, bundle)
         spread_a_sample = math.log1p(-math.log1p(-0.01) / 0.03)
-        found[preset] = float(rendered.spread) * 20 / spread_a_sample / rendered.num_samples
+        found[preset] = float(rendered.sparsity) * 20 / spread_a_sample / rendered.num_samples
     assert found[WITHOUT_ALPHA] == pytest.approx(1, rel=0.01)
     assert found[WITH_ALPHA] < 0.8
 
@@ -129,3 +133,56 @@ def test_points_are_asked_cell_by_cell_and_outside_the_box_is_nothing():
 def test_impossible_settings_are_refused(settings, message):
     with pytest.raises(ConfigError, match=message):
         RendererConfig(**settings)
+
+
+@pytest.mark.parametrize("smallest_weight", [0.0, 4e-3, 0.2])
+@pytest.mark.parametrize("opacity", [1e-4, 0.05, 0.9])
+def test_samples_found_from_the_front_are_those_of_all(smallest_weight, opacity):
+    renderer, field = make(smallest_weight=smallest_weight)
+    bundle, step = rays(30), renderer.step
+    with torch.no_grad():
+        field.table.normal_(std=3.0, generator=torch.Generator().manual_seed(2))
+        field.log_initial_density = math.log(-math.log1p(-opacity) / step)
+        samples = renderer._march(bundle, None)
+        found = visible_samples(field, samples, bundle, step, smallest_weight)
+        encoded = field.encode(points_of(samples, bundle)[0])
+        densities, features = field.density_of(encoded)
+        keep = volume_weights(densities * step, samples.packed_info) > smallest_weight
+    assert torch.equal(found.samples.t, samples.t[keep])
+    assert torch.equal(found.samples.packed_info, samples.select(keep).packed_info)
+    assert torch.equal(found.encoded(), encoded[keep])
+    assert_close(found.densities(), densities[keep])
+    assert_close(found.features(), features[keep])
+    assert found.num_evaluated <= len(samples)
+
+
+def test_what_lies_behind_an_opaque_front_is_not_evaluated():
+    renderer, field = make(pixel=0.02)
+    bundle = rays(30)
+    with torch.no_grad():
+        field.table.zero_()
+        field.log_initial_density = math.log(10 / renderer.step)
+        samples = renderer._march(bundle, None)
+        found = visible_samples(field, samples, bundle, renderer.step, renderer.smallest_weight)
+    assert found.num_evaluated == 30 * 8
+    assert len(samples) > 10 * found.num_evaluated
+    assert len(found.samples) == 30
+
+
+def test_rays_that_miss_have_no_samples():
+    renderer, field = make()
+    bundle = rays(3)
+    away = type(bundle)(bundle.origins, -bundle.directions, bundle.camera_indices)
+    found = visible_samples(field, renderer._march(away, None), away, renderer.step, 0.1)
+    assert (len(found.samples), len(found.encoded()), found.num_evaluated) == (0, 0, 0)
+
+
+def test_a_picture_without_gradients_is_that_with_them():
+    renderer, field = make()
+    bundle = rays(20)
+    with torch.no_grad():
+        field.table.normal_(generator=torch.Generator().manual_seed(2))
+    with_gradients = renderer.render(field, bundle).coefficients.packed
+    assert with_gradients.requires_grad
+    with torch.no_grad():
+        assert_close(renderer.render(field, bundle).coefficients.packed, with_gradients.detach())

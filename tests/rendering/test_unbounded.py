@@ -13,11 +13,12 @@ from tests.method_factory import CONFIG, initial_data, make_model, make_rays
 from unmix_plugin.editing.edited_field import EditedField
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.engine.processes import Processes
-from unmix_plugin.field import UnmixField, UnmixFieldConfig
+from unmix_plugin.field import UnmixField
 from unmix_plugin.operators.compositing import scale_gradient
 from unmix_plugin.operators.occupancy import OccupancyGrid, skip_distances
 from unmix_plugin.rendering.grid_upkeep import update_grid
 from unmix_plugin.rendering.renderer import VolumeRenderer
+from unmix_plugin.settings import UnmixFieldConfig
 
 BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 
@@ -127,7 +128,7 @@ def test_training_tells_the_grid_what_rays_meet_in_a_world_without_end_and_only_
     batch = {"spectra": torch.rand(200, 5), "alpha": torch.ones(200), "pixels": torch.arange(200)}
     for model in (boxed, world):
         model.generator = torch.Generator().manual_seed(0)
-        model.observe(model.get_outputs(rays), batch)
+        model.get_train_loss_dict(rays, batch)
     assert boxed.grid.observed is None
     assert world.grid.observed is not None
     is_met = world.grid.observed >= 0

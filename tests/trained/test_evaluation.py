@@ -10,7 +10,7 @@ from torch.testing import assert_close
 
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.scenes.reading.loader import load_scene
-from unmix_plugin.scenes.scene import SceneOptions
+from unmix_plugin.settings import SceneOptions
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.metrics import abundance_rmse, psnr, sam
 from unmix_plugin.spectral.sensor import SceneSensor

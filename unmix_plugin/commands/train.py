@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import shlex
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass, replace
 from pathlib import Path
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import tyro
 
 from unmix_plugin.commands.entry import INTERRUPTED, run_command
-from unmix_plugin.engine.configs import Common, TrainerConfig
+from unmix_plugin.engine.configs import Common, Hidden, TrainerConfig
 from unmix_plugin.engine.registry import MethodSpecification, discover_methods, find_method
 from unmix_plugin.errors import ConfigError, counted
 from unmix_plugin.viewer.access import TrainingViewerOptions
@@ -77,9 +77,10 @@ def parse_all(argv: Sequence[str]) -> tuple[TrainerConfig, TrainingViewerOptions
     name, options = argv[0], list(argv[1:])
     method = find_method(name)
     if "--help-all" in options:
-        _parse(method, method.config, ["--help"])
+        _parse(method, method.config, ["--help"], lambda marks: Hidden not in marks)
     if {"--help", "-h"} & set(options):
-        _parse(method, method.config, ["--help"], only_common=True)
+        ending = " --help-all lists all options, also those of the viewer."
+        _parse(method, method.config, ["--help"], lambda marks: Common in marks, ending)
     given = tyro.cli(
         _Given, args=options, prog=f"{_PROGRAM} {name}", return_unknown_args=True, add_help=False
     )[0]
@@ -105,13 +106,15 @@ def _overview(methods: dict[str, MethodSpecification]) -> str:
 
 
 def _parse(
-    method: MethodSpecification, default: TrainerConfig, options: list[str], only_common: bool = False
+    method: MethodSpecification,
+    default: TrainerConfig,
+    options: list[str],
+    is_shown: Callable[[Collection[Any]], bool] | None = None,
+    ending: str = "",
 ) -> tuple[TrainerConfig, TrainingViewerOptions]:
     name, viewing = method.config.method_name, TrainingViewerOptions(enabled=sys.stdout.isatty())
-    ending = ""
-    if only_common:
-        default, viewing = _common_only(default), _common_only(viewing)
-        ending = " --help-all lists all options, also those of the viewer."
+    if is_shown is not None:
+        default, viewing = _shown_only(default, is_shown), _shown_only(viewing, is_shown)
     settings, viewer = type(default), type(viewing)
     parts = [("config", Annotated[settings, tyro.conf.arg(name="")]), ("viewer", viewer)]
     kind = make_dataclass("Arguments", parts, frozen=True)
@@ -137,17 +140,17 @@ def _stored_config(name: str, path: Path) -> TrainerConfig:
     return stored
 
 
-def _common_only(config: Any) -> Any:
-    """The same settings in classes whose help leaves out all fields but those annotated with `Common`."""
+def _shown_only(config: Any, is_shown: Callable[[Collection[Any]], bool]) -> Any:
+    """The same settings in classes whose help has those fields alone that are to be shown, by their annotations."""
     hints = get_type_hints(type(config), include_extras=True)
     shown: list[tuple[str, Any, Any]] = []
     values: dict[str, Any] = {}
     for entry in fields(config):
         hint, value = hints[entry.name], getattr(config, entry.name)
         if is_dataclass(value) and not isinstance(value, type):
-            value = _common_only(value)
+            value = _shown_only(value, is_shown)
             hint = type(value)
-        elif Common not in getattr(hint, "__metadata__", ()):
+        elif not is_shown(getattr(hint, "__metadata__", ())):
             hint = Annotated[hint, tyro.conf.Suppress]
         values[entry.name] = value
         shown.append((entry.name, hint, field(default_factory=lambda value=value: value)))
@@ -309,7 +312,7 @@ if __name__ == "__main__":
 
 _FEWEST_LINES = 8
 """Lines of metrics below which nothing is said."""
-_DOUBTED = 0.02
+_OUTLIERS = 0.02
 """Share of poses that are not believed, of which more is said."""
 _HARDLY_FELL = 0.6
 """Loss in the last quarter of the training, over that in the first, above which it hardly fell. Trainings that settle
@@ -346,10 +349,10 @@ def _remarks(lines: Sequence[Mapping[str, Any]]) -> list[str]:
             f"corrections of the poses of {counted(undone, 'view')} went beyond a quarter of the distance to the scene "
             "(or 14 degrees) and were undone: look whether these views belong to the scene, or train with --poses fixed"
         )
-    doubted = float(known[-1].get("poses_doubted") or 0)
-    if doubted > _DOUBTED:
+    outliers = float(known[-1].get("pose_outliers") or 0)
+    if outliers > _OUTLIERS:
         found.append(
-            f"{doubted:.0%} of the views, or of the rows of line cameras, still fit far worse than the others and "
+            f"{outliers:.0%} of the views, or of the rows of line cameras, still fit far worse than the others and "
             "hardly shape the scene: their poses are off by more than was found, or they show something else"
         )
     if last > _HARDLY_FELL * first:

@@ -29,6 +29,9 @@ when it is needed. Neither shown on the command line nor written to a file."""
 Common = "common"
 """Annotation of a setting that most people need: `Annotated[int, Common, short("name")]`; --help shows only these."""
 
+Hidden = "hidden"
+"""Annotation of a setting that works as a flag, but that no help lists: `Annotated[int, Hidden]`."""
+
 
 def short(name: str) -> Any:
     """Annotation that gives a setting the flag `--name` beside its long one."""

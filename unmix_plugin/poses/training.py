@@ -3,38 +3,50 @@
 The levels of the field's grid join in the coarse part of the training, a little after whose start poses begin to move;
 at its end space is carved by the corrected cameras.
 
-Notation: `X x Y x Z` cells of the occupancy grid.
+Notation: `X x Y x Z` cells of the occupancy grid, `N` rays, `M` knots of all views.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
+from unmix_plugin.engine.model import DataManager
 from unmix_plugin.engine.processes import Processes
 from unmix_plugin.field import CoefficientField, UnmixField
-from unmix_plugin.losses.batch_comparison import BatchComparison
+from unmix_plugin.losses.comparison import BatchComparison, ComparedPixels
 from unmix_plugin.poses.refinement import PoseRefinement
-from unmix_plugin.poses.settings import PoseConfig
-from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.settings import PoseConfig
 
 
 @runtime_checkable
 class CarvesAgain(Protocol):
     """Data with masks by which space can be carved."""
 
-    train_cameras: Cameras
-
     def carved_by(self, cameras: Cameras) -> Bool[Tensor, "X Y Z"] | None:
         """Cells that may hold something, if the training views stand there; None where that is not known."""
         ...
+
+
+@dataclass(frozen=True)
+class CorrectedRays:
+    """Training rays as their corrected cameras send them, and the corrections, computed once a step."""
+
+    rays: RayBundle
+    steps: Float[Tensor, "M 6"] | None = None
+    """`PoseRefinement.free_steps`; None where poses are taken as they are."""
+    knots: Int[Tensor, "N"] | None = None
+    """Nearest to each ray; None while the grid is coarse."""
+    weights: Float[Tensor, "N"] | None = None
+    """By which rays shape the scene: less where their pose is an outlier."""
 
 
 class PoseTraining:
@@ -43,13 +55,14 @@ class PoseTraining:
     def __init__(self, config: PoseConfig, poses: PoseRefinement | None) -> None:
         """`poses` is None where they are taken as they are."""
         self._config, self._poses = config, poses
+        self._cameras: Cameras | None = None
         self._fineness = 0.0
 
     def begin(
         self, initial_data: Mapping[str, np.ndarray], box: SceneBox, pixel_size: float
     ) -> Bool[Tensor, "X Y Z"]:
-        """Take in where the cameras stand, and say which cells can be reached at first: poses that are off carve away
-        what is there."""
+        """Note where the cameras stand, and say which cells can be reached at first: poses that are off carve away what
+        is there."""
         reachable = torch.from_numpy(initial_data["reachable"])
         if self._poses is None:
             return reachable
@@ -68,52 +81,50 @@ class PoseTraining:
         if self._poses is not None:
             self._poses.undo_runaways(is_final=self._is_fine)
 
-    def carved(self, data: object) -> Bool[Tensor, "X Y Z"] | None:
-        """Once, when the levels of the grid have joined: what can't be carved away by the corrected cameras."""
-        if (
-            self._poses is None
-            or self._poses.is_settled
-            or not self._is_fine
-            or not isinstance(data, CarvesAgain)
-        ):
+    def between_steps(self, data: DataManager) -> Bool[Tensor, "X Y Z"] | None:
+        """Know the cameras; and once, when the levels of the grid have joined, what these can't carve away."""
+        if self._poses is None:
             return None
-        self._poses.settle()
+        if self._cameras is None:
+            self._cameras = data.train_cameras.to(self._poses.steps.device)
+        if self._poses.is_carved or not self._is_fine or not isinstance(data, CarvesAgain):
+            return None
+        self._poses.finish_carving()
         return data.carved_by(self._poses.refined(data.train_cameras))
 
-    def corrected(self, rays: RayBundle) -> RayBundle:
+    def corrected(self, rays: RayBundle) -> CorrectedRays:
         """Training rays as their corrected cameras send them."""
-        if self._poses is None or self._fineness < self._config.start:
-            return rays
-        return self._poses(rays)
+        if self._poses is None:
+            return CorrectedRays(rays)
+        steps = self._poses.free_steps()
+        if self._fineness < self._config.start:
+            return CorrectedRays(rays, steps)
+        knots = self._poses.nearest_knots(rays)
+        weights = self._poses.robust.weights[knots]
+        moved = self._poses(rays, self._cameras, steps, 1 / weights)
+        return CorrectedRays(moved, steps, knots, weights) if self._is_fine else CorrectedRays(moved, steps)
 
-    def believed(self, outputs: dict[str, Tensor], rays: RayBundle) -> dict[str, Tensor]:
-        """Outputs of training rays, which shape the scene as far as their poses are believed."""
-        return self._poses.believed(outputs, rays) if self._poses is not None and self._is_fine else outputs
-
-    def observe(
-        self,
-        outputs: dict[str, Tensor],
-        batch: dict[str, Tensor],
-        comparison: BatchComparison,
-        materials: Materials,
-    ) -> None:
+    def observe(self, compared: Sequence[ComparedPixels], corrected: CorrectedRays) -> None:
         """Note how well pixels fit, as far as it tells of their poses."""
-        if self._poses is not None and "knots" in outputs:
-            parts = comparison.parts(outputs, batch, materials)
-            self._poses.trust.observe(*comparison.errors_of_poses(parts))
+        if self._poses is not None and corrected.knots is not None:
+            self._poses.robust.observe(*BatchComparison.pose_errors(compared, corrected.knots))
 
-    def judge(self, processes: Processes) -> None:
-        """Decide which poses are believed."""
+    def update_weights(self, processes: Processes) -> None:
+        """Decide which poses are outliers."""
         if self._poses is not None and self._is_fine:
-            self._poses.trust.judge(processes)
+            self._poses.robust.update(processes)
 
-    def penalty(self) -> dict[str, Float[Tensor, ""]]:
+    def penalty(self, corrected: CorrectedRays) -> dict[str, Float[Tensor, ""]]:
         """What large and rough corrections cost, as `poses`; nothing where none are made."""
-        return {} if self._poses is None else {"poses": self._poses.penalty(self._config)}
+        if self._poses is None or corrected.steps is None:
+            return {}
+        return {"poses": self._poses.penalty(corrected.steps)}
 
-    def figures(self) -> dict[str, Tensor]:
+    def figures(self, corrected: CorrectedRays) -> dict[str, Tensor]:
         """How far poses were corrected; nothing where they are not."""
-        return {} if self._poses is None else self._poses.figures()
+        if self._poses is None or corrected.steps is None:
+            return {}
+        return self._poses.figures(corrected.steps)
 
     @property
     def _is_fine(self) -> bool:

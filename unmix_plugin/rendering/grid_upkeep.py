@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 from unmix_plugin.engine.processes import Processes
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.operators.occupancy import OccupancyGrid
-from unmix_plugin.rendering.renderer import VolumeRenderer
+from unmix_plugin.rendering.renderer import RenderedRays, VolumeRenderer
 
 _GRID_INTERVAL = 16
 """Steps between updates of the occupancy grid."""
@@ -31,7 +32,7 @@ _FIRST_CELLS_UNTIL = 0.5
 """That part."""
 
 _SHARE_OF_PIXELS = 0.07
-"""Of the pixels of the training views, that must be looked at before it is decided anew what is visible. In large
+"""Of the pixels of the training views, that must be cast before it is decided anew what is visible. In large
 pictures a cell has many pixels: fewer rays would by chance miss what few views see, and it would be left out for good.
 """
 
@@ -94,7 +95,7 @@ def occupied_density(renderer: VolumeRenderer, num_cells: int) -> float:
 
 
 def share_sights(grid: OccupancyGrid, processes: Processes) -> None:
-    """Take in which cells the rays of all processes saw, and what they met; twice is as good as once."""
+    """Share which cells the rays of all processes saw, and what they met; twice is as good as once."""
     visibility = grid.visibility
     processes.smallest(visibility.lowest_view)
     processes.largest(visibility.highest_view)
@@ -104,11 +105,14 @@ def share_sights(grid: OccupancyGrid, processes: Processes) -> None:
 
 
 def record_seen(
-    grid: OccupancyGrid, outputs: dict[str, Tensor], visible_weight: float, processes: Processes
+    grid: OccupancyGrid,
+    rendered: RenderedRays,
+    views: Int[Tensor, "N"],
+    visible_weight: float,
+    processes: Processes,
 ) -> None:
-    """Note which cells the rays of a batch saw, from the model's outputs; nothing where all cells stay visible."""
+    """Note which cells the rays of a batch saw, each of a view; nothing where all cells stay visible."""
     if visible_weight >= 1:
         return
-    is_seen = outputs["weights"] > visible_weight
-    num_rays = len(outputs["accumulation"]) * processes.count
-    grid.visibility.record(outputs["positions"], outputs["views"], is_seen, num_rays)
+    own, is_seen = views.index_select(0, rendered.ray_indices), rendered.weights > visible_weight
+    grid.visibility.record(rendered.positions, own, is_seen, len(views) * processes.count)

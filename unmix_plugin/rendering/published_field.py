@@ -10,50 +10,29 @@ Source: Perez et al. 2025, section 3, and the authors' code. docs/background/met
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from unmix_plugin.engine.configs import Target
-from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.field import (
     NUM_DIRECTION_FEATURES,
+    NUM_FEATURES,
     UnmixField,
-    UnmixFieldConfig,
     direction_features,
 )
-from unmix_plugin.light.networks import bias_free_network
-from unmix_plugin.light.shading import Lamplight
+from unmix_plugin.light.shading import Lamplight, bias_free_network
 
 _NUM_FREQUENCIES = 2
 _NUM_POSITION_FEATURES = 3 * 2 * _NUM_FREQUENCIES
-
-
-@dataclass(frozen=True)
-class PublishedFieldConfig(UnmixFieldConfig):
-    """Sizes as published; `cells_per_pixel`, `scale` and `specular_bias` have no effect here."""
-
-    _target: Target = field(default_factory=lambda: PublishedField)
-    num_levels: int = 16
-    features_per_level: int = 2
-    log2_rows_per_level: int = 19
-    finest_resolution: int = 2048
-    """Cells along the scene box's longest edge on the finest level."""
-    temperature: float = 0.4
-
-    def cells_of_finest_level(self, scene_box: SceneBox, pixel_size: float) -> int:
-        """As published, whatever the images."""
-        return max(self.coarsest_resolution, self.finest_resolution)
 
 
 class PublishedField(UnmixField):
     """Density, abundances, scales and one view-dependent value a band (J = B), of points in a scene box."""
 
     def _make_networks(self) -> None:
-        width, num_features = self.config.hidden_width, self.config.num_features + _NUM_POSITION_FEATURES
-        self.density_network = bias_free_network(self.num_encoded, width, 1 + self.config.num_features)
+        width, num_features = self.config.hidden_width, NUM_FEATURES + _NUM_POSITION_FEATURES
+        self.density_network = bias_free_network(self.num_encoded, width, 1 + NUM_FEATURES)
         self.material_network = bias_free_network(num_features, width, width, self.num_endmembers + 1)
         self.scale_network = bias_free_network(num_features, width, width, self.num_endmembers)
         if self.num_specular:

@@ -10,44 +10,23 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Shaped, UInt8
 
-from unmix_plugin.engine.configs import Common, short
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.runs.config_json import config_from_json
 from unmix_plugin.scenes.placement import Normalisation, Placement
-from unmix_plugin.scenes.reading.cubes import InvalidPixels, map_array, read_cube, read_invalid
+from unmix_plugin.scenes.reading.cubes import map_array, read_cube, read_invalid
 from unmix_plugin.scenes.reading.images import read_colour, read_labels, read_mask
 from unmix_plugin.scenes.reading.transforms_json import FILE_NAME
+from unmix_plugin.settings import SceneOptions
 from unmix_plugin.spectral.sensor import SceneSensor
 
 _COMPARED = ("wavelengths_nm", "frames", "train_indices", "eval_indices", "cameras", "normalisation")
 _OF_RIGS = ("sensors", "frame_sensors")
-
-
-@dataclass(frozen=True)
-class SceneOptions:
-    """How to read a scene."""
-
-    value_scale: Annotated[float | None, Common, short("value-scale")] = None
-    """Cubes are divided by this number (needed for integer cubes, such as 255 or 4095); None takes them as they are."""
-    invalid_pixels: Annotated[InvalidPixels, Common, short("invalid-pixels")] = "refuse"
-    """What to do with pixels that hold NaN, infinite or negative values: refuse the scene; leave them out (mask); or
-    set negative values to 0, as suits noise around black, and leave the others out (clip)."""
-    allow_outside_paths: Annotated[bool, short("allow-outside-paths")] = False
-    """Follow paths in transforms.json that lead out of the scene folder (`..`, absolute, symbolic links)."""
-    eval_split: Annotated[Literal["auto", "lists", "filename", "interval"], short("eval-split")] = "auto"
-    """Evaluation frames by the lists of transforms.json, by folder or file name, or every n-th; auto takes the first
-    of these that the scene supports."""
-    eval_interval: Annotated[int, short("eval-interval")] = 8
-    """With an interval split every n-th frame, from the first on, is for evaluation."""
-    world: Annotated[Literal["bounded", "unbounded", "auto"], Common, short("world")] = "auto"
-    """Whether all that pictures show lies in a box, or goes on behind it as far as the sky. Auto is bounded where
-    pictures have alpha; otherwise it is unbounded if views agree on places outside of the box."""
 
 
 @dataclass(frozen=True)

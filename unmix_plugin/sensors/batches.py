@@ -1,100 +1,93 @@
-"""Training batches of scenes with several sensors: the pixels of one sensor are together, one sensor after the other.
+"""Training batches: what the pixels of each sensor measured, as values here and as the engine's dictionary between.
 
-Such a batch has, beside what every batch has, `sensors`, `sensor_pixels` and `sensor_rays` (G each, on the CPU): which
-sensors some pixels are of, how many of each, and how many rays each such pixel has. `spectra` (R, b) is 0 beyond the
-channels of a pixel's sensor.
+The pixels of one sensor are together, one sensor after the other; the rays of a pixel follow each other. The batch of a
+rig has, beside what every batch has, `sensors`, `sensor_pixels` and `sensor_rays` (G each, on the CPU): which sensors
+some pixels are of, how many of each, and how many rays each such pixel has. `spectra` is 0 beyond a sensor's channels.
 
-Notation: `R` pixels, `P` rays, `b` channels of a sensor, `G` sensors of a batch.
+Notation: `R` pixels, `b` channels of a sensor, `G` sensors of a batch.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.space import RayBundle
-
-_OF_BATCH = ("sensors", "sensor_pixels", "sensor_rays")
+_COLUMNS = ("alpha", "pixels", "alpha_trust", "surfaces")
 
 
 @dataclass(frozen=True)
-class SensorPart:
-    """The pixels of one sensor, or of a scene's only one."""
+class MeasuredPixels:
+    """Pixels of one sensor."""
 
     sensor: int | None
     """Which of the scene's; None where it has one ordinary camera."""
-    share: float
-    """Of the batch's rays."""
-    outputs: dict[str, Tensor]
-    """Rendered, one row a ray."""
-    batch: dict[str, Tensor]
-    """Measured, one row a pixel; spectra (R, b)."""
+    num_rays: int
+    """Through all of them."""
+    spectra: Float[Tensor, "R b"]
+    alpha: Float[Tensor, "R"]
+    pixels: Int[Tensor, "R"]
+    """Number of each."""
+    alpha_trust: Float[Tensor, "R"] | None = None
+    """How far alpha can be trusted, 0 or 1; None: everywhere."""
+    surfaces: Float[Tensor, "R 3"] | None = None
+    """Places that the pixels are known to show, model space, NaN where unknown; None where none are known."""
+
+    def __len__(self) -> int:
+        return len(self.spectra)
+
+    def surfaces_of_rays(self) -> Float[Tensor, "rays 3"] | None:
+        """`surfaces` of the pixel of each ray."""
+        if self.surfaces is None:
+            return None
+        return self.surfaces.repeat_interleave(self.num_rays // len(self), dim=0)
+
+    def first(self, count: int) -> MeasuredPixels:
+        """The first so many pixels."""
+        columns = {name: getattr(self, name) for name in ("spectra", *_COLUMNS)}
+        cut = {name: None if values is None else values[:count] for name, values in columns.items()}
+        return replace(self, **cut)
 
 
-def join_parts(
-    parts: Sequence[tuple[int, RayBundle, dict[str, Tensor]]],
-) -> tuple[RayBundle, dict[str, Tensor]]:
-    """One batch of sensors, their rays and what their pixels measured; at least one."""
-    bundles, batches = [bundle for _, bundle, _ in parts], [batch for _, _, batch in parts]
-    most = max(batch["spectra"].shape[1] for batch in batches)
-    counts = [len(batch["spectra"]) for batch in batches]
-    joined = {name: torch.cat([batch[name] for batch in batches]) for name in batches[0] if name != "spectra"}
-    joined["spectra"] = torch.cat(
-        [torch.nn.functional.pad(b["spectra"], (0, most - b["spectra"].shape[1])) for b in batches]
-    )
-    joined["sensors"] = torch.tensor([sensor for sensor, _, _ in parts])
-    joined["sensor_pixels"] = torch.tensor(counts)
-    joined["sensor_rays"] = torch.tensor(
-        [len(bundle) // count for bundle, count in zip(bundles, counts, strict=True)]
-    )
-    columns: list[Any] = []
-    for name in RayBundle.__dataclass_fields__:
-        column = [getattr(bundle, name) for bundle in bundles]
-        columns.append(None if any(x is None for x in column) else torch.cat(column))
-    rays = RayBundle(*columns)
-    return rays, joined
+def to_batch(parts: Sequence[MeasuredPixels]) -> dict[str, Tensor]:
+    """The engine's batch of some pixels; those of a rig have numbers of sensors."""
+    most = max(part.spectra.shape[1] for part in parts)
+    padded = [torch.nn.functional.pad(part.spectra, (0, most - part.spectra.shape[1])) for part in parts]
+    batch = {"spectra": torch.cat(padded)}
+    for name in _COLUMNS:
+        columns = [getattr(part, name) for part in parts]
+        if columns[0] is not None:
+            batch[name] = torch.cat(columns)
+    sensors = [part.sensor for part in parts if part.sensor is not None]
+    if sensors:
+        batch["sensors"] = torch.tensor(sensors)
+        batch["sensor_pixels"] = torch.tensor([len(part) for part in parts])
+        batch["sensor_rays"] = torch.tensor([part.num_rays // len(part) for part in parts])
+    return batch
 
 
-def split_parts(
-    outputs: dict[str, Tensor], batch: dict[str, Tensor], num_channels: Callable[[int], int]
-) -> list[SensorPart]:
-    """What belongs to each sensor; the whole, as it is, for a batch of one ordinary camera.
+def from_batch(
+    batch: dict[str, Tensor], num_rays: int, num_channels: Callable[[int], int]
+) -> list[MeasuredPixels]:
+    """The pixels of a batch, sensor by sensor.
 
     Args:
-        outputs: Of the model; those without a row for each ray go to no part of several.
-        batch: As `join_parts` made it, or without sensors.
+        batch: As `to_batch` makes it.
+        num_rays: Of the batch.
         num_channels: Of a sensor.
     """
+    columns = {name: batch[name] for name in _COLUMNS if name in batch}
     if "sensors" not in batch:
-        return [SensorPart(None, 1.0, outputs, batch)]
-    groups = [batch[name].tolist() for name in _OF_BATCH]
-    num_rays = sum(pixels * rays for _, pixels, rays in zip(*groups, strict=True))
-    of_rays = {name: x for name, x in outputs.items() if x.ndim > 0 and len(x) == num_rays}
-    of_pixels = {name: x for name, x in batch.items() if name not in _OF_BATCH}
-    parts, first_pixel, first_ray = [], 0, 0
+        return [MeasuredPixels(None, num_rays, batch["spectra"], **columns)]
+    groups = [batch[name].tolist() for name in ("sensors", "sensor_pixels", "sensor_rays")]
+    parts, start = [], 0
     for sensor, pixels, rays in zip(*groups, strict=True):
-        pixel_rows = slice(first_pixel, first_pixel + pixels)
-        ray_rows = slice(first_ray, first_ray + pixels * rays)
-        own = {name: x[pixel_rows] for name, x in of_pixels.items()}
-        own["spectra"] = own["spectra"][:, : num_channels(sensor)]
-        seen = {name: x[ray_rows] for name, x in of_rays.items()}
-        parts.append(SensorPart(sensor, pixels * rays / num_rays, seen, own))
-        first_pixel, first_ray = pixel_rows.stop, ray_rows.stop
+        rows = slice(start, start + pixels)
+        own = {name: values[rows] for name, values in columns.items()}
+        spectra = batch["spectra"][rows, : num_channels(sensor)]
+        parts.append(MeasuredPixels(sensor, pixels * rays, spectra, **own))
+        start = rows.stop
     return parts
-
-
-def mean_over_parts(
-    parts: Sequence[SensorPart], losses: Callable[[SensorPart], dict[str, Tensor]]
-) -> dict[str, Tensor]:
-    """Mean of each loss over parts, weighted with their shares; a part without some loss adds 0 to it."""
-    if len(parts) == 1:
-        return losses(parts[0])
-    totals: dict[str, Tensor] = {}
-    for part in parts:
-        for name, loss in losses(part).items():
-            totals[name] = totals[name] + part.share * loss if name in totals else part.share * loss
-    return totals

@@ -31,9 +31,9 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import rotation_matrix
 from unmix_plugin.engine.geometry.space import RayBundle
-from unmix_plugin.light.view_gains import smooth_terms
 from unmix_plugin.poses.refinement import LARGEST_STEP
 from unmix_plugin.poses.row_fitting import fit_rows, main_axes
+from unmix_plugin.sensors.views import smooth_terms
 from unmix_plugin.spectral.evidence import is_blown_out
 from unmix_plugin.trained.evaluation import PredictedView, ViewTruth
 from unmix_plugin.trained.outputs import MaterialView

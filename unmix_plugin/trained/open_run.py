@@ -21,7 +21,8 @@ from unmix_plugin.engine.runs.scene_record import differences, name_differences
 from unmix_plugin.errors import ConfigError, RunError, SceneError
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.scenes.reading.loader import load_scene
-from unmix_plugin.scenes.scene import Scene, SceneOptions, scene_identity
+from unmix_plugin.scenes.scene import Scene, scene_identity
+from unmix_plugin.settings import SceneOptions
 from unmix_plugin.trained.model_scene import frozen_parameters, model_scene
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.run_views import recorded_views, world_frame
@@ -48,7 +49,7 @@ def unmix_scene(
         record = replace(
             record,
             train_cameras=own.refined(record.train_cameras),
-            eval_cameras=own.lens.of(record.eval_cameras),
+            eval_cameras=own.corrected_lens(record.eval_cameras),
         )
     materials = replace(materials, endmembers=frozen[id(model.endmembers)], specular_spectra=specular)
     opaque = renderer.opaque_skips

@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from tests.scenes.scene_factory import look_at, make_scene
-from unmix_plugin.datamanager_settings import HyperspectralDataManagerConfig
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes import load_scene
@@ -21,6 +20,7 @@ from unmix_plugin.scenes.geometry.view_agreement import (
     compare_conventions,
     parallax_warning,
 )
+from unmix_plugin.settings import HyperspectralDataManagerConfig
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 WRONG = {

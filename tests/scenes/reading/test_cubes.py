@@ -18,7 +18,7 @@ from tests.scenes.scene_factory import make_scene
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.reading import cubes as arrays
 from unmix_plugin.scenes.reading.loader import load_scene
-from unmix_plugin.scenes.scene import SceneOptions
+from unmix_plugin.settings import SceneOptions
 
 
 def test_headers_are_parsed_one_at_a_time(tmp_path, monkeypatch):

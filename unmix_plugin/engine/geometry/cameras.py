@@ -147,8 +147,8 @@ class Cameras:
 
     @cached_property
     def is_distorted(self) -> bool:
-        """Whether any lens bends; found once, since the answer costs a device synchronisation."""
-        return bool(self.distortion.ne(0.0).any())
+        """Whether any lens bends, or is learning to; found once, since the answer costs a device synchronisation."""
+        return self.distortion.requires_grad or bool(self.distortion.ne(0.0).any())
 
     def generate_rays(
         self, camera_indices: Int[Tensor, " R"], pixel_coords: Float[Tensor, "R 2"]
@@ -170,7 +170,7 @@ class Cameras:
         directions = (poses[:, :, :3] * local[:, None, :]).sum(dim=-1)
         directions = directions / directions.norm(dim=-1, keepdim=True)
         return RayBundle(
-            poses[:, :, 3].contiguous(), directions, camera_indices, -poses[:, :, 2], pixel_coords[:, 1]
+            poses[:, :, 3].contiguous(), directions, camera_indices, -poses[:, :, 2], pixel_coords
         )
 
     def image_rays(self, index: int, subpixel_offset: tuple[float, float] = (0.5, 0.5)) -> RayBundle:

@@ -33,8 +33,8 @@ class RayBundle:
     """Index of the camera that sent each ray, int64."""
     axes: Float[Tensor, "R 3"] | None = None
     """Where the camera of each ray looked when it was taken, unit vectors; None where no camera is known."""
-    image_y: Float[Tensor, " R"] | None = None
-    """Height in the image that each ray passes, pixels; None where no image is known."""
+    pixel_coords: Float[Tensor, "R 2"] | None = None
+    """x and y in the image that each ray passes, pixels; None where no image is known."""
 
     def __len__(self) -> int:
         return self.origins.shape[0]

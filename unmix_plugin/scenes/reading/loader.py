@@ -38,7 +38,8 @@ from unmix_plugin.scenes.reading.images import check_colours, check_labels, chec
 from unmix_plugin.scenes.reading.sensors import check_coverage, group_by_sensor, read_operators
 from unmix_plugin.scenes.reading.splits import Split, split_frames
 from unmix_plugin.scenes.reading.transforms_json import FILE_NAME, SceneEntry, Size, read_transforms
-from unmix_plugin.scenes.scene import Frame, Scene, SceneOptions
+from unmix_plugin.scenes.scene import Frame, Scene
+from unmix_plugin.settings import SceneOptions
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, read_illuminant_csv, read_spectra_csv
 from unmix_plugin.spectral.sensor import SceneSensor

@@ -1,14 +1,65 @@
-"""Densities guide the normals that a lamp's light teaches."""
+"""Losses that know where surfaces are and how they face."""
 
 import pytest
 import torch
 from torch import nn
 
 from tests.light.test_lamp import model_with_lamp
-from tests.method_factory import NUM_BANDS, make_model, make_rays
+from tests.method_factory import CONFIG, NUM_BANDS, losses_of, make_model, make_rays
+from unmix_plugin.engine.geometry.space import SceneBox, UnitSpace
 from unmix_plugin.light.shading import LampShading
-from unmix_plugin.losses.normals import normals_error
+from unmix_plugin.losses.geometry import normals_error, stray_light
 from unmix_plugin.model import UnmixModel
+
+SPACE = UnitSpace(SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])), is_unbounded=True)
+CELL = 1 / 64
+NAN = float("nan")
+
+
+def stray(weights, cells_off, ray_indices, surfaces):
+    """Of samples so many cells away from the middle of the box along x."""
+    positions = torch.full((len(weights), 3), 0.5)
+    positions[:, 0] += CELL * torch.tensor(cells_off)
+    return stray_light(
+        torch.as_tensor(weights), positions, torch.tensor(ray_indices), torch.tensor(surfaces), SPACE
+    )
+
+
+def test_light_counts_in_full_at_the_surface_and_not_at_all_far_from_it():
+    surfaces = [[0.0, 0.0, 0.0]]
+    for cells_off, expected in ((0.0, 0.0), (0.9, 0.0), (-2.0, 0.5), (3.1, 1.0), (20.0, 1.0)):
+        found = stray([1.0], [cells_off], [0], surfaces)
+        assert float(found) == pytest.approx(expected, abs=1e-5)
+
+
+def test_what_a_ray_lets_through_is_stray_and_rays_without_a_known_surface_are_not_asked():
+    surfaces = [[0.0, 0.0, 0.0], [NAN, NAN, NAN], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    found = stray([0.6, 0.2, 1.0], [0.0, 30.0, 30.0], [0, 0, 1], surfaces)
+    assert float(found) == pytest.approx((0.4 + 0 + 1 + 1) / 4)
+
+
+def test_it_draws_light_to_the_surface_alone():
+    weights = torch.tensor([0.3, 0.3], requires_grad=True)
+    stray(weights, [0.0, 10.0], [0, 0], [[0.0, 0.0, 0.0]]).backward()
+    assert weights.grad is not None
+    assert weights.grad.tolist() == [-1.0, 0.0]
+
+
+def test_it_fades_out_and_needs_pixels_with_known_surfaces():
+    box = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
+    model = CONFIG.setup(
+        scene_box=box, metadata={**make_model(has_alpha=False).metadata, "is_unbounded": True}
+    )
+    batch = {"spectra": torch.zeros(2, NUM_BANDS), "alpha": torch.ones(2)}
+    guided = {**batch, "surfaces": torch.tensor([[0.1, 0.2, 0.3], [NAN, NAN, NAN]])}
+    begin_step = model.get_training_callbacks()[0].func
+    found = []
+    for progress in (0.0, 0.25, 0.5):
+        begin_step(1, progress)
+        rendered = (batch["spectra"], torch.zeros(2))
+        assert "surface" not in losses_of(model, batch, *rendered)
+        found.append(float(losses_of(model, guided, *rendered).get("surface", 0.0)))
+    assert found == pytest.approx([0.15, 0.0375, 0.0])
 
 
 def growing_downwards(positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -47,7 +98,7 @@ def losses(model: UnmixModel, progress: float) -> dict[str, torch.Tensor]:
     before, *_ = model.get_training_callbacks()
     before.func(1, progress)
     batch = {"spectra": torch.rand(60, NUM_BANDS), "alpha": torch.ones(60), "pixels": torch.arange(60)}
-    return model.get_loss_dict(model.get_outputs(make_rays(60)), batch)
+    return model.get_train_loss_dict(make_rays(60), batch)[1]
 
 
 def test_normals_are_guided_less_and_less_and_only_where_a_lamp_moves():

@@ -1,0 +1,161 @@
+"""What sensors see: weights of bands, and gains of views."""
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from tests.method_factory import BOX, CONFIG, NUM_BANDS, WAVELENGTHS_NM, initial_data, make_model, make_rays
+from unmix_plugin.engine.geometry.space import RayBundle
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.model import UnmixModel
+from unmix_plugin.sensors.batches import MeasuredPixels
+from unmix_plugin.sensors.views import ViewGains, smooth_terms
+from unmix_plugin.settings import LossConfig, UnmixModelConfig
+from unmix_plugin.spectral.unmixing.abundances import sparse_abundances
+from unmix_plugin.trained.alignment import align_gain
+from unmix_plugin.trained.evaluation import PredictedView, ViewTruth
+
+WEIGHTS = (1.24, 1.24, 0.04, 1.24, 1.24)
+
+
+def losses_of(model: UnmixModel, spoilt: float) -> dict[str, torch.Tensor]:
+    """Of pixels whose third band is wrong by so much."""
+    rays = make_rays(16)
+    torch.manual_seed(0)
+    spectra = 0.2 + 0.5 * torch.rand(16, NUM_BANDS)
+    spectra[:, 2] += spoilt
+    batch = {"spectra": spectra, "alpha": torch.ones(16), "pixels": torch.arange(16)}
+    return model.get_train_loss_dict(rays, batch)[1]
+
+
+def weighted(weights: tuple[float, ...]) -> UnmixModel:
+    return make_model(losses=LossConfig(band_weights=weights, background="black", rgb=0.0))
+
+
+def test_errors_count_by_the_weight_of_their_band():
+    plain, less = weighted(()), weighted(WEIGHTS)
+    grown = [losses_of(m, 0.3)["spectral"] - losses_of(m, 0.0)["spectral"] for m in (plain, less)]
+    assert_close(grown[1] / grown[0], torch.tensor(0.04), rtol=0.01, atol=0)
+
+
+def test_weights_of_1_change_no_bit():
+    plain, ones = losses_of(weighted(()), 0.1), losses_of(weighted((1.0,) * NUM_BANDS), 0.1)
+    assert all(torch.equal(plain[name], ones[name]) for name in plain)
+
+
+def test_a_noisy_band_hardly_moves_the_mixtures_of_pixels():
+    generator = torch.Generator().manual_seed(0)
+    endmembers = torch.tensor(
+        [[0.6, 0.2, 0.2, 0.2, 0.3], [0.2, 0.6, 0.8, 0.2, 0.3], [0.2, 0.2, 0.5, 0.6, 0.3]]
+    )
+    shares = torch.eye(3)[torch.randint(3, (200,), generator=generator)]
+    pixels = shares @ endmembers
+    pixels[:, 2] = (pixels[:, 2] + 0.3 * torch.randn(200, generator=generator)).clamp(min=0)
+    errors = []
+    for weights in ((), WEIGHTS):
+        balance = weighted(weights).balance
+        found = sparse_abundances(
+            balance.scaled(pixels, None), balance.scaled(endmembers, None), torch.tensor(0.01)
+        )
+        errors.append(float((found - shares).square().mean()))
+    assert errors[1] < 0.3 * errors[0]
+
+
+def test_first_endmembers_come_back_as_bright_as_they_were_seen():
+    plain, less = weighted(()).endmembers, weighted(WEIGHTS).endmembers
+    assert_close(less.sort(dim=0).values, plain.sort(dim=0).values, atol=0.05, rtol=0)
+
+
+def test_weights_follow_from_the_data_and_only_where_bands_differ():
+    def resolved(weights: np.ndarray) -> UnmixModelConfig:
+        data = {**initial_data(), "band_weights": weights}
+        return UnmixModelConfig(num_endmembers=3).resolve_auto(lambda: data, torch.Generator())[0]
+
+    assert resolved(np.ones(NUM_BANDS, np.float32)).losses.band_weights == ()
+    assert resolved(np.array(WEIGHTS)).losses.band_weights == pytest.approx(WEIGHTS)
+
+
+@pytest.mark.parametrize("weights", [(1.0, 1.0), (1.0, -1.0, 1.0, 1.0, 1.0)])
+def test_impossible_weights_are_refused(weights):
+    with pytest.raises(ConfigError, match="band-weights"):
+        make_model(losses=replace(CONFIG.losses, band_weights=weights))
+
+
+WAVELENGTHS = torch.tensor(WAVELENGTHS_NM)
+
+
+def make_lit_model(light: Literal["fixed", "camera", "per-view"]) -> UnmixModel:
+    torch.manual_seed(0)
+    losses = LossConfig(background="black", abundances=0.0, rgb=0.0)
+    config = replace(CONFIG, light=light, losses=losses)
+    model: UnmixModel = config.setup(scene_box=BOX, metadata=make_model().metadata)
+    with torch.no_grad():
+        model.initialise(initial_data(), torch.Generator().manual_seed(0))
+        model.field.get_parameter("table").normal_(std=0.5)
+    return model.eval()
+
+
+def of_views(rays: RayBundle, num_views: int) -> RayBundle:
+    return replace(rays, camera_indices=torch.arange(len(rays)) % num_views)
+
+
+def test_gains_are_relative_to_their_mean():
+    gains = ViewGains(3, WAVELENGTHS)
+    with torch.no_grad():
+        gains.log_gains.copy_(torch.randn(3, 3))
+    found = gains(torch.arange(3), gains.terms)
+    assert_close(found.log().mean(dim=0), torch.zeros(NUM_BANDS), atol=1e-6, rtol=0)
+    with torch.no_grad():
+        gains.log_gains.add_(1.0)
+    assert_close(gains(torch.arange(3), gains.terms), found)
+
+
+def test_one_band_has_one_gain():
+    assert_close(smooth_terms(torch.tensor([550.0]))[0], torch.ones(1))
+
+
+def test_training_finds_the_exposure_of_each_view():
+    model = make_lit_model("per-view")
+    assert model.view_gains is not None
+    true = torch.tensor([1.2, 0.8, 1.0])
+    rays = of_views(make_rays(240), 3)
+    with torch.no_grad():
+        seen = model.get_outputs(rays)
+        measured = seen["spectral"] * true[rays.camera_indices, None]
+        pixels = [MeasuredPixels(None, 240, measured, seen["accumulation"], torch.arange(240))]
+    optimizer = torch.optim.Adam([model.view_gains.log_gains], lr=0.02)
+    for _ in range(150):
+        optimizer.zero_grad()
+        model.losses(model.training_batch(rays, pixels))["spectral"].backward()
+        optimizer.step()
+    found = model.view_gains(torch.arange(3), model.view_gains.terms).detach()
+    expected = (true / true.log().mean().exp())[:, None].expand(3, NUM_BANDS)
+    assert_close(found, expected, atol=0.02, rtol=0)
+    assert float(model.comparison.psnr(model.training_batch(rays, pixels).compared)) > 30
+
+
+def test_a_view_is_aligned_by_exposure_and_smooth_white_balance():
+    generator = torch.Generator().manual_seed(0)
+    shown = torch.rand(8, 9, NUM_BANDS, generator=generator) * 0.5
+    gain = (torch.tensor([0.2, -0.1, 0.05]) @ smooth_terms(WAVELENGTHS)).exp()
+    truth = ViewTruth("view", shown * gain, torch.ones(8, 9, dtype=torch.bool))
+    ones = torch.ones(8, 9)
+    predicted = PredictedView(shown, ones, ones[..., None], ones.to(torch.uint8), ones[..., None])
+    assert_close(align_gain(predicted, truth, WAVELENGTHS).spectra, truth.spectra, atol=1e-4, rtol=0)
+
+
+def test_a_view_without_matter_stays_as_it_is():
+    spectra = torch.zeros(4, 4, NUM_BANDS)
+    truth = ViewTruth("void", spectra, torch.ones(4, 4, dtype=torch.bool), torch.zeros(4, 4))
+    ones = torch.ones(4, 4)
+    predicted = PredictedView(spectra, ones, ones[..., None], ones.to(torch.uint8), ones[..., None])
+    assert align_gain(predicted, truth, WAVELENGTHS) is predicted
+
+
+@pytest.mark.parametrize("light", ["fixed", "camera"])
+def test_other_lights_have_no_gains(light):
+    assert make_lit_model(light).view_gains is None

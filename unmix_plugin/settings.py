@@ -1,0 +1,466 @@
+"""All that a user can set of the method and of its data; what follows from the scene is found by `resolve_auto`.
+
+Nothing here imports what it sets up, so that the help of commands is quick. Settings that only tests and the method as
+published need are annotated with `Ours`: they work as flags, but no help lists them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
+
+from unmix_plugin.engine.configs import Common, DataManagerConfig, Hidden, ModelConfig, Target, short
+from unmix_plugin.errors import ConfigError, require
+from unmix_plugin.presets import AlphaPreset, Auto, choose
+
+if TYPE_CHECKING:
+    import numpy as np
+    import torch
+
+Light = Literal["fixed", "camera", "per-view"]
+EndmemberInit = Literal["kmeans", "vca", "nfindr", "minimum-volume", "pairs", "pooled-pairs", "file"]
+T = TypeVar("T")
+Ours = Annotated[T, Hidden]
+
+LARGEST_RESOLUTION = 4096
+"""Cells along an edge of a hash grid."""
+COARSE_PART = 0.5
+"""Part of the training in which samples move together to the distance they have in the end."""
+_LARGE_BOX = 300
+"""Pixels along the scene box from which on fewer samples a pixel do."""
+_USUAL_ENDMEMBERS = 6
+_PIXELS_TO_COUNT_BY = 20_000
+_WHY_LIGHT = {
+    "camera": "the light moves with the camera: brightness depends on the direction of view",
+    "per-view": "views differ in exposure: training finds a gain for each (--light fixed leaves them out)",
+}
+_WHERE_LAMP = {
+    True: "the place of its lamp follows from shadows: training models them, and refines the place",
+    False: "no shadows tell the place of its lamp: shadows that move are blurred",
+}
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """How to read a scene."""
+
+    value_scale: Annotated[float | None, Common, short("value-scale")] = None
+    """Cubes are divided by this number (needed for integer cubes, such as 255 or 4095); None takes them as they are."""
+    invalid_pixels: Annotated[Literal["refuse", "mask", "clip"], Common, short("invalid-pixels")] = "refuse"
+    """What to do with pixels that hold NaN, infinite or negative values: refuse the scene; leave them out (mask); or
+    set negative values to 0, as suits noise around black, and leave the others out (clip)."""
+    allow_outside_paths: Annotated[bool, short("allow-outside-paths")] = False
+    """Follow paths in transforms.json that lead out of the scene folder (`..`, absolute, symbolic links)."""
+    eval_split: Annotated[Literal["auto", "lists", "filename", "interval"], short("eval-split")] = "auto"
+    """Evaluation frames by the lists of transforms.json, by folder or file name, or every n-th; auto takes the first
+    of these that the scene supports."""
+    eval_interval: Annotated[int, short("eval-interval")] = 8
+    """With an interval split every n-th frame, from the first on, is for evaluation."""
+    world: Annotated[Literal["bounded", "unbounded", "auto"], Common, short("world")] = "auto"
+    """Whether all that pictures show lies in a box, or goes on behind it as far as the sky. Auto is bounded where
+    pictures have alpha; otherwise it is unbounded if views agree on places outside of the box."""
+
+
+@dataclass(frozen=True)
+class HyperspectralDataManagerConfig(DataManagerConfig):
+    """How a scene of spectral images is read and sampled."""
+
+    _target: Target = "unmix_plugin.datamanager:HyperspectralDataManager"
+    train_num_rays_per_batch: Ours[int] = 2048
+    """Rays of the first training step; the model adapts the number to its budget of samples."""
+    scene: SceneOptions = SceneOptions()
+    """How the files are read and split."""
+    subpixels: int | Auto = "auto"
+    """Rays cast through a pixel, along each of its edges; their mean is the pixel, in training and in rendering. Auto
+    is 2, but 1 where the training views have more than 4 million pixels: more pixels teach more than exact ones."""
+    single_ray_until: Ours[float | Auto] = "auto"
+    """Part of the training in which a pixel has a single ray: coarse shape needs many pixels, not exact ones. Auto is
+    0.4 where alpha is known, otherwise 0.8."""
+    grid_resolution: Ours[int | Auto] = "auto"
+    """Cells along an edge of the occupancy grid, from which space is carved that the views show to be empty. Auto is
+    128 where alpha is known, otherwise 64: only what few cameras see can be carved then."""
+    trust_alpha: bool = False
+    """Believe alpha even where the light of a pixel contradicts it."""
+    mend_values: bool = True
+    """Replace stripes and spikes in training views by what is around them: values that stand out from the bands
+    beside them and from the pixels around them in that. From 8 bands on, for pixels that memory holds."""
+    memory_gb: float | Auto = "auto"
+    """GiB of memory for training pixels. Auto is most of what the device has left. Pixels that need more stay in the
+    scene's files, and a part of them is held that is renewed while training goes on."""
+
+    target_components: int | Literal["auto", "none"] = "auto"
+    """Numbers to keep of each training pixel instead of one a band: its components in the subspace that the scene's
+    spectra lie in. Auto is none where all bands fit into the memory for training pixels; otherwise, from 100 bands on,
+    as many as leave out no more than noise. What training compares are spectra on all bands in any case."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible settings.
+
+        Raises:
+            ConfigError: a number out of its range.
+        """
+        super().__post_init__()
+        rules = {
+            "memory-gb of at least 0.01 or auto": self.memory_gb == "auto" or self.memory_gb >= 0.01,
+            "subpixels of 1 to 8 or auto": self.subpixels == "auto" or 1 <= self.subpixels <= 8,
+            "single-ray-until in [0, 1] or auto": self.single_ray_until == "auto"
+            or 0 <= self.single_ray_until <= 1,
+            "grid-resolution of 8 to 512 or auto": self.grid_resolution == "auto"
+            or 8 <= self.grid_resolution <= 512,
+            "target-components of at least 1, auto or none": isinstance(self.target_components, str)
+            or self.target_components >= 1,
+        }
+        require("the data manager", self, rules)
+
+
+@dataclass(frozen=True)
+class UnmixFieldConfig:
+    """Sizes of the field's grid and networks."""
+
+    num_levels: Ours[int] = 8
+    """Levels of the hash grid."""
+    features_per_level: Ours[int] = 4
+    """Features that the hash grid holds at each vertex of a level."""
+    coarsest_resolution: Ours[int] = 16
+    """Cells along an edge of the scene box on the coarsest level."""
+    finest_resolution: Ours[int | Auto] = "auto"
+    """The same on the finest level. Auto follows from `cells_per_pixel`."""
+    cells_per_pixel: float = 1.7
+    """Cells of the finest level along the edge of a pixel where it meets the middle of the scene box: finer ones would
+    fit what the views don't show."""
+    log2_rows_per_level: Ours[int | Auto] = "auto"
+    """Largest number of vertices that a level stores, as a power of two; finer levels share rows by a hash. auto: from
+    16 to 19, about a third of the finest level's cells in a face of the scene box."""
+    hidden_width: Ours[int] = 64
+    """Width of the hidden layers."""
+    temperature: float = 1.0
+    """T of the abundances' softmax: lower is purer."""
+    scale: Literal["shared", "per-endmember"] = "shared"
+    """One brightness a point, or one a point and endmember."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible settings.
+
+        Raises:
+            ConfigError: a number out of its range.
+        """
+        finest, rows = self.finest_resolution, self.log2_rows_per_level
+        rules = {
+            "num-levels of 1 to 32": 1 <= self.num_levels <= 32,
+            "features-per-level of 1 to 8": 1 <= self.features_per_level <= 8,
+            "coarsest-resolution of 2 to 4096": 2 <= self.coarsest_resolution <= LARGEST_RESOLUTION,
+            "finest-resolution of 2 to 4096 or auto": finest == "auto" or 2 <= finest <= LARGEST_RESOLUTION,
+            "cells-per-pixel of 0.001 to 100": 0.001 <= self.cells_per_pixel <= 100,
+            "log2-rows-per-level of 4 to 24 or auto": rows == "auto" or 4 <= rows <= 24,
+            "hidden-width of 1 to 1024": 1 <= self.hidden_width <= 1024,
+            "a temperature of 0.01 to 100": 0.01 <= self.temperature <= 100,
+        }
+        require("the field", self, rules)
+
+
+@dataclass(frozen=True)
+class RendererConfig:
+    """How finely rays are sampled and what is left out."""
+
+    samples_per_pixel: float | Auto = "auto"
+    """Samples of a ray along the length of a pixel's edge where it meets the middle of the scene box. Auto is 1.5, but
+    1 where alpha is known and the box is more than 300 pixels long: more rays teach more than closer samples."""
+    coarse_samples: Ours[int | Auto] = "auto"
+    """Samples along the longest edge of the scene box at the start of training, if there are more in the end: what is
+    coarse must be found first, by many rays of few samples. Auto is 256, but 64 in an unbounded world, where rays go
+    on outside the box."""
+    smallest_weight: Ours[float | Auto] = "auto"
+    """Samples that contribute less than this share of their ray's light are left out. Auto is 0.004 where alpha is
+    known, else 0.001."""
+    visible_weight: Ours[float | Auto] = "auto"
+    """Share of its ray's light from which a sample counts as seen. Cells that no two training views have lately seen
+    are left out; 1 leaves none out. Auto is 0.05 where alpha is known, else 1."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible settings.
+
+        Raises:
+            ConfigError: a number out of its range.
+        """
+        rules = {
+            "samples-per-pixel of 0.01 to 100 or auto": self.samples_per_pixel == "auto"
+            or 0.01 <= self.samples_per_pixel <= 100,
+            "coarse-samples of at least 1 or auto": self.coarse_samples == "auto" or self.coarse_samples >= 1,
+            "smallest-weight in [0, 1) or auto": self.smallest_weight == "auto"
+            or 0 <= self.smallest_weight < 1,
+            "visible-weight in (0, 1] or auto": self.visible_weight == "auto" or 0 < self.visible_weight <= 1,
+        }
+        require("the renderer", self, rules)
+
+    def sample_distance(self, pixel_size: float, longest_edge: float, has_alpha: bool) -> float:
+        """Distance of samples in the unit of a pixel's edge and of the scene box's longest one.
+
+        >>> [RendererConfig().sample_distance(1.0, edge, has_alpha=True) for edge in (270.0, 480.0)]
+        [0.6666666666666666, 1.0]
+        """
+        is_large = has_alpha and longest_edge > _LARGE_BOX * pixel_size
+        return pixel_size / choose(self.samples_per_pixel, 1.0 if is_large else 1.5)
+
+    def coarseness(self, samples: float, preset: AlphaPreset, progress: float) -> float:
+        """Factor on the distance of samples, of which so many lie along the longest edge of the scene box in the end,
+        when that part of the training is over."""
+        left = max(1.0 - progress / COARSE_PART, 0.0)
+        return max(samples / choose(self.coarse_samples, preset.coarse_samples), 1.0) ** left
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """What rendered pixels are compared with, and how much each comparison counts."""
+
+    background: Literal["random", "black", "white", "last"] | Auto = "auto"
+    """What lies behind the scene in training: a random grey a ray, black, white, or the colour of the last sample. Auto
+    is random where alpha is known, otherwise black."""
+    spectral: Ours[float] = 1.0
+    """Weight of the mean squared error of spectra."""
+    rgb: float | Auto = "auto"
+    """Weight of the mean squared error of their sRGB colours, in which dark pixels count more. Auto is 0.2 where alpha
+    is known, otherwise 0: where black may be the void, it costs quality."""
+    band_weights: tuple[float, ...] | Auto = "auto"
+    """Weight of the squared error in each band of the scene; none are equal weights. Auto gives less to bands that are
+    much noisier than the others, or dead: the reciprocal of their noise's variance. The mean is 1."""
+    abundances: float = 0.1
+    """Weight of the mean squared distance of composited abundances to those of the measured spectra, unmixed one by
+    one with the first endmembers; 0 as published. It falls to a tenth of that at the end of training."""
+    exposure: Ours[float | Auto] = "auto"
+    """Factor on spectra, rendered and measured, before they are compared: errors of dark scenes count as much as those
+    of bright ones. Auto makes the median opaque pixel as bright as 0.2, but darkens nothing."""
+    relative: Ours[float | Auto] = "auto"
+    """Power of a pixel's brightness by which squared errors of its spectrum are divided: 0 for absolute errors, 2 for
+    relative ones. Auto is 0 unless alpha is known and the brighter pixels are much brighter than the others."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible settings.
+
+        Raises:
+            ConfigError: a number out of its range.
+        """
+        rules = {
+            "spectral of at least 0": self.spectral >= 0,
+            "rgb of at least 0": self.rgb == "auto" or self.rgb >= 0,
+            "abundances of at least 0": self.abundances >= 0,
+            "band-weights above 0, auto or none": self.band_weights == "auto"
+            or all(weight > 0 for weight in self.band_weights),
+            "an exposure above 0 or auto": self.exposure == "auto" or self.exposure > 0,
+            "relative in [0, 2] or auto": self.relative == "auto" or 0 <= self.relative <= 2,
+        }
+        require("the losses", self, rules)
+
+
+@dataclass(frozen=True)
+class PoseConfig:
+    """How poses are refined."""
+
+    lens: Literal["fixed", "focal", "radial"] = "fixed"
+    """What of the lens that all views share is refined too: nothing, its focal length, or also k1 and k2."""
+    coarse_until: Ours[float] = 0.3
+    """Part of the training in which the levels of the field's grid join, the coarsest first: what is fine draws poses
+    to the nearest likeness. Where pictures have alpha, space is carved at its end."""
+    coarse_steps: Ours[int] = 900
+    """Steps in which they join at most: what is coarse hardly holds poses, and they drift."""
+    start: Ours[float] = 0.1
+    """Part of the coarse part before which poses stay: the field must show something first."""
+
+    def fineness(self, step: int, progress: float) -> float:
+        """How much of the coarse part is over in [0, 1], after some steps and that part of the training.
+
+        >>> PoseConfig(coarse_until=0.3, coarse_steps=900).fineness(100, 0.15)
+        0.5
+        """
+        if progress >= self.coarse_until or step >= self.coarse_steps:
+            return 1.0
+        return max(progress / self.coarse_until, step / self.coarse_steps)
+
+    def level_weights(self, num_levels: int, share: float) -> list[float]:
+        """Weights in [0, 1] of a grid's levels when that share of the coarse part is over.
+
+        >>> PoseConfig().level_weights(4, 0.25)
+        [1.0, 0.853553390593, 0.0, 0.0]
+        """
+        joined = [min(max(1 + share * (num_levels - 1) - level, 0.0), 1.0) for level in range(num_levels)]
+        return [1.0 if x == 1 else round(0.5 - 0.5 * math.cos(math.pi * x), 12) for x in joined]
+
+
+@dataclass(frozen=True)
+class UnmixModelConfig(ModelConfig):
+    """Settings of the model of UnMix-NeRF."""
+
+    _target: Target = "unmix_plugin.model:UnmixModel"
+    num_endmembers: Annotated[int | Auto | None, Common, short("endmembers")] = None
+    """K, the number of materials to unmix into; auto proposes it from the training pixels. None is 6, or the number of
+    bands if that is smaller."""
+    endmember_init: Annotated[EndmemberInit, Common, short("endmember-init")] = "pairs"
+    """First guess of the endmembers from the pixels of all training views, or spectra from `endmember_file`."""
+    endmember_file: Annotated[Path | None, Common, short("endmember-file")] = None
+    """CSV of reflectances (wavelength,name,...) for `endmember_init` file; multiplied by the scene's light if known,
+    and by one factor for the scene's brightness."""
+    specular: Literal["none", "dictionary", "full"] = "dictionary"
+    """View-dependent part: none, multiples of a few spectra, or one value a band as published."""
+    num_specular_spectra: Ours[int | Auto] = "auto"
+    """Spectra of the specular dictionary. The first is the light's, a highlight's colour on anything but metal; then
+    come the endmembers', as light that they send on has. Auto is 1 where alpha is known, else all."""
+    train_endmembers: bool = True
+    """Whether endmembers change while training; else they stay the first guess, or the spectra from a file."""
+    light: Annotated[Light | Auto, Common, short("light")] = "auto"
+    """Light that is fixed, that moves with the camera (objects turned before camera and lamp), or that differs from
+    view to view (also exposure). Auto finds which it is, and takes fixed without alpha."""
+    lamp: tuple[float, ...] | Auto = "auto"
+    """Where the lamp stands that moves with the camera, when training starts: 0 if it turns with the turntable or 1 if
+    it also goes up and down with the camera, the turntable's middle and axis, and the way from the middle to the lamp
+    (right, up, towards the camera), in model space. Auto finds it where light is `auto` too; no numbers: not known, so
+    shading is a smooth function of direction and shadows that move are blurred."""
+    poses: Annotated[Literal["fixed", "refine"], Common, short("poses")] = "fixed"
+    """Whether training takes the poses as they are, or corrects them with the field."""
+    pose_refinement: PoseConfig = PoseConfig()
+    """How poses are corrected."""
+    segmentation: Literal["abundances", "probe"] = "abundances"
+    """Material of a ray: its largest abundance, or the endmember of smallest angle to its spectrum as published."""
+    samples_per_step: int = 25_000
+    """Samples of rays that a training step looks at; the number of rays adapts to it."""
+    initial_opacity: Ours[float | Auto] = "auto"
+    """Opacity of one sample's interval in the untrained field. Auto is 0.05 where alpha is known, else 0.01: space
+    between cameras and walls must stay clear."""
+    as_published: Ours[bool] = False
+    """Whether the field is that of the method's authors, and losses compare spectra alone."""
+    field: UnmixFieldConfig = UnmixFieldConfig()
+    """Sizes of the field."""
+    renderer: RendererConfig = RendererConfig()
+    """How rays are sampled."""
+    losses: LossConfig = LossConfig()
+    """What training asks for, and how strongly."""
+
+    def __post_init__(self) -> None:
+        """Refuse impossible settings.
+
+        Raises:
+            ConfigError: a number out of its range or settings that contradict each other.
+        """
+        super().__post_init__()
+        count, opacity = self.num_endmembers, self.initial_opacity
+        rules = {
+            "num-endmembers of 1 to 255 or auto": count in (None, "auto") or 1 <= int(count) <= 255,
+            "num-specular-spectra of 1 to 256 or auto": self.num_specular_spectra == "auto"
+            or 1 <= self.num_specular_spectra <= 256,
+            "samples-per-step of 1 to 100 million": 1 <= self.samples_per_step <= 100_000_000,
+            "eval-num-rays-per-chunk of at least 1": self.eval_num_rays_per_chunk >= 1,
+            "initial-opacity in (0, 1) or auto": opacity == "auto" or 0 < opacity < 1,
+            "a lamp of no or ten numbers, the first 0 or 1, or auto": self.lamp in ("auto", ())
+            or (len(self.lamp) == 10 and self.lamp[0] in (0, 1)),
+            "light fixed or per-view: the field as published has no shading": not self.as_published
+            or self.light != "camera",
+            "endmember-file exactly when endmember-init is file": (self.endmember_init == "file")
+            == (self.endmember_file is not None),
+        }
+        require("the model", self, rules)
+
+    def resolve_auto(
+        self, initial_data: Callable[[], Mapping[str, np.ndarray]], generator: torch.Generator
+    ) -> tuple[UnmixModelConfig, str]:
+        """With a number of endmembers, the scene's exposure and its light, and the evidence for them.
+
+        Raises:
+            SpectrumError: no pixel is neither dark nor saturated.
+        """
+        import numpy as np
+        import torch
+
+        from unmix_plugin.spectral.unmixing.endmembers import drop_uninformative_pixels
+        from unmix_plugin.spectral.unmixing.num_materials import propose_num_materials
+
+        found, reasons = self, []
+        if self.num_endmembers is None:
+            first = initial_data()
+            num_bands = len(first["typical"]) if "typical" in first else first["pixels"].shape[1]
+            found = replace(found, num_endmembers=_usual_num_endmembers(num_bands))
+            if num_bands < _USUAL_ENDMEMBERS:
+                reasons.append(
+                    f"num-endmembers is {num_bands}: {num_bands} bands can't tell more materials apart"
+                )
+        if self.num_endmembers == "auto":
+            pixels = drop_uninformative_pixels(torch.from_numpy(initial_data()["pixels"]))
+            kept = torch.randperm(len(pixels), generator=generator)[:_PIXELS_TO_COUNT_BY]
+            count = propose_num_materials(pixels[kept], generator)
+            found = replace(found, num_endmembers=count.number)
+            reasons.append(count.evidence())
+        losses, of_losses = _resolved_losses(self.losses, initial_data)
+        found = replace(found, losses=losses)
+        reasons += of_losses
+        if self.light == "auto":
+            light: Light = initial_data().get("light", np.array("fixed")).item()
+            found = replace(found, light=light)
+            if light != "fixed":
+                reasons.append(_WHY_LIGHT[light])
+        if self.lamp == "auto" and found.light == "camera":
+            numbers = initial_data().get("lamp", np.zeros(0))
+            found = replace(found, lamp=tuple(round(float(x), 6) for x in numbers))
+            reasons.append(_WHERE_LAMP[bool(found.lamp)])
+        return found, "\n".join(reasons)
+
+    def checked_num_endmembers(self, num_bands: int) -> int:
+        """K.
+
+        Raises:
+            ConfigError: more endmembers than bands.
+        """
+        count = self.num_endmembers
+        if count is None:
+            return _usual_num_endmembers(num_bands)
+        if count == "auto":
+            raise ConfigError("num-endmembers is auto: call resolve_auto first")
+        if count > num_bands:
+            raise ConfigError(
+                f"num-endmembers is {count} but the scene has {num_bands} bands; choose at most {num_bands}"
+            )
+        return count
+
+    def num_dictionary_spectra(self, preset: AlphaPreset, num_endmembers: int) -> int:
+        """Spectra of the specular dictionary."""
+        if self.specular != "dictionary":
+            return 0
+        if self.num_specular_spectra == "auto":
+            return 1 + num_endmembers if preset.specular_endmembers else 1
+        return self.num_specular_spectra
+
+
+def _resolved_losses(
+    losses: LossConfig, initial_data: Callable[[], Mapping[str, np.ndarray]]
+) -> tuple[LossConfig, list[str]]:
+    """With what follows from the brightness and the noise of the scene, and the evidence for it."""
+    import numpy as np
+    import torch
+
+    from unmix_plugin.spectral.evidence import exposure_of
+
+    reasons = []
+    if losses.exposure == "auto":
+        exposure = round(exposure_of(torch.from_numpy(initial_data()["pixels"])), 3)
+        losses = replace(losses, exposure=exposure)
+        if exposure > 1:
+            reasons.append(
+                f"the scene is dark: training compares spectra multiplied by {exposure:.3g} (exposure)"
+            )
+    if losses.relative == "auto":
+        relative = round(float(initial_data().get("relative", 0.0)), 3)
+        losses = replace(losses, relative=relative)
+        if relative > 0:
+            reasons.append(
+                "part of the scene is much brighter than the rest: squared errors are divided by the "
+                f"brightness to the power of {relative:.2g} (relative)"
+            )
+    if losses.band_weights == "auto":
+        given = initial_data().get("band_weights", np.ones(1))
+        weights = () if bool((given == 1).all()) else tuple(round(float(w), 6) for w in given)
+        losses = replace(losses, band_weights=weights)
+    return losses, reasons
+
+
+def _usual_num_endmembers(num_bands: int) -> int:
+    """Endmembers of a scene whose user gives no number."""
+    return min(_USUAL_ENDMEMBERS, num_bands)
