@@ -2,14 +2,18 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 from torch.testing import assert_close
 
+from tests.poses.test_training import config_for, trained
 from tests.rendering.test_renderer import make, rays
 from tests.rendering.test_unbounded import make as make_unbounded
 from tests.rendering.test_unbounded import rays as rays_without_end
+from tests.scenes.scene_factory import make_scene
+from unmix_plugin.presets import WITH_ALPHA
 from unmix_plugin.rendering import front_to_back
 
 
@@ -97,3 +101,21 @@ def test_a_world_without_end_and_its_sky_are_those_of_the_careful_way(density):
     with torch.no_grad():
         careful = renderer.render(field, bundle).coefficients.packed
     assert_close(renderer.composite(field, bundle).packed, careful, rtol=1e-3, atol=1e-4)
+
+
+def test_pictures_of_a_trained_scene_are_those_of_the_careful_renderer(tmp_path):
+    """Merging and early termination decide every reported figure: they must stay far below a scene's own error."""
+    make_scene(tmp_path / "scene")
+    pipeline = trained(config_for(tmp_path, "fixed", steps=150)).pipeline
+    model: Any = pipeline.model.eval()
+    rays = pipeline.datamanager.eval_cameras.image_rays(0)
+    exactly, quickly = (
+        replace(model.renderer, smallest_weight=weight) for weight in (0.0, WITH_ALPHA.smallest_weight)
+    )
+    with torch.no_grad():
+        exact, found = exactly.render(model.field, rays).coefficients, quickly.composite(model.field, rays)
+        errors = (model.materials.spectra(found) - model.materials.spectra(exact)).abs()
+    assert float(exact.accumulation.max()) > 0.8
+    assert 0 < float(errors.square().mean().sqrt()) < 1e-3
+    assert float(errors.max()) < 6e-3
+    assert float((found.accumulation - exact.accumulation).abs().max()) < 8e-3
