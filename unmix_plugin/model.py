@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -48,6 +49,7 @@ from unmix_plugin.sensors.views import BandBalance, SensorViews, ViewGains
 from unmix_plugin.settings import UnmixModelConfig
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.library.spectra_csv import write_spectra_csv
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.metrics import psnr
 
@@ -333,6 +335,10 @@ class UnmixModel(Model):
             spectra = self.materials.spectra(self.renderer.render(self.field, bundle).coefficients)
             parameters = [value for group in self.get_param_groups().values() for value in group]
             torch.autograd.grad(spectra.sum(), parameters, allow_unused=True)
+
+    def write_results(self, folder: Path) -> None:
+        """Write the endmembers that evaluation and exports will use: `endmembers.csv`."""
+        write_spectra_csv(folder / "endmembers.csv", self.materials.table())
 
     @property
     def _training_renderer(self) -> VolumeRenderer:

@@ -303,7 +303,10 @@ def test_poses_that_ran_away_are_said():
     lines = course(1.0, 0.2, 0.1, 0.09)
     assert _remarks([*lines[:-1], {**lines[-1], "poses_undone": 0.0}]) == []
     said = _remarks([*lines[:-1], {**lines[-1], "poses_undone": 3.0}])
-    assert "corrections of the poses of 3 views went beyond" in said[0]
+    assert (
+        "corrections of the poses of 3 views went beyond a quarter of the distance to the scene or too far a turn"
+        in said[0]
+    )
 
 
 def test_poses_that_are_not_believed_are_said():

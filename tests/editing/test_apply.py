@@ -27,7 +27,6 @@ from unmix_plugin.spectral.library.material_library import measured_library
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable
 from unmix_plugin.spectral.sensor import Sensor
 from unmix_plugin.trained.outputs import OUTPUTS, MaterialView
-from unmix_plugin.trained.run_materials import _endmember_table
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 BANDS = Bands.of(WAVELENGTHS_NM)
@@ -140,7 +139,7 @@ def test_a_new_name_is_used_from_then_on_and_ends_up_in_tables():
     result = edited(
         scene, "rename: {endmember: 1, name: red brick}", "scale: {endmember: red brick, factor: 0}"
     )
-    table = _endmember_table(result.materials)
+    table = result.materials.table()
     assert table.names == ("endmember_0", "red brick", "endmember_2")
     assert table.spectra[1].max() == 0
     assert result.materials.endmembers[0].max() > 0

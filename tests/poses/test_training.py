@@ -67,18 +67,17 @@ def test_poses_that_are_taken_as_they_are_leave_training_as_it_was(folder):
     assert torch.equal(first, model.get_outputs(bare)["spectral"])
 
 
-def test_space_is_carved_once_by_the_corrected_cameras(folder):
-    asked = []
+def test_space_is_carved_once_by_the_corrected_cameras(folder, monkeypatch):
+    asked, refined = [], PoseRefinement.refined
 
-    class Watched(PoseRefinement):
-        def refined(self, cameras: Cameras) -> Cameras:
-            asked.append((trainer.step, super().refined(cameras)))
-            return asked[-1][1]
+    def watched(poses: PoseRefinement, cameras: Cameras) -> Cameras:
+        asked.append((trainer.step, refined(poses, cameras)))
+        return asked[-1][1]
 
     trainer = Trainer(config_for(folder, steps=20), console=Console(file=io.StringIO()))
     model: Any = trainer.pipeline.model
     assert bool(model.grid.reachable.all())
-    model.poses.__class__ = Watched
+    monkeypatch.setattr(PoseRefinement, "refined", watched)
     trainer.train()
     datamanager: Any = trainer.pipeline.datamanager
     [(step, cameras)] = asked

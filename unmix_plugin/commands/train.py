@@ -84,7 +84,15 @@ def parse_all(argv: Sequence[str]) -> tuple[TrainerConfig, TrainingViewerOptions
     given = tyro.cli(
         _Given, args=options, prog=f"{_PROGRAM} {name}", return_unknown_args=True, add_help=False
     )[0]
-    default = method.config if given.load_run is None else _stored_config(name, given.load_run)
+    default = method.config
+    if given.load_run is not None:
+        from unmix_plugin.engine.runs.load_run import load_config
+
+        default = load_config(given.load_run)
+        if default.method_name != name:
+            raise ConfigError(
+                f"{given.load_run} is a run of {default.method_name}, not of {name}; go on with its own method"
+            )
     config, viewing = _parse(method, default, options)
     if given.max_num_iterations is None and given.max_seconds is not None and config.max_seconds is not None:
         config = replace(config, max_num_iterations=None)
@@ -95,14 +103,6 @@ def parse_all(argv: Sequence[str]) -> tuple[TrainerConfig, TrainingViewerOptions
     ):
         config = replace(config, max_seconds=None)
     return config, viewing
-
-
-def _overview(methods: dict[str, MethodSpecification]) -> str:
-    """Help without a method: which there are."""
-    width = max((len(name) for name in methods), default=0)
-    lines = [f"  {name:{width}}  {method.description}" for name, method in sorted(methods.items())]
-    ending = f"{_PROGRAM} METHOD --help lists the common options of a method, --help-all all of them."
-    return "\n".join([_USAGE, "methods:", *lines, "", ending])
 
 
 def _parse(
@@ -126,18 +126,6 @@ def _parse(
         description=f"Train {name}: {method.description}.{ending}",
     )
     return found.config, found.viewer
-
-
-def _stored_config(name: str, path: Path) -> TrainerConfig:
-    """Settings of the run to go on with."""
-    from unmix_plugin.engine.runs.load_run import load_config
-
-    stored = load_config(path)
-    if stored.method_name != name:
-        raise ConfigError(
-            f"{path} is a run of {stored.method_name}, not of {name}; go on with its own method"
-        )
-    return stored
 
 
 def _shown_only(config: Any, is_shown: Callable[[Collection[Any]], bool]) -> Any:
@@ -168,7 +156,11 @@ def train(argv: list[str]) -> None:
     for plugin in broken:
         print(f"warning: {plugin}", file=sys.stderr)
     if argv and argv[0] in ("-h", "--help", "--help-all"):
-        print(_overview(methods))
+        width = max((len(name) for name in methods), default=0)
+        print(_USAGE, "methods:", sep="\n")
+        for name, method in sorted(methods.items()):
+            print(f"  {name:{width}}  {method.description}")
+        print(f"\n{_PROGRAM} METHOD --help lists the common options of a method, --help-all all of them.")
         return
     config, viewing = parse_all(argv)
 
@@ -215,7 +207,7 @@ def _prepared(config: TrainerConfig, console: Console, processes: Processes) -> 
 
 
 def _run(trainer: Trainer, console: Console) -> None:
-    """Train and write the endmembers.
+    """Train, and write what the model has found.
 
     Raises:
         SystemExit: 130, after a stop on request.
@@ -237,7 +229,9 @@ def _run(trainer: Trainer, console: Console) -> None:
     if spectral_scene(trainer.pipeline.datamanager) is not None:  # remarks name settings of spectral methods
         for remark in _read_remarks(trainer.run.metrics_path):
             say(console, remark)
-    _write_endmembers(trainer)
+    averaged = nullcontext() if trainer.average is None else trainer.average.swapped_in()
+    with trainer.control.device.training_turn(), averaged:
+        trainer.pipeline.model.write_results(trainer.run.path)
 
 
 @contextmanager
@@ -250,7 +244,7 @@ def _shown(trainer: Trainer, viewing: TrainingViewerOptions, console: Console) -
     if not viewing.enabled:
         yield
         return
-    from unmix_plugin.commands.reporting import say
+    from unmix_plugin.commands.reporting import say, spectral_scene
     from unmix_plugin.engine.runs.load_run import read_scene_record
     from unmix_plugin.viewer.rendering.scene import source_of_training
     from unmix_plugin.viewer.server import Viewer
@@ -262,7 +256,14 @@ def _shown(trainer: Trainer, viewing: TrainingViewerOptions, console: Console) -
         yield
         return
     source.device.guest_share = viewing.share
-    viewer = Viewer(source, viewing, lambda: _scene_of(trainer), lambda line: say(console, line))
+
+    def scene() -> Scene:
+        found = spectral_scene(trainer.pipeline.datamanager)
+        if found is None:
+            raise ConfigError(f"{trainer.config.method_name} has no spectral scene")
+        return found
+
+    viewer = Viewer(source, viewing, scene, lambda line: say(console, line))
     viewer.start()
     try:
         yield
@@ -273,41 +274,6 @@ def _shown(trainer: Trainer, viewing: TrainingViewerOptions, console: Console) -
                 viewer.wait(while_watched=not viewing.keep_open)
     finally:
         viewer.stop()
-
-
-def _scene_of(trainer: Trainer) -> Scene:
-    """The scene under training.
-
-    Raises:
-        ConfigError: its data manager has none.
-    """
-    from unmix_plugin.commands.reporting import spectral_scene
-
-    scene = spectral_scene(trainer.pipeline.datamanager)
-    if scene is None:
-        raise ConfigError(f"{trainer.config.method_name} has no spectral scene")
-    return scene
-
-
-def _write_endmembers(trainer: Trainer) -> None:
-    """Write the endmembers that evaluation and exports will use, if the method has any."""
-    from unmix_plugin.spectral.materials import Materials
-    from unmix_plugin.trained.run_materials import write_endmembers_csv
-
-    averaged = nullcontext() if trainer.average is None else trainer.average.swapped_in()
-    with trainer.control.device.training_turn(), averaged:
-        materials = getattr(trainer.pipeline.model, "materials", None)
-        if isinstance(materials, Materials):
-            write_endmembers_csv(trainer.run.path / "endmembers.csv", materials)
-
-
-def main() -> None:
-    """Console script."""
-    run_command(train)
-
-
-if __name__ == "__main__":
-    main()
 
 
 _FEWEST_LINES = 8
@@ -322,7 +288,7 @@ _STILL_FALLS = 0.3
 
 
 def _read_remarks(metrics_path: Path) -> list[str]:
-    """Remarks on the training whose `metrics.jsonl` this is; none where the file can't be read."""
+    """Remarks on a training's `metrics.jsonl`; none where it can't be read."""
     try:
         lines = [json.loads(line) for line in metrics_path.read_text(encoding="utf-8").splitlines()]
     except (OSError, ValueError):
@@ -347,7 +313,8 @@ def _remarks(lines: Sequence[Mapping[str, Any]]) -> list[str]:
     if undone:
         found.append(
             f"corrections of the poses of {counted(undone, 'view')} went beyond a quarter of the distance to the scene "
-            "(or 14 degrees) and were undone: look whether these views belong to the scene, or train with --poses fixed"
+            "or too far a turn and were undone: look whether these views belong to the scene, or train with "
+            "--poses fixed"
         )
     outliers = float(known[-1].get("pose_outliers") or 0)
     if outliers > _OUTLIERS:
@@ -376,3 +343,12 @@ def _typical_loss(lines: Sequence[Mapping[str, Any]], quarter: int) -> float | N
     low, high = (start + (end - start) * part / 4 for part in (quarter - 1, quarter))
     losses = [float(line["loss"]) for line in lines if low < line["step"] <= high]
     return median(losses) if losses else None
+
+
+def main() -> None:
+    """Console script."""
+    run_command(train)
+
+
+if __name__ == "__main__":
+    main()

@@ -266,6 +266,14 @@ class Model(nn.Module, ABC):
         """Compile and allocate what the first step needs, before the training clock starts; changes no parameter,
         no buffer."""
 
+    def write_results(self, folder: Path) -> None:
+        """Write what people read of a trained model into its run's folder; called when training has ended, with the
+        averaged parameters. Usually nothing.
+
+        Raises:
+            RunError: the disk is full or refuses.
+        """
+
     @torch.no_grad()
     def get_outputs_for_camera(
         self, camera: Cameras, outputs: Collection[str] | None = None

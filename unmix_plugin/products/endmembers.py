@@ -11,8 +11,9 @@ from unmix_plugin.figures.plotting import figure_bytes, plain_axes
 from unmix_plugin.formats.envi import envi_library_paths, write_envi_library
 from unmix_plugin.formats.files import make_folder, write_file
 from unmix_plugin.products.product import Job, Product
+from unmix_plugin.spectral.library.spectra_csv import write_spectra_csv
 from unmix_plugin.spectral.materials import Materials
-from unmix_plugin.trained.run_materials import endmember_colours, write_endmembers_csv
+from unmix_plugin.trained.run_materials import endmember_colours
 
 _LINE_STYLES = ("-", "--", "-.", ":")
 _LEGEND_ROWS = 16
@@ -46,7 +47,7 @@ def _write_endmembers(folder: Path, materials: Materials) -> list[Path]:
     spectra = materials.endmembers.detach().cpu().numpy().astype(np.float32)
     about = "endmembers: radiance, 1 = full scale"
     write_envi_library(folder / "endmembers", spectra, materials.bands, materials.names, about)
-    write_endmembers_csv(table_path, materials)
+    write_spectra_csv(table_path, materials.table())
     write_file(plot_path, _draw_endmembers(materials))
     return _endmember_paths(folder)
 

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.library.spectra_csv import SpectraTable
 from unmix_plugin.spectral.maps.reflectance_maps import seen_reflectance
 from unmix_plugin.spectral.segmentation import material_ids, material_scores
 
@@ -148,6 +149,10 @@ class Materials:
             object.__setattr__(self, "names", default_names(count))
         if len(set(self.names)) != count or len(self.names) != count:
             raise SpectrumError(f"{count} endmembers need {count} distinct names; found {list(self.names)}")
+
+    def table(self) -> SpectraTable:
+        """The endmembers with their names: spectra under the scene's light, [0, 1]."""
+        return SpectraTable(self.bands, self.names, self.endmembers.detach().to("cpu", torch.float64).numpy())
 
     def to(self, device: torch.device | str) -> Materials:
         """The same spectra on another device, without gradients."""
